@@ -224,7 +224,7 @@ class Diagnostics:
         h64, t64, state_origin = sheet[H], sheet[END], integer(sheet, ORIGIN)
         self.reduce_blocks(0, h64, state_origin)
         self.sum_up(0, h64, t64, state_origin, sheet)
-        self.step.tell_halt(sheet)
+        self.step.write_halt(sheet)
 
     @ti.func
     def sum_up(self, thread, h64, t64, state_origin, sheet: ti.template()):  # type: ignore[valid-type]

@@ -53,7 +53,7 @@ class Launcher:
             self.waiting.append(name + "'" * now.newton)
             self.now = now
 
-    def again(self, now: Moment) -> bool:
+    def resumes(self, now: Moment) -> bool:
         """Whether the substep resumes in the middle."""
         return bool(now.span.resumed) and now.s == now.span.begin
 
@@ -61,53 +61,53 @@ class Launcher:
         """Return the Moment of substep s, with the values that the host needs."""
         return Moment(span, s, damps=(span.since + s) % EVERY == EVERY - 1)
 
-    def turn(self, now: Moment, half: int) -> Moment:
+    def pass_of(self, now: Moment, half: int) -> Moment:
         """Return the Moment of one half of a pass."""
         return now.of(half // self.halves, half < self.halves, half=half)
 
-    def works(self, now: Moment) -> bool:
+    def takes_part(self, now: Moment) -> bool:
         """Always true. Handles signals between two substeps."""
         self.runner.raise_signals()
         return True
 
-    def enters(self, now: Moment) -> bool:
+    def begins_substep(self, now: Moment) -> bool:
         """Whether the substep begins here."""
-        return now.s < now.span.substeps and not self.again(now)
+        return now.s < now.span.substeps and not self.resumes(now)
 
-    def solves(self, now: Moment) -> bool:
+    def has_pass(self, now: Moment) -> bool:
         """Whether this is a substep, not the round after all substeps."""
         return now.s < now.span.substeps
 
-    leaves = solves
+    ends_substep = has_pass
 
-    def ends(self, now: Moment) -> bool:
+    def ends_frame(self, now: Moment) -> bool:
         """Whether all substeps are done."""
         return now.s >= now.span.substeps
 
     def first_half(self, now: Moment) -> int:
         """Return the half of a pass in which the substep begins or resumes."""
-        return now.span.half if self.again(now) else 0
+        return now.span.half if self.resumes(now) else 0
 
     def last_half(self, now: Moment) -> int:
         """Return the half of a pass before which the substep ends. The round after all substeps has one half, for the list."""
         passes = now.span.iterations + (self.impacts.passes if self.impacts else 0)
         return passes * self.halves if now.s < now.span.substeps else 1
 
-    def regular(self, now: Moment, half: int) -> bool:
+    def is_regular(self, now: Moment, half: int) -> bool:
         """Whether every substep has this half of a pass; bodies that struck walls add further ones."""
         return half < now.span.iterations * self.halves or now.s >= now.span.substeps
 
-    def goes_on(self, now: Moment, half: int) -> bool:
+    def runs_half(self, now: Moment, half: int) -> bool:
         """Whether this half of a pass is run. If bodies may bounce off walls, the host has to wait for the answer."""
-        if self.regular(now, half):
+        if self.is_regular(now, half):
             return True
         it = half // self.halves - now.span.iterations
         self.flush()
         return bool(self.runner.memory.read(self.impacts.open)[it])
 
-    def begins(self, now: Moment) -> bool:
+    def begins_round(self, now: Moment) -> bool:
         """Whether this round (a substep, or the one after all substeps) begins here instead of resuming."""
-        return not self.again(now)
+        return not self.resumes(now)
 
     def evaluate_pair_forces(self, now: Moment) -> None:
         """Add the first phases of a substep. The frame may stop here until lists are rebuilt."""
@@ -126,10 +126,10 @@ class Launcher:
         """Add the check of the neighbour list. The frame may stop here until the list is rebuilt, or islands are woken."""
         if half and not half % self.halves:
             self.runner.raise_signals()
-        self.put(self.turn(now, half), "ask_for_list", bool(self.runner.search))
-        if self.looks and self.solves(now):
-            self.put(self.turn(now, half), "look_for_sleepers")
-            self.put(self.turn(now, half), "ask_to_wake")
+        self.put(self.pass_of(now, half), "ask_for_list", bool(self.runner.search))
+        if self.looks and self.has_pass(now):
+            self.put(self.pass_of(now, half), "look_for_sleepers")
+            self.put(self.pass_of(now, half), "ask_to_wake")
 
     def solve_constraints(self, now: Moment) -> None:
         """Add the phase solve_constraints, if there are constraints."""
@@ -152,7 +152,7 @@ class Launcher:
         """Add the phase apply_constraints, unless particles move only once, at the end of the pass."""
         self.put(now, "apply_constraints", self.applies_first)
 
-    def unmet(self, now: Moment) -> bool:
+    def needs_newton_step(self, now: Moment) -> bool:
         """Whether there is only one pass. The host reads no result; if all systems are met, a second Newton step does nothing."""
         return now.span.iterations == 1
 
@@ -160,7 +160,7 @@ class Launcher:
         """Add the phase solve_contacts, if there are contacts."""
         self.put(now, "solve_contacts", self.touches)
 
-    def struck(self) -> bool:
+    def any_struck(self) -> bool:
         """Always true. The host does not read whether a pair bounces; a round without a bounce does nothing."""
         return True
 

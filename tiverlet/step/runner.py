@@ -335,7 +335,7 @@ class Runner:
     def stop_at_walls(self, before: np.ndarray) -> None:
         """Stop particles at walls that the host has moved from `before`, (n, dim); with memory.compiler()."""
         if self.step.walls:
-            self.step.stopped(before)
+            self.step.stop_moved(before)
 
     def velocity(
         self,
@@ -441,7 +441,7 @@ class Runner:
             )  # fmt: skip
             self._fused()
             if self._data[HALT]:
-                resumed, begin, half = self.stopped()
+                resumed, begin, half = self.take_halt()
                 self.grow()
                 self.wake_called(stages, passes, begin, half)
                 continue
@@ -463,7 +463,7 @@ class Runner:
                     clock.h, clock.time, clock.tick, clock.since, clock.d_is_velocity, s, substeps, passes, max(0, half)
                 )
 
-    def stopped(self) -> tuple[int, int, int]:
+    def take_halt(self) -> tuple[int, int, int]:
         """Return where the frame stopped (resumed, begin, half of Span), and clear the stop, which the host handles next."""
         self.memory.write(self.step.halt, 0)
         resumed, begin, half = (int(v) for v in self._data[HALT:ACTIVE_THREADS])
@@ -474,7 +474,7 @@ class Runner:
         try:
             frame(self.launcher, span)
             while self.step.searches and self._data[HALT]:
-                span.resumed, span.begin, span.half = self.stopped()
+                span.resumed, span.begin, span.half = self.take_halt()
                 self.list_neighbours()
                 self.wake_called(span.substeps, span.iterations, span.begin, span.half)
                 frame(self.launcher, span)
@@ -508,7 +508,7 @@ class Runner:
             return
         with self.memory.compiler():
             for k, search in enumerate(self.step.searches):
-                while self.step.listed(k) > search.list.capacity:
+                while self.step.build_list(k) > search.list.capacity:
                     self.grow()
 
     def grow(self) -> None:
@@ -535,7 +535,7 @@ class Runner:
                 return  # overlap under a load is no error of placing
             contact.enable_shrink()
             self.renew()
-        self.step.shrunk(first)
+        self.step.shrink_overlapping(first)
 
     def report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
         """The StepReport of the last diagnostics."""

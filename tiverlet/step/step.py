@@ -30,9 +30,9 @@ def frame(do, span):
     """One frame: its substeps, then the report. The last round of the loop is for the neighbour list that diagnose() needs."""
     for s in range(span.begin, span.until):
         now = do.moment(span, s)
-        if do.works(now):
+        if do.takes_part(now):
             substep(do, now)
-            if do.ends(now):
+            if do.ends_frame(now):
                 do.diagnose(now)
 
 
@@ -44,36 +44,36 @@ def substep(do, now):
     neighbour list. Constraints may take a second Newton step in the first half.
     """
     if ti.static(do.has_pair_forces):
-        if do.begins(now):
+        if do.begins_round(now):
             do.evaluate_pair_forces(now)
-    if do.enters(now):
+    if do.begins_substep(now):
         do.integrate(now)
         do.drive(now)
     for half in range(do.first_half(now), do.last_half(now)):
-        if do.regular(now, half):
+        if do.is_regular(now, half):
             do.update_neighbours(now, half)
-        if do.solves(now) and do.goes_on(now, half):
-            turn = do.turn(now, half)
+        if do.has_pass(now) and do.runs_half(now, half):
+            this_pass = do.pass_of(now, half)
             if half % do.halves == 0:
                 for k in range(do.newton_steps):
-                    if k == 0 or do.unmet(now):
-                        do.solve_constraints(turn.newton_step(k))
-                        do.solve_systems(turn.newton_step(k))
-                        do.update_multipliers(turn.newton_step(k))
-                        do.apply_constraints(turn.newton_step(k))
+                    if k == 0 or do.needs_newton_step(now):
+                        do.solve_constraints(this_pass.newton_step(k))
+                        do.solve_systems(this_pass.newton_step(k))
+                        do.update_multipliers(this_pass.newton_step(k))
+                        do.apply_constraints(this_pass.newton_step(k))
             if half % do.halves == do.halves - 1:
-                if do.regular(now, half):
-                    do.solve_contacts(turn)
+                if do.is_regular(now, half):
+                    do.solve_contacts(this_pass)
                 if ti.static(do.has_restitution):
                     for _ in range(REBOUNDS):
-                        if turn.first != 0 and do.struck() != 0:
-                            do.rebound(turn)
-                do.apply_corrections(turn)
+                        if this_pass.first != 0 and do.any_struck() != 0:
+                            do.rebound(this_pass)
+                do.apply_corrections(this_pass)
     if ti.static(do.finishes):
-        if do.leaves(now):
+        if do.ends_substep(now):
             do.finish_substep(now)
     if ti.static(do.projects_velocities):
-        if do.leaves(now) and now.damps != 0:
+        if do.ends_substep(now) and now.damps != 0:
             for k in range(PASSES):
                 do.project_contact_velocities(now.of(k))
 
@@ -148,7 +148,7 @@ class Step:
         read_all(self.numbers)
         frame(self, span_on(sheet, thread))
         if thread == 0:
-            self.tell_halt(sheet)
+            self.write_halt(sheet)
             if ti.static(self.team.size > 1):
                 sheet[ACTIVE_THREADS] = self.team.active_threads[None]
 
@@ -158,7 +158,7 @@ class Step:
         owed: ti.f64, s: ti.i32, substeps: ti.i32, iterations: ti.i32, half: ti.i32,
     ):  # fmt: skip
         """Run some phases of a substep, by name. It returns nothing, because the host would have to wait for a result."""
-        now = self.turn(self.moment(Span(h64, start, start, tick, since, fresh, owed, 0, substeps, iterations), s), half)
+        now = self.pass_of(self.moment(Span(h64, start, start, tick, since, fresh, owed, 0, substeps, iterations), s), half)
         for phase, k in ti.static(self.named(names)):
             phase(now.newton_step(k))
 
@@ -175,7 +175,7 @@ class Step:
         return Moment(span, s, h, last, time, tick, frame_fraction, fresh, damps, final)
 
     @ti.func
-    def turn(self, now, half):
+    def pass_of(self, now, half):
         """The Moment of one half of a pass; halves are counted through all passes of the substep."""
         it = half // self.halves
         first = ti.cast(it == 0, ti.i32)
@@ -184,32 +184,32 @@ class Step:
         return now.of(it, first, checks_list, half)
 
     @ti.func
-    def works(self, now):
+    def takes_part(self, now):
         """Whether this thread takes part in the substep. All threads must call it."""
         return self.team.works(now.thread) and self.halted() == 0
 
     @ti.func
-    def again(self, now):
+    def resumes(self, now):
         """1 if the substep resumes in the middle, after the frame stopped there."""
         return ti.select(now.s == now.span.begin, now.span.resumed, 0)
 
     @ti.func
-    def enters(self, now):
+    def begins_substep(self, now):
         """Whether the substep begins here, with valid lists."""
-        out = now.s < now.span.substeps and self.again(now) == 0
+        out = now.s < now.span.substeps and self.resumes(now) == 0
         if ti.static(len(self.listed_forces) > 0):
             out = out and self.halted() == 0
         return out
 
     @ti.func
-    def begins(self, now):
+    def begins_round(self, now):
         """Whether this round (a substep, or the one after all substeps) begins here instead of resuming."""
-        return self.again(now) == 0
+        return self.resumes(now) == 0
 
     @ti.func
     def first_half(self, now):
         """The half of a pass in which the substep begins or resumes."""
-        return ti.select(self.again(now) != 0, now.span.half, 0)
+        return ti.select(self.resumes(now) != 0, now.span.half, 0)
 
     @ti.func
     def last_half(self, now):
@@ -220,7 +220,7 @@ class Step:
         return ti.select(now.s < now.span.substeps, passes * self.halves, 1)
 
     @ti.func
-    def regular(self, now, half):
+    def is_regular(self, now, half):
         """Whether every substep has this half of a pass; bodies that struck walls add further ones."""
         out = True
         if ti.static(self.has_impacts):
@@ -228,26 +228,26 @@ class Step:
         return out
 
     @ti.func
-    def goes_on(self, now, half):
+    def runs_half(self, now, half):
         """Whether this half of a pass is run: always if it is regular, else only if bodies struck walls."""
         out = True
         if ti.static(self.has_impacts):
-            if not self.regular(now, half):
-                out = self.impacts.wanted(self.turn(now, half))
+            if not self.is_regular(now, half):
+                out = self.impacts.wanted(self.pass_of(now, half))
         return out
 
     @ti.func
-    def solves(self, now):
+    def has_pass(self, now):
         """Whether there is a pass to run, with a valid list."""
         return now.s < now.span.substeps and self.halted() == 0
 
     @ti.func
-    def leaves(self, now):
+    def ends_substep(self, now):
         """Whether all passes of the substep are done."""
         return now.s < now.span.substeps and now.span.part == now.span.iterations and self.halted() == 0
 
     @ti.func
-    def ends(self, now):
+    def ends_frame(self, now):
         """Whether all substeps are done."""
         return now.s >= now.span.substeps and self.halted() == 0
 
@@ -353,8 +353,8 @@ class Step:
                     if self.search.list.need[None] > self.search.list.capacity:
                         self.halt[None] = [1, now.s, half]  # all write the same
         if ti.static(self.looks):
-            if self.solves(now) and (self.sleepers.count[None] > 0 or ti.static(self.detects)):
-                self.look_for_sleepers(self.turn(now, half))
+            if self.has_pass(now) and (self.sleepers.count[None] > 0 or ti.static(self.detects)):
+                self.look_for_sleepers(self.pass_of(now, half))
                 if self.sleepers.calls[None] != 0:
                     self.halt[None] = [1, now.s, half]
 
@@ -433,7 +433,7 @@ class Step:
             self.particles.apply_constraints(now)
 
     @ti.func
-    def unmet(self, now):
+    def needs_newton_step(self, now):
         """Whether any system needs a second Newton step. With several iterations it does not: every pass is a Newton step."""
         out = False
         if ti.static(self.newton_steps > 1):
@@ -446,7 +446,7 @@ class Step:
         self.contact_pass.solve(now)
 
     @ti.func
-    def struck(self):
+    def any_struck(self):
         """1 if a pair bounces in this substep."""
         return self.contact_pass.struck()
 
@@ -512,7 +512,7 @@ class Step:
         return out
 
     @ti.func
-    def tell_halt(self, sheet: ti.template()):  # type: ignore[valid-type]
+    def write_halt(self, sheet: ti.template()):  # type: ignore[valid-type]
         """Write to the sheet whether and where the frame stopped, for the host to grow or build a list."""
         if ti.static(len(self.searches) > 0):
             for k in ti.static(range(3)):
@@ -527,20 +527,20 @@ class Step:
         return out
 
     @ti.kernel
-    def listed(self, k: ti.template()) -> ti.i32:  # type: ignore[valid-type]
+    def build_list(self, k: ti.template()) -> ti.i32:  # type: ignore[valid-type]
         """Build the k-th neighbour list outside of a frame. Returns the largest number of entries that a block needs."""
         self.searches[k].build(0)
         return self.searches[k].list.need[None]
 
     @ti.kernel
-    def shrunk(self, first: ti.i32):
+    def shrink_overlapping(self, first: ti.i32):
         """Shrink particles that overlap any of number `first` or above until they fit; contacts let them grow back."""
         for c in ti.static(self.contacts):
             for i in range(self.n):
                 c.shrink(i, first)
 
     @ti.kernel
-    def stopped(self, old: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
+    def stop_moved(self, old: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
         """Stop particles at walls, posed as at the beginning of a frame, after the host moved them from `old`, (n, dim)."""
         for w in ti.static(self.posed):
             for _ in range(1):

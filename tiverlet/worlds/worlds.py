@@ -331,7 +331,7 @@ class Worlds:
             for k in some:
                 with self._at(k):
                     runner.sheet[:] = sheets[k]
-                    kernel.resume(sheets[k], *runner.stopped())
+                    kernel.resume(sheets[k], *runner.take_halt())
                     runner.grow()
                     runner.invalidate()
             memory.write(self._kernels.sheet, sheets)
