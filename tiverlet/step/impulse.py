@@ -209,7 +209,8 @@ def turn_on(runner: Any, first: int, share: np.ndarray) -> None:
 
 
 def let_go(runner: Any, some: np.ndarray, want: np.ndarray, iterations: int) -> None:
-    """Let the movable ones of particles `some`, (k,), in ascending order, continue with velocities `want`, (k, dim) [m/s]."""
+    """Let particles `some`, (k,) numbers in ascending order, go on with velocities `want`, (k, dim) [m/s], as far as they can
+    move."""
     memory, moves = runner.memory, runner.scene.inv_mass[some] > 0
     if not moves.all():
         some, want = some[moves], want[moves]

@@ -1,21 +1,21 @@
-"""What constraints leave undone becomes less where the substep gets shorter: else it would become energy.
+"""Projection: reduces the violations that passes leave, before the substep gets shorter. Without it they would become energy.
 
-A pass holds a load F by a violation Z = D h^2 F, beside what its compliance takes, as a spring of stiffness 1 / (D h^2) would.
-A shorter substep h' makes that spring stiffer while it is stretched, and its energy (h / h')^2 times as large. So positions
-first go to where the same loads need the violations (h' / h)^2 Z, and velocities to where they do not change:
+A pass holds a load F by a violation Z = D h^2 F, in addition to that of its compliance, like a spring of stiffness 1 / (D h^2). A
+shorter substep h' makes that spring stiffer while it is stretched, and its energy (h / h')^2 times as large. So positions first
+move to where the same loads need the violations (h' / h)^2 Z, and velocities change so that they keep these:
 
     x += w J^T lam,  C(x) = C - (1 - (h' / h)^2) Z;     v += w J^T lam,  (J w J^T + mu) lam = -J v
 
-Z, C + alpha lam / h^2 for what is at rest, is what the last substep left of a constraint; springs that it resolves stay as they
-are. Positions move without velocities, as contacts do that an impact left overlapping.
+Z is the residual violation of the last substep, C + alpha lam / h^2 for particles at rest. Springs that the substep resolves stay
+as they are. Positions move without changing velocities, as for contacts that an impact left overlapping.
 
-Where contacts are in the way, they are rows, too (ContactRows), and what they lead into are others, in a few rounds. Beads stay
-on their wires (Rails), and free bodies keep their angular momentum (FreeBodies).
+Where contacts are in the way, they are rows, too (ContactRows). Moves may lead into further contacts, which become rows in a few
+rounds. Beads stay on their wires (Rails), and free bodies keep their angular momentum (FreeBodies).
 
-Where that lifts what hangs, motion pays for it as far as it can: a taut net has no direction to sag in, so velocities know
-nothing of its fall, and lifting it back at the end of each fall would be a pump. The energy that was gained is taken out of the
-velocities, of the part along the moves first, then of the whole of what is anchored. What hangs at rest is lifted for nothing:
-its fall became heat when it stretched.
+Where moves lift particles, the motion pays for the energy as far as it can. A taut net has no direction to sag in, so its fall
+does not show in velocities; lifting it back at the end of each fall would pump energy in. The energy gained is taken from the
+velocities: first from the part along the moves, then from all motion of anchored bodies. A body that hangs at rest is lifted for
+nothing, since its fall became heat when it stretched.
 """
 
 import copy
@@ -40,30 +40,34 @@ from .rigid_rows import RigidRows, left_out, rigid_rows
 if TYPE_CHECKING:
     from .runner import Runner
 
-ENOUGH = 1e-3  # of its size: a violation that matters, over (r - 1)^2 / r with r = (h / h')^2: what one jump leaves to vibrate
-FRAIL = 0.01  # of what breaks a constraint: a load that a violation may have by itself
-FIRM = 0.9  # theta from where on velocities may not change a constraint
-FAR = 0.75  # of the longest: a substep in which what is small now has had its chance
+ENOUGH = 1e-3  # of its size: a violation that matters, divided by (r - 1)^2 / r, r = (h / h')^2: what one jump leaves to vibrate
+FRAIL = 0.01  # of break_at: the extra load that a violation may cause in a shorter substep
+FIRM = 0.9  # theta from which on velocities must not change a constraint
+FAR = 0.75  # of the longest substep: below, violations that are small now are settled
 NEWTON = 40  # steps, at most
-PRODUCTS = 1e9  # of numbers: some seconds, after which the rest is left as it is
-SHARED = PRODUCTS / 8  # where contacts move, too: they are tried after links alone, some times
-BEGIN, HARDEST, LEAST = 1e-3, 10.0, 1e-9  # mu of the first, and of the last try; the least
-FINE, STALLED = 1e-5, 0.05  # mu from which on a step has to take out as much of what is stored: what cannot be met stays
+PRODUCTS = 1e9  # multiplications, at most: some seconds, after which the remaining violations stay
+SHARED = PRODUCTS / 8  # the limit where contacts move, too: that is tried after links alone, several times
+BEGIN, HARDEST, LEAST = 1e-3, 10.0, 1e-9  # mu of the first and of the last try; the least mu
+FINE, STALLED = 1e-5, 0.05  # mu from which on a step must remove this share of the stored energy, or violations are left
 SLIGHT = 0.01  # of the kinetic energy: what violations may become where contacts are in the way
-SLIGHTEST = 1e-3  # of the kinetic energy inside of bodies: what violations, and moves in the next substep, may make of it
-LOOKS = 8  # steps of conjugate gradients, to see what a solver would move
-LEFT = 0.01  # of what violations store: what may be left of it in the shorter substep
-DONE = 1e-6, 1e-13  # of its size: a violation that is none; and that breaks nothing in the shortest substep
-TURNS = 16  # with walls, at most: a link that stands on one halves its violation in each
-WORSE = 2.0  # times what violations stored before: what is left of it, at most, where it is taken at all
-BETTER = 0.5  # times that, where contacts move, too: what they and links store then
-TOGETHER = 4  # times that links and contacts move together: each may lead into others
+SLIGHTEST = 1e-3  # of the kinetic energy inside bodies: what violations, and moves in the next substep, may add to it
+LOOKS = 8  # steps of conjugate gradients, to estimate the moves of a solver
+LEFT = 0.01  # of the energy that violations store: what may be left of it in the shorter substep
+DONE = 1e-6, 1e-13  # of its size: a violation that counts as none; and one that breaks nothing in the shortest substep
+TURNS = 16  # with walls, at most: a link that stands on a wall halves its violation in each
+WORSE = 2.0  # times the energy stored before: a result that stores more is discarded
+BETTER = 0.5  # times that energy, of links and contacts: the limit where contacts move, too
+TOGETHER = 4  # rounds in which links and contacts move together: each may lead into further contacts
 HELD = 1e3  # of its mass: how firmly a wall holds a particle that it has stopped
 
 
 class Aims(NamedTuple):
-    """Of what violations store, and of the work that a solver of so many `steps` would do: the share that may be left, unless it
-    is less than `slight`. products: how many numbers it may multiply. done: a violation that is none, of its size."""
+    """The aims of _newton().
+
+    share: what may be left of the stored energy, and of the work of a solver with so many `steps`. slight: the amount of both
+    that may be left in any case. products: multiplications, at most. done: a violation that counts as none, as a share of its
+    size.
+    """
 
     share: float
     steps: int
@@ -73,17 +77,17 @@ class Aims(NamedTuple):
 
 
 def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | None = None) -> bool | None:
-    """Take out what violations would store; d holds velocities. Nothing happens where they are small, or would overlap.
+    """Remove the energy that violations would store in a shorter substep; d holds velocities.
 
-    h: the coming substep [s]; longest: since this was done last. contacts: which move together with links. Returns whether
-    positions have been looked after; None where contacts are in the way of what would be more than a hundredth of the kinetic
-    energy.
+    Nothing happens if violations are small, or if the moves would make contacts overlap more. h: the coming substep [s]. longest:
+    the longest substep since the last projection [s]. contacts: contacts that move together with links. Returns whether positions
+    are settled for h; None where contacts are in the way and the energy is more than a hundredth of the kinetic energy.
     """
     ratio = h / longest
     slots = runner.scene.slots
     w, state, memory = runner.scene.inv_mass, runner.scene.state, runner.memory
     x = before = state.get(memory)
-    if not (np.abs(x) < LARGEST).all():  # nor what is no number
+    if not (np.abs(x) < LARGEST).all():  # or NaN
         return True
     batches: list[Any] = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
     stays = left_out(runner.batches, w, x)
@@ -105,7 +109,7 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     kept = memory.read(state.d)
     v = kept.astype(np.float64)
     n = len(x)
-    # Where the solver converges, it moves what is left at once in the next substep, and that flies on.
+    # A solver that converges removes remaining violations at once in the next substep, which leaves velocities.
     steps = LOOKS if slots.converges or slots.exact else 0
     slight = SLIGHTEST * 2 * h * h * start.kinetic(v[:n])
     still = (undone != 0) & (start.theta > FIRM) & ~start.touches
@@ -121,7 +125,7 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     bodies = FreeBodies(start.jacobian, x, stopped | tethered(runner))
     v[:n], spun = bodies.spun(v[:n], before, kept[:n])
     memory.write(state.d, v)
-    runner.invalidate()  # moves may have led into what was far
+    runner.invalidate()  # moves may lead to particles that are not listed
     more, deeper = seen(runner)
     fails = left > BETTER if contacts else deeper > overlap or rows.stored > WORSE * start.stored
     if fails:
@@ -139,8 +143,10 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
 
 
 def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: Aims) -> tuple["Rows", np.ndarray]:
-    """Rows where particles are then, and which of them walls have stopped, (n,). aims: for _newton(), a share of what rows stored
-    at the start."""
+    """Move particles by _newton(), in turns with walls. Returns the rows there, and a mask of particles that walls stopped.
+
+    start: the rows whose stored energy aims.share refers to.
+    """
     state, memory, before = runner.scene.state, runner.memory, rows.x
     enough, stopped = aims.share * start.stored, np.zeros(rows.n, dtype=bool)
     for _ in range(TURNS):
@@ -163,8 +169,11 @@ def _together(
     runner: "Runner", start: "Rows", rows: "Rows", stopped: np.ndarray, pressed: float, links: list[Any],
     aims: Aims,
 ) -> tuple["Rows", np.ndarray, float]:  # fmt: skip
-    """The best rows and stops of some rounds, each among the contacts that the one before led into; and what links and contacts
-    store there, of what they did. pressed: what contacts stored at the start."""
+    """Move links and contacts together, in rounds; each round includes the contacts that the last one led into.
+
+    Returns the best rows, their stopped particles, and the energy that links and contacts store there as a share of that before.
+    pressed: the energy that contacts stored at the start.
+    """
     before, left, products = start.stored_in_links() + pressed, np.inf, 0
     for _ in range(TOGETHER):
         contacts: Any = ContactRows.of(runner)
@@ -183,8 +192,11 @@ def _together(
 
 
 def _newton(rows: "Rows", enough: float, aims: Aims) -> np.ndarray:
-    """Places at which what violations store is `enough` [J s^2], and where a solver of so many steps would move less, by this
-    share of the work, m p^2, that it would do at the begin; both unless they are less than `slight`."""
+    """Return positions at which violations store at most `enough` [J s^2], and a solver would do little work, m p^2.
+
+    That work, of a solver with aims.steps steps, is at most aims.share of that at the begin. Amounts below aims.slight are always
+    accepted.
+    """
     mu, begin = BEGIN, rows.work(aims.steps)
     for _ in range(NEWTON):
         new = rows.at(rows.x + rows.step(mu))
@@ -200,42 +212,44 @@ def _newton(rows: "Rows", enough: float, aims: Aims) -> np.ndarray:
 
 
 def matters(violation: float, ratio: float) -> bool:
-    """Whether what a violation, as a share of its size, leaves to vibrate is worth a look."""
+    """Whether a violation, as a share of its size, would leave so much vibration that it must be removed. ratio: h' / h."""
     return violation * (1 - ratio**2) ** 2 > ENOUGH * ratio**2
 
 
 def _off(batch: Scalar, x: np.ndarray) -> float:
-    """The worst violation of rigid constraints, as a share of their size: what Newton's method left of it, as after an impact."""
+    """Return the worst violation of rigid constraints, as a share of their size, as Newton's method leaves after an impact."""
     C = batch.violation(x) * batch.inverse_size(batch.start.position) * (batch.compliance == 0) * ~batch.broken
     return float((np.abs(C) if batch.side == 0 else C * batch.side).max(initial=0.0))
 
 
 def seen(runner: Any) -> tuple[float, float]:
-    """Energy [J], and the overlap of the worst contact, in radii."""
+    """Return the energy [J], and the overlap of the worst contact, in radii."""
     runner.look()
     report = runner.report()
     return report.energy, report.overlap
 
 
 def seen_before(runner: Any) -> tuple[float, float]:
-    """The same before positions move; energy, where it is known, by the loads of the last substep: what springs of its violations
-    would hold is not there."""
+    """Return energy and overlap as seen() does, before positions move.
+
+    The energy is that at the end of the last frame, if known: it does not contain the energy of violations as springs.
+    """
     energy, overlap = seen(runner)
     return energy if runner.clock.energy is None else runner.clock.energy, overlap
 
 
 def sizes(batch: Scalar | RigidRows | ContactRows) -> np.ndarray:
-    """The number of corners of each constraint, (m,)."""
+    """Return the number of corners of each constraint, (m,)."""
     return np.bincount(batch.owner, minlength=batch.count)
 
 
 def _over(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a / b; 0 where b is."""
+    """Return a / b; 0 where b is 0."""
     return np.divide(a, b, out=np.zeros_like(a), where=b > 0)
 
 
 class Rows:
-    """Constraints at positions x: what they are to give up, C, and their gradients J by corners.
+    """Constraints at positions x: the violations C that they are to lose, and their gradients J by corners.
 
     Corner k belongs to row[k] and is particle who[k].
     """
@@ -272,7 +286,7 @@ class Rows:
         self._measure(x)
 
     def _each(self, values: list[np.ndarray]) -> np.ndarray:
-        """Values of every constraint of the batches, for the rows."""
+        """Return the values of the rows, from those of all constraints of the batches."""
         return np.concatenate([value[some] for value, some in zip(values, self.some, strict=True)])
 
     def _measure(self, x: np.ndarray) -> None:
@@ -285,15 +299,15 @@ class Rows:
         self.stored = float(_over(self.weight * self.C * self.C, self.diagonal).sum())
 
     def stored_in_links(self) -> float:
-        """What is stored in all but contacts."""
+        """Return the energy that links store, without contacts."""
         return float((_over(self.weight * self.C * self.C, self.diagonal) * ~self.touches).sum())
 
     def _bounded(self, C: np.ndarray) -> np.ndarray:
-        """C on the side on which constraints act."""
+        """Return C, and 0 for one-sided constraints that do not act."""
         return np.where(self.side == 0, C, np.maximum(self.side * C, 0.0) * self.side)
 
     def _link(self) -> None:
-        """The matrix of step(), for what its rows and their tensions couple."""
+        """Build the matrix of step(), with the blocks that rows and their tensions couple."""
         begin = np.cumsum(self.arity) - self.arity
         wide = self.arity * self.dim > 2 * WIDEST  # no two levels hold such a row
         rows = [r for r in self._alike() if len(r) > 1 and not wide[r[0]]]
@@ -321,7 +335,7 @@ class Rows:
         self.matrix = BlockMatrix(len(self.inside), self.dim, *ends[:, self.free])
 
     def _alike(self) -> list[np.ndarray]:
-        """Rows that follow one another, by the same particles in the same order, as those of a cluster."""
+        """Return groups of adjacent rows with the same particles in the same order, as those of a cluster."""
         before = np.maximum(np.arange(len(self.who)) - self.arity[self.row], 0)
         other = (self.row[before] != self.row - 1) | (self.who[before] != self.who)
         other |= self.arity[np.maximum(self.row - 1, 0)] != self.arity[self.row]  # the last of more corners are others
@@ -338,13 +352,13 @@ class Rows:
         return new
 
     def at(self, x: np.ndarray) -> "Rows":
-        """The same rows elsewhere."""
+        """Return these rows at other positions."""
         new = copy.copy(self)
         new._measure(x)
         return new
 
     def towards(self, goal: np.ndarray) -> "Rows":
-        """The same rows, with C from what it is to be."""
+        """Return these rows with C measured from `goal`, (m,)."""
         new = copy.copy(self)
         new.goal = goal
         new._measure(self.x)
@@ -352,13 +366,16 @@ class Rows:
         return new
 
     def among(self, batches: list[Any], runner: Any) -> "Rows":
-        """The same links, towards the same, among other contacts, the last of these batches, which are to store nothing."""
+        """Return rows with the same links and goals, and with other contacts, the last of `batches`, whose goal is 0."""
         new = Rows(batches, self.w, self.x, self.box, self.rails)
         new.undone(runner)  # for how rigid they are
         return new.towards(np.concatenate([self.goal[~self.touches], np.zeros(int(new.touches.sum()))]))
 
     def undone(self, runner: Any) -> np.ndarray:
-        """Z = theta C_(n+1) + (1 - theta) C_n + damping dC/dt + alpha lam / h^2, to second order; and how rigid the rows are."""
+        """Return Z = theta C_(n+1) + (1 - theta) C_n + damping dC/dt + alpha lam / h^2, to second order, (m,).
+
+        Sets theta, and the weight, which is theta with the split masses of passes.
+        """
         read, h = runner.memory.read, runner.clock.h
         alpha, damping = (self._each([getattr(b, name) for b in self.batches]) for name in ("compliance", "damping"))
         split = read(runner.scene.slots.split)[: self.n].astype(np.float64)
@@ -378,7 +395,7 @@ class Rows:
         return self._bounded(gamma * self.C + (1 - gamma) * self._bounded(self._each(before)) + self._each(borne))
 
     def would_break(self, undone: np.ndarray, h: float, longest: float) -> bool:
-        """Whether a violation pulls harder in a substep h than it did, by so much that it counts beside what breaks its row."""
+        """Whether a violation would pull so much harder in a substep h that the change counts beside break_at of its row."""
         if not any(b.breaks for b in self.batches):
             return False
         each: list[Any] = [getattr(b, "break_at", None) for b in self.batches]
@@ -386,18 +403,21 @@ class Rows:
         return bool((np.abs(undone) * (1 / h**2 - 1 / longest**2) > FRAIL * strength * self.diagonal).any())
 
     def _rigid(self, alpha: np.ndarray, reach: np.ndarray) -> np.ndarray:
-        """theta, by what a force of 1 N moves in a substep."""
+        """Return theta. reach: (m,) the move by a force of 1 N in a substep [m]."""
         return _over(reach * reach, reach * reach + alpha * alpha)
 
     def kinetic(self, v: np.ndarray) -> float:
-        """The kinetic energy [J] of particles at velocities v, as they move in their bodies, of what constraints tie together."""
+        """Return the kinetic energy [J] at velocities v relative to the mean velocity of each body.
+
+        Bodies are what constraints connect.
+        """
         _, body = bodies_of(self.m, self.row, self.who, self.w)
         mass = np.bincount(body, self.mass, minlength=self.m + 1)[:, None]
         mean = summed(self.mass[:, None] * v, body, self.m + 1) * _over(np.ones_like(mass), mass)
         return float((self.mass[:, None] * (v - mean[body]) ** 2)[body < self.m].sum()) / 2
 
     def work(self, steps: int) -> float:
-        """m p^2 of the moves p by which a solver of so many steps, 0 for none, meets the rows."""
+        """Return m p^2 of the moves p with which a solver of `steps` steps would satisfy the rows; 0 without steps."""
         move = self.jacobian.solve(-self.theta * self.C, steps=steps) if steps else np.zeros_like(self.x)
         return float((self.mass[:, None] * move**2).sum())
 
@@ -433,7 +453,7 @@ class Rows:
 
 
 def given_back(runner: Any, energy: float, spun: float) -> float:
-    """How much of the energy [J] that bodies are spun up by they had before they were stretched: no more than the scene had."""
+    """Return the part of `spun` [J] that bodies had before they were stretched: at most what the scene has lost since."""
     bound = runner.clock.bound
     return spun if bound is None or bound == CHANGED else min(spun, max(bound - energy, 0.0))
 
@@ -441,17 +461,18 @@ def given_back(runner: Any, energy: float, spun: float) -> float:
 def paid(
     jacobian: Jacobian, v: np.ndarray, moves: np.ndarray, energy: float, walls: Any = False, bodies: FreeBodies | None = None
 ) -> np.ndarray:
-    """Velocities without the energy [J] that moves added: of their part along them first, then of what is anchored, or stands on
-    something. walls: whether one holds each particle. bodies: free ones, which pay by how they move in themselves.
+    """Return velocities from which the energy [J] that moves added is taken, (n, dim).
 
-    Each body, of what constraints tie together, pays by the mass that it has lifted, up to all it has.
+    It is taken from the part of velocities along the moves first, then from all motion of bodies that are anchored or stand on
+    something. Each body, of what constraints connect, pays in proportion to mass times distance of its moves, up to all it has.
+    walls: mask of particles that walls hold. bodies: free bodies, which pay by their inner motion.
     """
     rows, row, who, w = jacobian.m, jacobian.row, jacobian.who, jacobian.w
     m = np.divide(1, w, out=np.zeros_like(w), where=w > 0)
     label, body = bodies_of(rows, row, who, w)
 
     def summed(values: np.ndarray) -> np.ndarray:
-        """Sums by bodies."""
+        """Return the sums of values times masses by body."""
         return np.bincount(body, m * values, minlength=rows + 1)
 
     work, size, along = summed(np.linalg.norm(moves, axis=1)), summed((moves**2).sum(axis=1)), summed((moves * v).sum(axis=1))
@@ -467,6 +488,6 @@ def paid(
 
 
 def _settled(due: np.ndarray, kinetic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What is still due after kinetic energies have paid, and the factor of the velocities that they have left."""
+    """Return the energies still due after kinetic energies have paid, and the factor by which velocities shrink."""
     pays = np.minimum(due, kinetic)
     return due - pays, np.sqrt(np.maximum(1 - _over(pays, kinetic), 0.0))

@@ -1,4 +1,4 @@
-"""Clusters as bodies that the host moves: what moves their particles moves them as a whole."""
+"""Clusters as rigid bodies, when the host moves particles: moves of their particles become moves of the whole cluster."""
 
 from collections.abc import Callable
 from typing import Any
@@ -44,11 +44,11 @@ class Solids:
         self.shape = self.shape + off - (1 - ratio**2) * undone
 
     def _means(self, values: np.ndarray) -> np.ndarray:
-        """Means over bodies, by their masses, for each of their particles."""
+        """Return the mass-weighted mean over its body, for each particle."""
         return np.stack([np.bincount(self.owner, self.m * v) / self.total for v in values.T], axis=1)[self.owner]
 
     def _placed(self, x: np.ndarray) -> np.ndarray:
-        """Where shapes are that fit best to positions x (Kabsch 1976)."""
+        """Return the positions of the shapes where they fit best to positions x (Kabsch 1976)."""
         center = self._means(x[self.who])
         moment = self._summed((x[self.who] - center)[:, :, None] * self.shape[:, None, :])
         u, _, vt = np.linalg.svd(moment)
@@ -57,12 +57,12 @@ class Solids:
         return center + np.einsum("kab,kb->ka", self.turn[self.owner], self.shape)
 
     def _summed(self, values: np.ndarray) -> np.ndarray:
-        """Sums over bodies of m times matrices or vectors of particles."""
+        """Return the sums over bodies of m times matrices or vectors of particles."""
         weighted = self.m[:, None] * values.reshape(len(self.m), -1)
         return summed(weighted.reshape(values.shape), self.owner, len(self.total))
 
     def fitted(self, x: np.ndarray) -> np.ndarray:
-        """Positions x, with all bodies in shape."""
+        """Return positions x with all bodies put into their shapes."""
         if not self.count:
             return x
         out = x.copy()
@@ -70,11 +70,14 @@ class Solids:
         return np.where(self.free, out, x)
 
     def off(self, x: np.ndarray) -> float:
-        """How far particles are from these: the sum of m times the square."""
+        """Return the sum of m times the square of the distances from x to fitted(x)."""
         return float((self.m * ((x - self.fitted(x))[self.who] ** 2).sum(axis=1)).sum()) if self.count else 0.0
 
     def whole(self, x: np.ndarray) -> Callable[[np.ndarray], np.ndarray] | None:
-        """What makes moves of particles at x, (n, dim), moves of bodies, with the same momentum and angular momentum."""
+        """Return a function that projects moves, (n, dim), of particles at x on moves of whole bodies; None without clusters.
+
+        Momentum and angular momentum stay the same.
+        """
         if not self.count:
             return None
         r, dim = x[self.who] - self._means(x[self.who]), x.shape[1]
@@ -84,7 +87,7 @@ class Solids:
         inverse = np.linalg.pinv(self._summed(np.einsum("kia,kja->kij", turned, turned)), hermitian=True)
 
         def project(moves: np.ndarray) -> np.ndarray:
-            """The moves of whole bodies, others as they are."""
+            """Return moves projected on those of whole bodies; moves of other particles stay."""
             p, out = moves[self.who], moves.copy()
             omega = np.einsum("cij,cj->ci", inverse, self._summed(np.einsum("kia,ka->ki", turned, p)))
             out[self.who] = self._means(p) + np.einsum("kia,ki->ka", turned, omega[self.owner])
@@ -94,8 +97,11 @@ class Solids:
 
 
 def _state(batch: Any, w: np.ndarray, h: float, h2_effective: float) -> tuple[np.ndarray, ...]:
-    """By corners: the shape at rest, the deformation before and what moved each, (corners, dim), the share of the present
-    deformation in what passes see, and what a multiplier gives. See ShapeMatch and Equation for the letters."""
+    """Return for each corner the rest shape, the last deformation and the pull, (corners, dim), and two weights, (corners,).
+
+    The weights are those of the present deformation and of the pull in the residual of passes. See ShapeMatch and Equation for
+    the symbols.
+    """
     read, spring, owner = batch.scene.memory.read, batch.dev.spring, batch.owner
     mass = np.divide(1, w[batch.indices], out=np.zeros(len(owner)), where=w[batch.indices] > 0)
     alpha, total = batch.compliance, np.bincount(owner, mass)
