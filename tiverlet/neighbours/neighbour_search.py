@@ -47,7 +47,7 @@ class NeighbourSearch:
     too_far: Any = OnDevice()  # the square of the displacement beyond which the list is stale [m^2]
     farthest: Any = OnDevice()  # the largest distance of listed pairs [m]
     n: Any = OnDevice()  # number of particles
-    told_apart = True  # as a Feature
+    told_apart = True  # see Feature
 
     def __init__(
         self, scene: "Scene", skin: float, linked: np.ndarray, table: Any, pair_data: list[PairData], team: Team, scratch: Any,

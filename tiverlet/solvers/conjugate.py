@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients on the constraints of a scene: cloth and nets that converge."""
+"""Preconditioned conjugate gradients on the constraints of a scene, for cloth and nets that must converge."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -127,7 +127,7 @@ class CGSystem(System):
         count = int(part.max(initial=0)) + 2
         self.groups = self.memory.number(count)
         self.strained = self.ints("strained", np.zeros(count, dtype=np.int32))  # parts whose floor is too low
-        self.floor = scene.memory.field("system.floor", scene.count, kind=ti.f64, state=True)  # of its part, for each particle
+        self.floor = scene.memory.field("system.floor", scene.count, kind=ti.f64, state=True)  # floor of its part, by particle
 
     def vector(self, name: str):
         """Declare a field of real numbers, one for each row."""

@@ -1,4 +1,4 @@
-"""Mass-split Jacobi by slots and gathers: parallel, momentum-conserving, the same bits on any number of threads."""
+"""Mass-split Jacobi by slots and gathers: parallel, momentum-conserving, the same bit for bit on any number of threads."""
 
 import numpy as np
 

@@ -39,9 +39,9 @@ class Rebuild:
         self.checkpoint = checkpoint.keep(world)
         self.attributes = {f: dict(vars(f)) for f in {*self.before, *features}}
         self.noted = {f: world._runner.memory.scratch(f) for f in self.before if isinstance(f, Batch)}
-        self.old: dict[str, np.ndarray] = {}  # state
-        self.masks: dict[Feature, tuple[np.ndarray, ...]] = {}  # of the rows of each feature that stay
-        self.rests: dict[Feature, np.ndarray] = {}  # rest values that were assigned and wait
+        self.old: dict[str, np.ndarray] = {}  # the state before, by name
+        self.masks: dict[Feature, tuple[np.ndarray, ...]] = {}  # of the rows of each feature that remain
+        self.rests: dict[Feature, np.ndarray] = {}  # rest values that were assigned but not yet uploaded
 
     def run(self) -> None:
         """Rebuild the world. Raises the errors of building it, with the world unchanged."""
@@ -64,7 +64,7 @@ class Rebuild:
         """Store the state. If the forces on remaining particles will change, displacements become velocities first."""
         runner = self.world._runner
         runner.note_displacements()
-        pulled = (self.added is not None or not self.some.all()) and runner.step.has_pair_forces  # by others than before
+        pulled = (self.added is not None or not self.some.all()) and runner.step.has_pair_forces  # by other particles than before
         if any(isinstance(f, Collider) for f in self.went):
             self.world._let_go()
         elif pulled or self.world._force_waits or any(map(self._drives, (*self.came, *self.went, *self.extending.values()))):

@@ -116,7 +116,7 @@ class Composition:
         self.fastest = (float(np.abs(g).max()) / self.first) ** 2 * fastest(batches, scene)
 
     def passes(self, iterations: int) -> int:
-        """Passes over the constraints in each stage."""
+        """Return the number of passes over the constraints in each stage."""
         return max(iterations, self.solved) if self.solved else 0
 
     @ti.func

@@ -254,9 +254,9 @@ class Rows:
     Corner k belongs to row[k] and is particle who[k].
     """
 
-    goal: Any = 0.0  # what C is measured from
-    theta: Any = 1.0  # how rigid they are
-    weight: Any = 1.0  # the same as passes see it, which split masses
+    goal: Any = 0.0  # the violation from which C is measured
+    theta: Any = 1.0  # how rigid rows are, 0 to 1
+    weight: Any = 1.0  # theta with the split masses of passes
 
     rails: Any = None  # see Rails
 
@@ -266,7 +266,7 @@ class Rows:
     ):  # fmt: skip
         self.rails = rails if rails and len(rails.who) else None
         self.batches, self.w, self.n, self.dim = batches, w, *x.shape
-        self.mass = _over(np.ones_like(w), w)  # 0 of what cannot move
+        self.mass = _over(np.ones_like(w), w)  # 0 for particles that cannot move
         self.box = box  # the Periodic of the world
         self.some = [~b.idle(w) & ~b.broken if b.breaks else ~b.idle(w) for b in batches]
         for b, some in zip(batches, self.some, strict=True):
@@ -309,15 +309,15 @@ class Rows:
     def _link(self) -> None:
         """Build the matrix of step(), with the blocks that rows and their tensions couple."""
         begin = np.cumsum(self.arity) - self.arity
-        wide = self.arity * self.dim > 2 * WIDEST  # no two levels hold such a row
+        wide = self.arity * self.dim > 2 * WIDEST  # such a row does not fit into two adjacent levels
         rows = [r for r in self._alike() if len(r) > 1 and not wide[r[0]]]
-        self.alike = [begin[r, None] + np.arange(int(self.arity[r[0]])) for r in rows]  # corners of each
+        self.alike = [begin[r, None] + np.arange(int(self.arity[r[0]])) for r in rows]  # corners of each group
         apart = wide.copy()
         apart[np.concatenate([np.zeros(0, dtype=np.int64), *rows])] = True
-        width = np.where(apart[self.row], 0, np.repeat(self.arity, self.arity))  # of the row of each corner
+        width = np.where(apart[self.row], 0, np.repeat(self.arity, self.arity))  # corners in the row of each corner
         a = np.repeat(np.arange(len(self.who)), width)
         b = np.repeat(begin[self.row], width) + np.arange(len(a)) - np.repeat(np.cumsum(width) - width, width)
-        self.corners = a, b  # of each other row, each with each
+        self.corners = a, b  # all pairs of corners within each of the other rows
         each = [self.who[c[0]] for c in self.alike]
         both = [np.repeat(who, len(who)) for who in each], [np.tile(who, len(who)) for who in each]
         self.wide = np.flatnonzero(wide[self.row] & (self.w[self.who] > 0))
@@ -326,7 +326,7 @@ class Rows:
         number = np.full(self.n, -1)
         number[self.inside] = every = np.arange(len(self.inside))
         self.number = number
-        sides = [i, j, i, j], [i, j, j, i]  # of tensions across links
+        sides = [i, j, i, j], [i, j, j, i]  # blocks of tensions across links
         ends = np.stack([
             np.concatenate([*(number[who] for who in (self.who[corner], *some, *side)), every])
             for corner, some, side in zip(self.corners, both, sides, strict=True)
@@ -368,7 +368,7 @@ class Rows:
     def among(self, batches: list[Any], runner: Any) -> "Rows":
         """Return rows with the same links and goals, and with other contacts, the last of `batches`, whose goal is 0."""
         new = Rows(batches, self.w, self.x, self.box, self.rails)
-        new.undone(runner)  # for how rigid they are
+        new.undone(runner)  # sets theta and weight
         return new.towards(np.concatenate([self.goal[~self.touches], np.zeros(int(new.touches.sum()))]))
 
     def undone(self, runner: Any) -> np.ndarray:
@@ -425,8 +425,8 @@ class Rows:
         """Moves p that minimize sum (C + J p)^2 / (2 D) + p^T M (mu + HELD n n^T) p / 2 + p^T K p / 2, with D the diagonal of
         J w J^T and n the normals of walls that hold particles: else these are sent into them again, and stopped again.
 
-        K is what tensions C / D across links are: without it, those that are in one line have no direction to give way in, and
-        what would draw a taut rope straight throws it into a zigzag.
+        K is the transverse stiffness of links under tensions C / D. Without it, links in one line have no direction to give way
+        in, and the step that should straighten a taut rope throws it into a zigzag.
         """
         stiff = _over(self.weight, self.diagonal)
         row, i, j = self.pairs
@@ -476,7 +476,7 @@ def paid(
         return np.bincount(body, m * values, minlength=rows + 1)
 
     work, size, along = summed(np.linalg.norm(moves, axis=1)), summed((moves**2).sum(axis=1)), summed((moves * v).sum(axis=1))
-    due = energy * _over(work, np.full(len(work), work.sum()))  # none where rounding gained it, and nothing moved
+    due = energy * _over(work, np.full(len(work), work.sum()))  # 0 where no particle moved: such a gain is rounding
     part = _over(along, size)
     due, left = _settled(due, part * along / 2)
     v = v - ((1 - left) * part)[body][:, None] * moves
