@@ -41,7 +41,7 @@ class Rebuild:
         self.noted = {f: world._runner.memory.scratch(f) for f in self.before if isinstance(f, Batch)}
         self.old: dict[str, np.ndarray] = {}  # the state before, by name
         self.masks: dict[Feature, tuple[np.ndarray, ...]] = {}  # of the rows of each feature that remain
-        self.rests: dict[Feature, np.ndarray] = {}  # rest values that were assigned but not yet uploaded
+        self.rests: dict[Feature, np.ndarray] = {}  # rest values that still move to the assigned ones
 
     def run(self) -> None:
         """Rebuild the world. Raises the errors of building it, with the world unchanged."""
