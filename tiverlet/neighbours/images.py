@@ -16,8 +16,7 @@ FLOW, GRADIENT = 0, 1  # the axes of a shear: images along y move along x
 class Images:
     """The nearest images of particles, on the device of one world.
 
-    axes: the periodic axes. sheared: whether images along GRADIENT slide along FLOW. in_state: fields of the exact state, by
-    name.
+    axes: the periodic axes. sheared: whether images along GRADIENT slide along FLOW. in_state: fields of the state, by name.
     """
 
     def __init__(self, scene: "Scene", box: "Periodic"):

@@ -1,5 +1,8 @@
-"""World.add and World.remove. Particles and constraints are added and removed in place, see edit_in_place.py. For all other
-edits the world is rebuilt around the same features, and the state of what remains is carried over."""
+"""World.add and World.remove: edits of particles, constraints and features.
+
+Particles and constraints are added and removed in place, see edit_in_place.py. For all other edits the world is rebuilt around
+the same features, and the state of the remaining particles and constraints is carried over.
+"""
 
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
