@@ -24,7 +24,7 @@ WIDTH, HEIGHT = 8.0, 7.0
 
 @dataclass
 class Scene:
-    """The world, and what main() needs of it."""
+    """The world, and the parts of it that main() needs."""
 
     world: tv.World
     hand: tv.Pin
@@ -32,7 +32,7 @@ class Scene:
 
 
 def build(discs: int = 360, **settings) -> Scene:
-    """Discs above, a bridge of ropes below them, a chain from the ceiling, and a hand that holds one disc."""
+    """Make discs above, a bridge of ropes below them, a chain from the ceiling, and a hand that holds one disc."""
     spots = tv.golden(np.arange(discs), dim=3)
     falling = tv.mix(np.array([0.3, 3.3]), np.array([WIDTH - 0.3, HEIGHT - 0.3]), spots[:, :2])
     sizes = tv.mix(0.045, 0.125, tv.smoothstep(0.0, 1.0, spots[:, 2]))
@@ -41,7 +41,7 @@ def build(discs: int = 360, **settings) -> Scene:
     both, (_, on_chain) = tv.shapes.join(bridge, chain)
     position = np.concatenate([both.position, [_path(0.0)], falling])
     radius = np.concatenate([np.full(51, 0.07), np.full(13, 0.09), [0.22], sizes])
-    # Discs that the hand, the bridge or the chain would start inside of make room.
+    # Leave out discs that would overlap the hand, the bridge or the chain at the start.
     keep = np.ones(len(position), dtype=bool)
     pairs, _ = tv.measure.overlapping(position, radius * 1.02)
     keep[[j for i, j in pairs if i < 65 <= j]] = False
@@ -66,25 +66,25 @@ def build(discs: int = 360, **settings) -> Scene:
 
 
 def play() -> tv.World:
-    """For `tiverlet play article`: without the hand, since the mouse is one."""
+    """Return the world for `tiverlet play article`: without the hand, since the user has the mouse."""
     scene = build()
     scene.world.remove(features=[scene.hand])
     return scene.world
 
 
 def _path(time: float) -> np.ndarray:
-    """Where the hand is drawn to at a given time: a figure of eight through the heap."""
+    """Return the place towards which the hand is drawn at a given time: a figure of eight through the heap."""
     return np.array([WIDTH / 2 + 2.9 * np.sin(0.8 * time), 2.4 + 1.3 * np.sin(1.6 * time)])
 
 
 def lead(scene: Scene) -> None:
-    """Move the hand a little of the way to the path: the article's exponential smoothing."""
+    """Move the hand part of the way towards the path: the article's exponential smoothing."""
     target = tv.approach(scene.hand.target[0], _path(scene.world.time + DT), rate=6.0, dt=DT)
     scene.hand.target = target[None]
 
 
 def check(scene: Scene, worst: tv.StepReport) -> None:
-    """What must be true at the end."""
+    """Check overlap, and that no disc left the box."""
     x, r = scene.world.position, scene.world.particles.radius[:, None]
     if not ((x - r > -1e-5) & (x + r < np.array([WIDTH, HEIGHT]) + 1e-5)).all():
         raise SystemExit("a disc left the box")
@@ -93,7 +93,7 @@ def check(scene: Scene, worst: tv.StepReport) -> None:
 
 
 def main(path: str = "article.rrd") -> None:
-    """Simulate, record, and say how it went."""
+    """Simulate, record, and print the results."""
     scene = build()
     world, reports, stretch = scene.world, [], 0.0
     rest = np.linalg.norm(np.diff(world.position[scene.chain], axis=1)[:, 0], axis=1)

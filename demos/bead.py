@@ -16,12 +16,12 @@ A, G = 0.5, 9.81  # radius of the rolling circle [m], gravity [m/s^2]
 
 
 def cycloid(t) -> np.ndarray:
-    """Lowest at t = 0; the arc length from there is 4 A sin(t / 2)."""
+    """Return points of a cycloid, lowest at t = 0; the arc length from there is 4 A sin(t / 2)."""
     return np.stack([A * (t + np.sin(t)), -A * (1 + np.cos(t)), 0 * t], axis=-1)
 
 
 def build() -> tuple[tv.World, np.ndarray]:
-    """Three wires from one point to another, one with four beads, and a loop."""
+    """Make three wires between the same two points, one wire with four beads, and a loop."""
     t = np.linspace(-3.0, 0.0, 60)
     start, end = cycloid(t[0]), cycloid(t[-1])
     straight = tv.shapes.rope(start, end, 3).position
@@ -39,7 +39,7 @@ def build() -> tuple[tv.World, np.ndarray]:
 
 
 def main(path: str = "bead.rrd") -> None:
-    """Race, and compare with the formulas."""
+    """Run the race, and compare with the formulas."""
     world, heights = build()
     arrival, first = np.full(3, np.inf), None
     with tv.Recorder(path, world, overwrite=True) as recorder:

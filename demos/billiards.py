@@ -18,7 +18,7 @@ SPEED, SLIDING, ROLLING = 6.0, 0.2, 0.01
 
 
 def build() -> tv.World:
-    """Fifteen balls in a triangle, on a table with cushions, and a cue ball that was hit above its middle."""
+    """Make fifteen balls in a triangle, on a table with cushions, and a cue ball that was hit above its centre."""
     rows = [(row, k - row / 2) for row in range(5) for k in range(row + 1)]
     rack = np.array([(0.75 * LENGTH + row * np.sqrt(3) * 1.002 * RADIUS, 2.004 * k * RADIUS) for row, k in rows])
     x = np.zeros((16, 3))
@@ -26,7 +26,7 @@ def build() -> tv.World:
     x[:, 2] = RADIUS
     velocity, spin = np.zeros((2, 16, 3))
     velocity[0, 0] = SPEED
-    spin[0] = (0.0, 1.4 * SPEED / RADIUS, 20.0)  # forward, more than rolling, and to the side
+    spin[0] = (0.0, 1.4 * SPEED / RADIUS, 20.0)  # forward, faster than rolling, and sideways
     felt = tv.HalfSpace((0, 0, 1), friction=(SLIDING, SLIDING, ROLLING, 0.02), restitution=0.5)
     cushions = tv.Box((0, -WIDTH / 2, -0.1), (LENGTH, WIDTH / 2, 0.1), friction=0.14, restitution=0.75)
     balls = tv.Particles(x, velocity=velocity, mass=MASS, radius=RADIUS, spin=spin, orientation=0)
@@ -34,7 +34,7 @@ def build() -> tv.World:
 
 
 def check(world: tv.World) -> None:
-    """All lie on the table, at rest, and the rack is broken."""
+    """Check that all balls lie at rest on the table, and that the rack is broken."""
     x = world.position
     if (np.abs(x[:, 2] - RADIUS) > 1e-3).any() or (x[:, :2] < [RADIUS - 1e-5, -WIDTH / 2]).any() or (x[:, 0] > LENGTH).any():
         raise SystemExit("a ball has left the table")
@@ -45,7 +45,7 @@ def check(world: tv.World) -> None:
 
 
 def main(path: str = "billiards.rrd", *, seconds: float = 20.0) -> None:
-    """Run, record, and say how it went."""
+    """Simulate, record, and print the results."""
     world = build()
     with tv.Recorder(path, world, overwrite=True) as recorder:
         report = world.run(seconds, recorder=recorder, progress=True)

@@ -12,13 +12,16 @@ import numpy as np
 
 import tiverlet as tv
 
-WHEEL, RIM, BASE, SPOKES = 0.3, 0.04, 1.0, 24  # radii of wheels and of what they roll on, distance of the axles [m]
-SPEED, TORQUE, ROPE, WIND, SHORT = 6.0, 10.0, 2.0, 0.3, 0.8  # [rad/s], [N m] of a wheel, [m], [m/s], [m]
-GATE, BACK, END = 7.5, 8.0, 10.5  # where the gate is [m], when the motors turn back [s], and the end [s]
+WHEEL, RIM, BASE, SPOKES = 0.3, 0.04, 1.0, 24  # radii of wheels and of the particles on their rims, wheelbase [m]
+SPEED, TORQUE, ROPE, WIND, SHORT = 6.0, 10.0, 2.0, 0.3, 0.8  # [rad/s], [N m] per wheel, [m], [m/s], [m]
+GATE, BACK, END = 7.5, 8.0, 10.5  # place of the gate [m], time at which the motors reverse [s], end [s]
 
 
 def build() -> tuple[tv.World, tv.Motor, tv.Winch]:
-    """A wheel is a hub, which comes first, and a rim; the third one is the trailer. The last particle is the driver."""
+    """Make the buggy, its trailer, the hills and the gate.
+
+    Each wheel is a hub, which is its first particle, and a rim. The third wheel is the trailer. The last particle is the driver.
+    """
     angle = 2 * np.pi * np.arange(SPOKES) / SPOKES
     wheel = np.concatenate([[[0.0, 0.0]], (WHEEL - RIM) * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
     hubs = np.array([[-1.5, WHEEL], [-1.5 - BASE, WHEEL], [-1.5 - BASE - ROPE, WHEEL]])
@@ -41,7 +44,7 @@ def build() -> tuple[tv.World, tv.Motor, tv.Winch]:
 
 
 def main(path: str = "buggy.rrd") -> None:
-    """Drive, turn back, and compare speeds, rope and torque with what was asked for."""
+    """Drive, reverse, and compare speeds, rope and torque with their settings."""
     world, motor, winch = build()
     angles, rope, load, flags = [], 0.0, 0.0, set()
     with tv.Recorder(path, world, overwrite=True) as recorder:

@@ -15,7 +15,7 @@ CENTER, RADIUS = np.array([0.0, 0.5, 0.0]), 0.4
 
 
 def build(points: int = 31) -> tuple[tv.World, tv.shapes.Shape]:
-    """A square of 1.4 m, inextensible along the threads and soft across them, and a ball and the ground with friction."""
+    """Make a square of 1.4 m, inextensible along the threads and soft across them, over a ball and a ground with friction."""
     sheet = tv.shapes.cloth((-0.7, 1.05, -0.65), (1.4, 0, 0), (0, 0, 1.4), (points, points))
     features = [
         tv.Gravity(9.81),
@@ -29,7 +29,7 @@ def build(points: int = 31) -> tuple[tv.World, tv.shapes.Shape]:
 
 
 def main(path: str = "cloth.rrd", *, seconds: float = 3.0) -> None:
-    """Fall, record, and measure."""
+    """Drop the cloth, record, and measure."""
     world, sheet = build()
     with tv.Recorder(path, world, every=2, overwrite=True) as recorder:
         report = world.run(seconds, recorder=recorder, progress=True)

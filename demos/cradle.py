@@ -13,7 +13,7 @@ import tiverlet as tv
 
 
 def build(restitution: float = 1.0) -> tv.World:
-    """Five touching balls on threads, the first of them pulled aside."""
+    """Make five touching balls on threads, the first of them pulled aside."""
     hang = tv.shapes.join(*(tv.shapes.rope((0.1 * k, 1.0), (0.1 * k, 0.0), points=2) for k in range(5)))[0]
     position = hang.position.copy()
     position[1] = [-np.sin(0.5), 1 - np.cos(0.5)]
@@ -23,7 +23,7 @@ def build(restitution: float = 1.0) -> tv.World:
 
 
 def cradle(substeps: tuple[int, int], restitution: float) -> list[float]:
-    """Speed of the last ball after the first was swung into the row, by the number of substeps."""
+    """Return the speed of the last ball after the first has swung into the row, for each number of substeps."""
     speeds = []
     with build(restitution) as world:
         for n in substeps:
@@ -38,7 +38,7 @@ def cradle(substeps: tuple[int, int], restitution: float) -> list[float]:
 
 
 def bounce(substeps: tuple[int, int], restitution: float) -> list[float]:
-    """Height of the third bounce of a ball dropped from 1 m."""
+    """Return the height of the third bounce of a ball dropped from 1 m, for each number of substeps."""
     floor = tv.HalfSpace((0, 1), restitution=restitution)
     third = []
     with tv.World(tv.Particles([[0.0, 1.0]]), [tv.Gravity(9.81), floor], precision="f64") as world:
@@ -50,7 +50,7 @@ def bounce(substeps: tuple[int, int], restitution: float) -> list[float]:
 
 
 def slide(substeps: tuple[int, int], friction: float) -> list[float]:
-    """How far a disc slides on level ground at 2 m/s."""
+    """Return how far a disc slides on level ground from a speed of 2 m/s, for each number of substeps."""
     floor = tv.HalfSpace((0, 1), friction=friction)
     start = tv.Particles([[0.0, 0.1]], radius=0.1, velocity=(2.0, 0.0))
     ways = []
@@ -63,12 +63,12 @@ def slide(substeps: tuple[int, int], friction: float) -> list[float]:
 
 
 def again(world: tv.World, substeps: int) -> None:
-    """Back to the start, with another number of substeps."""
+    """Reset the world to its start, with another number of substeps."""
     world.position, world.velocity, world.substeps = world.particles.position, world.particles.velocity, substeps
 
 
 def main() -> None:
-    """Print each figure for two steps, and its formula."""
+    """Print each figure for two numbers of substeps, and its formula."""
     table = Table(title="contacts against formulas")
     for name in ("what", "4 substeps", "40 substeps", "formula"):
         table.add_column(name, justify="left" if name == "what" else "right")

@@ -16,7 +16,7 @@ GRAINS, RADIUS, TURN = 420, 0.03, 0.8  # TURN [rad/s]
 
 
 def build(rolling: float = 0.1) -> tv.World:
-    """A drum of radius 1, about half full."""
+    """Make a drum of radius 1, about half full."""
     angle = np.linspace(0, 2 * np.pi, 96, endpoint=False)
     grip = (0.6, 0.6, rolling)
     drum = tv.Polygon(np.stack([np.cos(angle), np.sin(angle)], axis=1), inside=True, friction=grip)
@@ -28,13 +28,13 @@ def build(rolling: float = 0.1) -> tv.World:
 
 
 def lean(world: tv.World) -> float:
-    """The angle of the surface of the heap [degrees]: across the line from its middle to that of the drum."""
+    """Return the angle of the heap's surface [degrees]: perpendicular to the line from its centre to that of the drum."""
     middle = world.position.mean(axis=0)
     return float(np.degrees(np.arctan2(middle[0], -middle[1])))
 
 
 def check(world: tv.World, angle: float) -> None:
-    """Grains stay inside, and the heap leans as heaps of such grains do."""
+    """Check that grains are inside, and that the heap leans by a plausible angle of repose."""
     if (np.linalg.norm(world.position, axis=1) > 1.0).any():
         raise SystemExit("a grain is outside of the drum")
     if not 18 < angle < 45:
@@ -42,7 +42,7 @@ def check(world: tv.World, angle: float) -> None:
 
 
 def main(path: str = "drum.rrd", *, seconds: float = 8.0) -> None:
-    """Run, record, and say how it went."""
+    """Simulate, record, and print the results."""
     world = build()
     drum, angles = world.features[2], []
     with tv.Recorder(path, world, overwrite=True) as recorder:

@@ -15,37 +15,37 @@ from rich.table import Table
 
 import tiverlet as tv
 
-TRUE = {"upper": 1.0, "lower": 0.7, "mass": 0.5}  # of the rods [m], and of the lower bob [kg]; the upper one has 1 kg
+TRUE = {"upper": 1.0, "lower": 0.7, "mass": 0.5}  # lengths of the rods [m], mass of the lower bob [kg]; the upper has 1 kg
 GUESS = {"upper": 0.8, "lower": 0.9, "mass": 1.0}
-NOISE = 0.005  # [m]
-SEEN = 2.0  # [s] of the track
+NOISE = 0.005  # standard deviation of the measured track [m]
+SEEN = 2.0  # duration of the track [s]
 PIN = (-2.3, 2.3)
-FROM, RADIUS = (0.0, 1.0), 0.1  # the ball
+FROM, RADIUS = (0.0, 1.0), 0.1  # start and radius of the ball [m]
 BUCKET, HEIGHT = (5.08, 5.8), 0.8
 THROWS, ROUNDS, ELITE = 1000, 6, 50
 
 
 def pendulum(upper: float, lower: float, mass: float) -> tv.World:
-    """A double pendulum, drawn aside."""
+    """Make a double pendulum, pulled aside."""
     return tv.World(bobs(upper, lower, mass), [tv.Gravity(), tv.Distance([[0, 1], [1, 2]])], substeps=20, precision="f64")
 
 
 def bobs(upper: float, lower: float, mass: float) -> tv.Particles:
-    """The pin and the two bobs."""
+    """Make the pin and the two bobs."""
     elbow = PIN + upper * np.array([np.sin(1.2), -np.cos(1.2)])
     end = elbow + lower * np.array([np.sin(0.6), -np.cos(0.6)])
     return tv.Particles(np.array([PIN, elbow, end]), mass=[1.0, 1.0, mass], pinned=[0])
 
 
 def track(worlds: tv.Worlds) -> np.ndarray:
-    """Where the lower bob is, 30 times a second, (worlds, frames, 2)."""
+    """Return the positions of the lower bob, 30 times a second, (worlds, frames, 2)."""
     return worlds.rollout(SEEN, every=2).position[:, :, 2]
 
 
 def fit(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Lengths and mass by Gauss and Newton, from the guess; what the noise leaves of doubt in them; and how many runs it took.
+    """Fit lengths and mass by the Gauss-Newton method, from GUESS. Returns them, their standard errors, and the number of runs.
 
-    Steps are of the logarithms, so that all stay positive.
+    The steps are in the logarithms, so that all parameters stay positive.
     """
     found, runs = np.array([*GUESS.values()]), 0
     for _ in range(20):
@@ -62,7 +62,7 @@ def fit(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
 
 
 def walls() -> list[tv.HalfSpace | tv.Polygon]:
-    """The ground, the wall, and the two sides of the bucket."""
+    """Make the ground, the wall, and the two sides of the bucket."""
 
     def block(left: float, right: float, height: float) -> tv.Polygon:
         return tv.Polygon([(left, 0.0), (right, 0.0), (right, height), (left, height)], restitution=0.6, friction=0.3)
@@ -72,7 +72,7 @@ def walls() -> list[tv.HalfSpace | tv.Polygon]:
 
 
 def velocities(throws: np.ndarray) -> np.ndarray:
-    """Of throws by speed and angle, (..., 2)."""
+    """Return the velocities of throws, given by speed and angle, (..., 2)."""
     speed, angle = np.moveaxis(throws, -1, 0)
     return np.stack([speed * np.cos(angle), speed * np.sin(angle)], axis=-1)
 
@@ -83,9 +83,11 @@ def caught(x: np.ndarray) -> np.ndarray:
 
 
 def search() -> tuple[np.ndarray, np.ndarray, np.ndarray, list[float]]:
-    """The throw, by cross-entropy: of many at random the best say where to look next. Impacts make the way of a ball jump with
-    its speed and angle, so that slopes lead nowhere. Returns speed and angle of the throw in the middle of those that were caught
-    last, its way, some throws of the first round, and what share of each round was caught.
+    """Find the throw by the cross-entropy method: the best of many random throws give the distribution of the next round.
+
+    Impacts make the path of a ball a discontinuous function of speed and angle, so gradients do not help. Returns speed and angle
+    of the most central throw among those caught last, its path, some throws of the first round, and the share of throws caught in
+    each round.
     """
     random, mouth = np.random.default_rng(1), (np.mean(BUCKET), HEIGHT)
     mean, spread, first, shares = np.array([6.0, 0.8]), np.array([2.0, 0.4]), np.zeros((0, 2)), []
@@ -106,7 +108,7 @@ def search() -> tuple[np.ndarray, np.ndarray, np.ndarray, list[float]]:
 
 
 def build(fitted: np.ndarray, points: np.ndarray, throws: np.ndarray) -> tv.World:
-    """All of it in one scene: the pendulum, throws, which do not feel each other, and points where something was seen."""
+    """Put everything into one scene: the pendulum, throws without contacts between them, and the measured points."""
     rods, n = bobs(*fitted), len(throws)
     at = np.concatenate([rods.position, np.tile(FROM, (n, 1)), points])
     velocity = np.concatenate([np.zeros((3, 2)), velocities(throws), np.zeros_like(points)])
@@ -117,12 +119,12 @@ def build(fitted: np.ndarray, points: np.ndarray, throws: np.ndarray) -> tv.Worl
 
 
 def play() -> tv.World:
-    """The pendulum and one throw, to be taken by hand."""
+    """Make the pendulum and one throw, to be moved by mouse."""
     return build(np.array([*TRUE.values()]), np.zeros((0, 2)), np.array([[7.9, 1.04]]))
 
 
 def main(path: str = "fit.rrd") -> None:
-    """Fit, search, show, and check what was found."""
+    """Fit, search, show, and check the results."""
     random = np.random.default_rng(0)
     with tv.Worlds(pendulum(**TRUE), 1) as worlds:
         exact = track(worlds)[0]

@@ -15,24 +15,24 @@ import tiverlet as tv
 from tiverlet.device import ti
 
 LONG, HIGH, TOP, POINTS = 1.5, 1.0, 2.4, (37, 25)  # length, width and upper edge of the flag [m], its particles
-MASS, RATE = 0.3 / (POINTS[0] * POINTS[1]), 3.0  # of a particle [kg]; how fast the air takes it along [1/s]
+MASS, RATE = 0.3 / (POINTS[0] * POINTS[1]), 3.0  # of a particle [kg]; rate of the drag by the wind [1/s]
 
 
 @ti.func
 def eddies(x, v, t):
-    """What eddies add to the force of the wind [N]: waves of air across it, which travel with it."""
+    """Return the force of eddies, in addition to the wind [N]: waves of air across the wind that travel with it."""
     long, short = ti.sin(4.0 * x[0] + 2.0 * x[1] - 22.0 * t), ti.sin(9.0 * x[0] - 3.0 * x[1] - 41.0 * t)
     return MASS * RATE * ti.Vector([0.0, ti.sin(5.0 * x[0] - 20.0 * t), 3.0 * long + 2.0 * short])
 
 
 def wind(time: float) -> np.ndarray:
-    """Velocity of the air [m/s]."""
+    """Return the velocity of the air [m/s]."""
     turn, speed = 0.5 * np.sin(0.9 * time), 7.0 + 3.0 * np.sin(1.7 * time) * np.sin(0.6 * time)
     return speed * np.array([np.cos(turn), 0.0, np.sin(turn)])
 
 
 def build() -> tuple[tv.World, tv.shapes.Shape]:
-    """Threads that do not stretch and a weave that is soft across them, pinned along the pole."""
+    """Make inextensible threads and a weave that is soft across them, pinned along the pole."""
     sheet = tv.shapes.cloth((0.05, TOP - HIGH, 0.0), (LONG, 0, 0), (0, HIGH, 0), POINTS)
     features = [
         tv.Gravity(9.81),
@@ -48,18 +48,18 @@ def build() -> tuple[tv.World, tv.shapes.Shape]:
 
 
 def each_frame(world: tv.World) -> None:
-    """Let the wind change, also in `tiverlet play flag`."""
+    """Set the wind for the next frame; `tiverlet play flag` calls this too."""
     air = next(f for f in world.features if isinstance(f, tv.Wind))
     air.velocity = wind(world.time + 1 / 60)
 
 
 def heading(vector: np.ndarray) -> float:
-    """Where to, seen from above [rad]."""
+    """Return the direction of a vector, seen from above [rad]."""
     return float(np.arctan2(vector[2], vector[0]))
 
 
 def main(path: str = "flag.rrd", *, seconds: float = 6.0) -> None:
-    """Blow, record, and compare where the flag and the wind point to."""
+    """Simulate, record, and compare the directions of flag and wind."""
     world, sheet = build()
     rest = np.linalg.norm(np.diff(sheet.position[sheet.links], axis=1)[:, 0], axis=1)
     stretch, apart, flags = 0.0, 0.0, set()

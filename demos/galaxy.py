@@ -14,8 +14,8 @@ import numpy as np
 import tiverlet as tv
 from tiverlet.device import ti
 
-STARS, CORE, SOFT = 360, 1.0, 0.1  # of each galaxy; mass of its core, G = 1; what rounds off close encounters
-mass: Any = None  # of all stars, a field that kernels read
+STARS, CORE, SOFT = 360, 1.0, 0.1  # stars of each galaxy; mass of its core, with G = 1; softening length
+mass: Any = None  # masses of all stars, a field that kernels read
 
 
 @ti.func
@@ -30,7 +30,7 @@ def energy(r, i, j):
 
 
 def disc(center: np.ndarray, velocity: np.ndarray, tilt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and velocities of a core and of stars on circles around it, in a plane that is tilted about x."""
+    """Return positions and velocities of a core and of stars on circles around it, in a plane tilted about x."""
     k = np.arange(STARS)
     r, turn = 0.25 + 0.85 * np.sqrt((k + 0.5) / STARS), 2 * np.pi * tv.golden(k)
     speed = r * np.sqrt(CORE) / (r * r + SOFT * SOFT) ** 0.75
@@ -43,9 +43,9 @@ def disc(center: np.ndarray, velocity: np.ndarray, tilt: float) -> tuple[np.ndar
 
 
 def build() -> tv.World:
-    """Two discs on a parabola around each other, with 1.2 between the cores where they are nearest."""
+    """Make two discs on a parabola around each other, with a closest approach of 1.2 between the cores."""
     near, far, total = 1.2, 4.0, 2 * CORE
-    speed, aside = np.sqrt(2 * total / far), np.sqrt(2 * total * near) / far  # energy 0; angular momentum as at the nearest
+    speed, aside = np.sqrt(2 * total / far), np.sqrt(2 * total * near) / far  # energy 0; angular momentum of the closest approach
     center, way = np.array([far / 2, 0, 0]), np.array([-np.sqrt(speed**2 - aside**2) / 2, aside / 2, 0])
     one, other = disc(center, way, 0.4), disc(-center, -way, -0.9)
     x, v = (np.concatenate(parts) for parts in zip(one, other, strict=True))
@@ -60,7 +60,7 @@ def build() -> tv.World:
 
 
 def main(path: str = "galaxy.rrd", *, seconds: float = 9.0) -> None:
-    """Run, record, and check what is to be kept."""
+    """Simulate, record, and check the conserved quantities."""
     world = build()
     m, start = world.particles.mass, world.particles.velocity
     scale = m @ np.linalg.norm(start, axis=1)

@@ -16,7 +16,7 @@ NECK, TOP, WIDTH = 0.36, 2.0, 1.2
 
 
 def build(grains: int = 1000) -> tv.World:
-    """Two funnels of rods, neck to neck, filled above."""
+    """Make two funnels of rods, neck to neck, with the upper one filled."""
     spots = tv.golden(np.arange(4 * grains), dim=2) * [2 * WIDTH, TOP] + [-WIDTH, 0.1]
     inside = np.abs(spots[:, 0]) < NECK / 2 + (WIDTH - NECK / 2) * spots[:, 1] / TOP - 0.12
     position = spots[inside][:grains]
@@ -34,7 +34,7 @@ def build(grains: int = 1000) -> tv.World:
 
 
 def check(world: tv.World) -> None:
-    """Every grain is in the glass, and some have run through."""
+    """Check that every grain is in the glass, and that some have run through."""
     x = world.position
     edge = NECK / 2 + (WIDTH - NECK / 2) * np.abs(x[:, 1]) / TOP
     if not np.isfinite(x).all() or (np.abs(x[:, 0]) > edge + 0.05).any():
@@ -44,7 +44,7 @@ def check(world: tv.World) -> None:
 
 
 def main(path: str = "hourglass.rrd", *, seconds: float = 6.0) -> None:
-    """Run, record, and say how it went."""
+    """Simulate, record, and print the results."""
     world = build()
     with tv.Recorder(path, world, every=2, overwrite=True) as recorder:
         report = world.run(seconds, recorder=recorder, progress=True)

@@ -13,11 +13,11 @@ from rich.progress import track
 
 import tiverlet as tv
 
-SIDE, CELLS, MASS = 1.0, 6, 50.0  # [m], along each edge, [kg]
+SIDE, CELLS, MASS = 1.0, 6, 50.0  # [m], cells along each edge, [kg]
 
 
 def build() -> tuple[tv.World, tv.Volume]:
-    """Tetrahedra that keep their volumes and soft links that keep their form, between the floor and the lid of a box."""
+    """Make a cube between the floor and the lid of a box. Tetrahedra keep its volume, and soft links its shape."""
     cube = tv.shapes.truss((-SIDE / 2, 0.0, -SIDE / 2), (SIDE / 2, SIDE, SIDE / 2), (CELLS,) * 3)
     flesh = tv.Volume(cube.tetrahedra, compliance=1e-9)
     form = tv.Distance(np.concatenate([cube.links, cube.braces]), compliance=2e-3, damping=1.0)
@@ -27,18 +27,18 @@ def build() -> tuple[tv.World, tv.Volume]:
 
 
 def lid(time: float) -> float:
-    """Height of the lid [m]: it comes down within a second, waits for one, and is lifted within a tenth."""
+    """Return the height of the lid [m]: it comes down within a second, waits for one, and rises within a tenth."""
     return float(SIDE * (1.65 - 1.1 * tv.smoothstep(0.0, 1.0, time) * (1 - tv.smoothstep(2.0, 2.1, time))))
 
 
 def each_frame(world: tv.World) -> None:
-    """Move the lid, over and over again in `tiverlet play jelly`."""
+    """Move the lid; `tiverlet play jelly` repeats this."""
     room = next(f for f in world.features if isinstance(f, tv.Box))
     room.upper = (SIDE, lid((world.time + 1 / 60) % 4), SIDE)
 
 
 def main(path: str = "jelly.rrd", *, seconds: float = 4.0) -> None:
-    """Squeeze, let go, record and measure."""
+    """Squeeze, release, record and measure."""
     world, flesh = build()
     top = np.flatnonzero(world.position[:, 1] > 0.99 * SIDE)
     rest, lost, wide, high, flags = flesh.rest.sum(), 0.0, 0.0, [], set()

@@ -12,24 +12,24 @@ import numpy as np
 
 import tiverlet as tv
 
-CRANK, ROD, RATE, STAMP = 0.3, 1.0, 2.0, 1.0  # lengths [m], turns a second, mass of the stamp [kg]
+CRANK, ROD, RATE, STAMP = 0.3, 1.0, 2.0, 1.0  # lengths [m], turns per second, mass of the stamp [kg]
 
 
 def stamp(time: float) -> float:
-    """Height of the stamp [m]: the crank is at angle 2 pi RATE time, and the rod hangs from it down to the rail."""
+    """Return the height of the stamp [m]: the crank is at angle 2 pi RATE time, and the rod hangs from it down to the rail."""
     turn = 2 * np.pi * RATE * time
     return CRANK * np.sin(turn) - np.sqrt(ROD**2 - (CRANK * np.cos(turn)) ** 2)
 
 
 def side(time: float) -> float:
-    """What the stamp presses on its rail with [N]: its weight and inertia, along the slope of the rod."""
+    """Return the force of the stamp on its rail [N]: weight and inertia, along the slope of the rod."""
     a = (stamp(time + 1e-4) - 2 * stamp(time) + stamp(time - 1e-4)) / 1e-8
     lean = CRANK * np.cos(2 * np.pi * RATE * time)
     return STAMP * (a + 9.81) * lean / np.sqrt(ROD**2 - lean**2)
 
 
 def build() -> tuple[tv.World, tv.Path]:
-    """Numbers 0 to 8 are the wheel and its hub, 9 the stamp, 10 to 12 the rocker, 13 to 16 the arm."""
+    """Make the machine. Particles 0 to 8 are the wheel and its hub, 9 the stamp, 10 to 12 the rocker, 13 to 16 the arm."""
     angle = 2 * np.pi * np.arange(8) / 8
     wheel = CRANK * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     rocker, arm = [[1.3, 0.0], [1.52, 0.449], [1.08, -0.449]], [[1.9, 0.5], [1.9, 0.1], [1.9, -0.3], [2.2, -0.3]]
@@ -48,7 +48,7 @@ def build() -> tuple[tv.World, tv.Path]:
 
 
 def main(path: str = "machine.rrd", *, seconds: float = 3.0) -> None:
-    """Turn, and compare the stamp and its rail with the formulas."""
+    """Turn the wheel, and compare the stamp and its rail with the formulas."""
     world, rail = build()
     off, force = 0.0, []
     with tv.Recorder(path, world, overwrite=True) as recorder:

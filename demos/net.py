@@ -12,12 +12,12 @@ import numpy as np
 
 import tiverlet as tv
 
-CELLS, SIDE, STRENGTH = 20, 1.6, 12.0  # [m], [N]
-BALLS = (0.5, 4.0)  # [kg]
+CELLS, SIDE, STRENGTH = 20, 1.6, 12.0  # cells along a side, side [m], strength of a thread [N]
+BALLS = (0.5, 4.0)  # masses of the balls [kg]
 
 
 def build() -> tv.World:
-    """Square nets in frames, side by side, and a ball above each. Threads pull and do not push."""
+    """Make two square nets in frames, side by side, and a ball above each. Threads pull and do not push."""
     k = np.arange((CELLS + 1) ** 2).reshape(CELLS + 1, CELLS + 1)
     i, j = np.divmod(k.ravel(), CELLS + 1)
     knots = np.stack([i / CELLS - 0.5, 0.0 * i, j / CELLS - 0.5], axis=1) * SIDE
@@ -41,7 +41,10 @@ def build() -> tv.World:
 
 
 def check(world: tv.World) -> float:
-    """The first net holds, and bears its weight; the second is torn, and its ball on the ground. Returns load over weight."""
+    """Check that the first net holds, and that the second is torn and its ball on the ground.
+
+    Returns the load of the first net over the weight that it carries.
+    """
     rope, n, x = next(f for f in world.features if isinstance(f, tv.Rope)), (CELLS + 1) ** 2, world.position
     whole = ~rope.broken
     first = rope.indices[:, 0] < n
@@ -49,7 +52,7 @@ def check(world: tv.World) -> float:
         raise SystemExit("the first net did not hold")
     if whole[~first].all() or x[-1, 1] > -0.7:
         raise SystemExit("the second net did not tear")
-    held = world.particles.pinned[rope.indices]  # threads at the frame, and how steeply each leaves it
+    held = world.particles.pinned[rope.indices]  # threads at the frame have one pinned end
     edge = first & (held.sum(axis=1) == 1)
     a, b = x[rope.indices[edge, 0]], x[rope.indices[edge, 1]]
     steep = np.abs(a - b)[:, 1] / np.linalg.norm(a - b, axis=1)
@@ -58,7 +61,7 @@ def check(world: tv.World) -> float:
 
 
 def main(path: str = "net.rrd") -> None:
-    """Run, record, and say what tore when."""
+    """Simulate, record, and print what tore when."""
     world, events = build(), []
     with tv.Recorder(path, world, every=2, overwrite=True) as recorder:
         for _ in range(360):

@@ -15,7 +15,7 @@ N = 4000
 
 
 def rows():
-    """Name and features of each row; every row has all of the one above it."""
+    """Yield name, particles and features of each row; every row has all features of the row above."""
     spots = np.stack([np.arange(N) % 63, np.arange(N) // 63], axis=1) * 0.025
     i = np.arange(0, N - 1, 2)
     pairs = np.stack([i, i + 1], axis=1)

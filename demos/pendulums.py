@@ -17,32 +17,32 @@ import numpy as np
 
 import tiverlet as tv
 
-SECONDS, G, ARM = 10.0, 9.81, 1.0  # how long each swings; [m/s^2]; length of both arms [m], at the end of each 1 kg
-SHOWN = 24  # pendulums on a side of the recording, at most
+SECONDS, G, ARM = 10.0, 9.81, 1.0  # duration [s]; [m/s^2]; length of both arms [m], each with 1 kg at its end
+SHOWN = 24  # most pendulums along a side of the recording
 
 
 def angles(side: int) -> tuple[np.ndarray, np.ndarray]:
-    """Those of the upper and the lower arm from below, of a map from -pi to pi whose halves mirror each other to the bit."""
+    """Return the angles of upper and lower arms from below: a map from -pi to pi, whose halves mirror each other bit for bit."""
     some = (2 * np.arange(side) + 1 - side) * (np.pi / side)
     first, second = np.meshgrid(some, some)
     return first.ravel(), second.ravel()
 
 
 def hanging(first, second) -> np.ndarray:
-    """Anchor, elbow and end of pendulums, (..., 3, 2) [m]."""
+    """Return anchor, elbow and end of pendulums, (..., 3, 2) [m]."""
     elbow = ARM * np.stack([np.sin(first), -np.cos(first)], axis=-1)
     end = elbow + ARM * np.stack([np.sin(second), -np.cos(second)], axis=-1)
     return np.stack([0 * elbow, elbow, end], axis=-2)
 
 
 def make(first: float, second: float) -> tv.World:
-    """One double pendulum, at rest."""
+    """Make one double pendulum, at rest."""
     particles = tv.Particles(hanging(first, second), pinned=[0])
     return tv.World(particles, [tv.Gravity(G), tv.Distance([(0, 1), (1, 2)])], substeps=10, precision="f64")
 
 
 def figures(worlds: Any) -> dict[str, np.ndarray]:
-    """The time at which an arm first goes over the top; SECONDS for those of which none does."""
+    """Return the time at which an arm first goes over the top; SECONDS if none does."""
     arms = np.diff(worlds.rollout(SECONDS).position, axis=2)  # (worlds, frames, arms, 2)
     x, y = arms[..., 0], arms[..., 1]
     over = ((x[:, 1:] > 0) != (x[:, :-1] > 0)) & (np.minimum(y[:, 1:], y[:, :-1]) > 0)
@@ -51,10 +51,10 @@ def figures(worlds: Any) -> dict[str, np.ndarray]:
 
 
 def build(first: np.ndarray | None = None, second: np.ndarray | None = None) -> tv.World:
-    """The pendulums of a map in one world, each in its place; by default of a small map."""
+    """Make one world with the pendulums of a map, each at its place; by default of a small map."""
     if first is None or second is None:
         first, second = angles(SHOWN)
-    apart = 3.2 * ARM * np.sqrt(len(first)) / (2 * np.pi)  # they may cross: nothing touches
+    apart = 3.2 * ARM * np.sqrt(len(first)) / (2 * np.pi)  # pendulums may cross, since there are no contacts
     x = hanging(first, second) + apart * np.stack([first, second], axis=-1)[:, None]
     joints = 3 * np.arange(len(first))
     links = np.concatenate([np.stack([joints + k, joints + k + 1], axis=1) for k in (0, 1)])
@@ -63,18 +63,18 @@ def build(first: np.ndarray | None = None, second: np.ndarray | None = None) -> 
 
 
 def main(path: str = "pendulums.rrd", side: int | str = 24, processes: int | str | None = None, *, at_once: int = 192) -> None:
-    """Sweep, check, tell the time of a million, and record a few."""
+    """Sweep the map, check it, estimate the time of a million, and record a few pendulums."""
     side, processes = int(side), None if processes is None else int(processes)
     first, second = angles(side)
     parameters = {"first": first, "second": second}
-    if processes is None:  # what is compiled is not to be counted
+    if processes is None:  # compile first, so that compilation is not timed
         tv.sweep(make, {name: values[:at_once] for name, values in parameters.items()}, figures)
     clock = perf_counter()
     flip = tv.sweep(make, parameters, figures, processes, at_once, progress=True)["flip"]
     each = (perf_counter() - clock) / len(flip)
 
     flips = flip < SECONDS
-    bound = 2 * np.cos(first) + np.cos(second) > 1  # energy below that of the lower arm upright and the upper one hanging
+    bound = 2 * np.cos(first) + np.cos(second) > 1  # less energy than with the upper arm hanging and the lower one upright
     map_ = flip.reshape(side, side)
     if (flips & bound).any():
         raise SystemExit("a pendulum flips without the energy for it")

@@ -16,7 +16,7 @@ from tiverlet.commands import run
 from tiverlet.recording import viewer
 
 HERE = pathlib.Path(__file__).parent / "pictures"
-# Of each demo the frame to show, and which part of the scene: left, top, right and bottom, as shares of its size.
+# For each demo: the frame to show, and the part of the scene: left, top, right and bottom, as shares of its size.
 ALL = (0.0, 0.0, 1.0, 1.0)
 PICTURES = {
     "article": (290, ALL),
@@ -43,12 +43,12 @@ PICTURES = {
     "tidy": (300, (0.0, 0.42, 1.0, 1.0)),
     "wrecking": (90, ALL),
 }
-WIDTH, HEIGHT, COLORS = 800, 480, 256  # of a picture, at most
-MARGIN = 12  # pixels of background that are left around a scene
+WIDTH, HEIGHT, COLORS = 800, 480, 256  # the largest values for a picture
+MARGIN = 12  # pixels of background kept around a scene
 
 
 def scene(folder: str, demo: str, frame: int, part: tuple[float, float, float, float]) -> Image.Image:
-    """A part of one frame of one demo, without the empty background around the scene."""
+    """Return a part of one frame of one demo, without the empty background around the scene."""
     out, png = f"{folder}/{demo}.rrd", f"{folder}/{demo}.png"
     with run.recording(out):
         status = run.execute(run.find(demo), [])
@@ -64,7 +64,7 @@ def scene(folder: str, demo: str, frame: int, part: tuple[float, float, float, f
 
 
 def main(names: list[str]) -> None:
-    """Make the pictures of these demos, or of all."""
+    """Make the pictures of the named demos, or of all."""
     with tempfile.TemporaryDirectory() as folder:
         for name in names or PICTURES:
             image = scene(folder, name, *PICTURES[name])

@@ -12,11 +12,11 @@ import numpy as np
 
 import tiverlet as tv
 
-RADIUS, SPEED = 1.5, 0.8  # of the drum [m], [rad/s]
+RADIUS, SPEED = 1.5, 0.8  # radius [m] and speed [rad/s] of the drum
 
 
 def build(bodies: int = 45) -> tv.World:
-    """Regular polygons of 3 to 7 corners, each corner linked to all others of its body, in a hexagonal drum."""
+    """Make regular polygons of 3 to 7 corners, each corner linked to all others of its body, in a hexagonal drum."""
     spots = tv.golden(np.arange(4 * bodies), dim=2) * 2.2 - 1.1
     chosen: list[np.ndarray] = []
     for spot in spots:
@@ -38,7 +38,7 @@ def build(bodies: int = 45) -> tv.World:
 
 
 def deepest(world: tv.World) -> float:
-    """How deep a corner, or a point a quarter or half along an edge, is inside of another body at worst [m]."""
+    """Return the largest depth of a corner, or of a point a quarter or half along an edge, inside another body [m]."""
     x, worst = world.position, 0.0
     loops = next(f for f in world.features if isinstance(f, tv.Polygons)).loops
     after = np.arange(len(x))
@@ -53,13 +53,13 @@ def deepest(world: tv.World) -> float:
         if len(near):
             u = x[after[loop]] - a
             outward = np.stack([u[:, 1], -u[:, 0]], axis=1) / np.linalg.norm(u, axis=1)[:, None]
-            height = (near @ outward.T - (a * outward).sum(axis=1)).max(axis=1)  # of each point over the convex body
+            height = (near @ outward.T - (a * outward).sum(axis=1)).max(axis=1)  # distance of each point from the convex body
             worst = max(worst, float(-height.min()))
     return worst
 
 
 def main(path: str = "polygons.rrd", *, seconds: float = 8.0) -> None:
-    """Run, record, and say how it went."""
+    """Simulate, record, and print the results."""
     world = build()
     drum = next(f for f in world.features if isinstance(f, tv.Polygon))
     worst = 0.0

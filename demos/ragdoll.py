@@ -15,7 +15,7 @@ STEPS = [(0.0, 2.4), (1.6, 2.4)] + [(1.6 + 0.4 * ((k + 1) // 2), 2.4 - 0.3 * (k 
 
 
 def build() -> tuple[tv.World, tv.AngleLimit, tv.Distance]:
-    """Three figures at the top of the stairs, one leaning further than the other, and a push."""
+    """Make three figures at the top of the stairs, each leaning further than the one before, with a push."""
     dolls = [tv.shapes.ragdoll((0.45 + 0.5 * k, 2.5 + 0.05 * k), 1.2).turned(-0.15 * k) for k in range(3)]
     body, parts = tv.shapes.join(*dolls)
     stairs = [*STEPS, (STEPS[-1][0] + 3.0, STEPS[-1][1]), (STEPS[-1][0] + 3.0, -0.6), (0.0, -0.6)]
@@ -31,7 +31,7 @@ def build() -> tuple[tv.World, tv.AngleLimit, tv.Distance]:
 
 
 def main(path: str = "ragdoll.rrd", *, seconds: float = 5.0) -> None:
-    """Fall, record, and look at every joint."""
+    """Simulate, record, and check every joint."""
     world, joints, bones = build()
     with tv.Recorder(path, world, overwrite=True) as recorder:
         report = world.run(seconds, recorder=recorder, progress=True)

@@ -14,12 +14,12 @@ import numpy as np
 import tiverlet as tv
 
 GRAINS, RADIUS, WIDTH, GATE = 450, 0.03, 0.6, 0.27
-G, SETTLED = 9.81, 4.0  # [s] until the gate opens; in the last quarter of that the walls rise a little
-RISE = 0.02  # [m/s]
+G, SETTLED = 9.81, 4.0  # [m/s^2]; time until the gate opens [s], in whose last quarter the walls rise a little
+RISE = 0.02  # speed of the rising walls [m/s]
 
 
 def build() -> tv.World:
-    """A narrow silo whose floor is a row of discs that cannot move, over a bin."""
+    """Make a narrow silo over a bin. The floor of the silo is a row of fixed discs."""
     floor = np.arange(-WIDTH / 2 + RADIUS / 2, WIDTH / 2, RADIUS)
     rows = int(WIDTH / (2.2 * RADIUS))
     k = np.arange(GRAINS)
@@ -40,23 +40,23 @@ def build() -> tv.World:
 
 
 def pressed(world: tv.World) -> np.ndarray:
-    """The sum of all forces along normals on each grain, for its colour [N]."""
+    """Return the sum of all normal forces on each grain [N], for its colour."""
     found = world.contacts
     return np.bincount(found.pairs.ravel(), np.repeat(found.impulse, 2), len(world.particles)) * 60 * world.substeps
 
 
 def borne(world: tv.World) -> float:
-    """The part of the grains' weight that the floor bears."""
+    """Return the share of the grains' weight that the floor carries."""
     p, found = world.particles, world.contacts
     held = p.pinned[found.pairs]
-    pushes = found.impulse[:, None] * found.normal  # on the first of each pair, from the second
+    pushes = found.impulse[:, None] * found.normal  # impulse on the first particle of each pair, from the second
     down = np.where(held[:, 1] & ~held[:, 0], pushes[:, 1], np.where(held[:, 0] & ~held[:, 1], -pushes[:, 1], 0.0))
     h = 1 / 60 / world.substeps
     return float(down.sum() / h / (G * p.mass[~p.pinned].sum()))
 
 
 def check(share: float, rates: np.ndarray) -> None:
-    """The floor bears less than the weight, and the flow is steady."""
+    """Check that the floor carries less than the weight, and that the flow is steady."""
     if not 0.2 < share < 0.75:
         raise SystemExit(f"the floor bears {share:.0%} of the weight")
     if rates.min() < 0.6 * rates.max():
@@ -64,7 +64,7 @@ def check(share: float, rates: np.ndarray) -> None:
 
 
 def main(path: str = "silo.rrd", *, seconds: float = 7.0) -> None:
-    """Fill, open, record, and say how it went."""
+    """Fill the silo, open it, record, and print the results."""
     world = build()
     walls = world.features[2:4]
     shares, out = [], []

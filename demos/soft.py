@@ -16,7 +16,7 @@ STAR = [[0.45 * r * np.sin(t), 0.45 * r * np.cos(t)] for t, r in zip(np.arange(1
 
 
 def build() -> tuple[tv.World, tv.Area, list[slice]]:
-    """Five balls, a star and a box in a box."""
+    """Make five balls, a star and a rigid box, inside a larger box."""
     S = tv.shapes
     balls = [S.ball((x, y), 0.35, 4) for x, y in ((-1.0, 0.4), (0.0, 0.4), (1.0, 0.4), (-0.5, 1.3), (0.55, 1.3))]
     star, box = S.blob(STAR, 0.1).moved((0.0, 2.3)), S.truss((-0.9, 2.0), (-0.4, 2.3), (5, 3)).turned(0.3)
@@ -35,7 +35,7 @@ def build() -> tuple[tv.World, tv.Area, list[slice]]:
 
 
 def main(path: str = "soft.rrd", *, seconds: float = 4.0) -> None:
-    """Run, record, and check what is to be kept."""
+    """Simulate, record, and check areas and shapes."""
     world, area, parts = build()
     with tv.Recorder(path, world, overwrite=True) as recorder:
         report = world.run(seconds, recorder=recorder, progress=True)

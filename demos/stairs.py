@@ -14,12 +14,12 @@ from rich.progress import track
 
 import tiverlet as tv
 
-STEPS, STEP, WIDE, FLOOR, TALL = 10, 0.45, 5.0, 3.5, 1.2  # how many, their depth and height [m]; lengths [m]
+STEPS, STEP, WIDE, FLOOR, TALL = 10, 0.45, 5.0, 3.5, 1.2  # how many steps, depth and height of each [m]; lengths [m]
 INF = float("inf")
 
 
 def stairs() -> tuple[np.ndarray, np.ndarray]:
-    """Treads and risers from a landing down to the floor at y = 0, as vertices and faces."""
+    """Return treads and risers from a landing down to the floor at y = 0, as vertices and faces."""
     x = np.array([-2 * STEP, *np.repeat(STEP * np.arange(STEPS), 2), STEP * (STEPS - 1) + FLOOR])
     y = np.repeat(STEP * np.arange(STEPS, -1, -1), 2)
     vertices = np.stack([np.tile(x, 2), np.tile(y, 2), np.repeat([-WIDE / 2, WIDE / 2], len(x))], axis=1)
@@ -28,7 +28,7 @@ def stairs() -> tuple[np.ndarray, np.ndarray]:
 
 
 def build(rows: int = STEPS) -> tuple[tv.World, tv.AngleLimit, tv.Distance]:
-    """Ten figures on each of the lowest `rows` steps, who lean forward, and a push."""
+    """Make ten figures on each of the lowest `rows` steps, leaning forward, with a push."""
     lean, sway = tv.golden(np.arange(10 * rows)), tv.golden(7 * np.arange(10 * rows)) - 0.5
     dolls = []
     for k in range(10 * rows):
@@ -40,7 +40,7 @@ def build(rows: int = STEPS) -> tuple[tv.World, tv.AngleLimit, tv.Distance]:
     bones = tv.Distance(np.concatenate([body.links, body.braces]))
     features = [
         tv.Gravity(9.81), tv.Drag(0.1), bones, joints,
-        tv.Contact(friction=0.2, groups=list(combinations(range(len(dolls)), 2))),  # a figure does not collide with itself
+        tv.Contact(friction=0.2, groups=list(combinations(range(len(dolls)), 2))),  # no contacts within a figure
         tv.Mesh(*stairs(), closed=False, friction=0.2),
         tv.Box((-2 * STEP, -INF, -WIDE / 2), (STEP * (STEPS - 1) + FLOOR, INF, WIDE / 2)),
     ]  # fmt: skip
@@ -55,7 +55,7 @@ def build(rows: int = STEPS) -> tuple[tv.World, tv.AngleLimit, tv.Distance]:
 
 
 def main(path: str = "stairs.rrd", *, seconds: float = 3.5) -> None:
-    """Fall, record, and look at every joint."""
+    """Simulate, record, and check every joint."""
     world, joints, bones = build()
     over, off, deep, flags, radius = 0.0, 0.0, 0.0, set(), world.particles.radius
     with tv.Recorder(path, world, every=2, overwrite=True) as recorder:

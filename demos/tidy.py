@@ -16,7 +16,7 @@ SPACING = 0.1
 
 
 def build() -> tuple[tv.World, tv.Gravity, tv.Snap]:
-    """Discs in a box; the grid is there from the start, and loses against gravity."""
+    """Make discs in a box. The grid is there from the start, but gravity is stronger."""
     pile = tv.shapes.pile((-1.0, 0.02), (1.0, 0.8), (0.025, 0.045))
     gravity = tv.Gravity(9.81)
     snap = tv.Snap(np.arange(len(pile)), SPACING, origin=(0.0, SPACING / 2), compliance=0.05, damping=0.4)
@@ -25,7 +25,7 @@ def build() -> tuple[tv.World, tv.Gravity, tv.Snap]:
 
 
 def main(path: str = "tidy.rrd") -> None:
-    """Fall, toss, tidy up, and count."""
+    """Drop, toss and tidy up the discs, and count them."""
     world, gravity, snap = build()
     n = len(world.particles)
     with tv.Recorder(path, world, overwrite=True) as recorder:

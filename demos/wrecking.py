@@ -13,13 +13,16 @@ from rich.progress import track
 
 import tiverlet as tv
 
-ROWS, COLUMNS, WIDE, HIGH, ROUND = 10, 4, 0.5, 0.25, 0.025  # of bricks in the wall; of a brick and its corners [m]
+ROWS, COLUMNS, WIDE, HIGH, ROUND = 10, 4, 0.5, 0.25, 0.025  # of the wall; size of a brick and radius of its corners [m]
 TOP, LENGTH, LINKS, BALL = 5.2, 4.2, 16, 0.45  # height of the crane, length of the chain and radius of the ball [m]
-HIT = 1.0  # until then the ball is on its way [s]
+HIT = 1.0  # time before which the ball does not reach the wall [s]
 
 
 def wall(first: int) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Corners of all bricks, the loop of each, numbered from `first` on. Every other row begins and ends with half of one."""
+    """Return the corners of all bricks, and the loop of each, numbered from `first` on.
+
+    Every other row begins and ends with half a brick.
+    """
     corners = []
     for row in range(ROWS):
         cut = np.arange(COLUMNS + 1.0) if row % 2 else np.array([0.0, *(np.arange(COLUMNS) + 0.5), COLUMNS])
@@ -30,7 +33,7 @@ def wall(first: int) -> tuple[np.ndarray, list[np.ndarray]]:
 
 
 def build() -> tuple[tv.World, list[np.ndarray], tv.Distance]:
-    """A chain from the crane, with the ball at its end pulled aside, and the wall."""
+    """Make the wall, and a chain from the crane with the ball at its end, pulled aside."""
     chain = tv.shapes.rope((0.0, TOP), (LENGTH * np.sin(-1.1), TOP - LENGTH * np.cos(-1.1)), points=LINKS + 1)
     corners, loops = wall(first=LINKS + 1)
     links = tv.Distance(chain.links)
@@ -46,7 +49,7 @@ def build() -> tuple[tv.World, list[np.ndarray], tv.Distance]:
 
 
 def deepest(world: tv.World, loops: list[np.ndarray]) -> float:
-    """How deep the ball, a corner or a point along an edge is inside of a brick at worst [m]; bricks are rectangles."""
+    """Return the largest depth of the ball, a corner or a point along an edge inside a brick [m]; bricks are rectangles."""
     x, brick = world.position, world.position[np.array(loops)]
     rim = np.concatenate([brick + k / 4 * (np.roll(brick, -1, axis=1) - brick) for k in range(4)], axis=1).reshape(-1, 2)
     points, radius = np.concatenate([rim, x[[LINKS]]]), np.append(np.full(len(rim), ROUND), BALL)
@@ -60,7 +63,7 @@ def deepest(world: tv.World, loops: list[np.ndarray]) -> float:
 
 
 def main(path: str = "wrecking.rrd", *, seconds: float = 5.0) -> None:
-    """Swing, record, and measure."""
+    """Simulate, record, and measure."""
     world, loops, links = build()
     corners = np.concatenate(loops)
     start, energy, moved, depth, stretch, flags = world.position, [], 0.0, 0.0, 0.0, set()

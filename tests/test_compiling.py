@@ -61,7 +61,7 @@ unrolling.SWITCHES = (told, *unrolling.SWITCHES[:COUNT])
 world = tv.World(tv.Particles([(0, 0.2), (0.15, 0.1)], radius=0.1), [tv.Gravity(), tv.Contact(), tv.HalfSpace((0, 1))])
 world.step(1 / 60)
 print(world.hash())
-unrolling.command_line().give(told)
+unrolling.command_line().set_switches(told)
 seen = ti.field(ti.f32, 100)
 @ti.kernel
 def add(count: ti.i32):

@@ -535,6 +535,34 @@ def test_what_an_impact_left_of_a_link_is_no_spring_where_a_wall_holds_it(world)
     assert report.residual < 1e-3 and report.energy < before.energy + m * g * L * before.residual
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_what_stands_stays_on_its_feet_where_the_substep_gets_shorter(world, dim):
+    # A block of links, twice as high as wide, on a slope of 15 degrees with friction 0.6 > tan 15: its weight acts through
+    # 2 tan 15 = 0.54 half widths from the middle, so all feet bear some of it, and none leaves the ground or walks. The links
+    # between feet are stretched by e, which friction bears, and draw feet together by e / 2 each. Left to itself, the moves of
+    # the least m p^2 turned the block over its lower feet by 0.4 % of its width, and took it down by 0.8 e, which threw it by
+    # 0.03 m/s.
+    corners = np.indices((2,) * dim).reshape(dim, -1).T * [1.0, 2.0, 1.0][:dim]
+    slope, pairs = np.radians(15.0), np.stack(np.triu_indices(len(corners), 1), axis=1)
+    down = np.array([np.sin(slope), -np.cos(slope), 0.0])[:dim]
+    floor, up = tv.HalfSpace((0, 1, 0)[:dim], friction=0.6), corners[:, 1] == 0
+    front = up & (corners[:, 0] > 0)
+    w = world(tv.Particles(corners), [tv.Gravity(9.81 * down), tv.Distance(pairs), floor], substeps=2, precision="f64")
+    for turns in ((2, 30), (4, 100)):
+        for _ in range(3):
+            w.substeps = turns[0]
+            w.run(1.0)
+            before = w.position
+            sag = np.ptp([np.linalg.norm(before[i] - before[j]) - np.linalg.norm(corners[i] - corners[j]) for i, j in pairs])
+            stretch = np.abs(before[front, 0].mean() - before[up, 0].mean() - 0.5) * 2
+            w.substeps = turns[1]
+            w.step(1 / 60)
+            moved = (w.position - before)[up]
+            assert w.position[up, 1].max() < 0.02 * sag and abs(moved[:, 0].mean()) < 0.1 * stretch
+            assert np.abs(w.velocity).max() < 0.01
+            w.run(0.5)
+
+
 def test_a_plate_bent_over_a_ball_is_no_spring(world):
     # A braced plate falls on a ball and bends at 2 substeps: links are off by 6 % of their length. To straighten it sends its
     # middle into the ball, which sends it back: each turn left more than was there, and 64 substeps made 12000 J of the 104 J.

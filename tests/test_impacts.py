@@ -129,6 +129,23 @@ def test_bouncing_ball(floor, e):
     np.testing.assert_allclose(ends, ends[0], rtol=1e-12)
 
 
+@pytest.mark.parametrize("e", [0.5, 0.9, 1.0])
+@pytest.mark.parametrize("kind", ["box", "half space", "disc"])
+def test_what_rests_does_not_bounce_where_the_substep_gets_shorter(world, kind, e):
+    # Displacements of what rests stand for -g h / 2 without what it leans on, which bounced where e h_old > h: up to g h_old / 2.
+    wall = tv.Box((-1, 0), (1, 9), restitution=e) if kind == "box" else tv.HalfSpace((0, 1), restitution=e)
+    start, features = tv.Particles([[0.0, 0.1]], radius=0.1), [tv.Gravity(9.81), wall]
+    if kind == "disc":
+        start = tv.Particles([[0.0, 0.1], [0.0, -0.1]], radius=0.1, pinned=[1])
+        features = [tv.Gravity(9.81), tv.Contact(restitution=e)]
+    w = world(start, features, substeps=1, precision="f64")
+    for substeps in (1, 1, 100, 3, 20, 2, 200, 1, 4000, 7, "auto", "auto", "auto"):
+        w.substeps = substeps
+        report = w.step(1 / 60)
+        assert report.clean and np.abs(w.velocity).max() < 1e-6 * 9.81 / 60, substeps
+        np.testing.assert_allclose(w.position, start.position, rtol=0, atol=1e-9)
+
+
 def in_rows(rows, dim=2):
     """Particles (x, y, speed upwards, radius, pinned) in rows, a group each and 10 m apart; and where those are that are free."""
     flat, group = np.concatenate(rows).astype(float), np.repeat(np.arange(len(rows)), [len(row) for row in rows])

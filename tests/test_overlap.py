@@ -20,8 +20,10 @@ def test_overlap_is_what_comparing_all_pairs_finds():
         pairs, _ = tv.measure.overlapping(x, radius)
         want = bool(free[pairs].any())
         state = Some(double=True, compensated=False)
-        scene: Any = Some(periodic=None, particles=Some(radius=radius), inv_mass=free * 2.0, state=state)
-        assert overlapping(scene, [], x) == want
+        scene: Any = Some(
+            periodic=None, particles=Some(radius=radius, group=0 * radius.astype(int)), inv_mass=free * 2.0, state=state
+        )
+        assert overlapping(scene, [], tv.Contact().wanted, x) == want
         seen[want] += 1
     assert min(seen) > 30
 
@@ -46,9 +48,16 @@ def test_only_scenes_that_start_with_overlap_have_the_field_for_it(world):
         ([tv.Contact(), tv.Distance([[1, 0]])], x, False),  # linked
         ([tv.Contact()], x * 1.1, False),
         ([tv.Contact()], np.zeros((2, 2)), True),  # in one place
+        ([tv.Contact(groups=[(0, 1), (0, 2)])], x, True),
+        ([tv.Contact(groups=[(0, 2)])], x, False),
+        ([tv.Contact(friction={(0, 1): 0.5})], x, True),
+        ([tv.Contact(sensors=[(0, 1)])], x, False),
     ):
-        w = world(tv.Particles(start, radius=0.1), features)
+        w = world(tv.Particles(start, radius=0.1, group=[0, 1, 2, 2][: len(start)]), features)
         assert ("Contact.shrunk" in w.fields) == want
+        if want and features[0].groups:
+            step = w._runner.step
+            assert w.step(1e-3).clean and w._runner.step is step  # compiled once
         if not want and len(features) == 1:  # where it was needed once, and is no more, nothing is left of it
             begin, before = checkpoint.keep(w), w.hash()
             w.position = 0.1 * x

@@ -147,6 +147,34 @@ def broken(w):
     return [f.broken.tolist() for f in w.features[1:-1]]
 
 
+def test_rounding_breaks_nothing_and_holds_nothing(world):
+    # f32 places are known to 4e-6 m at 30 m, and loads in substeps of 13 us to m 4e-6 m / h^2 = 45 kN. What they sum up to over
+    # N substeps is known to m 4e-6 m, so a body of 20 N on strengths of 30 N and 2 N is told from it by MARGIN times that
+    # / (h^2 18 N) = 1e4 substeps, 8 frames. A blow of m v = 40 kg m/s is m v h = 5e-4 kg m, 17 times that, and
+    # breaks at once.
+    bodies, frame, n = Bodies(2), 1 / 60, 1280
+    for corners, make, load, held in [*BREAKING, (BENT, lambda p: tv.Bend(p, break_at=np.inf), WEIGHT, 2)]:
+        bodies.put(corners, make, load, held, copies=2)
+    upper, angles = bodies.features[3].indices.reshape(2, 2)[:, 0], bodies.features[-1].indices
+    bodies.features.append(tv.Distance(np.concatenate([np.stack([upper - 1, upper], axis=1), angles[:, 1:]])))
+    w = bodies.world(world, precision="f32", substeps=n)
+    kinds = w.features[1:-1]
+    for feature, load in zip(kinds, bodies.loads, strict=True):
+        feature.break_at = load * np.array([1.5, 0.1])
+    noise = 0.0
+    for _ in range(12):
+        w.step(frame)
+        noise = max(noise, abs(kinds[2].load[0]) / bodies.loads[2])
+    assert noise > 10  # in one substep
+    assert broken(w) == len(kinds) * [[False, True]]
+    for feature, load in zip(kinds, bodies.loads, strict=True):
+        feature.break_at = 1000 * load
+    w.velocity = np.tile([0.0, -20.0], (len(w.position), 1))
+    w.substeps = 2  # for the cluster, which hangs by a link, and has its blow from there
+    w.step(2 * frame / n)
+    assert broken(w) == len(kinds) * [[True, True]]
+
+
 @pytest.mark.parametrize("angle", [60, 90, 120])
 def test_a_pendulum_breaks_at_its_strength_under_auto(world, angle):
     # Let go at rest at an angle a it pulls with T = m g (3 cos b - 2 cos a) at b, and most at its lowest point. The load of a
@@ -196,3 +224,28 @@ def test_what_sags_holds_where_the_substep_gets_shorter(world):
         w.run(0.5, dt=1 / 60 / ratio)
         np.testing.assert_allclose(np.abs(angles.load), [4 * G, G], rtol=1e-4)
         assert not angles.broken.any()
+
+
+def test_what_is_moved_steadily_bears_its_weight_in_f32(world):
+    # What is lifted without acceleration bears m g, whatever lifts it: a winch, rest lengths, pins or paths. Coordinates of 3 m
+    # end at e = 2^-22 m in f32: where a rest value or a place is rounded to that it jerks, by m e / h^2 = 17 N here. Angles
+    # likewise, by I e / (r h^2): a motor that turns a spoke of 1 m steadily gives m g cos(angle), and a bend holds m g 1 m.
+    h, speed = 1 / 6000, 0.5
+    bodies = Bodies(2)
+    bodies.put(HANGING, lambda p: tv.Winch(p, -speed), WEIGHT, held=1)
+    lifted = bodies.put(HANGING, tv.Distance, WEIGHT, held=1)
+    bodies.put(HANGING, tv.Distance, WEIGHT, held=0)
+    bodies.put(HANGING, tv.Distance, WEIGHT, held=0)
+    bodies.put(BENT, lambda p: tv.Motor(p, speed), WEIGHT, held=2)
+    bodies.put(BENT, tv.Bend, -WEIGHT, held=2)
+    spokes = tv.Distance([[9, 10], [12, 13]])
+    pin = tv.Pin([4], bodies.x[4])
+    path = tv.Path([6], [bodies.x[6], bodies.x[6] + np.array([0.0, 9.0])], speed=speed)
+    bodies.features += [pin, path, spokes]
+    w = bodies.world(world, substeps=100, precision="f32", solver=tv.Direct())
+    for frame in range(40):
+        lifted.rest, pin.target = 2 - speed * (frame + 1) / 60, bodies.x[4] + np.array([0.0, speed * (frame + 1) / 60])
+        w.step(100 * h)
+        turned = speed * (w.time - h)
+        expected = [*bodies.loads[:4], -WEIGHT * np.cos(turned), bodies.loads[5]]
+        np.testing.assert_allclose([f.load[0] for f in bodies.features[:6]], expected, rtol=1e-3)

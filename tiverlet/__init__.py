@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from .device import runtime  # first: it sets what Taichi reads when it is imported  # isort: skip
+from .device import runtime  # first: it sets variables that Taichi reads at import  # isort: skip
 from . import measure, shapes
 from .colliders import Ball, Box, Capsule, HalfSpace, Mesh, Polygon, Sdf
 from .constraints import (
@@ -46,16 +46,16 @@ __all__ = [
     "clamp", "golden", "golden_colors", "golden_index", "gradient", "init", "measure", "mix", "play", "replay", "runtime",
     "shapes", "smoothstep", "sweep",
 ]  # fmt: skip
-__version__ = "0.1.0"  # the only place that says it
+__version__ = "0.1.0"  # the only place where it is written
 
 
 def __dir__() -> list[str]:
-    """What is public, for tab completion."""
+    """Return the public names, for tab completion."""
     return sorted([*__all__, "__version__", "report"])
 
 
 def __getattr__(name: str) -> Any:
-    """tv.report and tv.play are imported when they are first asked for: scenes need none of them, nor of rerun."""
+    """Import tv.report and tv.play at first use: scenes need neither of them, nor rerun."""
     if name == "report":
         import importlib
 

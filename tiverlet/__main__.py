@@ -6,7 +6,7 @@ import sys
 from . import __version__
 from .commands import demos, info, play, replay, report, run, speed, stress
 
-# Each has ABOUT (a line), add(parser) for its arguments, and main(args) -> exit status. A name may be of two words.
+# Each module has ABOUT (one line), add(parser) for its arguments, and main(args) -> exit status. A name may have two words.
 COMMANDS = {
     "run": run,
     "play": play,
@@ -20,7 +20,7 @@ COMMANDS = {
 
 
 def main(words: list[str] | None = None) -> int:
-    """Run one command; returns the exit status."""
+    """Run one command; return the exit status."""
     parser = argparse.ArgumentParser(prog="tiverlet", description="A particle engine on Taichi.")
     parser.add_argument("--version", action="version", version=f"tiverlet {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")

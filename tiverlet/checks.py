@@ -1,4 +1,4 @@
-"""Argument checks: what is wrong (name, index, value), why, and what to type instead. Raised before Taichi sees anything."""
+"""Argument checks, before Taichi reads anything. Errors name the argument, index and value, and say what to write instead."""
 
 import math
 import numbers
@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-ANY = 2**31 - 1  # particles, while it is not known yet how many there are
+ANY = 2**31 - 1  # number of particles, while it is not yet known
 
 
 def number(who: str, name: str, value: Any, *, above=None, least=None, most=None, below=None) -> float:
-    """A finite real number within the bounds given."""
+    """Check a finite real number within the given bounds."""
     if type(value) is not float:
         value = _real(who, name, value)
     if not math.isfinite(value):
@@ -31,14 +31,14 @@ def _real(who: str, name: str, value: Any) -> float:
 
 
 def flag(who: str, name: str, value: Any) -> bool:
-    """value as True or False."""
+    """Return `value` as True or False."""
     if not isinstance(value, (bool, np.bool_)):
         raise TypeError(f"{who}: {name} = {value!r} is a {type(value).__name__}, but True or False is needed.")
     return bool(value)
 
 
 def integer(who: str, name: str, value, *, least: int) -> int:
-    """An integer of at least `least`."""
+    """Check an integer of at least `least`."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, numbers.Integral):
         kind = type(value).__name__
         raise TypeError(f"{who}: {name} = {value!r} is a {kind}, but an integer of at least {least} is needed.")
@@ -48,7 +48,7 @@ def integer(who: str, name: str, value, *, least: int) -> int:
 
 
 def per_item(who: str, name: str, value, count: int, *, infinite=False, **bounds) -> np.ndarray:
-    """A scalar or a (count,) array as a (count,) array of floats, finite (or +inf if allowed) and within bounds."""
+    """Expand a scalar or a (count,) array to a (count,) array of floats: finite (or +inf if allowed) and within bounds."""
     array = _floats(who, name, value)
     if array.ndim == 0:
         array = np.full(count, float(array))
@@ -63,7 +63,7 @@ def per_item(who: str, name: str, value, count: int, *, infinite=False, **bounds
 
 
 def points(who: str, name: str, value, *, dim: int | None = None, count: int | None = None) -> np.ndarray:
-    """A (n, dim) array of finite floats; dim 2 or 3 where it is not given."""
+    """Check an (n, dim) array of finite floats; dim is 2 or 3 if not given."""
     array = _floats(who, name, value)
     if array.size == 0 and array.ndim != 2:
         array = array.reshape(0, dim or 2)
@@ -77,7 +77,7 @@ def points(who: str, name: str, value, *, dim: int | None = None, count: int | N
 
 
 def vector(who: str, name: str, value, dim: int, *, infinite=False) -> np.ndarray:
-    """A (dim,) array of finite floats."""
+    """Check a (dim,) array of finite floats."""
     array = _floats(who, name, value)
     if array.shape != (dim,):
         raise ValueError(f"{who}: {name} has shape {array.shape}, but {dim} numbers are needed in a {dim}D world.")
@@ -87,7 +87,7 @@ def vector(who: str, name: str, value, dim: int, *, infinite=False) -> np.ndarra
 
 
 def finite(who: str, name: str, array: np.ndarray) -> None:
-    """Raise for the first element that is NaN or infinite."""
+    """Raise ValueError for the first element that is NaN or infinite."""
     sound = np.isfinite(array)
     if not sound.all():
         at = np.unravel_index(int(np.argmin(sound)), array.shape)
@@ -96,7 +96,7 @@ def finite(who: str, name: str, array: np.ndarray) -> None:
 
 
 def indices(who: str, name: str, value, count: int, *, arity: int | None = None, things: str = "particles") -> np.ndarray:
-    """Indices of things below `count`: (m,), or (m, arity) with distinct members in each row."""
+    """Check indices of things below `count`: (m,), or (m, arity) with distinct members in each row."""
     array = plain(who, name, value)
     if array.size == 0:
         return np.zeros((0, arity) if arity else (0,), dtype=np.int32)
@@ -107,7 +107,7 @@ def indices(who: str, name: str, value, count: int, *, arity: int | None = None,
         one = array.ndim == (1 if arity else 0) and array.size <= 4
         write = f"; write [{array.tolist()}]" if one else ""
         raise ValueError(f"{who}: {name} has shape {array.shape}, but {shape} is needed{write}.")
-    if array.astype(np.uint64).max() >= count:  # which those below 0 are then, too
+    if array.astype(np.uint64).max() >= count:  # as unsigned numbers, negative ones are large, too
         bad = (array < 0) | (array >= count)
         i = int(np.argmax(bad.any(axis=1) if arity else bad))
         least = int(array[i].min())
@@ -128,14 +128,14 @@ def _show(row) -> str:
 
 
 def rows(who: str, name: str, value: Any, what: str) -> list:
-    """A sequence as a list. what: that it is to be, for the error."""
+    """Return a sequence as a list. what: the expected kind of value, for the error."""
     if isinstance(value, (str, bytes)) or not isinstance(value, Iterable) or (isinstance(value, np.ndarray) and not value.ndim):
         raise TypeError(f"{who}: {name} = {value!r} is a {type(value).__name__}, but {what} is needed.")
     return list(value)
 
 
 def plain(who: str, name: str, value: Any) -> np.ndarray:
-    """An array of anything that has the same length in all rows."""
+    """Return anything whose rows have equal lengths as an array."""
     try:
         return np.asarray(value)
     except ValueError:
@@ -150,7 +150,7 @@ def _floats(who: str, name: str, value) -> np.ndarray:
 
 
 def _missed(value: float, above=None, least=None, most=None, below=None) -> str:
-    """What it must be and is not, in words; empty if it is within the bounds."""
+    """Return the bound that a value violates, in words; empty if it is within the bounds."""
     if above is not None and not value > above:
         return f"above {above:g}"
     if least is not None and not value >= least:
@@ -163,7 +163,7 @@ def _missed(value: float, above=None, least=None, most=None, below=None) -> str:
 
 
 def _bounds(who, name, array, **bounds) -> None:
-    """The same of all."""
+    """Raise ValueError for the first element of an array that is out of bounds."""
     ends = {int(np.argmin(array)), int(np.argmax(array))} if len(array) else set()
     if any(_missed(array[i], **bounds) for i in ends):
         i, words = next((i, words) for i, value in enumerate(array) if (words := _missed(value, **bounds)))
@@ -171,7 +171,7 @@ def _bounds(who, name, array, **bounds) -> None:
 
 
 def group_pair(who: str, name: str, pair: Any, what: str = "") -> tuple[int, int]:
-    """A pair of groups, checked. what: it is in `name`, for the error."""
+    """Check a pair of groups. what: the place of the pair in `name`, for the error."""
     if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and all(isinstance(k, (int, np.integer)) for k in pair)):
         raise TypeError(f"{who}: {name} has {what}{pair!r}, but a pair of groups such as (0, 1) is needed.")
     return int(pair[0]), int(pair[1])

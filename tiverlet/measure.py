@@ -1,4 +1,4 @@
-"""What a scene amounts to, from plain arrays in f64: for tests, for reports, for the curious."""
+"""Physical quantities of a scene, computed from plain arrays in f64: for tests and reports."""
 
 from typing import TYPE_CHECKING
 
@@ -13,44 +13,44 @@ if TYPE_CHECKING:
 
 
 def kinetic_energy(world: "World") -> float:
-    """Sum of m v^2 / 2 and of I omega^2 / 2 [J]; static particles have none."""
+    """Return the sum of m v^2 / 2 and of I omega^2 / 2 [J]; static particles have none."""
     m, moment, spin = _mass(world), moments(world.particles), _spin(world)
     return float(0.5 * np.sum(m * np.sum(world.velocity**2, axis=1)) + 0.5 * np.sum(moment * np.sum(spin**2, axis=1)))
 
 
 def momentum(world: "World") -> np.ndarray:
-    """Sum of m v [kg m/s], (dim,)."""
+    """Return the sum of m v [kg m/s], (dim,)."""
     return _mass(world) @ world.velocity
 
 
 def angular_momentum(world: "World", about=None) -> np.ndarray:
-    """Sum of m (x - about) x v + I omega [kg m^2/s]: (1,) in 2D, (3,) in 3D; about the origin where no point is given."""
+    """Return the sum of m (x - about) x v + I omega [kg m^2/s], (1,) in 2D, (3,) in 3D; about the origin if no point is given."""
     r = world.position - (0.0 if about is None else np.asarray(about))
     p = _mass(world)[:, None] * world.velocity
     return moments(world.particles) @ _spin(world) + moment_sum(r, p)
 
 
 def moment_sum(r: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Sum of r x p of vectors (n, dim): (1,) in 2D, (3,) in 3D."""
+    """Return the sum of r x p of vectors (n, dim): (1,) in 2D, (3,) in 3D."""
     if r.shape[1] == 2:
         return np.array([np.sum(r[:, 0] * p[:, 1] - r[:, 1] * p[:, 0])])
     return np.cross(r, p).sum(axis=0)
 
 
 def torque(world: "World") -> np.ndarray:
-    """Moments of contacts and walls on each particle that spins, in the last substep [N m]: (n,) in 2D, (n, 3) in 3D."""
+    """Return the torque of contacts and walls on each spinning particle in the last substep [N m]: (n,) in 2D, (n, 3) in 3D."""
     out = world._runner.torque()
     return out[:, 0] if world.particles.dim == 2 else out
 
 
 def center_of_mass(world: "World") -> np.ndarray:
-    """Of the particles that can move [m], (dim,)."""
+    """Return the center of mass of the particles that can move [m], (dim,)."""
     m = _mass(world)
     return m @ world.position / m.sum()
 
 
 def strain(world: "World", pairs, rest) -> np.ndarray:
-    """(|x_i - x_j| - rest) / rest of each pair, (m,)."""
+    """Return (|x_i - x_j| - rest) / rest of each pair, (m,)."""
     i, j = np.asarray(pairs).T
     x = world.position
     return np.linalg.norm(between(x[i], x[j], world._runner.scene.periodic), axis=1) / np.asarray(rest) - 1
@@ -59,9 +59,11 @@ def strain(world: "World", pairs, rest) -> np.ndarray:
 def overlapping(
     position: np.ndarray, radius, skin: float = 0.0, periodic: "Periodic | None" = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """All pairs of discs or spheres that overlap, or lack less than `skin` [m] of it: pairs (m, 2) with i < j, in order, and how
-    deep they overlap, with the skin (m,) [m]. periodic: the box, in which images count too. By a sweep along x, which has nothing
-    in common with how a World finds contacts."""
+    """Return all pairs of discs or spheres that overlap or are less than `skin` [m] apart.
+
+    Returns pairs (m, 2) with i < j, in order, and their overlap plus the skin, (m,) [m]. periodic: the box, in which images count
+    too. It sweeps along x, an algorithm independent of the contact search of a World.
+    """
     position = np.asarray(position, dtype=np.float64)
     radius = np.broadcast_to(np.asarray(radius, dtype=np.float64), (len(position),))
     if periodic is not None:
@@ -87,7 +89,7 @@ def overlapping(
 
 
 def _spin(world: "World") -> np.ndarray:
-    """Angular velocities, (n, 1) in 2D and (n, 3) in 3D [rad/s]."""
+    """Return angular velocities, (n, 1) in 2D and (n, 3) in 3D [rad/s]."""
     shape = len(world.particles), world.particles.axes
     return world.spin.reshape(shape) if world.particles.spins else np.zeros(shape)
 

@@ -1,4 +1,4 @@
-"""The article's small tools. Each works on numbers, on NumPy arrays and inside Taichi kernels and functions alike."""
+"""Small numerical tools from the article. Each works on numbers, on NumPy arrays, and inside Taichi kernels and functions."""
 
 import colorsys
 import functools
@@ -17,7 +17,7 @@ _BITS = 1 << 32
 
 @functools.cache
 def golden_steps(dim: int) -> tuple[int, ...]:
-    """The step of the golden sequence along each of `dim` axes, as odd multiples of 2**-32."""
+    """Return the step of the golden sequence along each of `dim` axes, as odd multiples of 2**-32."""
     root = 2.0
     for _ in range(64):
         root = (1.0 + root) ** (1.0 / (dim + 1))
@@ -25,14 +25,14 @@ def golden_steps(dim: int) -> tuple[int, ...]:
 
 
 def _both(kernel: Callable) -> Callable[[Callable], Callable]:
-    """Use `kernel`, a ti.func, when called while a kernel is compiled, and the decorated function otherwise."""
+    """Make a function that runs `kernel`, a ti.func, while a kernel is compiled, and the decorated function otherwise."""
 
     def decorate(python: Callable) -> Callable:
-        """Of one function."""
+        """Combine one Python function with the kernel."""
 
         @functools.wraps(python)
         def chosen(*args, **kwargs):
-            """Call the one that fits where this is."""
+            """Call the function for the present context."""
             return kernel(*args, **kwargs) if inside_kernel() else python(*args, **kwargs)
 
         return callable_in_kernels(chosen)
@@ -42,32 +42,32 @@ def _both(kernel: Callable) -> Callable[[Callable], Callable]:
 
 @ti.pyfunc
 def mix(a, b, amount):
-    """From a (amount 0) to b (amount 1), in a straight line; exact at both ends.
+    """Interpolate linearly from a (amount 0) to b (amount 1); exact at both ends.
 
-    The article's form, a (1 - amount) + b amount: the shorter a + (b - a) amount misses b by a rounding error.
+    The article's formula is a (1 - amount) + b amount. The shorter a + (b - a) amount misses b by a rounding error.
     """
     return a * (1 - amount) + b * amount
 
 
 @ti.pyfunc
 def clamp(value, lower, upper):
-    """`value`, but no less than `lower` and no more than `upper`."""
+    """Limit `value` to at least `lower` and at most `upper`."""
     return ti.min(ti.max(value, lower), upper)
 
 
 @ti.pyfunc
 def smoothstep(lower, upper, value):
-    """0 up to `lower`, 1 from `upper` on, and t^2 (3 - 2 t) between, with level ends."""
+    """Return 0 up to `lower`, 1 from `upper` on, and t^2 (3 - 2 t) between, with zero slope at both ends."""
     t = ti.min(ti.max((value - lower) / (upper - lower), 0), 1)
     return t * t * (3 - 2 * t)
 
 
 @ti.pyfunc
 def approach(value, target, rate, dt):
-    """Exponential smoothing: move `value` towards `target` with `rate` [1/s] for a time dt [s].
+    """Smooth exponentially: move `value` towards `target` with `rate` [1/s] for a time dt [s].
 
-    value' = target + (value - target) exp(-rate dt), the solution of x' = rate (target - x), so the result does not
-    depend on how the time is cut into frames.
+    value' = target + (value - target) exp(-rate dt), the solution of x' = rate (target - x). So the result does not depend on how
+    the time is divided into frames.
     """
     return target + (value - target) * ti.exp(-rate * dt)
 
@@ -88,10 +88,10 @@ def _golden_kernel(i, dim: ti.template() = 1):  # type: ignore[valid-type]
 
 @_both(_golden_kernel)
 def golden(i, dim: int = 1):
-    """The i-th point of the golden-ratio sequence: evenly spread over [0, 1)^dim however many are taken.
+    """Return the i-th point of the golden-ratio sequence: evenly spread over [0, 1)^dim for any number of points.
 
     i: integer or integer array, 0 <= i < 2**32. Returns a number (dim 1) or dim numbers, added as the last axis.
-    In 1 dimension i / phi mod 1; in more the R_d sequence (Roberts 2018).
+    In 1 dimension the sequence is i / phi mod 1; in more dimensions the R_d sequence (Roberts 2018).
     """
     index = np.asarray(i)
     if index.dtype.kind not in "iu":
@@ -106,7 +106,7 @@ def golden(i, dim: int = 1):
 
 @functools.cache
 def _golden_inverse(dim: int) -> int:
-    """What the first step of the golden sequence times it is 1 mod 2**32."""
+    """Return the inverse of the first step of the golden sequence, modulo 2**32."""
     return pow(golden_steps(dim)[0], -1, _BITS)
 
 
@@ -126,9 +126,9 @@ def _golden_index_kernel(value, dim: ti.template() = 1):  # type: ignore[valid-t
 
 @_both(_golden_index_kernel)
 def golden_index(value, dim: int = 1):
-    """The inverse of golden: the i whose point is `value` (dim 1) or has `value` as its first coordinate; in kernels a u32.
+    """Invert golden: return the i whose point is `value` (dim 1) or has `value` as its first coordinate; a u32 in kernels.
 
-    Exact for every value that golden returns; for others, the index of the nearest multiple of 2**-32.
+    Exact for every value that golden returns; for other values, the index of the nearest multiple of 2**-32.
     """
     array = np.asarray(value, dtype=np.float64)
     if dim > 1:
@@ -140,7 +140,7 @@ def golden_index(value, dim: int = 1):
 
 
 def golden_colors(count: int, saturation: float = 0.62, value: float = 0.95) -> np.ndarray:
-    """`count` colours with hues at golden-ratio steps: (count, 3) uint8, red, green and blue."""
+    """Return `count` colours with hues at golden-ratio steps: (count, 3) uint8, red, green and blue."""
     hues = golden(np.arange(count))
     rgb = [colorsys.hsv_to_rgb(hue, saturation, value) for hue in np.atleast_1d(hues)]
     return np.array(np.rint(np.array(rgb).reshape(count, 3) * 255), dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""The world: a scene, and its step."""
+"""The World: a scene (particles and features) and its time step."""
 
 import os
 import weakref
@@ -24,7 +24,7 @@ from .neighbours.queries import Contacts, PointSearch, near_by_all, nearest
 from .particles import Particles, at_rest, in_range, spin_of
 from .solvers.jacobi import Jacobi
 from .solvers.solver import Solver
-from .step import checkpoint, edit_scene, energy_bound, impulse
+from .step import checkpoint, edit_scene, energy_bound, impulse, initial_violation
 from .step.adaptive import StepController
 from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver
 from .step.build_again import Rebuild
@@ -40,21 +40,23 @@ LIVE = ("position", "velocity", "spin", "substeps", "iterations")
 
 
 class World:
-    """Particles and what acts on them.
+    """A scene: particles, the features that act on them, and the time step.
 
-    particles: Particles. features: what acts, in any order; at most one Contact. What is not in the list costs nothing.
-    substeps: substeps of a frame, or "auto" for as many as it needs (see StepController). iterations: passes over the constraints
-    in each. Both may change at any time, at no compile cost.
-    solver: how constraints are solved: Direct for chains, trees and loops, Jacobi, Chebyshev or ConjugateGradient for cloth. None
-    takes ConjugateGradient(5) where elimination would leave many stiff links to Jacobi, such as those of cloth; else Direct for
-    what hangs together like chains or beams; else Jacobi. explain() says what was chosen, and why.
-    precision: "f32" (position and displacement; the digits of a coordinate end at 6e-8 of it, 1 mm at 10 km and 6 cm at 1000 km),
-    "f32-compensated" (the position carries a low word, which keeps 1e-4 m at any of these), "f64". Where constraints are solved
-    to rounding, positions and displacements of f32 carry what rounding takes from them: shorter substeps never make it worse.
+    particles: Particles. features: forces, constraints, contacts and walls, in any order; at most one Contact. A feature that is
+    not in the list costs nothing.
+    substeps: substeps per frame, or "auto" for as many as each frame needs (see StepController). iterations: passes over the
+    constraints in each substep. Both may change at any time, without compiling.
+    solver: how constraints are solved: Direct for chains, trees and loops; Jacobi, Chebyshev or ConjugateGradient for cloth. None
+    chooses ConjugateGradient(5) where elimination would leave many stiff links to Jacobi, as in cloth; else Direct where
+    constraints are connected like chains or beams; else Jacobi. explain() reports the choice and its reason.
+    precision: "f32" (for position and displacement; a coordinate is resolved to 6e-8 of its value: 1 mm at 10 km and 6 cm at 1000
+    km), "f32-compensated" (the position has a low word, which keeps 1e-4 m at any of these distances), "f64". Where constraints
+    are solved to rounding, positions and displacements in f32 carry their rounding errors along, so that shorter substeps never
+    make the result worse.
     path: "auto", "fused" (one launch per frame, one thread) or "parallel" (one launch, a team of CPU threads; several launches on
-    a GPU); the bits are the same.
-    order: of the error in the substep: 2, or 4, 6 or 8 in f64 for motion without contacts, walls, damping and limits, where
-    every rigid constraint is solved directly. A substep is then made of 5, 9 or 15 stages, see high_order.py.
+    a GPU). The results are the same bit for bit.
+    order: order of the error in the substep: 2; or 4, 6 or 8 in f64, for motion without contacts, walls, damping and limits where
+    every rigid constraint is solved directly. A substep then has 5, 9 or 15 stages, see high_order.py.
 
     Raises ValueError or TypeError, naming the argument, the index and the value, before anything is compiled.
     """
@@ -72,24 +74,24 @@ class World:
         self._build(particles, features, starts, substeps, iterations, solver, precision, path, order)
         for contact in self._runner.step.contacts:
             scene, batches = self._runner.scene, self._runner.batches
-            if not contact.shrinks and contact.table.uniform and overlapping(scene, batches, particles.position):
-                contact.enable_shrink()  # before anything is compiled: later, the frame would be compiled again
+            if not contact.shrinks and overlapping(scene, batches, contact.table, particles.position):
+                contact.enable_shrink()  # before anything is compiled; later, the frame would have to be compiled again
 
     @staticmethod
     def _of(
         particles: Particles, features: tuple[Feature, ...], starts: Sequence[Particles | None], copies: Copies | None = None,
         **settings,
     ) -> "World":  # fmt: skip
-        """A world of features that came at different times, see _build(). copies: where it stands for many."""
+        """Return a world whose features were added at different times, see _build(). copies: set where it stands for many."""
         new = object.__new__(World)
         new._copies = copies
         new._build(particles, features, starts, **settings)
         return new
 
     def _build(self, particles, features, starts, substeps, iterations, solver, precision, path, order) -> None:
-        """starts: for each feature the particles as they were when it came; None if it comes now."""
+        """Build the world. starts: for each feature the particles as they were when it was added; None if it is added now."""
         check_settings(precision, path, order, features)
-        self._requested = checked_solver(solver), path  # None where the solver is to be chosen
+        self._requested = checked_solver(solver), path  # None: the solver is chosen
         self._solver, self._precision, self._order = self._requested[0] or Jacobi(), precision, order
         self._controller = StepController()
         self.substeps, self.iterations = substeps, iterations
@@ -100,45 +102,47 @@ class World:
         self._install(particles, features, parts)
         self._handles: weakref.WeakSet[Handle] = weakref.WeakSet()
         self._last: StepReport | None = None
-        self._watchers: list[Any] = []  # recorders: told of what the user assigns, and before and after every step
+        self._watchers: list[Any] = []  # recorders: called at each assignment, and before and after every step
         self._undo: tuple | None = None  # the state before a step that takes long, and flags of features
-        self._events: tuple[ContactEvents, ContactEvents] | None = None  # of the last frame, where the device has them no more
+        self._events: tuple[ContactEvents, ContactEvents] | None = None  # of the last frame, once the device has lost them
 
     @property
     def _build_options(self) -> tuple[Solver | None, str, str, int, Scale]:
-        """What assemble() takes. A solver that was chosen for constraints that there are stays."""
+        """The options of assemble(). A solver that was chosen for the present constraints stays."""
         solver = self._requested[0] or (self._solver if self._runner.batches else None)
         return solver, self._precision, self._requested[1], self._order, self._scale
 
     def _install(self, particles: Particles, features: tuple[Feature, ...], parts: Assembly) -> None:
-        """Take these for the parts of the world."""
+        """Make these the parts of the world."""
         self._particles, self._features = particles, features
         self._runner, self._solver, self._scale = Runner(parts, self._clock), parts.solver, parts.scale
-        self._search: PointSearch | None = None  # compiled when it is first asked
+        self._search: PointSearch | None = None  # compiled at the first query
         parts.scene.residuals = self._runner.residuals
 
     def _rebuild(
         self, some: np.ndarray, added: Particles | None, features: tuple[Feature, ...], extend: Mapping[Feature, Feature]
     ) -> Rebuild:
-        """How it is to be built anew, of other particles and features."""
+        """Return the plan to rebuild the world with other particles and features."""
         return Rebuild(self, some, added, features, extend)
 
     # The step.
 
     def step(self, dt: float, tolerance: float | None = None, budget: float | None = None) -> StepReport:
-        """Advance by dt [s], and say how it went.
+        """Advance the world by dt [s], one frame, and return its report.
 
         Without tolerance and budget the frame has `substeps` substeps; with substeps="auto", as many as it needs to be stable.
-        tolerance: of the residual and the overlap, both relative, of phi^2 / 24 for the angle phi by which rigid constraints turn
-        in a substep, and of (omega h)^2 / 24 in forces that differ from place to place; the frame is made again with more
-        substeps until they are met.
-        budget: seconds of computing that the frame may take; alone, it is spent for as many substeps as fit. The report says how
-        many substeps there were, and has a flag when the aim was missed. Results of a budget depend on the speed of the machine.
+        tolerance: upper bound of the residual and the overlap, both relative; of phi^2 / 24, for the angle phi by which rigid
+        constraints turn in a substep; and of (omega h)^2 / 24 for forces that vary in space. The frame is repeated with more
+        substeps until all of these are met.
+        budget: seconds of computing that the frame may take. Without tolerance, it is spent on as many substeps as fit. The
+        report gives the number of substeps, and has a flag if the aim was missed. Results of a budget depend on the speed of the
+        machine.
 
-        Raises ValueError for dt, tolerance or budget that is not finite and above 0. With another substep length than before,
+        Raises ValueError for dt, tolerance or budget that is not finite and above 0. When the substep length changes,
         displacements are turned into velocities first and back after (time-corrected Verlet), so the step stays second order. But
-        piles that stand by friction creep where frames differ: keep to one dt, and take as many steps of it as a clock asks for.
-        A signal such as Ctrl-C is handled after the frame. One that takes seconds is undone at once if the handler raises.
+        piles that stand by friction creep where frames differ in length: use one dt, and take as many steps of it as the clock
+        asks for.
+        A signal such as Ctrl-C is handled after the frame. A frame that takes seconds is undone at once if the handler raises.
         """
         self._runner.memory.check()
         dt = checks.number("World.step", "dt", dt, above=0.0)
@@ -147,6 +151,7 @@ class World:
                 watcher.before()
             clock = perf_counter()
             try:
+                self._find_stiffened()
                 guarded = self._controller.auto or tolerance is not None or budget is not None
                 if guarded or self._substeps * self._iterations > self._runner.passes_at_once:
                     self._undo = checkpoint.keep(self), checkpoint.flags(self)
@@ -164,14 +169,14 @@ class World:
             self._runner.arrive()
             if self._clock.exceeds(report.energy, self._runner.sheet.item(KINETIC), report.overlap):
                 report = energy_bound.checked(self, report)
-            report.__dict__["seconds"] = perf_counter() - clock  # which is no part of what it says
+            report.__dict__["seconds"] = perf_counter() - clock  # the report is frozen; this field is not compared
             self._last, self._clock.energy, self._undo, self._events = report, report.energy, None, None
             for watcher in self._watchers:
                 watcher.after(dt, report)
         return report
 
     def _broken_off(self) -> None:
-        """A step ended with an exception: undo it, or tell recorders that no step leads to this state."""
+        """Clean up after a step that ended with an exception: undo it, or inform recorders that no step leads to this state."""
         undo, self._undo, self._events = self._undo, None, (none := no_events(self._particles.dim), none)
         if undo:
             checkpoint.undo(self, *undo)
@@ -179,8 +184,16 @@ class World:
         for watcher in self._watchers:
             watcher.broken_off()
 
+    def _find_stiffened(self) -> None:
+        """Before knobs are uploaded: what was a spring and is to be rigid is met as where its particles are placed, by these and
+        all after them. It has to be known before a state is kept, or copied, which has what was uploaded since."""
+        waiting, clock = [f for f in self._features if f.changed and isinstance(f, Batch) and f.soft], self._clock
+        first = initial_violation.first_stiffened(waiting, self.position) if waiting else None
+        if first is not None:
+            clock.energy, clock.first_moved = None, first if clock.first_moved is None else min(first, clock.first_moved)
+
     def _upload_parameters(self) -> None:
-        """Bring the knobs to the device. Where a force has changed, displacements become velocities first, by the old force."""
+        """Write the knobs to the device. Where a force has changed, first turn displacements into velocities by the old force."""
         waiting = [f for f in self._features if f.changed or f.moving]
         if waiting:
             self._clock.bound = CHANGED
@@ -195,8 +208,10 @@ class World:
         return any(f.changed and (f.new_force or isinstance(f, Acceleration)) for f in self._features)
 
     def _settle_forces(self, steps: bool) -> None:
-        """Where a force has changed, turn displacements into velocities by the old one, before it is overwritten, or left behind
-        by a copy. steps: see _adapt()."""
+        """Where a force has changed, turn displacements into velocities by the old force before it is lost.
+
+        The old force is lost when it is overwritten, or left out of a copy. steps: see _adapt().
+        """
         changed = [f for f in self._features if f.changed]
         if any(f.lets_go for f in changed):
             if not steps:
@@ -207,7 +222,7 @@ class World:
                 (self._runner.restart if steps else self._runner.restart_between)(self._iterations)
 
     def _let_go(self) -> None:
-        """Start from the velocities of now, to which what is about to go has given its part."""
+        """Start from the present velocities, which include the reaction that is about to end."""
         if not self._clock.d_is_velocity:
             self._start_from(self.velocity)
 
@@ -217,14 +232,16 @@ class World:
         self._clock.energy = None
 
     def _adapt(self, steps: bool = False) -> None:
-        """Settle forces; where knobs ask for what the kernels do not have, build the world anew. steps: a frame comes next,
-        before which nobody asks for residuals of the last one."""
+        """Handle changed forces, see _settle_forces(), and rebuild the world where knobs need other kernels.
+
+        steps: whether a frame follows at once, so that residuals of the last frame are not read before it.
+        """
         self._settle_forces(steps)
         if any(f.outgrown for f in self._features if f.changed):
             edit_scene.renew(self)
 
     def _upload(self) -> None:
-        """Write what was changed in Python since the last frame."""
+        """Write to the device what was changed in Python since the last frame."""
         for feature in self._features:
             if feature.moving:
                 feature.moving = False
@@ -238,8 +255,7 @@ class World:
         self, seconds: float, dt: float = 1 / 60, recorder=None, progress: bool = False, *, tolerance: float | None = None,
         budget: float | None = None,
     ) -> StepReport:  # fmt: skip
-        """Step for `seconds` [s], to the nearest whole number of frames of dt [s] and at least one; returns the worst figures of
-        all frames.
+        """Step for `seconds` [s], rounded to whole frames of dt [s], at least one. Returns the worst figures of all frames.
 
         tolerance, budget: of each frame, see step(). recorder: a Recorder that logs each frame, or the path of one that is made
         for this run. progress: show a bar.
@@ -263,7 +279,7 @@ class World:
             frames = track(frames, description=f"{len(self._particles)} particles")
         worst = None
         for _ in frames:
-            with whole:  # the frame is in the file, too
+            with whole:  # signals wait until the frame is in the file, too
                 report = self.step(dt, tolerance, budget)
                 worst = report if worst is None else worst.worse(report)
                 if recorder is not None:
@@ -274,11 +290,11 @@ class World:
     # Other worlds.
 
     def hash(self) -> str:
-        """SHA-256 of the exact state: equal if and only if two worlds of the same scene will go on alike, bit for bit."""
+        """Return the SHA-256 of the exact state: equal if and only if two worlds of one scene continue alike, bit for bit."""
         return checkpoint.digest(self, checkpoint.keep(self))
 
     def explain(self) -> str:
-        """What was compiled and what was left out, with fields, bytes and launches, and how long compiling took."""
+        """Describe what was compiled and what was left out, with fields, bytes and launches, and how long compiling took."""
         return "\n".join([explain(self), *compiling(self)])
 
     # State.
@@ -290,7 +306,7 @@ class World:
 
     @position.setter
     def position(self, value) -> None:
-        """Move particles to (n, dim) [m]; velocities are kept, and lists are built anew."""
+        """Move particles to (n, dim) [m]. Velocities are kept, and neighbour lists are rebuilt."""
         value = checks.points("World", "position", value, dim=self._particles.dim, count=len(self._particles))
         in_range("World", "position", value)
         if self._runner.step.contacts:
@@ -304,11 +320,12 @@ class World:
 
     @property
     def velocity(self) -> np.ndarray:
-        """Velocities [m/s], (n, dim), a read-only copy in f64; of the order of the world.
+        """Velocities [m/s], (n, dim), a read-only copy in f64, accurate to the order of the world.
 
-        Assign an array to set them, as an impulse to those whose velocity it changes; others go on to the bit, also where these
-        leave what they lean on, or rub another way. But where what hangs on a taut rope is sent off, and in orders above 2, all
-        start from these velocities. To write back what was read changes nothing.
+        Assign an array to set them. A particle whose velocity changes gets an impulse. All others continue bit for bit, even
+        where a changed particle leaves a contact, or its friction turns to another direction. But where a changed particle hangs
+        on a taut rope, and in orders above 2, all particles start from the assigned velocities (a start is the first substep
+        after velocities were set). Writing back the velocities that were read changes nothing.
         """
         out = self._clock.parted
         if out is None:
@@ -319,7 +336,7 @@ class World:
 
     @velocity.setter
     def velocity(self, value) -> None:
-        """Have particles go on with (n, dim) [m/s]."""
+        """Set the velocities with which particles continue, (n, dim) [m/s]."""
         value = checks.points("World", "velocity", value, dim=self._particles.dim, count=len(self._particles))
         self._runner.memory.check()
         with whole:
@@ -342,7 +359,7 @@ class World:
 
     @spin.setter
     def spin(self, value) -> None:
-        """Have particles turn at (n,) in 2D, (n, 3) in 3D [rad/s]. ValueError where they do not spin."""
+        """Set the angular velocities, (n,) in 2D, (n, 3) in 3D [rad/s]. Raises ValueError where particles do not spin."""
         if not self._particles.spins:
             raise ValueError("World.spin: these particles do not spin. Make them with tv.Particles(..., spin=0).")
         value = spin_of("World", value, self._particles)
@@ -357,9 +374,9 @@ class World:
             change = np.where(others[:, None], spin.from_rates(value) - has, 0.0)
             if not change.any():
                 return
-            if impulse.rubs(runner) or runner.probe:  # friction becomes another one
+            if impulse.rubs(runner) or runner.probe:  # the change alters friction
                 seen = self.velocity
-                if not impulse.steer(runner, seen, seen, change, self._iterations):
+                if not impulse.steer(runner, seen, seen, change, self._iterations, has):
                     self._let_go()
             runner.wake(np.flatnonzero(others))
             s = runner.memory.read(spin.s)[: runner.n]
@@ -368,17 +385,18 @@ class World:
 
     @property
     def orientation(self) -> np.ndarray:
-        """How far particles are turned, a read-only copy: angles (n,) in 2D [rad], unit quaternions (n, 4) (x, y, z, w) in 3D."""
+        """Orientations, a read-only copy: angles (n,) in 2D [rad], unit quaternions (n, 4) (x, y, z, w) in 3D."""
         if self._particles.orientation is None:
             raise ValueError("World.orientation: nobody keeps track of it. Make particles with tv.Particles(..., orientation=0).")
         turned = self._runner.memory.read(self._runner.scene.state.spin.orientation)[: len(self._particles)]
         return read_only(turned[:, 0] if self._particles.dim == 2 else turned, structure("World", "orientation"))
 
     def near(self, points, radius) -> np.ndarray:
-        """The particles whose centers are within `radius` [m] of points: (m, 2), rows of `points` and particles, in order.
+        """Return which particles have their center within `radius` [m] of which points.
 
-        points: (k, dim) [m]. radius: number or (k,), at least 0. With a Contact in the world its grid is used; without, all are
-        compared. In a periodic box the nearest image of each particle counts.
+        Returns (m, 2): rows of an index into `points` and a particle, in order. points: (k, dim) [m]. radius: number or (k,), at
+        least 0. The grid of the Contact is used if the world has one; otherwise all particles are compared. In a periodic box the
+        nearest image of each particle counts.
         """
         points = checks.points("World.near", "points", points, dim=self._particles.dim)
         radius = checks.per_item("World.near", "radius", radius, len(points), least=0.0)
@@ -396,7 +414,7 @@ class World:
                 return self._search.near(points, radius)
 
     def nearest(self, points) -> tuple[np.ndarray, np.ndarray]:
-        """Index of, and distance [m] to, the particle whose center is nearest to each point; of equally near ones the first."""
+        """Return the particle nearest to each point, by its center, and its distance [m]; the first of equally near ones."""
         points = checks.points("World.nearest", "points", points, dim=self._particles.dim)
         if not len(self._particles):
             raise ValueError("World.nearest: there are no particles.")
@@ -408,47 +426,49 @@ class World:
         self, origin, direction, reach=np.inf, *, radius: float = 0.0, groups=None, skip=(), features: Iterable[Feature] | None =
         None,
     ) -> Hits:  # fmt: skip
-        """What rays meet first: a particle, a link between two particles, or a wall; see Hits.
+        """Return what each ray hits first: a particle, a link between two particles, or a wall; see Hits.
 
         origin, direction: (dim,) or (k, dim) [m], as many of both or one for all; a direction has any length above 0. reach:
-        number or (k,) [m], how far a ray goes. radius: [m] of a ball that is cast instead of a line, to see whether it gets
-        through; then distance is the way of its center, and point is where it touches. groups: particles of this group, or of
-        these, count; None for all, () for none. skip: particles that are not there for the ray, by indices, a mask or a handle.
-        Links count where both of their particles do. features: walls, and what has links, that count, such as [floor]; None for
-        all, () for none.
+        number or (k,) [m], the length of a ray. radius: [m] of a ball that is cast instead of a line, to see whether it fits
+        through. Then distance is the path of the ball's center, and point is where the ball touches. groups: hit only particles
+        of this group, or of these; None for all, () for none. skip: particles that the ray ignores, by indices, a mask or a
+        handle. A link counts if both of its particles do. features: hit only these walls and these features' links, such as
+        [floor]; None for all, () for none.
 
-        A particle is its disc or sphere; a point (radius 0) is met where a ray goes through it within rounding. A link is a rod
-        with the smaller of the radii of its ends, so that a rope is as thick as it looks; between points it is a line, which in
-        3D no ray meets without a radius. Links are all that pictures draw as lines and that are not broken, and the edges of
-        Polygons, numbered from body to body. Walls are where they are at world.time: a place that was assigned since is where
-        they go in the next frame. Those that are not active are not there. In a periodic box, particles are met where they are in
-        it; rays do not go on in the next one.
+        A particle is a disc or sphere; a point (radius 0) is hit where a ray goes through it within rounding. A link is a rod
+        with the smaller radius of its two ends, so that a rope is as thick as it looks. Between points a link is a line, which in
+        3D only a ray with a radius can hit. Links are all features that pictures draw as lines and that are not broken, and the
+        edges of Polygons, numbered from body to body. Walls are where they are at world.time: a pose assigned since then is
+        reached in the next frame. Inactive walls are ignored. In a periodic box, particles are hit where they lie in the box;
+        rays do not continue into the next image.
 
-        A ray meets what it comes into from outside. It does not meet what it starts in, so one from the center of a particle
-        needs no skip; walls let out what is in them, and are met where they would hold a particle. A ray that starts on a
-        surface and goes in meets it at 0. Of what is met at the same distance, particles come first, then links, then walls, in
-        order.
+        A ray hits what it enters from outside. It does not hit the thing in which it starts, so a ray from the center of a
+        particle needs no skip. A ray leaves the wall in which it starts, and hits walls where they would hold a particle. A ray
+        that starts on a surface and goes inwards hits it at distance 0. At equal distances, particles come first, then links,
+        then walls, in order.
 
-        Raises ValueError or TypeError naming the first value that makes no sense.
+        Raises ValueError or TypeError naming the first invalid value.
         """
         self._runner.memory.check()
         return ray(self, origin, direction, reach, radius, groups, skip, features)
 
     def inside(self, shape: Collider, part: str = "center") -> np.ndarray:
-        """The particles that are inside of a shape, in order, (m,).
+        """Return the particles inside a shape, in order, (m,).
 
-        shape: a Box, Ball, Capsule, Polygon or Mesh, which need not act in the world: what it encloses, whether as a wall it
-        keeps particles out or in; a HalfSpace, behind the plane; or an Sdf, where the function is negative. One that acts in a
-        world is where it is at that world's time. part: what has to be inside: the "center", the "whole" disc or sphere, or any
-        part of it, "touching".
+        shape: a Box, Ball, Capsule, Polygon or Mesh: the region that it encloses, whether as a wall it keeps particles out or in;
+        a HalfSpace: the region behind the plane; or an Sdf: where the function is negative. The shape need not act in the world;
+        a shape that acts in a world is where it is at that world's time. part: the part of each particle that must be inside: the
+        "center", the "whole" disc or sphere, or, with "touching", any part of it.
         """
         self._runner.memory.check()
         return inside(self, shape, part)
 
     @property
     def contacts(self) -> Contacts:
-        """What touches now, as arrays: discs or spheres, and vertices and edges of Polygons; with impulses of the last substep,
-        where events() has those of the frame. Empty without a Contact."""
+        """Present contacts of discs or spheres, and of vertices and edges of Polygons, as arrays. Empty without a Contact.
+
+        Impulses are those of the last substep; events() has those of the frame.
+        """
         self._runner.memory.check()
         if not self._runner.search:
             none, index = np.zeros(0), np.zeros((0, 2), dtype=np.int64)
@@ -458,16 +478,17 @@ class World:
         with whole:
             self._runner.list_neighbours()
             if contact.detects and self._runner.step.launched:
-                self._runner.look()  # which measures; elsewhere it makes the list, too
+                self._runner.look()  # measures contacts; on other paths list_neighbours() has called it
         return contact.found(self.position, self._clock.h or 1.0)
 
     def events(self, groups: Iterable | None = None) -> ContactEvents:
-        """Which contacts of particles began, ended and went on in the last step, with a Contact(events=True) or with sensors.
+        """Return the contacts of particles that began, ended and lasted in the last step. Needs Contact(events=True) or sensors.
 
-        groups: only those between these pairs of groups, such as [(0, 1)]; None for all. They are those of one step: ask after
-        each. Removing and adding particles keeps them, with the present indices; a clone has none before its first step.
+        groups: only contacts between these pairs of groups, such as [(0, 1)]; None for all. Events are those of one step: read
+        them after each. Removing and adding particles keeps the events, with the present indices; a clone has none before its
+        first step.
 
-        Raises RuntimeError where nothing tells of events.
+        Raises RuntimeError where nothing records events.
         """
         self._runner.memory.check()
         if not any(isinstance(f, PairContact) and f.has_events for f in self._features):
@@ -475,10 +496,11 @@ class World:
         return self._all_events()[0].among(self._particles.group, groups)
 
     def wall_events(self) -> ContactEvents:
-        """Which particles met, left and went on touching walls in the last step, of those with events=True: see events(). Pairs
-        are a particle and the number of the wall in world.features.
+        """Return the contacts of particles with walls that began, ended and lasted in the last step, for walls with events=True.
 
-        Raises RuntimeError where no wall tells of events.
+        See events(). Pairs are a particle and the number of the wall in world.features.
+
+        Raises RuntimeError where no wall records events.
         """
         self._runner.memory.check()
         if not any(isinstance(f, Collider) and f.events for f in self._features):
@@ -486,7 +508,7 @@ class World:
         return self._all_events()[1]
 
     def _all_events(self) -> tuple[ContactEvents, ContactEvents]:
-        """Those of particles, and of walls; none where nothing tells of them."""
+        """Return the events of particles, and those of walls; no events where nothing records them."""
         if self._events is not None:
             return self._events
         h, time, step = self._clock.h or 1.0, self._clock.time, self._runner.step
@@ -502,7 +524,7 @@ class World:
 
     @property
     def broken(self) -> list[tuple[Feature, np.ndarray]]:
-        """What broke in the last frame: features, and the indices of their constraints. Those of all frames: feature.broken."""
+        """What broke in the last frame: features, and the indices of their constraints. For all frames, see feature.broken."""
         self._runner.memory.check()
         out = []
         if self._last and self._last.broken:
@@ -525,37 +547,37 @@ class World:
 
     @property
     def particles(self) -> Particles:
-        """What the world was built from: initial state and structure."""
+        """The particles from which the world was built: initial state and structure."""
         return self._particles
 
     @property
     def features(self) -> tuple[Feature, ...]:
-        """What acts on the particles."""
+        """The features that act on the particles."""
         return self._features
 
     @property
     def precision(self) -> str:
-        """ "f32", "f32-compensated" or "f64"."""
+        """The precision: "f32", "f32-compensated" or "f64"."""
         return self._precision
 
     @property
     def order(self) -> int:
-        """Of the error in the substep."""
+        """The order of the error in the substep."""
         return self._order
 
     @property
     def path(self) -> str:
-        """ "fused" or "parallel"."""
+        """The path that runs: "fused" or "parallel"."""
         return self._runner.path
 
     @property
     def substeps(self) -> int:
-        """Substeps of a frame; of the next one where they are chosen. Assign a number, or "auto"."""
+        """Substeps per frame; with "auto", those of the next frame. Assign a number, or "auto"."""
         return self._controller.substeps if self._controller.auto else self._substeps
 
     @substeps.setter
     def substeps(self, value: int | str) -> None:
-        """At least 1, or "auto", from the next frame on."""
+        """Set the substeps from the next frame on: at least 1, or "auto"."""
         if isinstance(value, str) and value != "auto":
             raise ValueError(f'World: substeps = {value!r}, but it must be an integer of at least 1, or "auto".')
         self._controller.auto = value == "auto"
@@ -564,19 +586,19 @@ class World:
 
     @property
     def iterations(self) -> int:
-        """Passes over the constraints in a substep."""
+        """Passes over the constraints in each substep."""
         return self._iterations
 
     @iterations.setter
     def iterations(self, value: int) -> None:
-        """At least 1, and what the solver allows, from the next frame on."""
+        """Set the iterations from the next frame on: at least 1, and a number that the solver allows."""
         value = checks.integer("World", "iterations", value, least=1)
         self._solver.check(value)
         self._iterations = value
 
     @property
     def fields(self) -> dict[str, int]:
-        """Every field on the device, by name, and its size [bytes]."""
+        """The size of every field on the device [bytes], by name."""
         return {e.name: e.bytes for memory in self._runner.memories for e in memory.entries}
 
     def add(
@@ -588,25 +610,26 @@ class World:
     ) -> Handle:
         """Add particles and features, between frames. Returns a handle to the particles, see Handle.
 
-        The new particles come after the last; features name all of them by their numbers, so a rope that is added on top of n
-        particles has the links shapes.rope(...).links + n. Rest values that are not given are taken from the present positions.
-        Rigid constraints that are not met there are met before the next frame, without velocity; it has the flag "moved".
-        Particles that overlap others part gently, as at the start.
+        The new particles come after the last. Features name all particles by their numbers, so a rope that is added to a world of
+        n particles has the links shapes.rope(...).links + n. Rest values that are not given are taken from the present positions.
+        Rigid constraints that these positions violate are satisfied before the next frame, without velocity; the frame has the
+        flag "moved". Particles that overlap others separate gently, as at the beginning of a world.
 
-        extend: features of the world, and others of their kind, whose constraints or bodies they take behind their own:
-        world.add(tv.Particles(more.position), extend={ropes: tv.Distance(more.links + n)}). All constraints take more but Pin,
-        Path, Constraint, and a ShapeMatch whose rest is given; and so does Polygons. Each feature has kernels to compile,
-        but no kernel knows how many constraints there are: the first rope that comes as a tv.Distance of its own takes seconds,
-        and so does the next one; those that a Distance is extended by take milliseconds.
+        extend: a mapping from features of the world to others of their kind, whose constraints or bodies are appended:
+        world.add(tv.Particles(more.position), extend={ropes: tv.Distance(more.links + n)}). It works for Polygons and for all
+        constraints but Pin, Path, Constraint, and a ShapeMatch whose rest is given. Each feature has kernels to compile, but
+        kernels do not depend on the number of constraints. So every rope that is added as a tv.Distance of its own takes seconds
+        to compile; a rope that extends a Distance takes milliseconds.
 
-        What was there goes on to the bit: time, positions, velocities, multipliers, the history of springs, what pairs in contact
-        remember. Where a force or a spring is added, displacements are first turned into velocities, as when a force changes.
-        On a CPU it takes two to four milliseconds where particles, constraints and bodies of kinds that are there come in place,
-        and ten else. Nothing is compiled: the world keeps its kernels until there are four times as many of what they work on.
-        Features, masses or radii of a kind that it did not have, and the first particles that overlap others, cost the compiling
-        that a new world costs, once; all worlds share what was compiled.
+        The rest of the world continues bit for bit: time, positions, velocities, multipliers, the history of springs, and the
+        data of pairs in contact. Where a force or a spring is added, displacements are first turned into velocities, as when a
+        force changes.
+        On a CPU, an edit takes 2 to 4 ms in place, which needs kinds of constraints and bodies that the world has; otherwise 10
+        ms. Nothing is compiled: the world keeps its kernels until they work on four times as many elements. But features, masses
+        or radii of a kind that the world did not have, and the first particles that overlap others, are compiled once, as for a
+        new world; all worlds share compiled kernels.
 
-        Raises as World() does; the world is then as before.
+        Raises the errors of World(); the world is then unchanged.
         """
         with whole:
             return edit_scene.add(self, particles, features, extend)
@@ -614,40 +637,41 @@ class World:
     def remove(self, particles: Any = (), features: Iterable[Feature] = ()) -> None:
         """Remove particles and features, between frames.
 
-        particles: a handle, indices or a Boolean mask. The others close up, in order. A constraint goes with any of its
-        particles, and so do a loop, a surface, a cluster or a body of Polygons, whole; what it was part of stays, with what is
-        left, in the same Python object, and costs nothing once it is empty. features: of world.features; they become free.
-        One link of many is cut by its strength: make them with break_at=np.inf, and assign an array that is 1e-30 at that link,
-        which breaks in the next substep in which it bears anything.
+        particles: a handle, indices or a Boolean mask. The remaining particles move up, in order. A constraint is removed with
+        any of its particles, and so is a whole loop, surface, cluster or body of Polygons. Its feature stays, with the remaining
+        constraints, as the same Python object; an empty feature costs nothing. features: features of world.features; they may be
+        used in another world afterwards. To cut one link of many, make the links with break_at=np.inf, and assign an array that
+        is 1e-30 at that link: it breaks in the next substep in which it has any load.
 
-        What stays goes on to the bit, see add(). A force that goes with a particle is gone from the next substep on, as when a
-        constraint breaks. Functions of the user's own that take the number of a particle or constraint get the new one.
+        Everything else continues bit for bit, see add(). The force of a removed constraint ends with the next substep, as when a
+        constraint breaks. Functions of the user that take the number of a particle or constraint get the new number.
 
-        Raises ValueError or TypeError for what there is not; the world is then as before.
+        Raises ValueError or TypeError for particles or features that do not exist; the world is then unchanged.
         """
         with whole:
             edit_scene.remove(self, particles, features)
 
     def handle(self, particles: Any) -> Handle:
-        """A handle to some particles, by indices or a Boolean mask; it knows their numbers when others are removed."""
+        """Return a handle to some particles, by indices or a Boolean mask. It follows their numbers when others are removed."""
         self._runner.memory.check()
         return edit_scene.handle(self, edit_scene.chosen(self, "World.handle", particles))
 
     @property
     def settings(self) -> dict[str, Any]:
-        """How it is computed: substeps, iterations, solver, precision, path and order, as __init__ takes them."""
+        """How the world is computed: substeps, iterations, solver, precision, path and order, as __init__ takes them."""
         out: dict[str, Any] = {"substeps": "auto" if self._controller.auto else self.substeps, "iterations": self.iterations}
         return out | {"solver": self._solver, "precision": self._precision, "path": self._runner.path, "order": self._order}
 
     def clone(self, **changes) -> "World":
-        """The same scene in the same state, with other substeps, iterations, solver, precision, path or order.
+        """Return the same scene in the same state, with other substeps, iterations, solver, precision, path or order.
 
-        Handles stay with the world that gave them.
+        Handles stay with the world that returned them.
         """
         settings = self.settings
         if unknown := set(changes) - set(settings):
             raise TypeError(f"World.clone: {sorted(unknown)[0]} cannot be changed; one of {', '.join(settings)} can.")
         self._runner.memory.check()
+        self._find_stiffened()
         self._adapt()
         copies = tuple(f.twin() for f in self._features)
         new = World._of(self._particles, copies, [f.start for f in self._features], **{**settings, **changes})
@@ -656,11 +680,12 @@ class World:
         return new
 
     def report(self, seconds: float, tolerance: float | None = None, **options):
-        """Error against run time of this scene, from its present state: a SceneReport with the cheapest settings, ready to paste.
+        """Measure error against run time of this scene from its present state; returns a SceneReport with the cheapest settings.
 
-        seconds [s]: how far ahead. tolerance: error at the end [m], by default a thousandth of the motion. options: dt [s] of a
-        frame; substeps: those to try; progress: show a bar. Clones run; this world is not touched. Knobs keep their present
-        values. There is no known answer: the reference is the finest run, and how far that is off is estimated and said.
+        The report shows the settings ready to paste. seconds [s]: length of the measured motion. tolerance: error at the end [m],
+        by default a thousandth of the motion. options: dt [s] of a frame; substeps: those to try; progress: show a bar. Clones
+        run; this world does not change. Knobs keep their present values. There is no known answer: the reference is the finest
+        run, and its own error is estimated and reported.
         """
         from .report.accuracy.scene import scene_report
 

@@ -1,4 +1,4 @@
-"""What particles stay outside of, or inside: static or moved by the user."""
+"""Walls that particles stay outside of, or inside: static or moved by the user."""
 
 from .ball import Ball
 from .box import Box

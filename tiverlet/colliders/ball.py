@@ -21,14 +21,14 @@ class Ball(Collider):
     C(x) = |x - center| - (R + r) >= 0 outside, R - r - |x - center| >= 0 inside; grad C = +- (x - center) / |x - center|.
 
     center: (dim,) [m], live: assign to it between frames, and the ball moves there during the next frame. radius: R [m], live: it
-    changes at once, and what is inside then goes out at push_out. inside: keep particles in. friction, restitution, push_out,
-    active, events: see Collider.
+    changes at once, and particles that are then inside move out at push_out. inside: keep particles in. friction, restitution,
+    push_out, active, events: see Collider.
 
-    What passes through in one substep is caught on the way in: the moment when it met the surface is solved for, as for pairs.
-    Nothing passes at any speed, nor can anything draw it through.
-    What slides inside without restitution is pushed along n at the start of the substep until C(x) = 0 at its end, as a rigid
-    link is (SHAKE): it is second order in the substep and keeps its energy. With restitution, and outside, it is pushed along n
-    where it is nearest or was met: first order, and it loses speed.
+    A particle that passes through in one substep is caught on the way in: the time when it met the surface is solved for, as for
+    pairs. Nothing passes at any speed, and no force can pull a particle through.
+    A particle that slides inside without restitution is pushed along n at the start of the substep until C(x) = 0 at its end, as
+    a rigid link is (SHAKE): it is second order in the substep and conserves energy. With restitution, and outside, it is pushed
+    along n where it is nearest or was met: first order, and it loses speed.
     """
 
     center = Knob(lambda f, v: checks.vector("Ball", "center", v, f.dim or len(np.atleast_1d(v))), "Middle of the ball [m].")
@@ -63,29 +63,32 @@ class Ball(Collider):
 
     @property
     def repeats(self) -> bool:
-        """Inside, the way along the surface leads out, and a bounce may lead to the other end."""
+        """Whether one round may not be enough.
+
+        Inside, motion along the surface leads out, and a bounce may lead to the other end.
+        """
         return self.inside and (self.dev.surface.has_friction or self.dev.surface.has_restitution)
 
     def bind(self, scene: Scene) -> None:
-        """The center at the start and the end of a frame."""
+        """Declare the center at the start and the end of a frame, and the radius."""
         Collider.bind(self, scene)
         self.dev.center = Track(scene.memory, "Ball.center", self.center)
         self.dev.size = scene.memory.field("Ball.radius", None, values=self.radius)
         self.changed = False
 
     def upload(self) -> None:
-        """Move to the new center."""
+        """Move to the new center in the next frame."""
         Collider.upload(self)
         self.scene.memory.write(self.dev.size, self.radius)
         self.dev.center.aim(self.center)
         self.moving = True
 
     def end_motion(self) -> None:
-        """Stay."""
+        """Stay at the last center."""
         self.dev.center.end_motion()
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
-        """A circle in 2D, three in 3D."""
+        """Return a circle in 2D, three circles in 3D."""
         turn = np.linspace(0, 2 * np.pi, 65)
         circles = []
         for a in range(self.dim):
@@ -97,18 +100,18 @@ class Ball(Collider):
         return np.array(circles), 0.0
 
     def solid(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The ball, unless the scene is inside of it."""
+        """Return the ball, unless the scene is inside of it."""
         if self.dim != 3 or self.inside:
             return Collider.solid(self, low, high)
         return rounded(self.center, self.center, self.radius)
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """|x - center| - R outside, the opposite inside."""
+        """Return |x - center| - R outside, the opposite inside."""
         gap = np.linalg.norm(points - self._middle, axis=1) - self.radius
         return -gap if self.inside else gap
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """Into the ball, or out of it."""
+        """Return the distances into the ball, or out of it, and the normals there."""
         center = self._middle
         way = ball(origin, direction, center, self.radius + (-radius if self.inside else radius))
         close = rounding(origin, center[None])
@@ -118,12 +121,15 @@ class Ball(Collider):
 
     @property
     def _middle(self) -> np.ndarray:
-        """The center, where it is now."""
+        """The present center [m]."""
         return self.center if self.scene is None else self.dev.center.now
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, turn):
-        """The surface where it was met, or where it is nearest; for what slides inside, where it was at the start."""
+        """Press the particle at the surface where it was met, or where it is nearest.
+
+        For particles that slide inside, the normal is the one at the start of the displacement.
+        """
         center, moved = self.dev.center.at(frame_fraction[1]), self.dev.center.step(frame_fraction)
         r = self.dev.state.nearest(self.dev.state.place(i) - center)
         own = ti.cast(self.radius, self.dev.real)
@@ -142,7 +148,7 @@ class Ball(Collider):
                     n = (start + s * d).normalized()
                     depth = (s - 1) * d.dot(n)
         elif ti.static(not self.dev.surface.has_restitution):
-            # A slide: it lay on the surface, and that turns little along its way.
+            # A slide: the particle lay on the surface, which turns little along its displacement.
             close = self.dev.state.digits(i)
             bounced, _lift = self.dev.surface.bounced(i)
             near = d.norm() * ti.static(NEAR) + 4 * close
@@ -156,7 +162,7 @@ class Ball(Collider):
 
     @ti.func
     def nearest(self, r, own, radius):
-        """Depth in the surface and its normal at r from the middle; a particle right there goes along +x."""
+        """Return depth in the surface and its normal at r from the center; a particle at the center moves along +x."""
         length, n = r.norm(), 0 * r
         n[0] = 1
         if length > 0:

@@ -1,4 +1,4 @@
-"""Impacts of bodies on walls: where what a wall strikes is linked to other particles."""
+"""Impacts of bodies on walls: where a struck particle is linked to other particles."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -7,49 +7,53 @@ from ..device import ti
 if TYPE_CHECKING:
     from ..features.feature import Batch, Scene
 
-# Passes over the constraints, at most, beside those of every substep: where a system solves them, and where blows go from link to
-# link. Of those, most have little to do.
+# Passes over the constraints, at most, beside the regular ones of every substep: FEW where a system solves them, MANY where
+# impulses propagate from link to link. Most of the latter have little to do.
 FEW, MANY = 8, 32
-MET = 2.0**-9  # of the first push: a velocity that is missed by less is met
-LIGHTEST = 2.0**-7  # a particle is taken for this part, at least, of the mass that it has to stop
-FELT = 2.0**-20  # of the square of a displacement: a change that is less is no blow
-WAITS, HELD = 1, 2  # what is struck is so in the pass in which it meets the wall, and in those after that
+MET = 2.0**-9  # of the first push: a smaller error of the normal displacement counts as met
+LIGHTEST = 2.0**-7  # the least share that a particle may have in the mass that its impact stops
+FELT = 2.0**-20  # of a squared displacement: a smaller change is no impact
+WAITS, HELD = 1, 2  # a particle is struck: in the pass in which it meets the wall, and in later passes
 
 
 def can_have_impacts(scene: "Scene", batches: "list[Batch]") -> bool:
-    """Whether there can be passes beside those of every substep. Particles bounce alone in stages of higher orders; where passes
-    are steps of a semi-iteration, which are as many as it was made for; and beside clusters, outlines and places, whose
-    violations nobody notes: taken out all at once, those that contacts leave shook heaps for ever."""
+    """Whether there can be passes beside the regular ones of every substep.
+
+    Particles bounce alone in three cases: in stages of higher orders; where passes are steps of a semi-iteration, whose number is
+    fixed; and beside clusters, outlines and places, whose violations are not recorded. If contacts leave such violations and they
+    are removed all at once, heaps shake for ever.
+    """
     noted = all(b.arity > 1 for b in batches)
     return bool(batches) and noted and scene.order == 2 and not scene.slots.semi_iteration
 
 
 class BodyImpacts:
-    """A linked particle that strikes a wall leaves it with -e times its normal velocity, and takes along what it is linked to.
+    """A linked particle that strikes a wall leaves it with -e times its normal velocity, and takes its body along.
 
-    A wall that turns one particle round has only begun: links take back what it gave. In a substep with such an impact there are
-    more passes, at most FEW or MANY, until both hold: constraints are met, as far as a pass meets them, and what was struck has
-    the normal displacement t = -e d_n, with d_n that before the substep. So the impact is at the start of the substep, and
-    positions and displacements stay one. In each pass the sum p >= 0 of all pushes on the particle is corrected,
+    Links take back part of the velocity that the wall gives to a single particle. So in a substep with such an impact there are
+    more passes, at most FEW or MANY, until two conditions hold. Constraints are met, as far as a pass meets them, and the struck
+    particle has the normal displacement t = -e d_n, with d_n that before the substep. So the impact is at the start of the
+    substep, and positions agree with displacements. In each pass the sum p >= 0 of all pushes on the particle is corrected,
 
         p' = max(p + (t - d.n) / s, 0),    s = (miss_last - miss) / push_last,    miss = t - d.n
 
-    where constraints are solved exactly: s is what they left of the last push, the secant of the particle's part of the mass, and
-    two or three passes do. Elsewhere s = 1, for what a pass leaves is on its way; what the last leaves is lost. All impacts of a
-    substep together are Newton's law for a rigid body. It neither takes nor gives energy at e = 1, which is kept to O(h) in an
-    impact, for a body turns in a substep. Friction holds the tangential displacement by up to its coefficient times p.
+    where constraints are solved exactly: s is the part of the last push that they left, the secant of the particle's part of the
+    mass, and two or three passes suffice. Otherwise s = 1, since the violation that a pass leaves is still propagating; what the
+    last pass leaves is lost. All impacts of a substep together are Newton's law for a rigid body. At e = 1 it neither removes nor
+    adds energy; energy is conserved to O(h) in an impact, since a body turns in a substep. Friction holds the tangential
+    displacement by up to its coefficient times p.
 
-    The first of these passes only notes what the passes of every substep left of violations. The others leave that: taken out all
-    at once it would be speed. Contacts wait for the next substep. What comes nearer by no more than SLOW substeps of forces and
-    links add does not bounce, see Surface.
+    The first of these passes only records the violations that the regular passes left. The later passes leave these violations:
+    removed all at once, they would become speed. Contacts wait for the next substep. A particle that approaches by no more than
+    SLOW substeps of forces and links add does not bounce, see Surface.
 
-    open: for each pass beyond those of every substep, whether it is needed.
+    open: for each pass beyond the regular ones of every substep, whether it is needed.
     """
 
     def __init__(self, scene: "Scene", batches: "list[Batch]"):
         system = scene.slots.system
         self.passes = FEW if system else MANY
-        self.spreads = not system  # from link to link; a system takes all at once
+        self.spreads = not system  # from link to link; a system solves all links at once
         self.exact = bool(scene.slots.exact and (not system or system.left_out(batches) == 0))
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.state = scene.state
@@ -60,13 +64,13 @@ class BodyImpacts:
         self.target, self.pushed, self.first_push = (add(f"impacts.{k}", n) for k in ("target", "pushed", "first_push"))
         self.last_push, self.last_miss = add("impacts.last_push", n), add("impacts.last_miss", n)
         self.held = add("impacts.held", n, width=dim)  # by friction
-        self.logs: list[Any] = []  # of walls that tell of events
+        self.logs: list[Any] = []  # of walls that report events
         self.log = add("impacts.log", n, kind=ti.i32)  # of the wall, by its number, or -1
-        self.stirred = add("impacts.stirred", n, kind=ti.i32, state=True)  # whether a blow of the last substep has reached it
+        self.stirred = add("impacts.stirred", n, kind=ti.i32, state=True)  # whether an impact of the last substep has reached it
         self.open = add("impacts.open", self.passes + 1, kind=ti.i32)
 
     def enter(self, log: Any) -> int:
-        """The number of a log; -1 for None."""
+        """Return the number of a log; -1 for None."""
         if log is None:
             return -1
         self.logs.append(log)
@@ -79,7 +83,10 @@ class BodyImpacts:
 
     @ti.func
     def link(self, batch: ti.template(), c):  # type: ignore[valid-type]
-        """In the first pass: note whom constraint c holds, if it is rigid. Springs take no part in a blow: it is over before."""
+        """In the first pass: mark the particles that constraint c holds, if it is rigid.
+
+        An impact is too short for springs to act.
+        """
         holds = batch.dev.spring.is_rigid(c)
         if ti.static(batch.breaks):
             holds = holds and batch.dev.strength.holds(c)
@@ -94,45 +101,45 @@ class BodyImpacts:
 
     @ti.func
     def clear(self, i):
-        """As a substep begins."""
+        """At the start of a substep: clear the marks of particle i."""
         self.struck[i] = self.stirred[i] = self.rigid[i] = 0
 
     @ti.func
     def close(self):
-        """As a substep begins: no pass is needed but those of every substep."""
+        """At the start of a substep: request no passes beside the regular ones."""
         for k in range(ti.static(self.passes + 1)):
             self.open[k] = 0
 
     @ti.func
     def ask(self, now):
-        """Have more passes, once those of every substep are done."""
+        """Request another pass, once the regular ones are done."""
         if now.it + 1 >= now.span.iterations:
             self.open[now.it + 1 - now.span.iterations] = 1
 
     @ti.func
     def wanted(self, now):
-        """Whether the pass is needed, beyond those of every substep."""
+        """Whether this pass, beyond the regular ones, is needed."""
         return self.open[now.it - now.span.iterations] != 0
 
     @ti.func
     def notes(self):
-        """Whether this is the first of them, which only notes what constraints leave."""
+        """Whether this is the first extra pass, which only records the violations that constraints leave."""
         return self.open[0] != 0 and self.open[1] == 0
 
     @ti.func
     def goes_on(self):
-        """Whether this is a later one."""
+        """Whether this is a later extra pass."""
         return self.open[1] != 0
 
     @ti.func
     def stir(self, i, change):
-        """The displacement of particle i changed by so much in such a pass."""
+        """Mark particle i if an extra pass changed its displacement by more than rounding."""
         if change.norm_sqr() > ti.static(FELT) * self.state.d[i].norm_sqr():
             self.stirred[i] = 1
 
     @ti.func
     def reaches(self, batch: ti.template(), c):  # type: ignore[valid-type]
-        """Whether anything of a blow has reached constraint c, which is rigid."""
+        """Whether constraint c is rigid, and an impact has reached it."""
         out = batch.dev.spring.is_rigid(c)
         if ti.static(self.spreads):
             near = False
@@ -143,9 +150,11 @@ class BodyImpacts:
 
     @ti.func
     def strike(self, i, n, moved, target, static, dynamic, log):
-        """A wall with the normal n that itself moved by `moved` is to take particle i to the normal displacement `target`, as it
-        sees it, and to note that in this log. Returns whether that can wait for another pass: not where particle i has struck a
-        wall before in this substep, nor in the last pass."""
+        """Record that a wall is to give particle i the normal displacement `target`, relative to the wall.
+
+        n: normal of the wall. moved: motion of the wall. log: number of the log for the impulse. Returns whether a later pass
+        does that. It does not if particle i has struck a wall before in this substep, nor in the last pass.
+        """
         out = self.struck[i] == 0 and self.open[ti.static(self.passes - 1)] == 0
         if out:
             self.struck[i] = WAITS
@@ -158,14 +167,16 @@ class BodyImpacts:
 
     @ti.func
     def calm_between(self, i, n):
-        """A wall with the normal n presses particle i, too: if it faces the one that i has struck, i does not bounce off that,
-        for what one of them gives, the other would make more."""
+        """Cancel the bounce of particle i off the wall that it struck, if a wall with normal n presses it from the other side.
+
+        Otherwise each of the two walls would amplify the push of the other.
+        """
         if self.struck[i] == HELD and n.dot(self.normal[i]) < 0:
             self.target[i] = ti.min(self.target[i], 0)
 
     @ti.func
     def hold(self, i):
-        """Push particle i, or push it on. Returns whether it was off."""
+        """Push particle i towards its target, or correct the push. Returns whether its displacement was off."""
         off = False
         if self.struck[i] != 0:
             n, d = self.normal[i], self.state.d[i] - self.moved[i]

@@ -38,10 +38,10 @@ class Box(Collider):
     C(x) = x_k - lower_k - radius >= 0 and upper_k - x_k - radius >= 0, with unit gradients along axis k.
 
     lower, upper: (dim,) [m]; -inf and inf leave a side open. Live: assign to .lower or .upper between frames, and the walls move
-    there during the next frame (to or from an open side they jump). friction, restitution, push_out:
-    see Collider.
+    there during the next frame (to or from an open side they jump). friction, restitution, push_out, active, events: see
+    Collider.
 
-    One-sided: a particle cannot leave at any speed, nor can anything draw it out.
+    One-sided: a particle cannot leave at any speed, and no force can pull it out.
     """
 
     inside = poses = True
@@ -64,7 +64,7 @@ class Box(Collider):
         self.lower, self.upper = self.lower, self.upper
 
     def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Warn of particles whose centers start outside; not of a box that is switched off, which has no inside."""
+        """Warn of particles whose centers start outside. A box that is switched off has no inside."""
         if not self.active:
             return
         x = particles.position
@@ -80,19 +80,22 @@ class Box(Collider):
 
     @property
     def repeats(self) -> bool:
-        """In a corner friction on one side may lead into another, and a bounce may lead to the other end."""
+        """Whether one round may not be enough.
+
+        In a corner, friction on one side may lead into another, and a bounce may lead to the other end.
+        """
         return self.dev.surface.has_friction or self.dev.surface.has_restitution
 
     def bind(self, scene: Scene) -> None:
-        """Corners at the start and the end of a frame."""
+        """Declare the corners at the start and the end of a frame."""
         Collider.bind(self, scene)
         sides = np.concatenate([self.lower, self.upper])
         self.dev.sides = scene.memory.field("Box.sides", len(sides), width=2, values=np.stack([sides, sides], 1), state=True)
-        self.dev.now = scene.memory.field("Box.sides_now", len(sides), width=2)  # the plane, and how far it goes in the substep
+        self.dev.now = scene.memory.field("Box.sides_now", len(sides), width=2)  # the plane, and its motion in the substep
         self.changed = False
 
     def upload(self) -> None:
-        """Move from the last corners to the new ones."""
+        """Move from the last corners to the new ones in the next frame."""
         Collider.upload(self)
         old, new = self.scene.memory.read(self.dev.sides)[:, 1], np.concatenate([self.lower, self.upper])
         jump = np.isinf(old) | np.isinf(new)
@@ -100,12 +103,12 @@ class Box(Collider):
         self.moving = True
 
     def end_motion(self) -> None:
-        """Stay."""
+        """Stay at the last corners."""
         sides = self.scene.memory.read(self.dev.sides)[:, 1]
         self.scene.memory.write(self.dev.sides, np.stack([sides, sides], axis=1))
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
-        """The edges of its sides; a side at infinity is open, and what leads to it ends with the scene."""
+        """Return the edges of the sides. A side at infinity is open, and edges that lead to it end with the scene."""
         bits = np.array([[(c >> k) & 1 for k in range(self.dim)] for c in range(2**self.dim)])
         open_ends = np.where(bits, np.isinf(self.upper), np.isinf(self.lower))
         corners = np.where(open_ends, np.where(bits, high, low), np.where(bits, self.upper, self.lower))
@@ -119,14 +122,14 @@ class Box(Collider):
         return corners[np.array(edges)], 0.0
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """The distance to the nearest side; outside, to the nearest point of the box."""
+        """Return the distance to the nearest side; outside, minus the distance to the nearest point of the box."""
         lower, upper = self._corners
         off = np.maximum(np.maximum(lower - points, points - upper), 0.0)
         within = np.minimum(points - lower, upper - points).min(axis=1)
         return np.where((off > 0).any(axis=1), -np.linalg.norm(off, axis=1), within)
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """Out of the box, at the side that is first."""
+        """Return the distances out of the box, and the normals of the sides that are met first."""
         lower, upper = self._corners
         lower, upper = lower + radius, upper - radius
         finite = (np.where(np.isfinite(side), side, 0.0)[None] for side in (lower, upper))
@@ -142,7 +145,7 @@ class Box(Collider):
 
     @property
     def _corners(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper, where they are now."""
+        """The present lower and upper corners [m]."""
         if self.scene is None:
             return self.lower, self.upper
         sides = self.scene.memory.read(self.dev.sides)[:, 1].astype(np.float64)
@@ -150,7 +153,7 @@ class Box(Collider):
 
     @ti.func
     def pose(self, frame_fraction):
-        """Where the planes are; what stands is where it stands, to the bit, and at infinity too."""
+        """Compute the planes of this substep. A resting plane keeps its position bit for bit, also at infinity."""
         for side in range(ti.static(2 * self.dim)):
             a, b = self.dev.sides[side][0], self.dev.sides[side][1]
             at, shift = b, ti.zero(b)
@@ -160,7 +163,7 @@ class Box(Collider):
 
     @ti.func
     def may_touch(self, i, radius):
-        """1 if there may be something to press()."""
+        """Return 1 if press() may have something to do, else 0."""
         out, x, close = 0, self.dev.state.place(i), self.dev.state.digits(i)
         for k in ti.static(range(self.dim)):
             out |= ti.cast(self.dev.now[k][0] + radius - x[k] > -close, ti.i32)
@@ -169,7 +172,7 @@ class Box(Collider):
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, turn):
-        """Two planes per axis, lower ones first."""
+        """Press the particle at two planes per axis, lower ones first."""
         if self.may_touch(i, radius) != 0:
             for side in range(ti.static(2 * self.dim)):
                 wall, shift, x = self.dev.now[side][0], self.dev.now[side][1], self.dev.state.place(i)

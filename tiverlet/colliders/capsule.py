@@ -14,7 +14,7 @@ from .round_mesh import rounded
 from .surface import TOUCH
 from .track import Track
 
-MARCH = 32  # steps along a path; what only grazes is then within 1e-6 of its way
+MARCH = 32  # steps along a path; a grazing path is then resolved within 1e-6 of its length
 
 
 def _end(name: str) -> Knob:
@@ -26,11 +26,11 @@ class Capsule(Collider):
 
     C(x) = |x - q| - (R + r) >= 0 with q the nearest point of the segment; grad C = (x - q) / |x - q|.
 
-    a, b: (dim,) [m], live: the ends move to what is assigned during the next frame. radius: R [m], above 0,
+    a, b: (dim,) [m], live: the ends move to assigned places during the next frame. radius: R [m], above 0,
     live: it changes at once. friction, restitution, push_out, active, events, one_way: see Collider.
 
-    What passes through in one substep is caught on the way in, however thin the rod: the path, as seen from the rod, is followed
-    to where it meets the surface (sphere tracing, Hart 1996). Nothing can be drawn through either.
+    A particle that passes through in one substep is caught on the way in, however thin the rod. Its path relative to the rod is
+    followed to where it meets the surface (sphere tracing, Hart 1996). No force can pull a particle through either.
     """
 
     bulk = 0.6
@@ -51,14 +51,14 @@ class Capsule(Collider):
         self.a, self.b = self.a, self.b
 
     def bind(self, scene: Scene) -> None:
-        """The ends at the start and the end of a frame."""
+        """Declare the ends at the start and the end of a frame, and the radius."""
         Collider.bind(self, scene)
         self.dev.size = scene.memory.field("Capsule.radius", None, values=self.radius)
         self.dev.a, self.dev.b = Track(scene.memory, "Capsule.a", self.a), Track(scene.memory, "Capsule.b", self.b)
         self.changed = False
 
     def upload(self) -> None:
-        """Move to the new ends."""
+        """Move to the new ends in the next frame."""
         Collider.upload(self)
         self.scene.memory.write(self.dev.size, self.radius)
         self.dev.a.aim(self.a)
@@ -66,25 +66,25 @@ class Capsule(Collider):
         self.moving = True
 
     def end_motion(self) -> None:
-        """Stay."""
+        """Stay at the last ends."""
         self.dev.a.end_motion()
         self.dev.b.end_motion()
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
-        """The axis, as thick as the rod."""
+        """Return the axis, as thick as the rod."""
         return np.array([[self.a, self.b]]), self.radius
 
     def solid(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The rod."""
+        """Return the rod in 3D."""
         return rounded(self.a, self.b, self.radius) if len(self.a) == 3 else Collider.solid(self, low, high)
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """The distance to the axis, less the radius."""
+        """Return the distance to the axis, less the radius."""
         a, b = self._ends
         return np.linalg.norm(points - on_segment(points, a[None], b[None])[0], axis=1) - self.radius
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """Into the rod."""
+        """Return the distances into the rod, and the normals there."""
         a, b = (np.broadcast_to(end, origin.shape) for end in self._ends)
         close = rounding(origin, a, b)
         distance = entry(capsule(origin, direction, a, b, self.radius + radius), close)
@@ -93,12 +93,12 @@ class Capsule(Collider):
 
     @property
     def _ends(self) -> tuple[np.ndarray, np.ndarray]:
-        """a and b, where they are now."""
+        """The present ends a and b [m]."""
         return (self.a, self.b) if self.scene is None else (self.dev.a.now, self.dev.b.now)
 
     @ti.func
     def nearest(self, x, a, b):
-        """Where on the axis, from 0 at a to 1 at b, the point nearest to x is, the distance to it, and the direction from it."""
+        """Return the point of the axis nearest to x, from 0 at a to 1 at b, the distance to it, and the direction from it."""
         axis = b - a
         size = axis.dot(axis)
         t = 0 * size
@@ -113,8 +113,10 @@ class Capsule(Collider):
 
     @ti.func
     def along(self, x, a, b, frame_fraction):
-        """Where a point at x, at the start of the substep, would be if the rod took it along as it turns: beside the same place
-        on the axis, which ends between a and b, and as far from it."""
+        """Return where a point at x, at the start of the substep, would be if the rod carried it along.
+
+        The point keeps its place beside the axis, whose ends move to a and b, and its distance from the axis.
+        """
         t, length, n = self.nearest(x, self.dev.a.at(frame_fraction[0]), self.dev.b.at(frame_fraction[0]))
         axis = b - a
         if 0 < t < 1:
@@ -123,7 +125,7 @@ class Capsule(Collider):
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, turn):
-        """The surface where it was met, or where it is nearest."""
+        """Press the particle at the surface where it was met, or where it is nearest."""
         a, b = self.dev.a.at(frame_fraction[1]), self.dev.b.at(frame_fraction[1])
         a_moved, b_moved = self.dev.a.step(frame_fraction), self.dev.b.step(frame_fraction)
         middle, contact_distance = (a + b) / 2, ti.cast(self.radius, self.dev.real) + radius
@@ -135,10 +137,10 @@ class Capsule(Collider):
         if (a_moved != b_moved).any():
             d = x - self.along(x - self.dev.surface.path(i, 0 * x), a, b, frame_fraction)
         way = d.norm()
-        # Else its path begins further from the rod than it is long, whatever is rounded.
+        # Otherwise the path begins further from the rod than it is long, whatever the rounding.
         if depth + 2 * way > -TOUCH * (abs(a).sum() + abs(b).sum() + abs(x).sum() + contact_distance):
             s, start_depth, k, going = 0 * length, 0 * length, 0, True
-            # If it was outside, or touched, it may have come in: walk along the path, never further than the surface is away.
+            # If the particle was outside, or touched, step along its path, each step no longer than the distance to the surface.
             while going:
                 _t, distance, m = self.nearest(x - (1 - s) * d, a, b)
                 gap = distance - contact_distance
@@ -150,7 +152,7 @@ class Capsule(Collider):
                     if k <= MARCH:
                         further += ti.max(gap, 0) / way
                     k += 1
-                    if not (further < 1) or further == s:  # past the end, or where the surface is
+                    if not (further < 1) or further == s:  # past the end, or at the surface
                         going, depth = False, ti.min(depth, 0)
                         if further < 1:
                             n, depth = m, (s - 1) * d.dot(m)

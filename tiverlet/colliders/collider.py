@@ -1,4 +1,4 @@
-"""The contract of all colliders: what particles stay outside of, or inside."""
+"""The contract of all colliders: walls that particles stay outside of, or inside."""
 
 from typing import Any
 
@@ -14,38 +14,40 @@ from .wall_log import WallLog
 
 
 class Collider(Feature):
-    """Keeps each particle by itself on one side of a wall, with the last word in every iteration.
+    """Keeps each particle on one side of a wall, as the last correction in every iteration.
 
-    Subclasses give confine(), which finds how deep a particle is and calls dev.surface.press(): that of the Surface that each
-    holds; and for questions of the host, clearance() and cast(). One-sided: what entered in this substep is taken back whole, at
-    any speed, whether it flew in or constraints, contacts, friction or a bounce off another wall took it there. Depth from before
-    (a bad start) is left at `push_out` [m/s], and gives no more velocity than that.
+    Subclasses implement confine(), which finds how deep a particle is and calls dev.surface.press() of the Surface that each
+    holds; and for host queries, clearance() and cast(). One-sided: depth that was gained in this substep is removed completely,
+    at any speed, whether it came from motion, constraints, contacts, friction or a bounce off another wall. Earlier depth (a bad
+    start) is removed at `push_out` [m/s], and gives no more velocity than that.
 
-    Where one correction may lead into a wall again (several walls, a box in whose corners particles bounce), corrections take
-    turns until none changes anything: some rounds as they come, then more without friction and bounces, which are projections of
-    the displacement and give no energy. What is still not free then, in a wedge, stays where it was at the start of the substep.
-    Walls that move towards each other may leave no room at all: then the last of them in the list has its way.
+    Where one correction may push a particle into a wall again (several walls, a box in whose corners particles bounce),
+    corrections are repeated until none changes anything. The first rounds include friction and bounces. Later rounds leave both
+    out, and are then projections of the displacement, which add no energy. A particle that is still not free, in a wedge, stays
+    where it was at the start of the substep. Where walls that move towards each other leave no room, the last of them in the list
+    prevails.
 
-    friction: Coulomb, a number or (static, dynamic). The tangential displacement relative to the wall is taken back, up to
-    friction times the normal displacement that the wall gave, so neither coefficient depends on h. What sticks goes back to
-    where it was at the start of the substep, to the bit, so it does not creep.
-    restitution: 0 ... 1. The moment of the impact within the substep is solved for, with the acceleration in it; the particle
-    leaves at restitution times its velocity then, and is placed where it would be at the end of the substep. What rigid
-    links hold takes its body along, see BodyImpacts, and rests where 8 substeps of forces and links gave it its speed; on
-    springs, beside ShapeMatch, Area of loops, Path or Snap, and where it spins and rubs, it bounces alone.
-    Of particles that spin, the displacement of the point that touches is taken back. friction = (static, dynamic, rolling,
-    twisting) then also resists rolling, by a moment of up to rolling * radius times the normal force, and spinning about the
-    normal, by up to twisting * radius times it; what these hold does not roll. restitution = (normal, tangential): in a bounce
-    the point that touches leaves across the normal at -tangential times its velocity, as far as friction holds it; 0 grips, 1 is
-    a super ball (Garwin 1969).
-    active: whether it is there, a gate that opens and closes. With True or False given it is a switch, which costs nothing to
-    turn; None is always there, and costs the compiling of another scene when it is switched off for the first time. What is
-    inside of a wall that comes back is left at push_out.
-    events: whether World.wall_events() tells which particles met and left it.
-    one_way: a direction along which particles pass, for platforms: (0, 1) holds what comes from above, and lets through what
-    comes from below. Particles are held where they touch with a normal to that side; what was inside of the wall at the start of
-    the substep, however it came there, is let through until it is free. Fixed, and turned with the wall. Nothing is remembered of
-    a particle but where it is. Capsule, Polygon and Mesh take it; None is a wall for both sides.
+    friction: Coulomb, a number or (static, dynamic). The tangential displacement relative to the wall is removed, up to friction
+    times the normal displacement from the wall, so neither coefficient depends on h. A sticking particle returns bit for bit to
+    where it was at the start of the substep, so it does not creep.
+    restitution: 0 ... 1. The time of impact within the substep is solved for, with the acceleration during the substep. The
+    particle leaves at restitution times its velocity at that time, and is placed where it would be at the end of the substep. A
+    particle that rigid links hold takes its body along, see BodyImpacts; it does not bounce if 8 substeps of forces and links
+    account for its speed. On springs, beside ShapeMatch, Area of loops, Path or Snap, and where it spins and has friction, a
+    particle bounces alone.
+    For particles that spin, the displacement of the contact point is removed. Then friction = (static, dynamic, rolling,
+    twisting) also resists rolling, by a moment of up to rolling * radius times the normal force, and spinning about the normal,
+    by up to twisting * radius times it; a particle that these moments hold does not roll. With restitution = (normal, tangential)
+    the contact point leaves a bounce across the normal at -tangential times its velocity, as far as friction holds it; 0 grips, 1
+    is a super ball (Garwin 1969).
+    active: whether the wall is present, for a gate that opens and closes. With True or False given it is a switch, which costs
+    nothing to turn. None is always present; switching it off for the first time compiles another scene. Particles inside of a
+    wall that returns are pushed out at push_out.
+    events: whether World.wall_events() reports which particles met and left the wall.
+    one_way: a direction along which particles pass, for platforms: (0, 1) holds particles from above, and lets particles from
+    below through. Particles are held where they touch with a normal to that side. A particle that was inside of the wall at the
+    start of the substep, for whatever reason, is let through until it is free. Fixed, and turned with the wall. Only the position
+    of a particle decides; nothing else is remembered. Capsule, Polygon and Mesh take it; None is a wall for both sides.
 
     A conveyor is a long Capsule or Polygon with friction that is moved along itself: its place is assigned before each frame.
     """
@@ -58,25 +60,25 @@ class Collider(Feature):
     compiled_for = ("has_friction", "has_restitution", "has_switch", "turns")
     host_only = ("widest",)
     one_way: Any = None  # unit vector along which particles pass
-    _switch = False  # it was made with one
+    _switch = False  # whether `active` was given
     sweeps = False  # needs the exact position at the start of the substep
-    repeats = False  # one confine() may leave a particle that rubs or bounces where it has to be confined again
+    repeats = False  # after confine(), a particle with friction or a bounce may have to be confined again
     dim = 0  # 2 or 3; 0 while it is not known
     inside = False  # particles are kept inside of it
-    poses = False  # has a pose(frame_fraction) to be worked out once for each substep, before any confine()
+    poses = False  # has a pose(frame_fraction) to be computed once for each substep, before any confine()
 
     def surface(
         self, friction: Any, restitution: Any, push_out: float, active: bool | None, events: bool = False, one_way: Any = None,
         dim: int = 0,
     ) -> None:  # fmt: skip
-        """Check and keep the arguments that all walls have; one_way in dim axes."""
+        """Check and store the arguments that all walls have; one_way in dim axes."""
         self.friction, self.restitution, self.push_out, self.events = friction, restitution, push_out, events
         if one_way is not None:
             self.one_way = self._direction(one_way, dim)
         self._switch, self.active = active is not None, True if active is None else active
 
     def _direction(self, one_way: Any, dim: int) -> np.ndarray:
-        """one_way, checked, as a unit vector."""
+        """Return one_way, checked, as a unit vector."""
         way = checks.vector(repr(self), "one_way", one_way, dim)
         length = float(np.linalg.norm(way))
         if length == 0:
@@ -105,21 +107,21 @@ class Collider(Feature):
 
     @property
     def lets_go(self) -> bool:
-        """Whether it bore what it no longer will."""
+        """Whether the wall was present in the last frame and is switched off now, so that it ends its support."""
         return not self.active and self.stands
 
     @property
     def stands(self) -> bool:
-        """Whether it is there, as the last frame had it."""
+        """Whether the wall was present in the last frame."""
         return self.active if self.scene is None else self.dev.surface.stands
 
     @property
     def has_switch(self) -> bool:
-        """Whether it can be switched off, by the kernels as they are or are to be."""
+        """Whether the wall can be switched off, by the compiled kernels or those to be compiled."""
         return self._switch or not self.active or "has_switch" in self.once
 
     def bind(self, scene: Scene) -> None:
-        """Keep the state at hand, and make the surface."""
+        """Store the state, and make the surface."""
         self.scene = scene
         self.dev.state = scene.state
         self.dev.real = scene.real
@@ -131,39 +133,46 @@ class Collider(Feature):
         )
 
     def upload(self) -> None:
-        """Write friction and restitution, and whether it is there."""
+        """Write friction, restitution and `active` to the device."""
         self.dev.surface.upload(friction_of(repr(self), "friction", self.friction), self._bounce, self.active)
 
     def can_regroup(self, change: Regrouping) -> bool:
-        """Whether the widest particle, for which it was checked and made, is as wide as before."""
+        """Whether the widest particle, for which the wall was checked and built, is as wide as before."""
         return change.now.radius.max(initial=0.0) == change.before.radius.max(initial=0.0)
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
-        """For pictures of a scene between two corners: line strips (m, k, dim), and half their width [m], 0 for a thin line."""
+        """Return line strips (m, k, dim) and half their width [m], for pictures of a scene between two corners.
+
+        A width of 0 is a thin line.
+        """
         return np.zeros((0, 2, len(low))), 0.0
 
     def solid(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """For pictures of a 3D scene between two corners: vertices (v, 3) and triangles (t, 3); none where lines say more."""
+        """Return vertices (v, 3) and triangles (t, 3), for pictures of a 3D scene between two corners.
+
+        There are none where lines show more.
+        """
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """C(x) of points (k, dim): how far they are from the wall [m], negative inside of it, (k,).
+        """Return C(x) of points (k, dim): their distance from the wall [m], negative inside of it, (k,).
 
-        In a world, the wall is where the last frame took it: a place that is assigned is where it goes in the next one.
+        In a world, the wall is where the last frame took it. An assigned position is reached in the next frame.
         """
         raise NotImplementedError
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """How far balls of a radius [m] go until the wall stops them, and its normals there.
+        """Return how far balls of a radius [m] go until the wall stops them, and its normals there.
 
         origin: (k, dim) [m]. direction: (k, dim), unit. Returns the lengths (k,) [m], inf where nothing is met, and unit normals
-        (k, dim), against the direction: where clearance() falls to `radius` from above. A wall lets out what starts in it.
+        (k, dim), against the direction: where clearance() falls to `radius` from above. A ray that starts in a wall leaves it
+        freely.
         """
         raise NotImplementedError
 
     @ti.func
     def may_touch(self, i, radius):
-        """0 where confine() has nothing to do for particle i, if that can be told without a branch, for several at once."""
+        """Return 0 where confine() has nothing to do for particle i, if that can be computed without a branch, else 1."""
         return 1
 
     @ti.func

@@ -1,4 +1,4 @@
-"""Cosine and sine in f64, from arithmetic alone: SPIR-V, which Taichi compiles to on Vulkan and Metal, has them for f32 only.
+"""Cosine and sine in f64, by arithmetic only: SPIR-V, which Taichi compiles to on Vulkan and Metal, has them for f32 only.
 
 The polynomials are those of fdlibm (Sun Microsystems 1993, k_sin.c and k_cos.c), for angles of up to pi/4.
 """
@@ -19,7 +19,7 @@ COSINE = (
 
 @ti.func
 def cos_sin(x):
-    """Both, of an f64; within 2e-16 for up to a million turns."""
+    """Return cosine and sine of an f64; within 2e-16 for up to a million turns."""
     k = ti.floor(x * ti.f64(QUARTERS) + ti.f64(0.5))
     for part in ti.static(QUARTER):
         x -= k * ti.f64(part)

@@ -1,10 +1,10 @@
-"""Which facets of a fixed shape are near a place: cells that list them, built once in NumPy, with no capacity."""
+"""Grid of the facets of a fixed shape: cells that list the facets near them, built once in NumPy, of any length."""
 
 import numpy as np
 
-CELLS = 1024  # at least as many as the budget of a small shape; larger ones have 8 for each facet
-ENTRIES = 256  # of lists for each facet, at most; then cells are made larger
-CHUNK = 1 << 22  # pairs of a facet and a cell that are looked at together
+CELLS = 1024  # cell budget of a small shape; larger shapes have 8 cells for each facet
+ENTRIES = 256  # of lists for each facet, at most; beyond, cells are made larger
+CHUNK = 1 << 22  # pairs of a facet and a cell that are tested together
 
 
 class FacetGrid:
@@ -12,7 +12,7 @@ class FacetGrid:
 
     Every facet closer than `reach` to a cell is in the list of that cell: list[begin[b] : begin[b + 1]] with b = bucket[cell],
     axis 0 fastest. Cells that are further away have b = -1 - rings instead, with `rings` cells and reach between them and any
-    facet. Those deep inside a closed shape have the last b, whose list holds all facets.
+    facet. Cells deep inside a closed shape have the last b, whose list holds all facets.
     """
 
     def __init__(self, corners: np.ndarray, most_distance: float, closed: bool):
@@ -29,7 +29,7 @@ class FacetGrid:
             self.cell *= 1.2
         self.origin = low - self.reach
         facet, cell = self._pairs(corners)
-        order = np.argsort(cell, kind="stable")  # facets come in order
+        order = np.argsort(cell, kind="stable")  # stable: facets stay in order
         facet, cell = facet[order], cell[order]
         used, counts = np.unique(cell, return_counts=True)
         bucket = np.full(int(self.shape.prod()), -1)
@@ -44,7 +44,7 @@ class FacetGrid:
         self.list = np.concatenate([facet, np.arange(m)])
 
     def _pairs(self, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Every facet with every cell within reach of it, or a little more: by the facet's box, then by its plane."""
+        """Return pairs of facets and cells within reach, or slightly more: by the facet's box, then by its plane."""
         first = np.floor((corners.min(axis=1) - self.reach - self.origin) / self.cell).astype(int)
         last = np.floor((corners.max(axis=1) + self.reach - self.origin) / self.cell).astype(int)
         first, last = np.clip(first, 0, self.shape - 1), np.clip(last, 0, self.shape - 1)
@@ -78,7 +78,7 @@ class FacetGrid:
         return at @ np.concatenate([[1], np.cumprod(self.shape)[:-1]])
 
     def _rings(self, near: np.ndarray) -> np.ndarray:
-        """How many cells lie between each cell and the nearest one that has a list, along the axis where they are most."""
+        """Return the number of cells between each cell and the nearest one that has a list, along the axis with most."""
         grid = near.reshape(self.shape[::-1])
         rings = np.where(grid, -1, 0)
         reached, k = grid, 0
@@ -93,9 +93,9 @@ class FacetGrid:
         return rings.ravel()
 
     def _winding(self, corners: np.ndarray) -> np.ndarray:
-        """How often the facets go around the middle of each cell: crossings of a ray from it towards -x, with their sign."""
+        """Return the winding number of the facets around the middle of each cell: signed crossings of a ray towards -x."""
         m, arity, dim = corners.shape
-        # Middles are shifted a little off the cells' own pattern, so that no ray meets a corner or an edge.
+        # Middles are shifted slightly off the cell pattern, so that no ray meets a corner or an edge.
         shift = self.cell * np.array([0.0, 0.0137, 0.0091][:dim])
         local = (corners - self.origin - shift) / self.cell - 0.5  # in cells, from the middle of cell 0
         first = np.maximum(np.ceil(local[..., 1:].min(axis=1)).astype(int), 0)

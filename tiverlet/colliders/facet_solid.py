@@ -1,4 +1,4 @@
-"""What facets enclose, as the host sees it: which points are inside, and where rays come in."""
+"""The solid that facets enclose, for host queries: which points are inside, and where rays enter."""
 
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,7 @@ PIECES = 1 << 12  # of a solid on the way out of it, at most
 
 
 class FacetSolid:
-    """Facets in the frame of the collider that holds them, in a tree; the solid is what is behind them, or near to them."""
+    """Facets in the frame of the collider that holds them, in a tree; the solid is behind them, or within a radius of them."""
 
     def __init__(self, facets: "Facets"):
         self._facets = facets
@@ -23,14 +23,15 @@ class FacetSolid:
         self._normals, self._size = facets.normals, float(np.abs(facets.corners).max())
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """The distance of points to the facets, (k,) [m]; negative behind them where they are closed.
+        """Return the distance of points to the facets, (k,) [m]; negative behind them where they are closed.
 
-        Behind is where the mean normal of the nearest facet, edge or corner points away from (Baerentzen and Aanaes 2005).
+        A point is behind where the mean normal of the nearest facet, edge or corner points away from it (Baerentzen and Aanaes
+        2005).
         """
         corners = self._facets.corners
 
         def distance(q: np.ndarray, f: np.ndarray) -> np.ndarray:
-            """Of point q[i] to facet f[i]."""
+            """Return the distances of points q[i] to facets f[i]."""
             r = points[q] - on_facet(points[q], corners[f])[0]
             return np.sqrt(dot(r, r))
 
@@ -42,7 +43,10 @@ class FacetSolid:
         return length
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """How far rays go until they come within `radius` of the facets from outside, (k,) [m], and the normals, (k, dim)."""
+        """Return how far rays go until they come within `radius` of the facets from outside, and the normals.
+
+        origin, direction: (k, dim). Returns lengths (k,) [m] and normals (k, dim).
+        """
         distance, f = self._bare(origin, direction) if radius == 0 else self._thick(origin, direction, radius)
         met = f >= 0
         d, corners = direction[met], self._facets.corners[f[met]]
@@ -56,11 +60,11 @@ class FacetSolid:
         return distance, normal
 
     def _bare(self, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distances, and which facets: of closed ones those that are seen from in front."""
+        """Return distances and facets of rays without thickness. A closed shape is entered through facets seen from the front."""
         corners, closed = self._facets.corners, self._facets.closed
 
         def enter(q: np.ndarray, f: np.ndarray) -> np.ndarray:
-            """Where ray q[i] passes facet f[i]."""
+            """Return where rays q[i] pass facets f[i]."""
             o, d, c = origin[q], direction[q], corners[f]
             t, _ = triangle(o, d, c)
             slope = dot(d, self._normals[f])
@@ -73,7 +77,7 @@ class FacetSolid:
         return self._tree.first(len(origin), np.full(len(origin), np.inf), ahead(origin, direction, 0.0), enter)
 
     def _thick(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """The same, of the facets whose surroundings are entered first; what starts in the solid goes out of it before."""
+        """Return distances and facets where rays first come within `radius`. A ray that starts in the solid leaves it first."""
         start = self._way_out(origin, direction, radius)
         distance, f = np.full(len(origin), np.inf), np.full(len(origin), -1)
         some = start < np.inf
@@ -81,7 +85,7 @@ class FacetSolid:
         corners = self._facets.corners
 
         def enter(q: np.ndarray, f: np.ndarray) -> np.ndarray:
-            """Where ray q[i] comes near facet f[i]."""
+            """Return where rays q[i] come within `radius` of facets f[i]."""
             c = corners[f]
             return entry(rounded(o[q], d[q], c, radius), rounding(o[q], c[:, 0], c[:, 1]) + ROUNDING * radius)
 
@@ -90,7 +94,7 @@ class FacetSolid:
         return distance, f
 
     def _way_out(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> np.ndarray:
-        """How far rays go until they are out of the solid that they start in: 0 outside of it, inf where there is no way out."""
+        """Return how far rays go until they leave the solid that they start in: 0 outside of it, inf where they never do."""
         close = rounding(origin) + ROUNDING * (self._size + radius)
         t, going = np.zeros(len(origin)), np.arange(len(origin))
         if not (self._facets.closed and self._facets.inside):
@@ -109,16 +113,19 @@ class FacetSolid:
         return t
 
     def _step_out(self, x: np.ndarray, d: np.ndarray, radius: float, close: np.ndarray, deep: np.ndarray) -> np.ndarray:
-        """From places in the solid to the end of the surroundings of facets that they are in; if deep, to the next facet."""
+        """Return the step from points in the solid to the end of the facet surroundings that they are in.
+
+        deep: points further inside than the surroundings of any facet; their step is to the next facet.
+        """
         corners = self._facets.corners
         to_boxes, out_of_boxes = ahead(x, d, 0.0), beyond(x, d, radius)
 
         def bound(q: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-            """Of boxes around facets."""
+            """Return bounds of the values in boxes around facets."""
             return np.where(deep[q][:, None], to_boxes(q, low, high), out_of_boxes(q, low, high))
 
         def value(q: np.ndarray, f: np.ndarray) -> np.ndarray:
-            """Where ray q[i] passes facet f[i]; or the negative of where it leaves the surroundings, to find the last one."""
+            """Return where rays q[i] pass facets f[i]; or minus where they leave the surroundings, to find the last one."""
             out, some = np.full(len(q), np.inf), deep[q]
             enter, _ = triangle(x[q[some]], d[q[some]], corners[f[some]])
             out[some] = np.where(enter > close[q[some]], enter, np.inf)

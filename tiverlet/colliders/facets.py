@@ -13,16 +13,17 @@ from .facet_solid import FacetSolid
 from .shape import Shape
 from .surface import TOUCH
 
-NEWTON = 16  # steps to the moment of a touch; only what grazes needs more than 3
+NEWTON = 16  # steps to the time of a touch; only grazing paths need more than 3
 
 
 @dataclass(frozen=True)
 class Facets:
-    """Facets in the frame of the collider that holds them; the order of a facet's corners says which way it faces.
+    """Facets in the frame of the collider that holds them; the order of a facet's corners determines which way it faces.
 
     corners: (m, dim, dim) [m]. features: (m, k) the numbers of the corners (and in 3D, from column 3, of the edges 01, 12, 20).
-    wings: (feature, direction) pairs, in which directions facets go on from a feature. facing: (features, dim) mean normals.
-    closed: they enclose something. inside: particles are kept inside, so that the solid is all around.
+    wings: (feature, direction) pairs: the directions in which facets continue from a feature. facing: (features, dim) mean
+    normals.
+    closed: the facets enclose a volume. inside: particles are kept inside, so that the solid is all around.
     """
 
     corners: np.ndarray
@@ -39,23 +40,23 @@ class Facets:
 
     @cached_property
     def _solid(self) -> FacetSolid:
-        """For questions of the host; made when the first is asked."""
+        """The solid for host queries, made at the first query."""
         return FacetSolid(self)
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """How far points of this frame are from the facets, negative behind them, (k,) [m]."""
+        """Return the distance of points of this frame to the facets, negative behind them, (k,) [m]."""
         return self._solid.clearance(points)
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """As Collider.cast(), in this frame; radius: with what the facets are thickened by."""
+        """Return lengths and normals as Collider.cast(), in this frame; radius: by what the facets are thickened."""
         return self._solid.cast(origin, direction, radius)
 
     def on_device(self, scene: Scene, who: str, radius: float) -> "FacetShape":
-        """As fields."""
+        """Return the facets as fields."""
         return FacetShape(self, scene, who, radius)
 
     def check(self, who: str, particles: Particles, radius: float) -> None:
-        """Refuse points that meet a wall without thickness: a point on it would have no side."""
+        """Raise ValueError for points that meet a wall without thickness: a point on it would have no side."""
         points = particles.radius + radius == 0
         if not self.closed and points.any():
             raise ValueError(
@@ -65,7 +66,7 @@ class Facets:
 
 
 def facet_normals(corners: np.ndarray) -> np.ndarray:
-    """Unit normals of facets with corners (m, dim, dim)."""
+    """Return unit normals of facets with corners (m, dim, dim)."""
     if corners.shape[1] == 2:
         u = corners[:, 1] - corners[:, 0]
         n = np.stack([u[:, 1], -u[:, 0]], axis=1)
@@ -75,13 +76,13 @@ def facet_normals(corners: np.ndarray) -> np.ndarray:
 
 
 class FacetShape(Shape):
-    """Facets on the device: C(x) = dist(x, facets) - (R + r) >= 0 with R what they are thickened by.
+    """Facets on the device: C(x) = dist(x, facets) - (R + r) >= 0 with R the thickness that is added to them.
 
     grad C is the direction from the nearest point.
 
-    The distance to one facet is convex along a straight way, so Newton's method from its start goes to the moment of the touch
-    without ever overshooting. A facet that is touched at a corner or an edge counts only where no neighbour is nearer, which is
-    seen from the directions (`wings`) in which the neighbours go on; so nothing catches on the seams of a flat surface.
+    The distance to one facet is convex along a straight path, so Newton's method from its start converges to the time of the
+    touch without overshooting. A facet that is touched at a corner or an edge counts only where no neighbour is nearer. That is
+    tested with the directions (`wings`) in which the neighbours continue, so that nothing catches on the seams of a flat surface.
     """
 
     def __init__(self, facets: Facets, scene: Scene, name: str, radius: float):
@@ -95,7 +96,7 @@ class FacetShape(Shape):
         self.reach, self.cell, self.shape = buckets.reach, buckets.cell, buckets.shape.tolist()
         self.low, self.high = corners.min(axis=(0, 1)).tolist(), corners.max(axis=(0, 1)).tolist()
         self.pieces = 4 * int(buckets.shape.sum()) + 64
-        self.all = len(buckets.begin) - 2  # the last bucket holds all facets, for what starts deep inside
+        self.all = len(buckets.begin) - 2  # the last bucket holds all facets, for particles that start deep inside
         self.beyond = self.closed and facets.inside
         order = np.argsort(wings[0], kind="stable")
         begin = np.searchsorted(wings[0][order], np.arange(len(facing) + 1))
@@ -112,12 +113,15 @@ class FacetShape(Shape):
 
     @ti.func
     def corner(self, f, k):
-        """Corner k of facet f."""
+        """Return corner k of facet f."""
         return self.points[f * self.dim + k]
 
     @ti.func
     def nearest(self, f, q):
-        """Distance from q to facet f, the direction from the nearest point to q, and the feature that has it (-1: none)."""
+        """Return the distance from q to facet f, the direction from the nearest point to q, and the feature of that point.
+
+        The feature is -1 where the nearest point is inside of the facet.
+        """
         n = self.normal[f]
         r, at, over = q - self.corner(f, 0), -1, True
         least = r.dot(r)
@@ -151,7 +155,7 @@ class FacetShape(Shape):
 
     @ti.func
     def around(self, q):
-        """Where the list of the facets around q begins and ends, and how far from q there are no others."""
+        """Return begin and end of the list of the facets around q, and the distance from q within which there are no others."""
         low, high = self.constant(self.low), self.constant(self.high)
         reach, size = ti.cast(self.reach, self.real), ti.cast(self.cell, self.real)
         off = ti.max(low - q, q - high)
@@ -177,17 +181,20 @@ class FacetShape(Shape):
 
     @ti.func
     def constant(self, values: ti.template()):  # type: ignore[valid-type]
-        """A vector of numbers that are known when the kernel is compiled."""
+        """Return a vector of numbers that are known when the kernel is compiled."""
         return ti.Vector([ti.cast(v, self.real) for v in ti.static(values)])
 
     @ti.func
     def rounding(self, q):
-        """That of the largest of the coordinates of the corners."""
+        """Return the rounding of the largest coordinate of the corners."""
         return ti.cast(self.close, self.real)
 
     @ti.func
     def strike(self, a, e, contact_distance, close, limit):
-        """The first touch of any facet on the way. Where the start is inside of a closed shape, the nearest facet lets it out."""
+        """Find the first touch of any facet on the way, see Shape.strike().
+
+        Where the start is inside of a closed shape, the nearest facet lets the particle out.
+        """
         way, s, piece, on = e.norm(), 0 * contact_distance, 0, ti.max(self.touch, 4 * close)
         best, depth, normal = 0 * contact_distance + 2, 0 * contact_distance, 0 * e
         least, outside, exit = contact_distance + way + 1, 0 * contact_distance + 1, 0 * e
@@ -209,8 +216,8 @@ class FacetShape(Shape):
                             if not on_it and distance <= on:
                                 on_it = at < 0 or not self.alone(at, self.normal[f])
                             if on_it:
-                                # On the surface, by the digits of the particle, each facet that is touched there has its own
-                                # direction; at a corner only where others rise in front of it, for they may be what it lies on.
+                                # On the surface, within the particle's rounding, each touched facet uses its own normal.
+                                # At a corner that holds only where neighbours rise in front of it: the particle may lie on them.
                                 distance, n, at = ti.select(side < 0, -distance, distance), self.normal[f], -1
                         gap, slope = distance - contact_distance, e.dot(n)
                         if gap <= close or k == NEWTON - 1:

@@ -19,7 +19,7 @@ class HalfSpace(Collider):
     normal: (dim,), any length above 0; offset: [m] along the unit normal, from the origin. offset is live: assign to it between
     frames, and the plane moves there during the next frame. friction, restitution, push_out, active, events: see Collider.
 
-    One-sided: a particle cannot pass at any speed, nor can anything draw it through.
+    One-sided: a particle cannot pass at any speed, and no force can pull it through.
     """
 
     offset = Knob(lambda f, v: checks.number("HalfSpace", "offset", v), "Of the plane along its normal [m].")
@@ -39,37 +39,37 @@ class HalfSpace(Collider):
         self.surface(friction, restitution, push_out, active, events)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check the normal's length."""
+        """Check the dimension of the normal."""
         checks.vector("HalfSpace", "normal", self.normal, particles.dim)
 
     def bind(self, scene: Scene) -> None:
-        """Normal, and the offsets at the start and the end of a frame."""
+        """Declare the normal, and the offsets at the start and the end of a frame."""
         Collider.bind(self, scene)
         self.dev.normal = scene.memory.field("HalfSpace.normal", None, width=len(self.normal), values=self.normal)
         self.dev.offset = scene.memory.field("HalfSpace.offset", None, width=2, values=[self.offset] * 2, state=True)
         self.changed = False
 
     def upload(self) -> None:
-        """Move from the last offset to the new one."""
+        """Move from the last offset to the new one in the next frame."""
         Collider.upload(self)
         memory = self.scene.memory
         memory.write(self.dev.offset, [memory.read(self.dev.offset)[0, 1], self.offset])
         self.moving = True
 
     def end_motion(self) -> None:
-        """Stay."""
+        """Stay at the last offset."""
         memory = self.scene.memory
         memory.write(self.dev.offset, memory.read(self.dev.offset)[0, 1])
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
-        """Lines across the scene: one in 2D, two at right angles in 3D."""
+        """Return lines across the scene: one in 2D, two at right angles in 3D."""
         middle, reach = (low + high) / 2, float(np.linalg.norm(high - low)) or 1.0
         foot = middle - (self.normal @ middle - self.offset) * self.normal
         across = np.linalg.svd(self.normal[None])[2][1:]  # an orthonormal basis of the plane
         return np.stack([foot - reach * across, foot + reach * across], axis=1), 0.0
 
     def solid(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A square of the plane, as wide as the scene."""
+        """Return a square of the plane, as wide as the scene."""
         if len(low) != 3:
             return Collider.solid(self, low, high)
         ends = self.outline(low, high)[0]
@@ -77,11 +77,11 @@ class HalfSpace(Collider):
         return corners, np.array([[0, 1, 2], [0, 2, 3]])
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """n . x - offset."""
+        """Return n . x - offset."""
         return points @ self.normal - self._plane
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """Down to the plane."""
+        """Return the distances down to the plane, and its normal."""
         end = self._plane + radius
         close = rounding(origin, np.array([[end]]))
         way = slab(origin @ self.normal, direction @ self.normal, -np.inf, end, close)
@@ -89,12 +89,12 @@ class HalfSpace(Collider):
 
     @property
     def _plane(self) -> float:
-        """The offset, where the plane is now [m]."""
+        """The present offset of the plane [m]."""
         return float(self.offset if self.scene is None else self.scene.memory.read(self.dev.offset)[0, 1])  # type: ignore[arg-type]
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, turn):
-        """One plane."""
+        """Press the particle if it is below the plane."""
         n, offset = self.dev.normal[None], self.dev.offset[None]
         before, now = (
             offset[0] * (1 - frame_fraction[0]) + offset[1] * frame_fraction[0],

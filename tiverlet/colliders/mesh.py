@@ -17,13 +17,15 @@ class Mesh(Moving):
 
     C(x) = dist(x, faces) - (R + r) >= 0, grad C the direction from the nearest point of the mesh (see FacetShape).
 
-    vertices: (m, 3) [m]. faces: (k, 3) vertices of each triangle, either way round: they are turned alike here, and outwards.
-    inside: keep particles in. closed: False for a sheet, a thin wall with two sides. radius: R [m], what the faces are thickened
-    by; a sheet that points (particles of radius 0) meet needs some. position, rotation: where the vertices are put (see Moving);
-    live. friction, restitution, push_out, active, events, one_way: see Collider.
+    vertices: (m, 3) [m]. faces: (k, 3) vertices of each triangle, either way round: they are reordered to face outwards.
+    inside: keep particles in. closed: False for a sheet, a thin wall with two sides. radius: R [m], by which the faces are
+    thickened; it must be above 0 for a sheet and points (particles of radius 0). position, rotation: pose of the vertices (see
+    Moving); live.
+    friction, restitution, push_out, active, events, one_way: see Collider.
 
-    Nothing passes, at any speed of the particle or of the wall. The cost for a particle grows with the faces around it, not with
-    those of the mesh. Raises ValueError for faces of no area, and for a closed mesh with an edge that does not have two faces.
+    Nothing passes, at any speed of the particle or of the wall. The cost for a particle grows with the number of faces around it,
+    not with the size of the mesh. Raises ValueError for faces of no area, and for a closed mesh with an edge that does not have
+    two faces.
     """
 
     dim = 3
@@ -58,7 +60,7 @@ class Mesh(Moving):
         self.facets = self._joined()
 
     def _outward(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """The faces with their corners in the order that makes normals point away from the solid."""
+        """Return the faces with their corners in the order that makes normals point away from the solid."""
         halves = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         owner = np.repeat(np.arange(len(faces)), 3)
         edges, which, number = np.unique(np.sort(halves, axis=1), axis=0, return_inverse=True, return_counts=True)
@@ -82,7 +84,7 @@ class Mesh(Moving):
         return faces[:, ::-1] if (volume < 0) != self.inside else faces
 
     def _joined(self) -> Facets:
-        """Corners and edges, the ways in which the faces go on from them, and the mean normals there."""
+        """Compute corners and edges, the directions in which the faces continue from them, and the mean normals there."""
         faces, m = self.faces, len(self.vertices)
         c = self.vertices[faces]
         normal = facet_normals(c)
@@ -92,7 +94,7 @@ class Mesh(Moving):
         features = np.concatenate([faces, m + edge], axis=1)
         along = self.vertices[self.edges[:, 1]] - self.vertices[self.edges[:, 0]]
         along /= np.linalg.norm(along, axis=1)[:, None]
-        # From an edge, the face goes on at right angles to it; from a corner, along its edges.
+        # From an edge, the face continues at right angles to it; from a corner, along its edges.
         opposite = c[:, [2, 0, 1]] - c
         across = opposite - (opposite * along[edge]).sum(axis=2)[:, :, None] * along[edge]
         across /= np.linalg.norm(across, axis=2)[:, :, None]
@@ -100,7 +102,7 @@ class Mesh(Moving):
             np.concatenate([m + edge.ravel(), self.edges[:, 0], self.edges[:, 1]]),
             np.concatenate([across.reshape(-1, 3), along, -along]),
         )
-        # The sum of normals weighted by angles tells inside from outside at a corner (Baerentzen and Aanaes 2005).
+        # The sum of normals weighted by angles distinguishes inside from outside at a corner (Baerentzen and Aanaes 2005).
         sides = c[:, [1, 2, 0]] - c
         sides /= np.linalg.norm(sides, axis=2)[:, :, None]
         angle = np.arccos(np.clip(-(sides * sides[:, [2, 0, 1]]).sum(axis=2), -1, 1))
@@ -110,12 +112,12 @@ class Mesh(Moving):
         self.creases = np.linalg.norm(facing[m:], axis=1) < 2 * np.sqrt((1 + FLAT) / 2)
         size = np.linalg.norm(facing, axis=1)
         weak = np.flatnonzero(size[features].ravel() < 1e-9)
-        facing[features.ravel()[weak]] = np.repeat(normal, 6, axis=0)[weak]  # a knife's edge: either side will do
+        facing[features.ravel()[weak]] = np.repeat(normal, 6, axis=0)[weak]  # faces back to back: either normal will do
         facing /= np.maximum(np.linalg.norm(facing, axis=1), 1e-9)[:, None]
         return Facets(c, features, wings, facing, self.closed, self.inside)
 
     def host_shape(self, dim: int) -> HostShape:
-        """Its facets."""
+        """Return the facets."""
         return self.facets
 
     @property
@@ -124,16 +126,19 @@ class Mesh(Moving):
         return self.facets.normals
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
-        """The edges where the mesh bends."""
+        """Return the edges where the mesh bends."""
         return self.placed(self.vertices[self.edges[self.creases]]), self.radius
 
     def solid(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Its faces, unless the scene is inside of it."""
+        """Return the faces, unless the scene is inside of the mesh."""
         return Collider.solid(self, low, high) if self.inside else (self.placed(self.vertices), np.asarray(self.faces))
 
 
 def _turned(count: int, first: np.ndarray, second: np.ndarray, same: np.ndarray) -> np.ndarray:
-    """Which faces to turn so that all neighbours agree, given pairs of neighbours and whether exactly one of them is turned."""
+    """Return which faces to reverse so that all neighbours agree.
+
+    first, second: pairs of neighbours. same: whether exactly one of each pair has to be reversed.
+    """
     a, b, differ = np.concatenate([first, second]), np.concatenate([second, first]), np.concatenate([same, same])
     order = np.argsort(a, kind="stable")
     b, differ = b[order], differ[order]

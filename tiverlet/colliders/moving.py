@@ -1,4 +1,4 @@
-"""Colliders of any shape, which are moved and turned as a whole: what all of them share."""
+"""Colliders of any shape that are moved and turned as a whole."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from .collider import Collider
 from .pose import Pose, rotation_matrix
 from .shape import HostShape
 
-TOUCHES = 8  # of one particle in one substep; then it stays where it is known to be free
+TOUCHES = 8  # of one particle in one substep; after these it stays at the last place known to be free
 
 
 def _position(wall: "Moving", value):
@@ -33,14 +33,14 @@ class Moving(Collider):
     """A collider that is described in a frame of its own: its point p is at position + R p in the world.
 
     position: (dim,) [m]. rotation: an angle [rad] in 2D, counterclockwise; a rotation vector, axis times angle [rad], in 3D. Both
-    are live: assign between frames, and the wall goes there during the next frame, along the straight line between the old value
-    and the new. About a fixed axis that is a constant angular velocity, however many turns it makes. Friction and restitution
-    feel the velocity of the wall where it is touched.
+    are live: assign between frames, and the wall moves there during the next frame, linearly from the old value to the new. About
+    a fixed axis that is a constant angular velocity, for any number of turns. Friction and restitution use the velocity of the
+    wall at the contact point.
 
     It holds a Pose and a Shape. A particle is followed in the wall's frame, along the straight line from where it was at the
-    start of the substep: shape.strike() finds the first touch, surface.press() deals with it, and the rest of the way is followed
-    in turn. So nothing passes, at any speed of either, and corners need no special case. Where a particle is still on its way in
-    after TOUCHES of them (in a wedge), it stays at the last one.
+    start of the substep. shape.strike() finds the first touch, surface.push() corrects it, and then the rest of the way is
+    followed. So nothing passes, at any speed of either, and corners need no special case. Where a particle still moves in after
+    TOUCHES touches (in a wedge), it stays at the last one.
     """
 
     bulk = 1.5
@@ -52,7 +52,7 @@ class Moving(Collider):
     rotation = Knob(_rotation, "Angle (2D) or rotation vector (3D) [rad].")
 
     def place(self, position: Any, rotation: Any) -> None:
-        """Check and keep where the wall starts."""
+        """Check and store the initial pose of the wall."""
         self.position, self.rotation = position, rotation
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
@@ -64,7 +64,7 @@ class Moving(Collider):
         self.host_shape(self.dim).check(repr(self), particles, self.radius)
 
     def bind(self, scene: Scene) -> None:
-        """The pose at the ends of a frame and of the substep that is under way, and the shape."""
+        """Declare the pose at the ends of a frame and of the current substep, and the shape."""
         Collider.bind(self, scene)
         self.dev.pose = Pose(scene, repr(self), self.position, self.rotation, self.dev.surface.turns)
         self.dev.surface.poses = [self.dev.pose]
@@ -73,37 +73,37 @@ class Moving(Collider):
         self.changed = False
 
     def upload(self) -> None:
-        """Move and turn to the new place."""
+        """Move and turn to the new pose in the next frame."""
         Collider.upload(self)
         self.dev.pose.aim(self.position, self.rotation)
         self.moving = True
 
     def end_motion(self) -> None:
-        """Stay."""
+        """Stay at the last pose."""
         self.dev.pose.end_motion()
 
     def placed(self, points: np.ndarray) -> np.ndarray:
-        """Where points (..., dim) of the wall's frame are in the world, for pictures."""
+        """Return points (..., dim) of the wall's frame in the world, for pictures."""
         return points @ rotation_matrix(self.rotation).T + self.position
 
     def frame(self, dim: int) -> tuple[np.ndarray, np.ndarray]:
-        """Its position (dim,) [m] and rotation matrix, where it is now; in a world, or for as many dimensions."""
+        """Return the present position (dim,) [m] and rotation matrix; outside of a world, for `dim` dimensions."""
         position, rotation = np.asarray(self.position), self.rotation
         if self.scene is not None:
             position, rotation = self.dev.pose.position.now, self.dev.pose.rotation.now
         return position, rotation_matrix(rotation) if np.any(rotation) else np.eye(dim)
 
     def host_shape(self, dim: int) -> HostShape:
-        """Its shape in its own frame; for as many dimensions where it is not in a world."""
+        """Return the shape in its own frame; outside of a world, for `dim` dimensions."""
         raise NotImplementedError
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """That of the shape, less what it is thickened by."""
+        """Return the clearance of the shape, less `radius`."""
         position, turn = self.frame(points.shape[1])
         return self.host_shape(points.shape[1]).clearance((points - position) @ turn) - self.radius
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """In the frame of the shape."""
+        """Return the lengths and normals of the shape, cast in its frame."""
         position, turn = self.frame(origin.shape[1])
         shape = self.host_shape(origin.shape[1])
         distance, normal = shape.cast((origin - position) @ turn, direction @ turn, self.radius + radius)
@@ -111,14 +111,15 @@ class Moving(Collider):
 
     @ti.func
     def pose(self, frame_fraction):
-        """Where the wall is in a substep."""
+        """Compute the pose of the wall in a substep."""
         self.dev.pose.update(frame_fraction)
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, turn):
-        """Touch by touch along the way.
+        """Follow the displacement of particle i, and correct touch by touch.
 
-        The wall moves by what its point under the start of the particle moves, so what sticks rides along and does not creep.
+        The wall moves by the motion of its point under the start of the particle, so a sticking particle rides along and does not
+        creep.
         """
         start, contact_distance = self.dev.state.inside(self.dev.state.begin(i)), radius + ti.cast(self.radius, self.dev.real)
         first = self.dev.pose.inward(0, start - self.dev.pose.place[0])
@@ -126,7 +127,7 @@ class Moving(Collider):
         e = self.dev.pose.inward(1, self.dev.state.d[i] - moved)
         close, lifted = ti.max(self.dev.state.digits(i), self.dev.shape.rounding(first)), False
         if ti.static(self.dev.state.befores):
-            # What has bounced in this substep is not where its displacement says.
+            # A particle that bounced in this substep is not where its displacement says.
             high, lift = self.dev.surface.bounced(i)
             lifted = high
             if high:
@@ -155,7 +156,7 @@ class Moving(Collider):
                 if going and self.dev.shape.astray(a, contact_distance, close):
                     a = first
         if going:
-            # There with no more speed than it had.
+            # It stays there, with no more speed than it had.
             gone = self.dev.pose.outward(1, a - first)
             d = self.dev.state.d[i]
             size, speed = gone.norm(), (d - moved).norm()

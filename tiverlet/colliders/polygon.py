@@ -16,13 +16,13 @@ class Polygon(Moving):
 
     C(x) = dist(x, outline) - (R + r) >= 0, grad C the direction from the nearest point of the outline (see FacetShape).
 
-    vertices: (m, 2) [m], in order, either way round; concave outlines are fine. inside: keep particles in. closed: False for a
-    line from the first vertex to the last, a thin wall with two sides. radius: R [m], what the outline is thickened by; a line
-    that points (particles of radius 0) meet needs some. position, rotation: where the vertices are put (see Moving); live.
+    vertices: (m, 2) [m], in order, either way round; outlines may be concave. inside: keep particles in. closed: False for a
+    line from the first vertex to the last, a thin wall with two sides. radius: R [m], by which the outline is thickened; it must
+    be above 0 for a line and points (particles of radius 0). position, rotation: pose of the vertices (see Moving); live.
     friction, restitution, push_out, active, events, one_way: see Collider.
 
     Nothing passes, at any speed of the particle or of the wall. Raises ValueError for edges of no length, and for a closed
-    outline that has no area or meets itself.
+    outline that has no area or intersects itself.
     """
 
     dim = 2
@@ -38,7 +38,7 @@ class Polygon(Moving):
         if self.inside and not self.closed:
             raise ValueError("Polygon: inside = True needs an inside; an open line (closed = False) has none.")
         if self.closed and len(vertices) > 1 and (vertices[0] == vertices[-1]).all():
-            vertices = vertices[:-1]  # written as a loop that ends where it began
+            vertices = vertices[:-1]  # a loop whose last vertex repeats the first
         if len(vertices) < (3 if self.closed else 2):
             raise ValueError(f"Polygon: vertices has shape {vertices.shape}, but at least {3 if self.closed else 2} are needed.")
         m = len(vertices) if self.closed else len(vertices) - 1
@@ -73,7 +73,7 @@ class Polygon(Moving):
         self.facets = Facets(vertices[features], features, wings, facing, self.closed, self.inside)
 
     def host_shape(self, dim: int) -> HostShape:
-        """Its facets."""
+        """Return the facets."""
         return self.facets
 
     @property
@@ -82,13 +82,13 @@ class Polygon(Moving):
         return self.facets.normals
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
-        """The polygon."""
+        """Return the polygon."""
         loop = np.concatenate([self.vertices, self.vertices[:1]]) if self.closed else self.vertices
         return self.placed(loop)[None], self.radius
 
 
 def _check_simple(vertices: np.ndarray, i: np.ndarray, j: np.ndarray) -> None:
-    """Raise for the first two edges that cross or touch, other than neighbours where they join."""
+    """Raise ValueError for the first two edges that cross or touch, other than neighbours at their joint."""
     a, b, m = vertices[i], vertices[j], len(vertices)
     low, high = np.minimum(a, b), np.maximum(a, b)
     order = np.argsort(low[:, 0], kind="stable")
@@ -103,7 +103,7 @@ def _check_simple(vertices: np.ndarray, i: np.ndarray, j: np.ndarray) -> None:
         p, q = p[near], q[near]
         wrong = _meet(a[p], b[p], a[q], b[q])
         joined = (q - p == 1) | ((p == 0) & (q == m - 1))
-        # Neighbours meet in their joint, and only there unless one folds back onto the other.
+        # Neighbours meet at their joint, and nowhere else unless one folds back onto the other.
         shared = np.where((q - p == 1)[:, None], a[q], a[p])
         one, two = np.where((shared == a[p]).all(1)[:, None], b[p], a[p]), np.where((shared == a[q]).all(1)[:, None], b[q], a[q])
         u, v = one - shared, two - shared
@@ -123,5 +123,5 @@ def _meet(a, b, c, d) -> np.ndarray:
     """Whether segments a-b and c-d have a point in common."""
     s, t = np.sign(_cross(b - a, c - a)), np.sign(_cross(b - a, d - a))
     u, v = np.sign(_cross(d - c, a - c)), np.sign(_cross(d - c, b - c))
-    flat = (s == 0) & (t == 0)  # all four on one line: then their boxes, which overlap, tell
+    flat = (s == 0) & (t == 0)  # all four points on one line: the segments meet, since their boxes overlap
     return ((s != t) & (u != v)) | flat

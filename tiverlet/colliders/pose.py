@@ -1,4 +1,4 @@
-"""Where the frame of a moving collider is, and how it moves in a substep."""
+"""The pose of a moving collider's frame, and its motion in a substep."""
 
 import numpy as np
 
@@ -9,11 +9,11 @@ from .track import Track
 
 
 class Pose:
-    """A point p of the collider's own frame is at position + R p in the world; R p is kept for the substep that is under way.
+    """The pose of a frame: a point p of it is at position + R p in the world. R is computed once for each substep.
 
-    position: (dim,) [m]; rotation: an angle (2D) or a rotation vector (3D) [rad]: where the first frame starts. turns: whether
-    somebody asks for `spin`, the angle or rotation vector of a substep [rad]; about another axis than before to first order.
-    in_state: what it has in the exact state, by name.
+    position: (dim,) [m]; rotation: an angle (2D) or a rotation vector (3D) [rad], at the start of the first frame. turns: whether
+    `spin` is needed, the angle or rotation vector of a substep [rad]; it is first order where the axis changes. in_state: its
+    fields in the exact state, by name.
     """
 
     def __init__(self, scene: Scene, name: str, position: np.ndarray, rotation, turns: bool):
@@ -29,7 +29,7 @@ class Pose:
         self.in_state = {"position": self.position.ends, "rotation": self.rotation.ends}
 
     def aim(self, position: np.ndarray, rotation) -> None:
-        """Go there during the next frame."""
+        """Move to this pose during the next frame."""
         self.position.aim(position)
         self.rotation.aim(np.atleast_1d(rotation))
 
@@ -40,7 +40,7 @@ class Pose:
 
     @ti.func
     def update(self, frame_fraction):
-        """Work out where it is at the start and the end of a substep, and how it moves in between, by differences in f64."""
+        """Compute the pose at the start and the end of a substep, and its change by differences in f64."""
         before = ti.Matrix.zero(ti.f64, self.dim, self.dim)
         for k in range(2):
             turn = self.matrix(self.rotation.at(ti.cast(ti.select(k == 0, frame_fraction[0], frame_fraction[1]), ti.f64)))
@@ -55,7 +55,7 @@ class Pose:
 
     @ti.func
     def matrix(self, rotation):
-        """R of an angle or a rotation vector (Rodrigues); exactly 1 at 0."""
+        """Return R of an angle or a rotation vector (Rodrigues); exactly 1 at 0."""
         angle, out = rotation.norm(), ti.Matrix.identity(ti.f64, self.dim)
         if angle > 0:
             if ti.static(self.dim == 2):
@@ -74,7 +74,7 @@ class Pose:
 
     @ti.func
     def inward(self, k: ti.template(), v):  # type: ignore[valid-type]
-        """R^T v: a vector of the world in the wall's frame, at the start (k = 0) or the end (1) of the substep."""
+        """Return R^T v: a vector of the world in the wall's frame, at the start (k = 0) or the end (1) of the substep."""
         out = 0 * v
         for a in ti.static(range(self.dim)):
             out += self.turn[k * self.dim + a] * v[a]
@@ -82,7 +82,7 @@ class Pose:
 
     @ti.func
     def outward(self, k: ti.template(), v):  # type: ignore[valid-type]
-        """R v, or with k = 2 how R v changes in the substep."""
+        """Return R v, or with k = 2 the change of R v in the substep."""
         out = 0 * v
         for a in ti.static(range(self.dim)):
             out[a] = self.turn[k * self.dim + a].dot(v)
@@ -90,7 +90,7 @@ class Pose:
 
 
 def rotation_matrix(rotation) -> np.ndarray:
-    """R of an angle (2D) or a rotation vector (3D)."""
+    """Return R of an angle (2D) or a rotation vector (3D)."""
     w = np.atleast_1d(np.asarray(rotation, dtype=np.float64))
     if len(w) == 1:
         return np.array([[np.cos(w[0]), -np.sin(w[0])], [np.sin(w[0]), np.cos(w[0])]])

@@ -6,7 +6,7 @@ AROUND, ALONG = 32, 8  # corners of a circle, and steps from the pole to the equ
 
 
 def rounded(a: np.ndarray, b: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """The points within `radius` of the line from a to b: vertices (v, 3) and triangles (t, 3). A ball where a is b."""
+    """Return the surface at `radius` from the line from a to b: vertices (v, 3) and triangles (t, 3). A ball where a is b."""
     axis = np.asarray(b, dtype=np.float64) - a
     length = float(np.linalg.norm(axis))
     up = axis / length if length else np.array([0.0, 1.0, 0.0])

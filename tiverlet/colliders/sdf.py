@@ -17,27 +17,27 @@ from .pose import rotation_matrix
 from .shape import HostShape, Shape
 from .surface import ALONG, NEAR
 
-FINE = NEAR  # of a way: closer than that, the surface is taken for its tangent plane
-MARCH = 64  # steps along a way, which are no shorter than FINE of it
-SAMPLES = 4096  # places where the function is looked at before it is used
+FINE = NEAR  # of a displacement: closer than that, the tangent plane replaces the surface
+MARCH = 64  # steps along a displacement, each at least FINE of it
+SAMPLES = 4096  # places where the function is checked before it is used
 CAST = 1 << 14  # steps along a ray; one that grazes a plane at less than 1e-3 may miss it
-STRIDE = 2.0**-16  # of the size of the scene: the shortest step of a ray; nothing that is as thin is seen from its side
+STRIDE = 2.0**-16  # of the size of the scene: the shortest step of a ray; thinner objects may be missed from their side
 SKIN = 2.0**-40  # of the size of the scene: rays that start no deeper than that are outside
-AWAY = 1e16  # [m] where no particle can be
+AWAY = 1e16  # [m] beyond any particle
 SLOPE = 1e-6  # of the largest coordinate: the step of differences at a surface
-LEAST = 0.5  # gradient that is counted upon near a surface
-STEEP, FLAT = 1.1, 0.9  # bounds of the gradient that pass for 1
+LEAST = 0.5  # the least gradient that is assumed near a surface
+STEEP, FLAT = 1.1, 0.9  # bounds of a gradient that counts as 1
 
 
 class Sdf(Moving):
-    """Particles stay where a function is positive: outside of any shape that can be written down.
+    """Particles stay where a function is positive: outside of any shape that a formula describes.
 
     C(x) = function(x) - (R + r) >= 0, grad C = grad function.
 
     function: a ti.func that takes a position [m] and returns the signed distance to the surface [m], negative inside of the
     solid. Its literals have the world's precision. gradient: a ti.func of the position that returns the gradient; None for
-    central differences. radius: R [m], what the shape is thickened by. position, rotation: where the shape is put (see Moving);
-    live. friction, restitution, push_out, active, events: see Collider.
+    central differences. radius: R [m], by which the shape is thickened. position, rotation: pose of the shape (see Moving); live.
+    friction, restitution, push_out, active, events: see Collider.
 
         @ti.func
         def torus(p):
@@ -45,11 +45,12 @@ class Sdf(Moving):
 
         world = tv.World(particles, [tv.Sdf(torus)])
 
-    The way of a particle is followed by steps as long as the function says, never shorter than 1/64 of it (sphere tracing, Hart
-    1996): nothing passes that is thicker than that with the particle's diameter added. A function that changes faster than
-    distance would break this, and one that changes more slowly at the surface would keep particles too far away: the gradient is
-    checked where particles start and around, and ValueError names the place. What slides in a hollow is second order in the
-    substep, as in a Ball, and keeps its energy; on a hump, or with restitution, it is first order and loses some.
+    The path of a particle is followed by steps as long as the value of the function, never shorter than 1/64 of the path (sphere
+    tracing, Hart 1996). No particle passes a wall that, with the particle's diameter added, is thicker than that step. A function
+    that changes faster than distance would break this. One that changes more slowly at the surface would keep particles too far
+    away. So the gradient is checked where particles start and around, and ValueError names the place. A particle that slides in a
+    hollow is second order in the substep, as in a Ball, and conserves energy; on a hump, or with restitution, it is first order
+    and loses some.
     """
 
     def __init__(
@@ -64,18 +65,18 @@ class Sdf(Moving):
         self.surface(friction, restitution, push_out, active, events)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check the dimension, and refuse a function that is not finite, or not a distance, around the particles."""
-        vars(self.dev).pop("probe", None)  # it may be of an earlier start of Taichi
+        """Check the dimension, and that the function is finite and a distance around the particles."""
+        vars(self.dev).pop("probe", None)  # it may belong to an earlier start of Taichi
         Moving.prepare(self, particles, inv_mass)
         self._try_around(particles)
 
     def check_added(self, particles: Particles, first: int) -> None:
-        """The same around particles that come in place; else prepare() has done it."""
+        """Check the function around particles that are added in place; otherwise prepare() has checked it."""
         if self.scene is not None and first < particles.count:
             self._try_around(particles)
 
     def _try_around(self, particles: Particles) -> None:
-        """Evaluate the function where particles are, and around."""
+        """Evaluate and check the function at the particles and around them."""
         x = particles.position
         if not len(x):
             return
@@ -111,7 +112,7 @@ class Sdf(Moving):
                 )
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
-        """Where the surface meets the plane of a 2D scene, or the three planes through the middle of a 3D one."""
+        """Return where the surface meets the plane of a 2D scene, or the three planes through the middle of a 3D scene."""
         middle, half = (low + high) / 2, float((high - low).max()) * 0.6 or 1.0
         line = np.linspace(-half, half, 129)
         out = []
@@ -125,7 +126,7 @@ class Sdf(Moving):
         return np.concatenate(out), 0.0
 
     def host_shape(self, dim: int) -> HostShape:
-        """The function; outside of any world, too, for as many dimensions as it is asked about."""
+        """Return the function as a shape in `dim` dimensions; it also works outside of a world."""
         if "probe" not in vars(self.dev) or self.dev.probe.dim != dim:
             runtime.ensure_started()
             self.dev.probe = _Probe(self, dim)
@@ -146,17 +147,17 @@ class FunctionShape(Shape):
 
     @ti.func
     def astray(self, q, contact_distance, close):
-        """By more than rounding."""
+        """Whether the function at q is below contact_distance by more than rounding."""
         return self.function(q) < contact_distance - close
 
     @ti.func
     def rounding(self, q):
-        """That of a function that is made of coordinates as large as those of q."""
+        """Return the rounding of a function of coordinates as large as those of q."""
         return q.norm() * ti.cast(self.digits, self.real)
 
     @ti.func
     def normal(self, q, contact_distance):
-        """The direction of the gradient, +x where there is none, and its size."""
+        """Return the direction of the gradient, +x where the gradient is 0, and its size."""
         g = self.slope(q, contact_distance)
         size, n = g.norm(), 0 * q
         n[0] = 1
@@ -166,8 +167,10 @@ class FunctionShape(Shape):
 
     @ti.func
     def slope(self, q, contact_distance):
-        """The gradient, the user's or by central differences; these know of what touches at `contact_distance` and of where it
-        is, and of nothing else in the scene."""
+        """Return the gradient, from the user's function or by central differences.
+
+        The step of differences depends only on q and `contact_distance`, not on other parts of the scene.
+        """
         out = 0 * q
         if ti.static(bool(self.gradient)):
             out = self.gradient(q)
@@ -187,12 +190,15 @@ class FunctionShape(Shape):
 
     @ti.func
     def difference(self, q, contact_distance):
-        """The step of central differences [m]."""
+        """Return the step of central differences [m]."""
         return ti.max(contact_distance, q.norm() / 100) * ti.cast(self.step, self.real)
 
     @ti.func
     def blur(self, q, contact_distance):
-        """Angle by which rounding may turn the gradient [rad]: to hold anything more exactly above a plane would never end."""
+        """Return the angle by which rounding may turn the gradient [rad].
+
+        To hold a particle above a plane more exactly would take endless corrections.
+        """
         out = ti.cast(self.slight, self.real)
         if ti.static(not self.gradient):
             out += self.rounding(q) / ti.max(self.difference(q, contact_distance), self.rounding(q))
@@ -200,12 +206,13 @@ class FunctionShape(Shape):
 
     @ti.func
     def strike(self, a, e, contact_distance, close, limit):
-        """The first touch on the way.
+        """Find the first touch on the way from a to a + e, see Shape.strike().
 
-        What starts close to the surface is first held above the tangent plane there. If nothing bounces, the end of its way on
-        that plane is looked at, too: in a hollow it is inside, and is pushed on along the same normal, as by SHAKE, which is of
-        second order. Then the way is followed at FINE * 4 of its length above the plane, so that steps do not shrink to nothing;
-        at last its end is looked at. Such a touch is at the start: a place on the way below could be behind a thin wall.
+        A particle that starts close to the surface is first held above the tangent plane there. If nothing bounces, the end of
+        its way on that plane is tested, too. In a hollow the end is inside the surface, and is pushed on along the same normal,
+        as by SHAKE, which is second order. Then the way is followed at a height of 4 FINE of its length above the plane, so that
+        steps do not shrink to nothing. At last the end is tested. A touch found there counts as at the start, since a later place
+        on the way could be behind a thin wall.
         """
         way = e.norm()
         best, depth, normal, first = 0 * contact_distance + 2, 0 * contact_distance, 0 * e, 0 * e
@@ -250,7 +257,7 @@ class FunctionShape(Shape):
                                     depth += more / along
                             else:
                                 best, depth, normal = 0 * contact_distance, more, n
-                                # What is left of such a push, or was too little at the start to be told from rounding.
+                                # The rest of such a push, or one that rounding hid at the start.
                                 if along > ALONG and (rise < blur or more < rise * FINE):
                                     depth, normal = more / along, first
                     else:
@@ -265,7 +272,7 @@ class FunctionShape(Shape):
 
 @ti.data_oriented
 class _Probe:
-    """The function at many places, in Python and f64."""
+    """The function at many points, evaluated from Python in f64."""
 
     def __init__(self, wall: Sdf, dim: int):
         self.compiler = Compiler(ti.f64)
@@ -273,22 +280,24 @@ class _Probe:
         self.dim = dim
 
     def check(self, who: str, particles: Particles, radius: float) -> None:
-        """All can meet it; Sdf.prepare() looks at the function around them."""
+        """Accept all particles; Sdf.prepare() checks the function around them."""
 
     def on_device(self, scene: Scene, who: str, radius: float) -> FunctionShape:
-        """The function in kernels."""
+        """Return the function for kernels."""
         return FunctionShape(self.wall.function, self.wall.gradient, scene, self.dim)
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """The function at points (n, dim) of the wall's frame, (n,)."""
+        """Return the function at points (n, dim) of the wall's frame, (n,)."""
         out = np.zeros(len(points))
         with self.compiler():
             self._value(np.ascontiguousarray(points, dtype=np.float64), out)
         return out
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """How far rays go until the function falls to `radius` from above, (n,) [m], inf where it does not in CAST steps of
-        sphere tracing, and its gradients there as normals, (n, dim)."""
+        """Return how far rays go until the function falls to `radius` from above, and its gradients there as normals, (n, dim).
+
+        The lengths (n,) [m] are inf where the function does not fall to it in CAST steps of sphere tracing.
+        """
         distance, normal = np.zeros(len(origin)), np.full(origin.shape, np.nan)
         with self.compiler():
             self._cast(np.ascontiguousarray(origin), np.ascontiguousarray(direction), radius, distance)
@@ -301,13 +310,13 @@ class _Probe:
         return distance, normal
 
     def slope(self, points: np.ndarray, step: float) -> np.ndarray:
-        """Its central differences, (n, dim)."""
+        """Return central differences of the function, (n, dim)."""
         moves = np.concatenate([np.eye(self.dim), -np.eye(self.dim)]) * step
         ahead, behind = np.split(self.clearance((points + moves[:, None]).reshape(-1, self.dim)).reshape(2 * self.dim, -1), 2)
         return (ahead - behind).T / (2 * step)
 
     def gradient(self, points: np.ndarray) -> np.ndarray:
-        """The user's gradient, (n, dim)."""
+        """Return the user's gradient, (n, dim)."""
         out = np.zeros(points.shape)
         with self.compiler():
             self._gradient(np.ascontiguousarray(points, dtype=np.float64), out)
@@ -327,8 +336,10 @@ class _Probe:
         self, points: ti.types.ndarray(ti.f64, 2), direction: ti.types.ndarray(ti.f64, 2), radius: ti.f64,
         out: ti.types.ndarray(ti.f64, 1),
     ):  # type: ignore[valid-type]  # fmt: skip
-        """Steps as long as there is nothing for certain (Hart 1996), out of the solid first where a ray starts in it; then the
-        step in which the surface was passed is halved until nothing is left of it."""
+        """Trace rays by steps as long as the function guarantees to be free (Hart 1996).
+
+        A ray that starts in the solid first leaves it. The step that passes the surface is bisected to the last digit.
+        """
         for i in range(points.shape[0]):
             o, d = self._point(points, i), self._point(direction, i)
             size = ti.abs(o).max()  # type: ignore[reportOptionalCall]
@@ -370,7 +381,7 @@ class _Probe:
 
 
 def contour(grid: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Segments (m, 2, dim) of the line value = 0 on a grid of places (r, c, dim): in each half of a cell, at most one."""
+    """Return segments (m, 2, dim) of the line value = 0 on a grid of points (r, c, dim): at most one in each half of a cell."""
     low, high = slice(0, -1), slice(1, None)
     corners = [(low, low), (high, low), (high, high), (low, high)]
     out = []
@@ -390,7 +401,7 @@ def contour(grid: np.ndarray, value: np.ndarray) -> np.ndarray:
 
 
 def _taken(name: str, function):
-    """A ti.func of one argument."""
+    """Check that a function is a ti.func of one argument, and return it."""
     if not is_kernel_function(function):
         raise TypeError(
             f"Sdf: {name} = {function!r} is not a Taichi function. Put the decorator @ti.func above its def "

@@ -1,4 +1,4 @@
-"""What happens to a particle that is inside of a collider: it is taken out, with friction and restitution."""
+"""The response of a wall to a particle inside of it: the particle is moved out, with friction and restitution."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -10,21 +10,22 @@ if TYPE_CHECKING:
     from ..features.material import Bounce, Coefficients
     from .wall_log import WallLog
 
-# How a collider confines: as it comes; only what is further out than rounding; of that, without friction and bounces.
+# How a collider confines. FIRST: at any depth. AGAIN: only deeper than rounding. GENTLY: as AGAIN, without friction and bounces.
+# AHEAD: before contacts are solved, as AGAIN, without friction; particles that would bounce stay.
 FIRST, AGAIN, GENTLY, AHEAD = range(4)
-TOUCH = 2.0**-20  # of the size of a wall: a start that is no deeper inside than this counts as on the surface
-SLOW = 8.0  # what a linked particle comes nearer by before forces and links of a substep add to it, times that, does not bounce
-NEAR = 1 / 64  # of its way: what starts no further from a surface than that lies on it, and may slide along
-ALONG = 0.9  # cosine of the angle by which a surface turns along a way on it, at most, for that to be a slide: 26 degrees
-ON = 1e-3  # of its distance from the middle of a wall: what is no deeper inside than this lies on it
+TOUCH = 2.0**-20  # of the size of a wall: a start no deeper inside than this counts as on the surface
+SLOW = 8.0  # a linked particle does not bounce if it approaches by less than this times what forces and links of a substep add
+NEAR = 1 / 64  # of its displacement: a particle that starts closer to a surface than this lies on it, and may slide along it
+ALONG = 0.9  # cosine of the largest angle by which a surface turns along a displacement that counts as a slide: 26 degrees
+ON = 1e-3  # of its distance from the middle of a wall: a particle no deeper inside than this lies on the wall
 
 
 class Surface:
-    """How the surface of one collider answers on the device: friction, restitution, push_out; see Collider for what they mean.
+    """The response of the surface of one collider on the device: friction, restitution, push_out; Collider defines them.
 
-    friction: coefficients, or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s]. active: whether
-    it is there, or None for one without a switch. turns: whether it resists rolling, or bounces across the normal. poses: of a
-    wall that may turn, its Pose; else none. log: of what touches, or None. one_way: unit vector along which it lets particles
+    friction: coefficients, or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s]. active: whether the wall
+    is present, or None for a wall without a switch. turns: whether it resists rolling, or bounces across the normal. poses: the
+    Pose of a wall that may turn; else none. log: of events, or None. one_way: unit vector along which the wall lets particles
     pass, or None.
     """
 
@@ -37,7 +38,7 @@ class Surface:
         self._memory, self.state, self.push_out, self.real = scene.memory, scene.state, push_out, scene.real
         self.has_friction, self.has_restitution = friction is not None, restitution is not None
         self.impacts: Any = scene.impacts
-        # What spins and rubs bounces alone, for passes do not turn it.
+        # A particle with spin and friction bounces alone, since the extra passes do not change its spin.
         self.has_impacts = self.has_restitution and scene.impacts is not None and not (scene.state.spins and friction)
         self.log_number = self.impacts.enter(log) if self.has_impacts else -1
         self.poses: list[Any] = []
@@ -59,7 +60,7 @@ class Surface:
             self.active = scene.memory.field(f"{name}.active", None, kind=ti.i32, values=float(active or 0))
 
     def upload(self, friction: "Coefficients", restitution: "Bounce", active: bool) -> None:
-        """Write these to the device, as far as kernels read them."""
+        """Write these values to the device, as far as kernels read them."""
         if self.has_friction:
             self._memory.write(self.friction, friction[:2])
         if self.has_restitution:
@@ -71,22 +72,22 @@ class Surface:
 
     @property
     def stands(self) -> bool:
-        """Whether it is there, as the last frame had it."""
+        """Whether the wall was present in the last frame."""
         return not self.has_switch or bool(self._memory.read(self.active))
 
     @inline
     def static(self):
-        """The coefficient of static friction."""
+        """Return the coefficient of static friction."""
         return at(at(self.friction, None), 0)
 
     @inline
     def dynamic(self):
-        """The coefficient of dynamic friction."""
+        """Return the coefficient of dynamic friction."""
         return at(at(self.friction, None), 1)
 
     @ti.func
     def bounced(self, i):
-        """Whether particle i is not where its displacement says, because it has bounced in this substep; and by how much."""
+        """Whether particle i is not where its displacement says, because it bounced in this substep; and the offset [m]."""
         lift = 0 * self.state.d[i]
         if ti.static(self.state.befores):
             lift = self.state.place(i) - self.state.begin(i) - self.state.d[i]
@@ -94,7 +95,7 @@ class Surface:
 
     @ti.func
     def path(self, i, moved):
-        """From where particle i was at the start of the substep to where it is, as seen from a wall that moved by `moved`."""
+        """Return the path of particle i since the start of the substep, relative to a wall that moved by `moved`."""
         out = self.state.d[i] - moved
         if ti.static(self.state.befores):
             high, lift = self.bounced(i)
@@ -104,10 +105,11 @@ class Surface:
 
     @ti.func
     def lets_through(self, i, n, start_depth, contact_distance):
-        """Whether particle i passes: it touches with a normal n that is not towards the side of the wall on which it is held, or
-        it is on its way, that is, further inside at the start of the substep than what lies there.
+        """Whether particle i passes a one-way wall.
 
-        n: in the frame in which one_way is given. contact_distance: of its center from what the wall is made of [m].
+        It passes if its normal n does not point to the side on which particles are held. It also passes if it is on its way
+        through, that is, if it was further inside at the start of the substep than a particle that lies on the wall.
+        n: in the frame in which one_way is given. contact_distance: of its center from the middle of the wall [m].
         """
         out = False
         if ti.static(self.is_one_way):
@@ -117,18 +119,18 @@ class Surface:
 
     @ti.func
     def press(self, i, depth, start_depth, n, moved, h, turn):
-        """As push(), of what does not slide along a curved surface."""
+        """Push particle i out as push() does, where it does not slide along a curved surface."""
         return self.push(i, depth, start_depth, n, moved, h, turn, False)
 
     @ti.func
     def push(self, i, depth, start_depth, n, moved, h, turn, slides):
-        """Take particle i out of a wall that it entered by `depth` [m], along the normal n; the wall itself moved by `moved`.
+        """Move particle i out of a wall that it entered by `depth` [m], along the normal n; the wall itself moved by `moved`.
 
-        start_depth: how deep it was at the start of the substep, 0 or less outside [m]. turn: FIRST, AGAIN, GENTLY or AHEAD.
-        slides: whether n is the normal at the start of its way along a surface that rises; it goes with its position then, for
-        walls that follow displacements would be passed otherwise.
-        What comes as close as the last digits of the position can tell touches: it does not sink, or slip, by these digits.
-        Returns how the position was shifted.
+        start_depth: depth at the start of the substep, 0 or less outside [m]. turn: FIRST, AGAIN, GENTLY or AHEAD.
+        slides: whether n is the normal at the start of a displacement along a curved surface. The displacement then changes as
+        much as the position; otherwise the particle would pass walls that follow displacements.
+        A particle within rounding of the surface touches it, so that it does not sink, or slip, by the last digits of its
+        position. Returns the shift of the position.
         """
         d = self.state.d[i] - moved
         shift = 0 * d
@@ -141,13 +143,13 @@ class Surface:
                 depth = ti.min(depth, 0)
         if depth > ti.select(turn == FIRST, 0, close):
             move = ti.max(depth - ti.max(start_depth - self.push_out * h, 0), 0)
-            # Normal displacement after the substep; what has bounced may be moved further than that is to tell.
+            # Normal displacement after the substep. A particle that bounced may be moved further than its displacement changes.
             after = leaving + move
             if not slides:
                 after = ti.min(after, ti.max(ti.abs(leaving), self.push_out * h))
             rise, left = 0 * depth, 1 + 0 * depth
             if ti.static(self.has_restitution):
-                # Where the last bounce has put it back on a straight way, that way began at a height of `gap`.
+                # After an earlier bounce in this substep, the straight path to the present position begins at the height `gap`.
                 gap = -depth - leaving
                 if gap >= 0 and leaving < 0 and turn != GENTLY:
                     before = (self.state.before[i] - moved).dot(n)
@@ -157,7 +159,7 @@ class Surface:
                             move, after = 0 * depth, leaving
                     else:
                         rise, after, left = self.bounce(gap, leaving, before, after)
-                if turn == AHEAD and rise > 0:  # what bounces in this substep does not lean on the wall
+                if turn == AHEAD and rise > 0:  # a particle that bounces in this substep is not supported by the wall
                     move, rise, after = 0 * depth, 0 * depth, leaving
             if ti.static(self.has_log):
                 if turn != AHEAD:
@@ -187,7 +189,7 @@ class Surface:
                     shift -= slip
             self.state.d[i] = self.state.d[i] + change
             if ti.static(self.state.befores):
-                impact = change  # which is no acceleration
+                impact = change  # an impact is no acceleration
                 if rise == 0:
                     impact -= (after - leaving) * n
                 self.state.before[i] = self.state.before[i] + impact
@@ -208,8 +210,10 @@ class Surface:
 
     @ti.func
     def left_to_passes(self, i, n, moved, target, bounces, turn):
-        """Whether particle i, which is linked, is left where it is for now: if it bounces, passes to come take it to the normal
-        displacement `target`."""
+        """Whether linked particle i is left where it is in this pass.
+
+        If it bounces, later passes give it the normal displacement `target`.
+        """
         out = False
         if ti.static(self.has_impacts):
             static = dynamic = 0 * target
@@ -225,11 +229,12 @@ class Surface:
 
     @ti.func
     def grip(self, i, n, across, support, bounces):
-        """What friction takes of the displacement `across` the normal of a particle that spins, for a normal displacement
-        `support`; its spin changes. And whether it stays where it is: it neither slides nor rolls.
+        """Return what friction removes from the displacement `across` the normal of a spinning particle, and whether it rests.
 
-        Of the point that touches, d - s x n is taken back. Where the wall resists rolling, by up to a moment of rolling r N, both
-        are solved for together: what sticks stops, as long as that moment holds it; what rolls on does so against it.
+        A particle rests where it neither slides nor rolls. support: the normal displacement from the wall. The spin is updated.
+        The displacement of the contact point, d - s x n, is removed. Where the wall resists rolling, by up to a moment of rolling
+        r N, both are solved for together. A particle that sticks stops as long as that moment holds it; one that rolls on does so
+        against it.
         """
         k, s = self.spin.share.of(i), self.spin.s[i]
         most, least = self.static() * support, self.dynamic() * support
@@ -261,7 +266,7 @@ class Surface:
 
     @ti.func
     def wall_turn(self, i):
-        """How far the surface of particle i would turn if it turned with the wall [m]."""
+        """Return how far the surface of particle i would turn if it turned with the wall [m]."""
         out = 0 * self.spin.s[i]
         for pose in ti.static(self.poses):
             out = self.radius.of(i) * pose.spin[None]
@@ -269,9 +274,10 @@ class Surface:
 
     @ti.func
     def bounce(self, gap, leaving, before, after):
-        """What is above the wall at the end of the substep, the normal displacement that carries the velocity then, and which
-        part of the substep is left after the impact: all of it where there is no bounce.
+        """Return the height above the wall after a bounce, the normal displacement then, and the rest of the substep.
 
+        The normal displacement is the one with the velocity at the end of the substep. The rest is the part after the impact: all
+        of the substep where there is no bounce.
         In units of the substep, the height is gap + v s + k s^2 / 2, with k the acceleration and v = leaving - k / 2; the impact
         is at its root s. A bounce that would end below the wall has come to rest.
         """

@@ -1,4 +1,4 @@
-"""A point that goes where it is sent during a frame."""
+"""A point that moves to a given place during a frame."""
 
 import numpy as np
 
@@ -7,9 +7,9 @@ from ..device.memory import Memory
 
 
 class Track:
-    """A point of a wall that goes where it is sent during a frame, in a straight line.
+    """A point of a wall that moves to a given place during a frame, in a straight line.
 
-    in_state: what it has in the exact state, by name.
+    in_state: its fields in the exact state, by name.
     """
 
     def __init__(self, memory: Memory, name: str, value: np.ndarray, kind=None):
@@ -18,7 +18,7 @@ class Track:
         self.in_state = {"ends": self.ends}
 
     def aim(self, value: np.ndarray) -> None:
-        """Go to `value` during the next frame."""
+        """Move to `value` during the next frame."""
         self._memory.write(self.ends, [self._memory.read(self.ends)[1], value])
 
     def end_motion(self) -> None:
@@ -27,16 +27,16 @@ class Track:
 
     @property
     def now(self) -> np.ndarray:
-        """Where the last frame ended, (dim,)."""
+        """The place where the last frame ended, (dim,)."""
         return self._memory.read(self.ends)[1].astype(np.float64)
 
     @ti.func
     def at(self, frame_fraction):
-        """Where it is at this fraction of the frame; what stands is where it stands, to the bit."""
+        """Return the place at this fraction of the frame; a resting point keeps its place bit for bit."""
         a, b = self.ends[0], self.ends[1]
         return ti.select(a == b, a, a * (1 - frame_fraction) + b * frame_fraction)
 
     @ti.func
     def step(self, frame_fraction):
-        """How far it goes in a substep."""
+        """Return the motion in a substep."""
         return (self.ends[1] - self.ends[0]) * (frame_fraction[1] - frame_fraction[0])

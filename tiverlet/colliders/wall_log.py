@@ -10,16 +10,16 @@ from ..device import ti
 if TYPE_CHECKING:
     from ..features.feature import Scene
 
-ASIDE = 1e-6  # of an impulse: it is longer by more than that than along the first normal where others gave to it, too
+ASIDE = 1e-6  # of an impulse: if it is longer by more than that than its part along the first normal, several normals contributed
 
 
 class WallLog:
     """A row for each particle, written where the wall presses it, see Surface.press().
 
-    touching: whether it was pressed in the last substep of the last frame, all that is carried on between frames. when: the
-    substeps of the frame, from 1 on, in which it was first pressed and pressed last, or BEFORE or NEVER. impulse: what the
-    displacement got along normals [m], of which there are several in corners and in hollows; normal: the first of them. speed:
-    what it came nearer in the substep in which it met the wall [m].
+    touching: whether it was pressed in the last substep of the last frame; only this is kept between frames. when: the substeps
+    of the frame, from 1 on, in which it was first pressed and last pressed, or BEFORE or NEVER. impulse: the sum of the changes
+    of its displacement along normals [m]; there are several normals in corners and in hollows. normal: the first of them. speed:
+    its approach in the substep in which it met the wall [m].
     """
 
     per_particle = True
@@ -30,7 +30,7 @@ class WallLog:
         self.touching = add(f"events.{name}.touching", n, kind=ti.i32, state=True, told=True)
         self.when = add(f"events.{name}.when", n, width=2, kind=ti.i32)
         self.impulse, self.speed = add(f"events.{name}.impulse", n, width=dim), add(f"events.{name}.speed", n)
-        sleeps = bool(scene.state.sleepers)  # where what sleeps touches, nobody finds again
+        sleeps = bool(scene.state.sleepers)  # sleeping particles are not tested again, so their points are state
         self.normal, self.point = (
             add(f"events.{name}.{what}", n, width=dim, state=sleeps, told=sleeps) for what in ("normal", "point")
         )
@@ -39,7 +39,7 @@ class WallLog:
 
     @ti.func
     def open(self, i):
-        """As a frame begins: what particle i has, which touched before or not."""
+        """At the start of a frame: clear the events of particle i. Whether it touched before is kept."""
         began = ti.select(self.touching[i] != 0, BEFORE, NEVER)
         self.when[i] = [began, began]
         self.impulse[i] = ti.zero(self.state.x[i])
@@ -50,14 +50,16 @@ class WallLog:
 
     @ti.func
     def wake(self, i, substep):
-        """Particle i wakes after so many substeps of the frame: it has touched until then what it touched before."""
+        """Particle i wakes after `substep` substeps of the frame: until then it touched if it touched before."""
         if self.when[i][0] == BEFORE:
             self.when[i][1] = substep
 
     @ti.func
     def note(self, i, depth, n, push, approach):
-        """Particle i is `depth` [m] inside of the wall with the normal n, and its displacement gets `push` along it, which was
-        `approach` towards the wall [m]."""
+        """Record that particle i is `depth` [m] inside of the wall with the normal n.
+
+        push: change of its displacement along n [m]. approach: its displacement towards the wall [m].
+        """
         began, last, now = self.when[i][0], self.when[i][1], self.substep[None]
         if last < now - 1:
             self.speed[i] = ti.max(self.speed[i], approach)
@@ -69,27 +71,30 @@ class WallLog:
 
     @ti.func
     def add(self, i, push):
-        """Its displacement gets so much more, a vector."""
+        """Add a vector to the impulse of particle i."""
         self.impulse[i] = self.impulse[i] + push
 
     @ti.func
     def close(self, i):
-        """As a frame ends: keep whether particle i touches; what sleeps touches what it touched."""
+        """At the end of a frame: store whether particle i touches. A sleeping particle touches if it did before."""
         if self.when[i][0] == BEFORE and not self.state.awake(i):
             self.when[i][1] = self.substep[None]
         self.touching[i] = ti.cast(self.when[i][1] == self.substep[None], ti.i32)
 
     @property
     def made(self) -> Any:
-        """The field that is 0 where there are no events to tell of."""
+        """The field that is 0 where there are no events to report."""
         return self.substep
 
     def forget(self) -> None:
-        """No frame was made, for another state than that of one."""
+        """Discard the events: the state does not come from the last frame."""
         self._scene.memory.write(self.made, 0)
 
     def read(self, number: int, h: float, time: float) -> Touches:
-        """What the last frame, of substeps h [s], which ended at `time` [s], came to. number: of the wall in world.features."""
+        """Return the events of the last frame, which ended at `time` [s].
+
+        number: of the wall in world.features. h: length of its substeps [s].
+        """
         memory = self._scene.memory
         substeps, when = int(memory.read(self.substep)[0]), memory.read(self.when)[: self._scene.particles.count]
         some = np.flatnonzero(when[:, 0] != NEVER) if substeps else np.zeros(0, dtype=np.int64)

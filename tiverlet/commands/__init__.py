@@ -1,4 +1,4 @@
-"""Commands of `python -m tiverlet`, one in each file: ABOUT, add(parser) and main(args) -> exit status.
+"""Commands of `python -m tiverlet`, one per file: ABOUT, add(parser) and main(args) -> exit status.
 
-They import what they need when they run, so that --help is quick.
+Commands import packages when they run, so that --help is quick.
 """

@@ -1,4 +1,4 @@
-"""The demos: what each shows, and how to run it, play it or read it."""
+"""List the demos: what each shows, and how to run, play or read it."""
 
 import argparse
 import ast
@@ -8,11 +8,11 @@ ABOUT = "list the demos"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """No arguments."""
+    """Add no arguments."""
 
 
 def main(args: argparse.Namespace) -> int:
-    """A line for each."""
+    """Print one line per demo; return 0."""
     from .run import DEMOS
 
     found = sorted(DEMOS.glob("*.py"))
@@ -24,5 +24,5 @@ def main(args: argparse.Namespace) -> int:
 
 
 def first_sentence(path: pathlib.Path) -> str:
-    """What a script says of itself."""
+    """Return the first paragraph of a script's docstring, on one line."""
     return (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").partition("\n\n")[0].replace("\n", " ")

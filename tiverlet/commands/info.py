@@ -1,4 +1,4 @@
-"""What tiverlet runs on: versions, architectures and cores; for bug reports."""
+"""Print versions, architectures and cores, for bug reports."""
 
 import argparse
 
@@ -6,11 +6,11 @@ ABOUT = "versions, architectures and cores"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """No arguments."""
+    """Add no arguments."""
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print them."""
+    """Print the table; return 0."""
     import platform
     from importlib import metadata
 

@@ -1,4 +1,4 @@
-"""Run a demo or a script at real time in a page of the browser, and take what is in it by hand."""
+"""Run a demo or a script in real time in a browser page, where the mouse can pull its particles."""
 
 import argparse
 import runpy
@@ -8,7 +8,7 @@ ABOUT = "run a demo or script live, and take it by hand"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """The script, and how it is shown."""
+    """Add the script, and options of the page."""
     parser.add_argument("script", help="a .py file with a function play() or build() that returns a world, or the name of a demo")
     parser.add_argument("--record", metavar="FILE.rrd", help="write what happens, the hand included; replays bit for bit")
     parser.add_argument("--port", type=int, default=0, help="default: a free one")
@@ -16,7 +16,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Until interrupted."""
+    """Serve the page until interrupted; return 0."""
     from ..live import play
     from .run import find
 
@@ -27,7 +27,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def built(script: str) -> tuple[Any, Any]:
-    """The world of a script's play() or build(), or its variable `world`; and its function each_frame(world), if it has one."""
+    """Return the world of a script's play() or build(), or its variable `world`; and its function each_frame(world) or None."""
     from ..world import World
 
     found = runpy.run_path(script, run_name="play")

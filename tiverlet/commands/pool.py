@@ -1,4 +1,4 @@
-"""Processes for commands that have much to do."""
+"""A pool of processes for long commands."""
 
 import argparse
 import contextlib
@@ -9,14 +9,14 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 
 
 def add_workers(parser: argparse.ArgumentParser) -> None:
-    """The argument --workers."""
+    """Add the argument --workers."""
     number = max(1, min(8, os.cpu_count() or 1))
     parser.add_argument("--workers", type=int, default=number, metavar="N", help=f"processes (default {number}; 1: none)")
 
 
 @contextlib.contextmanager
 def workers(count: int) -> Iterator[Executor | None]:
-    """A pool of `count` processes, started anew because Taichi does not survive a fork; None for one."""
+    """Yield a pool of `count` processes, or None for one. They are spawned, because Taichi does not survive a fork."""
     if count < 1:
         raise ValueError(f"--workers {count}: at least 1 is needed.")
     if count == 1:

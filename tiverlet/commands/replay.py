@@ -1,4 +1,4 @@
-"""A recording: open it in the viewer, compute it again and compare, take a picture, or write it for other programs."""
+"""Open a recording in the viewer, verify it by computing it again, save a picture, or export it for other programs."""
 
 import argparse
 import os
@@ -10,11 +10,11 @@ from ..device.language import is_kernel_function
 ABOUT = "view, verify, picture or export a recording"
 
 
-STATUS = {"intact": 0, "changed": 1, "incomplete": 3}  # 2: it cannot be read
+STATUS = {"intact": 0, "changed": 1, "incomplete": 3}  # 2: unreadable
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """The file, and what to do with it."""
+    """Add the file, and options for each action."""
     parser.add_argument("file", help="an .rrd file that a Recorder has written")
     what = parser.add_mutually_exclusive_group()
     what.add_argument(
@@ -35,7 +35,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Do it."""
+    """Run the chosen action; return the exit status."""
     from ..recording import replay
     from ..recording.journal import Changed
     from ..shapes import load
@@ -75,9 +75,10 @@ def main(args: argparse.Namespace) -> int:
 
 
 def functions(script: str, names: dict[str, str]) -> dict[str, Any]:
-    """What of these names a script defines. The script is run, up to its `if __name__ == "__main__":`.
+    """Return the functions in a script that have one of these names.
 
-    Only functions for kernels: what else there is in a script is not for a file to choose from.
+    The script runs up to its `if __name__ == "__main__":`. Only functions for kernels are accepted: a recording must not choose
+    other objects of a script.
     """
     from ..recording.scene import plain
 

@@ -1,4 +1,4 @@
-"""Error against run time on scenes with known answers, beside the article's scheme and textbook XPBD."""
+"""Measure error against run time on scenes with known answers, beside the article's scheme and textbook XPBD."""
 
 import argparse
 
@@ -8,7 +8,7 @@ ABOUT = "error against run time on scenes with known answers"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """The arguments."""
+    """Add the arguments."""
     parser.add_argument("cases", nargs="*", help="names or beginnings of names, such as D01 or S; all without any")
     parser.add_argument("--list", action="store_true", help="list the cases")
     parser.add_argument("--quick", action="store_true", help="a few substeps and one timed run of each")
@@ -21,7 +21,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Measure, print, write; the status is 1 when a case is not what it must be."""
+    """Measure, print and write the report; return 1 if a case fails its criterion."""
     from rich.console import Console
 
     from ..report import CASES, error_vs_time

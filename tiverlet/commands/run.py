@@ -1,4 +1,4 @@
-"""Run a demo or a script of your own, and record it: what its Recorder writes, or, where it has none, its first world."""
+"""Run a demo or your own script, and record what its Recorder writes or, if it has none, its first world."""
 
 import argparse
 import contextlib
@@ -10,12 +10,12 @@ from collections.abc import Iterator
 from typing import Any
 
 ABOUT = "run a demo or script, and record it"
-# Beside the package in a checkout, in the package where it was installed.
+# The folder beside the package in a checkout, or in the installed package.
 DEMOS = next((p / "demos" for p in pathlib.Path(__file__).parents[1:3] if (p / "demos").is_dir()), pathlib.Path("demos"))
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """The script, and where to record it."""
+    """Add the script, and where to record it."""
     parser.add_argument("script", help="a .py file, or the name of a demo")
     parser.add_argument("--out", metavar="FILE.rrd", help="default: the name of the script, here")
     parser.add_argument("--live", nargs="?", const=True, default=False, choices=("web",), help="watch it meanwhile")
@@ -23,7 +23,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run it."""
+    """Run and record the script; return its exit status."""
     from ..recording import replay
     from ..recording.sink import is_recording
 
@@ -41,7 +41,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def execute(path: pathlib.Path, arguments: list[str]) -> int:
-    """Run a script as Python would; returns its exit status."""
+    """Run a script as Python would; return its exit status."""
     before = sys.argv, list(sys.path)
     sys.argv, sys.path[0] = [str(path), *arguments], str(path.parent)
     try:
@@ -56,7 +56,7 @@ def execute(path: pathlib.Path, arguments: list[str]) -> int:
 
 
 def find(name: str) -> pathlib.Path:
-    """The script of that name, or the demo."""
+    """Return the path of a script, or of the demo of that name."""
     for path in (pathlib.Path(name), DEMOS / f"{name}.py"):
         if path.is_file():
             return path.resolve()
@@ -66,8 +66,10 @@ def find(name: str) -> pathlib.Path:
 
 @contextlib.contextmanager
 def recording(out: str, live: bool | str = False) -> Iterator[list[Any]]:
-    """While this lasts, the first Recorder writes to `out`, and a world that is stepped before there is one gets its own. live:
-    see Recorder."""
+    """Redirect the first Recorder to `out` while the context lasts.
+
+    A world that is stepped before any Recorder exists gets its own. live: see Recorder.
+    """
     import tiverlet
 
     from ..world import World
@@ -77,14 +79,14 @@ def recording(out: str, live: bool | str = False) -> Iterator[list[Any]]:
     step, recorder = World.step, tiverlet.Recorder
 
     class Redirected(recorder):
-        """A Recorder that writes to the file of the command, and is known to it."""
+        """A Recorder that writes to the file of the command, and is listed in `made`."""
 
         def __init__(self, path, *args, **kwargs):
             super().__init__(path if made else out, *args, **(kwargs if made else kwargs | given))
             made.append(self)
 
     def stepped(world: World, *args, **kwargs):
-        """World.step(), recorded by one of our own where the script makes no Recorder."""
+        """Run World.step(), and record it if the script makes no Recorder."""
         if not made:
             made.append(recorder(out, world, **given))
         report = step(world, *args, **kwargs)

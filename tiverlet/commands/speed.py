@@ -1,4 +1,4 @@
-"""How fast scenes of 10 to a million particles run, next to what the machine and other engines can do, and what starts cost."""
+"""Measure speed, memory and start-up of scenes with 10 to a million particles, beside a pile in C and other engines."""
 
 import argparse
 
@@ -6,7 +6,7 @@ ABOUT = "speed, memory and starts; beside a pile in C, and other engines"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """The arguments."""
+    """Add the arguments."""
     parser.add_argument(
         "scenes", nargs="*", help="pile, settled, loaded, spheres, cloth, ropes, rope, mixed; none: all; or worlds"
     )
@@ -25,7 +25,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Measure, print, write; the status is 1 when something could not be measured."""
+    """Measure, print and write the report; return 1 if something could not be measured."""
     from rich.console import Console
 
     from ..report import SpeedReport, speed

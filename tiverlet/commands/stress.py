@@ -1,4 +1,4 @@
-"""The certificate of stiff and extreme cases: each is run, measured, and passes or fails by its own criterion."""
+"""Run stiff and extreme cases; each passes or fails by its own criterion."""
 
 import argparse
 
@@ -8,14 +8,14 @@ ABOUT = "stiff and extreme cases, with a verdict on each"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """The arguments."""
+    """Add the arguments."""
     parser.add_argument("rows", nargs="*", type=int, help="numbers of rows; all without any")
     parser.add_argument("--json", metavar="FILE", help="write the certificate, for machines")
     add_workers(parser)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run, print, write; the status is 1 when a row fails."""
+    """Run, print and write the certificate; return 1 if a row fails."""
     from rich.console import Console
 
     from ..report import stress

@@ -1,4 +1,4 @@
-"""What keeps particles where they should be: links, angles, areas, volumes, clusters, pins and rails."""
+"""Constraints on particles: links, angles, areas, volumes, clusters, pins and rails."""
 
 from .angle_limit import AngleLimit
 from .area import Area

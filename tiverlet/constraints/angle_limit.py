@@ -1,4 +1,4 @@
-"""Limbs and hinges: corners that turn only so far."""
+"""Joints with limited rotation: limbs and hinges."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,36 +16,38 @@ from .core.scalar import Scalar
 
 
 class AngleFromMiddle(Angle):
-    """On the device, how far the angle of a path is from the middle of its range; on the host the angle itself, since the middle
-    is a knob's."""
+    """The angle of a path relative to the middle of its range, on the device.
+
+    On the host values() returns the angle itself, since the middle depends on knobs.
+    """
 
     arity, centred = 3, True
     exchangeable = ((0, 2),)
     middle: Any
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """The angles of paths."""
+        """Return the angles of the paths, (m,)."""
         return path_angles(x[:, 0], x[:, 1], x[:, 2])
 
     def bind(self, scene: Scene, batch: Any, equation: Any) -> "AngleFromMiddle":
-        """With the middle of each range."""
+        """Return the quantity for kernels, with a field for the middle of each range."""
         bound = super().bind(scene, batch, equation)
         bound.middle = scene.memory.field("AngleLimit.middle", batch.count, values=batch.middle)
         return bound
 
     @ti.func
     def reach(self, q):
-        """The shorter of the two legs."""
+        """Return the length of the shorter leg."""
         return shorter_leg(q)
 
     @ti.func
     def unwrap(self, f, other):
-        """A distance from the middle has one value."""
+        """Return f unchanged: a distance from the middle has a single value."""
         return f
 
     @ti.func
     def measure(self, c, q):
-        """|angle - middle|, and its gradients: those of the angle, with the sign of the side on which it is."""
+        """Return |angle - middle| and its gradients: the gradients of the angle, with the sign of angle - middle."""
         f, g = path_angle(q, 0 * q[0, :], False, faint(self.state, self.real))
         middle = self.middle[c]
         f = wrapped(f, middle) - middle
@@ -54,24 +56,24 @@ class AngleFromMiddle(Angle):
 
 
 class AngleLimit(Scalar):
-    """Corners that are free between two angles: elbows, knees, doors.
+    """Corners that turn freely between two angles: elbows, knees, doors.
 
     C(x) = |f(x) - (lower + upper) / 2| - (upper - lower) / 2 <= 0, with the angle f [rad] of Bend, taken within half a turn of
-    the middle; gradients those of f, with the sign of the side on which it is.
+    the middle. The gradients are those of f, with the sign of f - middle.
 
     triples: (m, 3) particle indices, the corner in the middle; 0 is straight.
     lower, upper: number or (m,) [rad], lower <= upper and at most a turn apart; in 2D signed, positive to the left, in 3D in
     [0, pi]. Live.
-    compliance: number or (m,) [rad/(N m)] of the stops; 0 is rigid. damping: [N m s/rad], while at a stop. break_at: [N m].
+    compliance: number or (m,) [rad/(N m)] of the stops; 0 is rigid. damping: [N m s/rad], acts while at a stop. break_at: [N m].
 
-    A rigid stop takes the impact inelastically. Limits that are assigned are reached in the course of the next frame, at a third
-    of a radian in one where rigid; what they meet has that speed then.
+    A rigid stop takes the impact inelastically. Assigned limits are reached during the next frame; a rigid stop removes at most a
+    third of a radian of its violation per frame. The particles that it pushes then have that speed.
     `load` is the moment at either stop [N m].
     """
 
     measures = AngleFromMiddle
     bulk = 3.0
-    uploads_all = False  # limits are checked against each other, of one
+    uploads_all = False  # limits are checked against each other, for a single world
     index_name = "triples"
     each = ("lower", "upper", "compliance", "damping", "break_at")
     side = 1
@@ -94,37 +96,37 @@ class AngleLimit(Scalar):
 
     @property
     def middle(self) -> np.ndarray:
-        """Halfway between the limits [rad], (m,)."""
+        """The middle of each free range [rad], (m,)."""
         return (self.lower + self.upper) / 2
 
     @property
     def rest(self) -> np.ndarray:
-        """Half of the free range [rad], (m,)."""
+        """Half the width of each free range [rad], (m,)."""
         return (self.upper - self.lower) / 2
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check the indices, and the limits against the dimension."""
+        """Check the indices, and check the limits against the dimension."""
         checks.indices("AngleLimit", self.index_name, self.indices, particles.count, arity=3)
         for name, value in (("lower", self.lower), ("upper", self.upper)):
             if particles.dim == 3:
                 checks.per_item("AngleLimit", f"{name} (in 3D)", value, self.count, least=0.0, most=np.pi)
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """How far the angles are from the middle; of all corners once, or several times."""
+        """Return how far the angles are from the middle [rad]. x may hold several copies of all corners, one after the other."""
         return np.abs(turned(super().values(x) - np.tile(self.middle, len(x) // max(1, self.count))))
 
     def gradients(self, position: np.ndarray) -> np.ndarray:
-        """Of that, by each corner."""
+        """Return the gradients of |angle - middle| by each corner, (m, 3, dim)."""
         return differences(self.values, self.placed(position))
 
     def tracks(self) -> list[tuple[Any, np.ndarray, Callable]]:
-        """Half of the range, and its middle."""
+        """List what an assignment moves: half of the range, and its middle."""
         return [
             (self.dev.equation.rest, self.rest, np.subtract),
             (self.dev.quantity.middle, self.middle, self.quantity.difference),
         ]
 
     def violation(self, position: np.ndarray) -> np.ndarray:
-        """C at the given positions."""
+        """Return C at the given positions, (m,)."""
         half, middle = self.ramp.now() if self.ramp and self.ramp.under_way else (self.rest, self.middle)
         return np.abs(turned(super().values(self.placed(position)) - middle)) - half

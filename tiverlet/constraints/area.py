@@ -20,18 +20,19 @@ class Area(Scalar):
     """Triangles, or closed loops of any length in 2D, that keep their area: cells, soft bodies, cushions.
 
     C(x) = A(x) - pressure rest.
-    In 2D A is the signed area, by the shoelace formula, and grad_k A = (x_(k+1) - x_(k-1)) / 2, turned by -90 degrees; what was
-    turned inside out comes back. In 3D A = |n| / 2 of a triangle, n = (b - a) x (c - a), with grad_b A = (c - a) x n / (2 |n|)
-    and so on; a triangle without area has no gradient there, is left alone, and shows as a residual of 1.
+    In 2D A is the signed area, by the shoelace formula, and grad_k A = (x_(k+1) - x_(k-1)) / 2, turned by -90 degrees; a body
+    that is inside out turns back. In 3D A = |n| / 2 of a triangle, n = (b - a) x (c - a), with grad_b A = (c - a) x n / (2 |n|)
+    and so on. A triangle without area has no gradient in 3D: the constraint does not act on it, and its residual is 1.
 
     loops: (m, 3) indices of triangles, or in 2D a sequence of index sequences, around each area in either sense; or one of them.
     rest: area at pressure 1, number or (m,) [m^2]; None takes the initial areas. Live.
     pressure: factor on the rest area, number or (m,): above 1 inflates, at least 0. Live.
-    compliance: number or (m,) [m^3/N], inverse of what pressure (N/m in 2D) each m^2 of missing area makes; 0 is rigid.
-    damping: number or (m,) [N s/m^3], of a dashpot beside the spring. break_at: load at which it bursts, number or (m,) [N/m].
+    compliance: number or (m,) [m^3/N], inverse of the pressure (N/m in 2D) per m^2 of missing area; 0 is rigid.
+    damping: number or (m,) [N s/m^3], of a dashpot parallel to the spring. break_at: load at which it bursts, number or (m,)
+    [N/m].
 
     `load` is the tension that keeps the area [N/m]; -load is the pressure inside. Second order in h, see Equation. Raises
-    ValueError for loops of fewer than 3 or repeated particles, and for longer ones in 3D, where they enclose no area.
+    ValueError for loops of fewer than 3 or repeated particles, and for loops of more than 3 in 3D, where they enclose no area.
     """
 
     index_name = "loops"
@@ -49,25 +50,25 @@ class Area(Scalar):
 
     @property
     def goal(self) -> np.ndarray:
-        """pressure rest."""
+        """The target areas, pressure * rest [m^2], (m,)."""
         return self.pressure * self.rest
 
     def quantity_of(self, indices) -> Quantity:
-        """Triangles are simpler than loops, and have kernels of their own."""
+        """Return Triangles where all loops have 3 corners, else Loops. Triangles have simpler kernels of their own."""
         loops = checks.rows("Area", "loops", indices, "a sequence of index sequences")
         if all(np.ndim(loop) == 1 and len(loop) == 3 for loop in loops):
             return Triangles(self.fixed(indices, 3))
         return Loops(VariableSize("Area", rows("Area", "loops", indices, 3)))
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Go around each area so that it is positive at the start."""
+        """Order the corners of each area so that it is positive at the start."""
         if not self.arity and particles.dim != 2:
             raise ValueError("Area: loops of more than 3 particles enclose no definite area in 3D; use triangles, or Volume.")
         self.check_indices(particles)
         if particles.dim == 2:
-            for _ in range(2):  # back again where it is negative either way round, being flat: a clone asks anew
+            for _ in range(2):  # twice: a flat area can be negative in both senses; it keeps its order, so a clone does, too
                 self.hold(self.quantity.reversed(self.rest_of(particles.position) < 0))
-        if "rest" not in self.__dict__ and self._rest_given is None:  # what is straight is so to rounding, either way round
+        if "rest" not in self.__dict__ and self._rest_given is None:  # the area of a straight loop may be negative by rounding
             self.rest = np.maximum(self.rest_of(particles.position), 0.0)
         super().prepare(particles, inv_mass)
 
@@ -79,12 +80,12 @@ class Triangles(Quantity):
     exchangeable = ((0, 1, 2),)
 
     def reversed(self, which: np.ndarray) -> "Triangles":
-        """Two corners swapped."""
+        """Return these triangles, with two corners swapped where `which` (m,) is True."""
         indices = self.members.indices
         return Triangles(FixedSize("Area", np.where(which[:, None], indices[:, ::-1], indices)))
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """Areas of the triangles; signed in 2D."""
+        """Return the areas of the triangles, (m,) [m^2]; signed in 2D."""
         a, b, c = x[:, 0], x[:, 1], x[:, 2]
         if x.shape[2] == 2:
             (ux, uy), (vx, vy) = (b - a).T, (c - a).T
@@ -93,12 +94,12 @@ class Triangles(Quantity):
 
     @ti.func
     def reach(self, q):
-        """The size of a triangle."""
+        """Return the size of a triangle [m]."""
         return q.norm()
 
     @ti.func
     def measure(self, c, q):
-        """Area, and its gradients."""
+        """Return the area and its gradients."""
         a, b = q[1, :], q[2, :]
         f = 0 * a[0]
         u, v = 0 * a, 0 * b
@@ -108,7 +109,7 @@ class Triangles(Quantity):
         else:
             n = a.cross(b)
             largest = ti.max(ti.abs(n[0]), ti.max(ti.abs(n[1]), ti.abs(n[2])))
-            if largest > 0:  # squares of areas would leave f32
+            if largest > 0:  # normalised first: squares of areas would exceed the range of f32
                 n /= largest
                 size = n.norm()
                 f = largest * size / 2
@@ -123,11 +124,11 @@ class Loops(Quantity):
     sides: Any  # on the device: the neighbours of each corner, (total, 2)
 
     def reversed(self, which: np.ndarray) -> "Loops":
-        """Some of them the other way round."""
+        """Return these loops, with the order of corners reversed where `which` (m,) is True."""
         return Loops(VariableSize("Area", [self.members.row(k)[:: -1 if w else 1] for k, w in enumerate(which)]))
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """Areas by the shoelace formula."""
+        """Return the areas, (m,) [m^2], by the shoelace formula."""
         indices, starts = self.members.indices, self.members.starts
         if not self.members.count:
             return np.zeros(0)
@@ -136,14 +137,14 @@ class Loops(Quantity):
         return np.add.reduceat(r[:, 0] * s[:, 1] - r[:, 1] * s[:, 0], starts[:-1]) / 2
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
-        """Their gradients by each corner, (total, 2)."""
+        """Return the gradients of the areas by each corner, (total, 2)."""
         sides = x[self.neighbours]
         across = sides[:, 1] - sides[:, 0]
         return np.stack([across[:, 1], -across[:, 0]], axis=1) / 2
 
     @property
     def after(self) -> np.ndarray:
-        """The corner that comes after each, around its loop."""
+        """The next corner around the loop of each corner, (total,)."""
         starts = self.members.starts
         out = np.arange(1, len(self.members.indices) + 1)
         out[starts[1:] - 1] = starts[:-1]
@@ -158,19 +159,19 @@ class Loops(Quantity):
         return np.stack([indices[before], indices[self.after]], axis=1)
 
     def pairs(self) -> np.ndarray:
-        """Neighbours along a loop."""
+        """Return the pairs of particles that are neighbours along a loop, (total, 2)."""
         indices = self.members.indices
         return np.stack([indices, indices[self.after]], axis=1)
 
     def bind(self, scene: Scene, batch: Any, equation: Any) -> "Loops":
-        """Its gradients, on the device."""
+        """Return the quantity for kernels, with the neighbours of each corner in a field."""
         bound, sides = super().bind(scene, batch, equation), self.neighbours
         bound.sides = scene.memory.field("Area.sides", len(sides), width=2, kind=ti.i32, values=sides)
         return bound
 
     @ti.func
     def slope(self, e, back):
-        """Half the way from the corner before to the corner after, turned by -90 degrees."""
+        """Return half the vector from the previous corner to the next one, turned by -90 degrees."""
         i, j = self.sides[e]
         r = self.state.apart(j, i) - back * (self.state.d[j] - self.state.d[i])
         return ti.Vector([r[1], -r[0]]) / 2

@@ -16,12 +16,12 @@ class Bend(Scalar):
     rest: rest angle, number or (m,) [rad]; None takes the initial angles. Live. In 2D signed, positive to the left; in 3D in
     [0, pi], and with rest = 0 the angle keeps its sign while a rod swings through straight.
     compliance: number or (m,) [rad/(N m)]; 0 is rigid. A beam of stiffness EI [N m^2] cut into links of length l has l / EI.
-    damping: of a dashpot beside the spring, number or (m,) [N m s/rad].
-    break_at: moment beyond which it breaks, number or (m,) [N m].
+    damping: of a dashpot parallel to the spring, number or (m,) [N m s/rad].
+    break_at: moment at which a corner breaks, number or (m,) [N m].
 
-    Corners that coincide have no angle: nothing acts until they part. `load` is the moment [N m].
-    Jacobi passes stiffen a long beam slowly: in a chain of masses m [kg] and links l [m], one pass per substep h leaves a joint
-    the compliance 30 h^2 / (m l^2), however rigid it was meant to be.
+    Coincident particles have no angle: the constraint exerts no moment until they separate. `load` is the moment [N m].
+    Jacobi passes stiffen a long beam slowly. In a chain of masses m [kg] and links l [m], one pass per substep h leaves each
+    joint a compliance of 30 h^2 / (m l^2), even where compliance is 0.
     """
 
     measures = BendAngle

@@ -1,4 +1,4 @@
-"""The user's own constraint."""
+"""Constraints on a function that the user gives."""
 
 import inspect
 from typing import Any
@@ -16,13 +16,15 @@ from .core.finite_differences import NumericGradient
 from .core.quantity import Quantity
 from .core.scalar import Scalar
 
-WRONG = 1e-4  # relative difference between a gradient and differences of the function that is not rounding
+WRONG = 1e-4  # a relative difference between the given gradient and finite differences that rounding does not explain
 
 
 class Function(Quantity):
-    """f that the user gives, in the unit that is given. derivative: it and its gradients. origin: what corners are relative to,
-    in two words, so that in f32 too it is where it was put; None for the first corner. size: of what it acts on [m]. All but the
-    unit are known once there are particles."""
+    """The user's function f, in the given unit.
+
+    derivative: f and its gradients. origin: what corners are relative to, as two f32 words, so that f32 does not round it; None
+    for the first corner. size: of the scene part that f acts on [m]. All but the unit are known only once there are particles.
+    """
 
     size: Any  # on the device
 
@@ -32,18 +34,18 @@ class Function(Quantity):
         self._size = size
 
     def bind(self, scene: Scene, batch: Any, equation: Any) -> "Function":
-        """With the step of differences."""
+        """Return the quantity for kernels, with a number for the step of finite differences."""
         bound = super().bind(scene, batch, equation)
         bound.size = scene.memory.number(self._size, ti.f64)
         return bound
 
     def frame(self, corners: Any) -> "Frame":
-        """Corners relative to the origin, or to the first."""
+        """Return corners relative to the origin, or to the first corner."""
         return Frame(corners, self.origin)
 
     @ti.func
     def measure(self, c, q):
-        """The function and its gradient; nothing where they are not finite."""
+        """Return the function and its gradient; both are 0 where either is not finite."""
         f, g = self.derivative.both(c, ti.cast(q, ti.f64), self.size.now)
         total = f
         for k, a in ti.static(ti.ndrange(self.corners.arity, self.state.dim)):
@@ -56,14 +58,14 @@ class Function(Quantity):
 
 
 class Frame:
-    """The corners of constraints relative to an origin, in two words, or to the first where that is None."""
+    """The corners of constraints relative to an origin, given in two words, or to the first corner where origin is None."""
 
     def __init__(self, corners: Any, origin: Any):
         self.corners, self.state, self.real, self.arity, self.origin = corners, corners.state, corners.real, corners.arity, origin
 
     @ti.func
     def apart(self, c, back):
-        """At x - back d."""
+        """Return the corners of constraint c at x - back d."""
         q = ti.Matrix.zero(self.real, self.arity, self.state.dim)
         for k in ti.static(range(self.arity)):
             i = self.corners.member(c, k)
@@ -82,22 +84,23 @@ class Frame:
 
     @ti.func
     def now_and_start(self, c):
-        """Now and at the start of the substep."""
+        """Return the corners of constraint c now and at the start of the substep."""
         return self.apart(c, 0), self.apart(c, 1)
 
 
 class Constraint(Scalar):
-    """C(x) = function(x_0, x_1, ...) - rest = 0, or <= 0, or >= 0: the user's own constraint, soft or rigid like all others.
+    """The user's own constraint, soft or rigid: C(x) = function(x_0, x_1, ...) - rest = 0, or <= 0, or >= 0.
 
-    function: takes the corners as vectors [m], as many as the constraint has, and, if it names one more, the number of the
-    constraint (to look up parameters in Taichi fields); returns one number. It is in Taichi's language: arithmetic, ti.sqrt and
-    its like, v.norm(), a.cross(b), if and for; decorated with @ti.func or not. Numbers that it reads from Python are frozen.
+    function: takes the corners as vectors [m], as many as the constraint has. It may take one more argument, the number of the
+    constraint, to read parameters from Taichi fields. It returns one number. It is in Taichi's language: arithmetic, ti.sqrt and
+    its like, v.norm(), a.cross(b), if and for; decorated with @ti.func or not. Python numbers that it reads are compiled as
+    constants.
     indices: (m, arity) particle indices, or (m,) for constraints on one particle each.
     rest: number or (m,); None takes the initial values of function. Live.
-    gradient: takes the same, returns the gradient by each corner, as many vectors. None: central differences.
-    side: 0 for C = 0; 1 for function at most rest; -1 for at least.
-    origin: the corners are relative to this point [m]. None: to the first corner, which is exact in f32 anywhere, and conserves
-    momentum; for a single corner, (0, ..., 0). Put it near the scene where coordinates are large.
+    gradient: takes the arguments of function, returns its gradient by each corner, as many vectors. None: central differences.
+    side: 0 for C = 0; 1 for function at most rest; -1 for function at least rest.
+    origin: the corners are relative to this point [m]. None: relative to the first corner, which is exact in f32 at any place,
+    and conserves momentum; for a single corner, (0, ..., 0). Put it near the scene where coordinates are large.
     unit: what the reported residual is relative to; None: the rest value, or the mean initial |function| where that is 0.
     compliance: [F m / N] for a function in units of F; 0 is rigid. damping, break_at: see Distance.
 
@@ -106,19 +109,19 @@ class Constraint(Scalar):
 
         tv.Constraint(bead, [0], rest=2.0)
 
-    Differences are taken in f64 whatever the world's precision, with a step of 1e-6 of the distance between corners: within 1e-9
-    of the exact gradients of a distance and of a dihedral angle, so that the order stays two. In f32 rounding would leave 3e-5.
-    Nothing is unrolled, so compiling takes 10 to 20 % more than with a gradient; a substep takes two evaluations per coordinate
-    (measured: 0.19 instead of 0.11 us per distance, 2.0 instead of 0.23 us per dihedral angle). Dual numbers would need operators
-    that Taichi's structs do not have, and what Taichi differentiates itself is kernels, not functions inside of them.
-    A gradient that is given is compared with differences when the world is built: ValueError names the corner and the axis.
-    Where function or gradient are not finite, as between coincident corners, the constraint does not act, and where the gradient
-    is 0 it cannot; if it is rigid its residual tells what it misses, by a function of 0 where that is not finite.
+    Differences are taken in f64 in every world, with a step of 1e-6 of the distance between corners: within 1e-9 of the exact
+    gradients of a distance and of a dihedral angle, so that the order stays two. In f32 rounding would leave 3e-5.
+    Loops are not unrolled, so compiling takes 10 to 20 % more than with a gradient. A substep takes two evaluations per
+    coordinate (measured: 0.19 instead of 0.11 us per distance, 2.0 instead of 0.23 us per dihedral angle). Dual numbers would
+    need operators that Taichi's structs do not have, and Taichi differentiates kernels, not functions inside them.
+    A given gradient is compared with differences when the world is built: ValueError names the corner and the axis.
+    Where function or gradient are not finite, as between coincident corners, the constraint does not act. It cannot act where the
+    gradient is 0. A rigid one then reports its violation as residual, with 0 in place of a function that is not finite.
     """
 
     index_name = "indices"
-    grows = False  # functions may ask for the number of a constraint
-    _size = 0.0  # of what it acts on [m]
+    grows = False  # the function may read the number of a constraint
+    _size = 0.0  # of the part of the scene that it acts on [m]
     _known: tuple[Any, Any, Any] = (None, None, None)  # positions, and values and gradients there
     rest = Knob(lambda f, v: checks.per_item(repr(f), "rest", v, f.count), "What function should be.")
 
@@ -141,14 +144,14 @@ class Constraint(Scalar):
         self.setup(indices, rest, compliance, damping, break_at)
 
     def quantity_of(self, indices) -> Quantity:
-        """That of any corners, in the unit that is given."""
+        """Return the user's function of these corners, in the given unit."""
         return Function(self.fixed(indices, self.arity), self._unit)
 
     def __repr__(self) -> str:
         return f"Constraint({self.name})"
 
     def _taken(self, name: str, function) -> Any:
-        """The function for kernels, and whether it takes the number of the constraint."""
+        """Check the function. Returns it for kernels, and whether it takes the number of the constraint."""
         if not callable(function):
             raise TypeError(f"Constraint: {name} = {function!r} is not a function.")
         plain = undecorated(function)
@@ -163,7 +166,7 @@ class Constraint(Scalar):
         return function if plain is not function else ti.func(function), len(names) > self.arity
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check the indices and the gradient, and settle the rest values."""
+        """Check the indices and the gradient, and set the rest values."""
         checks.indices(repr(self), self.index_name, self.indices, particles.count, arity=self.arity)
         words = None
         if self.origin is not None or self.arity == 1:
@@ -172,7 +175,7 @@ class Constraint(Scalar):
             self._keep(origin=origin)
             high = origin.astype(np.float32).astype(np.float64)
             words = [high.tolist(), (origin - high).tolist()]
-        mine = self.indices.ravel()  # others, wherever they are, change no bit
+        mine = self.indices.ravel()  # only its own particles, so that no other particle changes a bit of the result
         extent = float(np.ptp(particles.position[mine], axis=0).max()) if len(mine) else 0.0
         self._keep(_size=extent or float(particles.radius[mine].max(initial=0.0)) or 1.0)
         self._keep(_known=(None, None, None))
@@ -190,7 +193,10 @@ class Constraint(Scalar):
             self._check_gradient(particles.position)
 
     def _check_gradient(self, position: np.ndarray) -> None:
-        """Compare with differences at the initial positions and near by; two of four must agree, since there may be kinks."""
+        """Compare the gradient with differences at the initial positions and at three places near by.
+
+        Two of four must agree, since the function may have kinks.
+        """
         wrong, found = np.zeros((self.count, self.arity, position.shape[1]), dtype=int), []
         for k in range(4):
             q = self._corners(position)
@@ -209,19 +215,19 @@ class Constraint(Scalar):
             )
 
     def _corners(self, position: np.ndarray) -> np.ndarray:
-        """What function takes, (m, arity, dim)."""
+        """Return the corners that function takes, (m, arity, dim)."""
         q = position[self.indices]
         return q - (q[:, :1] if self.origin is None else self.origin)
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
-        """The values of function."""
+        """Return the values of function, (m,)."""
         known, values, _ = self._known
-        if position is known:  # while the world's fields are being declared, Taichi cannot launch kernels
+        if position is known:  # Taichi cannot launch kernels while the world's fields are being declared
             return values
         return self._derivative(self._corners(position), self._size)[0] if self.count else np.zeros(0)
 
     def gradients(self, position: np.ndarray) -> np.ndarray:
-        """The gradients of function."""
+        """Return the gradients of function, (m, arity, dim)."""
         known, _, slopes = self._known
         if position is known:
             return slopes

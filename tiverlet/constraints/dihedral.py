@@ -16,7 +16,8 @@ class Dihedral(Scalar):
     rest: rest angle, number or (m,) [rad]; None takes the initial angles. Live.
     compliance: number or (m,) [rad/(N m)]; 0 is rigid. damping: number or (m,) [N m s/rad]. break_at: number or (m,) [N m].
 
-    An edge or a triangle of no size has no angle: nothing acts until it has one. `load` is the moment about the edge [N m].
+    An edge without length or a triangle without area has no angle: the constraint exerts no moment until it has one. `load` is
+    the moment about the edge [N m].
     """
 
     measures = DihedralAngle
@@ -27,7 +28,7 @@ class Dihedral(Scalar):
         self.setup(quads, rest, compliance, damping, break_at)
 
     def prepare(self, particles, inv_mass: np.ndarray) -> None:
-        """Surfaces are in 3D."""
+        """Check the indices, and refuse a 2D world: surfaces need 3D."""
         if particles.dim != 3:
             raise ValueError("Dihedral: there is no angle between triangles in 2D. Use Bend(triples).")
         super().prepare(particles, inv_mass)

@@ -14,9 +14,9 @@ class Distance(Scalar):
     pairs: (m, 2) particle indices.
     rest: rest length, number or (m,) [m], at least 0; None takes the initial distances. Live.
     compliance: inverse stiffness, number or (m,) [m/N]; 0 is rigid. A spring of k [N/m] has compliance 1 / k.
-    damping: of a dashpot beside the spring, number or (m,) [N s/m]; beside a rigid link there is nothing for it to do.
-    break_at: load beyond which a link breaks, pulled or pushed, number or (m,) [N]; None for never. It acts no more from the next
-    substep on; see world.broken and .broken.
+    damping: of a dashpot parallel to the spring, number or (m,) [N s/m]; it has no effect on a rigid link.
+    break_at: load at which a link breaks, pulled or pushed, number or (m,) [N]; None for never. A broken link does not act from
+    the next substep on; see world.broken and .broken.
 
     Second order in h, without artificial damping, for every compliance (see Equation). `load` is the tension of each link [N].
     """

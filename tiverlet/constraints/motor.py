@@ -1,4 +1,4 @@
-"""Hinges that turn by themselves."""
+"""Hinges that are driven by a motor."""
 
 from typing import Any
 
@@ -12,37 +12,37 @@ from .core.angle import TURN, DihedralAngle, PathAngle
 from .core.drive import Drive, largest_load
 from .core.scalar import Scalar
 
-SETTLE = 0.1  # [s] how long a servo takes for the last e-th of its way
-PLACED = 0.2  # [rad] from where on hinges that were placed elsewhere go on from there
+SETTLE = 0.1  # [s] time constant with which a servo approaches its angle
+PLACED = 0.2  # [rad] hinges that were placed further than this from their rest angle continue from their new angle
 
 
 class Motor(Scalar):
     """Motors: the angle of a hinge turns at a given speed, or to a given angle, with a largest torque.
 
     C(x) = f(x) - rest with the angle f [rad] and its gradients of Bend (triples) or Dihedral (quads). In a substep h the rest
-    angle turns by speed h, or as much towards `angle`. Its multiplier is clamped, |lam| <= torque h^2: below the largest torque
-    the speed is met, at it the torque is; see core.drive.Drive. All torques are between its particles, so a motor moves no center
-    of mass and gives no angular momentum.
+    angle turns by speed h, or by at most speed h towards `angle`. Its multiplier is clamped, |lam| <= torque h^2. Below the
+    largest torque the hinge turns at the given speed; at the limit it exerts the largest torque; see core.drive.Drive. All
+    torques act between its particles, so a motor moves no center of mass and gives no angular momentum.
 
     hinges: (m, 3) particle indices, the corner in the middle, of joints in a plane: a wheel turns by i - j - k where i is on the
     frame, j the hub and k on the wheel. (m, 4) of hinges in 3D: the two ends of the axis, then a particle of either side.
     speed: number or (m,) [rad/s]; positive to the left in 2D. 0 holds: a brake of dry friction, if the torque is finite. Live.
-    angle: number or (m,) [rad]; where to turn to, by the shorter way, and to stay: a servo, which turns at |speed|, and at
-    most at the angle that is left in 0.1 s. Live. None: turn for ever; it cannot be given later.
-    torque: the largest, number or (m,) [N m]. Live. 0 lets the hinge run free. None that is given is one that meets any load, so
-    a stop in its way bears whatever it takes.
-    compliance: number or (m,) [rad/(N m)] of a spring between the motor and the hinge; 0 is rigid. damping: [N m s/rad] beside
-    it. break_at: moment beyond which it breaks, number or (m,) [N m].
+    angle: number or (m,) [rad]; a servo turns to this angle by the shorter way and stays there. It turns at |speed|, and at most
+    at the remaining angle per 0.1 s. Live. None: turn without end; an angle cannot be given later.
+    torque: the largest torque, number or (m,) [N m]. Live. 0 lets the hinge turn freely. Without it the motor meets any load, and
+    a stop in its way bears whatever the motor exerts.
+    compliance: number or (m,) [rad/(N m)] of a spring between the motor and the hinge; 0 is rigid. damping: [N m s/rad] parallel
+    to it. break_at: moment at which it breaks, number or (m,) [N m].
 
-    In 3D the angle of triples lies in [0, pi], where a motor comes to its end; take quads for more.
+    In 3D the angle of triples lies in [0, pi], and a motor stops at either end; take quads for more.
     `load` is the moment of the hinge against increasing angles [N m]: -load is the torque of the motor, and -load times the speed
-    its power. `rest` is where the rest angle is now [rad]: under a load the angle lags by what bears it, as in a Bend.
+    its power. `rest` is the current rest angle [rad]: under a load the angle lags behind by what bears the load, as in a Bend.
     """
 
     index_name = "hinges"
     driven = True
     each = ("speed", "angle", "torque", "compliance", "damping", "break_at")
-    uploads_all = False  # goals are of one
+    uploads_all = False  # goals are computed for a single world
     speed = Knob(lambda f, v: checks.per_item("Motor", "speed", v, f.count), "Angular velocity [rad/s].")
     angle = Knob(lambda f, v: f._angle(v), "Where to turn to [rad].")
     torque = Knob(lambda f, v: largest_load(f, "torque", v), "The largest torque [N m].")
@@ -60,7 +60,7 @@ class Motor(Scalar):
             self.angle = angle
 
     def check_more(self, more: Feature) -> None:
-        """Both turn at a speed, or to angles."""
+        """Raise TypeError unless both motors turn at a speed, or both to angles."""
         super().check_more(more)
         if more.serves != self.serves:  # type: ignore[attr-defined]
             raise TypeError("World.add: extend: one Motor turns to an angle, and the other at a speed. Add it to features.")
@@ -74,12 +74,12 @@ class Motor(Scalar):
 
     @property
     def largest(self) -> Any:
-        """The largest torques."""
+        """The largest torques [N m], (m,)."""
         return self.torque
 
     @property
     def rest(self) -> np.ndarray:
-        """Where the rest angles are now [rad], (m,)."""
+        """The current rest angles [rad], (m,)."""
         if "drive" in vars(self.dev):
             return self.dev.drive.values()[: self.count]
         if "_begin" not in self.__dict__:
@@ -87,7 +87,7 @@ class Motor(Scalar):
         return self._begin
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check the indices and angles against the dimension, and start from where hinges are."""
+        """Check the indices and angles against the dimension, and take the initial angles as rest angles."""
         self.check_indices(particles)
         if particles.dim == 2 and self.arity == 4:
             raise ValueError("Motor: there is no hinge of four particles in 2D. Use triples (i, j, k), the joint in the middle.")
@@ -96,18 +96,18 @@ class Motor(Scalar):
         self._begin = self.rest_of(particles.position)
 
     def drive_of(self, scene: Scene) -> Drive:
-        """Towards the angle, or on and on."""
-        largest, ends = self.torque if self.capped else None, scene.state.dim == 3 and self.arity == 3  # at 0 and pi
+        """Make the drive, which goes to the angle, or on without end."""
+        largest, ends = self.torque if self.capped else None, scene.state.dim == 3 and self.arity == 3  # it ends at 0 and pi
         endless, period = not (self.serves or ends), 0.0 if ends else TURN
         return Drive(scene, "Motor", self._begin, *self.course(), largest, endless, period, SETTLE * self.serves)
 
     def course(self) -> tuple[Any, Any]:
-        """Where rest angles go to, and how fast."""
+        """Return the goals of the rest angles [rad] and the speeds [rad/s]."""
         end = np.where(self.speed > 0, np.pi, 0.0)
         return self.angle if self.serves else end, self.speed
 
     def start_at(self, position: np.ndarray, first: int) -> None:
-        """Go on from where hinges were placed."""
+        """Move the rest angles of hinges with placed particles to where the hinges are now."""
         far = (np.abs(self.violation(position)) > PLACED) & (self.indices >= first).any(axis=1)
         if far.any():
             self.dev.drive.put(np.where(far, self.rest_of(position), self.rest))

@@ -18,18 +18,18 @@ from .core.on_curve import OnCurve
 class Path(Anchored):
     """Particles on a curve: free to slide without friction, or driven along it.
 
-    C(x) = x - P(s), a vector across the curve. Free, s is where the plane across the curve at the start of the substep, through
-    the predicted place, meets the curve: the force of the wire has no part along it (SHAKE). Second order, and energy is kept.
-    Where the curve turns by more than 41 degrees in a substep the nearest point takes its place, and it is flagged. At the
-    ends of an open curve particles stop.
+    C(x) = x - P(s), a vector across the curve. For free particles, s is where the curve meets the plane through the predicted
+    position, normal to the curve at the start of the substep: the force of the wire has no component along it (SHAKE). Second
+    order, and energy is conserved. Where the curve turns by more than 41 degrees in a substep, the nearest point is used instead,
+    and the report has a flag. Particles stop at the ends of an open curve.
 
-    indices: (m,) particles. points: (k, dim) [m], along the curve. closed: from the last point back to the first.
+    indices: (m,) particles. points: (k, dim) [m], along the curve. closed: the last point is connected to the first.
     smooth: a cubic spline through the points, with continuous curvature; otherwise a polyline, with corners.
     speed: number or (m,) [m/s]; driven at this speed, positive in the order of the points. Live.
     at: number or (m,) [m]; driven to this arc length, evenly during each frame in which it changes. Live. Not with `speed`.
     compliance: number or (m,) [m/N], of a soft wire; damping: number or (m,) [N s/m], across it. Free particles only.
 
-    `length` is that of the curve [m], `place(s)` its points, `load` the force of the wire on each particle [N].
+    `length` is the length of the curve [m], `place(s)` its points, `load` the force of the wire on each particle [N].
     """
 
     each = ("compliance", "damping", "speed", "at")
@@ -65,7 +65,7 @@ class Path(Anchored):
 
     @property
     def does_work(self) -> bool:
-        """Whether the particles are driven."""
+        """Whether the particles are driven, which may add energy."""
         return self.drives
 
     def _drive(self, name: str, value) -> np.ndarray:
@@ -88,11 +88,11 @@ class Path(Anchored):
         return self.curve.length
 
     def place(self, s) -> np.ndarray:
-        """Points of the curve at arc lengths s [m]."""
+        """Return the points of the curve at arc lengths s [m]."""
         return self.curve.at(s)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Driven particles cannot be moved by anything else."""
+        """Find the start on the curve, and set the inverse mass of driven particles to 0."""
         super().prepare(particles, inv_mass)
         checks.points("Path", "points", self.points, dim=particles.dim)
         rows = self.indices[:, 0]
@@ -101,7 +101,7 @@ class Path(Anchored):
             inv_mass[rows] = 0.0
 
     def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Warn of particles that are not on the curve."""
+        """Warn of particles that do not start on the curve."""
         x = particles.position[self.indices[:, 0]]
         off = np.linalg.norm(x - self.curve.at(self._start), axis=1)
         if not self.drives and not self.soft and (off > 1e-2 * self.length).any():
@@ -113,33 +113,36 @@ class Path(Anchored):
             )
 
     def tangents(self, x: np.ndarray) -> np.ndarray:
-        """Along the curve, where it is nearest."""
+        """Return the tangents of the curve at the points nearest to x."""
         return self.curve.tangent(self.curve.nearest(x))
 
     def start_offset(self, position: np.ndarray) -> np.ndarray:
-        """C at the start."""
+        """Return C at the start, (m, dim)."""
         return position[self.indices[:, 0]] - self.curve.at(self._start)
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
-        """The curve, for pictures."""
+        """Return points along the curve, for pictures."""
         return self.curve.at(np.linspace(0, self.length * (1 - 1e-12), 4 * len(self.curve.lengths) + 1))[None], 0.0
 
     def place_of(self, scene: Scene, passes: AnchorPasses) -> OnCurve:
-        """Where each is on the curve."""
+        """Make the arc length of each particle, on the device."""
         extent, moves = float(np.ptp(self.points, axis=0).max()), "speed" in self.__dict__
         pace = None if not self.drives else self.speed if moves else self._start
         return OnCurve(scene, passes, self.curve, self._start, pace, moves, extent)
 
     def upload(self) -> None:
-        """Take the new speed, or aim at the new arc lengths."""
+        """Write the new speed, or the new target arc lengths."""
         super().upload()
         if self.acts and self.drives:
             self.scene.memory.write(self.dev.place.target, self.speed if self.dev.place.moves else self.at)
             self.moving = not self.dev.place.moves
 
     def point_along(self, velocity: np.ndarray, dt: Any, some: np.ndarray | None = None) -> None:
-        """Give what it drives its part of velocities (..., n, dim): along the curve where it is now, at the speed of the last
-        frame, dt [s]; 0 at the ends of an open curve. some: of these worlds, where there are many."""
+        """Set `velocity` (..., n, dim) of driven particles to the velocity along the curve [m/s].
+
+        It is taken where each particle is now, at the speed of the last frame, dt [s]; 0 at the ends of an open curve. some:
+        which worlds, where there are many.
+        """
         place, read = self.dev.place, self.scene.memory.read
         begin, end = (read(field)[..., : self.count] for field in (place.source, place.target))
         if some is not None:
@@ -150,6 +153,6 @@ class Path(Anchored):
         velocity[..., self.indices[:, 0], :] = speed[..., None] * self.curve.tangent(s)
 
     def end_motion(self) -> None:
-        """The next frame starts from where this one went."""
+        """Start the next frame from the arc lengths where the last one ended."""
         if self.acts:
             self.scene.memory.write(self.dev.place.source, self.scene.memory.read(self.dev.place.target))

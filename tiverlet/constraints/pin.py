@@ -25,9 +25,9 @@ def _targets(pin: "Pin", target):
 
 
 def _indices(pin: "Pin", indices) -> np.ndarray:
-    """Those in hand: also the members, which are made of them."""
+    """Check assigned indices and replace `members` by them. Returns the indices, (m, 1)."""
     rows = np.asarray(indices)
-    rows = rows[:, 0] if rows.ndim == 2 and rows.shape[1] == 1 else rows  # as they are read
+    rows = rows[:, 0] if rows.ndim == 2 and rows.shape[1] == 1 else rows  # (m, 1), the shape in which indices are read
     members, own = one_each("Pin", rows, checks.ANY if pin.start is None else pin.start.count), vars(pin)
     before = pin.members.rows
     if members.count != len(before):
@@ -39,7 +39,7 @@ def _indices(pin: "Pin", indices) -> np.ndarray:
 
 
 class Target(Place):
-    """A place for each particle, to which it goes in the course of a frame. here: where it is at first, (m, dim)."""
+    """A target for each particle, which moves there during a frame. here: the initial targets, (m, dim)."""
 
     def __init__(self, scene: Scene, passes: AnchorPasses, here: np.ndarray):
         add, (m, dim) = scene.memory.field, here.shape
@@ -50,32 +50,36 @@ class Target(Place):
 
     @ti.func
     def aim(self, c, frame_fraction):
-        """The target at this fraction of the frame."""
+        """Return the target at this fraction of the frame."""
         return self.source[c] * (1 - frame_fraction) + self.target[c] * frame_fraction
 
     @ti.func
     def drive(self, c, h, frame_fraction):
         """Put the particle on the target."""
         i = self.corners.member(c, 0)
-        d = self.aim(c, frame_fraction) - self.state.place(i)
-        self.state.d[i] = d
-        self.state.advance(i, d)
+        if ti.static(self.state.sums):  # else what hangs on it would be jerked, with rounding / h^2
+            source, target = ti.cast(self.source[c], ti.f64), ti.cast(self.target[c], ti.f64)
+            self.state.bring(i, source + (target - source) * frame_fraction)
+        else:
+            d = self.aim(c, frame_fraction) - self.state.place(i)
+            self.state.d[i] = d
+            self.state.advance(i, d)
 
     @ti.func
     def offsets(self, c, frame_fraction, first, fresh):
-        """x - target."""
+        """Return x - target, now and at the start of the substep."""
         x = self.state.place(self.corners.member(c, 0))
         return x - self.aim(c, frame_fraction[1]), x - self.state.d[self.corners.member(c, 0)] - self.aim(c, frame_fraction[0])
 
     @ti.func
     def offset_now(self, c, back):
-        """x - target at the end of the frame, where it is at rest."""
+        """Return x - target at the end of the frame, where the target is at rest."""
         i = self.corners.member(c, 0)
         return self.state.place(i) - back * self.state.d[i] - self.target[c]
 
     @ti.func
     def offset_change(self, c):
-        """The motion of the particle."""
+        """Return the displacement of the particle in this substep."""
         return self.state.d[self.corners.member(c, 0)]
 
 
@@ -85,21 +89,21 @@ class Pin(Anchored):
     C(x) = x - target (a vector), with unit gradients.
 
     indices: (m,) particles, read as (m, 1), a row for each. target: (m, dim), (m, 1, dim) as world.position[pin.indices], or
-    (dim,) [m]; None holds them where they start. Both are live: assign to .target between frames, and the particles go there in a
-    straight line during the next frame; assign as many other particles to .indices, and these are held from then on, as by a new
-    Pin. That compiles nothing; a tv.Hand takes others faster still.
-    compliance: number or (m,) [m/N]. 0 takes the particles out of the solver and drives them, whatever pulls at them; above 0
-    they are drawn by a spring of stiffness 1 / compliance, as by a mouse. damping: [N s/m], of that spring.
+    (dim,) [m]; None holds the particles at their initial positions. Both are live. Assign to .target between frames, and the
+    particles go there in a straight line during the next frame. Assign as many other particles to .indices, and the Pin holds
+    those from then on, as a new Pin would. That compiles nothing; a tv.Hand takes other particles faster still.
+    compliance: number or (m,) [m/N]. 0 takes the particles out of the solver and drives them, whatever forces act on them; above
+    0 a spring of stiffness 1 / compliance draws them, as a mouse does. damping: [N s/m], of that spring.
 
-    `load` is the force of each spring on its particle [N]; where particles are driven it raises, for nothing tells what holds
-    them: give a small compliance.
+    `load` is the force of each spring on its particle [N]. It raises where particles are driven, since nothing computes the force
+    that holds them: give a small compliance.
     """
 
     each = ("compliance", "damping", "target")
     dim = 0
     exclusive = True
     indices: Any = Knob(_indices, "The particles that are held, (m, 1).")
-    _grabs = False  # other particles than in the frame before, which were:
+    _grabs = False  # whether other particles were assigned since the last frame; the previous ones are in _held
     _held = np.zeros(0, dtype=np.int32)
     target = Knob(_targets, "Where the particles are held, (m, dim) [m].")
 
@@ -129,21 +133,21 @@ class Pin(Anchored):
 
     @property
     def outgrown(self) -> bool:
-        """Other particles are other masses, and another place for what they are moved by."""
+        """Whether the world has to be rebuilt: also when other particles are held, since their masses and slots differ."""
         return self._grabs or super().outgrown
 
     @property
     def afresh(self) -> bool:
-        """Whether it holds others."""
+        """Whether the Pin starts anew when the world is rebuilt: when other particles were assigned."""
         return self._grabs
 
     @property
     def held(self) -> np.ndarray:
-        """Where it holds others: those that it held before, (m,)."""
+        """The particles that the Pin held before others were assigned, (m,)."""
         return self._held
 
     def grab(self, scene: Scene) -> None:
-        """Hold them as a new Pin would. Where it drives them, it takes nothing else from where particles are as it begins."""
+        """Hold the assigned particles as a new Pin would. A Pin that drives them takes only their positions from the state."""
         memory, dev, own, drives, rows = scene.memory, self.dev, vars(self), self.drives, self.members.rows
         self.note_arguments()
         own.update(_grabs=False, changed=drives, moving=False, new_force=False)
@@ -156,17 +160,17 @@ class Pin(Anchored):
         memory.write_each((dev.corners.members, rows), (dev.place.source, here), (dev.place.target, here))
 
     def select(self, some: np.ndarray, number: np.ndarray) -> None:
-        """Keep some, by their new numbers."""
+        """Keep the rows in the mask `some`, with the new numbers of their particles."""
         super().select(some, number)
         self._keep(indices=self.members.indices)
 
     def release(self) -> None:
-        """Forget the world, and what was held there."""
+        """Forget the world, and which particles were held there."""
         super().release()
         self._grabs = False
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check indices and targets; driven particles cannot be moved by anything else."""
+        """Check indices and targets, and set the inverse mass of driven particles to 0."""
         super().prepare(particles, inv_mass)
         rows = self.indices[:, 0]
         self._keep(dim=particles.dim)
@@ -175,27 +179,27 @@ class Pin(Anchored):
             inv_mass[rows] = 0.0
 
     def place_of(self, scene: Scene, passes: AnchorPasses) -> "Target":
-        """Targets at the start and the end of a frame."""
+        """Make the targets at the start and the end of a frame."""
         return Target(scene, passes, self._anchors)
 
     def bind(self, scene: Scene) -> None:
-        """What it drives goes there from where it is."""
+        """Declare fields. Driven particles have to go from where they are to the target, so the target is uploaded first."""
         super().bind(scene)
         self.changed = self.drives
 
     @property
     def _anchors(self) -> np.ndarray:
-        """Where a driven particle sets out from: where it is. A spring is anchored at the target from the start."""
+        """Where targets start, (m, dim): at the particles where they are driven, at the given target for springs."""
         return self.start.position[self.indices[:, 0]] if self.drives else self.target
 
     def upload(self) -> None:
-        """Aim at the new target."""
+        """Write the new target, which the next frame moves to."""
         super().upload()
         if self.acts:
             self.scene.memory.write(self.dev.place.target, self.target)
             self.moving = True
 
     def end_motion(self) -> None:
-        """The next frame starts from the target."""
+        """Start the next frame from the target of the last one."""
         if self.acts:
             self.scene.memory.write(self.dev.place.source, self.scene.memory.read(self.dev.place.target))

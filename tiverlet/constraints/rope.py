@@ -7,13 +7,15 @@ from .core.scalar import Scalar
 
 
 class Rope(Scalar):
-    """Links that are at most as long as given: taut they are a Distance, slack they are not there.
+    """Links that are at most as long as given: a taut rope acts as a Distance, a slack rope exerts no force.
 
     C(x) = |x_i - x_j| - length <= 0, gradients as in Distance; the multiplier may only pull.
 
-    pairs: (m, 2); length: number or (m,) [m], None takes the initial distances; compliance [m/N] and damping [N s/m] of
-    the taut rope. A rigid rope that becomes taut takes the impact inelastically. break_at: tension beyond which it
-    breaks, number or (m,) [N]. Assign to .rest to change the length.
+    pairs: (m, 2) particle indices.
+    length: number or (m,) [m]; None takes the initial distances. Assign to .rest to change it.
+    compliance, damping: number or (m,) [m/N] and [N s/m], of the taut rope. A rigid rope that becomes taut takes the impact
+    inelastically.
+    break_at: tension at which a rope breaks, number or (m,) [N].
     """
 
     side = 1

@@ -16,35 +16,38 @@ from .core.strength import strength_of
 
 
 class ShapeMatch(Batch):
-    """Clusters that keep their shape: rigid bodies, or soft ones that spring back (after Mueller et al. 2005).
+    """Clusters that keep their shape: rigid bodies, or soft bodies that spring back (after Mueller et al. 2005).
 
-    C_i(x) = x_i - (c + R q_i) for each particle of a cluster, with q the shape at rest, c and R where it is and how it is turned.
+    C_i(x) = x_i - (c + R q_i) for each particle of a cluster, with the rest shape q, and the center c and rotation R of the
+    cluster.
 
-    Rigid, c and R are not the best fit of the predicted places, which would take spin away in every step. They are such that the
-    correcting forces have no sum and no moment about the places at the start of the step, as the forces of SHAKE. For one
-    cluster by itself that is the discrete rigid body of Moser and Veselov (1991): second order, momentum and angular momentum
-    kept to rounding, no damping. A cluster that would turn by more than 90 degrees in a step turns by 90; above 41 it is flagged.
+    For rigid clusters, c and R are not the best fit to the predicted positions, which would damp spin in every step. They are
+    chosen so that the correcting forces have no sum and no moment about the positions at the start of the step, as the forces of
+    SHAKE. For a single cluster that is the discrete rigid body of Moser and Veselov (1991): second order, momentum and angular
+    momentum conserved to rounding, no damping. A rotation of more than 90 degrees in a step is limited to 90; above 41 it is
+    flagged.
 
-    Soft, each particle is drawn to its place by a spring with its part, by mass, of the stiffness of the whole: all ways in which
-    a cluster of mass M can deform have the one frequency sqrt(1 / (compliance M)). From soft to rigid by the law of Spring, with
-    deformations compared in the frame of the body. Damping acts on the deformation alone, never on the motion of the whole.
+    In soft clusters, a spring pulls each particle to its place. Its stiffness is the particle's share, by mass, of the cluster's
+    stiffness, so all deformations of a cluster of mass M have the same frequency sqrt(1 / (compliance M)). From soft to rigid by
+    the law of Spring, with deformations compared in the body frame. Damping acts on the deformation only, not on the rigid
+    motion.
 
     clusters: a sequence of index sequences, or (m, k), or one sequence. They may overlap. A cluster may be flat, on a line, in
-    one place or inside out; it is turned, never reflected.
-    rest: (n, dim) [m], the shape of all particles at rest; None takes the initial positions.
+    one place or inside out; it is rotated, never reflected.
+    rest: (n, dim) [m], the rest shape of all particles; None takes the initial positions.
     compliance: number or (m,) [m/N]; the stiffnesses of a cluster's springs add up to 1 / compliance. 0 is rigid.
-    damping: number or (m,) [N s/m], of the dashpots beside the springs, all together.
-    creep: number or (m,) [1/s], plastic flow: the shape at rest goes after what exceeds yield_strain at this rate.
-    yield_strain: number or (m,), how far a particle may be off its place without flow, of the cluster's radius.
-    break_at: force on one of its particles beyond which a cluster falls apart, number or (m,) [N]; None for never.
+    damping: number or (m,) [N s/m], the sum of the dashpots parallel to the springs.
+    creep: number or (m,) [1/s], plastic flow: rate at which the rest shape follows the deformation that exceeds yield_strain.
+    yield_strain: number or (m,), displacement of a particle without flow, relative to the cluster's radius.
+    break_at: force on one of its particles at which a cluster falls apart, number or (m,) [N]; None for never.
 
     `load` is the largest force on a particle of each cluster [N], m omega^2 r where it spins freely.
 
-    Particles that cannot move weigh as much as 1024 clusters in their own. Sums and rotations are f64 in every world: a
-    rotation rounded to f32 would shake the spin by 1e-7 of the size in every step, which is much of a small displacement.
-    In f32 the rounding of x, by some 2^-25 of the size, and of d, by 2^-25 of itself, changes the angular momentum sum m x x d by
-    about 2^-25 of itself in every substep, at random: by 2^-25 sqrt(n) after n of them, 3e-6 after 10 s at 1200 per second.
-    "f32-compensated" is without the part of x, "f64" without both (1e-11).
+    A particle that cannot move counts with 1024 times the mass of its cluster. Sums and rotations are f64 in every world: a
+    rotation rounded to f32 would change the spin by 1e-7 of the size in every step, which is large beside a small displacement.
+    In f32, positions x are rounded by about 2^-25 of the size, and displacements d by 2^-25 of themselves. This changes the
+    angular momentum sum m x x d by about 2^-25 of itself in every substep, at random: by 2^-25 sqrt(n) after n of them, 3e-6
+    after 10 s at 1200 per second. "f32-compensated" avoids the error of x, "f64" both (1e-11).
     """
 
     clusters = True
@@ -78,7 +81,7 @@ class ShapeMatch(Batch):
         return value
 
     def upload(self) -> None:
-        """Write new stiffnesses, rates and strengths."""
+        """Write new stiffnesses, rates and strengths to the device."""
         if self.acts:
             write = self.scene.memory.write
             self.dev.spring.upload(self.compliance, self.damping)
@@ -89,7 +92,7 @@ class ShapeMatch(Batch):
 
     @property
     def soft(self) -> bool:
-        """Whether any cluster has compliance."""
+        """Whether any cluster has compliance, or had when kernels were compiled."""
         return bool((self.compliance > 0).any()) or "soft" in self.once
 
     @property
@@ -99,11 +102,11 @@ class ShapeMatch(Batch):
 
     @property
     def transcends(self) -> bool:
-        """Whether any cluster flows, at an exponential rate."""
+        """Whether any cluster flows, at an exponential rate, or did when kernels were compiled."""
         return bool((self.creep > 0).any()) or "transcends" in self.once
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Settle the shapes at rest, each about its center."""
+        """Compute the rest shapes, each about its center of mass."""
         self.members.check(repr(self), "clusters", particles.count)
         rest = particles.position
         if self._rest is not None:
@@ -118,19 +121,19 @@ class ShapeMatch(Batch):
 
     @property
     def grows(self) -> bool:
-        """Shapes that are given are given for all particles."""
+        """Whether more clusters can be appended: not where `rest` was given, which has a row for every particle."""
         return self._rest is None
 
     def hold_all(self, listing: Any) -> None:
-        """Act on these."""
+        """Replace the clusters by these."""
         self._keep(members=VariableSize("ShapeMatch", listing))
 
     def shape_of(self, c: int) -> np.ndarray:
-        """The shape at rest of cluster c, about its center, (k, dim)."""
+        """Return the rest shape of cluster c about its center, (k, dim)."""
         return self._shape[self.members.starts[c] : self.members.starts[c + 1]]
 
     def remap_indices(self, number: np.ndarray, count: int) -> None:
-        """Particles that come later have a place in the shape of all, which no cluster uses."""
+        """Renumber the particles. Rows of `rest` for particles added later are 0; no cluster uses them."""
         super().remap_indices(number, count)
         if self._rest is not None:
             rest = np.zeros((count, self._rest.shape[1]))
@@ -139,7 +142,7 @@ class ShapeMatch(Batch):
             self.arguments = {**self.arguments, "rest": rest}
 
     def excluded_pairs(self, particles: Particles) -> np.ndarray:
-        """Particles of a cluster that are near each other may overlap; the rest cannot meet unless it is soft."""
+        """Return pairs of the same cluster that may overlap: neighbours only. Others cannot meet unless the cluster is soft."""
         sizes, out = np.diff(self.members.starts), [np.zeros((0, 2), dtype=np.int32)]
         for size in distinct(sizes)[0].tolist():
             first = self.members.starts[:-1][sizes == size]
@@ -147,11 +150,11 @@ class ShapeMatch(Batch):
         return np.concatenate(out)
 
     def passes(self, scene: Scene) -> ClusterPasses:
-        """Over clusters."""
+        """Make the passes over clusters."""
         return ClusterPasses(scene, self, self._shape, self._radius)
 
     def bind(self, scene: Scene) -> None:
-        """With the shapes and rotations of the clusters."""
+        """Declare fields for the shapes and rotations of the clusters."""
         super().bind(scene)
         self.changed = False
 
@@ -174,7 +177,7 @@ class ShapeMatch(Batch):
 
 
 def _near(members: np.ndarray, particles: Particles) -> np.ndarray:
-    """Pairs of members of the same cluster less than 3 radii apart. members: of clusters, (m, k)."""
+    """Return pairs of members of the same cluster less than 3 radii apart. members: of clusters of k particles, (m, k)."""
     x, r = particles.position[members], particles.radius[members]
     out = [np.zeros((0, 2), dtype=np.int32)]
     for k in range(members.shape[1] - 1):

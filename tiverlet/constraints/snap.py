@@ -1,4 +1,4 @@
-"""A tidy grid."""
+"""Particles drawn to a regular grid."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,8 +12,10 @@ from .core.anchored import Anchored
 
 
 class Nodes(Place):
-    """The node of a grid for each particle. grid: where one node is, and how far they are apart, 0 along axes that are free.
-    node: of each particle at first, (m, dim)."""
+    """The node of a grid for each particle.
+
+    grid: the position of one node, and the spacing, 0 along free axes. node: the initial node of each particle, (m, dim).
+    """
 
     def __init__(self, scene: Scene, passes: AnchorPasses, grid: list[np.ndarray], node: np.ndarray):
         add, (m, dim) = scene.memory.field, node.shape
@@ -24,7 +26,7 @@ class Nodes(Place):
 
     @ti.func
     def nearest(self, x):
-        """The node nearest to x; x itself along axes that are free."""
+        """Return the node nearest to x; x itself along free axes."""
         node = x
         for k in ti.static(range(self.state.dim)):
             step, zero = self.grid[1][k], self.grid[0][k]
@@ -34,7 +36,10 @@ class Nodes(Place):
 
     @ti.func
     def offsets(self, c, frame_fraction, first, fresh):
-        """x - node; what is remembered of the substep before is put in terms of the same node."""
+        """Return x - node, now and at the start of the substep.
+
+        The first pass takes the new node, and expresses the remembered C in terms of it.
+        """
         i = self.corners.member(c, 0)
         x, start = self.state.place(i), self.state.place(i) - self.state.d[i]
         if first != 0:
@@ -53,22 +58,22 @@ class Nodes(Place):
 
     @ti.func
     def offset_now(self, c, back):
-        """x - node."""
+        """Return x - node, with the node nearest to x."""
         i = self.corners.member(c, 0)
         x = self.state.place(i) - back * self.state.d[i]
         return x - self.nearest(x)
 
     @ti.func
     def offset_change(self, c):
-        """The motion of the particle."""
+        """Return the displacement of the particle in this substep."""
         return self.state.d[self.corners.member(c, 0)]
 
 
 class Snap(Anchored):
-    """Particles drawn to the nearest node of a grid, as by a spring.
+    """Particles drawn to the nearest node of a grid by springs.
 
     C(x) = x - node(x_n), the node nearest to the particle at the start of the substep; unit gradients. The energy
-    |C|^2 / (2 compliance) is continuous where the node changes, half way between two.
+    |C|^2 / (2 compliance) is continuous where the node changes, half way between two nodes.
 
     indices: (m,) particles. spacing: of the grid, number or (dim,) [m], above 0; inf leaves an axis free.
     origin: one of the nodes, number or (dim,) [m].
@@ -91,7 +96,7 @@ class Snap(Anchored):
         return value
 
     def check_more(self, more: Feature) -> None:
-        """Only of the same grid."""
+        """Raise TypeError unless `more` has the same grid."""
         super().check_more(more)
         for name in ("spacing", "origin"):
             mine, other = getattr(self, name), getattr(more, name)
@@ -101,30 +106,30 @@ class Snap(Anchored):
                 )
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Settle the grid."""
+        """Check the indices, and expand spacing and origin to one number per axis."""
         super().prepare(particles, inv_mass)
         dim = particles.dim
         self._spacing = checks.per_item("Snap", "spacing", self.spacing, dim, infinite=True, above=0.0)
         self._origin = checks.per_item("Snap", "origin", self.origin, dim)
 
     def node(self, position: np.ndarray) -> np.ndarray:
-        """The nodes nearest to positions (m, dim)."""
+        """Return the nodes nearest to positions (m, dim)."""
         free = np.isinf(self._spacing)
         step = np.where(free, 1.0, self._spacing)
         return np.where(free, position, self._origin + np.floor((position - self._origin) / step + 0.5) * step)
 
     def start_offset(self, position: np.ndarray) -> np.ndarray:
-        """C at the start."""
+        """Return C at the start, (m, dim)."""
         x = position[self.indices[:, 0]]
         return x - self.node(x)
 
     def place_of(self, scene: Scene, passes: AnchorPasses) -> "Nodes":
-        """The node of each particle."""
+        """Make the nodes of the particles, on the device."""
         free = np.isinf(self._spacing)
         x = self.start.position[self.indices[:, 0]]
         return Nodes(scene, passes, [self._origin, np.where(free, 0.0, self._spacing)], self.node(x))
 
     def bind(self, scene: Scene) -> None:
-        """Nothing of it changes."""
+        """Declare fields. No knob has to be uploaded before the first frame."""
         super().bind(scene)
         self.changed = False

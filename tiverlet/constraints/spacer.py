@@ -7,13 +7,14 @@ from .core.scalar import Scalar
 
 
 class Spacer(Scalar):
-    """Pairs that stay at least `length` apart, contact or not.
+    """Pairs of particles that stay at least `length` apart, whether or not the scene has contacts.
 
     C(x) = |x_i - x_j| - length >= 0, gradients as in Distance; the multiplier may only push.
 
-    pairs: (m, 2); length: number or (m,) [m]; compliance [m/N] and damping [N s/m] of the pushing spring; break_at: load
-    beyond which it breaks, number or (m,) [N].
-    Assign to .rest to change the length.
+    pairs: (m, 2) particle indices.
+    length: number or (m,) [m]. Assign to .rest to change it.
+    compliance, damping: number or (m,) [m/N] and [N s/m], of the pushing spring.
+    break_at: load at which a spacer breaks, number or (m,) [N].
     """
 
     side = -1

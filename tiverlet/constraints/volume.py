@@ -15,7 +15,7 @@ from .core.outline_passes import PRESSURE
 from .core.quantity import Quantity
 from .core.scalar import Scalar
 
-LARGEST = 1e9  # [m] the square of a volume's gradient, a length to the fourth, has to stay below 3e38
+LARGEST = 1e9  # [m] the squared gradient of a volume is a length to the fourth, and must stay below 3e38
 
 
 class Volume(Scalar):
@@ -23,15 +23,16 @@ class Volume(Scalar):
 
     C(x) = V(x) - pressure rest,   V = sum over faces of a . (b x c) / 6,   grad_a V = sum over the faces at a of b x c / 6.
 
-    cells: (m, 4) indices of tetrahedra, one constraint each; or (k, 3) indices of faces, of one or several closed surfaces. Each
-    surface that hangs together by its edges encloses a volume of its own and is one constraint, in the order of first faces.
-    Corners may be given in any sense: they are turned so that volumes are positive at the start.
+    cells: (m, 4) indices of tetrahedra, one constraint each; or (k, 3) indices of faces, of one or several closed surfaces. Faces
+    connected by edges form one surface. Each surface encloses its own volume and is one constraint, in the order of first faces.
+    Corners may be given in any sense: they are reordered so that volumes are positive at the start.
     rest: volume at pressure 1, number or (m,) [m^3]; None takes the initial volumes. Live.
     pressure: factor on the rest volume, number or (m,), at least 0. Live.
-    compliance: number or (m,) [m^5/N], inverse of what pressure [Pa] each m^3 of missing volume makes; 0 is rigid.
+    compliance: number or (m,) [m^5/N], inverse of the pressure [Pa] per m^3 of missing volume; 0 is rigid.
     damping: number or (m,) [N s/m^5]. break_at: pressure at which it bursts, number or (m,) [Pa].
 
-    `load` is -p, with p the pressure inside [Pa]. Second order in h, see Equation. Bodies of 1e9 m and more leave f32.
+    `load` is -p, with p the pressure inside [Pa]. Second order in h, see Equation. Bodies of 1e9 m and more exceed the range of
+    f32.
 
     Raises ValueError in 2D, and for surfaces with an open edge, an edge of three faces, or only one side; the edge is named.
     """
@@ -51,35 +52,35 @@ class Volume(Scalar):
 
     @property
     def goal(self) -> np.ndarray:
-        """pressure rest."""
+        """The target volumes, pressure * rest [m^3], (m,)."""
         return self.pressure * self.rest
 
     def quantity_of(self, indices) -> Quantity:
-        """Tetrahedra are simpler than meshes, and have kernels of their own."""
+        """Return Surfaces for faces (k, 3), else Tetrahedra, which have simpler kernels of their own."""
         if np.ndim(indices) == 2 and np.shape(indices)[1] == 3:
             return Surfaces(*_oriented(checks.indices("Volume", "cells", indices, checks.ANY, arity=3)))
         return Tetrahedra(self.fixed(indices, 4))
 
     @property
     def faces(self) -> np.ndarray:
-        """Faces of closed surfaces, (k, 3), as seen from outside. Raises AttributeError where there are tetrahedra."""
+        """Faces of closed surfaces, (k, 3), as seen from outside. Raises AttributeError for tetrahedra."""
         if self.arity:
             raise AttributeError(f"{self!r} has tetrahedra and no faces; their particles are in .indices.")
         return self.listing
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Turn the corners so that volumes are positive at the start."""
+        """Order the corners so that volumes are positive at the start."""
         if particles.dim != 3:
             raise ValueError("Volume: there are no volumes in a 2D world; use Area.")
         self.check_indices(particles)
-        for _ in range(2):  # back again where it is negative either way round, being flat: a clone asks anew
+        for _ in range(2):  # twice: a flat body, negative in both senses by rounding, keeps its order, so a clone finds the same
             self.hold(self.quantity.reversed(self.rest_of(particles.position) < 0))
         super().prepare(particles, inv_mass)
-        if (self.rest < 0).any():  # of a flat body, by rounding, either way round
+        if (self.rest < 0).any():  # a flat body, by rounding in both senses
             self.start_from(np.maximum(self.rest, 0.0))
 
     def bind(self, scene: Scene) -> None:
-        """Refuse what f32 cannot hold."""
+        """Bind, after raising ValueError for volumes that f32 cannot represent."""
         largest = float(np.cbrt(np.abs(self.goal).max(initial=0.0)))
         if scene.real == ti.f32 and largest >= LARGEST:
             raise ValueError(f"Volume: a body of {largest:g} m is too large for f32. Use World(..., precision='f64').")
@@ -93,23 +94,23 @@ class Tetrahedra(Quantity):
     exchangeable = ((0, 1, 2, 3),)
 
     def reversed(self, which: np.ndarray) -> "Tetrahedra":
-        """Two corners of some swapped."""
+        """Return these tetrahedra, with two corners swapped where `which` (m,) is True."""
         indices = self.members.indices
         return Tetrahedra(FixedSize("Volume", np.where(which[:, None], indices[:, [0, 1, 3, 2]], indices)))
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """Signed volumes."""
+        """Return the signed volumes, (m,) [m^3]."""
         a, b, c, d = (x[:, k] for k in range(4))
         return np.einsum("ij,ij->i", b - a, cross(c - a, d - a)) / 6
 
     @ti.func
     def reach(self, q):
-        """The size of a tetrahedron."""
+        """Return the size of a tetrahedron [m]."""
         return q.norm()
 
     @ti.func
     def measure(self, c, q):
-        """Volume, and its gradients."""
+        """Return the volume and its gradients."""
         a, b, e = q[1, :], q[2, :], q[3, :]
         u, v, w = b.cross(e) / 6, e.cross(a) / 6, a.cross(b) / 6
         return a.dot(u), ti.Matrix.rows([-u - v - w, u, v, w])
@@ -118,8 +119,8 @@ class Tetrahedra(Quantity):
 class Surfaces(Quantity):
     """Volumes inside closed surfaces.
 
-    faces: (k, 3), the two at each edge run along it in opposite senses. surface: the surface that each belongs to, (k,).
-    On the device, ring: the other two corners of the faces around each corner e, from starts[e] on.
+    faces: (k, 3); the two faces at each edge run along it in opposite senses. surface: the surface of each face, (k,).
+    On the device, `ring` lists the other two corners of the faces around each corner e, from starts[e] on.
     """
 
     collapses, transcends, curved = 3, True, True
@@ -134,31 +135,31 @@ class Surfaces(Quantity):
 
     @property
     def listing(self) -> np.ndarray:
-        """The faces."""
+        """The faces, (k, 3)."""
         return self.faces
 
     def reversed(self, which: np.ndarray) -> "Surfaces":
-        """The faces of some turned around."""
+        """Return these surfaces, with the faces of surface k reversed where which[k] is True."""
         return Surfaces(np.where(which[self.surface][:, None], self.faces[:, ::-1], self.faces), self.surface)
 
     def remapped(self, some: np.ndarray, number: np.ndarray) -> "Surfaces":
-        """Those in the mask."""
+        """Return the surfaces in the mask `some`, with the new numbers of their particles."""
         stays = some[self.surface]
         return Surfaces(number[self.faces[stays]].astype(np.int32), (np.cumsum(some) - 1)[self.surface[stays]])
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """Signed volumes."""
+        """Return the signed volumes, (m,) [m^3]."""
         a, b, c = self._seen(x)
         parts = np.einsum("ij,ij->i", a, cross(b, c)) / 6
         return np.bincount(self.surface, weights=parts, minlength=self.members.count)
 
     def _seen(self, x: np.ndarray) -> np.ndarray:
-        """The corners of each face, (3, k, 3), as seen from one of the particles of its surface."""
+        """Return the corners of each face, (3, k, 3), relative to one of the particles of its surface."""
         eye = x[self.members.indices[self.members.starts[:-1]]][self.surface][:, None]
         return np.moveaxis(x[self.faces] - eye, 1, 0)
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
-        """Their gradients by each corner, (total, 3)."""
+        """Return the gradients of the volumes by each corner, (total, 3)."""
         members, corner = self.members, self._corner
         a, b, c = self._seen(x)
         parts = np.stack([cross(b, c), cross(c, a), cross(a, b)], axis=1).reshape(-1, 3) / 6
@@ -166,18 +167,18 @@ class Surfaces(Quantity):
 
     @property
     def _corner(self) -> np.ndarray:
-        """The place among the members of each corner of a face, (3 faces,)."""
+        """The index among the members of each corner of each face, (3 faces,)."""
         members = self.members
         most = 1 + int(members.indices.max(initial=0))
-        own = members.owner.astype(np.int64) * most + members.indices  # sorted, as np.unique made them
+        own = members.owner.astype(np.int64) * most + members.indices  # sorted, since np.unique sorts the members
         return np.searchsorted(own, self.surface[:, None].astype(np.int64) * most + self.faces).ravel()
 
     def pairs(self) -> np.ndarray:
-        """The ends of each edge."""
+        """Return the two ends of each edge, (edges, 2)."""
         return np.unique(np.sort(_edges(self.faces)[:, :2], axis=1), axis=0)
 
     def bind(self, scene: Scene, batch: Any, equation: Any) -> "Surfaces":
-        """Its gradients, on the device: the faces around each corner, as the two other corners of each, in order."""
+        """Return the quantity for kernels, with the faces around each corner in fields, in order: their other two corners."""
         members, corner = self.members, self._corner
         others = np.stack([self.faces[:, [1, 2, 0]].ravel(), self.faces[:, [2, 0, 1]].ravel()], axis=1)
         order = np.argsort(corner, kind="stable")
@@ -189,7 +190,10 @@ class Surfaces(Quantity):
 
     @ti.func
     def slope(self, e, back):
-        """Sum of b x c / 6 over the faces around a corner; b and c relative to it, which changes nothing in a closed ring."""
+        """Return the sum of b x c / 6 over the faces around a corner, with b and c relative to it.
+
+        The reference point does not change the sum over a closed ring.
+        """
         i = self.corners.members[e]
         total = 0 * self.state.d[i]
         for k in range(self.starts[e], self.starts[e + 1]):
@@ -201,13 +205,13 @@ class Surfaces(Quantity):
 
 
 def _edges(faces: np.ndarray) -> np.ndarray:
-    """The edges of each face in its sense, and the face: (3 k, 3)."""
+    """Return the edges of each face in its sense, and the face: (3 k, 3)."""
     f = np.arange(len(faces), dtype=faces.dtype)
     return np.concatenate([np.stack([faces[:, a], faces[:, (a + 1) % 3], f], axis=1) for a in range(3)])
 
 
 def _oriented(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Faces, turned so that the two at each edge run along it in opposite senses, and the surface that each belongs to."""
+    """Orient faces so that the two at each edge run along it in opposite senses. Returns the faces and the surface of each."""
     edges = _edges(faces)
     forward = edges[:, 0] < edges[:, 1]
     ends = np.sort(edges[:, :2], axis=1)

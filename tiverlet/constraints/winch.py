@@ -12,31 +12,31 @@ from .core.drive import Drive, largest_load
 from .core.length import Length
 from .core.scalar import Scalar
 
-SHORTEST = 1e-2  # of its initial length: what remains of a rope, where nothing else is said
+SHORTEST = 1e-2  # of its initial length: the default for `shortest`
 
 
 class Winch(Scalar):
     """Winches: ropes whose length changes at a given speed, with a largest force.
 
     C(x) = |x_i - x_j| - rest <= 0, gradients as in Distance; the multiplier may only pull. In a substep h the length `rest` grows
-    by speed h, between `shortest` and `longest`. The pull is clamped, lam <= force h^2: below the largest force the speed is met,
-    beyond it the rope runs out; see core.drive.Drive.
+    by speed h, between `shortest` and `longest`. The pull is clamped, lam <= force h^2. Below the largest force the length
+    changes at the given speed; beyond it the rope runs out; see core.drive.Drive.
 
     pairs: (m, 2) particle indices.
     speed: number or (m,) [m/s]; positive pays out, negative winds up, 0 holds. Live.
     length: number or (m,) [m] at the start, above 0; None takes the initial distances.
-    shortest, longest: number or (m,) [m], where it stops by itself; shortest is above 0, None for a hundredth of `length`. Live.
-    force: the largest, number or (m,) [N]. Live. 0 lets the rope run free. None that is given is one that meets any load.
-    compliance: number or (m,) [m/N] and damping [N s/m] of the taut rope. break_at: tension beyond which it breaks, [N].
+    shortest, longest: number or (m,) [m], where the winch stops; shortest is above 0, None for a hundredth of `length`. Live.
+    force: the largest pull, number or (m,) [N]. Live. 0 lets the rope run free. Without it the winch meets any load.
+    compliance: number or (m,) [m/N] and damping [N s/m] of the taut rope. break_at: tension at which it breaks, [N].
 
-    `load` is the tension [N], `rest` the length now [m].
+    `load` is the tension [N], `rest` the current length [m].
     """
 
     measures = Length
     side = 1
     driven = True
     each = ("speed", "length", "shortest", "longest", "force", "compliance", "damping", "break_at")
-    uploads_all = False  # goals are of one
+    uploads_all = False  # goals are computed for a single world
     speed = Knob(lambda f, v: checks.per_item("Winch", "speed", v, f.count), "Change of length [m/s].")
     shortest = Knob(lambda f, v: checks.per_item("Winch", "shortest", v, f.count, above=0.0), "Least length [m].")
     longest = Knob(lambda f, v: checks.per_item("Winch", "longest", v, f.count, above=0.0, infinite=True), "Largest length [m].")
@@ -55,17 +55,17 @@ class Winch(Scalar):
 
     @property
     def cusp(self) -> bool:
-        """No length is 0."""
+        """False: no length of a winch is 0."""
         return False
 
     @property
     def largest(self) -> Any:
-        """The largest pulls."""
+        """The largest pulls [N], (m,)."""
         return self.force
 
     @property
     def rest(self) -> np.ndarray:
-        """The lengths now [m], (m,)."""
+        """The current lengths [m], (m,)."""
         if "drive" in vars(self.dev):
             return self.dev.drive.values()[: self.count]
         if "length" not in self.__dict__:
@@ -73,7 +73,7 @@ class Winch(Scalar):
         return self.length
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check the indices, and take lengths that were not given."""
+        """Check the indices, and take the initial distances as lengths where none were given."""
         self.check_indices(particles)
         if "length" not in self.__dict__:
             self._keep(length=self.rest_of(particles.position))
@@ -85,15 +85,15 @@ class Winch(Scalar):
             self.shortest = SHORTEST * self.length
 
     def drive_of(self, scene: Scene) -> Drive:
-        """From end to end."""
+        """Make the drive, which goes to the shortest or the longest length."""
         return Drive(scene, "Winch", self.length, *self.course(), self.force if self.capped else None, False, 0.0, 0.0)
 
     def course(self) -> tuple[Any, Any]:
-        """Where lengths go to, and how fast."""
+        """Return the goals of the lengths [m] and the speeds [m/s]."""
         return np.where(self.speed > 0, self.longest, self.shortest), np.abs(self.speed)
 
     def start_at(self, position: np.ndarray, first: int) -> None:
-        """Ropes that can run out have done so, where their ends were placed further apart."""
+        """Lengthen ropes with a limited force whose ends were placed further apart, to the new distance."""
         far = np.isfinite(self.force) & (self.violation(position) > 0) & (self.indices >= first).any(axis=1)
         if far.any():
             self.dev.drive.put(np.where(far, self.rest_of(position), self.rest))

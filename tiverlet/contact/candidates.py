@@ -1,4 +1,4 @@
-"""What may touch where the host moves particles: overlaps and their gradients, in NumPy."""
+"""Possible contacts where the host moves particles: overlaps and their gradients, in NumPy."""
 
 from typing import TYPE_CHECKING, Protocol
 
@@ -11,26 +11,30 @@ if TYPE_CHECKING:
 
 
 class Candidates(Protocol):
-    """m contacts, of which some overlap, and others may once particles have moved. who: (m, k), the particles of each. size: (m,)
-    [m], what overlaps are deep beside."""
+    """m possible contacts: some overlap, others may overlap once particles have moved.
+
+    who: (m, k), the particles of each. size: (m,) [m], the length relative to which an overlap is deep.
+    """
 
     who: np.ndarray
     size: np.ndarray
 
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """At positions x (n, dim): how deep each overlaps [m], (m,), negative where apart, and the gradients of C, which is the
-        opposite of it, (m, k, dim)."""
+        """Return overlaps (m,) [m] at positions x (n, dim) [m], and the gradients (m, k, dim) of C = -overlap.
+
+        Overlaps are negative where particles are apart.
+        """
         ...
 
 
 class DiscCandidates:
-    """Pairs of discs or spheres, who (m, 2). reach: at which distance each pair touches [m], (m,). box: the Periodic, or None."""
+    """Pairs of discs or spheres, who (m, 2). reach: (m,) [m], the contact distance of each pair. box: the Periodic, or None."""
 
     def __init__(self, who: np.ndarray, reach: np.ndarray, box: "Periodic | None"):
         self.who, self.reach, self.box, self.size = who, reach, box, reach / 2
 
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """C = |x_i - x_j| - (r_i + r_j)."""
+        """Return the overlaps (m,) [m] and the gradients (m, 2, dim) of C = |x_i - x_j| - (r_i + r_j)."""
         r = between(x[self.who[:, 0]], x[self.who[:, 1]], self.box)
         length = np.linalg.norm(r, axis=1)
         n = np.divide(r, length[:, None], out=np.zeros_like(r), where=length[:, None] > 0)
@@ -41,12 +45,12 @@ class EdgeCandidates:
     """Vertices v and edges from a to b; or corners that touch as discs do, where b is a (2D).
 
     C = (x_v - (1 - t) x_a - t x_b) . n - (r_v + (1 - t) r_a + t r_b) + allowed, as in Polygons. A vertex is over the edge that
-    pushed it last, whichever is nearest now, or else over that which PolygonGeometry finds. What touched nothing may come in over
-    an edge that it was in front of, or a corner.
+    pushed it last, even if another edge is nearer now, or else over the edge that PolygonGeometry finds. A vertex that touched
+    nothing may come in over an edge that it was in front of, or over a corner.
 
-    pairs: (m, 2), v and a. found: (m, 4), overlap, t and normal at positions x. discs: what t is for discs. pushed: (m,), whether
-    they were pushed apart in the last substep. ends: (n, 2), of each particle the next and the one before around its body, -1
-    where there is none; body: (n,), its number. allowed: (m,) [m].
+    pairs: (m, 2), v and a. found: (m, 4), overlap, t and normal at positions x. discs: the value of t for discs. pushed: (m,),
+    whether the pair was pushed apart in the last substep. ends: (n, 2), the next and the previous particle around the body of
+    each particle, -1 without a body. body: (n,), its number. allowed: (m,), the allowed overlap [m].
     """
 
     def __init__(
@@ -56,18 +60,18 @@ class EdgeCandidates:
         self.radius, self.ends = radius, ends
         (v, a), after, lone = pairs.T, ends[:, 0], ends[:, 0] < 0
         both = v * (body.max(initial=0) + 1) + body[a]
-        told = ~lone[a] & np.isin(both, both[pushed & ~lone[a]])  # whose last push tells where it came in
+        told = ~lone[a] & np.isin(both, both[pushed & ~lone[a]])  # a push of this vertex by this body shows where it came in
         touches = found[:, 0] > 0
         known = np.where(told, pushed, touches)
         at_edge = np.where(touches, found[:, 1] > discs, ~lone[a] & ~((radius[v] + radius[a] > 0) & self._corners(x, v, a)))
-        keeps = np.where(lone[v] == lone[a], v < a, lone[v]) & (radius[v] + radius[a] > 0)  # of two discs, one
+        keeps = np.where(lone[v] == lone[a], v < a, lone[v]) & (radius[v] + radius[a] > 0)  # one entry of two discs
         kinds = known & at_edge, ~known & ~lone[a], known & ~at_edge & keeps, ~known & keeps
         some = np.concatenate([np.flatnonzero(kind) for kind in kinds])
         known_edge, fresh_edge, _, fresh_disc = np.repeat(np.eye(4, dtype=bool), [kind.sum() for kind in kinds], axis=1)
         v, a, normal, self.allowed = v[some], a[some], found[some, 2:], allowed[some]
         edge = known_edge | fresh_edge
         self.who = np.stack([v, a, np.where(edge, after[a], a)], axis=1)
-        # What has passed an inner corner goes back over that: its normal is not that of the edge.
+        # A vertex that has passed an inner corner goes back over that corner: the normal is not that of the edge.
         edges = x[self.who[:, 2]] - x[a]
         inner = known_edge & touches[some] & ((normal * edges).sum(axis=1) > 0.01 * np.linalg.norm(edges, axis=1))
         self.who[inner, 2] = a[inner]
@@ -83,7 +87,7 @@ class EdgeCandidates:
         self.size = np.where(self.edge, np.linalg.norm(x[b] - x[a], axis=1), radius[v] + radius[a]) / 2
 
     def _measured(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Overlaps, normals, and where on the line of the edge each vertex is."""
+        """Return overlaps [m], normals, and the place of each vertex along the line of its edge, 0 at a and 1 at b."""
         v, a, b = self.who.T
         r, u, one = x[v] - x[a], x[b] - x[a], np.ones(len(v))
         uu, rr = (u**2).sum(axis=1), (r**2).sum(axis=1)
@@ -96,7 +100,10 @@ class EdgeCandidates:
         return reach - (r * n).sum(axis=1), n, place
 
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As in the class. A vertex that touched nothing and is beside no edge has neither an overlap nor a gradient."""
+        """Return overlaps (m,) [m] and the gradients of C (m, 3, 2) by v, a and b.
+
+        A vertex that touched nothing and is beside no edge has neither an overlap nor a gradient.
+        """
         overlap, n, place = self._measured(x)
         t = np.clip(place, self.low, self.high)
         none = self.fresh_edge & (t != place)
@@ -105,7 +112,7 @@ class EdgeCandidates:
         return overlap, np.stack([n, (t - 1)[:, None] * n, -t[:, None] * n], axis=1)
 
     def _corners(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Whether each of two particles is beside no edge of the other."""
+        """Whether each of the particles v and a is in front of a corner of the other, beside none of its edges, (m,)."""
         out = np.ones(len(v), dtype=bool)
         for i, j in ((v, a), (a, v)):
             after, before = self.ends[j].T

@@ -1,4 +1,4 @@
-"""Particles that do not overlap."""
+"""Contacts of discs and spheres."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -28,63 +28,69 @@ from .spinning import Spinning
 from .velocity_projection import VelocityProjection
 
 RELAXATION = 1.25  # below 4/3, see Contact
-CARRY = 0.4  # of its last push that a pair keeps, at most; below 1/2
-UPTAKE = 1 / 8  # of the slack of a pair, what a substep takes back
+CARRY = 0.4  # largest share of its last push that a pair keeps; below 1/2
+UPTAKE = 1 / 8  # share of the slack of a pair that a substep removes
 
 
 class Contact(PairContact):
-    """Discs and spheres do not overlap.
+    """Contacts of discs and spheres: no two of them overlap.
 
     C(x) = |x_i - x_j| - (r_i + r_j) >= 0 for all pairs, grad_i C = n = (x_i - x_j) / |x_i - x_j|.
 
-    friction: Coulomb, a number or (static, dynamic), or a mapping from pairs of groups to these: {(0, 1): 0.5}. restitution:
-    0 to 1, or such a mapping. groups: the pairs of groups that touch, None for all. skin: how far beyond touching pairs are
-    listed [m], "auto" for 0.75 of the median radius; speed only, never the result. push_out: two particles that overlap at
-    the start, or after positions were assigned, part at this speed [m/s] at most: they act as if they were small enough to fit,
-    and grow back. In a cluster each pair parts at about that speed, so its rim moves as much faster as there are pairs on the way
-    to it. events: whether World.events() tells which pairs met and parted. sensors: pairs of groups that do not touch;
-    World.events() tells which particles of the second group, the sensors, overlap with those of the first. It costs least where
-    sensors are few. loads: pairs know what they bear at rest, and hold it without overlap; see known_loads.py.
+    friction: Coulomb friction, a number or (static, dynamic), or a mapping from pairs of groups to these: {(0, 1): 0.5}.
+    restitution: 0 to 1, or such a mapping.
+    groups: the pairs of groups that touch, None for all.
+    skin: how far beyond contact distance pairs are listed [m], "auto" for 0.75 of the median radius. It affects speed only, never
+    the result.
+    push_out: largest speed [m/s] at which two particles part that overlap at the start, or after positions were assigned. They
+    act as if they were small enough to fit, and grow back. In a cluster each pair parts at about that speed, so the rim moves
+    as many times faster as there are pairs on the way to it.
+    events: whether World.events() reports which pairs met and parted.
+    sensors: pairs of groups that do not touch. World.events() reports which particles of the second group, the sensors, overlap
+    particles of the first group. It costs least where sensors are few.
+    loads: whether pairs store the load that they bear at rest, and hold it without overlap; see known_loads.py.
 
-    A Jacobi pass: each pair wants C back along n, split by mass, p = C / (m_i w_i + m_j w_j), which conserves momentum, and
-    angular momentum with n at the start of the substep, see DiscGeometry.impact(). A particle has its mass split m times, where m
-    bounds the eigenvalues of S, the sum of n n^T over its overlapping pairs: then sum w J J^T <= diag(sum w m) for the rows J of
+    Jacobi pass: each pair takes C back along n, split by mass, p = C / (m_i w_i + m_j w_j). This conserves momentum, and angular
+    momentum with n at the start of the substep, see DiscGeometry.impact(). The mass of a particle is split m times, where m
+    bounds the eigenvalues of S, the sum of n n^T over its overlapping pairs. Then sum w J J^T <= diag(sum w m) for the rows J of
     its pairs, and no eigenvalue of a pass exceeds 1. m is 3 for a disc among six neighbours (counting pairs gives 6) and 4 for a
-    sphere among twelve. With friction tangents are taken back too; n n^T and t t^T sum up to the count, which is taken then, and
-    for up to two pairs. m is worked out when other pairs touch than before, where i moves by a 64th of its radius, and every 8
-    substeps, for pairs slide. It rises at once and decays by 1/32 of its excess per pass; otherwise the stiffness would jump
-    whenever a contact opens, and keep pairs moving.
+    sphere among twelve. Friction corrects tangents, too; n n^T and t t^T sum up to the number of pairs. So with
+    friction, and for up to two pairs, m is that number. m is computed anew when the set of touching pairs changes, where i moves
+    by a 64th of its radius, and every 8 substeps because pairs slide. m rises at once and decays by 1/32 of its excess per pass;
+    otherwise the stiffness would jump whenever a contact opens, and keep pairs moving.
 
-    Pushes are over-relaxed by r = 5/4, and a pair that overlapped in the last substep keeps a part of what it got. With M =
-    m_i w_i + m_j w_j, p = r C / M + c p_last, but no more than what parts the pair alone, C / (w_i + w_j). For a mode with
-    eigenvalue L of a pass, stepping has the characteristic polynomial (z - 1)^2 (z - c) + r L z (2 z - 1), stable if and only if
-    c < 1/2 and r L < 4 (1 + c) / 3. A load is held by (1 - c) / r of the overlap; c = 0.4, or less where p would pass that bound
-    at rest. So the k-th contact below the top of a stack overlaps by 2 k g h^2. Sound that is left in a pile is taken out now and
-    then, see velocity_projection.py.
+    Over-relaxation: pushes are over-relaxed by r = 5/4, and a pair that overlapped in the last substep keeps a part of its push.
+    With M = m_i w_i + m_j w_j, p = r C / M + c p_last, but no more than separates the pair alone, C / (w_i + w_j). For a mode
+    with eigenvalue L of a pass, stepping has the characteristic polynomial (z - 1)^2 (z - c) + r L z (2 z - 1). It is stable if
+    and only if c < 1/2 and r L < 4 (1 + c) / 3. A load needs (1 - c) / r of the overlap that it would need otherwise. c is 0.4,
+    or less where p would exceed that bound at rest. So the k-th contact below the top of a stack overlaps by 2 k g h^2. Sound
+    (waves through loaded contacts) is removed now and then, see velocity_projection.py.
 
-    Particles that are in the same place part in a direction made from their indices, another one for each pair. Linked particles
-    (Distance, Rope, Spacer) do not touch, nor do those that a chain of links holds closer than they reach, see exclusions.py.
+    Two particles in the same place part in a direction computed from their indices, a different one for each pair. Linked
+    particles (Distance, Rope, Spacer) do not touch, nor do particles that a chain of links holds closer than the sum of their
+    radii, see exclusions.py.
 
-    Friction wants back the slip s of a pair, up to friction times the overlap: what a pair has moved across its normal since it
-    touched, kept as long as it touches (Cundall and Strack 1979). Restitution gives the pair, from the moment on when it meets,
-    the normal velocity -e times the one that it has then, with the force in that substep. Neither depends on h: a bounce keeps
-    e^2 of the energy along the normal, to rounding under forces that are the same everywhere, and to second order under others.
+    Friction takes back the slip s of a pair, up to friction times the overlap. s is the tangential displacement since the pair
+    touched, kept as long as it touches (Cundall and Strack 1979). Restitution gives the pair, from the time of impact on, -e
+    times its normal velocity at that time, with the force in that substep. Neither depends on h: a bounce keeps e^2 of the energy
+    along the normal, to rounding under uniform forces, and to second order under others.
 
-    Particles that spin (see Particles) slide past each other by what the points that touch do, and turn as friction acts there.
+    Particles that spin (see Particles): the slip is that of the points that touch, and friction there turns the particles.
     friction = (static, dynamic, rolling, twisting) also resists rolling, by a moment of up to rolling * r times the normal force,
-    with r = r_i r_j / (r_i + r_j), and spinning about the normal, by up to twisting * r times it (Luding 2008). restitution =
-    (normal, tangential): in an impact the points that touch leave across the normal at -tangential times their velocity, as far
-    as friction holds it; 0 grips, 1 is a super ball (Walton 1993). Of particles that do not spin, friction is that of skaters.
+    with r = r_i r_j / (r_i + r_j). It resists spinning about the normal by up to twisting * r times that force (Luding 2008).
+    restitution = (normal, tangential): in an impact the points that touch leave across the normal at -tangential times their
+    velocity, as far as friction holds it; 0 grips, 1 is a super ball (Walton 1993). Friction of particles without spin does not
+    turn them.
 
-    What is struck by several in one substep bounces off one after the other. Of the pairs that were struck, those take their turn
-    that come first for both of their particles; then the next ones, on the new ways. Each impact is between two, so it keeps
-    momentum, and energy if e = 1, however many there are.
+    Several impacts of one particle in a substep are resolved one after the other. A round takes the struck pairs that come first
+    for both of their particles; the next round takes the next pairs, on the new paths. Each impact is between two particles, so
+    it conserves momentum, and energy if e = 1, however many impacts there are.
 
-    Overlap left after an impact is slack: it is not pushed out, which would add energy, because pushes act like springs and no
-    spring was there when the pair was thrown together. It is removed from positions only, an eighth per substep. Other overlap of
-    pairs that bounce is pushed out: what came to be while pushes acted, or in the substep in which the pair comes to rest. A pair
-    with slack rests unless it is thrown together by more than that in a substep, or e is 1; otherwise it bounces again, or is let
-    go on its way out. Unless e is 1, a pair rests, too, that comes together no faster than two substeps of forces make it.
+    Slack is the overlap left after an impact. It is not pushed out, which would add energy, because pushes act like springs and
+    no spring was there when the pair was thrown together. It is removed from positions only, an eighth per substep. Other overlap
+    of pairs that bounce is pushed out: overlap that arose while pushes acted, or in the substep in which the pair comes to rest.
+    A pair with slack rests unless it comes together by more than the slack in a substep, or e is 1; otherwise it bounces again,
+    or separates freely. Unless e is 1, a pair also rests if it comes together no faster than two substeps of forces make it.
     """
 
     def __init__(
@@ -101,7 +107,7 @@ class Contact(PairContact):
     projects = True
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Choose the skin, and refuse positions too far out for cells to be told apart."""
+        """Choose the skin, and refuse positions too far out for the cells."""
         if self.wanted.turns and not particles.spins:
             refuse_turning("Contact")
         self._measure(particles.radius)
@@ -110,14 +116,14 @@ class Contact(PairContact):
             self.check_range(particles.position)
 
     def _measure(self, radius: np.ndarray) -> None:
-        """How far beyond touching pairs are listed [m], and the smallest radius [m]."""
+        """Store the skin [m] and the smallest radius [m] of particles with these radii (n,) [m]."""
         some = radius[radius > 0]
         auto = 0.75 * median(some) if len(some) else 1.0
         self._listed = auto if self.skin == "auto" else float(self.skin)
         self._finest = float(radius.min(initial=np.inf))
 
     def can_regroup(self, change: Regrouping) -> bool:
-        """Whether particles can come and go: not where there are others to tell apart, or lists of another make."""
+        """Whether particles can come and go in place: not if the groups, the blocks or the neighbour search would differ."""
         dev, now = self.dev, change.now
         if not self.matters:
             return not bool((now.radius > 0).any())
@@ -126,7 +132,7 @@ class Contact(PairContact):
         return alike and splits and bool((now.radius > 0).any()) and dev.search.can_regroup(change, now.radius)
 
     def regroup(self, change: Regrouping) -> None:
-        """Particles came and went, and the team knows."""
+        """Resize the fields after particles came and went. The thread team already has the new number."""
         if not self.matters:
             return
         dev, n = self.dev, change.now.count
@@ -137,18 +143,18 @@ class Contact(PairContact):
         dev.projection.regroup(n, dev.list.team)
 
     def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
-        """Declare the fields, among them the neighbour list's, which is returned."""
+        """Declare the fields and the neighbour search, and return the search."""
         dim, dev = scene.particles.dim, self.dev
         linked = excluded_pairs(batches, scene.particles.radius)
         self.enter(scene)
         dev.move = scene.memory.field("Contact.move", scene.count, width=dim)
         self.table.bind(scene)
-        # What parted the pair in the last substep, per inverse mass [kg m].
+        # The push of the pair in the last substep, per inverse mass [kg m].
         dev.push = PairData("push", 0, lasting=True, marked=True)
         dev.slip = PairData("slip", dim, lasting=True)
         dev.spins, dev.axes = scene.state.spins and dev.has_friction, scene.particles.axes
         dev.turn = PairData("turn", dev.axes, lasting=True) if dev.turns else None
-        dev.slack = PairData("slack", 0, lasting=True, marked=True)  # of the overlap, what no push is for
+        dev.slack = PairData("slack", 0, lasting=True, marked=True)  # the part of the overlap that is not pushed out [m]
         dev.impulse = PairData("given", 0, lasting=True, told=True)  # pushes and impacts in the last substep [kg m]
         dev.has_loads = self.has_loads
         dev.known = KnownLoads(scene) if dev.has_loads else None
@@ -169,7 +175,8 @@ class Contact(PairContact):
         dev.geometry = DiscGeometry(scene, dev.search, self.push_out, dev.impulse if dev.has_restitution else dev.push)
         if dev.events:
             dev.events.bind(dev.list, dev.geometry)
-        skips = not scene.memory.compiler.few and not dev.has_restitution  # in relax() what bounces forgets the last impact
+        # With restitution relax() has to clear the last impacts, so no block is skipped.
+        skips = not scene.memory.compiler.few and not dev.has_restitution
         ended = [dev.push, *loads, *bouncing]
         slid = [*([dev.slip] if dev.has_friction else []), *([dev.turn] if dev.turn else [])]
         dev.splitting = MassSplitting(scene, dev.geometry, slid, skips, dev.push, ended, team, dev.known)
@@ -189,18 +196,20 @@ class Contact(PairContact):
 
     @ti.func
     def presses(self, i, e):
-        """Whether particle i presses on the one at entry e of its list, which does on it."""
+        """Whether particle i and the particle at entry e of its list press on each other."""
         return self.dev.push.field[e] > 0 or self.dev.geometry.push_each_other(i, self.dev.list.neighbour[e], 0)
 
     @ti.func
     def held_by(self, j):
-        """Which particle it is that another one presses on by particle j."""
+        """Return the particle that is pressed where an entry of a list is j: for discs, j itself."""
         return j
 
     @ti.func
     def reached(self, i, e, margin):
-        """The particle at entry e of the list of particle i where it sleeps and i is no further from it than the margin; if i is
-        driven, also where it touched it as the substep began."""
+        """Return the particle at entry e of the list of i if it sleeps and i is within `margin` [m] of it, else -1.
+
+        A driven particle i also reaches a sleeping particle that it touched as the substep began.
+        """
         j, out = self.dev.list.neighbour[e], -1
         if not self.dev.state.awake(j):
             met = self.dev.geometry.push_each_other(i, j, margin)
@@ -212,17 +221,17 @@ class Contact(PairContact):
 
     @ti.func
     def count(self, begin, end, now):
-        """Which pairs of some particles touch, and how often their masses are split."""
+        """Find the touching pairs of particles begin ... end - 1, and how often their masses are split."""
         self.dev.splitting.count(begin, end, now)
 
     @ti.func
     def busy(self, begin):
-        """0 if none of the particles that were counted together, from `begin` on, touches another."""
+        """Return 0 if no particle in the block that begins at `begin` touches another."""
         return self.dev.splitting.busy(begin)
 
     @ti.func
     def relax(self, i, now):
-        """What the pairs of particle i want of it."""
+        """Compute the corrections of particle i by its pairs, and the new pushes of these pairs."""
         first, fresh, final = now.first, now.fresh, now.final
         total, w = ti.Vector.zero(self.scene.real, self.dev.state.dim), self.dev.w.of(i)
         lift, forced, carried = total, total, total
@@ -231,10 +240,11 @@ class Contact(PairContact):
         if ti.static(self.dev.has_restitution):
             if first != 0:
                 self.dev.restitution.clear(i, self.dev.splitting.weight[i])
-        # 1 or 0, for a branch in the loop takes longer: whether pairs go on from their push in this substep, or the last one.
+        # Factors 1 or 0, faster than a branch in the loop: whether pairs continue from their push in this substep (again), or
+        # from the push of the last substep (carries).
         again = ti.cast(ti.select(first == 0, 1, 0), self.scene.real)
         carries = ti.cast(ti.select(first != 0 and fresh == 0, 1, 0), self.scene.real)
-        own, least = self.dev.splitting.weight[i], ti.cast(1, self.scene.real)  # least: of all pushes
+        own, least = self.dev.splitting.weight[i], ti.cast(1, self.scene.real)  # least: the smallest push of i
         if own > 0:
             for word in range(self.dev.list.words(i)):
                 bits = self.dev.splitting.touching(i, word)
@@ -251,8 +261,8 @@ class Contact(PairContact):
                     overlap, each, n, reach = self.dev.geometry.impact(i, j, contact_distance, shared, bears)
                     each *= ti.static(RELAXATION)
                     paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self.dev.w.of(j)
-                    push, known = again * last, ti.zero(overlap)  # known: what of its push was given before
-                    left = ti.zero(overlap)  # of the substep, after an impact
+                    push, known = again * last, ti.zero(overlap)  # known: the part of the push that its known load already gave
+                    left = ti.zero(overlap)  # the part of the substep after an impact
                     keeps = ti.max(lesser(1 - alone * each, ti.static(CARRY)), 0)
                     if ti.static(self.dev.has_loads):
                         if first != 0:
@@ -260,7 +270,7 @@ class Contact(PairContact):
                             push = known
                     if ti.static(self.dev.has_restitution):
                         held = overlap
-                        if ti.static(self.dev.has_loads):  # what bounces asks its overlap whether it rests: that of its load, too
+                        if ti.static(self.dev.has_loads):  # bounce() compares what holds the load: add the known load's overlap
                             held = ti.max(overlap, 0) + ti.max((1 - keeps) / each, alone) * self.dev.known.given(e, now)
                         given, slack, rests = self.dev.restitution.bounce(i, j, n, held, self.dev.slack.field[e], last, first)
                         slack = ti.min(slack, ti.max(overlap, 0))
@@ -274,7 +284,7 @@ class Contact(PairContact):
                         part = ti.select(paid > 0, lesser(part, paid / alone), ti.max(part, paid / alone))
                         part = ti.max(part, -push)
                     else:
-                        part = lesser(part, paid / alone)  # without a branch: it would be taken at random
+                        part = lesser(part, paid / alone)  # no branch: it would be mispredicted
                     if ti.static(self.dev.has_restitution):
                         if given > 0:
                             self.dev.restitution.struck.field[e] = 1
@@ -285,7 +295,7 @@ class Contact(PairContact):
                             push -= known
                     if ti.static(self.dev.has_loads):
                         load = self.dev.known.remember(i, j, e, part, push + part, now)
-                        carried += w * load * self.dev.geometry.direction(i, j)  # as the next substep starts
+                        carried += w * load * self.dev.geometry.direction(i, j)  # the normal as the next substep starts
                     pressed = part + known
                     if ti.static(self.dev.has_restitution):
                         self.dev.impulse.field[e] = self.dev.impulse.field[e] + pressed
@@ -301,7 +311,7 @@ class Contact(PairContact):
                         tangential, turned = self.grip(i, j, e, n, reach, pressed + given / shared, given > 0)
                         want += tangential
                         if ti.static(self.dev.has_restitution):
-                            if given > 0:  # it acts from the time of impact on
+                            if given > 0:  # friction of an impact acts from the time of impact on
                                 lift -= (1 - left) * w * tangential
                         spin_change += w * turned
                         if final != 0:
@@ -335,14 +345,16 @@ class Contact(PairContact):
 
     @ti.func
     def held(self, i, j, n, normal, slip):
-        """The part of a pair's slip, with the present displacements, that friction takes back for a normal displacement."""
+        """Return the part of a pair's slip [m], this substep included, that friction takes back for a normal displacement."""
         moved = self.dev.state.slid(slip + self.dev.state.d[i] - self.dev.state.d[j], i, j)
         return self.table.held(i, j, n, normal, moved)
 
     @ti.func
     def grip(self, i, j, e, n, reach, pressed, bounces):
-        """What friction between particles that spin pushes i by, and turns its surface by, both per inverse mass, for a push
-        `pressed` along the normal of a pair that is `reach` apart."""
+        """Return how far friction between spinning particles pushes i and turns its surface, both per inverse mass [kg m].
+
+        pressed: the push along the normal n [kg m]. reach: the distance of the pair [m]. bounces: whether this is an impact.
+        """
         m, split_mass = self.dev.spinning.arm_of(i, j, n, reach), self.dev.spinning.split_mass(i, j)
         slip = self.dev.slip.field[e] + self.dev.spinning.slip(i, j, m)
         if ti.static(self.dev.turns and self.dev.has_restitution):
@@ -355,9 +367,13 @@ class Contact(PairContact):
         return push, turned
 
     @ti.func
-    def reaction(self, i, h):
-        """Pushes along the normals at the present places, where they have no moment, and friction, known from the passes; but not
-        what forces have of them."""
+    def reaction(self, i, h, soft):
+        """Return how far contact forces moved particle i in the last substep of a frame, h [s] long [m].
+
+        It is the sum of pushes along the normals at the present places, where they have no moment, and of friction as the passes
+        summed it up. The part of known loads that counts as a force already is left out: h^2 / soft of a load, as in
+        KnownLoads.given().
+        """
         total, w = 0 * self.dev.state.d[i], self.dev.w.of(i)
         if self.dev.splitting.weight[i] > 0:
             for word in range(self.dev.list.words(i)):
@@ -373,7 +389,7 @@ class Contact(PairContact):
                         approach = -self.dev.state.slid(self.dev.forces.before[i] - self.dev.forces.before[j], i, j).dot(n)
                         share = self.dev.forces.share(approach, push * (w + self.dev.w.of(j)))
                         if ti.static(self.dev.has_loads):
-                            push -= self.dev.known.load.field[e] * h * h
+                            push -= self.dev.known.load.field[e] * h * h / soft
                         total += share * w * push * n
         if ti.static(self.dev.has_friction):
             total += self.dev.forces.sum[i]
@@ -381,8 +397,8 @@ class Contact(PairContact):
 
     @ti.func
     def apply_corrections(self, i, first):
-        """Move particle i as its pairs want."""
-        if self.dev.state.moves(i):  # what touches nothing moves by 0, without a branch
+        """Move particle i by the corrections of its pairs."""
+        if self.dev.state.moves(i):  # without contact the correction is 0: no branch for that
             self.dev.state.shift(i, self.dev.move[i])
             if ti.static(self.dev.spins):
                 self.dev.state.spin.s[i] = self.dev.state.spin.s[i] + self.dev.spinning.change[i]
@@ -391,8 +407,10 @@ class Contact(PairContact):
 
     @ti.func
     def finish_substep(self, i, now):
-        """At the end of a substep: add to each pair's slip what it has moved, as far as friction can hold it; a pair that parted
-        has no slack. What came to overlap after pairs were pushed, which a list with a narrow skin may not know yet, waits."""
+        """Update the slip of each pair at the end of a substep, as far as friction can hold it, and clear slack of parted pairs.
+
+        Pairs that began to overlap after the pushes wait until the next substep: a list with a narrow skin may not have them yet.
+        """
         if ti.static(self.dev.has_friction):
             for word in range(self.dev.list.words(i)):
                 bits = self.dev.splitting.sliding(i, word, now)

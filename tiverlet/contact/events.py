@@ -1,12 +1,12 @@
-"""Contact events: what began to touch, went on touching, or ended in a frame, and what sensors noted.
+"""Contact events: contacts that began, lasted or ended in a frame, and overlaps of sensors.
 
-Contacts come and go within a frame, so each is noted where it is solved, in the pass and on the device. A pair that touches has a
-row in a table; its number stands in the pair's data (`touched`), which keeps the pair on the neighbour list until the frame ends,
-wherever it goes. The table has as much room as the list, and a pair has one row, so nothing can be lost. Between frames `touched`
-is 1 for pairs that touched in the last substep: that alone is carried on, by clones, recordings and edits.
+Contacts come and go within a frame, so each is recorded where it is solved, in the pass and on the device. A pair that touches
+has a row in a table. The row number is in the pair data `touched`, which keeps the pair on the neighbour list until the frame
+ends, wherever its particles go. The table has as much room as the list, and a pair has one row, so no event can be lost. Between
+frames `touched` is 1 for pairs that touched in the last substep; clones, recordings and edits keep only that.
 
-Rows come in any order, and the host sorts them. Each is written by one particle of the pair, in a fixed order: the same bits on
-any number of threads.
+Rows come in any order, and the host sorts them. One particle of the pair writes its row, in a fixed order, so the bits are the
+same on any number of threads.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -25,12 +25,13 @@ if TYPE_CHECKING:
 
 
 class EventLog:
-    """The table of one world on the device, and who writes what to it.
+    """The table of contact events of one world, on the device.
 
-    touched: data of each pair, on the side that writes its row: during a frame the number of the row, from 1 on, and 0 without
-    one; between frames 1 where it touched in the last substep. Columns: pair, the particle that writes and the other; when, the
-    substeps in which it began to touch and touched last; impulse [kg m]; speed [m], what it came together in a substep; normal,
-    from the other; point [m].
+    touched: pair data, on the side that writes the row. During a frame it is the row number plus 1, or 0 without a row. Between
+    frames it is 1 for pairs that touched in the last substep.
+
+    Columns: pair, the particle that writes and the other particle; when, the substeps in which the pair began to touch and
+    touched last; impulse [kg m]; speed [m], the approach in a substep; normal, from the other particle; point [m].
     """
 
     list: "NeighbourList"
@@ -45,7 +46,7 @@ class EventLog:
         self.impulse, self.speed = Column("events.impulse"), Column("events.speed")
         self.normal, self.point = Column("events.normal", dim), Column("events.point", dim)
         self.rows = add("events.rows", None, kind=ti.i32)
-        self.substep = add("events.substep", None, kind=ti.i32)  # of the frame, from 1 on
+        self.substep = add("events.substep", None, kind=ti.i32)  # the number of the substep in the frame, from 1 on
         if self.senses:
             _, rows = table.rows(scene.particles.group)
             ranks = round(len(rows) ** 0.5)
@@ -53,20 +54,20 @@ class EventLog:
             self.is_sensor = add("events.is_sensor", ranks, kind=ti.i32, values=some)
 
     def bind(self, pairs: "NeighbourList", geometry: "DiscGeometry") -> None:
-        """Have the columns made with the list."""
+        """Store the list and the geometry, and have the columns declared with the list."""
         self.list, self.geometry = pairs, geometry
         pairs.columns = [self.pair, self.when, self.impulse, self.speed, self.normal, self.point]
 
     @ti.func
     def start(self, s, first):
-        """One thread, as a pass of substep s begins: note which one it is; a frame begins with an empty table."""
+        """Store the number of substep s as a pass begins, and empty the table as a frame begins. One thread calls it."""
         self.substep[None] = s + 1
         if s == 0 and first != 0:
             self.rows[None] = 0
 
     @ti.func
     def open(self, begin, end):
-        """As a frame begins: a row for each pair of some particles that touched when the last one ended."""
+        """Open a row for each pair of particles begin ... end - 1 that touched when the last frame ended, as a frame begins."""
         number = 0
         for i in range(begin, end):
             for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
@@ -81,7 +82,7 @@ class EventLog:
 
     @ti.func
     def enter(self, row, i, e, began, last):
-        """Begin a row for entry e of particle i. began, last: the substeps in which it began to touch, and touched last."""
+        """Begin a row for entry e of particle i. began, last: the substeps in which the pair began to touch, and touched last."""
         self.touched.field[e] = row + 1
         self.pair.field[row] = [i, self.list.neighbour[e]]
         self.when.field[row] = [began, last]
@@ -90,14 +91,16 @@ class EventLog:
 
     @ti.func
     def note(self, i, j, e, n, impulse, final):
-        """Note that entry e of particle i, with j, touches in this pass. Both sides of a pair ask for it, but for one that cannot
-        move; one of them writes."""
+        """Record that entry e of particle i, with j, touches in this pass.
+
+        Both particles of a pair call it, unless one cannot move. Only one of them writes.
+        """
         if i < j or not self.state.w.positive(j):
             self.write(i, j, e, n, impulse, final)
 
     @ti.func
     def write(self, i, j, e, n, impulse, final):
-        """Note a touch: its impulse [kg m]; where the pair meets, its speed, normal and point."""
+        """Write a touch to the row of entry e: its impulse [kg m] and, if the pair meets now, its speed, normal and point."""
         row, now = self.touched.field[e] - 1, self.substep[None]
         if row < 0:
             row = ti.atomic_add(self.rows[None], 1)
@@ -114,14 +117,14 @@ class EventLog:
 
     @ti.func
     def place(self, row, i, j, n):
-        """Where the pair touches: in the middle between the two surfaces along n."""
+        """Write the normal and the point where the pair touches: in the middle between the two surfaces along n."""
         self.normal.field[row] = n
         way = (self.radius.of(j) - self.radius.of(i)) * n - self.state.apart(i, j)
         self.point.field[row] = self.state.place(i) + way / 2
 
     @ti.func
     def note_impact(self, e, impulse, speed):
-        """Entry e, whose pair touches, got an impulse [kg m] in an impact, at a speed [m]; one side has the row."""
+        """Add the impulse [kg m] of an impact at a speed [m per substep] to the row of entry e, if this side has the row."""
         row = self.touched.field[e] - 1
         if row >= 0:
             self.impulse.field[row] = self.impulse.field[row] + impulse
@@ -129,7 +132,7 @@ class EventLog:
 
     @ti.func
     def sense(self, i, final):
-        """At the end of a substep, what particle i overlaps as a sensor."""
+        """Record the particles that sensor i overlaps at the end of a substep."""
         rank = self.table.rank[i]
         if self.is_sensor[rank] != 0:
             for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
@@ -141,8 +144,10 @@ class EventLog:
 
     @ti.func
     def sleeps(self, i, j):
-        """Whether particle i sleeps, which writes, and j does not move from it: the pair touches what it touched. What sensors
-        overlap is found in every substep."""
+        """Whether particle i, which writes the row, sleeps and j does not move, so that the pair still touches.
+
+        Pairs of sensors do not count: their overlaps are found in every substep.
+        """
         out = False
         if ti.static(self.can_sleep):
             out = not self.state.awake(i) and not self.state.moves(j) and self.geometry.pushes(i, j) != 0
@@ -150,7 +155,7 @@ class EventLog:
 
     @ti.func
     def wake(self, i, substep):
-        """Particle i wakes after so many substeps of the frame: it has touched until then what it touched before."""
+        """Extend the touches of particle i, which wakes after `substep` substeps of the frame, up to that substep."""
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             row = self.touched.field[e] - 1
             if row >= 0:
@@ -159,7 +164,7 @@ class EventLog:
 
     @ti.func
     def close(self, i):
-        """As a frame ends: keep which pairs of particle i touch."""
+        """Set `touched` to 1 or 0 for the pairs of particle i, as a frame ends."""
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             row = self.touched.field[e] - 1
             if row >= 0:
@@ -178,15 +183,15 @@ class EventLog:
 
     @property
     def made(self) -> Any:
-        """The field that is 0 where there are no events to tell of."""
+        """The field that is 0 if there are no events to report."""
         return self.rows
 
     def forget(self) -> None:
-        """Empty the table, for another state than that of a frame that has just been made."""
+        """Empty the table, because the state is not the end of a frame that was just computed."""
         self.list.memory.write(self.made, 0)
 
     def read(self, h: float, time: float) -> ContactEvents:
-        """What the last frame, of substeps h [s], which ended at `time` [s], came to."""
+        """Return the events of the last frame, which had substeps h [s] and ended at `time` [s]."""
         memory, store = self.list.memory, self.list.store
         assert store
         count, substeps = int(memory.read(self.rows)[0]), int(memory.read(self.substep)[0])
@@ -196,7 +201,7 @@ class EventLog:
         normal[pair[:, 0] > pair[:, 1]] *= -1
         order = np.lexsort(pairs.T[::-1])
         pairs, when, impulse, speed = pairs[order], when[order], impulse[order], speed[order]
-        # A pair has two rows where a particle of it moves that was held before the frame, when the other one wrote.
+        # A pair has two rows if one of its particles was held before the frame (then the other one wrote) and moves now.
         one = np.flatnonzero((np.diff(pairs, axis=0, prepend=-1) != 0).any(axis=1))
         if len(one) < len(pairs):
             when = np.stack([np.minimum.reduceat(when[:, 0], one), np.maximum.reduceat(when[:, 1], one)], axis=1)

@@ -1,12 +1,13 @@
-"""Pairs that contacts leave out: constraints say where the two are to each other.
+"""Pairs that contacts leave out, because constraints fix the distance of the two particles.
 
-These are the pairs of each constraint, and those that a chain of links holds closer than they reach, with lengths l at the start:
+These are the pairs of each constraint, and pairs that a chain of links holds closer than the sum of their radii, with the lengths
+l at the start:
 
     sum l <= r_i + r_j
 
-They overlap however the chain bends, while links are as long as they were, as a ball does with all of the rope that ends inside
-of it, or beads thicker than the links between them are long with the next but one: a contact would push against the links for
-good. Links that give way, or break, hold nothing there.
+Such a pair overlaps however the chain bends, as long as the links keep their lengths. Examples are a ball and the rope that ends
+inside of it, or a bead and the next but one, if beads are thicker than the links are long. A contact would push against the links
+for ever. Links that are compliant, or can break, do not count.
 """
 
 from collections.abc import Sequence
@@ -16,12 +17,12 @@ import numpy as np
 from ..features.feature import Batch
 from ..geometry.ordered import distinct
 
-DIGIT = 1e-6  # of a length: what beads that just touch may be off
-FOLDED = 0.25  # of the smaller radius: a link that is shorter at the start has yet to get its length
+DIGIT = 1e-6  # relative tolerance of lengths, for beads that just touch
+FOLDED = 0.25  # radii of the smaller particle: a link that is shorter at the start counts as folded up, and is skipped
 
 
 def excluded_pairs(batches: Sequence[Batch], radius: np.ndarray) -> np.ndarray:
-    """Pairs of particles with these radii (n,) [m] that never touch, (m, 2)."""
+    """Return pairs of particles that contacts leave out, (m, 2). radius: (n,) [m]."""
     own = [b.excluded_pairs(b.start) for b in batches]
     ties = [b.ties() for b in batches]
     links, lengths = (np.concatenate(some) for some in zip((np.zeros((0, 2), dtype=np.int32), np.zeros(0)), *ties, strict=True))
@@ -29,9 +30,10 @@ def excluded_pairs(batches: Sequence[Batch], radius: np.ndarray) -> np.ndarray:
 
 
 def _inside(links: np.ndarray, lengths: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Pairs that chains of two links (m, 2) or more hold closer than their radii (n,) reach; lengths: (m,).
+    """Return pairs that chains of two or more links hold closer than the sum of their radii.
 
-    Ways go out from the larger of two, for as long as they are shorter than it is wide.
+    links: (m, 2). lengths: (m,) [m]. radius: (n,) [m]. Paths start at the larger particle of a pair, and end when they are longer
+    than its diameter.
     """
     some = lengths > FOLDED * radius[links].min(axis=1)
     if lengths[some].min(initial=np.inf) > (1 + DIGIT) * radius.max(initial=0.0):
@@ -43,7 +45,7 @@ def _inside(links: np.ndarray, lengths: np.ndarray, radius: np.ndarray) -> np.nd
     begin, degree = np.searchsorted(i, np.arange(n)), np.bincount(i, minlength=n)
     least = np.full(n, np.inf)
     np.minimum.at(least, i, far)
-    known, ways = np.zeros(0, dtype=np.int64), np.zeros(0)  # from a * n + to b, and how long
+    known, ways = np.zeros(0, dtype=np.int64), np.zeros(0)  # a * n + b of each path from a to b, and its length
     a, b, way = i, j, far
     while len(a):
         goes = way + least[b] <= 2 * radius[a]

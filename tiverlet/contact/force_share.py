@@ -1,4 +1,4 @@
-"""What of the pushes of contacts are forces: the part that counts for velocities at the end of a frame."""
+"""The share of contact pushes that are forces, not impacts: it counts for velocities at the end of a frame."""
 
 from typing import TYPE_CHECKING
 
@@ -9,9 +9,9 @@ if TYPE_CHECKING:
 
 
 class ForceShare:
-    """Pushes of the last substep of a frame, as far as they are forces, which act before and after, and not impacts.
+    """The pushes of the last substep of a frame, as far as they are forces, which act before and after it, and not impacts.
 
-    in_state: its fields that are part of the state. lasting: whether they are.
+    sums: whether pushes are summed up here. lasting: whether `before` is part of the state. in_state: its fields by name.
     """
 
     def __init__(self, scene: "Scene", sums: bool, lasting: bool):
@@ -29,32 +29,32 @@ class ForceShare:
 
     @ti.func
     def start(self, i, scale):
-        """At the start of the last substep of a frame: keep the displacement of particle i, `scale` times what is kept there."""
+        """Keep the displacement of particle i, times `scale`, at the start of the last substep of a frame."""
         self.before[i] = scale * self.state.d[i]
 
     @ti.func
     def share(self, approach, push):
-        """How much of a push is a force.
+        """Return the share of a push that is a force, 0 to 1.
 
-        An impact is no more than what stops a pair that came together by `approach` in the substep before. It is the same for
-        both of a pair, which keeps momentum.
+        An impact is at most the push that stops a pair that approached by `approach` in the substep before. The share is the same
+        for both particles of a pair, which conserves momentum.
         """
         return ti.max(1 - ti.select(push > 0, ti.max(approach, 0) / push, ti.zero(push)) ** 2, 0)
 
     @ti.func
     def add_turn(self, i, turned, first):
-        """Add what forces of a pass turned the surface of particle i by; the first pass begins the sum."""
+        """Add how far forces of a pass turned the surface of particle i [m]. The first pass begins the sum."""
         accumulate(self.turned, i, turned, first)
 
     @ti.func
     def add(self, i, moved, first):
-        """Add what forces of a pass moved particle i by; the first pass begins the sum."""
+        """Add how far forces of a pass moved particle i [m]. The first pass begins the sum."""
         accumulate(self.sum, i, moved, first)
 
 
 @ti.func
 def accumulate(field: ti.template(), i, value, first):  # type: ignore[valid-type]
-    """Add to what a field has of particle i; the first pass begins the sum."""
+    """Add a value to the entry of particle i in a field. The first pass begins the sum."""
     if first != 0:
         field[i] = value
     else:

@@ -1,24 +1,26 @@
-"""Whether particles overlap where they are put: a world that knows it need not be compiled for it, or not twice."""
+"""The test whether particles overlap where they are placed. Its result saves a world from compiling for overlap, or twice."""
 
 from itertools import product
 
 import numpy as np
 
 from ..features.feature import Batch, Scene
+from ..features.material import Table
 from ..particles import State
 from .exclusions import excluded_pairs
 
-FEW = 1_000_000  # pairs that are looked at one by one
-MANY = 20_000  # particles for which it is not worth the time
-CROWD = 16  # in a cell, likewise
+FEW = 1_000_000  # most pairs for which all pairs are compared
+MANY = 20_000  # particles above which the test takes too long
+CROWD = 16  # particles in a cell above which the test takes too long
 
 
-def overlapping(scene: Scene, batches: list[Batch], x: np.ndarray, first: int = 0) -> bool | None:
-    """Whether discs or spheres at x, (n, dim) [m], overlap, one of them free to move and one of them from number `first` on; what
-    is linked never touches. None where finding out would take long.
+def overlapping(scene: Scene, batches: list[Batch], table: Table, x: np.ndarray, first: int = 0) -> bool | None:
+    """Whether discs or spheres at x (n, dim) [m] that push each other, by this table, overlap; None if the test would take long.
 
-    From 0 on all that the device will see counts, with what it rounds, for that is what a world is compiled for; else what f32
-    rounds does not.
+    Only pairs count of which one particle is free to move and one has an index of `first` or more. Linked pairs never touch.
+
+    With first = 0 an overlap counts exactly if the device finds it, rounding included, because the world is compiled for that.
+    Otherwise an overlap within the rounding of f32 does not count.
     """
     radius, free = scene.particles.radius, scene.inv_mass > 0
     count, number = len(x), np.arange(len(x))
@@ -27,7 +29,7 @@ def overlapping(scene: Scene, batches: list[Batch], x: np.ndarray, first: int = 
         radius, free = radius[number], free[number]
     close = 2.0**-20 * float(np.abs(x).max(initial=0.0) + radius.max(initial=0.0))
     begin = first if len(x) == count else 0
-    wide = radius + (0.0 if first else close / 2)  # what only rounding may have overlap is looked at, too
+    wide = radius + (0.0 if first else close / 2)  # include pairs that overlap by rounding only
     pairs = _by_all(x, wide, begin) if (len(x) - begin) * len(x) <= FEW else _by_cells(x, wide)
     if pairs is None:
         return None
@@ -37,6 +39,7 @@ def overlapping(scene: Scene, batches: list[Batch], x: np.ndarray, first: int = 
     else:
         near = _meet(scene.state, x, radius, i, j)
     pairs = number[np.stack([i, j], axis=1)[near & (free[i] | free[j])]]
+    pairs = pairs[table.pushing(scene.particles.group, pairs)]
     if not len(pairs):
         return False
     linked = excluded_pairs(batches, scene.particles.radius)
@@ -45,7 +48,7 @@ def overlapping(scene: Scene, batches: list[Batch], x: np.ndarray, first: int = 
 
 
 def _meet(state: State, x: np.ndarray, radius: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
-    """Which pairs overlap as the device works it out, see NarrowPhase.overlap()."""
+    """Return the mask of pairs that overlap, computed as on the device, see DiscGeometry.overlap()."""
     real = np.float64 if state.double else np.float32
     high, r = x.astype(real), radius.astype(real)
     apart = high[i] - high[j]
@@ -59,11 +62,11 @@ def _meet(state: State, x: np.ndarray, radius: np.ndarray, i: np.ndarray, j: np.
 
 
 def _by_all(x: np.ndarray, radius: np.ndarray, first: int) -> np.ndarray:
-    """Pairs of which one is from number `first` on, near along the first axis."""
+    """Return pairs that are near along the first axis, and of which one index is at least `first`."""
     y, r = x[first:], radius[first:]
     reach = r.max(initial=0.0) + radius.max(initial=0.0)
     others = np.arange(len(x))
-    for a in range(x.shape[1]):  # one axis after the other, which takes NumPy a tenth of the time
+    for a in range(x.shape[1]):  # one axis at a time takes NumPy a tenth of the time
         low, high = y[:, a].min(initial=np.inf) - reach, y[:, a].max(initial=-np.inf) + reach
         others = others[(x[others, a] >= low) & (x[others, a] <= high)]
     near = np.abs(y[:, None, 0] - x[others, 0]) < r[:, None] + radius[others]
@@ -73,7 +76,7 @@ def _by_all(x: np.ndarray, radius: np.ndarray, first: int) -> np.ndarray:
 
 
 def _by_cells(x: np.ndarray, radius: np.ndarray) -> np.ndarray | None:
-    """Pairs in the same cell or in cells side by side; None where that would take long."""
+    """Return pairs in the same cell or in adjacent cells; None if that would take long."""
     if len(x) > MANY:
         return None
     place = np.floor((x - x.min(axis=0)) / (2 * radius.max())) + 1

@@ -1,4 +1,4 @@
-"""Piles that carry their loads: what contacts bear at rest, they give without being asked."""
+"""Known loads: each pair learns the load that it bears at rest, and applies it in every substep like a force."""
 
 from typing import TYPE_CHECKING
 
@@ -14,51 +14,54 @@ if TYPE_CHECKING:
     from ..features.feature import Scene
     from ..neighbours.neighbour_list import NeighbourList
 
-WINDOW = 128  # substeps over which is averaged what is missing; at their end sound has just been taken out
+WINDOW = 128  # substeps over which the missing load is averaged; it begins just after sound is removed (EVERY)
 SLOW = 0.3  # substeps that it takes to learn the load of k particles, per k^2
-SAME = 1e-3  # of its length: by how much the line between a pair may change where particles are put elsewhere
+SAME = 1e-3  # relative change of the vector between a pair beyond which it forgets its load when positions are assigned
 
 
 class Carried(Acceleration):
-    """What particles are given of the loads that their contacts know [m/s^2], as one more force. field: it, (n, dim)."""
+    """The acceleration of particles by the known loads of their contacts [m/s^2], as one more force. field: (n, dim)."""
 
-    uniform = True  # it has no stiffness: it changes by what is learnt
+    uniform = True  # no stiffness: it does not depend on positions within a substep
 
     def __init__(self, scene: "Scene"):
         self.field = scene.memory.field("Contact.carried", scene.count, width=scene.particles.dim, state=True)
 
     @ti.func
     def acceleration(self, i, x, v, t):
-        """Of particle i."""
+        """Return the acceleration of particle i by its known loads."""
         return self.field[i]
 
 
 class KnownLoads:
-    """Each pair knows the load F [N] that it bears, and gives it in every substep like a force, before positions are looked at.
-    Contacts add what is missing, and may take back what was given, but never pull. It acts along the normal that the pair has as
-    the last substep ends: the next one starts there, so it has no moment.
+    """The known loads of contacts: each pair stores the load F [N] that it bears, and applies it in every substep like a force.
 
-    One pass per substep holds a load by an overlap, 2 k g h^2 for the k-th contact of a column; what is known needs none. F is
-    learnt by and by, which is integral control: over a window, contacts added `mean`, and if that is what they added in the
-    window before to within a fifth, F += gain mean. A substep sees a constant force, so it is as stable as without.
-    What is learnt must not be faster than the slowest sound of the pile decays, see VelocityProjection: in a column of N in
-    0.1 N^2 substeps. So gain = WINDOW / (LAG + SLOW k^2), with k = F / (m g) the number of particles that a pair bears. An
-    impact has a large k, and is not learnt.
+    The force acts before contacts are detected. Contacts add the missing part. They may take back a part of F, but never pull. F
+    acts along the normal of the pair at the end of the last substep, where the next one starts, so it has no moment.
 
-    A pair that gives nothing in the end, because its particles have parted or bounced, forgets at once. Restitution asks the
-    overlap of a pair whether it rests; one that knows its load has that, too, which would hold it. A wall takes back in the same
-    substep what is pushed into it; for contacts to know, particles are where walls leave them while contacts are solved (`lean`),
-    and walls begin again with all that is pushed into them, which friction needs.
+    One pass per substep holds a load by an overlap, 2 k g h^2 for the k-th contact of a column. A known load needs no overlap. F
+    is learnt gradually, which is integral control. If contacts added `mean` on average over a window, within a fifth of what they
+    added in the window before, F += gain mean. Within a substep F is constant, so stability is the same as without.
 
-    Warm starting (Box2D) of a single pass would be unstable: a mode of eigenvalue L has z^3 - 3 a z^2 + 3 a z - a, a = 1 - r L,
-    whose roots near 1 grow like (r L)^(1/3) / 2.
+    Learning must be slower than the slowest sound of the pile decays, see VelocityProjection: 0.1 N^2 substeps in a column of N.
+    So gain = WINDOW / (LAG + SLOW k^2), with k = F / (m g) the number of particles that a pair bears. An impact has a large k, so
+    it is not learnt.
+
+    A pair with no push at the end of a pass, because its particles parted or bounced, forgets its load at once. Restitution
+    decides by the overlap of a pair whether it rests; for a known load, the overlap that would hold it is added.
+
+    A wall undoes, in the same substep, the displacement into it. For contacts to see that, particles are placed where walls leave
+    them while contacts are solved (`lean`). Walls then start again with the whole displacement into them, which friction needs.
+
+    Warm starting (Box2D) of a single pass would be unstable: a mode of eigenvalue L has the characteristic polynomial
+    z^3 - 3 a z^2 + 3 a z - a, a = 1 - r L, whose roots near 1 grow like (r L)^(1/3) / 2.
     """
 
     def __init__(self, scene: "Scene"):
         self.state, self.weights = scene.state, scene.own_weight
         self.load = PairData("load", 0, lasting=True, marked=True)  # [N]
-        self.borne = PairData("borne", 0, lasting=True, marked=True)  # what was missing of it in this window, summed up [kg m]
-        self.earlier = PairData("earlier", 0, lasting=True, marked=True)  # on average in the window before [N]
+        self.borne = PairData("borne", 0, lasting=True, marked=True)  # sum of the missing part in this window [kg m]
+        self.earlier = PairData("earlier", 0, lasting=True, marked=True)  # mean missing part in the window before [N]
         self.pair_data = [self.load, self.borne, self.earlier]
         n, dim = scene.count, scene.particles.dim
         self.carried = Carried(scene)
@@ -66,11 +69,11 @@ class KnownLoads:
         self.in_state = {"carried": self.carried.field}
 
     def bind(self, pairs: "NeighbourList") -> None:
-        """pairs: those that are listed."""
+        """Store the neighbour list, which holds the pair data."""
         self.list = pairs
 
     def forget(self, scene: "Scene", x: np.ndarray) -> None:
-        """Before particles are put to x, (n, dim): pairs that are others there forget."""
+        """Clear the loads of pairs whose relative position changes, before particles are moved to x (n, dim) [m]."""
         pairs, values = self.list.lasting_data()
         if not values["load"].any():
             return
@@ -84,7 +87,10 @@ class KnownLoads:
         self.carry(scene, x, pairs, values)
 
     def carry(self, scene: "Scene", x: np.ndarray, pairs: np.ndarray, values: dict[str, np.ndarray]) -> None:
-        """Give particles at x, (n, dim), what pairs (m, 2) know, of values as in NeighbourList.lasting_data()."""
+        """Set the accelerations of particles at x (n, dim) [m] by the loads of pairs (m, 2).
+
+        values: as returned by NeighbourList.lasting_data().
+        """
         i, j = pairs.T
         r = between(x[i], x[j], scene.periodic)
         length = np.linalg.norm(r, axis=1)
@@ -94,20 +100,23 @@ class KnownLoads:
 
     @ti.func
     def given(self, e, now):
-        """What entry e was given in this substep, per inverse mass [kg m]."""
+        """Return what the known load of entry e gave in this substep, per inverse mass [kg m]."""
         return self.load.field[e] * self.weights.integrator.h2_effective(now.h, now.fresh)
 
     @ti.func
     def remember(self, i, j, e, part, push, now):
-        """Entry e, the pair of i and j, got `part` in this pass, and `push` in all. Returns what it gives from now on [N]."""
+        """Update the load of entry e, the pair of i and j, and return it [N].
+
+        part: the push that contacts added in this pass [kg m]. push: the whole push of the pair [kg m].
+        """
         load, borne = self.load.field[e], self.borne.field[e] + part
         if now.first != 0:
             if now.fresh != 0:
-                borne = part  # a start: forces were others before it
+                borne = part  # a start (velocities were set): forces were different before it
             if (now.span.since + now.s) % WINDOW == 0:
                 load = self.learn(i, j, e, load, (borne - part) / (WINDOW * now.h * now.h))
                 self.load.field[e] = load
-                borne = part  # a start: forces were others before it
+                borne = part  # the next window begins with this substep
         if push <= 0:
             load *= 0
             self.load.field[e] = load
@@ -116,7 +125,7 @@ class KnownLoads:
 
     @ti.func
     def learn(self, i, j, e, load, mean):
-        """At the end of a window, in which entry e lacked `mean` of its load: what it knows from now on [N]."""
+        """Return the load of entry e after a window in which `mean` of it was missing on average [N]."""
         if steady(mean, self.earlier.field[e]):
             k = ti.abs(load + mean) * ti.max(self.state.w.of(i), self.state.w.of(j))
             own = ti.max(self.weights.field[i], self.weights.field[j])

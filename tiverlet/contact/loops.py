@@ -1,4 +1,4 @@
-"""Bodies as loops of particles, in NumPy: which way round they go, how long their edges are, what starts inside of them (2D)."""
+"""Bodies as loops of particles, in NumPy: orientation, edge lengths, and particles that start inside of them (2D)."""
 
 from collections.abc import Iterable
 
@@ -8,7 +8,7 @@ from .. import checks
 
 
 def checked(loops: Iterable) -> list[np.ndarray]:
-    """The particles of each body, at least 3, each in one body and once."""
+    """Return the particles of each body, checked: at least 3 in a body, and no particle twice."""
     loops = checks.rows("Polygons", "loops", loops, "a sequence of index sequences, one for each body,")
     if len(loops) and np.ndim(loops[0]) == 0:
         raise TypeError(f"Polygons: loops = {loops!r} is one body; write a list of bodies, [[...]].")
@@ -25,8 +25,11 @@ def checked(loops: Iterable) -> list[np.ndarray]:
 
 
 def laid(loops: list[np.ndarray], x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of particles at x (n, 2): the next and the one before, counterclockwise (n, 2), -1 where there is none; the number of the
-    loop (n,), or -1; and the length of the longer edge (n,) [m]. Refuses flat loops."""
+    """Return the arrays of an Outline for particles at x (n, 2) [m], and refuse flat loops.
+
+    These are the next and the previous particle, counterclockwise (n, 2), the number of the loop (n,), both -1 in no loop, and
+    the length of the longer edge (n,) [m].
+    """
     n = len(x)
     ends, body, length = np.full((n, 2), -1), np.full(n, -1), np.zeros(n)
     if not loops:
@@ -55,13 +58,13 @@ def laid(loops: list[np.ndarray], x: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def flat(loops: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The corners of at least one loop, one loop after the other; where each begins, and all end; the loop of each corner."""
+    """Return the corners of one or more loops in one array, the offsets of loops (k + 1,), and the loop of each corner."""
     begin = np.concatenate([[0], np.cumsum([len(loop) for loop in loops])])
     return np.concatenate(loops), begin, np.repeat(np.arange(len(loops)), np.diff(begin))
 
 
 def turned(begin: np.ndarray, by: int) -> np.ndarray:
-    """For each corner of loops that begin there the one that is so far, 1 or -1, around its loop."""
+    """Return the position of the next (by = 1) or previous (-1) corner around the loop, for each corner. begin: of flat()."""
     out = np.arange(begin[-1]) + by
     first, last = (begin[:-1], begin[1:] - 1) if by > 0 else (begin[1:] - 1, begin[:-1])
     out[last] = first
@@ -69,7 +72,7 @@ def turned(begin: np.ndarray, by: int) -> np.ndarray:
 
 
 def refuse_deep(loops: list[np.ndarray], x: np.ndarray, first: int) -> None:
-    """Raise for particles, from number `first` on, that are deeper inside of a body than half of the edge that is nearest."""
+    """Raise ValueError if a particle of index `first` or more is deeper inside of a body than half of its nearest edge."""
     if not loops or first >= len(x):
         return
     corner, begin, _ = flat(loops)
@@ -87,7 +90,7 @@ def refuse_deep(loops: list[np.ndarray], x: np.ndarray, first: int) -> None:
 
 
 def area_of(loop: np.ndarray) -> float:
-    """The area that a loop (k, 2) encloses, positive where it goes around counterclockwise [m^2]."""
+    """Return the area that a loop (k, 2) [m] encloses, positive if it is counterclockwise [m^2]."""
     after = np.roll(loop, -1, axis=0)
     v = loop - loop.mean(axis=0)
     w = after - loop.mean(axis=0)
@@ -95,7 +98,7 @@ def area_of(loop: np.ndarray) -> float:
 
 
 def depth_of(point: np.ndarray, loop: np.ndarray) -> tuple[float, float]:
-    """How deep a point is inside of a loop, 0 outside, and the length of the nearest edge."""
+    """Return how deep a point is inside of a loop [m], 0 outside, and the length of the nearest edge [m]."""
     a, b = loop, np.roll(loop, -1, axis=0)
     u, r = b - a, point - a
     length = np.linalg.norm(u, axis=1)

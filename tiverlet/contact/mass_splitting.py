@@ -1,4 +1,4 @@
-"""How often the mass of a particle is split, so that all contacts that it is in can be solved at once."""
+"""Mass splitting: how often the mass of a particle is split, so that all of its contacts can be solved at once."""
 
 from typing import Any
 
@@ -8,20 +8,22 @@ from ..features.feature import Scene
 from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
 from .narrow_phase import SAME_PLACE, DiscGeometry
 
-# Of (|r| / contact distance)^2: down to here all pairs count as if they were as deep as the deepest, which spares a division for
-# each. Deeper that would split masses too often, and a heap that is compressed would stay so.
+# Least (|r| / contact distance)^2 for which all pairs count as being as deep as the deepest. This saves a division per pair. For
+# deeper pairs it would split masses too often, and a compressed heap would stay compressed.
 DEEP = 0.8
-EVERY = 8  # substeps after which a bound is worked out again, for pairs slide
-SLOW = 1 / 64  # of its radius in a substep: what moves further has it worked out in each; in 8 a normal turns by 1/8 at most
-FADE = 31 / 32  # of how much more often than needed a mass was split, what is left a pass later
+EVERY = 8  # substeps after which a bound is computed anew, because pairs slide
+SLOW = 1 / 64  # radii per substep: a faster particle gets its bound anew in each; in 8 substeps a normal turns by 1/8 at most
+FADE = 31 / 32  # share of the excess splitting that is left a pass later
 
 
 class MassSplitting:
-    """A disc or sphere i has its mass split m_i times, see Contact; `weight` is m_i w_i, 0 where it touches nothing.
+    """The split masses of discs or spheres: the mass of i is split m_i times, see Contact.
 
-    ended: what pairs carry only while they touch. slid: what those with friction carry only while they touch as a substep ends.
-    skips: whether blocks of particles without contact are skipped. known: the KnownLoads of pairs, or None. in_state: its fields
-    that are part of the state.
+    weight: m_i w_i of each particle, 0 without contact.
+    slid: pair data of friction, cleared unless the pair touches at the end of a substep.
+    skips: whether blocks of particles without contact are skipped.
+    ended: pair data that is cleared when the pair does not touch.
+    known: the KnownLoads of pairs, or None. in_state: its fields that are part of the state.
     """
 
     def __init__(
@@ -45,23 +47,25 @@ class MassSplitting:
         return -(-n // self.block)
 
     def can_regroup(self, piece: int) -> bool:
-        """Whether blocks are what they were when so many particles make up a piece of the team."""
+        """Whether the block size stays the same when a piece of the team has `piece` particles."""
         return not self.skips or self.block == min(BLOCK, piece)
 
     def regroup(self, n: int) -> None:
-        """There are n particles now."""
+        """Resize the fields of blocks for n particles."""
         if self.skips:
             self.list.memory.resize(self.some, self._blocks(n))
 
     @ti.func
     def touches(self, i, word):
-        """Bits for the entries of particle i that the word is for: which touch, as in overlap(), to the last digit, or know a
-        load."""
+        """Return the bits of a word of the list of particle i: 1 for each entry that touches or has a known load.
+
+        The comparison is bit for bit that of DiscGeometry.overlap().
+        """
         out, begin = ti.u32(0), self.list.first[i] + word * WORD
         for k in range(ti.min(self.list.number[i] - word * WORD, WORD)):
             j = self.list.neighbour[begin + k]
             r, contact_distance = self.state.apart(i, j), self.geometry.contact_distance(i, j)
-            one = ti.cast(r.dot(r) < contact_distance * contact_distance, ti.u32)  # no branch: it would be taken at random
+            one = ti.cast(r.dot(r) < contact_distance * contact_distance, ti.u32)  # no branch: it would be mispredicted
             if ti.static(self.has_loads):
                 one |= ti.cast(self.known.load.field[begin + k] > 0, ti.u32)
             out |= one << ti.cast(k, ti.u32)
@@ -76,7 +80,7 @@ class MassSplitting:
 
     @ti.func
     def touching(self, i, word):
-        """The same bits, of the first word as count() left them."""
+        """Return the bits of touches(). Those of the first word are stored by count()."""
         out = self.list.touching[i]
         if word > 0:
             out = self.touches(i, word)
@@ -84,9 +88,10 @@ class MassSplitting:
 
     @ti.func
     def count(self, begin, end, now):
-        """Which pairs of some particles touch, and how often their masses are split.
+        """Find the touching pairs of particles begin ... end - 1, and how often their masses are split.
 
-        Fast path: a block without contact in the last pass is tested only for any contact. Small worlds compile faster without.
+        Fast path: a block without contact in the last pass is tested only for any contact. Small worlds leave this code out, to
+        compile faster.
         """
         some = self.state.stirs(begin, end)
         if ti.static(not self.few):
@@ -106,7 +111,7 @@ class MassSplitting:
 
     @ti.func
     def busy(self, begin):
-        """0 if none of the particles that were counted together, from `begin` on, touches another, and nothing is to be done."""
+        """Return 0 if no particle in the block that begins at `begin` touches another, so relax() can be skipped."""
         out = 1
         if ti.static(self.skips):
             out = self.some[begin // self.block]
@@ -114,7 +119,10 @@ class MassSplitting:
 
     @ti.func
     def any_contact(self, i):
-        """1 if any pair of particle i touches, to the last digit: a difference is below 0 if and only if one is the lesser."""
+        """Return 1 if any pair of particle i touches.
+
+        The result is bit for bit that of touches(): a difference is below 0 if and only if the first number is less.
+        """
         same = ti.static(self.geometry.radius.uniform and not self.geometry.shrinks)
         gap, begin = ti.cast(ti.math.inf, self.real), self.list.first[i]
         for e in range(begin, begin + self.list.number[i]):
@@ -130,7 +138,7 @@ class MassSplitting:
 
     @ti.func
     def split(self, i, now):
-        """Which pairs of particle i touch, and how often its mass is split. What does not touch has no push to keep."""
+        """Find the touching pairs of particle i, and how often its mass is split. Clear the pushes of other pairs."""
         bits = self.touches(i, 0)
         pairs, others = ti.math.popcnt(bits), self.list.touching[i] != bits
         self.clear(i, 0, self.list.touching[i] & ~bits, now)
@@ -153,13 +161,13 @@ class MassSplitting:
 
     @ti.func
     def hurries(self, i):
-        """Whether particle i moves so far in a substep that its normals turn."""
+        """Whether particle i moves so far in a substep that its normals turn, see SLOW."""
         d, slow = self.state.d[i], ti.static(SLOW) * self.geometry.radius.of(i)
         return d.dot(d) > slow * slow
 
     @ti.func
     def changes(self, i, word, bits):
-        """Whether, of the entries of this word, others touch than those that got a push; bits of later words are kept nowhere."""
+        """Whether the touching entries of this word differ from those with a push. Bits of later words are not stored."""
         out, begin = False, self.list.first[i] + word * WORD
         for k in range(ti.min(self.list.number[i] - word * WORD, WORD)):
             touch = bits >> ti.cast(k, ti.u32) & ti.u32(1)
@@ -168,7 +176,7 @@ class MassSplitting:
 
     @ti.func
     def bound_of(self, i, pairs):
-        """What bounds the eigenvalues of S of particle i, no more than there are pairs."""
+        """Return and store m, a bound of the eigenvalues of S of particle i, see Contact; at most the number of pairs."""
         tensor = ti.Matrix.zero(self.real, self.state.dim, self.state.dim)
         deepest = ti.cast(1, self.real)
         for word in range(self.list.words(i)):
@@ -188,14 +196,13 @@ class MassSplitting:
 
     @ti.func
     def doubt(self, i):
-        """Have the bound of particle i worked out again: it touches a particle that gave it no push, which a new list would not
-        remember."""
+        """Invalidate the bound of particle i, which touches a particle without a push: a new list would not keep that bit."""
         if ti.static(not self.has_friction):
             self.bound[i] = 0
 
     @ti.func
     def normals(self, i):
-        """S, the sum of n n^T over the pairs of particle i that touch, and of the identity for those in the same place."""
+        """Return S, the sum of n n^T over the touching pairs of particle i, and of the identity for pairs in the same place."""
         tensor = ti.Matrix.zero(self.real, self.state.dim, self.state.dim)
         for word in range(self.list.words(i)):
             bits = self.touching(i, word)
@@ -213,7 +220,7 @@ class MassSplitting:
 
     @ti.func
     def clear(self, i, word, gone, now):
-        """Take from pairs that do not touch any more what they carry only while they touch."""
+        """Clear the data that pairs have only while they touch. gone: bits of entries of this word that do not touch."""
         while gone != 0:
             e = self.list.entry(i, word, gone)
             for piece in ti.static(self.ended):
@@ -225,20 +232,23 @@ class MassSplitting:
 
     @ti.func
     def sliding(self, i, word, now):
-        """Bits for the entries of particle i that may have slid, as a substep ends: those that touch. Where there are several
-        passes a pair may touch in some and not in others, so it keeps what it carries to the end."""
+        """Return the bits of the entries of particle i that may have slid in this substep.
+
+        With one pass these are the touching pairs. With several passes a pair may touch in some of them only, so all entries
+        count.
+        """
         return ti.select(now.span.iterations == 1, self.list.touched(i, word), self.list.all_bits(i, word))
 
 
 @ti.func
 def lesser(a, b):
-    """The lesser of two numbers; ti.min asks whether either is NaN, which takes longer."""
+    """Return the lesser of two numbers. ti.min would also test for NaN, which takes longer."""
     return ti.select(a < b, a, b)
 
 
 @ti.func
 def largest(tensor):
-    """The largest eigenvalue of a symmetric 2 x 2 matrix, and an upper bound for 3 x 3 ones (Wolkowicz and Styan 1980)."""
+    """Return the largest eigenvalue of a symmetric 2 x 2 matrix, or an upper bound for 3 x 3 (Wolkowicz and Styan 1980)."""
     n = ti.static(tensor.n)
     mean = tensor.trace() / n
     for k in ti.static(range(n)):

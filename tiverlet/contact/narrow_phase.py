@@ -1,4 +1,4 @@
-"""Discs and spheres: which of them touch, how deep and in which direction."""
+"""The narrow phase of discs and spheres: overlaps and normals of listed pairs."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -15,15 +15,15 @@ from .candidates import DiscCandidates
 if TYPE_CHECKING:
     from ..neighbours.neighbour_search import NeighbourSearch
 
-SHRUNK = "Contact.shrunk"  # the name of the field of how much smaller each particle is than its radius
-SAME_PLACE = 2.0**-80  # two particles are in the same place: their distance over that at which they touch, squared
+SHRUNK = "Contact.shrunk"  # the field of how much smaller each particle is than its radius [m]
+SAME_PLACE = 2.0**-80  # (distance / contact distance)^2 below which two particles count as in the same place
 
 
 class DiscGeometry:
-    """Pairs of discs or spheres, C(x) = |x_i - x_j| - (r_i + r_j), with the normal n = (x_i - x_j) / |x_i - x_j| from j to i.
+    """The geometry of pairs of discs or spheres: C(x) = |x_i - x_j| - (r_i + r_j), normal n = (x_i - x_j) / |x_i - x_j|.
 
-    Particles that the user put into each other may be smaller than they are, for a while; they grow back at push_out [m/s].
-    search: has the pairs listed. impulse: what the pairs of the list got in the last substep [kg m].
+    The normal points from j to i. Particles that the user put into each other shrink for a while, and grow back at push_out
+    [m/s]. search: the NeighbourSearch that lists the pairs. impulse: the pushes of listed pairs in the last substep [kg m].
     """
 
     push_out: Any = OnDevice()
@@ -39,15 +39,15 @@ class DiscGeometry:
 
     @ti.func
     def contact_distance(self, i, j):
-        """The distance at which particles i and j touch."""
+        """Return the distance at which particles i and j touch [m]."""
         contact_distance = self.radius.of(i) + self.radius.of(j)
         if ti.static(self.shrinks):
-            contact_distance = ti.max(contact_distance - (self.shrunk[i] + self.shrunk[j]), 0)  # no less, by rounding
+            contact_distance = ti.max(contact_distance - (self.shrunk[i] + self.shrunk[j]), 0)  # rounding may make it negative
         return contact_distance
 
     @ti.func
     def pushes(self, i, j):
-        """1 if particles i and j push each other where they overlap, 0 where one of them only senses the other."""
+        """Return 1 if particles i and j push each other where they overlap, 0 if they do not, as for sensors."""
         out = 1
         if ti.static(self.senses):
             out = ti.cast(ti.cast(self.search.table.of(i, j)[3], ti.i32) == TOUCHES, ti.i32)
@@ -55,7 +55,7 @@ class DiscGeometry:
 
     @ti.func
     def depth(self, i, j, contact_distance):
-        """The overlap alone."""
+        """Return the overlap of a pair that touches at `contact_distance` [m], without the normal; negative where apart."""
         r = self.state.apart(i, j)
         rr = r.dot(r)
         overlap = 0 * contact_distance - 1
@@ -67,7 +67,7 @@ class DiscGeometry:
 
     @ti.func
     def overlap(self, i, j, contact_distance):
-        """Overlap [m] of a pair that touches at `contact_distance` (negative where apart), and its normal."""
+        """Return the overlap [m] of a pair that touches at `contact_distance` [m], negative where apart, and its normal."""
         r = self.state.apart(i, j)
         rr = r.dot(r)
         overlap, n = 0 * contact_distance - 1, 0 * r
@@ -81,14 +81,14 @@ class DiscGeometry:
 
     @ti.func
     def gap(self, i, j):
-        """The overlap of a pair that is apart, which is negative, and its normal."""
+        """Return the (negative) overlap of a pair that is apart [m], and its normal."""
         r = self.state.apart(i, j)
         length = r.norm()
         return self.contact_distance(i, j) - length, r / length
 
     @ti.func
     def direction(self, i, j):
-        """The normal of a pair that may be apart."""
+        """Return the normal of a pair that may be apart, 0 in the same place."""
         r = self.state.apart(i, j)
         length = r.norm()
         n = 0 * r
@@ -98,17 +98,19 @@ class DiscGeometry:
 
     @ti.func
     def impact(self, i, j, contact_distance, shared, bears):
-        """Overlap, 1 / shared, and normal, as in overlap(), of a pair that touches; and how far from each other it was where its
-        push acts, for particles that spin. bears: whether it pushed in the last substep, too.
+        """Return the overlap [m], 1 / shared, the normal, and the distance of a touching pair where its push acts [m].
 
-        A pair that came together in this substep has the normal that it had at the time of impact: |r0 + s d| = contact_distance,
-        with r0 at the start and d the relative displacement; what is left of d along n is the overlap. This is exact for free
-        flight, where the normal at the end is off by the way that a pair slides past each other.
+        shared: m_i w_i + m_j w_j. bears: whether the pair bears a load, from the last substep. Spin needs the distance.
+
+        A pair that came together in this substep has the normal of the time of impact: |r0 + s d| = contact_distance, with r0 at
+        the start of the substep and d the relative displacement. The rest of d along n is the overlap. This is exact for free
+        flight; the normal at the end would be off by the distance that the pair slides.
+
         A pair that touched before has the normal at the start, as a rigid link has. With d_(n+1) = d_n + p and x_(n+1) = x_n +
-        d_(n+1), sum m x x d changes by sum m x_n x p, which is 0 for pushes along r0: angular momentum is kept to rounding, and
-        what slides or rolls on another is second order. Along normals at the end, a load would feed what slides past it: seven
-        discs that are drawn to a point doubled their angular momentum in 20 s at 20 substeps. What slides on a straight way ends
-        a little above what it slides on, so it counts as touching, too, if the pair bears a load.
+        d_(n+1), sum m x x d changes by sum m x_n x p, which is 0 for pushes along r0. So angular momentum is conserved to
+        rounding, and sliding or rolling on another particle is second order. With normals at the end, a load would accelerate
+        sliding particles: seven discs drawn to a point would double their angular momentum in 20 s at 20 substeps. A particle
+        that slides on a straight path ends a little above the other one, so a pair that bears a load counts as touching, too.
         """
         r = self.state.apart(i, j)
         d = self.state.slid(self.state.d[i] - self.state.d[j], i, j)
@@ -118,7 +120,7 @@ class DiscGeometry:
         overlap, each, n, reach = contact_distance - ti.sqrt(rr), 1 / shared, r, contact_distance
         if (c <= 0 or bears) and before > near:
             reach = ti.sqrt(before)
-            n = start / reach  # with 1 / shared, all in one division of a vector
+            n = start / reach  # next to 1 / shared: the compiler can do both in one division of a vector
         else:
             a, b = d.dot(d), start.dot(d)
             root = ti.sqrt(ti.max(b * b - a * c, 0)) - b
@@ -134,7 +136,7 @@ class DiscGeometry:
 
     @ti.func
     def fallback_normal(self, i, j, r):
-        """A normal for two particles in the same place: opposite for (j, i), different for other pairs."""
+        """Return a normal for two particles in the same place: opposite for (j, i), different for other pairs."""
         low, high = ti.cast(ti.min(i, j), ti.u32), ti.cast(ti.max(i, j), ti.u32)
         mixed = (low * ti.u32(2654435769)) ^ ((high + ti.u32(1)) * ti.u32(2246822519))
         n = 0 * r
@@ -149,25 +151,27 @@ class DiscGeometry:
 
     @ti.func
     def on_circle(self, bits):
-        """A point of the unit circle: (1 - t^2, 2 t) / (1 + t^2), on its right half for t in (-1, 1), or the opposite one. A
-        cosine has other bits elsewhere, and some GPUs have none of f64."""
+        """Return a point of the unit circle, (1 - t^2, 2 t) / (1 + t^2) on its right half for t in (-1, 1), or the opposite one.
+
+        A cosine would have other bits on other machines, and some GPUs have no cosine in f64.
+        """
         t = self.fraction(bits << ti.u32(1))
         per = (1 - 2 * ti.cast(bits >> ti.u32(31), ti.i32)) / (1 + t * t)
         return (1 - t * t) * per, 2 * t * per
 
     @ti.func
     def fraction(self, bits):
-        """In (-1, 1): an odd multiple of 2^-23, which f32 can hold."""
+        """Return a number in (-1, 1): an odd multiple of 2^-23, which f32 can hold."""
         return ti.cast(2 * ti.cast(bits >> ti.u32(9), ti.i32) + 1 - 2**23, self.real) * ti.static(2.0**-23)
 
     @ti.func
     def overshoots(self, i):
-        """1 if particle i crosses more than its own size in one substep."""
+        """Return 1 if particle i moves by more than its own size in one substep, or by NaN."""
         d, limit = self.state.d[i], self.radius.stride(i)
         return ti.select(d.dot(d) <= limit * limit, 0, 1)
 
     def enable_shrink(self) -> None:
-        """From now on particles may be smaller than they are; the field for it exists only once it is needed."""
+        """Prepare for shrink(): declare the field of shrunk radii, which exists only once it is needed."""
         if not self.shrinks:
             self.store = self.scene.memory.more()
             self.shrunk = self.store.field(SHRUNK, self.scene.count, state=True)
@@ -176,8 +180,7 @@ class DiscGeometry:
 
     @ti.func
     def shrink(self, i, first):
-        """Make particle i small enough: each pair with a particle from number `first` on gives up its overlap in proportion to
-        the radii."""
+        """Shrink particle i to remove its overlap with particles of index `first` or more, shared in proportion to the radii."""
         less = ti.select(first > 0, self.shrunk[i], ti.cast(0, self.real))
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             j = self.list.neighbour[e]
@@ -189,7 +192,7 @@ class DiscGeometry:
 
     @ti.func
     def restore(self, i, h):
-        """Let particle i grow back to its radius."""
+        """Let particle i grow back for a substep h [s], at push_out / 2: both particles of a pair grow."""
         if ti.static(self.shrinks):
             self.shrunk[i] = ti.max(self.shrunk[i] - self.push_out * h / 2, 0)
 
@@ -203,30 +206,30 @@ class DiscGeometry:
 
     @ti.func
     def push_each_other(self, i, j, margin):
-        """Whether particles i and j push each other, and overlap or are no further from that than the margin."""
+        """Whether particles i and j push each other, and are less than `margin` [m] from overlapping."""
         r, distance = self.state.apart(i, j), self.contact_distance(i, j) + margin
         return r.dot(r) < distance * distance and self.pushes(i, j) != 0
 
     @ti.func
     def worst_overlap(self, i):
-        """For the report: contacts of particle i with later ones, and the worst overlap in radii of the smaller."""
+        """Return the number of contacts of i with particles j > i, and their worst overlap in radii of the smaller particle."""
         touching, worst = 0, ti.cast(0, self.real)
         number = self.list.number[i]
         last = self.list.first[i] + number - 1
         for k in range(number):
             j = self.list.neighbour[last - k]
-            if j < i:  # and so are the rest
+            if j < i:  # the list is sorted: so are the rest
                 break
             a, b, r = self.radius.of(i), self.radius.of(j), self.state.apart(i, j)
             small = ti.select(ti.min(a, b) > 0, ti.min(a, b), ti.max(a, b))
             overlap = ((a + b) * self.pushes(i, j) - ti.sqrt(r.dot(r))) / small
-            # No branch: half of what is listed is apart.
+            # No branch: half of the listed pairs are apart.
             touching += ti.cast(overlap > 0, ti.i32)
             worst = ti.select(overlap > worst, overlap, worst)
         return touching, ti.cast(worst, ti.f64)
 
     def candidates(self, x: np.ndarray) -> DiscCandidates:
-        """What may touch around positions x (n, dim) [m], for the host: the listed pairs."""
+        """Return the listed pairs as possible contacts around positions x (n, dim) [m], for the host."""
         particles, (pairs, _) = self.scene.particles, self.list.entries()
         some = (pairs[:, 0] < pairs[:, 1]) | (self.scene.inv_mass[pairs[:, 1]] == 0)
         who = pairs[some & self.search.table.pushing(particles.group, pairs)]
@@ -236,13 +239,13 @@ class DiscGeometry:
         return DiscCandidates(who, radius[who].sum(axis=1), self.scene.periodic)
 
     def found(self, x: np.ndarray, h: float) -> Contacts:
-        """The pairs that touch, of particles at x (n, dim) [m], for world.contacts."""
+        """Return the pairs that touch, of particles at x (n, dim) [m] after a substep h [s], for world.contacts."""
         assert self.impulse
         r = self.scene.particles.radius
         pairs, at = self.list.entries()
         push = self.list.read(self.impulse, at)
         if self.search.has_static:
-            # What is static does not keep what it gives, nor the pair in its list when it is far: the other one of the pair does.
+            # A static particle does not store its push, nor keep a far pair on its list. The other particle of the pair does.
             n = len(self.scene.particles)
             keys, which = np.unique(pairs.min(axis=1) * n + pairs.max(axis=1), return_inverse=True)
             pairs, most = np.stack(np.divmod(keys, n), axis=1), np.zeros(len(keys))
@@ -268,10 +271,10 @@ class DiscGeometry:
 
 
 def fallback_normals(pairs: np.ndarray, dim: int) -> np.ndarray:
-    """What DiscGeometry.fallback_normal() returns for pairs i < j, (m, dim)."""
+    """Return the normals of DiscGeometry.fallback_normal() for pairs i < j, (m, dim)."""
 
     def fraction(bits: np.ndarray) -> np.ndarray:
-        """Bits as numbers between -1 and 1, never 0."""
+        """Turn bits into numbers between -1 and 1, never 0."""
         return (2.0 * (bits >> np.uint32(9)) + 1 - 2**23) * 2.0**-23
 
     low, high = pairs.astype(np.uint32).T

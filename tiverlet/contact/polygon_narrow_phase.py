@@ -1,4 +1,4 @@
-"""Where vertices are to the edges of bodies made of loops of particles (2D)."""
+"""The narrow phase of bodies made of loops of particles: vertices and edges (2D)."""
 
 from typing import Any, NamedTuple
 
@@ -14,23 +14,28 @@ from ..neighbours.queries import Contacts
 from .candidates import EdgeCandidates
 from .narrow_phase import DiscGeometry
 
-SLACK = 1 / 512  # of an edge: as much further it goes at its ends, so that bodies of the same width stand on each other
-STRETCH = 1.25  # of an edge, beyond which a contact in its middle might not be listed
-BEYOND = 1 / 4  # of an edge, how far beyond its end a contact may be
-REACH = 1.35  # of an edge, from one end to where a contact may be: (1 + BEYOND, 1 / 2)
-CLOSE = 1e-4  # edges whose distances differ by less are equally near: the first of them counts
-TILT = 1 / 16  # the sine of an angle by which edges that lie on each other may lean, as bodies give way
+# Lengths relative to an edge.
+SLACK = 1 / 512  # extension of an edge at its ends, so that bodies of the same width stand on each other
+STRETCH = 1.25  # longest edge, relative to its first length, for which all contacts in its middle are listed
+BEYOND = 1 / 4  # how far beyond the end of an edge a contact may be
+REACH = 1.35  # from one end of an edge to the farthest contact: |(1 + BEYOND, 1 / 2)|
+
+CLOSE = 1e-4  # edges whose relative distances differ by less are equally near: the first one counts
+TILT = 1 / 16  # sine of the angle by which edges that lie on each other may lean, as bodies deform
 TINY = 1e-30
 
-RATE = 0.4  # at which the usual depth of a contact follows its depth, see PolygonGeometry.share()
-DISCS = -1  # as a place on an edge: there is no edge, two discs touch
-OVER_EDGE = 1  # what tips_cross() returns where the way out is over the edge of the second corner
-VERTEX, START, END = range(3)  # what a particle is in a contact with one that it is listed with
+RATE = 0.4  # at which the usual depth of a contact approaches its depth, see PolygonGeometry.share()
+DISCS = -1  # the place on an edge where there is no edge: two discs touch
+OVER_EDGE = 1  # what tips_cross() returns if the way out is over the edge of the second corner
+VERTEX, START, END = range(3)  # the role of a particle in a contact with a listed particle
 
 
 class Outline(NamedTuple):
-    """Bodies as arrays: of each particle the next and the one before around its body, (n, 2), and the number of the body, (n,),
-    or -1; and the length of the longer of its two edges, (n,) [m]."""
+    """Bodies as arrays. Particles in no body have -1.
+
+    ends: (n, 2), the next and the previous particle around the body. body: (n,), the number of the body. length: (n,) [m], of the
+    longer of the two edges of each particle.
+    """
 
     ends: np.ndarray
     body: np.ndarray
@@ -38,26 +43,26 @@ class Outline(NamedTuple):
 
     @property
     def longest(self) -> np.ndarray:
-        """The length of the edges [m] up to which the list is complete."""
+        """The edge length up to which the neighbour list is complete, (n,) [m]."""
         return STRETCH * self.length
 
     @property
     def reach(self) -> np.ndarray:
-        """How far from each particle a contact of its edges may be [m]."""
+        """How far from each particle a contact of its edges may be, (n,) [m]."""
         return REACH * self.longest
 
 
 class PolygonGeometry:
-    """Bodies made of loops of particles: which vertex is beside, over or inside of which edge, and who takes part in a contact.
+    """The geometry of bodies made of loops of particles: vertices beside, over or inside of edges, and the parts of particles.
 
     C(x) = (x_v - (1 - t) x_a - t x_b) . n - (r_v + (1 - t) r_a + t r_b) of a vertex v and the edge from a to b of another body,
-    or C of two discs, see DiscGeometry, of which one may be a corner. push_out: at which speed what is inside goes out [m/s].
+    or C of two discs, see DiscGeometry, of which one may be a corner. push_out: speed at which overlap from the start ends [m/s].
     """
 
-    shrinks, store, late = True, None, ()  # its field is there from the start
+    shrinks, store, late = True, None, ()  # the field of allowed overlaps exists from the start
 
     push_out: Any = OnDevice()
-    step: Any = OnDevice()  # how far a vertex may go in a substep and be seen to come in [m]
+    step: Any = OnDevice()  # how far a vertex may move in a substep without missing an edge [m]
 
     def __init__(self, scene: Scene, outline: Outline, push_out: float):
         n, add = scene.count, scene.memory.field
@@ -68,45 +73,47 @@ class PolygonGeometry:
         self.step = scene.memory.number(self._stride(outline), scene.real)
         self.allowed = add("Polygons.allowed", n, state=True)  # overlap [m]
         self.in_state = {"allowed": self.allowed}
-        self.h = add("Polygons.substep", None, state=bool(scene.state.sleepers))  # the first particle may sleep, and not tell
-        # For each entry the contact of which its particle is the vertex: overlap, place on the edge (DISCS: there is none) and
-        # normal; where in the list of the other one those are in which it is the start, and the end, of the edge (-1: nowhere).
+        # Particle 0 writes h. It may sleep, so with Sleep h is part of the state.
+        self.h = add("Polygons.substep", None, state=bool(scene.state.sleepers))
+        # manifold: for each entry the contact of which its particle is the vertex: overlap, place on the edge (DISCS without an
+        # edge) and normal. back: the offsets, in the other particle's list, of the contacts in which this particle is the start,
+        # and the end, of the edge; -1 without one.
         self.manifold, self.back = PairData("met", 4, False, kept=False), PairData("back", 2, False, kept=False)
         self.most = PairData("most", 0, False, kept=False)  # how far the contact alone may be pushed out in this substep [m]
         self.impulse = PairData("given", 0, lasting=True, told=True)  # pushes and impacts in the last substep [kg m]
-        self.usual = PairData("usual", 0, lasting=True)  # how deep it has been, with the last substeps counting most [m]
+        self.usual = PairData("usual", 0, lasting=True)  # the depth, averaged over substeps with the latest weighing most [m]
         self.carried = [self.manifold, self.back, self.most, self.impulse, self.usual]
 
     @staticmethod
     def _stride(outline: Outline) -> float:
-        """A quarter of the shortest edge [m]."""
+        """Return a quarter of the shortest edge [m]."""
         return float(outline.length[outline.body >= 0].min(initial=np.inf)) / 4
 
     def become(self, outline: Outline) -> None:
-        """Have other bodies, of the particles that there are now."""
+        """Write other bodies, of the present particles, to the device."""
         self.outline, self.step, memory = outline, self._stride(outline), self.scene.memory
         memory.write(self.loop, np.c_[outline.ends, outline.body])
         memory.write(self.longest, outline.longest)
 
     def bind(self, search: NeighbourSearch) -> None:
-        """Take the neighbour list, which asks for pairs by `Beside`."""
+        """Store the neighbour list of a search whose pairs `Beside` selects."""
         self.list, self.discs = search.list, DiscGeometry(self.scene, search)
 
     @ti.func
     def after(self, i):
-        """The next particle around the body of particle i; -1 if it has none."""
+        """Return the next particle around the body of particle i; -1 if it is in no body."""
         return self.loop[i][0]
 
     @ti.func
     def before(self, i):
-        """The previous particle around the body of particle i; -1 if it has none."""
+        """Return the previous particle around the body of particle i; -1 if it is in no body."""
         return self.loop[i][1]
 
     @ti.func
     def corner(self, v, a):
-        """1 if v is in front of the corner a, beside none of its edges; -1 if it is behind an inner one; 0 if beside an edge.
+        """Return 1 if v is in front of the corner a, beside none of its edges; -1 if behind an inner corner; 0 if beside an edge.
 
-        A particle without edges is a corner all around.
+        A particle without edges is a corner on all sides.
         """
         out = 1
         if self.after(a) >= 0:
@@ -119,11 +126,13 @@ class PolygonGeometry:
 
     @ti.func
     def edge(self, v, a, front, moved):
-        """How far v overlaps the edge from a to the next, negative where it does not, the normal, where on the edge, and how far
-        it may be pushed out in this substep.
+        """Return the overlap of v with the edge that begins at a, the normal, the place on the edge, and the largest push.
 
-        What was in front at the start of the substep came in over this edge if it crossed it between its ends. What was behind
-        already goes out over the nearest one that faces its own body, at push_out. moved: as in detect().
+        The overlap [m] is negative without contact. The largest push is how far v may be pushed out in this substep [m].
+
+        A vertex in front of the edge at the start of the substep came in over it if it crossed between the ends of the edge. A
+        vertex that was behind already leaves over the nearest edge that faces its own body, at push_out. front: what corner(v, a)
+        returned. moved: as in detect().
         """
         b = self.after(a)
         r, u = self.state.apart(v, a), self.state.apart(b, a)
@@ -152,7 +161,7 @@ class PolygonGeometry:
             else:
                 if not came and t < 0:
                     beside = front < 0
-                    if beside:  # the nearest way out is over an inner corner
+                    if beside:  # the shortest way out is over an inner corner
                         height, shared = -r.norm(), self.before(a)
                         n = r / ti.min(height, -uu * TINY)
                 t = ti.min(ti.max(t, 0), 1)
@@ -179,19 +188,19 @@ class PolygonGeometry:
     @called
     @ti.func
     def tips_cross(self, v: ti.i32, c: ti.i32) -> ti.i32:
-        """Whether the bodies of two corners v and c cross there although neither corner is inside of the other body.
+        """Return whether the bodies of corners v and c cross there although neither corner is inside of the other body, and how.
 
-        Each corner has then passed between the edges of the other: it is behind one of them and in front of the next, and the
-        latter is crossed by both edges of the corner. The shortest way out is over the edge that v is behind, or over that which
-        c is behind. Returns 1 for the edge from c to the next, -1 for that which ends at c; twice that where the way over the
-        edge of v is shorter; and 0 where they do not cross.
+        Each corner has then passed between the edges of the other corner: it is behind one edge and in front of the next, and
+        both edges of the corner cross the latter. The shortest way out is over the edge that v is behind, or over the edge that c
+        is behind. Returns 0 without a crossing. Otherwise 1 if v is behind the edge from c to the next particle, -1 if it is
+        behind the edge that ends at c; twice that number if the way over the edge of v is shorter.
         """
         out = 0
         if self.after(v) >= 0 and self.after(c) >= 0:
             r = self.state.apart(v, c)
             p, q = self.state.apart(self.after(v), v), self.state.apart(self.before(v), v)
             a, b = self.state.apart(self.after(c), c), self.state.apart(self.before(c), c)
-            # Heights, times the lengths of the edges: of v over those of c, and of c over those of v.
+            # Heights times edge lengths: of v over the edges of c, and of c over the edges of v.
             over_a, over_b, over_p, over_q = r.cross(a), b.cross(r), p.cross(r), r.cross(q)
             if p.cross(q) > 0 and a.cross(b) > 0 and over_a * over_b < 0 and over_p * over_q < 0:
                 side, behind, front = 1, a, b
@@ -200,7 +209,7 @@ class PolygonGeometry:
                 own, other, turn = p, q, 1
                 if over_p > 0:
                     own, other, turn = q, p, -1
-                # Both corners leave over the edge that the other one is behind, and the edges in front are crossed.
+                # Both corners can leave over the edges that they are behind, and the edges in front are crossed.
                 leaves = turns(p, side * behind) and turns(q, side * behind) and turns(a, turn * own) and turns(b, turn * own)
                 if (
                     leaves
@@ -215,9 +224,10 @@ class PolygonGeometry:
 
     @ti.func
     def inside(self, p, a):
-        """Whether a point, p from a, is inside of the body of a: a ray from it along +x crosses the loop an odd number of times.
+        """Whether the point x_a + p is inside of the body of a: a ray from it along +x crosses the loop an odd number of times.
 
-        What is behind one edge may be in front of the next, where they meet at less than 90 degrees.
+        The sides of single edges do not decide it: where edges meet at less than 90 degrees, a point behind one may be in front
+        of the next.
         """
         out, k, r = False, a, -p
         going = True
@@ -232,7 +242,7 @@ class PolygonGeometry:
 
     @ti.func
     def inward(self, v):
-        """The way from an outer corner v into its own body; 0 where there is none."""
+        """Return a vector from an outer corner v into its own body; 0 at inner corners and without a body."""
         out = 0 * self.state.x[v]
         if self.after(v) >= 0:
             u, w = self.state.apart(self.after(v), v), self.state.apart(self.before(v), v)
@@ -242,9 +252,9 @@ class PolygonGeometry:
 
     @ti.func
     def nearest(self, v, a, shared, height, back):
-        """Whether no edge of the body of a but those from a and `shared` is nearer to v, which is at `height` below 0 over them.
+        """Whether no edge of the body of a is nearer to v than those from a and `shared`. height: of v over them, below 0 [m].
 
-        Edges that face away from the body of v, which lies in the direction `back`, are no way out for it.
+        Edges that face away from the body of v are no way out for v, and are skipped. back: the direction of that body from v.
         """
         out = True
         for e in range(self.list.first[v], self.list.first[v] + self.list.number[v]):
@@ -262,10 +272,11 @@ class PolygonGeometry:
     @called
     @ti.func
     def detect(self, i: ti.i32, moved: ti.i32):
-        """Find the contacts that particle i is the vertex of, or one of two discs: at most one with each near particle.
+        """Find the contacts in which particle i is the vertex, or one of two discs: at most one with each listed particle.
 
-        moved: in a substep, by how particles moved in it, and without the overlap that is allowed. Otherwise by where they are
-        and the nearest edges: before the first substep after a start, d is the velocity. 2 in passes but the first.
+        moved: 1 in the first pass of a substep, 2 in later ones: by how particles moved in it, less the allowed overlap. 0
+        otherwise: by present positions and the nearest edges. Then d may be a velocity, as it is at a start (before the first
+        substep after velocities were set).
         """
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             j = self.list.neighbour[e]
@@ -282,7 +293,7 @@ class PolygonGeometry:
                     overlap, n, t, self.most.field[e] = self.edge(i, j, front, moved)
                     if overlap > 0:
                         if self.find(i, self.after(j)) < 0:
-                            overlap = -overlap  # the edge is so long that its end knows nothing of i: momentum would be lost
+                            overlap = -overlap  # the end of a long edge is not on the list of i: momentum would be lost
                 if overlap <= 0 and front > 0 and self.keeps(i, j):
                     overlap, n = self.discs.overlap(i, j, self.radius.of(i) + self.radius.of(j))
                     if overlap > 0:
@@ -301,7 +312,7 @@ class PolygonGeometry:
 
     @ti.func
     def remember(self, i, j, e, moved):
-        """Keep how deep the contact of vertex i with j, at entry e, usually is; what sleeps keeps what it knows."""
+        """Update the usual depth of the contact of vertex i with j, at entry e, unless both sleep."""
         if moved != 0 and (self.state.awake(i) or self.state.awake(self.held_by(j))):
             depth, usual = self.depth(e), self.usual.field[e]
             if depth <= 0:
@@ -314,21 +325,21 @@ class PolygonGeometry:
 
     @ti.func
     def keeps(self, i, j):
-        """Whether of two particles that touch as discs it is i that keeps the contact, as its vertex.
+        """Whether particle i, of two particles that touch as discs, stores the contact as its vertex.
 
-        Particles in no loop are never the start or end of an edge: they keep all contacts that they are in. Two of them both keep
-        that of the pair; this tells then which of the two counts.
+        Particles in no loop are never the start or end of an edge, so they store all of their contacts. Two particles in no loop
+        both store the contact of the pair. The result then says which of the two entries counts.
         """
         return (i < j) if (self.after(i) < 0) == (self.after(j) < 0) else self.after(i) < 0
 
     @ti.func
     def roles(self, i):
-        """How many roles particle i may have in a contact, of VERTEX, START and END."""
+        """Return how many of the roles VERTEX, START and END particle i may have in a contact."""
         return ti.select(self.after(i) < 0, 1, 3)
 
     @ti.func
     def find(self, v, a):
-        """Where a is in the list of v, counted from its begin; -1 if it is not."""
+        """Return the offset of a in the list of v, or -1 (binary search)."""
         low, end = self.list.first[v], self.list.first[v] + self.list.number[v]
         high = end
         while low < high:
@@ -345,10 +356,10 @@ class PolygonGeometry:
 
     @ti.func
     def participants(self, i, e, role):
-        """The contact in which particle i, with the one at entry e of its list, is in a role.
+        """Return the contact in which particle i has a role, with the particle at entry e of its list.
 
-        Returns the entry that keeps it (-1: there is none), its particles v, a, b, where on the edge, and the part of its move
-        that is that of i: 1, -(1 - t) or -t. Two discs are an edge of which only the start is touched.
+        Returns the entry that stores the contact (-1 without one), its particles v, a, b, the place t on the edge, and the part
+        of its correction that i gets: 1, -(1 - t) or -t. Two discs count as an edge that is touched at its start.
         """
         j = self.list.neighbour[e]
         at, v, a = e, i, j
@@ -377,22 +388,22 @@ class PolygonGeometry:
 
     @ti.func
     def relative(self, d: ti.template(), v, a, b, t):  # type: ignore[valid-type]
-        """The displacement of v relative to the point t of the edge from a to b."""
+        """Return the displacement of v relative to the point t of the edge from a to b [m]."""
         return d[v] - (1 - t) * d[a] - t * d[b]
 
     @ti.func
     def inverse_mass(self, v, a, b, t):
-        """The inverse mass of a contact whose particles are in no other."""
+        """Return the inverse mass of a contact whose particles have no other contact."""
         return self.w.of(v) + (1 - t) * (1 - t) * self.w.of(a) + t * t * self.w.of(b)
 
     @ti.func
     def split_mass(self, split: ti.template(), v, a, b, t):  # type: ignore[valid-type]
-        """The same where the masses of particles are split."""
+        """Return the inverse mass of a contact whose particles' masses are split. split: how often, by particle."""
         return split[v] * self.w.of(v) + (1 - t) * split[a] * self.w.of(a) + t * split[b] * self.w.of(b)
 
     @ti.func
     def depth(self, at):
-        """How deep the contact at entry `at` is, or how far it may be pushed out in this substep, if that is less."""
+        """Return the depth of the contact at entry `at`, or how far it may be pushed out in this substep, if that is less [m]."""
         depth = self.manifold.field[at][0]
         if self.manifold.field[at][1] > DISCS:
             depth = ti.min(depth, self.most.field[at])
@@ -400,14 +411,17 @@ class PolygonGeometry:
 
     @ti.func
     def share(self, depths: ti.template(), at, v, a, b, t):  # type: ignore[valid-type]
-        """Of the contact at entry `at`: the overlap that a pass takes back, and the inverse mass by which that is split.
+        """Return the overlap that a pass takes back of the contact at entry `at` [m], and the inverse mass by which it is split.
 
-        depths: S_i = sum_k p_ki a_k of the contacts k of particle i, of which it has the parts p_ki: 1, 1 - t or t, with their
-        usual depths a_k. (sum_k p_ki y_k)^2 <= S_i sum_k p_ki y_k^2 / a_k, so J w J^T <= diag(sum_i p_ki w_i S_i / a_k). By
-        their depths C_k in this substep pushes would go as C_k^2 / S_i: what is squeezed from both sides, with the eigenvalue 1,
-        would have 2, and go to and fro for good. With a_k += RATE (C_k - a_k) it has z^2 + (3 RATE - 1) z = RATE, which is stable
-        below 1/2; slower ones take damping from what is slow. What goes out at push_out does so whatever else its particles bear,
-        p <= most / (inverse mass alone): else a load could hold it inside for good.
+        depths: S_i = sum_k p_ki a_k over the contacts k of particle i, with its parts p_ki (1, 1 - t or t) and the usual depths
+        a_k. (sum_k p_ki y_k)^2 <= S_i sum_k p_ki y_k^2 / a_k, so J w J^T <= diag(sum_i p_ki w_i S_i / a_k).
+
+        With the depths C_k of this substep in place of a_k, pushes would go as C_k^2 / S_i. A particle squeezed from both sides,
+        with the eigenvalue 1, would then have 2, and oscillate for ever. With a_k += RATE (C_k - a_k) it has
+        z^2 + (3 RATE - 1) z = RATE, which is stable below 1/2; a lower RATE would take damping from slow modes.
+
+        A contact that is pushed out at push_out goes at that speed whatever else its particles bear, p <= most / (inverse mass
+        alone). Otherwise a load could hold a vertex inside for ever.
         """
         overlap, depth = self.manifold.field[at][0], self.depth(at)
         shared = self.split_mass(depths, v, a, b, t) / self.usual.field[at]
@@ -417,7 +431,7 @@ class PolygonGeometry:
 
     @ti.func
     def too_long(self, i):
-        """1 if the edge that begins at particle i is too long for the list."""
+        """Return 1 if the edge that begins at particle i is too long for the list."""
         after, out = self.after(i), 0
         if after >= 0:
             u = self.state.apart(after, i)
@@ -427,18 +441,18 @@ class PolygonGeometry:
 
     @ti.func
     def overshoots(self, i):
-        """1 if particle i crosses a quarter of an edge in one substep."""
+        """Return 1 if particle i moves by more than a quarter of the shortest edge in one substep, or a disc by its size."""
         d, limit = self.state.d[i], ti.cast(self.step, self.real)
         if self.after(i) < 0:
             limit = ti.min(limit, self.radius.stride(i) if ti.static(self.radius.discs) else limit)
         return ti.select(d.dot(d) <= limit * limit, 0, 1)
 
     def enable_shrink(self) -> None:
-        """The field is there from the start."""
+        """Do nothing: the field of allowed overlaps exists from the start."""
 
     @ti.func
     def shrink(self, i, first):
-        """Allow particle i the overlap that it has as a vertex, as far as particles from number `first` on have to do with it."""
+        """Allow particle i the overlap that it has as a vertex in contacts with particles of index `first` or more."""
         self.detect(i, 0)
         allowed = ti.select(first > 0, self.allowed[i], 0 * self.w.of(i))
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
@@ -449,7 +463,7 @@ class PolygonGeometry:
 
     @ti.func
     def restore(self, i, h):
-        """Allow particle i less, and keep the length of the substep at hand."""
+        """Reduce the allowed overlap of particle i after a substep h [s], at push_out. Particle 0 stores h."""
         if i == 0:
             self.h[None] = h
         self.allowed[i] = ti.max(self.allowed[i] - self.push_out * h, 0)
@@ -461,13 +475,13 @@ class PolygonGeometry:
 
     @ti.func
     def forget(self, i):
-        """Particle i sleeps, and nothing is near that moves: no contact that it is the vertex of is one."""
+        """Clear the contacts of which particle i is the vertex: it sleeps, and no listed particle moves."""
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             self.manifold.field[e] = ti.Vector([-1, 0, 0, 0], self.real)
 
     @ti.func
     def held_by(self, j):
-        """Who moves where an edge from j, or disc j, does: j, or where that cannot move the other end."""
+        """Return the particle that moves with disc j or the edge from j: j, or the other end if j cannot move."""
         out = j
         if not self.w.positive(j) and self.after(j) >= 0:
             out = self.after(j)
@@ -475,7 +489,7 @@ class PolygonGeometry:
 
     @ti.func
     def stays(self, i, e):
-        """Whether the contact of vertex i at entry e of its list is as it was: i cannot move, and the other one sleeps."""
+        """Whether the contact of vertex i at entry e of its list is unchanged: i cannot move, and the other particle sleeps."""
         out = False
         if ti.static(bool(self.state.sleepers)):
             out = not self.w.positive(i) and not self.state.awake(self.held_by(self.list.neighbour[e]))
@@ -483,9 +497,9 @@ class PolygonGeometry:
 
     @ti.func
     def worst_overlap(self, i):
-        """For the report: contacts that particle i is the vertex of, or the first disc, and the worst overlap.
+        """Return the number of contacts in which i is the vertex, or the first disc, and their worst overlap, for the report.
 
-        It is relative to half of the edge, or to the radius of the smaller disc.
+        The overlap is relative to half of the edge, or to the radius of the smaller disc.
         """
         touching, worst = 0, ti.cast(0, ti.f64)
         self.detect(i, 0)
@@ -502,7 +516,7 @@ class PolygonGeometry:
         return touching, worst
 
     def candidates(self, x: np.ndarray) -> EdgeCandidates:
-        """What may touch around positions x (n, 2) [m], for the host: what is listed, and was looked for there."""
+        """Return the listed pairs as possible contacts around positions x (n, 2) [m], for the host. detect() has run at x."""
         pairs, at = self.list.entries()
         lone, allowed = self.outline.ends[:, 0] < 0, self.scene.memory.read(self.allowed)
         both = lone[pairs].all(axis=1)
@@ -513,7 +527,7 @@ class PolygonGeometry:
         return EdgeCandidates(x, pairs, found, DISCS, pushed, ends, body, radius, allowed)
 
     def found(self, x: np.ndarray, h: float) -> Contacts:
-        """Vertices and edges, and pairs of discs, by what detect() found last; also those that were pushed apart since."""
+        """Return the contacts of the last detect(): vertices and edges, and pairs of discs, also those pushed apart since."""
         r = self.scene.particles.radius
         pairs, at = self.list.entries()
         found, push = self.list.read(self.manifold, at), self.list.read(self.impulse, at)
@@ -535,7 +549,7 @@ class PolygonGeometry:
 
 @ti.func
 def segments_cross(r, s, q):
-    """Whether the line from r to r + s crosses that from 0 to q."""
+    """Whether the line segment from r to r + s crosses the segment from 0 to q."""
     d = s.cross(q)
     at_s, at_q = q.cross(r), s.cross(r)
     if d < 0:
@@ -545,12 +559,12 @@ def segments_cross(r, s, q):
 
 @ti.func
 def turns(r, s):
-    """Whether s is counterclockwise from r, or the two are as good as parallel."""
+    """Whether s is counterclockwise from r, or nearly parallel to it (TILT)."""
     return r.cross(s) >= -TILT * r.norm() * s.norm()
 
 
 class Beside:
-    """What the neighbour search asks which pairs to list: those of different bodies, as far as their groups touch."""
+    """The table that selects pairs for the neighbour search: vertices near edges of other bodies, and discs."""
 
     uniform = senses = False
     skin: Any = OnDevice()
@@ -561,12 +575,12 @@ class Beside:
 
     @ti.func
     def reach(self, radius: ti.template(), i, j):  # type: ignore[valid-type]
-        """How far from each other particles i and j may take part in a contact."""
+        """Return the distance up to which particles i and j may take part in a contact [m]."""
         return radius.of(i) + radius.of(j) + ti.static(REACH) * ti.max(self.longest[i], self.longest[j])
 
     @ti.func
     def of(self, i, j):
-        """The row of the table, with 0 at its end for two particles of one body, or where no edge of one is near the other."""
+        """Return the row of the table. Entry 3, whether i and j touch, is 0 within one body and where no edge is near."""
         row = self.table.of(i, j)
         if self.loop[i][2] >= 0 or self.loop[j][2] >= 0:
             if self.loop[i][2] == self.loop[j][2] or not (self.beside(i, j) or self.beside(j, i)):
@@ -575,7 +589,7 @@ class Beside:
 
     @ti.func
     def beside(self, v, c):
-        """Whether v is near one of the edges of c: within the skin or, behind it, not deeper than half of it."""
+        """Whether v is near an edge of c: within the skin in front of it, or behind it by up to half its length and the skin."""
         out = False
         if self.loop[c][2] >= 0:
             r, reach = self.state.apart(v, c), self.radius.of(v) + self.skin

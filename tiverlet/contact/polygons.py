@@ -1,4 +1,4 @@
-"""Bodies made of loops of particles that do not overlap (2D)."""
+"""Contacts of bodies made of loops of particles (2D)."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -23,39 +23,44 @@ from .pair_contact import PairContact
 from .polygon_narrow_phase import VERTEX, Beside, Outline, PolygonGeometry
 from .restitution import SLOW, under_force
 
-SKIN = 0.15  # of the longer edge of a vertex
+SKIN = 0.15  # skin of a vertex, relative to its longer edge
 
 
 class Polygons(PairContact):
-    """Bodies made of particle loops do not overlap each other, nor other particles: vertex against edge, disc against disc (2D).
+    """Contacts of bodies made of particle loops, and of other particles: vertex against edge, disc against disc (2D).
 
     C(x) = (x_v - (1 - t) x_a - t x_b) . n - (r_v + (1 - t) r_a + t r_b) >= 0 for a vertex v and the edge from a to b of another
-    body, where t is where v stands beside the edge and n the outward normal. Gradients: n, -(1 - t) n, -t n.
+    body. t is the place of v along the edge, n the outward normal. Gradients: n, -(1 - t) n, -t n.
 
-    loops: for each body its particles in order around it, at least 3, either way round. Their radii round the rim off. What holds
-    a body together is up to others (Distance, Area, ShapeMatch); it may bend, and stretch by a quarter. friction, restitution: as
-    in Contact, and so are all particles that are in no loop. push_out: about the speed at which bodies that overlap part [m/s].
+    loops: for each body its particles in order around it, at least 3, either way round. Their radii round the rim. Other
+    constraints (Distance, Area, ShapeMatch) hold a body together; it may bend, and stretch by a quarter.
+    friction, restitution: as in Contact. Particles in no loop touch as in Contact.
+    skin: how far beyond contact distance pairs are listed [m], "auto" for the median of 0.15 of the longer edge of each vertex,
+    and of 0.75 of the radius of each disc in no loop.
+    push_out: about the speed at which bodies that overlap part [m/s].
 
-    A Jacobi pass: each contact wants C back, split by mass, p = -C / (m_v w_v + (1 - t) m_a w_a + t m_b w_b), with m_i = S_i / a,
-    where a is how deep the contact has been in the last few substeps, and S_i the same of all contacts of particle i, each times
-    the part, 1, 1 - t or t, that i has in it. By Cauchy's inequality no eigenvalue of a pass exceeds 1. A contact that is hardly
-    deep takes hardly a part of the mass: by the number of contacts, one that opens and closes would change how stiff those beside
-    it are, and heaps would never rest. That conserves momentum, and angular momentum but for the slip within a substep; friction
-    at a radius is a torque that nothing takes up. Corners that face each other touch as discs, by their radii. A vertex that is
-    inside of another body goes out through the edge over which it came, or the nearest that faces its own body, if it is not
-    deeper than half the length of that edge: in a substep nothing should get there, and the step flags "tunnelling-risk" where it
-    might. Particles that start deeper are refused.
+    Jacobi pass: each contact takes C back, split by mass, p = -C / (m_v w_v + (1 - t) m_a w_a + t m_b w_b), with m_i = S_i / a.
+    a is the usual depth of the contact in the last few substeps. S_i sums the usual depths of all contacts of particle i, each
+    times the part of i in it, 1, 1 - t or t. By Cauchy's inequality no eigenvalue of a pass exceeds 1. A contact that is hardly
+    deep takes hardly a part of the mass. If masses were split by the number of contacts instead, a contact that opens and closes
+    would change the stiffness of its neighbours, and heaps would never rest. The pass conserves momentum, and angular momentum
+    but for the slip within a substep; friction at a radius is a torque that nothing takes up.
 
-    Two sharp corners may pass each other, so that neither is inside of the other body but their edges cross. They part over that
-    of their edges which is nearer, C as above with t beyond the end of the edge. Other bodies that cross each other without a
-    corner of one inside of the other, such as two bars, are not seen. Walls act on particles: a sharp corner of a wall passes
-    between two of them.
+    Corners that face each other touch as discs, by their radii. A vertex inside of another body leaves through the edge over
+    which it came, or else through the nearest edge that faces its own body, if it is not deeper than half the length of that
+    edge. In a substep nothing should get that deep, and the step flags "tunnelling-risk" where it might. Particles that start
+    deeper are refused.
+
+    Two sharp corners may pass each other, so that neither is inside of the other body but their edges cross. They part over the
+    nearer of these edges, with C as above and t beyond the end of the edge. Other bodies that cross without a corner of one
+    inside of the other, such as two bars, are not detected. Walls act on particles: a sharp corner of a wall passes between two
+    of them.
     """
 
     host_only = ("loops",)
 
     detects = True
-    _after: Any = None  # the same bodies and others, as they are planned to be
+    _after: Any = None  # the copy with the bodies after a planned edit, see can_regroup()
     room = 64  # the particles of near bodies
 
     def __init__(
@@ -66,7 +71,7 @@ class Polygons(PairContact):
         self.loops = checked(loops)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Turn all loops counterclockwise, and measure them; refuse flat ones, and particles deep inside of others."""
+        """Turn all loops counterclockwise and measure them. Refuse flat loops, and positions too far out."""
         if particles.dim != 2:
             raise ValueError("Polygons: bodies of particle loops are for 2D worlds; these particles are in 3D.")
         if particles.spins:
@@ -83,18 +88,18 @@ class Polygons(PairContact):
             self.check_range(x)
 
     def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Refuse particles deep inside of bodies, as they come."""
+        """Warn as PairContact.review() does, and refuse particles that start deep inside of bodies."""
         super().review(particles, inv_mass)
         refuse_deep(self.loops, particles.position, 0)
 
     def check_added(self, particles: Particles, first: int) -> None:
-        """Refuse positions too far out, or inside of bodies."""
+        """Refuse positions too far out, and added particles deep inside of bodies."""
         bodies = self._after or self
         PairContact.check_added(bodies, particles, first)
         refuse_deep(bodies.loops, particles.position, first)
 
     def release(self) -> None:
-        """Forget the world, and what was planned there."""
+        """Unbind from the world, and drop a planned edit."""
         super().release()
         self._after = None
 
@@ -104,14 +109,14 @@ class Polygons(PairContact):
         return np.concatenate([*self.loops, np.zeros(0, dtype=np.int32)])
 
     def remap_indices(self, number: np.ndarray, count: int) -> None:
-        """Bodies stay as long as all of their particles do."""
+        """Take new particle indices (-1 for removed ones). A body remains if all of its particles do."""
         if self.loops:
             corner, begin, owner = flat(self.loops)
             new, whole = number[corner].astype(np.int32), np.bincount(owner, number[corner] < 0) == 0
             self._hold([new[begin[k] : begin[k + 1]] for k in np.flatnonzero(whole).tolist()])
 
     def check_more(self, more: Feature) -> None:
-        """It takes other bodies, which are to be like its own."""
+        """Raise unless `more` is a Polygons with the same settings."""
         if not isinstance(more, Polygons):
             raise TypeError(f"World.add: extend: {self!r} cannot take {more!r}, which is of another kind. Add it to features.")
         for name, value in more.arguments.items():
@@ -119,17 +124,20 @@ class Polygons(PairContact):
                 raise ValueError(f"World.add: extend: {more!r} has a {name} of its own, but all bodies have that of {self!r}.")
 
     def extend(self, more: "Polygons") -> None:
-        """Bodies behind bodies."""
+        """Append the bodies of `more`."""
         both = [*self.loops, *more.loops]
         self._hold(checked(both) if np.isin(more.indices, self.indices).any() else both)
 
     def _hold(self, loops: list[np.ndarray]) -> None:
-        """Have these bodies."""
+        """Store these bodies, in the arguments too."""
         self._keep(loops=loops)
         self.arguments = {**self.arguments, "loops": loops}
 
     def can_regroup(self, change: Regrouping) -> bool:
-        """Whether particles and bodies can come and go: not where bodies sleep as one, or lists are of another make."""
+        """Whether particles and bodies can come and go in place. If so, plan the edit for regroup().
+
+        Not in a world with Sleep, or if the groups or the neighbour search would differ.
+        """
         if not self.matters or self.scene.state.sleepers:
             return False
         came, now = change.now.position[change.kept :], change.now
@@ -146,7 +154,7 @@ class Polygons(PairContact):
         return alike and self.dev.search.can_regroup(change, now.radius, reach)
 
     def regroup(self, change: Regrouping) -> None:
-        """They came and went, and the team knows."""
+        """Carry out the planned edit. The thread team already has the new number of particles."""
         dev, after = self.dev, self._after
         self.start, self._listed, self._finest, self._after = after.start, after._listed, after._finest, None
         self._hold(after.loops)
@@ -157,20 +165,20 @@ class Polygons(PairContact):
         dev.search.regroup(change, self._listed, change.now.radius, dev.outline.reach)
 
     def rods(self) -> tuple[np.ndarray, np.ndarray]:
-        """Their edges, numbered from body to body."""
+        """Return the edges (k, 2) of all bodies, and their numbers (k,), counted from body to body. Rays meet them."""
         if not self.loops:
             return PairContact.rods(self)
         ends = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in self.loops])
         return ends, np.arange(len(ends))
 
     def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
-        """Declare the fields, among them the neighbour list's, which is returned."""
+        """Declare the fields and the neighbour search, and return the search."""
         n, add, dev = scene.count, scene.memory.field, self.dev
         self.enter(scene)
         dev.forces = ForceShare(scene, sums=True, lasting=False)
         dev.geometry = PolygonGeometry(scene, dev.outline, self.push_out)
         dev.move = add("Contact.move", n, width=2)
-        dev.depths = add("Contact.depths", n)  # of the contacts of each particle, see PolygonGeometry.share()
+        dev.depths = add("Contact.depths", n)  # S_i: the usual depths of the contacts of i, see PolygonGeometry.share()
         dev.fast = add("Contact.fast", None, kind=ti.i32)
         self.table.bind(scene, asked=True)
         dev.slip = PairData("slip", 2, lasting=True)
@@ -191,12 +199,12 @@ class Polygons(PairContact):
 
     @property
     def bodies(self) -> list[np.ndarray]:  # type: ignore[override]
-        """The loops."""
+        """The particles of each body, which sleep and wake together."""
         return self.loops
 
     @ti.func
     def detect(self, i, first):
-        """Find the contacts of particle i, and note an edge that is too long for the list."""
+        """Find the contacts of particle i, and set the flag if its edge is too long for the list."""
         if self.dev.state.awake(i):
             if first != 0:
                 for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
@@ -214,7 +222,7 @@ class Polygons(PairContact):
 
     @ti.func
     def is_near(self, i):
-        """Whether anything on the list of particle i moves."""
+        """Whether any particle on the list of i moves."""
         out = False
         for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
             j = self.dev.list.neighbour[e]
@@ -225,18 +233,20 @@ class Polygons(PairContact):
 
     @ti.func
     def presses(self, i, e):
-        """Whether particle i presses, as a vertex, on what is at entry e of its list, as it was found last."""
+        """Whether particle i, as a vertex, presses on the edge or disc at entry e of its list, by the last detect()."""
         return self.dev.geometry.impulse.field[e] > 0 or self.dev.geometry.manifold.field[e][0] > 0
 
     @ti.func
     def held_by(self, j):
-        """Which particle it is that a vertex presses on by particle j."""
+        """Return the particle that a vertex presses on where its entry is j, see PolygonGeometry.held_by()."""
         return self.dev.geometry.held_by(j)
 
     @ti.func
     def reached(self, i, e, margin):
-        """Who sleeps at entry e of the list of particle i and is touched by it, as was found last; if it is driven, also who was
-        in the substep before. Edges know no margin."""
+        """Return the sleeping particle at entry e of the list of i that i touches by the last detect(), or -1.
+
+        A driven particle i also reaches a sleeping particle that it touched in the substep before. Edges ignore `margin`.
+        """
         j, out = self.dev.list.neighbour[e], -1
         for role in range(self.dev.geometry.roles(i)):
             at, v, a, b, t, part = self.dev.geometry.participants(i, e, role)
@@ -251,7 +261,7 @@ class Polygons(PairContact):
 
     @ti.func
     def count(self, begin, end, now):
-        """How deep the contacts of some particles are, all together; and how many, for those that bounce."""
+        """Sum the usual depths of the contacts of particles begin ... end - 1; for restitution also their parts."""
         for i in range(begin, end):
             if self.dev.state.awake(i):
                 depths, parts = 0 * self.dev.w.of(i), 0 * self.dev.w.of(i)
@@ -269,7 +279,7 @@ class Polygons(PairContact):
 
     @ti.func
     def relax(self, i, now):
-        """What the contacts of particle i want of it."""
+        """Compute the corrections of particle i by its contacts."""
         first, final = now.first, now.final
         total, lifts, forced = 0 * self.dev.state.x[i], 0 * self.dev.state.x[i], 0 * self.dev.state.x[i]
         begin, roles = self.dev.list.first[i], self.dev.geometry.roles(i)
@@ -283,7 +293,7 @@ class Polygons(PairContact):
                         overlap, shared = self.dev.geometry.share(self.dev.depths, at, v, a, b, t)
                         d = self.dev.geometry.relative(self.dev.state.d, v, a, b, t)
                         share, missing = part * self.dev.w.of(i) / shared, 0 * overlap
-                        back = overlap  # what is taken back of the position and of the displacement
+                        back = overlap  # the correction of both position and displacement
                         if ti.static(self.dev.has_restitution):
                             if first != 0:
                                 aim, missing, lift = self.dev.restitution.target(at, v, a, b, t, n, overlap, d.dot(n))
@@ -313,7 +323,7 @@ class Polygons(PairContact):
 
     @ti.func
     def apply_corrections(self, i, first):
-        """Move particle i as its contacts want; what bounced goes where it is at the end of the substep."""
+        """Move particle i by its corrections. A particle that bounced is placed where it is at the end of the substep."""
         if self.dev.state.moves(i):
             if self.dev.depths[i] > 0:
                 self.dev.state.shift(i, self.dev.move[i])
@@ -323,7 +333,7 @@ class Polygons(PairContact):
 
     @ti.func
     def finish_substep(self, i, now):
-        """At the end of a substep: add to the slip of each contact what it has moved, as far as friction can hold it."""
+        """Update the slip of each contact at the end of a substep, as far as friction can hold it, and its last push."""
         if ti.static(self.dev.has_friction):
             for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
                 slip = 0 * self.dev.state.x[i]
@@ -342,25 +352,26 @@ class Polygons(PairContact):
 
 
 class PolygonRestitution:
-    """Contacts of vertices and edges leave with -e times the normal velocity that they have as they meet, see under_force()."""
+    """Restitution of vertices and edges: a contact leaves with -e times its normal velocity at impact, see under_force()."""
 
     def __init__(self, scene: Scene, geometry: PolygonGeometry, table: Table):
         n, add = scene.count, scene.memory.field
         self.geometry, self.table, self.state = geometry, table, scene.state
         self.split = add("Contact.struck", n)  # how often the mass of each particle is split: its parts in all contacts
         self.d_change = add("Contact.d_change", n, width=2)
-        self.lift = add("Contact.lift", n, width=2)  # moves the position alone
+        self.lift = add("Contact.lift", n, width=2)  # moves the position only
         self.hit = add("Contact.hit", None, kind=ti.i32)
-        self.aim = PairData("aim", 2, lasting=False)  # with which displacement each contact is to leave, along its normal
-        self.last = PairData("pushed", 0, lasting=True)  # of the last substep, without impacts [kg m]
+        self.aim = PairData("aim", 2, lasting=False)  # the displacement with which each contact leaves, times its normal [m]
+        self.last = PairData("pushed", 0, lasting=True)  # push of the last substep, 0 after an impact [kg m]
 
     @ti.func
     def target(self, at, v, a, b, t, n, overlap, leaving):
-        """The displacement with which a contact is to leave; what it lacks of it; and how far it gets until the substep ends.
+        """Return the displacement with which a contact leaves, what it lacks of it, and how far it gets in this substep [m].
 
-        A contact rests, unless e is 1, that is to leave by no more than it overlapped before the substep and what it was pushed
-        in the last one: what is pushed as far in each substep came no faster than its load brings it. It rests, too, where SLOW
-        substeps of forces brought it, or heaps would hop on and on: what one bounce takes, the next corner gives back.
+        leaving: the present displacement along n [m]. Unless e is 1, a contact rests if it would leave by no more than its
+        overlap before the substep and its push in the last substep: then it came no faster than its load brings it. Unless e is
+        1, it also rests where SLOW substeps of forces gave it its speed. Otherwise heaps would hop on: each corner returns what
+        the bounce of another one took.
         """
         before = self.state.before[v] - (1 - t) * self.state.before[a] - t * self.state.before[b]
         approach, restitution = -before.dot(n), self.table.of(v, a)[2]
@@ -378,7 +389,7 @@ class PolygonRestitution:
 
     @ti.func
     def choose(self, i):
-        """One Jacobi pass over displacements alone: what the contacts of particle i that bounce lack."""
+        """Compute one Jacobi pass over displacements only: what the bouncing contacts of particle i lack."""
         total = 0 * self.state.x[i]
         if self.split[i] > 0:
             begin = self.geometry.list.first[i]
@@ -401,6 +412,6 @@ class PolygonRestitution:
 
     @ti.func
     def apply(self, i):
-        """Change the displacement of particle i, and the one before the substep with it."""
+        """Change the displacement of particle i, and its displacement before the substep."""
         self.state.d[i] = self.state.d[i] + self.d_change[i]
         self.state.before[i] = self.state.before[i] + self.d_change[i]

@@ -1,4 +1,4 @@
-"""Restitution of pairs of discs or spheres: impacts, one after the other."""
+"""Restitution of pairs of discs or spheres: impacts are resolved one after the other."""
 
 from typing import Any
 
@@ -8,17 +8,19 @@ from ..features.material import Table
 from ..neighbours.neighbour_list import PairData
 from .narrow_phase import DiscGeometry
 
-SLOW = 2.0  # substeps of forces that give a pair no more than the speed at which it rests, see Restitution
+SLOW = 2.0  # a pair rests if this many substeps of forces account for its speed, see Restitution
+ELASTIC = 2.0**-8  # the same for e = 1: rounding alone, so that a load at rest does not count as impacts
 
 
 class Restitution:
-    """A pair leaves with -e times the normal velocity that it has at the time of impact, from then on, see under_force().
+    """Restitution: from the time of impact on a pair has -e times its normal velocity at that time, see under_force().
 
-    struck: of its pairs, those that are struck in this substep. slack: of their overlap, what no push is for. impulse: pushes
-    and impacts of the last substep [kg m]. events: an EventLog, or None.
+    struck: pair data, 1 for pairs struck in this substep. slack: the part of the overlap that is not pushed out [m]. impulse:
+    pushes and impacts of the last substep [kg m]. events: an EventLog, or None.
 
-    A pair rests, unless e is 1, at the speed that two substeps of forces give it. Else what is pressed in between others would
-    bounce on and on, by loads that pairs know or as a corner of a body: what an impact takes the next one gives back.
+    Unless e is 1, a pair rests at a speed that two substeps of forces give it. Otherwise particles that are pressed between
+    others would bounce for ever, by known loads or as a corner of a body: each impact returns what the last one took. At e = 1 a
+    pair rests if it approaches by rounding only.
     """
 
     def __init__(
@@ -29,17 +31,17 @@ class Restitution:
         self.geometry, self.list, self.table, self.state = geometry, geometry.list, table, scene.state
         self.struck, self.slack, self.impulse, self.events = struck, slack, impulse, events
         self.has_events = events is not None
-        self.weight = add("Contact.struck", n)  # the split mass of the first pass, 0 where nothing touched
+        self.weight = add("Contact.struck", n)  # the split mass of the first pass, 0 without contact
         self.d_change = add("Contact.d_change", n, width=dim)
-        self.lift = add("Contact.lift", n, width=dim)  # moves the position alone
-        self.left = add("Contact.left", n)  # of the substep after the impact, as a fraction
+        self.lift = add("Contact.lift", n, width=dim)  # moves the position only
+        self.left = add("Contact.left", n)  # the fraction of the substep after the impact
         self.partner = add("Contact.partner", n, kind=ti.i32)
         self.first = add("Contact.first", n, kind=ti.i32)
         self.hit = add("Contact.hit", None, kind=ti.i32)
 
     @ti.func
     def clear(self, i, weight):
-        """Before the first pass: no pair of particle i has been struck."""
+        """Clear the struck flags and impulses of the pairs of particle i before the first pass. weight: m_i w_i of it."""
         self.weight[i] = weight
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             self.struck.field[e] = 0
@@ -47,17 +49,23 @@ class Restitution:
 
     @ti.func
     def bounce(self, i, j, n, overlap, slack, last, first):
-        """The displacement that takes a pair that was struck in this substep from coming together to leaving, 0 for others; its
-        slack; and whether it rests, so that it is pushed apart, as it was in the last substep. overlap: and what
-        would hold the load that it knows."""
+        """Return the impact of a pair [m], its slack [m], and whether it rests.
+
+        The impact is the change of displacement from approach to separation, 0 for pairs that are not struck in this substep.
+        Only resting pairs are pushed apart. overlap: including the overlap that would hold a known load. last: the push of the
+        pair in the last substep [kg m].
+        """
         given, here, a = self.target(i, j, n)
         rests, e = True, self.table.of(i, j)[2]
         if e > 0:
-            deep = ti.select(last > 0, overlap, ti.select(e < 1, slack, 0))  # nothing that is elastic rests where nothing pulls
+            deep = ti.select(last > 0, overlap, ti.select(e < 1, slack, 0))  # an elastic pair rests only if it was pushed
             if last == 0:
                 slack = ti.max(slack, overlap - ti.max(here, 0))
-            # Later passes have what others pushed in it, too.
-            if first != 0 and e < 1 and a <= ti.static(SLOW) * (here - a):
+            # First pass only: later passes include pushes of other pairs.
+            slow = ti.static(SLOW) * (here - a)
+            if e == 1:
+                slow *= ti.static(ELASTIC / SLOW)
+            if first != 0 and a <= slow:
                 deep = ti.max(deep, given)
             if a > 0:
                 rests = deep > 0 and (first == 0 or given <= deep)
@@ -71,16 +79,20 @@ class Restitution:
 
     @ti.func
     def target(self, i, j, n):
-        """What takes a pair from coming together to leaving at e times its velocity before the substep; how far it comes together
-        in this substep, and without forces."""
+        """Return the change of displacement from approach to separation at e times the speed before the substep [m].
+
+        Also return how far the pair approaches in this substep, and how far it would without forces [m].
+        """
         a = -self.state.slid(self.state.before[i] - self.state.before[j], i, j).dot(n)
         here = -self.state.slid(self.state.d[i] - self.state.d[j], i, j).dot(n)
         return here + self.table.of(i, j)[2] * ti.max(a, 0), here, a
 
     @ti.func
     def collision(self, i, j, n, overlap):
-        """What takes a pair that overlaps from coming together to leaving, with the force in the substep; the part of the substep
-        that is left after the impact; and how far the pair comes together without forces."""
+        """Return the impact of an overlapping pair, with the force in the substep, see under_force() [m].
+
+        Also return the fraction of the substep after the impact, and how far the pair would approach without forces [m].
+        """
         given, here, a = self.target(i, j, n)
         left = ti.select(overlap < here, overlap / here, 1)
         given, left = under_force(given, left, here, a, overlap, self.table.of(i, j)[2])
@@ -88,7 +100,7 @@ class Restitution:
 
     @ti.func
     def choose(self, i):
-        """The first of the pairs of particle i that were struck and still come together, and what it does to i."""
+        """Choose the earliest struck pair of particle i that still approaches, and store its impact on i."""
         first, partner, most, w = -1, -1, 0 * self.weight[i], self.state.w.of(i)
         if self.weight[i] > 0:
             for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
@@ -109,7 +121,7 @@ class Restitution:
 
     @ti.func
     def apply(self, i):
-        """Let particle i bounce off its partner, if it is the partner's partner."""
+        """Let particle i bounce off its partner, if the partner chose i, too, or cannot move."""
         j = self.partner[i]
         if j >= 0:
             if self.partner[j] == i or self.state.w.of(j) == 0:
@@ -126,13 +138,15 @@ class Restitution:
 
 @ti.func
 def under_force(given, left, here, a, overlap, e):
-    """The impact of a pair in a substep in which a force acts: what takes it from coming together to leaving [m], and the part of
-    the substep that is left after it; `given` and `left` where no force acts, or where the pair does not get free of overlap.
+    """Return the impact of a pair in a substep in which a force acts, and the fraction of the substep after the impact.
 
-    In units of the substep, the pair comes together by `here`, of which f = here - a is what forces added. At s its way is
-    u s + f s^2 / 2, u = here - f / 2, and its velocity u + f s. It meets at s = 2 gap / (u + sqrt(u^2 + 2 f gap)), gap = here -
-    overlap, leaves at e times its velocity then, and falls back by f (1 - s)^2 / 2. So energy is kept at e = 1, whatever s is:
-    a change J of the velocity at s changes what d and x are worth at the end by J (J / 2 - u - f s).
+    The impact is the change of displacement from approach to separation [m]. Returns `given` and `left` if no force acts, or if
+    the pair would not be free of overlap at the end.
+
+    In units of the substep, the pair approaches by `here`, of which forces added f = here - a. At time s it has moved by
+    u s + f s^2 / 2, u = here - f / 2, with the velocity u + f s. It meets at s = 2 gap / (u + sqrt(u^2 + 2 f gap)), gap = here -
+    overlap. It leaves at e times its velocity at that time, and falls back by f (1 - s)^2 / 2. So energy is conserved at e = 1,
+    whatever s is: a change J of the velocity at s changes the energy of d and x at the end by J (J / 2 - u - f s).
     """
     f, gap = here - a, here - overlap
     u = here - f / 2
@@ -146,6 +160,6 @@ def under_force(given, left, here, a, overlap, e):
 
 @ti.func
 def earlier(i, j, k):
-    """Whether (i, j) comes before (i, k) among pairs that are struck at the same time: an order of all pairs, whichever is i."""
+    """Whether (i, j) comes before (i, k) among pairs struck at the same time. The order is the same seen from either particle."""
     a, b = ti.min(i, j), ti.min(i, k)
     return a < b or (a == b and ti.max(i, j) < ti.max(i, k))

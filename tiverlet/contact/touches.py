@@ -1,4 +1,4 @@
-"""What World.events() and World.wall_events() return: which contacts began, ended and lasted in a frame."""
+"""The results of World.events() and World.wall_events(): the contacts that began, ended and lasted in a frame."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
@@ -8,26 +8,28 @@ import numpy as np
 
 from .. import checks
 
-BEFORE, NEVER = 0, -1  # numbers of substeps, which count from 1: it touched when the frame began; not yet
+BEFORE, NEVER = 0, -1  # in place of substeps, counted from 1: touched when the frame began; has not touched yet
 
 
 @dataclass(frozen=True)
 class Touches:
     """Pairs that touched in a frame, each once, in the order of their indices.
 
-    pairs: (m, 2), i < j. normal: (m, dim), from j to i. point: (m, dim) [m], in the middle between the two surfaces. Both as the
-    pair met; where it touched before the frame, as it touched last, or once it has parted as it is when the frame ends. impulse:
-    (m,) [N s] along the normal, the sum over all substeps of the frame, where that of World.contacts is of the last one alone,
-    without friction; i got impulse * normal, and j the opposite. 0 for sensors, and for what sleeps. A substep has what was given
-    from the middle of the one before to its own, so that a frame whose substeps h follow others of h_old has (h_old - h) / 2 of a
-    steady force more, and sums over frames miss no more than half a substep. speed: (m,) [m/s], the highest at which the pair
-    came together where it met in this frame, before the impact; 0 where it did not meet. began: (m,) [s], when it first met in
-    this frame; NaN where it touched before. ended: (m,) [s], when it was apart again; NaN where it still touches. Times are those
-    of the ends of substeps.
+    pairs: (m, 2), i < j.
+    normal: (m, dim), from j to i. point: (m, dim) [m], in the middle between the two surfaces. Both are those of the time when
+    the pair met. For a pair that touched before the frame they are those of the last touch, or of the end of the frame once it
+    has parted.
+    impulse: (m,) [N s] along the normal, without friction, summed over all substeps of the frame (World.contacts has that of the
+    last substep only). i got impulse * normal, and j the opposite. It is 0 for sensors and sleeping particles. The impulse of a
+    substep acts from the middle of the substep before to its own middle. So a frame of substeps h after substeps h_old has
+    (h_old - h) / 2 of a steady force more, and sums over frames miss no more than half a substep.
+    speed: (m,) [m/s], the highest speed of approach at which the pair met in this frame, before the impact; 0 if it did not meet.
+    began: (m,) [s], when the pair first met in this frame; NaN if it touched before. ended: (m,) [s], when it was apart again;
+    NaN if it still touches. Times are those of the ends of substeps.
 
-    Of walls, pairs are a particle and the number of the wall in world.features, and normals point from the wall to the particle,
-    in corners and in hollows along the sum of what the wall gave from all sides;
-    of what left a wall as the frame began neither normal nor point are known, they are 0.
+    For walls, a pair is a particle and the number of the wall in world.features. Normals point from the wall to the particle, in
+    corners and hollows along the sum of the impulses from all sides. Normal and point of a particle that left a wall as the frame
+    began are not known: they are 0.
     """
 
     pairs: np.ndarray
@@ -42,45 +44,45 @@ class Touches:
         return len(self.pairs)
 
     def __getitem__(self, rows: Any) -> "Touches":
-        """Some rows, by a mask, indices or a slice."""
+        """Return some rows, by a mask, indices or a slice."""
         return Touches(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
 @dataclass(frozen=True)
 class ContactEvents:
-    """What touched in the last frame.
+    """The contacts of the last frame.
 
-    A pair is in `begun` if it did not touch in the last substep before the frame, and in `ended` if it does not in the last one
-    of it; a ball that bounces within a frame is in both. It is in `lasting` if it touched before and after, whatever happened in
-    between: a speed above 0 tells that it met again. So (touching | begun) - ended is what touches now. Each pair is in `touches`
-    once, so that sums count nothing twice.
+    A pair is in `begun` if it did not touch in the last substep before the frame. It is in `ended` if it does not touch in the
+    last substep of the frame; a ball that bounces within a frame is in both. A pair is in `lasting` if it touched before and
+    after, whatever happened in between; a speed above 0 says that it met again. So (touching | begun) - ended is the set of pairs
+    that touch now. Each pair is in `touches` once, so that sums count nothing twice.
 
-    A pair touches in a substep if it overlaps in it before it is pushed apart, and so does what is at rest under a load. What
-    falls asleep touching, see Sleep, stays in `lasting` while it sleeps, with an impulse of 0.
+    A pair touches in a substep if it overlaps before contacts push it apart; a pair at rest under a load does. A pair that falls
+    asleep while it touches, see Sleep, stays in `lasting` while it sleeps, with an impulse of 0.
     """
 
     touches: Touches
 
     @property
     def begun(self) -> Touches:
-        """Contacts that did not touch before the frame."""
+        """Pairs that did not touch before the frame."""
         return self.touches[~np.isnan(self.touches.began)]
 
     @property
     def ended(self) -> Touches:
-        """Contacts that do not touch after it."""
+        """Pairs that do not touch at the end of the frame."""
         return self.touches[~np.isnan(self.touches.ended)]
 
     @property
     def lasting(self) -> Touches:
-        """Contacts that touched before and after."""
+        """Pairs that touched before the frame and at its end."""
         return self.touches[np.isnan(self.touches.began) & np.isnan(self.touches.ended)]
 
     def __len__(self) -> int:
         return len(self.touches)
 
     def among(self, group: np.ndarray, groups: Iterable | None) -> "ContactEvents":
-        """Those between pairs of groups. group: (n,), of each particle; groups: None for all."""
+        """Return the contacts between some pairs of groups. group: (n,), of each particle. groups: the pairs, None for all."""
         if groups is None:
             return self
         wanted = checks.rows("World.events", "groups", groups, "a list of pairs of groups, such as [(0, 1)],")
@@ -91,7 +93,10 @@ class ContactEvents:
         return ContactEvents(self.touches[some])
 
     def renumbered(self, first: np.ndarray, second: np.ndarray) -> "ContactEvents":
-        """With new numbers of those that come first and second in pairs, in the same order; without what goes, -1."""
+        """Return the events with new indices, without pairs of which one is removed (-1).
+
+        first, second: the new indices, by the old ones, of the first and second member of each pair. They keep their order.
+        """
         if not len(self):
             return self
         pairs = np.stack([first[self.touches.pairs[:, 0]], second[self.touches.pairs[:, 1]]], axis=1)
@@ -99,19 +104,22 @@ class ContactEvents:
 
 
 def no_events(dim: int) -> ContactEvents:
-    """Events of a frame in which nothing touched."""
+    """Return the events of a frame without contacts."""
     pairs, vectors, numbers = np.zeros((0, 2), dtype=np.int64), np.zeros((0, dim)), np.zeros(0)
     return ContactEvents(Touches(pairs, vectors, vectors, numbers, numbers, numbers, numbers))
 
 
 def joined(parts: list[Touches]) -> Touches:
-    """All of these contacts, in the order of their pairs."""
+    """Join several Touches, in the order of their pairs."""
     out = Touches(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Touches)))
     return out[np.lexsort(out.pairs.T[::-1])]
 
 
 def span(when: np.ndarray, substeps: int, h: float, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """When contacts began and ended, as in Touches. when: (m, 2), the substeps of a frame, from 1 to `substeps`, in which they
-    began to touch and touched last, or BEFORE; h: of a substep [s]; time: when the frame ended [s]."""
+    """Return the times when contacts began and ended, as in Touches.
+
+    when: (m, 2), the substeps of the frame, from 1 to `substeps`, in which they began to touch (or BEFORE) and touched last. h:
+    length of a substep [s]. time: the end of the frame [s].
+    """
     began = np.where(when[:, 0] == BEFORE, np.nan, time - (substeps - when[:, 0]) * h)
     return began, np.where(when[:, 1] == substeps, np.nan, time - (substeps - 1 - when[:, 1]) * h)

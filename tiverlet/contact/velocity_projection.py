@@ -1,4 +1,4 @@
-"""Quiet piles: what takes the sound out of loaded contacts."""
+"""The projection of velocities that removes sound, the elastic waves through loaded contacts."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -18,18 +18,19 @@ CONDITION = 400.0  # modes with an eigenvalue of at least 1 / CONDITION keep 1 /
 
 
 class VelocityProjection:
-    """Pairs that bear a load move neither towards nor away from each other.
+    """The projection of displacements after which loaded pairs neither approach nor separate.
 
-    With one pass per substep loaded contacts are springs, and sound in them decays by a third of its eigenvalue L per substep,
-    which for the longest wave in a column of N is (pi / 4 N)^2. So every EVERY substeps displacements are projected onto those
-    that keep the lengths of loaded pairs, (d_i - d_j) . n = 0, by PASSES Jacobi passes with Chebyshev's acceleration: the slow
-    modes lose PASSES^2 L of their velocity, not PASSES L. The polynomial is within -1 ... 1 on all eigenvalues 0 ... 1, so no
-    energy is made; moves come in pairs, so momentum is conserved. Particles that lean on a wall do not move into it or off it.
+    With one pass per substep loaded contacts are springs. Sound in them decays by a third of its eigenvalue L per substep, which
+    for the longest wave in a column of N is (pi / 4 N)^2. So every EVERY substeps displacements are projected onto those that
+    keep the lengths of loaded pairs, (d_i - d_j) . n = 0, by PASSES Jacobi passes with Chebyshev acceleration. Slow modes then
+    lose PASSES^2 L of their velocity, not PASSES L. The polynomial is within -1 ... 1 on all eigenvalues 0 ... 1, so it adds no
+    energy. Corrections of a pair are opposite, so momentum is conserved. Particles pressed on a wall do not move into it or off
+    it.
 
-    It is what inelastic rigid discs do: there is no sound in them. Pairs that bounce (restitution) are left out.
+    Inelastic rigid discs, in which there is no sound, behave so. Pairs that bounce (restitution) are left out.
 
-    push: what each pair got in the last substep. weight: m_i w_i of each particle. restitution: theirs, or None.
-    change: a field of vectors, (n,), to use.
+    push: pair data, the push of each pair in the last substep. weight: m_i w_i of each particle. restitution: the Restitution of
+    the pairs, or None. change: a scratch field of vectors, (n,).
     """
 
     def __init__(
@@ -37,8 +38,8 @@ class VelocityProjection:
     ):  # fmt: skip
         self.list, self.push, self.weight, self.restitution = pairs, push, weight, restitution
         self.state, self.change, self.has_restitution = scene.state, change, restitution is not None
-        # The fields of the old list, which is needed only while lists are built, are free: here they hold the loaded pairs of
-        # each particle, how many they are, and the particles that have any, piece by piece.
+        # The fields of the old list are free except while a list is built. Here they hold the loaded pairs of each particle, the
+        # number of these pairs, and the particles that have any, piece by piece.
         self.number, self.loaded = self.list.old_number, self.list.old_first
         self.count = scene.memory.field("Contact.loaded", self._pieces(scene.particles.count, team), kind=ti.i32)
         self.factors = scene.memory.field("Contact.chebyshev", PASSES, values=chebyshev(PASSES, CONDITION))
@@ -48,7 +49,7 @@ class VelocityProjection:
         return -(-n // team.piece)
 
     def regroup(self, n: int, team: "Team") -> None:
-        """There are n particles now."""
+        """Resize the field of pieces for n particles."""
         self.list.memory.resize(self.count, self._pieces(n, team))
 
     @ti.func
@@ -62,12 +63,12 @@ class VelocityProjection:
 
     @ti.func
     def list_loaded(self, i):
-        """List the loaded pairs of particle i, each with what all passes multiply by; returns how many there are."""
+        """List the loaded pairs of particle i, each with the factor that all passes multiply by. Returns their number."""
         first, w = self.list.first[i], self.state.w.of(i)
         at = first
         if self.weight[i] > 0 and self.state.awake(i):
             for word in range(self.list.words(i)):
-                # Not touches(): the pair may have parted in this pass, and both of it have to agree.
+                # Not touches(): the pair may have parted in this pass, and both of its particles have to agree.
                 bits = self.list.touched(i, word)
                 while bits != 0:
                     e = first + word * WORD + lowest_bit(bits)
@@ -85,7 +86,7 @@ class VelocityProjection:
 
     @ti.func
     def begin(self, piece, begin, end):
-        """The loaded pairs of a piece of the particles. They move in no pass, so what depends on positions is worked out once."""
+        """List the loaded pairs of particles begin ... end - 1, a piece. Positions do not change: one list serves all passes."""
         count = 0
         for i in range(begin, end):
             number = self.list_loaded(i)
@@ -97,7 +98,7 @@ class VelocityProjection:
 
     @ti.func
     def relax(self, i, k):
-        """Pass k for particle i: what changes d. change' = (factor - 1) change + factor 2 / (1 + 1 / CONDITION) want."""
+        """Compute pass k for particle i: change = (factor - 1) change + factor 2 / (1 + 1 / CONDITION) want."""
         want, first = 0 * self.state.d[i], self.list.first[i]
         for e in range(first, first + self.number[i]):
             j = self.list.old_neighbour[e]
@@ -116,12 +117,12 @@ class VelocityProjection:
 
     @ti.func
     def apply(self, i):
-        """Change d."""
+        """Add the change of this pass to the displacement of particle i."""
         self.state.d[i] = self.state.d[i] + self.change[i]
 
 
 def chebyshev(passes: int, condition: float) -> np.ndarray:
-    """The factors of a semi-iteration for eigenvalues 1 / condition ... 1 (Golub and Varga 1961)."""
+    """Return the factors of a Chebyshev semi-iteration for eigenvalues 1 / condition ... 1 (Golub and Varga 1961)."""
     rho = (condition - 1) / (condition + 1)
     out = [1.0, 2 / (2 - rho * rho)]
     while len(out) < passes:

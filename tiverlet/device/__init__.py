@@ -1,4 +1,4 @@
-"""The door to Taichi: starting it, memory, threads. All other modules import Taichi from here."""
+"""The only entry point to Taichi: start-up, memory, threads. All other modules import Taichi from here."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ if lean:
 if patched:
     from .patches import calls, sharing, source_cache, statements, syntax_cache, timing
 
-    source_cache.apply()  # before what comes next, which is imported in half the time
+    source_cache.apply()  # first: the modules imported after it then import in half the time
     syntax_cache.apply()
     statements.apply()
     sharing.apply(timing.compiled)
@@ -21,6 +21,6 @@ else:
     called, called_with = copied, copied_with
 from . import copies
 
-copies.apply()  # last, and whatever is patched: it is what subscripts mean
+copies.apply()  # last, with and without patches: it wraps the final subscript function
 
 __all__ = ["at", "called", "called_with", "inline", "record", "ti"]

@@ -1,4 +1,4 @@
-"""Fields that are declared a second time, where parts of a world are made anew with other lengths and values."""
+"""A second declaration of existing fields, for parts of a world that are rebuilt in place with other lengths and values."""
 
 import contextlib
 from collections.abc import Iterator
@@ -13,33 +13,34 @@ if TYPE_CHECKING:
 
 
 class Differs(Exception):
-    """Other fields would be declared than there are: kernels would have to know."""
+    """Raised when an owner would declare other fields than before, so that kernels would have to be compiled again."""
 
 
 class Again:
-    """What Memory.field() and Memory.number() do meanwhile: give each owner the fields and numbers that it declared before, in
-    order. Nothing changes until write().
+    """Stands in for Memory.field() and Memory.number() while owners declare their fields a second time.
 
-    counts: what numbers that others own are going to be. Raises Differs for what was not declared so.
+    Each owner gets the fields and numbers that it declared the first time, in the same order. Memory does not change until
+    write(). counts: the coming values of numbers that other owners hold. Raises Differs where a declaration is not the same as
+    the first.
     """
 
     def __init__(self, memory: "Memory", counts: dict[Number, int]):
         self._memory, self._counts = memory, counts
         self._fields: Iterator[int] = iter(())
         self._places: Iterator[Number] = iter(())
-        self.wanted: list[tuple[int, int, Any]] = []  # which field, how long, with which values
+        self.wanted: list[tuple[int, int, Any]] = []  # index of the field, its length, its values
         self.numbers: list[Number] = []
 
     @contextlib.contextmanager
     def owned(self, fields: range, numbers: list[Number]) -> Iterator[None]:
-        """Of one owner, who has declared these."""
+        """Serve the declarations of one owner. fields, numbers: what this owner declared the first time."""
         self._fields, self._places = iter(fields), iter(numbers)
         yield
         if next(self._fields, None) is not None or next(self._places, None) is not None:
             raise Differs
 
     def field(self, length: int | Number | None, width: int, kind: np.dtype, values: Any) -> Any:
-        """The next one."""
+        """Return the owner's next field, and note its new length and values."""
         k = next(self._fields, None)
         if k is None:
             raise Differs
@@ -52,7 +53,7 @@ class Again:
         return entry.field
 
     def number(self, value: float, field: Any) -> Number:
-        """The next one."""
+        """Return the owner's next number, with a new value."""
         old = next(self._places, None)
         if old is None or old.field is not field:
             raise Differs
@@ -61,16 +62,16 @@ class Again:
 
     @property
     def longest(self) -> int:
-        """Of the fields, by elements."""
+        """The length of the longest of the fields [elements]."""
         return max((length for _, length, _ in self.wanted), default=0)
 
     @property
     def state(self) -> list[int]:
-        """Which of the fields are part of the exact state."""
+        """The indices of those fields that are part of the exact state."""
         return [k for k, _, _ in self.wanted if self._memory.entries[k].state]
 
     def write(self) -> None:
-        """Give fields their lengths and values, 0 where they have none, and numbers theirs."""
+        """Set lengths and values of the fields (0 where no values were given), and the values of the numbers."""
         for k, length, values in self.wanted:
             self._memory.fill(k, length, 0 if values is None or not np.size(values) else values)
         for number in self.numbers:

@@ -1,4 +1,4 @@
-"""A field as NumPy sees it: its entry, where it is in memory of the host, and kernels that copy it where it is not."""
+"""Fields as NumPy arrays: entries, addresses in host memory, and copy kernels where the host has no access."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,12 +8,12 @@ import numpy as np
 from . import runtime
 from .language import ti
 
-SMALL = 300_000  # numbers that one thread copies in a millisecond
+SMALL = 300_000  # how many numbers one thread copies in a millisecond
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One field: its place in memory, and what explain() says of it."""
+    """One field: its shape and type, its role in the state, and what explain() reports about it."""
 
     name: str
     field: Any
@@ -21,36 +21,36 @@ class Entry:
     length: int  # elements; 0 for a single one
     kind: np.dtype
     state: bool  # part of the exact state, hence of hash() and clone()
-    copies: int = 0  # of which each has so many elements; 0 where it is one for all
-    rows: Any = None  # the Number of what it has an element for each of; None where that is not told
-    told: bool = False  # part of the state for reports alone, hence not of hash()
-    below: int | None = None  # where kernels take its elements for indices: how many there are of what these mean
+    copies: int = 0  # number of copies with `length` elements each; 0 where all copies share the field
+    rows: Any = None  # the Number that its length follows; None where it follows none
+    told: bool = False  # state that only reports read, hence not part of hash()
+    below: int | None = None  # where kernels use its elements as indices: the size of what they index
 
     def of_length(self, length: int) -> "Entry":
-        """The same field with so many elements; replace() takes three times as long."""
+        """Return the same entry with another length; dataclasses.replace() takes three times as long."""
         return Entry(
             self.name, self.field, self.width, length, self.kind, self.state, self.copies, self.rows, self.told, self.below
         )  # fmt: skip
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the array that it is."""
+        """The shape of the field as an array, for one copy."""
         return (max(1, self.length),) + ((self.width,) if self.width else ())
 
     @property
     def whole(self) -> tuple[int, ...]:
-        """Of the array that all copies are."""
+        """The shape of the array that holds all copies, one after the other."""
         first, *rest = self.shape
         return (first * max(1, self.copies), *rest)
 
     @property
     def bytes(self) -> int:
-        """Size in memory, of one copy [bytes]."""
+        """The size of one copy in memory [bytes]."""
         return self.kind.itemsize * max(1, self.width) * max(1, self.length)
 
 
 def chain(field) -> tuple[list[int], Any]:
-    """How many bytes from the begin of its tree each component of the first element is, and the root of the tree."""
+    """Return the byte offset of each component of the first element from the begin of its tree, and the root of the tree."""
     offsets, node = [], None
     for component in field._get_field_members():
         node, offset = component.ptr.snode(), 0
@@ -62,31 +62,31 @@ def chain(field) -> tuple[list[int], Any]:
 
 @ti.data_oriented
 class Places:
-    """Where a field is."""
+    """Finds the address of a field."""
 
     def __init__(self, field: Any):
         self.field, self.first = field, [0] * len(field.shape)
 
     @ti.kernel
     def find(self, out: ti.types.ndarray(ti.u64, 1)):  # type: ignore[valid-type]
-        """The address of its first element."""
+        """Write the address of the field's first element to `out`."""
         out[0] = ti.get_addr(self.field, ti.static(self.first))
 
 
 @ti.data_oriented
 class Transfer:
-    """Kernels between a list of fields and one flat f64 array."""
+    """Kernels that copy between a list of fields and one flat f64 array."""
 
     def __init__(self, entries: list[Entry]):
         offset, self.plan = 0, []
         for e in entries:
             self.plan.append((e.field, e.field.dtype, max(1, e.length), e.width, bool(e.length), offset))
             offset += e.bytes // e.kind.itemsize
-        self.serial = offset < SMALL and runtime.architecture() == "cpu"  # in one piece, which compiles in half the time
+        self.serial = offset < SMALL and runtime.architecture() == "cpu"  # serial code compiles in half the time
 
     @ti.kernel
     def load(self, flat: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
-        """From the array to the fields."""
+        """Copy from the flat array to the fields."""
         if ti.static(self.serial):
             ti.loop_config(serialize=True)
             for _ in range(1):
@@ -96,7 +96,7 @@ class Transfer:
 
     @ti.kernel
     def dump(self, flat: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
-        """From the fields to the array."""
+        """Copy from the fields to the flat array."""
         if ti.static(self.serial):
             ti.loop_config(serialize=True)
             for _ in range(1):
@@ -106,7 +106,7 @@ class Transfer:
 
     @ti.func
     def put(self, flat: ti.template()):  # type: ignore[valid-type]
-        """All fields, one after the other."""
+        """Write all fields from the flat array, one after the other."""
         for field, kind, length, width, many, offset in ti.static(self.plan):
             for i in range(length):
                 if ti.static(width == 0):
@@ -123,7 +123,7 @@ class Transfer:
 
     @ti.func
     def get(self, flat: ti.template()):  # type: ignore[valid-type]
-        """All fields, one after the other."""
+        """Read all fields into the flat array, one after the other."""
         for field, kind, length, width, many, offset in ti.static(self.plan):
             for i in range(length):
                 if ti.static(width == 0):

@@ -1,10 +1,10 @@
-"""Ctrl-C between frames: whatever changes a world is done or not done.
+"""Safe handling of Ctrl-C: a change of a world is either complete or not made.
 
-Python calls the handler of a signal between any two instructions, and what it raises would leave a world with the positions of
-one frame and the time of another. So while a world changes, signals are noted, and their handlers are called after it.
+Python may call a signal handler between any two instructions. An exception from the handler could leave a world with the
+positions of one frame and the time of another. So while a world changes, signals are noted, and their handlers run afterwards.
 """
 
-import _signal  # type: ignore[import]  # of which `signal` is a wrapper that takes ten times as long
+import _signal  # type: ignore[import]  # `signal` wraps this module and takes ten times as long
 import functools
 import signal
 import threading
@@ -18,17 +18,18 @@ SIGNALS = tuple(int(getattr(signal, name)) for name in ("SIGINT", "SIGTERM", "SI
 
 
 class Whole:
-    """`with whole:` around what no signal's handler may cut in two.
+    """A context, `with whole:`, that no signal handler may interrupt.
 
-    Handlers run in the main thread, so other threads have nothing to wait for, and only handlers written in Python can raise.
-    Blocks may be nested: handlers are called after the outermost. It takes 0.8 us.
+    Python runs handlers in the main thread, so the context does nothing in other threads. Only handlers written in Python can
+    raise, so only these are deferred. Contexts may be nested: handlers run after the outermost one. Entering and leaving takes
+    0.8 us.
     """
 
     def __init__(self):
         self._main = threading.main_thread().ident
-        self._depth = 0  # of blocks, in the main thread
-        self._handlers: dict[int, Any] = {}  # those that wait
-        self._noted: set[int] = set()  # the signals that came
+        self._depth = 0  # how many contexts are open, in the main thread
+        self._handlers: dict[int, Any] = {}  # the deferred handlers, by signal
+        self._noted: set[int] = set()  # signals received meanwhile
 
     def __enter__(self) -> None:
         if get_ident() != self._main:
@@ -41,7 +42,7 @@ class Whole:
                     if callable(handler):
                         self._handlers[number] = handler
                         _signal.signal(number, self._note)
-            except BaseException:  # from a handler that does not wait yet
+            except BaseException:  # raised by a handler that is not deferred yet
                 self._restore()
                 raise
         self._depth += 1
@@ -53,10 +54,10 @@ class Whole:
         if not self._depth:
             self._restore()
             while self._noted:
-                interrupt_main(self._noted.pop())  # type: ignore[arg-type]  # as if it came now
+                interrupt_main(self._noted.pop())  # type: ignore[arg-type]  # as if the signal arrived now
 
     def raise_pending(self) -> None:
-        """In a block: call the handlers of signals that have come. The caller undoes what it has done if one of them raises."""
+        """Within the context: call the handlers of signals received so far. If a handler raises, the caller undoes its work."""
         if get_ident() == self._main:
             while self._noted:
                 number = self._noted.pop()
@@ -68,7 +69,7 @@ class Whole:
                 number = next(reversed(self._handlers))
                 _signal.signal(number, self._handlers[number])
                 del self._handlers[number]
-        finally:  # one that is back may raise while others are not
+        finally:  # a restored handler may raise before the others are restored
             if self._handlers:
                 self._restore()
 
@@ -79,12 +80,12 @@ class Whole:
 whole = Whole()
 
 
-def uncut(function: Callable) -> Callable:
-    """The function, as a whole."""
+def uninterrupted(function: Callable) -> Callable:
+    """Return the function wrapped so that no signal handler interrupts it."""
 
     @functools.wraps(function)
     def guarded(*args, **kwargs):
-        """The function, which no interrupt cuts in two."""
+        """Call the function with signal handlers deferred."""
         with whole:
             return function(*args, **kwargs)
 

@@ -1,7 +1,7 @@
-"""The language that kernels are written in: Taichi, or Quadrants, its maintained fork, where TIVERLET_COMPILER=quadrants.
+"""The language of kernels: Taichi, or its maintained fork Quadrants with TIVERLET_COMPILER=quadrants.
 
-Both speak nearly the same language. They are imported here alone, quietly and offline: without banner, and without a version
-check over the network. Where their insides differ, it is said here.
+Both accept nearly the same language. Only this module imports them, without their banner and without a version check over the
+network. All differences between their internals are handled here.
 """
 
 import contextlib
@@ -22,11 +22,11 @@ if COMPILER not in NAMES:
     raise ImportError(f'TIVERLET_COMPILER = {COMPILER!r}, but it must be "taichi", as where it is not set, or "quadrants".')
 NAME = NAMES[COMPILER]
 
-if COMPILER not in sys.modules and os.name == "posix" and "HOME" not in os.environ:  # or it ends the process
+if COMPILER not in sys.modules and os.name == "posix" and "HOME" not in os.environ:  # without HOME the import ends the process
     os.environ["HOME"] = next(folder for folder in (os.path.expanduser("~"), tempfile.gettempdir()) if os.path.isabs(folder))
 if TYPE_CHECKING or COMPILER == "taichi":
-    # Taichi reads these when it is imported; where that was before, it has printed its banner, and it would warn of the level
-    # being set twice.
+    # Taichi reads these variables at import. If it was imported before, the banner is printed already, and setting the log level
+    # again would cause a warning.
     os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
     os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
     if "taichi" not in sys.modules:
@@ -45,35 +45,35 @@ _MARK, _INNER = ("_is_taichi_function", "func") if COMPILER == "taichi" else ("_
 
 
 def module(name: str) -> Any:
-    """A module of the compiler's Python, by its path below `lang`."""
+    """Return a module of the compiler's Python, by its path below `lang`."""
     return import_module(f"{COMPILER}.lang.{name}")
 
 
 if COMPILER == "quadrants":
-    # It would keep the functions of an object in the object, bound; those of a copy would go on with the original.
+    # Quadrants caches an object's bound functions in the object; in a copy they would still act on the original.
     _callables: Any = module("_quadrants_callable")
     _callables.QuadrantsCallable.__get__ = lambda self, instance, owner: (
         self if instance is None else _callables.BoundQuadrantsCallable(instance, self)
     )
 impl, sources = module("impl"), module("_wrap_inspect")
 inside_kernel: Callable[[], bool] = impl.inside_kernel
-Expression: Any = module("expr").Expr  # a number or a vector while a kernel is translated
+Expression: Any = module("expr").Expr  # the type of numbers and vectors while a kernel is translated
 _VECTORS, _NUMBERS = module("matrix").MatrixField, module("field").ScalarField
-Operations: Any = getattr(module("common_ops"), f"{NAME}Operations")  # what it inherits
+Operations: Any = getattr(module("common_ops"), f"{NAME}Operations")  # the base class of Expression
 
 
-active: list[Any] = []  # Compilers whose kernels are being compiled or launched, the innermost last
-# Where functions come from that are known to be safe.
+active: list[Any] = []  # the Compilers whose context is open, the innermost last
+# Folders of source code that the patches may handle: tiverlet's own and the compiler's.
 HOME = OURS, TAICHI = tuple(str(p) + os.sep for p in (pathlib.Path(__file__).parents[1], pathlib.Path(ti.__file__).parent))
 
 
 def current() -> Any:
-    """What runs: another object after each ti.init and ti.reset."""
+    """Return the compiler's runtime object; each ti.init and ti.reset makes another one."""
     return impl.get_runtime()
 
 
 def has(arch: str) -> bool:
-    """Whether this machine and this compiler have an architecture, by its name in Taichi."""
+    """Whether this machine and this compiler support an architecture, by its name in Taichi."""
     with contextlib.suppress(Exception):
         library: Any = ti._lib
         return bool(getattr(library.core, f"with_{arch}")())
@@ -81,27 +81,27 @@ def has(arch: str) -> bool:
 
 
 def unplaced_field(width: int) -> Any:
-    """A field that is nowhere yet, of vectors or, with a width of 0, of numbers."""
+    """Return a field without memory: of vectors, or of numbers where width is 0."""
     return object.__new__(_VECTORS if width else _NUMBERS)
 
 
 def place_field(field: Any, placed: Any, name: Any) -> None:
-    """Make it the same as one that has a place. name: of this place, by which it is known."""
+    """Give a field the memory of `placed`. name: the name of this place, by which shared kernels are keyed."""
     field.__dict__.update(vars(placed), place_name=name)
 
 
 def plain_field(thing: Any) -> bool:
-    """Whether it is a field of numbers or of vectors."""
+    """Whether a thing is a field of numbers or of vectors."""
     return type(thing) is _NUMBERS or type(thing) is _VECTORS
 
 
 def before_fields(check: Callable[[], None]) -> None:
-    """Have `check` called before a field is made, by whoever makes it."""
+    """Have `check` called before any field is made, by anyone."""
     create: Any = impl.create_field_member
 
     @functools.wraps(create)
     def created(*args, **kwargs):
-        """A field's member, where a check allows one."""
+        """Run the check, then create the field's member."""
         check()
         return create(*args, **kwargs)
 
@@ -109,57 +109,57 @@ def before_fields(check: Callable[[], None]) -> None:
 
 
 def at(field: Any, index: Any) -> Any:
-    """field[index], in a Python function that a kernel calls as it is; see inline()."""
+    """Return field[index], in a Python function that kernels call as it is; see inline()."""
     return impl.subscript(current().compiling_callable.ast_builder(), field, index)
 
 
 class _Text(str):
-    """A text that can be weakly referred to, as a str cannot."""
+    """A string that can be weakly referenced, unlike a str."""
 
 
 @functools.cache
 def template(text: str) -> str:
-    """A text for a kernel to have as a template: Quadrants refers weakly to what these are."""
+    """Return a text as a template argument for a kernel: Quadrants keeps weak references to these."""
     return _Text(text)
 
 
 def callable_in_kernels(function: Any) -> Any:
-    """A Python function or class that kernels may call as it is, without a warning; functions are asked for these two."""
+    """Let kernels call a Python function or class as it is, without a warning: the compiler checks for these two attributes."""
     setattr(function, _MARK, True)
     setattr(function, _INNER, SimpleNamespace(has_print=False))
     return function
 
 
 def inline(function: Any) -> Any:
-    """A function of one expression, for kernels to call as Python does: they get the expression itself.
+    """Let kernels call a function of one expression as Python does: they get the expression itself.
 
-    Taichi compiles a call of a ti.func by reading its source, copying each argument to a variable, and each result: as much as
-    for ten more operations.
+    For a call of a ti.func, Taichi reads the source and copies each argument and each result to a variable: as much work as for
+    ten more operations.
     """
     return callable_in_kernels(function)
 
 
 def copied(function: Any) -> Any:
-    """A ti.func as it is: each place that calls it gets a copy of it."""
+    """Return a ti.func unchanged: each place that calls it gets a copy of its code."""
     return function
 
 
 def copied_with(types: Any) -> Any:
-    """The same, where it would be called with other types than integers."""
+    """Return copied(), whatever the types; the counterpart of called_with() without patches."""
     return copied
 
 
 def record(kind: Any) -> Any:
-    """A class of several values under names, for kernels: what they call makes one, passes it on whole and reads it."""
-    kind._data_oriented = True  # by this Taichi knows objects of ours, which it leaves as they are
+    """Let kernels use a class of several named values: they can construct it, pass it on whole and read it."""
+    kind._data_oriented = True  # Taichi passes such objects on unchanged
     return inline(kind)
 
 
 def is_kernel_function(thing: Any) -> bool:
-    """Whether it is a ti.func, or was made callable in kernels."""
+    """Whether a thing is a ti.func, or was made callable in kernels."""
     return bool(getattr(thing, _MARK, False))
 
 
 def undecorated(thing: Any) -> Any:
-    """The Python function that a ti.func was made of; others are what they are."""
+    """Return the Python function behind a ti.func; anything else unchanged."""
     return getattr(getattr(thing, _INNER, None), "func", thing) if is_kernel_function(thing) else thing

@@ -1,11 +1,13 @@
-"""Trees of fields, which worlds of the same structure share: bytes are their own, and kernels find those that they are told.
+"""Trees of fields, which worlds of the same structure share; each world has its own bytes.
 
-A kernel of Taichi knows of a field in which tree it is, and where in that. Where the tree is, it looks up at each launch. So
-worlds whose fields are of the same kinds have one tree, and before a launch the place of their own bytes is written to where
-kernels look it up, see patches/roots.py. Every field of a shared tree has room, of which the system gives what is used, page by
-page: what grows stays where it is, and no kernel has to know. Such a tree stays as long as Taichi runs; it takes no memory. When
-there are MANY, the next has all that any had, so that there will not be many more. Where trees cannot be shared, as on a GPU,
-every world has its own, with fields as long as they must be.
+A Taichi kernel has compiled into it the tree of each field and the offset within the tree. It looks up the tree's address at each
+launch. So worlds whose fields are of the same kinds share one tree. Before a launch, the address of the world's own bytes is
+written to the place where kernels look it up, see patches/roots.py.
+
+Every field of a shared tree reserves room; the system gives memory page by page, as it is used. So fields grow in place, and no
+kernel changes. A shared tree exists as long as Taichi runs, and takes no memory itself. Once there are MANY trees, the next one
+has the fields of all kinds that any earlier tree had, so that few further ones are needed. Where trees cannot be shared, as on a
+GPU, every world has its own, with fields just as long as needed.
 """
 
 import contextlib
@@ -25,32 +27,35 @@ from .host_copy import Places, chain
 from .language import ti
 from .patches import patched, roots
 
-MAX_TREES = 400  # Taichi holds at most 511 trees of fields and does not check; the rest is left to the user's own fields.
-NODES = 900  # of a tree: one for a field, and one for each of its components; Taichi takes 1024
-MANY = 200  # shared ones, each for worlds of one kind; further ones are for all
-FEW = 4  # fields of a kind, at least, that a shared tree has; it has 4, 8, 16 and so on
-ROOMS = (1 << 24, 1 << 20, 1 << 17)  # elements of a field: the first with which a tree is no larger than NEAR
-NEAR = 1 << 31  # bytes: what is as near as that to the begin of a tree, processors find without a number of its own
-BETWEEN = 23 * 64  # bytes; 64 fields, one after the other, begin at 64 places of a page
-NORESERVE = {"linux": 0x4000}.get(sys.platform, 0)  # lest Linux counts addresses as memory; Python has no name for it before 3.13
+MAX_TREES = 400  # Taichi holds at most 511 trees, without a check; the rest is left to the user's own fields
+NODES = 900  # most nodes of a tree: one per field and one per component; Taichi's limit is 1024
+MANY = 200  # shared trees, each for worlds of one kind; further trees serve all kinds
+FEW = 4  # a shared tree has 4, 8, 16, ... fields of each kind
+ROOMS = (1 << 24, 1 << 20, 1 << 17)  # elements reserved per field: the first with which the tree fits into NEAR
+NEAR = 1 << 31  # [bytes] offsets up to this fit into a processor instruction, without an extra register
+BETWEEN = 23 * 64  # [bytes] between fields: 64 successive fields begin at 64 different places of a page
+NORESERVE = {"linux": 0x4000}.get(sys.platform, 0)  # else Linux counts addresses as memory; Python has it since 3.13
 LAZY = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | NORESERVE if sys.platform != "win32" else 0
 
 
 @dataclass(frozen=True)
 class Declared:
-    """A field that is to be."""
+    """A declared field without a place."""
 
-    kind: Any  # of Taichi
+    kind: Any  # Taichi's type
     width: int  # components of one element; 0 for a scalar
     length: int  # elements; 0 for a single one of 0 dimensions
-    apart: bool  # in a second tree
+    apart: bool  # whether it goes into a second tree
 
 
-Kind = tuple[Any, int, bool]  # of a field in a shared tree: its type, width, and whether it has many elements
+Kind = tuple[Any, int, bool]  # the kind of a field in a shared tree: its type, its width, whether it has many elements
 
 
 class Layout:
-    """Fields that are placed together, and where. serial: no other one ever has this number. shared: several can have it."""
+    """Fields that are placed together, and their offsets.
+
+    serial: a number unique to this layout. shared: whether several worlds can use it.
+    """
 
     _serials = count()
 
@@ -65,18 +70,18 @@ class Layout:
             (builders[d.apart].dense(ti.i, d.length) if d.length else builders[d.apart]).place(field)
         self.trees = [roots.planned(builder) if shared else builder.finalize() for builder in builders.values()]
         runtime.trees += len(self.trees)
-        self.numbers: dict[Kind, list[int]] = {}  # of a shared one: by kind, which of its fields are of it
-        self.room = 0  # elements that fields of a shared one can have
-        self._now = 0  # the address of the bytes that kernels find
-        self._places: list[tuple[int, tuple[int, ...]]] = []  # of the fields in the tree: offset, strides; none if not seen
-        self.size = 0  # [bytes] of the tree; 0 where the host cannot see it
+        self.numbers: dict[Kind, list[int]] = {}  # if shared: the indices of its fields, by kind
+        self.room = 0  # if shared: the most elements of a field
+        self._now = 0  # the address of the bytes that kernels use
+        self._places: list[tuple[int, tuple[int, ...]]] = []  # offset and strides of each field; empty without host access
+        self.size = 0  # [bytes] of the tree; 0 without host access
         if shared or patched:
             self.look()
         if not shared and patched and _table[0] is not self.runtime:
             _know(self.runtime, None)
 
     def look(self) -> None:
-        """Find the tree, and the fields in it, where the host can see them. All fields that were made must have their places."""
+        """Find the addresses of the tree and its fields, where the host can access them. All fields must be placed already."""
         if self.size or runtime.architecture() != "cpu" or len(self.trees) > 1:
             return
         (first, *_), tree = chain(self.fields[0])
@@ -93,15 +98,15 @@ class Layout:
             offsets, _ = chain(field)
             steps = {b - a for a, b in pairwise(offsets)}
             if len(steps) > 1:
-                self._places = []  # laid out as never seen yet: by kernels, then
+                self._places = []  # components are not evenly spaced: copy by kernels instead
                 return
             cell = field.parent().ptr.cell_size_bytes
             self._places.append((offsets[0], (cell, steps.pop() if steps else cell)))
 
     def lend(self) -> tuple[int, Any]:
-        """Bytes, all 0, for one more: their address, and what is to be kept as long as they are needed.
+        """Provide zeroed bytes for one more memory: return their address, and an object to keep as long as they are needed.
 
-        The address is 0 for bytes of Taichi's that nobody has looked for yet.
+        The address is 0 for Taichi's own bytes before look() has found them.
         """
         if not self.shared:
             return self._now, None
@@ -112,12 +117,12 @@ class Layout:
         return ctypes.addressof(ctypes.c_char.from_buffer(room)), room
 
     def point(self, address: int) -> None:
-        """Have kernels find these bytes."""
+        """Let kernels use the bytes at this address."""
         if address != self._now:
             _table[1][self.trees[0].id] = self._now = address
 
     def views(self, address: int, wanted: list[tuple[int, tuple[int, ...], np.dtype]]) -> list[np.ndarray]:
-        """Some fields, by number, as arrays of these shapes that are what is at this address; none where the host sees none."""
+        """Return fields at this address as arrays. wanted: index, shape and type of each. Empty without host access."""
         if not self._places:
             return []
         memory: Any = (ctypes.c_char * self.size).from_address(address or self._now)
@@ -129,8 +134,8 @@ class Layout:
         if not self.shared and self.trees and language.current() is self.runtime and not runtime.forked():
             _leaving.append(self)
             try:
-                self.runtime.materialize()  # no kernel may have run since they were made
-            except RuntimeError:  # another world is being built, whose fields have no place: some time later
+                self.runtime.materialize()  # Taichi needs this if no kernel has run since the trees were made
+            except RuntimeError:  # another world under construction has fields without a place: a later call frees these trees
                 return
             while _leaving:
                 _leaving.pop()._free()
@@ -144,7 +149,7 @@ class Layout:
 
 
 def check_trees() -> None:
-    """Raise RuntimeError where there is no room for one more."""
+    """Raise RuntimeError if there is no room for one more tree."""
     if runtime.trees >= MAX_TREES:
         raise RuntimeError(
             f"So many worlds are alive that they have {runtime.trees} trees of fields, and Taichi crashes near 512. "
@@ -154,7 +159,7 @@ def check_trees() -> None:
 
 @contextlib.contextmanager
 def unshared() -> Iterator[None]:
-    """Worlds that are built within it have trees and kernels of their own."""
+    """Within this context, worlds are built with trees and kernels of their own."""
     global _unshared
     before, _unshared = _unshared, True
     try:
@@ -164,17 +169,17 @@ def unshared() -> Iterator[None]:
 
 
 def made(kind: Any, width: int) -> Any:
-    """A new field."""
+    """Make a field."""
     return ti.Vector.field(width, kind) if width else ti.field(kind)
 
 
 def field(kind: Any, width: int) -> Any:
-    """A field that take() will give a place."""
+    """Make a field that take() will place."""
     return language.unplaced_field(width) if patched else made(kind, width)
 
 
 def _know(of: Any, table: Any) -> None:
-    """Keep the table of a runtime; None where it has none."""
+    """Keep the table of tree addresses of a runtime; None if it has none."""
     global _table
     _table = of, table
 
@@ -182,13 +187,16 @@ def _know(of: Any, table: Any) -> None:
 def sharing() -> bool:
     """Whether worlds can share trees."""
     if patched and _table[0] is not language.current():
-        Layout((Declared(ti.i32, 0, 1, False),)).destroy()  # which finds out
+        Layout((Declared(ti.i32, 0, 1, False),)).destroy()  # its look() searches for the table
     return bool(LAZY) and _table[1] is not None and not _unshared
 
 
 def take(declared: list[Declared], fields: list[Any], held: list[Layout], shared: bool) -> tuple[Layout, list[int]]:
-    """A layout with such fields, and which of its fields they are. held: those that the world has, since the kernels of a world
-    need another tree for each. fields: from field(); they get their places. shared: see sharing()."""
+    """Return a layout with the declared fields, and the index of each of them in it.
+
+    fields: from field(); this function places them. held: the layouts that the world has already; they are not returned again,
+    since each memory of a world needs a tree of its own. shared: see sharing().
+    """
     if not shared:
         layout, which = Layout(tuple(declared), None if patched else fields), list(range(len(declared)))
     else:
@@ -203,7 +211,7 @@ def take(declared: list[Declared], fields: list[Any], held: list[Layout], shared
 
 
 def _shared(need: Counter[Kind], length: int, held: list[Layout]) -> Layout:
-    """One that has so many fields of each kind with room for `length` elements, and is not held."""
+    """Return a shared layout with so many fields of each kind and room for `length` elements, other than those in `held`."""
     now = language.current()
     for layout in [layout for layout in _known if layout.runtime is not now]:
         del _known[layout]
@@ -227,7 +235,7 @@ def _shared(need: Counter[Kind], length: int, held: list[Layout]) -> Layout:
 
 
 def _room(want: Counter[Kind], length: int) -> int:
-    """Elements that each of these fields is to have room for, `length` at least."""
+    """Return how many elements each field of a tree reserves, at least `length`."""
     each = sum(number * _size(kind, width) for (kind, width, many), number in want.items() if many)
     return next((room for room in ROOMS if length <= room and room * each <= NEAR), 1 << (length - 1).bit_length())
 
@@ -237,15 +245,15 @@ def _size(kind: Any, width: int) -> int:
 
 
 def _roomy(kind: Any, width: int, many: bool, room: int) -> Declared:
-    """A field of a shared tree.
+    """Declare a field of a shared tree.
 
-    Between two of them are BETWEEN bytes: where two begin at the same place of a page, a processor takes a write to one for a
-    write to the other, and they drive each other out of its first cache.
+    BETWEEN bytes separate two fields. Without this gap, two fields can begin at the same offset within a page. A processor then
+    takes a write to one for a write to the other, and they evict each other from its first cache.
     """
     return Declared(kind, width, room + -(-BETWEEN // _size(kind, width)) if many else 0, False)
 
 
-_leaving: list[Layout] = []  # that are to be freed
-_known: dict[Layout, Counter[Kind]] = {}  # the shared ones, and how many fields of each kind they have
+_leaving: list[Layout] = []  # layouts to free
+_known: dict[Layout, Counter[Kind]] = {}  # the shared layouts, and how many fields of each kind they have
 _unshared = False
-_table: tuple[Any, Any] = (None, None)  # a runtime, and where its kernels look up where trees are
+_table: tuple[Any, Any] = (None, None)  # a runtime, and the table in which its kernels look up tree addresses

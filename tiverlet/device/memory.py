@@ -1,8 +1,8 @@
-"""Fields: declared together, placed in one tree, or two, freed together.
+"""Fields of a world: declared together, placed in one or two trees, freed together.
 
-Taichi 1.7.4 ends the process, without an exception, when a field outlives its runtime, when 512 trees of fields are
-alive, when a field has no elements or when a child made by fork launches a kernel. The checks here and in layout.py turn each of
-these into an error that says what to do, so that no other module has to know.
+Taichi 1.7.4 ends the process without an exception in these cases: a field outlives its runtime, 512 trees of fields are alive, a
+field has no elements, or a child made by fork launches a kernel. The checks here and in layout.py raise errors instead that name
+the remedy, so that no other module has to check.
 """
 
 import contextlib
@@ -24,15 +24,15 @@ from .number import Number
 from .patches import patched
 from .patches.compiler import LEAN, Compiler
 
-GROUP = 16  # fields that one transfer kernel serves; Taichi unrolls the loop over them
+GROUP = 16  # fields per transfer kernel; Taichi unrolls the loop over them
 
 
 class Memory:
     """The fields of one world: declared first, then placed together, freed together.
 
-    `real` is ti.f32 or ti.f64; few: whether the world has few particles, passes: of its kernels, see Compiler. copies:
-    where there are many of the world; what is written, read, kept and put back is then that of the chosen one, or of all. Every
-    method that touches the fields checks first that they still exist.
+    real: ti.f32 or ti.f64. few, passes: whether the world has few particles, and its compiler settings, see Compiler. copies: if
+    there are many copies of the world; reading, writing, state() and restore() then act on the chosen copy, or on all. Every
+    method that touches the fields first checks that they still exist.
     """
 
     kernels_read = ("real",)
@@ -41,50 +41,53 @@ class Memory:
         self, real, few: bool = False, passes: Mapping[str, Any] = LEAN, compiler: Compiler | None = None,
         copies: Copies | None = None,
     ):  # fmt: skip
-        if not patched:  # whose fields need a place once they are made
+        if not patched:  # fields are then made at once, and need a place
             layout.check_trees()
         self.real, self.copies = real, copies
         self.compiler = compiler or Compiler(real, few, passes, copies is not None)
         self.entries: list[Entry] = []
-        self._at: dict[int, int] = {}  # by the ids of fields: which entry they are
+        self._at: dict[int, int] = {}  # index of the entry, by the id of the field
         self._named: Counter[str] = Counter()
         self._in_order: list[Number] = []
-        self._owned: dict[Any, tuple[range, list[Number]]] = {}  # by owner: fields and numbers
-        self._valued: set[int] = set()  # fields that were given values
-        self._again: Again | None = None  # while they are declared a second time
+        self._owned: dict[Any, tuple[range, list[Number]]] = {}  # fields and numbers, by owner
+        self._valued: set[int] = set()  # indices of fields declared with values
+        self._again: Again | None = None  # set while owners declare their fields a second time
         self._later: list[tuple[Entry, np.ndarray]] = []
         self._declared: list[Declared] = []
-        self.numbers: dict[Any, tuple[Any, list[Number]]] = {}  # by kind: the field, and what it holds
+        self.numbers: dict[Any, tuple[Any, list[Number]]] = {}  # by type: the field, and the numbers that it holds
         self._apart = not aligned()
         self._layout: Layout | None = None
-        self._which: list[int] = []  # of its fields
+        self._which: list[int] = []  # the index of each field in the layout
         self._runtime = language.current()
-        self._transfers: dict[tuple, Transfer] = {}  # compiled once, since that costs more than running them
+        self._transfers: dict[tuple, Transfer] = {}  # kept, since compiling costs more than running
         self._views: dict[int, np.ndarray] = {}  # see _seen()
-        self._rooms: dict[int, np.ndarray] = {}  # of fields that had other lengths, by number: arrays as long as they can be
-        self._address = 0  # of the bytes
-        self._room: Any = None  # the bytes, where they are not Taichi's own
-        self._most: dict[int, int] = {}  # of these fields: the most elements for which the system has given memory
-        self._ends: Any = None  # frees it
+        self._rooms: dict[int, np.ndarray] = {}  # of resized fields, by index: arrays of the whole reserved room
+        self._address = 0  # of the bytes of this memory
+        self._room: Any = None  # keeps the bytes alive, where they are not Taichi's own
+        self._most: dict[int, int] = {}  # of resized fields: for how many elements the system has given memory
+        self._ends: Any = None  # the finalizer that frees the fields
         if copies and copies.number is None:
             copies.number = self.field("copy", None, kind=ti.i32, shared=True)
 
     def more(self) -> "Memory":
-        """For more fields of the same world, which come and go by themselves."""
+        """Return another memory of the same world, for fields that are made and freed on their own."""
         return Memory(self.real, compiler=self.compiler, copies=self.copies)
 
     def field(
         self, name: str, length: int | Number | None, *, width: int = 0, kind=None, values=None, state: bool = False,
         shared: bool = False, told: bool = False, below: int | None = None,
     ) -> Any:  # fmt: skip
-        """Declare a field of `length` elements (None: a single one, of 0 dimensions) and give it its first values. A Number: one
-        for each of what it counts, see regroup(). shared: it is one for all copies. state, told, below: see Entry."""
+        """Declare a field of `length` elements (None: one element, of 0 dimensions) and give it its first values.
+
+        length: a Number makes the length follow that number, see regroup(). shared: all copies of the world share the field.
+        state, told, below: see Entry.
+        """
         kind, rows = self.real if kind is None else kind, None
         if self._again:
             return self._again.field(length, width, np.dtype(_NUMPY[kind]), values)
         if isinstance(length, Number):
             rows, length = length, int(length.now)
-        length = 0 if length is None else max(1, length)  # a field of 0 elements poisons the runtime
+        length = 0 if length is None else max(1, length)  # a field of 0 elements breaks the runtime
         made = layout.field(kind, width)
         self._declare(name, made, length, width, kind, state, shared, rows, told, below)
         if values is not None and np.size(values):
@@ -103,12 +106,15 @@ class Memory:
         self._declared.append(Declared(kind, width, in_all, self._apart and kind == ti.f64))
         self._named[name] += 1
         same = self._named[name]
-        name = f"{name} #{same}" if same > 1 else name  # two batches of a kind
+        name = f"{name} #{same}" if same > 1 else name  # several batches of a kind
         self._at[id(made)] = len(self.entries)
         self.entries.append(Entry(name, made, width, length, np.dtype(_NUMPY[kind]), state, copies, rows, told, below))
 
     def number(self, value: float, kind=None) -> Number:
-        """A number that kernels find in a field, so that others share them: an integer, unless `kind` says so."""
+        """Declare a number that kernels read from a field, so that worlds with other values share kernels.
+
+        kind: the number's type, i32 by default.
+        """
         kind = ti.i32 if kind is None else kind
         if kind not in self.numbers:
             self.numbers[kind] = layout.field(kind, 0), []
@@ -121,7 +127,7 @@ class Memory:
 
     @contextlib.contextmanager
     def owned(self, owner: Any) -> Iterator[None]:
-        """What is declared meanwhile is the owner's, who may declare it again()."""
+        """Within this context, declarations belong to `owner`, which may repeat them within again()."""
         if self._again:
             with self._again.owned(*self._owned[owner]):
                 yield
@@ -132,7 +138,7 @@ class Memory:
 
     @contextlib.contextmanager
     def again(self, counts: dict[Number, int]) -> "Iterator[Again]":
-        """Meanwhile owners declare what they have a second time, see Again."""
+        """Within this context, owners declare their fields a second time, see Again."""
         self._again = Again(self, counts)
         try:
             yield self._again
@@ -140,12 +146,17 @@ class Memory:
             self._again = None
 
     def scratch(self, owner: Any) -> list[np.ndarray]:
-        """What an owner has noted while it worked, by which residuals go before the next step: its fields that were given
-        no values and are no part of the state, copied."""
+        """Return copies of an owner's working fields: those declared without values and no part of the state.
+
+        They hold values from earlier passes, which the residuals use before the next step.
+        """
         return self._dump(self._scratch(owner))
 
     def put_scratch(self, owner: Any, noted: list[np.ndarray], kept: tuple[np.ndarray, ...] = ()) -> None:
-        """Give it to an owner, where it has as many such fields. kept: masks of the rows that stay, for arrays of as many."""
+        """Write arrays from scratch() back to an owner's working fields, if it still has as many.
+
+        kept: masks of the rows that remain; each applies to arrays of its length.
+        """
         entries = self._scratch(owner)
         if len(entries) != len(noted):
             return
@@ -162,12 +173,12 @@ class Memory:
         return [self.entries[k] for k in fields if k not in self._valued and not self.entries[k].state]
 
     def fill(self, k: int, length: int, values: Any) -> None:
-        """Give a field of an elastic memory, by its number, so many elements, and each of them a value."""
+        """Give a field of an elastic memory, by its index, a length and the value of its elements."""
         view = self._resized(k, length) if length else self._seen()[id(self.entries[k])]
         view[...] = values
 
     def set_number(self, number: Number) -> None:
-        """Write it, where it is on the device already; in all copies, for kernels are made for all."""
+        """Write a number to the device, if it is placed already. All copies get it, since they share kernels."""
         if view := self._seen():
             view[id(self._find(number.field))][..., number.place] = number._value
         elif self._layout:
@@ -182,7 +193,7 @@ class Memory:
             self._later.append((self.entries[-1], np.array([number._value for number in known], dtype=np.float64)))
 
     def place(self) -> None:
-        """Allocate what was declared and write the first values (everything else is zero)."""
+        """Allocate the declared fields and write their first values (all others are zero)."""
         self._declare_numbers()
         with self.compiler():
             shared = layout.sharing()
@@ -203,25 +214,28 @@ class Memory:
             self._later.clear()
 
     def lengthen(self, length: int) -> bool:
-        """Give all fields so many elements, where they are. False where kernels would have to know: nothing was done then."""
+        """Give all fields `length` elements in place. Returns False and changes nothing where kernels would need recompiling."""
         if self.copies or not (self._layout and self._layout.shared and length <= self._layout.room):
-            return False  # copies begin elsewhere when those before are longer
+            return False  # the offsets of copies would change with the length
         self._views = {}
         self.entries = [e.of_length(length) for e in self.entries]
         return True
 
     @property
     def elastic(self) -> bool:
-        """Whether fields can have other lengths where they are: on a CPU, of one world."""
+        """Whether fields can change their lengths in place: on a CPU, for a single world."""
         return not self.copies and bool(self._layout and self._layout.shared and self._seen())
 
     def holds(self, length: int) -> bool:
-        """Whether there is room for so many elements of each field."""
+        """Whether there is room for `length` elements in each field."""
         return bool(self._layout) and length <= self._layout.room  # type: ignore[union-attr]
 
     def regroup(self, rows: Number, first: int, behind: np.ndarray, count: int) -> None:
-        """Of each field that has an element for each of what a number counts, keep the first ones and those `behind` them, by
-        their numbers, in order, and give it `count` in all; new ones are 0. For an elastic memory."""
+        """Remove and add rows of all fields whose length follows the Number `rows`, in an elastic memory.
+
+        Each field keeps its `first` first rows, then the rows with the indices `behind`, in that order. It gets `count` rows in
+        all; new rows are 0.
+        """
         kept = first + len(behind)
         for k, e in enumerate(self.entries):
             if e.rows is rows:
@@ -230,14 +244,14 @@ class Memory:
                 view[first:kept], view[kept:] = moved, 0
 
     def resize(self, field, length: int) -> None:
-        """Give a field so many elements; those that it had stay, and new ones are 0. For an elastic memory."""
+        """Change the length of a field in an elastic memory: present elements stay, and new ones are 0."""
         k = self._at[id(field)]
         before = self.entries[k].length
         if length != before:
             self._resized(k, length)[before:] = 0
 
     def _resized(self, k: int, length: int) -> np.ndarray:
-        """A field by its number: what it is as an array when it has another length."""
+        """Change the length of a field, by its index, and return the field as an array."""
         old, views, length = self.entries[k], self._seen(), max(1, length)
         if old.length == length:
             return views[id(old)]
@@ -256,7 +270,7 @@ class Memory:
         return view
 
     def _give_back(self, rows: np.ndarray) -> None:
-        """Have the system take the memory of what went, page by page; what is there then is 0."""
+        """Return the memory of removed rows to the system, page by page; these rows then read as 0."""
         if not (self._room and hasattr(mmap, "MADV_DONTNEED")):
             return
         begin = rows.ctypes.data - self._address
@@ -266,13 +280,13 @@ class Memory:
 
     @property
     def spare(self) -> int:
-        """Memory that stays for what went: at most as much again as there is [bytes]."""
+        """Memory kept after rows were removed: at most as much as the present rows take [bytes]."""
         return sum(max(0, most - self.entries[k].length) * self._rooms[k][:1].nbytes for k, most in self._most.items())
 
     def _seen(self) -> dict[int, np.ndarray]:
-        """Arrays that are the fields, by the id of the entry; none where the host cannot see them.
+        """Return the fields as arrays, by the id of the entry; empty if the host has no access.
 
-        Reading and writing fields by kernels takes longer to compile than all else takes to run.
+        Access through kernels takes longer to compile than everything else takes to run.
         """
         if not self._views and self._layout:
             self._layout.look()
@@ -280,13 +294,13 @@ class Memory:
                 wanted = [(k, e.whole, e.kind) for k, e in zip(self._which, self.entries, strict=True)]
                 views = self._layout.views(self._address, wanted)
                 for e, view in zip(self.entries, views, strict=False):
-                    self._views[id(e)] = view.reshape(e.copies, *e.shape) if e.copies else view  # which is the same bytes
+                    self._views[id(e)] = view.reshape(e.copies, *e.shape) if e.copies else view  # same bytes
                 if self.copies and views and self.entries[0].field is self.copies.number:
                     self.copies.see(self._views[id(self.entries[0])])
         return self._views
 
     def check(self) -> None:
-        """Raise RuntimeError when the fields are gone or belong to a runtime that is."""
+        """Raise RuntimeError if the fields were freed or their runtime has ended."""
         if language.current() is not self._runtime:
             raise RuntimeError(
                 "Taichi was started again after this world was built, which destroyed its fields. Build the world anew."
@@ -304,31 +318,31 @@ class Memory:
         """Free the fields. Calling it twice, or after another ti.init, does nothing."""
         if self._ends:
             self._ends()
-        elif self.entries and not patched:  # fields that are never placed would poison everything that Taichi does later
+        elif self.entries and not patched:  # fields without a place would break everything that Taichi does later
             self._declare_numbers()
             Layout(tuple(self._declared), [e.field for e in self.entries]).destroy()
         self._layout, self._views, self._rooms, self._most, self._room = None, {}, {}, {}, None
         self.entries = self.entries if self._ends else []
 
     def choose(self, copy: int | None) -> None:
-        """Take one of the copies, or all, see Copies."""
+        """Choose one of the copies, or all (None), see Copies."""
         assert self.copies
         if not self.copies.choose(copy):
             self.write(self.copies.number, copy)
 
     def write(self, field, values) -> None:
-        """Overwrite a whole field. Of all copies, where none is chosen: values are the same for all, or have one more axis."""
+        """Overwrite a whole field. Without a chosen copy, write to all: values are the same for all, or have one more axis."""
         self.check()
         if np.size(values):
             self._load([self._find(field)], [np.asarray(values, dtype=np.float64)])
 
     def write_each(self, *values: tuple[Any, np.ndarray]) -> None:
-        """Overwrite fields, each with an array that is not empty."""
+        """Overwrite several fields, each with a non-empty array."""
         self.check()
         self._load([self._find(field) for field, _ in values], [array for _, array in values])
 
     def write_from(self, field, first: int, values) -> None:
-        """Overwrite some elements of a field, from one on; of a world alone."""
+        """Overwrite elements of a field from index `first` on. For a single world (not one of many copies)."""
         self.check()
         view = self._seen().get(id(self._find(field)))
         if view is None:
@@ -339,7 +353,7 @@ class Memory:
             view[first : first + len(values)] = values
 
     def write_rows(self, field, some: np.ndarray, values) -> None:
-        """Overwrite some elements of a field, by their numbers; of a world alone."""
+        """Overwrite some elements of a field, by index. For a single world (not one of many copies)."""
         self.check()
         view = self._seen().get(id(self._find(field)))
         if view is None:
@@ -350,13 +364,16 @@ class Memory:
             view[some] = values
 
     def write_some(self, field, values, some: np.ndarray) -> None:
-        """Overwrite a field of some copies; values: the same for all, or one row for each of them."""
+        """Overwrite a field of some copies. values: one value for all of them, or one row per copy."""
         self.check()
         entry = self._find(field)
         self._load_some([entry], [np.asarray(values)], some)
 
     def restore_some(self, state: dict[str, np.ndarray], some: np.ndarray) -> None:
-        """Write back what state() returned of some copies; one row is for all of them; 0 to fields that were not there then."""
+        """Write back, for some copies, what state() returned: one row for all of them, or one per copy.
+
+        Fields that it does not have become 0.
+        """
         self.check()
         chosen = [e for e in self.entries if e.state]
         self._load_some(chosen, [state.get(e.name, np.zeros(1)) for e in chosen], some)
@@ -374,8 +391,10 @@ class Memory:
         self.choose(None)
 
     def read(self, field, kind: Any = None) -> np.ndarray:
-        """A copy of a whole field, in its own type unless `kind` says so; with one more axis, the first, of all copies where none
-        is chosen."""
+        """Return a copy of a whole field, in its own type unless `kind` is given.
+
+        Without a chosen copy, the array has one more axis, the first.
+        """
         self.check()
         entry, views = self._find(field), self._seen()
         if views:
@@ -383,34 +402,36 @@ class Memory:
         return self._dump([entry])[0].astype(kind or entry.kind, copy=False)
 
     def seen(self, field) -> np.ndarray:
-        """The field itself as an array, where the host sees it; else a copy."""
+        """Return the field itself as an array, where the host has access; otherwise a copy."""
         self.check()
         view = self._seen().get(id(self._find(field)))
         return self.read(field) if view is None else view
 
     def state(self) -> dict[str, np.ndarray]:
-        """Copies of the fields that make up the exact state, by name."""
+        """Return copies of the fields that make up the exact state, by name."""
         self.check()
         chosen = [e for e in self.entries if e.state]
         return dict(zip((e.name for e in chosen), self._dump(chosen), strict=True))
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Write back what state() returned, bit for bit; 0 to fields that were not there then."""
+        """Write back what state() returned, bit for bit. Fields not in it become 0."""
         self.check()
         chosen = [e for e in self.entries if e.state]
         if chosen:
             self._load(chosen, [state.get(e.name, np.zeros(1)) for e in chosen])
 
     def take(self, other: "Memory") -> None:
-        """Give the chosen copy all that another memory holds in fields of the same names, but for sums of a frame, of which there
-        may be fewer here."""
+        """Copy into the chosen copy all fields of another memory with the same names.
+
+        The sums of a frame ("survey.") are left out, since they may be fewer here.
+        """
         self.check()
         theirs = {e.name: e for e in other.entries if not e.name.startswith("survey.")}
         ours = [e for e in self.entries if e.name in theirs]
         self._load(ours, other._dump([theirs[e.name] for e in ours]))
 
     def spread(self) -> None:
-        """Give all copies what the chosen one has."""
+        """Copy the fields of the chosen copy to all copies."""
         assert self.copies
         some = [e for e in self.entries if e.copies]
         values = self._dump(some)
@@ -429,7 +450,7 @@ class Memory:
         if self._all_of(entries):
             self._each(entries, lambda k: self._load(entries, [_part(e, a, k) for e, a in zip(entries, arrays, strict=True)]))
             return
-        # Every number that we hold (f32, f64, i32) is exact in f64, so one kernel and one flat array serve all.
+        # Every type of field (f32, f64, i32, u32) is exact in f64, so one kernel and one flat array serve all.
         for k in range(0, len(entries), GROUP):
             some = entries[k : k + GROUP]
             parts = [np.broadcast_to(a, e.shape).ravel() for e, a in zip(some, arrays[k : k + GROUP], strict=True)]
@@ -454,15 +475,15 @@ class Memory:
         return out
 
     def _one(self, entry: Entry, view: np.ndarray) -> np.ndarray:
-        """The part of a field that is the chosen copy's; all of it where none is."""
+        """Return the chosen copy's part of a field; all of it if none is chosen."""
         return view if not entry.copies or self.copies.chosen is None else view[self.copies.chosen]  # type: ignore[union-attr]
 
     def _all_of(self, entries: list[Entry]) -> bool:
-        """Whether fields are to be transferred for all copies."""
+        """Whether a transfer covers all copies."""
         return bool(self.copies) and self.copies.chosen is None and any(e.copies for e in entries)  # type: ignore[union-attr]
 
     def _each(self, entries: list[Entry], act: Any) -> list[Any]:
-        """Do something for one copy after the other."""
+        """Call `act` for each copy in turn."""
         out = []
         for k in range(self.copies.count):  # type: ignore[union-attr]
             self.choose(k)
@@ -478,13 +499,13 @@ class Memory:
 
 
 def _end(one: Layout, address: int, compiler: Compiler) -> None:
-    """Free a place in a layout."""
+    """Release a memory's place in a layout."""
     compiler.places.remove((one, address))
     one.destroy()
 
 
 def _part(entry: Entry, values: np.ndarray, copy: int) -> np.ndarray:
-    """The part of an array that is for one copy."""
+    """Return the part of an array that belongs to one copy."""
     return values[copy] if np.ndim(values) > len(entry.shape) else values
 
 
@@ -492,10 +513,10 @@ _NUMPY = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u32: np.u
 
 
 def aligned() -> bool:
-    """Whether a field of f64 may stand in one tree with others.
+    """Whether an f64 field may share a tree with fields of other types.
 
-    LLVM lays out trees so that all is aligned. Elsewhere Taichi 1.7.4 puts one field behind the other, the
-    smallest first, and finds an f64 by its address divided by 8: of a tree of 3 i32 and 4 f64, the first f64 begins at byte 12
-    and is written to byte 8, over the last i32. Alone in their tree all f64 are aligned.
+    LLVM aligns all fields of a tree. For other backends Taichi 1.7.4 packs fields one behind the other, the smallest first, and
+    computes the index of an f64 as its address divided by 8. In a tree of 3 i32 and 4 f64, the first f64 begins at byte 12 but is
+    written to byte 8, over the last i32. In a tree of their own all f64 are aligned.
     """
     return runtime.architecture() in runtime.LLVM

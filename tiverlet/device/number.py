@@ -1,6 +1,6 @@
-"""Numbers that kernels read from fields, so that what is compiled does not depend on them.
+"""Numbers that kernels read from fields, so that compiled code does not depend on their values.
 
-None changes while a kernel runs. The kernel of a frame reads all of them first: each time that an element of a field is looked up
+No number changes while a kernel runs. The kernel of a frame reads all of them at its begin, since each lookup of a field element
 takes as much code as twenty operations.
 """
 
@@ -8,12 +8,13 @@ from typing import Any
 
 from .language import at, current, impl, inline, inside_kernel
 
-# The kernel that is being translated, and its variables, by what they are. Not an attribute: kernels share what they do not read.
+# The kernel that is being translated, and its variables by the ids of their Numbers. A module variable, not an attribute: the
+# structure by which worlds share kernels must not depend on it.
 _read: tuple[Any, dict[int, Any]] = (None, {})
 
 
 class Number:
-    """One number, at a place of a field. Where kernels are translated `now` is that place, elsewhere the number."""
+    """One number in a field. While a kernel is translated, `now` is the field's element; on the host it is the number."""
 
     def __init__(self, memory: Any, field: Any, place: int, value: float):
         self.field, self.place = field, place
@@ -21,7 +22,7 @@ class Number:
 
     @property
     def now(self) -> Any:
-        """What it is."""
+        """The present value."""
         if not inside_kernel():
             return self._value
         kernel, known = _read
@@ -29,22 +30,24 @@ class Number:
         return known[id(self)] if read else at(self.field, self.place)
 
     def set(self, value: float) -> None:
-        """Make it another one."""
+        """Set the value, on the host and on the device."""
         self._value = value
         self._memory.set_number(self)
 
 
 @inline
 def read_all(numbers):
-    """In a kernel: from here on they are variables. numbers: of a Memory."""
+    """In a kernel: read all numbers of a Memory into variables, which are used from here on. numbers: Memory.numbers."""
     global _read
     known = [number for _, some in numbers.values() for number in some]
     _read = current().compiling_callable, {id(k): impl.expr_init(at(k.field, k.place)) for k in known}
 
 
 class OnDevice:
-    """An attribute that holds a Number: read as a number by the host, and by kernels as what stands in the field. Assign the
-    Number first, and later what it is to be."""
+    """An attribute that holds a Number. The host reads its value, and kernels read the field's element.
+
+    Assign the Number first, and plain values afterwards.
+    """
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.kept = f"{name}_number"

@@ -1,4 +1,4 @@
-"""Running sums of whole numbers, by one thread or by all of a GPU."""
+"""Prefix sums of integers, by one thread or by all threads of a GPU."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -8,24 +8,24 @@ from .number import OnDevice
 if TYPE_CHECKING:
     from .thread_team import Team
 
-RADIX = 64  # entries that one thread of a GPU adds up
-MOST = 2**30 - 1  # two of them are still an i32
+RADIX = 64  # entries per GPU thread
+MOST = 2**30 - 1  # the sum of two still fits in an i32
 
 
 class Sums:
-    """field[k] becomes field[0] + ... + field[k]; with `capped`, MOST where that is more.
+    """Replaces field[k] by field[0] + ... + field[k]; with `capped`, by at most MOST.
 
-    Where the team is launched, in parallel. Each thread adds up a block of RADIX entries, then of the sums of RADIX blocks, and
-    so on until one block is left; then each block goes on from the sum of those before it. A level is a loop in each direction,
-    and none takes more than RADIX steps. The sums of the blocks stand behind the `length` entries, so the field has to have
-    `room` for both.
+    Where phases are launched one by one, as on a GPU, the sums run in parallel. Each thread adds up a block of RADIX entries. The
+    next level adds up RADIX block sums, and so on until one block is left. Then each block continues from the sum of the blocks
+    before it. A level is one loop in each direction, and no loop takes more than RADIX steps. The block sums are stored behind
+    the `length` entries, so the field needs `room` for both.
     """
 
     room: Any = OnDevice()
 
     def __init__(self, length: int, team: "Team", capped: bool = False):
         self.team, self.capped = team, capped
-        lengths, self.begins = [length], [0]  # of each level
+        lengths, self.begins = [length], [0]  # length and first index of each level
         while team.launched and lengths[-1] > RADIX:
             self.begins.append(self.begins[-1] + lengths[-1])
             lengths.append(-(-lengths[-1] // RADIX))
@@ -34,7 +34,7 @@ class Sums:
 
     @ti.func
     def run(self, field: ti.template(), me):  # type: ignore[valid-type]
-        """Add up."""
+        """Compute the prefix sums in place."""
         for m in ti.static(range(1, self.levels)):
             for b in range(ti.static(self.above[m - 1])):
                 total = 0
@@ -55,7 +55,7 @@ class Sums:
 
     @ti.func
     def plus(self, a, b):
-        """Their sum."""
+        """Return a + b, capped if requested."""
         out = a + b
         if ti.static(self.capped):
             out = ti.min(out, MOST)
@@ -63,10 +63,10 @@ class Sums:
 
     @ti.func
     def low(self, m: ti.template(), b):  # type: ignore[valid-type]
-        """Where the entries begin that block b of level m is the sum of."""
+        """Return the first of the entries whose sum is block b of level m."""
         return self.begins[m - 1] + b * RADIX
 
     @ti.func
     def high(self, m: ti.template(), b):  # type: ignore[valid-type]
-        """Where they end."""
+        """Return the end of the entries whose sum is block b of level m."""
         return ti.min(self.low(m, b) + RADIX, self.begins[m])

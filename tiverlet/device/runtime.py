@@ -1,4 +1,4 @@
-"""The door to Taichi: starting it, and asking about it."""
+"""Starting Taichi, and queries about the running one."""
 
 import contextlib
 import ctypes
@@ -12,7 +12,10 @@ from .language import ti
 
 
 def _ask_for_start() -> None:
-    """Say how to start Taichi where a field is made before it runs; ti.init, as Taichi says, would round otherwise."""
+    """Raise RuntimeError if a field is made before Taichi runs, and name tv.init as the remedy.
+
+    Taichi's own message names ti.init, whose defaults round otherwise.
+    """
     if language.current().prog is None:
         raise RuntimeError(
             "A field of Taichi was asked for before Taichi runs. Call tv.init() first; else the first tv.World starts it."
@@ -22,11 +25,11 @@ def _ask_for_start() -> None:
 language.before_fields(_ask_for_start)
 
 ARCHITECTURES = ("cpu", "cuda", "metal", "vulkan")
-LLVM = ("cpu", "cuda")  # what LLVM compiles for; for the others Taichi writes SPIR-V
+LLVM = ("cpu", "cuda")  # compiled by LLVM; for the others Taichi writes SPIR-V
 
-_started: dict = {}  # what init() was asked for, and by which process and thread
-trees = 0  # of fields that are alive, of this runtime; memory.py counts them
-share: int | None = None  # CPU threads where none are asked for; in a process that has only some of the cores for itself
+_started: dict = {}  # the arguments of init(), and the process and thread that called it
+trees = 0  # live trees of fields of this runtime; layout.py counts them
+share: int | None = None  # the default number of CPU threads, in a process that may use only some of the cores
 
 
 def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, seed: int = 0) -> None:
@@ -37,8 +40,8 @@ def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, see
     debug: Taichi checks array bounds in kernels (slow).
     seed: of Taichi's random numbers; tiverlet itself uses none.
 
-    A Taichi that the user has started is used as it is. Calling init again with the same settings does nothing; with
-    other settings it raises RuntimeError, because starting Taichi anew would destroy the fields of every live world.
+    If the user has started Taichi, it is used as it is. Calling init again with the same settings does nothing. Calling it with
+    other settings raises RuntimeError, because a restart of Taichi would destroy the fields of every live world.
     """
     if arch not in ARCHITECTURES:
         raise ValueError(f"init: arch = {arch!r}, but it must be one of {', '.join(map(repr, ARCHITECTURES))}.")
@@ -58,8 +61,8 @@ def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, see
     running = _threads()
     threads = threads or share
     options: dict[str, Any] = {} if threads is None else {"cpu_max_num_threads": threads}
-    if arch == "cpu":  # where kernels are one task each; every thread that compiles has to load first what all kernels share
-        options["num_compile_threads"] = 1  # 0 would be the thread that asks: one that did not start Taichi ends the process
+    if arch == "cpu":  # a kernel is one task there, and each compiling thread first loads what all kernels share
+        options["num_compile_threads"] = 1  # 0: the calling thread, which ends the process if it did not start Taichi
     with contextlib.redirect_stdout(io.StringIO()):  # ti.init prints its banner whatever the log level
         ti.init(
             arch=getattr(ti, arch), default_fp=ti.f32, fast_math=False, debug=debug, random_seed=seed,
@@ -74,17 +77,18 @@ def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, see
 
 
 def _threads() -> set[int]:
-    """The threads of this process, where the system tells."""
+    """Return the threads of this process, on systems that list them."""
     with contextlib.suppress(OSError):
         return {int(name) for name in os.listdir("/proc/self/task")}
     return set()
 
 
 def _settle(started: set[int]) -> None:
-    """Give each of Taichi's workers, which it starts last, a core of its own, if it has them all.
+    """Pin each of Taichi's workers to a core of its own, if Taichi has a worker for every core. Taichi starts the workers last.
 
-    They sleep between loops. Linux wakes those of a loop on one core, and moves one of them away only milliseconds later: a loop
-    of 1.7 ms on one thread took 1.7 ms on two, and 0.9 ms with this; ten short loops took 0.45 and 0.16 ms.
+    Workers sleep between loops. Linux wakes the workers of a loop on one core, and moves one of them away only milliseconds
+    later. Without pinning, a loop of 1.7 ms on one thread takes 1.7 ms on two; pinned, 0.9 ms. Ten short loops take 0.45 and 0.16
+    ms.
     """
     with contextlib.suppress(AttributeError, OSError):
         cores, workers = sorted(os.sched_getaffinity(0)), sorted(started)[-threads() :]
@@ -94,51 +98,51 @@ def _settle(started: set[int]) -> None:
 
 
 def architecture() -> str:
-    """The architecture that Taichi runs on, by the names of init()."""
+    """Return the architecture that Taichi runs on, by the names of init()."""
     name = str(_config().arch).rsplit(".", 1)[-1]
     return "cpu" if name in ("x64", "arm64") else name
 
 
 def available() -> list[str]:
-    """The architectures that this machine and this Taichi have."""
+    """Return the architectures that this machine and this Taichi support."""
     return [a for a in ARCHITECTURES if a == "cpu" or language.has(a)]
 
 
 def threads() -> int:
-    """The number of CPU threads that Taichi may use."""
+    """Return the number of CPU threads that Taichi may use."""
     return int(_config().cpu_max_num_threads)
 
 
 def cores() -> int:
-    """The number of CPU threads that can run at the same time; 1 where Taichi runs on something else."""
+    """Return how many CPU threads can run at the same time; 1 if Taichi does not run on the CPU."""
     here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(threads(), here) if architecture() == "cpu" else 1
 
 
 def fast_math() -> bool:
-    """Whether the running Taichi may reorder arithmetic; tiverlet's own start says no."""
+    """Whether the running Taichi may reorder arithmetic; init() forbids it."""
     return bool(_config().fast_math)
 
 
 def default_fp() -> str:
-    """The type of plain numbers in the user's own functions: "f32" or "f64"."""
+    """Return the type of plain numbers in the user's own functions: "f32" or "f64"."""
     return str(_config().default_fp)
 
 
 def compiler() -> str:
-    """What makes machine code of kernels: Taichi or Quadrants, of which commit, and what it was built with."""
+    """Return the compiler that makes the machine code of kernels, Taichi or Quadrants, with version, commit and LLVM target."""
     library: Any = ti._lib
     core = library.core
     return f"{language.NAME} {core.get_version_string()} ({core.get_commit_hash()[:8]}), LLVM {core.get_llvm_target_support()}"
 
 
 def wanted() -> dict[str, Any]:
-    """What init() was asked for; nothing when the user started Taichi."""
+    """Return the arguments of init(); empty if the user started Taichi."""
     return _started.get("wanted") or {}
 
 
 def ensure_started() -> None:
-    """Start Taichi with the defaults if it does not run, and refuse where building fields would crash."""
+    """Start Taichi with the defaults if it does not run. Raise RuntimeError where building fields would crash or hang."""
     if ti.cfg is None:
         init()
     if _started.get("runtime") is not language.current():
@@ -162,7 +166,7 @@ def _config() -> Any:
 
 
 def _leave() -> None:
-    """In a forked child: keep Taichi from being ended there, which waits for ever for threads that only the parent has."""
+    """In a forked child: keep Taichi from shutting down. It would wait forever for threads that only the parent has."""
     runtime = _started.get("runtime")
     if runtime is not None and runtime is language.current() and runtime.prog:
         hold = ctypes.pythonapi.Py_IncRef
@@ -175,7 +179,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def _adopt(wanted: dict | None = None) -> None:
-    """Remember the running Taichi, and what it was asked for if it was started here."""
+    """Register the running Taichi, with the arguments of init() if init() started it."""
     global trees
     trees = 0
     _started.update(runtime=language.current(), pid=os.getpid(), thread=threading.get_ident(), wanted=wanted)

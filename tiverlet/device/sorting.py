@@ -1,13 +1,13 @@
-"""Sorting short lists of whole numbers that stand in a field, each by one thread."""
+"""Sorting of short lists of integers in a field, each list by one thread."""
 
 from .language import ti
 
-LONG = 64  # numbers that heapsort puts in order before insertion does
+LONG = 64  # length from which heapsort is faster than insertion sort
 
 
 @ti.func
 def sort(field: ti.template(), begin, count, runs: ti.template()):  # type: ignore[valid-type]
-    """The `count` numbers from `begin` on. runs: they come in a few runs, not in any order."""
+    """Sort `count` numbers from index `begin` on. runs: the numbers come in a few sorted runs, not in random order."""
     if ti.static(runs):
         insert(field, begin, count)
     elif count > LONG:
@@ -18,7 +18,7 @@ def sort(field: ti.template(), begin, count, runs: ti.template()):  # type: igno
 
 @ti.func
 def insert(field: ti.template(), begin, count):  # type: ignore[valid-type]
-    """Insertion sort: the fastest for lists that are short, or nearly in order."""
+    """Insertion sort: the fastest for lists that are short, or nearly sorted."""
     for a in range(1, count):
         j = field[begin + a]
         b = a
@@ -30,7 +30,7 @@ def insert(field: ti.template(), begin, count):  # type: ignore[valid-type]
 
 @ti.func
 def heap(field: ti.template(), begin, count):  # type: ignore[valid-type]
-    """Heapsort (Williams 1964, Floyd 1964): n log n steps, whatever the order."""
+    """Heapsort (Williams 1964, Floyd 1964): n log n steps in any order."""
     root, end = count // 2, count
     while end > 1:
         j = 0
@@ -57,7 +57,7 @@ def heap(field: ti.template(), begin, count):  # type: ignore[valid-type]
 
 @ti.func
 def exchange(field: ti.template(), begin, count, network: ti.template(), size: ti.template()):  # type: ignore[valid-type]
-    """At most `size` of them by a network, which has no branches, unless they are in order as they come."""
+    """Sort at most `size` numbers by a sorting network, which has no branches, unless they are sorted already."""
     j = ti.Vector.zero(ti.i32, size)
     for k in ti.static(range(size)):
         j[k] = ti.select(k < count, field[begin + k], ti.static(2**31 - 1))
@@ -74,7 +74,7 @@ def exchange(field: ti.template(), begin, count, network: ti.template(), size: t
 
 
 def sorting_network(size: int) -> list[list[tuple[int, int]]]:
-    """Layers of pairs to put in order, to sort a power of two of numbers (Batcher's odd-even mergesort, 1968)."""
+    """Return layers of index pairs to compare that sort `size` numbers, a power of two (Batcher's odd-even mergesort, 1968)."""
     out, p = [], 1
     while p < size:
         k = p

@@ -1,9 +1,9 @@
-"""CPU threads that go through a whole frame together, in one launch.
+"""A team of CPU threads that runs a whole frame together, in one launch.
 
-Taichi's threads sleep between two loops, and waking them takes some 50 us for each: as long as 10 000 particles take for a whole
-phase. So a frame is one loop over threads. Each does its share of every loop inside, and then waits for the others, which takes
-0.1 us as long as each has a core. Where other programs want the cores too, a thread waits for one that does not run, for
-milliseconds: after a few such waits the first thread goes on alone, and the others join it some frames later.
+Taichi's threads sleep between two loops, and waking them takes some 50 us each: as long as a whole phase of 10 000 particles. So
+a frame is one loop over threads. Each thread does its share of every inner loop and then waits for the others, which takes 0.1 us
+as long as each thread has a core. If other programs use the cores too, a thread may wait milliseconds for one that does not run.
+After a few such waits the first thread continues alone, and the others rejoin some frames later.
 """
 
 import contextlib
@@ -17,17 +17,17 @@ from .number import OnDevice
 if TYPE_CHECKING:
     from .memory import Memory
 
-LEAST = 512  # iterations of a loop that Taichi gives to a CPU thread, at least
-PIECES = 16  # into which a team divides particles that touch, at most
-SMALL = 128  # of them in a piece, at least: to send what neighbours need from core to core takes as long as to compute it
-EVEN = 64  # or a multiple: they fill whole lines of a cache
-BLOCK = 32  # of them that are asked at once whether any is near a wall, or touches another
-SHARE = 500  # particles and constraints for each thread, at least; with fewer they wait for each other longer than they work
-PATIENCE = 20_000  # looks at the counter, of 50 ns or less, and one more for each particle: then a wait was long
-LONG = 4  # long waits in a frame after which one thread goes on alone
-ALONE = 32  # frames until the others come back
-LINE = 32  # integers that are not in the same line of a cache
-SHIFT = 4096  # frames after which arrivals are counted from 0 again, while nobody waits
+LEAST = 512  # the fewest iterations of a loop that Taichi gives to a CPU thread
+PIECES = 16  # the most pieces into which a team divides particles with contacts
+SMALL = 128  # fewest particles per piece: sending data of neighbours between cores takes as long as computing with it
+EVEN = 64  # pieces are multiples of this, so that they fill whole cache lines
+BLOCK = 32  # particles per block: one test finds whether any of them is near a wall or has a contact
+SHARE = 500  # fewest particles and constraints per thread; with fewer, threads wait longer than they work
+PATIENCE = 20_000  # a wait is long after so many reads of the counter, of at most 50 ns, plus one per particle
+LONG = 4  # long waits in a frame after which one thread continues alone
+ALONE = 32  # frames until the others rejoin
+LINE = 32  # integers so far apart are in different cache lines
+SHIFT = 4096  # frames after which the count of arrivals restarts from 0, while no thread waits
 
 
 _launching = False
@@ -35,7 +35,7 @@ _launching = False
 
 @contextlib.contextmanager
 def launching() -> Iterator[None]:
-    """Worlds that are built within it, on the parallel path, are launched phase by phase, as they are on a GPU."""
+    """Within this context, worlds built for the parallel path are launched phase by phase, as on a GPU."""
     global _launching
     before, _launching = _launching, True
     try:
@@ -45,36 +45,39 @@ def launching() -> Iterator[None]:
 
 
 def size_of(path: str, work: int) -> int:
-    """How many threads make up the team of a world. work: particles and constraints."""
+    """Return the number of threads in a world's team. work: its number of particles and constraints."""
     return min(runtime.cores(), max(2, work // SHARE)) if path == "parallel" and not _launching else 1
 
 
 @inline
 def blocks(begin, end):
-    """How many blocks particles from `begin` up to `end` are."""
+    """Return the number of blocks of the particles from `begin` up to `end`."""
     return (end - begin + (BLOCK - 1)) // BLOCK
 
 
 @inline
 def block(b, begin, end):
-    """The particles of the b-th of them: the first, and where they end."""
+    """Return the first particle of block b, and where the block ends."""
     return begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
 
 
 @inline
 def quotient(a, b):
-    """a // b of numbers that are not negative: that of i32 would look at the signs."""
+    """Return a // b of non-negative numbers; division of i32 would test the signs."""
     return ti.cast(ti.cast(a, ti.u32) // ti.cast(b, ti.u32), ti.i32)
 
 
 class Team:
-    """size: the number of threads; 1 where there is nobody to wait for, because Taichi itself spreads loops over threads or
-    because there is one thread only. launched: which of the two; phase by phase, as on a GPU. A share of n is what a thread
-    does of it; what the shares are shows in no result. Particles are dealt out piece by piece, there and back, `pieces` in all:
-    in a heap those below have more to do than those above, and one thread would wait for the other.
+    """The threads that run a frame together, and how they divide loops.
 
-    halt: where a frame that is launched phase by phase notes that it waits for a list, [1, substep, half of a pass]; what was
-    launched behind has nothing to do then. None where it cannot happen, or is asked in other ways."""
+    size: the number of threads; 1 where none has to wait, because Taichi itself spreads loops over threads or because there is
+    only one. launched: which of the two; True if phases are launched one by one, as on a GPU. A share of n is the part of a loop
+    that one thread does; no result depends on how loops are shared. Particles are dealt out in `pieces` pieces, forwards and
+    backwards in turn: in a heap, particles below have more contacts than those above, and one thread would wait for the other.
+
+    halt: a field in which a frame launched phase by phase notes that it waits for a new neighbour list, [1, substep, half of a
+    pass]; phases launched after that do nothing. None where this cannot happen, or is handled in another way.
+    """
 
     halt: Any = None
 
@@ -88,25 +91,25 @@ class Team:
         self.piece = memory.number(self.piece_of(particles))
         self.spread = LEAST * size if size > 1 else 1
         self._alone, self._frames = 0, 0
-        self._in_substep: tuple[Any, Any] = (None, None)  # a kernel, and how many are at work in the substep it is in
+        self._in_substep: tuple[Any, Any] = (None, None)  # a kernel, and its number of active threads in the present substep
         self.memory = memory
         if size > 1:
             self.arrived = memory.field("team.arrived", 2 * LINE, kind=ti.i32)
-            self.active_threads = memory.field("team.active_threads", None, kind=ti.i32, values=size)  # at work
+            self.active_threads = memory.field("team.active_threads", None, kind=ti.i32, values=size)
             self.late = memory.field("team.long_waits", None, kind=ti.i32)
-            self.ends = memory.field("team.ends", None, kind=ti.i32)  # 1: in the next substep all but the first leave
+            self.ends = memory.field("team.ends", None, kind=ti.i32)  # 1: all threads but the first leave before the next substep
 
     def piece_of(self, particles: int) -> int:
-        """How many particles make up a piece."""
+        """Return how many particles make up a piece."""
         even = -(-particles // (max(min(self._pieces, particles // SMALL), self.size) * EVEN)) * EVEN
         return max(1, 1 if self.launched else particles if self.size == 1 else even)
 
     def regroup(self, particles: int) -> None:
-        """There are so many particles now."""
+        """Adapt to a new number of particles."""
         self.piece, self.patience = self.piece_of(particles), PATIENCE + particles
 
     def rejoin(self, active: int) -> None:
-        """Before a frame: those who left some frames ago come back. active: how many were at work in the last one."""
+        """Before a frame: let threads that left some frames ago rejoin. active: how many threads ran the last frame."""
         if self.size > 1:
             self._frames += 1
             if self._frames % SHIFT == 0:
@@ -120,8 +123,11 @@ class Team:
 
     @inline
     def works(self, thread):
-        """Whether a thread takes part in the coming substep; all must ask. Up to its end it knows how many do: each loop asks,
-        and a field takes as much code as twenty operations."""
+        """Whether a thread takes part in the coming substep; all threads must call this.
+
+        The number of active threads is kept in a variable up to the end of the substep. Each loop uses it, and reading a field
+        takes as much code as twenty operations.
+        """
         if self.size == 1:
             return True
         works = self._works(thread)
@@ -130,44 +136,47 @@ class Team:
 
     @inline
     def active(self):
-        """How many are at work."""
+        """Return the number of active threads."""
         kernel, number = self._in_substep
         return number if kernel is current().compiling_callable else at(self.active_threads, None)
 
     @inline
     def left(self, n):
-        """How many of n things there are to do: none while the frame waits."""
+        """Return how many of n things remain to do: none while the frame waits for a list."""
         return n if self.halt is None else n * (1 - at(at(self.halt, None), 0))
 
     @inline
     def chunk_begin(self, n, thread):
-        """Where the share begins. That of a single thread begins at 0, which LLVM must not know: it would write out loops over
-        few particles, one by one, and take half as long again for all."""
+        """Return where a thread's share of a loop begins.
+
+        For a single thread it is 0, in a form that LLVM cannot fold to a constant. If it could, it would unroll loops over few
+        particles completely, and all compiling would take half as long again.
+        """
         return self._share(n, thread) if self.size > 1 else thread * n
 
     @inline
     def chunk_end(self, n, thread):
-        """Where it ends."""
+        """Return where a thread's share of a loop ends."""
         return self._share(n, thread + 1) if self.size > 1 else self.left(n)
 
     @inline
     def dealt_count(self, n, unit, thread):
-        """How many of n things fall to a thread where they are dealt out in turn, `unit` at a time."""
+        """Return how many of n things a thread gets when they are dealt out in turn, `unit` at a time."""
         return self._dealt_count(n, unit, thread) if self.size > 1 else self.left(n)
 
     @inline
     def dealt_index(self, k, unit, thread):
-        """Which of them is the k-th."""
+        """Return the index of the k-th thing that a thread gets."""
         return self._dealt_index(k, unit, thread) if self.size > 1 else thread + k
 
     @inline
     def one(self, n, thread):
-        """All of it for one of them, nothing for the others."""
+        """Give all n things to the first thread, none to the others."""
         return ti.select(thread == 0, n, 0) if self.size > 1 else self.left(n)
 
     @inline
     def wait(self):
-        """Go on once all have come here, with what they have written."""
+        """Wait until all threads have arrived; everything that they wrote before is then visible."""
         return self._wait() if self.size > 1 else None
 
     @ti.func
@@ -185,7 +194,10 @@ class Team:
 
     @ti.func
     def watch(self, thread):
-        """Once in a substep, between two waits, so that all know the same when they ask whether they take part in the next."""
+        """Decide whether the others leave before the next substep.
+
+        Called once per substep, between two waits, so that all threads agree on it.
+        """
         if ti.static(self.size > 1):
             if thread == 0 and self.late[None] >= LONG and self.active_threads[None] > 1:
                 self.ends[None] = 1
@@ -212,7 +224,7 @@ class Team:
 
     @inline
     def _place(self, turn, thread):
-        """The place of a thread in a turn: there and back, so that it goes on where it was, and none has always the busier."""
+        """Return the place of a thread in a turn. The order alternates, so that no thread always gets the busier pieces."""
         return ti.select(turn & 1 == 0, thread, self.active() - 1 - thread)
 
     @inline
@@ -222,7 +234,10 @@ class Team:
     @called
     @ti.func
     def wait_for(self, active: ti.i32):
-        """Wait for so many. The last one says so in another place than where all arrive, whom those who look would hold up."""
+        """Wait for `active` threads to arrive.
+
+        The last one signals in another cache line than the arrivals, which the waiting threads would slow down.
+        """
         if active > 1:
             before = ti.atomic_add(self.arrived[0], 1)
             turn = quotient(before, active) + 1
@@ -237,6 +252,6 @@ class Team:
 
     @ti.func
     def reset_wait_count(self):
-        """Count long waits from 0 again."""
+        """Restart the count of long waits."""
         if ti.static(self.size > 1):
             self.late[None] = 0

@@ -1,1 +1,1 @@
-"""The contract of all that acts on particles."""
+"""The contract of features: forces, constraints, contacts and walls."""

@@ -1,8 +1,8 @@
-"""The arguments that an object was made with, what a recording needs to make it again; and which of them can be set later.
+"""The arguments of an object's __init__, kept so that a recording can rebuild the object; and which of them can be set later.
 
-Feature and Solver, and so all that is below them, keep them in `arguments`. Once __init__ is over only knobs can be set, and
-names that begin with an underscore: what else an object consists of is compiled into kernels. Its own methods set such an
-attribute by self._keep(name=value). Arrays become read-only, since no kernel would see what is written to them.
+Feature and Solver and their subclasses keep them in `arguments`. After __init__, only knobs and names that begin with an
+underscore can be set: the rest of an object is compiled into kernels. The object's own methods set such an attribute by
+self._keep(name=value). Arrays become read-only, since kernels would not see values written to them.
 """
 
 import difflib
@@ -17,17 +17,17 @@ from ..device import at
 from ..device.language import inside_kernel
 from .read_only import assign_whole, handed_out, structure
 
-TAKEN_BY = {"one_way": "Capsule, Polygon and Mesh"}  # arguments that others of the same kind do not have
+TAKEN_BY = {"one_way": "Capsule, Polygon and Mesh"}  # arguments that only some features of a kind take
 
 
 class Knob:
     """A live setting: checked when assigned, written to the device before the next frame.
 
-    check: a function (feature, value) -> value that raises for a wrong one.
-    force: it changes a force, so that displacements are turned into velocities first, see World._restart().
-    compiled: kernels have its value in them, so that another one has the world built anew, see Feature.outgrown.
-    built: another one has the world built anew, too, but with the same kernels.
-    device: the attribute that is its field, for kernels, which read the setting by the same name; None where they do not.
+    check: a function (feature, value) -> value that raises for an invalid value.
+    force: the knob changes a force, so displacements are turned into velocities first, see World._settle_forces().
+    compiled: kernels contain the value, so the world is rebuilt for another one, see Feature.outgrown.
+    built: the world is rebuilt for another value, too, but with the same kernels.
+    device: the attribute with the knob's field. Kernels read the setting by the knob's name; None where they do not read it.
     """
 
     def __init__(
@@ -58,15 +58,15 @@ class Knob:
 
 
 def record_arguments(kind: Any) -> None:
-    """Have a class, as it is made, keep the arguments of its __init__, by name, as they were when an object was made."""
+    """Make a class keep the arguments of its __init__, by name, as they were when an object was made. Called per class."""
     live = tuple(name for name, value in vars(kind).items() if isinstance(value, Knob))
-    kind.host_only = (*vars(kind).get("host_only", ()), *live)  # what kernels have of them is compiled()
+    kind.host_only = (*vars(kind).get("host_only", ()), *live)  # kernels contain only the values in compiled()
     if "__init__" in vars(kind):
         kind.__init__ = _recording(kind.__init__)
 
 
 def set_attribute(thing: Any, name: str, value: Any) -> None:
-    """The __setattr__ of what records its arguments: once it is made, only knobs and what a world keeps in it can be set."""
+    """The __setattr__ of classes that record arguments. After __init__, it sets only knobs and attributes that a world keeps."""
     if name.startswith("_") or name in thing.kept_by_world or isinstance(getattr(type(thing), name, None), Knob):
         object.__setattr__(thing, name, value)
     elif "arguments" in thing.__dict__:
@@ -82,12 +82,12 @@ def keep(thing: Any, **values: Any) -> None:
 
 
 def refuse_deletion(thing: Any, name: str) -> None:
-    """The __delattr__ of what records its arguments."""
+    """The __delattr__ of classes that record arguments."""
     raise AttributeError(f"{thing!r}.{name} cannot be deleted.")
 
 
 def _refused(thing: Any, name: str) -> str:
-    """Why an attribute cannot be set, and what to do instead."""
+    """Return why an attribute cannot be set, and what to do instead."""
     kind = type(thing)
     live, given = knobs_of(kind), [*inspect.signature(kind).parameters]
     can = f"Live are {', '.join(live)}" if live else "Nothing of it is live"
@@ -101,12 +101,12 @@ def _refused(thing: Any, name: str) -> str:
 
 @functools.cache
 def knobs_of(kind: type) -> tuple[str, ...]:
-    """The names of the live settings of a class."""
+    """Return the names of the live settings of a class."""
     return tuple(name for name in dir(kind) if isinstance(getattr(kind, name, None), Knob))
 
 
 def meant(name: str, names: Iterable[str]) -> str:
-    """A guess at what a misspelt name was to be, as the end of a sentence; empty if nothing is near."""
+    """Guess which name a misspelt one meant, as the end of a sentence; empty if no name is similar."""
     near = difflib.get_close_matches(name, [*names], 1)
     return f"; did you mean {near[0]!r}?" if near else ""
 
@@ -116,20 +116,20 @@ def _recording(init):
 
     @functools.wraps(init)
     def recorded(self, *args, **kwargs):
-        """The same __init__, which keeps its arguments."""
+        """Run the original __init__, and keep its arguments."""
         for name in (kwargs.keys() - signature.parameters.keys()) & TAKEN_BY.keys():
             raise TypeError(f"{type(self).__name__}: there is no {name}. {TAKEN_BY[name]} take it.")
         args, kwargs = _frozen(args), _frozen(kwargs)
         init(self, *args, **kwargs)
-        if type(self).__init__ is recorded:  # and not that of a base class, whose subclass is not done yet
+        if type(self).__init__ is recorded:  # not in the __init__ of a base class, called by a subclass
             self.arguments = dict(list(signature.bind(self, *args, **kwargs).arguments.items())[1:])
 
     return recorded
 
 
 def _frozen(value: Any) -> Any:
-    """The same value, safe from what its owner does with it later; what can be read only once is read."""
-    if type(value) in (int, float, str):  # most of what long lists hold
+    """Copy a value so that later changes by its owner have no effect; iterators are read into lists."""
+    if type(value) in (int, float, str):  # fast path: most items of long lists
         return value
     if isinstance(value, np.ndarray):
         if value.flags.writeable or value.base is not None:

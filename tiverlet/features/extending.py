@@ -1,4 +1,4 @@
-"""How a feature takes more constraints, or bodies, behind its own."""
+"""Appending constraints or bodies to a feature."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -9,8 +9,11 @@ if TYPE_CHECKING:
 
 
 def extended(feature: Any, more: Any, start: "Particles", now: "Particles", box: Any) -> "Particles":
-    """Give a feature that is not bound more constraints, which start now. Returns where it started: for what it had, when that
-    came; for other particles, now."""
+    """Append to an unbound feature more constraints, which start now.
+
+    Returns the particles by which the extended feature starts. Those of its own constraints are where they were when the feature
+    was added; all others are where they are now.
+    """
     more.periodic, more.start = box, now
     inv_mass = now.inv_mass.copy()
     more.prepare(now, inv_mass)

@@ -1,4 +1,4 @@
-"""How loads at rest become known: what was missing of them over a window is learnt, where it is steady."""
+"""How known loads are learnt: from the load that was missing over a window of substeps, if it is steady."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -7,15 +7,15 @@ from ..device import ti
 if TYPE_CHECKING:
     from .feature import Acceleration, Scene
 
-STEADY = 0.2  # of itself: by how much what is missing may differ from one window to the next
-GAIN = 0.8  # of what is missing is learnt at once, where little is borne
-LAG = 64  # substeps that it takes, at least, to learn a load
+STEADY = 0.2  # relative difference of the missing load between two windows, at most
+GAIN = 0.8  # largest share of the missing load that is learnt at once
+LAG = 64  # least number of substeps in which a load is learnt
 
 
 class OwnWeight:
-    """What forces accelerate each particle by, but for loads that are known: field, (n,) [m/s^2], as windows end.
+    """The acceleration of each particle by forces other than known loads, at the end of a window: field, (n,) [m/s^2].
 
-    Loads are compared with it: one that gives a particle k times of it is borne by k particles.
+    Loads are compared with it: a load of k times a particle's own weight is that of k particles.
     """
 
     def __init__(self, scene: "Scene"):
@@ -23,12 +23,12 @@ class OwnWeight:
         self.field = scene.memory.field("own_weight", scene.count, state=True)
 
     def follow(self, integrator: Any, loads: "list[Acceleration]") -> None:
-        """integrator: knows what accelerates particles. loads: of these, those that are known."""
+        """Set the integrator, which has all accelerations, and the known loads among them."""
         self.integrator, self.forces, self.loads = integrator, integrator.forces, loads
 
     @ti.func
     def weigh(self, i, now):
-        """Note that of particle i."""
+        """Store the own weight of particle i."""
         x, v = self.state.place(i), self.state.d[i] / now.h
         a = self.forces.accelerate(i, x, v, now.time, self.forces.pull(now.time))
         for f in ti.static(self.loads):
@@ -38,15 +38,16 @@ class OwnWeight:
 
 @ti.func
 def steady(mean, earlier):
-    """Whether what was missing is what was missing in the window before."""
+    """Whether the missing load equals that of the window before, within STEADY."""
     return ti.abs(mean - earlier) < STEADY * ti.abs(mean)
 
 
 @ti.func
 def gain(own, slow, window):
-    """The share of what is missing that is learnt at the end of a window, of so many substeps.
+    """Return the share of the missing load that is learnt at the end of a window of so many substeps.
 
-    Integral control must be slower than the slowest sound of what hangs together decays, which is in proportion to k^2 substeps
-    where k particles are borne: to learn takes LAG + slow / own, of numbers in proportion to k^2 and 1.
+    Integral control must be slower than the decay of the slowest sound of the connected particles. This decay takes a number of
+    substeps in proportion to k^2, for the load of k particles. So learning takes LAG + slow / own substeps. slow is in proportion
+    to k^2, own to 1.
     """
     return ti.min(window * own / (LAG * own + slow), GAIN)

@@ -1,4 +1,4 @@
-"""Friction and restitution: what users give, checked, and as tables for kernels."""
+"""Friction and restitution: checked arguments, and tables for kernels."""
 
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Coefficients(NamedTuple):
-    """Of Coulomb friction: static and dynamic; and of the resistance to rolling and to twisting, see Contact."""
+    """Coefficients of static and dynamic Coulomb friction, and of the resistance to rolling and to twisting, see Contact."""
 
     static: float
     dynamic: float
@@ -23,14 +23,14 @@ class Coefficients(NamedTuple):
 
 
 class Bounce(NamedTuple):
-    """Coefficients of restitution along the normal, and across it of what spins."""
+    """Coefficients of restitution along the normal, and, for spinning particles, tangential to it."""
 
     normal: float
     tangential: float = 0.0
 
 
 def friction_of(who: str, name: str, value: Any) -> Coefficients:
-    """A coefficient of Coulomb friction, or (static, dynamic), with rolling and twisting behind them or not."""
+    """Check a friction coefficient: a number, (static, dynamic), or these with rolling and twisting behind them."""
     given = value if isinstance(value, (tuple, list)) else (value, value)
     if not 2 <= len(given) <= 4:
         raise ValueError(
@@ -45,7 +45,7 @@ def friction_of(who: str, name: str, value: Any) -> Coefficients:
 
 
 def restitution_of(who: str, name: str, value: Any) -> Bounce:
-    """A coefficient of restitution, 0 (inelastic) to 1 (elastic), or (normal, tangential)."""
+    """Check a coefficient of restitution, 0 (inelastic) to 1 (elastic), or (normal, tangential)."""
     given = value if isinstance(value, (tuple, list)) else (value, 0.0)
     if len(given) != 2:
         raise ValueError(f"{who}: {name} = {value!r}, but a number or (normal, tangential) is needed.")
@@ -54,12 +54,12 @@ def restitution_of(who: str, name: str, value: Any) -> Bounce:
 
 
 def as_given(value: Any) -> Any:
-    """A number or a tuple of numbers that was checked, as the user is to see it."""
+    """Return a checked number or tuple of numbers as floats, in the form shown to the user."""
     return tuple(float(v) for v in value) if isinstance(value, (tuple, list)) else float(value)
 
 
 def refuse_turning(who: str) -> None:
-    """Raise: particles that do not spin have no use for what resists or reverses it."""
+    """Raise ValueError: particles that do not spin take no rolling resistance and no tangential restitution."""
     raise ValueError(
         f"{who}: resistance to rolling and tangential restitution are for particles that spin. Leave them out, or give "
         "tv.Particles a spin."
@@ -68,24 +68,26 @@ def refuse_turning(who: str) -> None:
 
 @ti.func
 def limited(v, most, length):
-    """A vector that is no longer than `most`; else it in this length: what friction can take back of a slip v."""
+    """Return a vector v, shortened to `length` if it is longer than `most`: the part of a slip v that friction takes back."""
     size = v.norm()
     if size > most:
         v *= length / size
     return v
 
 
-MOST = 1000  # groups of particles that are told apart
-TOUCHES, SENSES, SENSED = 1, 2, 3  # what a particle of a group does with one of another: push it, note it, be noted by it
+MOST = 1000  # groups of particles that the table can distinguish
+TOUCHES, SENSES, SENSED = 1, 2, 3  # a particle of the one group pushes that of the other, senses it, is sensed by it
 
 
 class Table:
-    """For each pair of groups: static friction, dynamic friction, restitution, whether they touch; and of what spins (`turns`)
-    the resistance to rolling, to twisting, and the tangential restitution. One row where `uniform`.
+    """A table of contact coefficients by pairs of groups.
+
+    Columns: static friction, dynamic friction, restitution, whether the groups touch; for spinning particles (`turns`) also the
+    resistance to rolling and to twisting, and the tangential restitution. One row where `uniform`.
 
     friction, restitution: one value for all, or a mapping from pairs of groups to values, with 0 for pairs that are not in it.
-    touching: None for all, or the pairs of groups that touch. sensing: the pairs of groups of which the second notes what of the
-    first it overlaps, and does not push; they do not touch.
+    touching: the pairs of groups that touch; None for all. sensing: pairs of groups (a, b): b records overlap with a, without
+    pushing; they do not touch.
     """
 
     kernels_read = ("uniform", "has_friction", "has_restitution", "turns", "senses", "groups", "rank", "entries")
@@ -113,8 +115,8 @@ class Table:
         self.has_friction = any(v.static > 0 for v in rub) or self.turns
 
     def pushing(self, group: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-        """Which pairs (m, 2) of particles of these groups push each other, (m,)."""
-        if not self.senses:
+        """Return which pairs (m, 2) of particles of these groups push each other, (m,)."""
+        if not self.senses and self.touching is None:
             return np.ones(len(pairs), dtype=bool)
         rank, table = self.rows(group)
         m = rank.max() + 1
@@ -122,17 +124,19 @@ class Table:
 
     @property
     def named(self) -> frozenset[int]:
-        """The groups that are named."""
+        """The groups that the arguments name."""
         given = [v for v in (self.friction, self.restitution) if isinstance(v, Mapping)]
         return frozenset(k for pairs in (*given, self.touching or (), self.sensing) for pair in pairs for k in pair)
 
     def rows(self, group: np.ndarray, also: frozenset[int] = frozenset()) -> tuple[np.ndarray, np.ndarray]:
-        """The rank of each particle's group, (n,), and the table, (ranks * ranks, 7). also: groups to tell apart beside those
-        that are named."""
+        """Return the rank of each particle's group, (n,), and the table, (ranks * ranks, 7).
+
+        also: groups to distinguish in addition to those that are named.
+        """
         named = self.named | also
         names, which, _ = distinct(group)
         at = {int(name): k for k, name in enumerate(name for name in names if name in named)}
-        m = len(at) + (len(at) < len(names))  # all others are one
+        m = len(at) + (len(at) < len(names))  # all other groups share one rank
         if m > MOST:
             raise ValueError(f"{self.who}: {len(at)} groups of particles are named, but there can be {MOST}.")
         rank = np.array([at.get(int(name), len(at)) for name in names], dtype=np.int64)[which]
@@ -158,11 +162,11 @@ class Table:
         return rank, table.reshape(m * m, 7)
 
     def make_room(self, has_friction: bool, has_restitution: bool, turns: bool) -> None:
-        """Have columns for what kernels ask for, though all of it may be 0."""
+        """Set which columns exist, even where all values are 0."""
         self.has_friction, self.has_restitution, self.turns = has_friction, has_restitution, turns
 
     def bind(self, scene: "Scene", asked: bool = False) -> None:
-        """Declare the table and the groups, where they differ. asked: of() is asked even where all rows are 0."""
+        """Declare the table, and the groups where they differ. asked: whether of() is called even where all rows are 0."""
         rank, rows = self.rows(scene.particles.group)
         self.groups = int(rank.max(initial=0)) + 1
         if self.uniform:
@@ -170,28 +174,31 @@ class Table:
         else:
             self.rank = scene.memory.field("Contact.group", scene.count, kind=ti.i32, values=rank)
         if self.has_friction or self.has_restitution or not self.uniform or asked:
-            self.width = 7 if self.turns else 4  # of a row on the device
+            self.width = 7 if self.turns else 4  # columns on the device
             self.entries = scene.memory.field("Contact.table", len(rows), width=self.width, values=rows[:, : self.width])
 
     def can_be(self, before: np.ndarray, now: np.ndarray) -> bool:
-        """Whether the rows for particles of the groups before are those for the groups now."""
+        """Whether particles of the groups `now` have the same table as those of the groups `before`."""
         return self.uniform or np.array_equal(self.rows(before)[1], self.rows(now)[1])
 
     def regroup(self, scene: "Scene", group: np.ndarray) -> None:
-        """Particles have these groups now, as can_be() says."""
+        """Write the groups of the present particles, for which can_be() is true."""
         if not self.uniform:
             scene.memory.write(self.rank, self.rows(group)[0])
 
     def upload(self, scene: "Scene", other: "Table") -> None:
-        """Write the values of another table, which names no other groups, for the same kernels."""
+        """Write the values of another table that names no other groups, for the same kernels."""
         if "entries" in vars(self):
             rows = other.rows(scene.particles.group, self.named)[1][: 1 if self.uniform else None]
             scene.memory.write(self.entries, rows[:, : self.width])
 
     @ti.func
     def of(self, i, j):
-        """Static friction, dynamic friction and restitution of particles i and j, and TOUCHES, SENSES or SENSED, or 0; and where
-        it `turns` the resistance to rolling, to twisting, and the tangential restitution."""
+        """Return the row of particles i and j.
+
+        It has static friction, dynamic friction and restitution, and TOUCHES, SENSES or SENSED, or 0. With `turns` also the
+        resistance to rolling, to twisting, and the tangential restitution.
+        """
         row = 0
         if ti.static(not self.uniform):
             row = self.rank[i] * self.groups + self.rank[j]
@@ -199,18 +206,20 @@ class Table:
 
     @ti.func
     def held(self, i, j, n, normal, slip):
-        """The part of a slip [m] of particles i and j that friction takes back, for a normal displacement along n [m]: up to
-        friction times that (Cundall and Strack 1979)."""
+        """Return the part of a slip [m] of particles i and j that friction takes back, for a normal displacement along n [m].
+
+        It is at most friction times that displacement (Cundall and Strack 1979).
+        """
         s, row = slip - slip.dot(n) * n, self.of(i, j)
         return limited(s, row[0] * normal, row[1] * normal)
 
     @inline
     def reach(self, radius, i, j):
-        """How far from each other particles i and j may touch."""
+        """Return the distance up to which particles i and j touch [m]."""
         return radius.of(i) + radius.of(j)
 
     def _pairs(self, name: str, pairs: list) -> list[tuple[int, int]]:
-        """Pairs of groups, checked; where there are thousands, one by one takes ten times as long."""
+        """Check pairs of groups. Thousands of plain pairs are checked at once, ten times as fast as one by one."""
         if {*map(type, pairs)} == {tuple} and {*map(len, pairs)} == {2} and {type(k) for pair in pairs for k in pair} == {int}:
             return pairs
         return [self._pair(name, pair) for pair in pairs]

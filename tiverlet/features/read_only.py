@@ -1,4 +1,4 @@
-"""Arrays and mappings that are handed out: they can be read like any other, and say what to do when they are written to."""
+"""Read-only arrays and mappings for users: they read like any other, and their errors say what to do instead of writing."""
 
 from collections.abc import Mapping
 from functools import cache
@@ -8,7 +8,7 @@ import numpy as np
 
 
 class ReadOnly(np.ndarray):
-    """A read-only array. Copies and results of arithmetic are plain arrays; `a += b` makes a new one, so x.a += b assigns it."""
+    """A read-only array. Copies and results of arithmetic are plain arrays. `a += b` makes a new one, so x.a += b assigns it."""
 
     advice = "This array is read-only."
 
@@ -25,14 +25,17 @@ class ReadOnly(np.ndarray):
         super().__setitem__(key, value)
 
     def __dlpack__(self, **options):
-        """For PyTorch, JAX and others, without a copy. Most know no read-only arrays, and take none that says it is one."""
+        """Export to PyTorch, JAX and others without a copy.
+
+        Most of them accept no array that is marked as read-only, so the mark is dropped where the memory below is writable.
+        """
         plain = np.asarray(self).view()
         if isinstance(self.base, np.ndarray) and self.base.flags.writeable:
             plain.flags.writeable = True
         return plain.__dlpack__(**options)
 
     def copy(self, order="C") -> np.ndarray:
-        """A plain array."""
+        """Return a plain array."""
         return np.array(self, order=order)
 
     def __iadd__(self, other):
@@ -55,7 +58,7 @@ class ReadOnly(np.ndarray):
 
 
 def read_only(array: np.ndarray, advice: str) -> ReadOnly:
-    """The same numbers, which nobody can write to. advice: what to do instead, for the error."""
+    """Return a read-only view of an array. advice: what to do instead of writing, for the error."""
     out = array.view(ReadOnly)
     out.advice = advice
     out.setflags(write=False)
@@ -63,7 +66,7 @@ def read_only(array: np.ndarray, advice: str) -> ReadOnly:
 
 
 class ReadOnlyMapping(Mapping):
-    """A mapping that nobody can write to."""
+    """A mapping that cannot be written to."""
 
     def __init__(self, values: Mapping, advice: str):
         self._values, self._advice = dict(values), advice
@@ -85,7 +88,7 @@ class ReadOnlyMapping(Mapping):
 
 
 def handed_out(value: Any, advice: str) -> Any:
-    """The same, read-only if it is an array or a mapping."""
+    """Return a value, read-only if it is an array or a mapping."""
     if isinstance(value, np.ndarray):
         return read_only(value, advice)
     if isinstance(value, Mapping):
@@ -95,7 +98,7 @@ def handed_out(value: Any, advice: str) -> Any:
 
 @cache
 def assign_whole(owner: str, name: str) -> str:
-    """Advice for an array that is live as a whole."""
+    """Return the advice for an array that is live as a whole."""
     return (
         f"{owner}.{name} is read-only, because a world does not notice when a part of it changes. Assign the whole: "
         f"new = {owner.lower()}.{name}.copy(); new[...] = ...; {owner.lower()}.{name} = new."
@@ -104,5 +107,5 @@ def assign_whole(owner: str, name: str) -> str:
 
 @cache
 def structure(owner: str, name: str) -> str:
-    """Advice for an array that is not live."""
+    """Return the advice for an array that is not live."""
     return f"{owner}.{name} is read-only: it is structure, fixed when {owner} is made."

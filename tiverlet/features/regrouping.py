@@ -1,4 +1,4 @@
-"""Which particles come and go, for what stays where it is meanwhile: see step/edit_in_place.py."""
+"""Which particles are added and removed, for data that is edited in place: see step/edit_in_place.py."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,9 +13,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Regrouping:
-    """Particles in the mask `some`, (n,), stay, in order, and behind them come others. number: their new numbers, -1 for those
-    that go. before, now: all particles, as they were when the world was built, and as and where they are. inv_mass: of those
-    that there are now, after pins. more: features, and others whose bodies they take behind their own."""
+    """A change of the particles: those in the mask `some`, (n,), stay, in order; added ones come after them.
+
+    number: new numbers of the old particles, -1 if removed. before: the particles as they were when the world was built. now: all
+    particles after the change, at their present positions. inv_mass: of the particles in `now`, after pins. more: a mapping from
+    features to others whose bodies they append.
+    """
 
     some: np.ndarray
     number: np.ndarray
@@ -26,25 +29,25 @@ class Regrouping:
 
     @cached_property
     def first(self) -> int:
-        """The first particle that goes; those before it keep their numbers."""
+        """The first removed particle; particles before it keep their numbers."""
         return int(np.argmin(self.some)) if self.goes else len(self.some)
 
     @cached_property
     def kept(self) -> int:
-        """How many stay; from this number on particles are new."""
+        """The number of particles that stay; from this number on particles are new."""
         return int(np.count_nonzero(self.some))
 
     @cached_property
     def stay(self) -> np.ndarray:
-        """Those that stay, by their old numbers. NumPy takes rows by numbers ten times as fast as by a mask."""
+        """The old numbers of the particles that stay. NumPy takes rows by numbers ten times as fast as by a mask."""
         return np.flatnonzero(self.some)
 
     def joined(self, rows: np.ndarray, added: np.ndarray | None) -> np.ndarray:
-        """Of rows for all that there were, those of what stays, and behind them the added ones."""
+        """Return the rows of the particles that stay, out of rows for all old ones, and the added rows behind them."""
         left = np.asarray(rows).take(self.stay, axis=0) if self.goes else np.asarray(rows)
         return left if added is None else np.concatenate([left, added])
 
     @property
     def goes(self) -> bool:
-        """Whether any goes."""
+        """Whether any particle is removed."""
         return self.kept < len(self.some)

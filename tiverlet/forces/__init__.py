@@ -1,4 +1,4 @@
-"""What accelerates particles one by one."""
+"""Forces that accelerate single particles, and forces between pairs."""
 
 from .attractor import Attractor
 from .drag import Drag

@@ -1,4 +1,4 @@
-"""A point that attracts."""
+"""A point that attracts particles."""
 
 from typing import Any
 
@@ -11,11 +11,13 @@ from ..particles import Particles
 
 
 class Attractor(Acceleration):
-    """a = -strength r / (r^2 + softening^2)^(3/2), r = x - center: a point of gravity (strength = G M); negative strength repels.
+    """The gravity of a point mass: a = -strength r / (r^2 + softening^2)^(3/2), r = x - center.
 
-    center: (dim,) [m]; strength: [m^3/s^2]; softening: the radius of a Plummer sphere (1911) in place of the point [m]. All live.
-    What falls into a point without softening has no bounded acceleration, and no substep resolves it; at the center itself it is
-    taken as 0. Elsewhere the step resolves an orbit of angular velocity omega while omega h is well below 1.
+    center: (dim,) [m]. strength: G M [m^3/s^2]; a negative strength repels. softening: the radius [m] of a Plummer sphere (1911)
+    in place of the point. All are live.
+
+    Without softening the acceleration grows without bound towards the center, and no substep resolves a fall into it. At the
+    center itself it is 0. Elsewhere the step resolves an orbit of angular velocity omega while omega h is well below 1.
     """
 
     for_all = True
@@ -31,17 +33,17 @@ class Attractor(Acceleration):
         self.softening = softening
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check the vector's length."""
+        """Check the length of `center`."""
         self._keep(dim=particles.dim)
         self.center = self.center
 
     def settings(self) -> dict[str, Any]:
-        """All."""
+        """Return center, strength and softening, for kernels."""
         return {"center": self.center, "strength": self.strength, "softening": self.softening}
 
     @ti.func
     def acceleration(self, i, x, v, t):
-        """-strength r / (r^2 + softening^2)^(3/2)."""
+        """Return -strength r / (r^2 + softening^2)^(3/2) [m/s^2]."""
         r = x - self.dev.center[None]
         rr = r.dot(r) + self.dev.softening[None] * self.dev.softening[None]
         out = 0 * r
@@ -51,7 +53,7 @@ class Attractor(Acceleration):
 
     @ti.func
     def potential(self, i, x):
-        """-strength / sqrt(r^2 + softening^2)."""
+        """Return -strength / sqrt(r^2 + softening^2) [J/kg]."""
         r = x - self.dev.center[None]
         rr = r.dot(r) + self.dev.softening[None] * self.dev.softening[None]
         out = 0 * rr

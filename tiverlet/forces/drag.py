@@ -5,11 +5,11 @@ from ..features.feature import Acceleration, Knob
 
 
 class Drag(Acceleration):
-    """a = -rate v, solved exactly: in a time t without other forces, v falls by the factor exp(-rate t), whatever the step.
+    """Linear drag, a = -rate v. It is exact: in a time t without other forces, v falls by the factor exp(-rate t) for any step.
 
     rate: [1/s], at least 0. Live: assign to .rate between frames.
 
-    With a constant acceleration a beside it, the displacements obey d' = exp(-z) d + h^2 a (1 - exp(-z)) / z, z = rate h.
+    With a constant acceleration a of other forces, the displacements obey d' = exp(-z) d + h^2 a (1 - exp(-z)) / z, z = rate h.
     """
 
     for_all = True

@@ -13,11 +13,11 @@ from ..particles import Particles
 
 
 class Force(Acceleration):
-    """F = function(x), function(x, v), function(x, v, t) or function(x, v, t, i): the user's own force in newtons.
+    """The user's own force [N]: function(x), function(x, v), function(x, v, t) or function(x, v, t, i).
 
-    function: a ti.func that takes position [m], velocity [m/s], time [s] and index of one particle, as many of these as
-    it names, and returns a vector [N]. Its literals have the world's precision. Numbers that it reads from Python are frozen when
-    the world is first stepped; put what changes into a Taichi field, or into t.
+    function: a ti.func of position [m], velocity [m/s], time [s] and index of one particle. It takes as many of these as it
+    names, and returns a vector [N]. Its literals have the world's precision. Numbers that it reads from Python are frozen when
+    the world is first stepped; put changing numbers into a Taichi field, or compute them from t.
 
         @ti.func
         def spring(x):
@@ -25,10 +25,12 @@ class Force(Acceleration):
 
         world = tv.World(particles, [tv.Force(spring)])
 
-    Position Verlet is second order in h as long as h times the force's fastest frequency stays below 2, and diverges beyond;
-    the step then flags "stiff-force" and says how many substeps resolve it. When the function takes v, v is solved for together
-    with the force, which calls it five times a substep in 2D, six times in 3D, and takes one more field: what turns v keeps the
-    speed, what brakes does not overshoot, whatever h is, see tiverlet/forces/README.md.
+    Position Verlet is second order in h as long as h times the force's fastest frequency stays below 2, and diverges beyond. The
+    step then flags "stiff-force" and says how many substeps resolve it.
+
+    If the function takes v, v is solved for together with the force. This calls the function five times a substep in 2D, six
+    times in 3D, and takes one more field. A force that turns v keeps the speed, and a force that brakes does not overshoot,
+    whatever h is, see tiverlet/forces/README.md.
     """
 
     for_all = True
@@ -39,21 +41,21 @@ class Force(Acceleration):
         self.uses_velocity = self.arity >= 2
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Nothing to check before the function is compiled."""
+        """Do nothing: the function is checked when it is compiled."""
 
     def bind(self, scene: Scene) -> None:
-        """No field of its own."""
+        """Store the scene. The force has no field of its own."""
         self.scene = scene
         self.dev.w, self.dev.dim = scene.state.w, scene.particles.dim
 
     @inline
     def force(self, value):
-        """What the function returned, if it is a vector; as a number it would be added to all components."""
+        """Return the value of the function if it is a vector. A number would be added to all components."""
         return check_vector("Force", undecorated(self.function).__name__, value, self.dev.dim)
 
     @ti.func
     def acceleration(self, i, x, v, t):
-        """F / m."""
+        """Return F / m [m/s^2]."""
         out = 0 * x
         if ti.static(self.arity == 1):
             out = self.force(self.function(x))
@@ -67,7 +69,7 @@ class Force(Acceleration):
 
 
 def check_function(who: str, name: str, function: Any, takes: tuple[str, ...], counts: tuple[int, ...]) -> int:
-    """How many arguments a ti.func of the user's takes, which must be one of `counts`, of those in `takes`."""
+    """Return how many of the arguments in `takes` a ti.func of the user takes. It must be one of `counts`."""
     if not is_kernel_function(function):
         raise TypeError(
             f"{who}: {name} = {function!r} is not a Taichi function. Put the decorator @ti.func above its def "
@@ -87,7 +89,7 @@ def check_function(who: str, name: str, function: Any, takes: tuple[str, ...], c
 
 
 def check_vector(who: str, name: str, value: Any, dim: int) -> Any:
-    """What a function returned, if it is a vector; as a number it would be added to all components."""
+    """Return the value of a function if it is a vector, else refuse it. A number would be added to all components."""
     known = isinstance(value, Expression)
     shape = (tuple(value.get_shape()) if value.is_tensor() else ()) if known else np.shape(value)
     if shape != (dim,):

@@ -18,7 +18,7 @@ def _vector(feature: "Gravity", g):
 
 
 class Gravity(Acceleration):
-    """a = g, the same for every particle. Position Verlet follows the parabola exactly, whatever the step.
+    """Uniform gravity: a = g for every particle. Position Verlet follows the parabola exactly, for any step.
 
     g: a number [m/s^2] along -y, or a vector (dim,). Live: assign to .g between frames.
     """
@@ -33,21 +33,21 @@ class Gravity(Acceleration):
         self.g = g
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check the vector's length."""
+        """Check the length of g, if it is a vector."""
         self._keep(dim=particles.dim)
         self.g = self.g
 
     def settings(self) -> dict[str, Any]:
-        """g as a vector."""
+        """Return g as a vector, for kernels."""
         g = np.asarray(self.g, dtype=np.float64)
         return {"g": (g if g.ndim else g * [0.0, -1.0, 0.0][: self.dim]).tolist()}
 
     @ti.func
     def acceleration(self, i, x, v, t):
-        """g."""
+        """Return g [m/s^2]."""
         return self.dev.g[None]
 
     @ti.func
     def potential(self, i, x):
-        """-g . x."""
+        """Return -g . x [J/kg]."""
         return -self.dev.g[None].dot(x)

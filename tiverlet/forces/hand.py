@@ -1,4 +1,4 @@
-"""A hand that draws one particle, whichever it is now."""
+"""A hand that draws one particle to a target, such as a mouse. The particle can be changed at any time."""
 
 from typing import Any
 
@@ -27,14 +27,15 @@ def _target(hand: "Hand", value) -> np.ndarray:
 
 
 class Hand(Acceleration):
-    """a = -rate^2 (x - target) - 2 rate v, of one particle: a hand, a mouse, which may take another particle at any time.
+    """A hand or mouse that draws one particle to a target: a = -rate^2 (x - target) - 2 rate v.
 
-    It is a critically damped spring, so the particle comes to a target at rest without swinging, in a few times 1 / rate,
-    whatever its mass; where others hang on it, they weigh it down. A Pin with compliance holds many, but always the same ones.
+    The hand is a critically damped spring. So the particle comes to a fixed target without oscillation in a few times 1 / rate,
+    whatever its mass. Particles that hang on it weigh it down. The hand can take another particle at any time; a Pin with
+    compliance holds many particles, but always the same ones.
 
-    target: (dim,) [m], which jumps as a frame begins, where that of a Pin glides; in a periodic box its nearest image. particle:
-    its number, -1 for none. rate: [1/s], at least 0; the step resolves it while h times the rate is well below 1, and is stable
-    below 2. All live: assign between frames, at no compile cost. A particle that is pinned stays where it is.
+    target: (dim,) [m]. It jumps at the start of a frame, where the target of a Pin glides. In a periodic box its nearest image
+    counts. particle: the index, -1 for none. rate: [1/s], at least 0; the step resolves it while h times the rate is well below
+    1, and is stable below 2. All are live: assign between frames, without compiling. A pinned particle stays where it is.
     """
 
     uses_velocity = True
@@ -48,31 +49,31 @@ class Hand(Acceleration):
         self.target, self.particle, self.rate = target, particle, rate
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check the vector's length and the particle."""
+        """Check the length of the target, and the particle."""
         self._keep(dim=particles.dim, _count=len(particles))
         self.target, self.particle = self.target, self.particle
 
     def remap_indices(self, number: np.ndarray, count: int) -> None:
-        """Go on with the same particle; let go of one that goes."""
+        """Take new particle indices. A removed particle (-1) is let go."""
         self._keep(_count=count)
         if self.particle >= 0:
             self.particle = int(number[self.particle])
 
     def can_regroup(self, change: Regrouping) -> bool:
-        """Always: it holds one particle, by its number."""
+        """Whether particles can come and go in place: always, because only the index of one particle is stored."""
         return True
 
     def regroup(self, change: Regrouping) -> None:
-        """Write its new number."""
+        """Write the new index of the particle to the device."""
         self.remap_indices(change.number, change.now.count)
         self.upload()
 
     def settings(self) -> dict[str, Any]:
-        """Which particle, where to, how fast."""
+        """Return particle, target and rate, for kernels."""
         return {"particle": self.particle, "target": self.target, "rate": self.rate}
 
     def bind(self, scene: Scene) -> None:
-        """The state, for images of the target."""
+        """Declare the fields, and store the state, which gives the nearest image of the target."""
         super().bind(scene)
         self.dev.state = scene.state
 
@@ -82,12 +83,12 @@ class Hand(Acceleration):
 
     @ti.func
     def acts_on(self, i):
-        """One particle."""
+        """Whether i is the particle of the hand."""
         return i == self.dev.particle[None]
 
     @ti.func
     def acceleration(self, i, x, v, t):
-        """-rate^2 (x - target) - 2 rate v."""
+        """Return -rate^2 (x - target) - 2 rate v for the particle of the hand, 0 for others [m/s^2]."""
         out, rate = 0 * x, self.dev.rate[None]
         if self.acts_on(i):
             out = -rate * (rate * self.dev.state.nearest(x - self.dev.target[None]) + 2 * v)
@@ -95,7 +96,7 @@ class Hand(Acceleration):
 
     @ti.func
     def potential(self, i, x):
-        """rate^2 |x - target|^2 / 2."""
+        """Return rate^2 |x - target|^2 / 2 for the particle of the hand, 0 for others [J/kg]."""
         out, r = 0 * x[0], self.dev.state.nearest(x - self.dev.target[None])
         if self.acts_on(i):
             out = self.dev.rate[None] ** 2 * r.dot(r) / 2

@@ -14,12 +14,12 @@ from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from .force import check_function, check_vector
 
-ROOM = (8, 40)  # listed neighbours of a particle for which there is room at first, in 2D and 3D; lists grow
-SKIN = 0.15  # of the radius, how far beyond it pairs are listed
+ROOM = (8, 40)  # initial room for listed neighbours per particle, in 2D and 3D; lists grow
+SKIN = 0.15  # skin of the neighbour list, relative to the radius
 
 
 class Cutoff:
-    """Which pairs are listed: those closer than a radius, whatever they are."""
+    """The table that selects pairs for the neighbour search: all pairs closer than a radius."""
 
     uniform = True
     radius: Any = OnDevice()
@@ -29,18 +29,19 @@ class Cutoff:
 
     @inline
     def reach(self, radius, i, j):
-        """How far from each other particles i and j may act."""
+        """Return the distance up to which particles i and j act on each other [m]."""
         return self.radius
 
 
 class PairForce(Acceleration):
-    """F = function(r) or function(r, i, j): the user's own force between each two particles [N], such as charges or gravity.
+    """The user's own force between pairs of particles [N], such as charges or gravity: function(r) or function(r, i, j).
 
-    function: a ti.func of r = x_i - x_j [m], and, if it names them, of the two indices, i < j; it returns the force on i as a
-    vector [N]. The force on j is the opposite one, to the last bit, so momentum is kept whatever the function is.
+    function: a ti.func of r = x_i - x_j [m], and, if it names them, of the two indices, i < j. It returns the force on i as a
+    vector [N]. The force on j is the opposite one, bit for bit, so momentum is conserved whatever the function is.
+    radius: only pairs closer than this [m] act. A neighbour list finds them; it is rebuilt when a particle has moved by half of
+    its skin. None for all pairs, which takes time as n^2.
     potential: a ti.func of the same arguments that returns the energy of the pair [J], 0 where the force ends, for the energy in
-    reports; None leaves it out of them. radius: only pairs closer than this act [m], found by a neighbour list that is built
-    anew when a particle has moved by half of its skin; None for all pairs, which takes time as n^2.
+    reports. None leaves it out of them.
 
         @ti.func
         def repel(r, i, j):
@@ -48,16 +49,17 @@ class PairForce(Acceleration):
 
         world = tv.World(particles, [tv.PairForce(repel)])
 
-    It acts on present positions, whichever particles are linked or touch. Particles in the same place do not act on each other,
-    nor do two that cannot move. Sums go by index, so they have the same bits on any threads. Numbers that the function reads
-    from Python are frozen when the world is first stepped; put what changes into a Taichi field.
+    The force acts at present positions, also between particles that are linked or touch. Particles in the same place do not act
+    on each other, nor do two particles that cannot move. Sums are in the order of indices, so they have the same bits on any
+    number of threads. Numbers that the function reads from Python are frozen when the world is first stepped; put changing
+    numbers into a Taichi field.
 
-    Position Verlet is second order in h while h times the fastest frequency of the motion stays below 2, and diverges beyond;
-    the step then flags "stiff-force". A force that does not end at the radius, but jumps there, makes energy drift.
+    Position Verlet is second order in h while h times the fastest frequency of the motion stays below 2, and diverges beyond. The
+    step then flags "stiff-force". A force that is not 0 at the radius jumps there, and makes energy drift.
     """
 
     pairwise = True
-    uniform = True  # it has a measure of stiffness of its own
+    uniform = True  # stiffness() measures its stiffness instead
     host_only = ("radius",)
 
     def __init__(self, function, radius: float | None = None, *, potential=None):
@@ -72,14 +74,14 @@ class PairForce(Acceleration):
 
     @property
     def does_work(self) -> bool:
-        """Whether its potential is not known."""
+        """Whether the force may change the energy in reports, because no potential is given."""
         return not self.potential_arity
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Nothing to check before the functions are compiled."""
+        """Do nothing: the functions are checked when they are compiled."""
 
     def bind(self, scene: Scene) -> None:
-        """Two fields of accelerations; the list comes with join()."""
+        """Declare two fields of accelerations, now and in the substep before. join() declares the list."""
         self.scene, dev = scene, self.dev
         dim = scene.particles.dim
         dev.state, dev.w, dev.real, dev.dim, dev.n = scene.state, scene.state.w, scene.real, dim, scene.count
@@ -87,7 +89,7 @@ class PairForce(Acceleration):
         dev.last = scene.memory.field("PairForce.acceleration_before", scene.count, width=dim)
 
     def join(self, scene: Scene, team: Any) -> NeighbourSearch | None:
-        """Declare the neighbour list; None without a radius."""
+        """Declare the neighbour search and return it; None without a radius."""
         dev = self.dev
         dev.search = dev.list = None
         if self.radius is not None:
@@ -98,36 +100,36 @@ class PairForce(Acceleration):
         return dev.search
 
     def _half(self, count: int) -> np.ndarray:
-        """What lists take for the radii of so many particles [m]."""
+        """Return half of the radius for each of `count` particles [m], which lists take as particle radii."""
         return np.full(count, self.radius / 2)  # type: ignore[operator]
 
     def can_regroup(self, change: Regrouping) -> bool:
-        """Whether particles can come and go: not while its list is about to be made longer."""
+        """Whether particles can come and go in place: not while the list is about to grow, or if the search would differ."""
         search = self.dev.search
         return search is None or (not search.list.saved and search.can_regroup(change, self._half(change.now.count)))
 
     def regroup(self, change: Regrouping) -> None:
-        """They came and went, and the team knows."""
+        """Resize the neighbour search after particles came and went. The thread team already has the new number."""
         if self.dev.search:
             self.dev.search.regroup(change, SKIN * self.radius, self._half(change.now.count))  # type: ignore[operator]
 
     def kept_mask(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Its fields are those of the particles."""
+        """Return the mask of particles that remain: its fields have a row for each particle."""
         return (number >= 0,)
 
     @property
     def room(self) -> int:
-        """Listed neighbours of a particle for which there is room at first."""
+        """Initial room for listed neighbours per particle."""
         return ROOM[self.dev.dim - 2]
 
     @inline
     def checked(self, value):
-        """What the function returned, if it is a vector."""
+        """Return the value of the function if it is a vector, else refuse it."""
         return check_vector("PairForce", undecorated(self.function).__name__, value, self.dev.dim)
 
     @ti.func
     def between(self, i, j, r):
-        """The force on particle i from particle j, r apart."""
+        """Return the force of the function on particle i by particle j [N], for i < j and r = x_i - x_j."""
         out = 0 * r
         if ti.static(self.arity == 1):
             out = self.checked(self.function(r))
@@ -137,7 +139,7 @@ class PairForce(Acceleration):
 
     @ti.func
     def near(self, r):
-        """Whether two particles that are r apart act on each other."""
+        """Whether two particles at the difference r act on each other: within the radius, and not in the same place."""
         rr = r.dot(r)
         out = rr > 0
         if ti.static(self.listed):
@@ -146,7 +148,7 @@ class PairForce(Acceleration):
 
     @ti.func
     def pull(self, i, j, r):
-        """The force on particle i by particle j, r apart, worked out from the lower index."""
+        """Return the force on particle i by particle j [N], computed for the lower index. r = x_i - x_j."""
         out = 0 * r
         if self.near(r):
             if i < j:
@@ -157,8 +159,11 @@ class PairForce(Acceleration):
 
     @ti.func
     def evaluate(self, i):
-        """The acceleration of particle i by all others, in the order of their indices. The sum begins at +0, not at 0 times
-        something: where nobody acts that might be -0, and the hash would know whether somebody far away is listed."""
+        """Compute the acceleration of particle i by all others, in the order of their indices.
+
+        The sum begins at +0. A product with 0 might be -0 if no particle acts, and the hash of the state would then depend on
+        whether a far particle is listed.
+        """
         self.dev.last[i] = self.dev.now[i]
         total, w = ti.Vector.zero(self.dev.real, self.dev.dim), self.dev.w.of(i)
         if w > 0:
@@ -174,12 +179,12 @@ class PairForce(Acceleration):
 
     @ti.func
     def acceleration(self, i, x, v, t):
-        """As evaluate() left it."""
+        """Return the acceleration that evaluate() stored [m/s^2]."""
         return self.dev.now[i]
 
     @ti.func
     def stiffness_between(self, i, j):
-        """omega^2 of a pair alone, (w_i + w_j) |F(r) - F(r - u)| / |u|, where r changed by u in the last substep."""
+        """Return omega^2 of a pair [1/s^2], (w_i + w_j) |F(r) - F(r - u)| / |u|, where r changed by u in the last substep."""
         r, u = self.dev.state.apart(i, j), self.dev.state.slid(self.dev.state.d[i] - self.dev.state.d[j], i, j)
         out, uu = 0 * r[0], u.norm_sqr()
         if uu > 0:
@@ -188,7 +193,7 @@ class PairForce(Acceleration):
 
     @ti.func
     def stiffness(self, i):
-        """At most omega^2 of particle i, by all others: the sum of what it is in each pair."""
+        """Return an upper bound of omega^2 of particle i, the sum of stiffness_between() over its pairs [1/s^2]."""
         out = 0 * self.dev.now[i][0]
         if ti.static(self.listed):
             for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
@@ -201,7 +206,7 @@ class PairForce(Acceleration):
 
     @ti.func
     def energy_between(self, i, j, back):
-        """The share of particle i in the energy of a pair, at x - back d, f64: half, or all where the other one is held."""
+        """Return the share of particle i in the energy of a pair at x - back d, in f64 [J]: half, or all if j cannot move."""
         shift = back * self.dev.state.slid(self.dev.state.d[i] - self.dev.state.d[j], i, j)
         r = self.dev.state.apart(i, j) - shift
         out = ti.cast(0, ti.f64)
@@ -218,7 +223,7 @@ class PairForce(Acceleration):
 
     @ti.func
     def energy(self, i, back):
-        """The share of particle i in the energy of all pairs [J]."""
+        """Return the share of particle i in the energy of all pairs at x - back d, in f64 [J]."""
         out = ti.cast(0, ti.f64)
         if ti.static(self.listed):
             for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):

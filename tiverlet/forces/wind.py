@@ -11,9 +11,9 @@ from ..particles import Particles
 
 
 class Wind(Acceleration):
-    """a = -rate (v - velocity): drag towards the velocity of the air, exact like Drag.
+    """Drag relative to moving air: a = -rate (v - velocity). It is exact, as Drag is.
 
-    velocity: (dim,) [m/s]; rate: [1/s], at least 0. Both live.
+    velocity: of the air, (dim,) [m/s]. rate: [1/s], at least 0. Both are live.
     """
 
     for_all = True
@@ -28,15 +28,15 @@ class Wind(Acceleration):
         self.rate = rate
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check the vector's length."""
+        """Check the length of `velocity`."""
         self._keep(dim=particles.dim)
         self.velocity = self.velocity
 
     def settings(self) -> dict[str, Any]:
-        """rate * velocity: the acceleration that is left when the drag is taken apart."""
+        """Return rate * velocity, the part of the acceleration beside the drag -rate v, for kernels."""
         return {"push": self.rate * self.velocity}
 
     @ti.func
     def acceleration(self, i, x, v, t):
-        """rate * velocity; the part -rate v is in `rate`."""
+        """Return rate * velocity [m/s^2]. The step solves the part -rate v by `rate`, as for Drag."""
         return self.dev.push[None]

@@ -1,4 +1,4 @@
-"""Scenes that run while they are watched, and are taken by hand."""
+"""Scenes that run while they are watched, and that the user moves by mouse."""
 
 from .session import play
 

@@ -1,9 +1,9 @@
-// The scene in WebGL 2: what is drawn, where the eye is, and what the mouse and the keys ask for.
+// The scene in WebGL 2: drawing, the camera, mouse and keys.
 "use strict";
 
 const canvas = document.getElementById("view");
 const gl = canvas.getContext("webgl2", { antialias: !inSoftware() });
-function inSoftware() { // where smooth edges of faces cost a fifth of the frames; discs and lines are smooth by themselves
+function inSoftware() { // in software, smooth edges of faces cost a fifth of the frames; discs and lines are smooth by themselves
   const probe = document.createElement("canvas").getContext("webgl2");
   const told = probe && probe.getExtension("WEBGL_debug_renderer_info");
   return /swiftshader|llvmpipe|software/i.test(told ? probe.getParameter(told.UNMASKED_RENDERER_WEBGL) : "");
@@ -12,7 +12,7 @@ const $ = (id) => document.getElementById(id);
 let scene = null, walls = [], figures = {}, x = null, held = null, dirty = true, frames = 0, fps = 0;
 const show = { strain: false, particles: false };
 
-// Programs. Everything is in three dimensions; a flat scene has z = 0.
+// Shader programs. All of them are 3D; a 2D scene has z = 0.
 
 const HEAD = "#version 300 es\nprecision highp float;\nuniform mat4 look; uniform vec2 size; uniform float flat2;\n";
 
@@ -30,7 +30,7 @@ function program(vertex, fragment) {
   return made;
 }
 
-// Discs, and in 3D balls: squares that face the eye. radius: in the scene, or, negative, in pixels.
+// Discs, and balls in 3D: squares that face the camera. radius: in scene units; a negative one is in pixels.
 const discs = program(
   `layout(location=0) in vec2 corner; layout(location=1) in vec3 center; layout(location=2) in float radius;
    layout(location=3) in vec4 color; uniform float pixels; out vec2 at; out vec4 hue;
@@ -52,7 +52,7 @@ const discs = program(
      color = vec4(hue.rgb * light, 1.0 - smoothstep(1.0 - edge, 1.0 + edge, rr));
    }`);
 
-// Lines with round ends of so many pixels, or so wide in the scene.
+// Lines with round ends. wide: half of their width, in pixels, or, negative, in scene units.
 const lines = program(
   `layout(location=0) in vec2 corner; layout(location=1) in vec3 a; layout(location=2) in vec3 b;
    layout(location=3) in vec4 color; uniform float wide; uniform float pixels; out vec2 at; out float len; out vec4 hue; out float r;
@@ -100,9 +100,9 @@ function attribute(where, name, width, stride = 0, offset = 0, norm = false) {
   gl.vertexAttribPointer(where, width, norm ? gl.UNSIGNED_BYTE : gl.FLOAT, norm, stride, offset);
 }
 
-// Squares with all corners written out: in software each instance would take as long as a draw of its own.
+// Squares with all corners written out: in software, each instance costs as much as a draw call.
 let room = 0;
-function fourfold(data, width) { // each row for all of its corners
+function fourfold(data, width) { // repeat each row for its four corners
   const out = new data.constructor(4 * data.length);
   for (let i = 0; i < data.length; i += width) {
     for (let k = 0; k < 4; k++) for (let c = 0; c < width; c++) out[4 * i + k * width + c] = data[i + c];
@@ -125,7 +125,7 @@ function squares(count) {
   gl.drawElements(gl.TRIANGLES, 6 * count, gl.UNSIGNED_INT, 0);
 }
 
-// The eye.
+// The camera.
 
 const eye = { center: [0, 0, 0], scale: 100, far: 3, turn: 0.5, lift: 0.35 };
 let look = new Float32Array(16), unlook = null, place = [0, 0, 1], pixels = 1;
@@ -133,7 +133,7 @@ const sub = (a, b) => a.map((v, k) => v - b[k]), add = (a, b, s = 1) => a.map((v
 const dot = (a, b) => a.reduce((t, v, k) => t + v * b[k], 0), unit = (a) => { const l = Math.hypot(...a) || 1; return a.map((v) => v / l); };
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 
-function axes() { // of the eye: right, up, and back towards it
+function axes() { // of the camera: right, up, and backwards
   const up = unit(scene.up), side = unit(cross(up, Math.abs(up[2]) < 0.9 ? [0, 0, 1] : [0, -1, 0])), front = cross(side, up);
   const out = add(add(add([0, 0, 0], up, Math.sin(eye.lift)), front, Math.cos(eye.lift) * Math.cos(eye.turn)), side, Math.cos(eye.lift) * Math.sin(eye.turn));
   const right = unit(cross(up, out));
@@ -168,12 +168,12 @@ function aim() {
   }
 }
 
-function project(p) { // pixels on the canvas, and how far away
+function project(p) { // returns pixels on the canvas, and the distance
   const q = [0, 1, 2, 3].map((k) => look[k] * p[0] + look[4 + k] * p[1] + look[8 + k] * p[2] + look[12 + k]);
   return [(q[0] / q[3] + 1) * canvas.width / 2, (1 - q[1] / q[3]) * canvas.height / 2, q[3]];
 }
 
-function under(px, py, through) { // the point under the mouse, as far from the eye as `through`
+function under(px, py, through) { // returns the point under the mouse at the distance of `through`
   if (scene.dim === 2) return [eye.center[0] + (px - canvas.width / 2) / eye.scale, eye.center[1] - (py - canvas.height / 2) / eye.scale, 0];
   const [r, u, o] = axes(), w = dot(sub(place, through), o) / pixels;
   return add(add(add(place, o, -w * pixels), r, (px - canvas.width / 2) * w), u, (canvas.height / 2 - py) * w);
@@ -181,7 +181,7 @@ function under(px, py, through) { // the point under the mouse, as far from the 
 
 const at = (i) => (scene.dim === 2 ? [x[2 * i], x[2 * i + 1], 0] : [x[3 * i], x[3 * i + 1], x[3 * i + 2]]);
 
-function pick(px, py) { // the particle under the mouse, or -1
+function pick(px, py) { // returns the particle under the mouse, or -1
   let best = -1, least = Infinity;
   for (let i = 0; x && i < scene.radius.length; i++) {
     const [qx, qy, w] = project(at(i)), r = scene.radius[i] * pixels / (scene.dim === 2 ? 1 : w);
@@ -195,7 +195,7 @@ function pick(px, py) { // the particle under the mouse, or -1
 
 // Drawing.
 
-function three(flat) { // positions with three components
+function three(flat) { // returns positions with three components
   if (scene.dim === 3) return flat;
   const out = new Float32Array(flat.length / 2 * 3);
   for (let i = 0; 2 * i < flat.length; i++) { out[3 * i] = flat[2 * i]; out[3 * i + 1] = flat[2 * i + 1]; }
@@ -301,7 +301,7 @@ function draw() {
   }
 }
 
-// What comes from the world.
+// Messages from the world.
 
 const url = new URL("socket", location.href);
 url.protocol = "ws:";
@@ -336,7 +336,7 @@ function take(message) {
   scene.loose = scene.links.map((_, k) => k).filter((k) => !(scene.covered[scene.links[k][0]] && scene.covered[scene.links[k][1]]));
   const dots = scene.radius.map((r) => r > 0 ? r : -3);
   upload("radius", fourfold(new Float32Array(dots), 1));
-  // What is part of a surface is as dark as it is in 2D, and in 3D not seen, but for what is pinned.
+  // Particles of a surface have its shade in 2D. In 3D they are hidden, except pinned ones.
   const under = (i) => scene.covered[i] && !scene.pinned[i];
   upload("seen", fourfold(new Float32Array(dots.map((r, i) => under(i) && (scene.dim === 3 || r < 0) ? 0 : r)), 1));
   const hues = new Uint8Array(scene.color.flatMap((c, i) => [...c, under(i) && scene.dim === 2 ? 0 : 255]));

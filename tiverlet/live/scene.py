@@ -1,4 +1,4 @@
-"""What the page is told of a world: once what it consists of, and in every frame where it is."""
+"""The data that the page gets about a world: once its parts, and in every frame its positions."""
 
 import json
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def scene(world: "World", title: str) -> str:
-    """Everything that stays, as JSON."""
+    """Return everything that does not change, as JSON."""
     p = world.particles
     found = links(world)
     none = np.zeros((0, 2), dtype=np.int64)
@@ -42,7 +42,7 @@ def _short(values: np.ndarray) -> list:
 
 
 def walls(world: "World", extent: tuple[np.ndarray, np.ndarray]) -> list[dict[str, Any]]:
-    """Outlines of walls and paths, where they are now."""
+    """Return outlines of walls and paths at their present places."""
     out = []
     for f in world.features:
         if isinstance(f, (Collider, Path)) and getattr(f, "active", True):
@@ -54,17 +54,17 @@ def walls(world: "World", extent: tuple[np.ndarray, np.ndarray]) -> list[dict[st
 
 
 def told(text: str) -> str:
-    """A few lines for who watches, as JSON."""
+    """Return a message for the user, as JSON."""
     return json.dumps({"kind": "told", "text": text})
 
 
 def placed_walls(outlines: list[dict[str, Any]]) -> str:
-    """What walls() returns, as JSON."""
+    """Return the result of walls() as JSON."""
     return json.dumps({"kind": "walls", "walls": outlines})
 
 
 def named(world: "World", i: int) -> str:
-    """A particle, in words."""
+    """Describe a particle in words."""
     p = world.particles
     i = checks.indices("play", "particle", [i], len(p))[0]
     x, v = world.position[i], world.velocity[i]
@@ -79,7 +79,7 @@ def named(world: "World", i: int) -> str:
 
 
 def frame(world: "World", figures: dict[str, Any]) -> bytes:
-    """Where it is: the length of the figures as JSON (u32, little-endian), they themselves, and positions in f32."""
+    """Return a frame as bytes: the length of the JSON figures (u32, little-endian), the figures, and positions in f32."""
     text = json.dumps(figures).encode()
     text += b" " * (-len(text) % 4)
     places = InBox().places(world, world.position)

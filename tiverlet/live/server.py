@@ -1,4 +1,4 @@
-"""The page and its connection: one port on this machine, which serves nobody who does not know its token."""
+"""The server of the page and its connections: one port on this machine, which answers only requests with its token."""
 
 import contextlib
 import json
@@ -12,8 +12,8 @@ from typing import Any
 
 LOCAL = "127.0.0.1"
 NAMES = (LOCAL, "localhost")
-AHEAD = 2  # frames that may be under way to a page that has not shown the last ones
-LARGEST = 4096  # bytes of what a page says
+AHEAD = 2  # most frames sent to a page that it has not shown yet
+LARGEST = 4096  # most bytes of a message from a page
 FILES = {"": ("page.html", "text/html"), "page.js": ("page.js", "text/javascript")}
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; connect-src 'self' ws:; base-uri 'none'; "
@@ -26,10 +26,10 @@ class Viewer:
 
     def __init__(self, connection: Any):
         self.connection = connection
-        self.waiting = 0  # frames that it was sent and has not shown yet
+        self.waiting = 0  # frames sent that the page has not shown yet
 
     def send(self, message: str | bytes) -> None:
-        """To the page, unless it has gone."""
+        """Send a message to the page, if it is still connected."""
         from websockets.exceptions import ConnectionClosed
 
         with contextlib.suppress(ConnectionClosed, OSError):
@@ -37,10 +37,10 @@ class Viewer:
 
 
 class Server:
-    """Serves the page at `url`. said: what pages say, (viewer, message), in the order in which it came.
+    """Serves the page at `url`. said: messages from pages, (viewer, message), in order of arrival.
 
-    Who asks has to know the token, which is in the address; to name this machine as Host, so that no page from elsewhere, whose
-    name was made to mean this machine, comes in; and for the connection to have the page from here, by its Origin.
+    A request must contain the token, which is part of the address. It must name this machine as Host, which keeps out foreign
+    pages whose host name resolves to this machine. A connection must also come from the page served here, by its Origin.
     """
 
     def __init__(self, port: int = 0):
@@ -62,7 +62,7 @@ class Server:
 
     @property
     def viewers(self) -> list[Viewer]:
-        """The pages that are open."""
+        """The open pages."""
         with self._lock:
             return list(self._viewers)
 
@@ -72,7 +72,7 @@ class Server:
         self._thread.join(5)
 
     def _answer(self, connection: Any, request: Any) -> Any:
-        """A file of the page; None lets the connection be made."""
+        """Answer with a file of the page; return None to accept a connection."""
         host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
         _, token, name = (urllib.parse.urlsplit(request.path).path + "//").split("/")[:3]
         if host.rpartition(":")[0] not in NAMES or not secrets.compare_digest(token.encode(), self.token.encode()):
@@ -90,7 +90,7 @@ class Server:
         return response
 
     def _take(self, viewer: Viewer, text: str | bytes) -> None:
-        """What a page has said."""
+        """Process a message from a page."""
         try:
             message = json.loads(text)
         except ValueError:
@@ -103,7 +103,7 @@ class Server:
             self.said.put((viewer, message))
 
     def _listen(self, connection: Any) -> None:
-        """Of each page, in a thread of its own."""
+        """Receive the messages of one page, in a thread of its own."""
         from websockets.exceptions import ConnectionClosed
 
         viewer = Viewer(connection)

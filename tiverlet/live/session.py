@@ -1,4 +1,4 @@
-"""A world that runs at real time under the eyes and hands of who watches."""
+"""A world that runs in real time while users watch it and move it by mouse."""
 
 import os
 import sys
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 DT = 1 / 60  # [s] of a frame at full speed
 SLOWEST = 64
-REFRESH = 0.25  # [s] after which a page of a paused scene gets its figures again
+REFRESH = 0.25  # [s] between updates of pages while the scene is paused
 
 
 class Session:
-    """A world, the hand that it gets, and the pages that show it.
+    """A world, its Hand, and the pages that show it.
 
-    Frames are 1/60 s long, and 1/60 s apart where the machine keeps up; at a half of the speed they are half as long, so that
-    slow motion is smooth, and is computed more finely.
+    A frame is 1/60 s of simulated time, and frames are 1/60 s apart if the machine keeps up. At half speed a frame is half as
+    long, so that slow motion is smooth and is computed more finely.
     """
 
     def __init__(
@@ -42,10 +42,10 @@ class Session:
             world.add(features=hands)
         self.hand = hands[0]
         self.paused, self.slower, self.steps, self.restarts = False, 1, 0, 0
-        self._one = False  # whether one frame is asked for, of a scene that is paused
+        self._one = False  # whether to compute one frame of a paused scene
         self._start = checkpoint.keep(world), checkpoint.flags(world)
         self._extent = scene.bounds(world)
-        self._computed: deque[tuple[float, float]] = deque(maxlen=30)  # of frames: when [s], and how long it took [ms]
+        self._computed: deque[tuple[float, float]] = deque(maxlen=30)  # for each frame: its begin [s] and computing time [ms]
         self._walls: Any = None
         self._sent = 0.0
         self._holder: Viewer | None = None
@@ -53,7 +53,7 @@ class Session:
         self._recording()
 
     def _recording(self) -> None:
-        """Begin a file, if there is to be one."""
+        """Begin a file, if one was requested."""
         if self.record is not None:
             from ..recording import Recorder
 
@@ -66,7 +66,7 @@ class Session:
             self._recorder.close()
 
     def turn(self) -> None:
-        """What was said is done, a frame is made, and shown."""
+        """Process the messages of pages, compute a frame, and send it."""
         heard = self._hear()
         if not self.paused or self._one:
             self._one = False
@@ -76,12 +76,12 @@ class Session:
         self._show()
 
     def run(self, frames: int | None = None) -> None:
-        """Turn by turn at real time, until interrupted; or so many of them."""
+        """Compute frames in real time, until interrupted; or so many of them."""
         due = time.perf_counter()
         while frames is None or frames > 0:
             frames = None if frames is None else frames - 1
             self.turn()
-            due = max(due + DT, time.perf_counter() - DT)  # what was lost is not made up for
+            due = max(due + DT, time.perf_counter() - DT)  # do not catch up on lost time
             time.sleep(max(0.0, due - time.perf_counter()))
 
     def _step(self) -> None:
@@ -95,7 +95,7 @@ class Session:
         self._computed.append((clock, 1e3 * (time.perf_counter() - clock)))
 
     def _restart(self) -> None:
-        """Back to the start; the file, too, begins there."""
+        """Return to the start, and begin the file again."""
         if self._recorder is not None:
             self._recorder.close()
         checkpoint.undo(self.world, *self._start)
@@ -105,14 +105,14 @@ class Session:
         self._recording()
 
     def _hear(self) -> bool:
-        """Do what pages have asked for; returns whether there was something."""
+        """Process the requests of pages; return whether there were any."""
         heard = False
         while not self.server.said.empty():
             viewer, message = self.server.said.get()
             heard = True
             try:
                 self._do(viewer, message)
-            except (ValueError, TypeError, KeyError) as e:  # of what it said: the scene goes on
+            except (ValueError, TypeError, KeyError) as e:  # an invalid request must not stop the scene
                 viewer.send(scene.told(str(e)))
         return heard
 
@@ -147,7 +147,7 @@ class Session:
         return scene.walls(self.world, self._extent)
 
     def _figures(self) -> dict[str, Any]:
-        """Of the last frame."""
+        """Return the figures of the last frame."""
         report, out = self.world.last, {"time": self.world.time, "paused": self.paused, "slower": self.slower, "step": self.steps}
         if len(self._computed) > 1:
             first, last = self._computed[0][0], self._computed[-1][0]
@@ -180,15 +180,18 @@ def play(
     world: "World", *, record: str | os.PathLike | None = None, each_frame: Callable[["World"], None] | None = None,
     title: str = "tiverlet", port: int = 0, browser: bool = True,
 ) -> None:  # fmt: skip
-    """Run a world at real time in a page of the browser, and take it by hand, until Ctrl-C.
+    """Run a world in real time in a page of the browser, where the user can drag its particles, until Ctrl-C.
 
-    Drag a particle with the mouse; the keys are on the page. The world gets a Hand, unless it has one, and is where it was left
-    afterwards. record: a file that is written meanwhile, see Recorder; what the hand did is in it, and is computed again bit for
-    bit. After a restart it begins anew. each_frame: called with the world before each frame, for what moves by itself. title: of
-    the page. port: 0 takes a free one. browser: whether to open the page; its address is printed in any case.
+    Drag a particle with the mouse; the page lists the keys. The world gets a Hand, unless it has one, and keeps its state
+    afterwards.
 
-    The page is served to this machine only. From another one forward the port: ssh -L PORT:127.0.0.1:PORT host, and open the
-    address there; the line is printed. In a notebook the page shows below the cell, which runs until it is interrupted.
+    record: a file that is written meanwhile, see Recorder. It contains what the hand did, which is computed again bit for bit.
+    After a restart the file begins again. each_frame: called with the world before each frame, for example to move walls. title:
+    of the page. port: 0 uses a free one. browser: whether to open the page; its address is printed in any case.
+
+    The page is served to this machine only. To watch from another machine, forward the port: ssh -L PORT:127.0.0.1:PORT host, and
+    open the address there; over SSH this command is printed. In a notebook the page shows below the cell, which runs until it is
+    interrupted.
 
     Raises ModuleNotFoundError without the package websockets: pip install 'tiverlet[play]'.
     """
@@ -207,7 +210,7 @@ def play(
 
 
 def _announce(server: Server, browser: bool) -> None:
-    """Say where it is, and open it where that can be done."""
+    """Print the address, and open it where possible."""
     if "ipykernel" in sys.modules:
         from IPython.display import IFrame, display  # type: ignore[import-not-found]
 

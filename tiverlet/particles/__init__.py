@@ -1,4 +1,4 @@
-"""What particles are: what the user gives, what a world keeps of them on the device, and how they spin."""
+"""Particles: the user's arrays, the state that a world keeps on the device, and spin."""
 
 from .particles import LARGEST, TURNING, Particles, at_rest, in_range, spin_of
 from .per_particle import Radii

@@ -1,4 +1,4 @@
-"""Particles as the user gives them: plain arrays, checked."""
+"""Particles as the user specifies them: checked arrays."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -7,7 +7,7 @@ from .. import checks
 from ..features.arguments import meant
 from ..features.read_only import read_only, structure
 
-LARGEST = 1e15  # [m] beyond this, squared lengths near 1e38 leave f32; nothing physical is that far
+LARGEST = 1e15  # [m] squared lengths up to 1e30 leave room below the largest f32, 3e38
 
 
 class Particles:
@@ -15,20 +15,20 @@ class Particles:
 
     position: (n, dim) [m], dim 2 or 3; n = 0 is allowed.
     velocity: 0, (dim,) or (n, dim) [m/s].
-    mass: number or (n,) [kg], above 0; inf means static: it never moves, and nothing moves it.
+    mass: number or (n,) [kg], above 0; inf makes a particle static: nothing moves it.
     radius: number or (n,) [m], at least 0. A point (radius 0) touches discs and walls but not other points.
-    pinned: indices or a Boolean mask of particles that stay where they are, whatever their mass.
+    pinned: indices or a Boolean mask of particles that stay in place, whatever their mass.
     group: integer or (n,), for contact filters.
-    spin: angular velocity, a number or (n,) in 2D, counterclockwise, 0, (3,) or (n, 3) in 3D [rad/s]. Without it, particles do
-    not spin, and nothing is computed for it; 0 is for particles that do and start without. Friction turns them, see Contact;
-    what cannot move (pinned, or of infinite mass) keeps the spin that it has, as a driven roller does.
-    inertia: their moment of inertia in units of mass radius^2: "disc" (1/2; the default in 2D), "ring" (1), "sphere" (2/5; the
-    default in 3D), "shell" (2/3), or a number or (n,), above 0; inf for what no friction turns.
-    orientation: where they start from, an angle or (n,) in 2D [rad], 0, (4,) or (n, 4) unit quaternions (x, y, z, w) in 3D.
-    Without it nobody keeps track of how far they have turned.
+    spin: angular velocity [rad/s]: a number or (n,) in 2D, counterclockwise; 0, (3,) or (n, 3) in 3D. Without it, particles do
+    not spin, and nothing is computed for spin; 0 makes them spin from rest. Friction turns them, see Contact. A particle that
+    cannot move (pinned, or of infinite mass) keeps its spin, as a driven roller does.
+    inertia: moment of inertia in units of mass radius^2: "disc" (1/2; the default in 2D), "ring" (1), "sphere" (2/5; the default
+    in 3D), "shell" (2/3), or a number or (n,), above 0; inf for particles that friction does not turn.
+    orientation: initial orientation: an angle or (n,) in 2D [rad]; 0, (4,) or (n, 4) unit quaternions (x, y, z, w) in 3D. Without
+    it, orientations are not tracked.
 
-    Raises ValueError or TypeError naming the first offending index. The arrays are read-only: mass, radius and links are
-    structure, fixed when a world is built. To move particles, assign to world.position and world.velocity.
+    Raises ValueError or TypeError naming the first invalid index. The arrays are read-only: mass, radius and links are structure,
+    fixed when a world is built. To move particles, assign to world.position and world.velocity.
     """
 
     kernels_read = ("dim",)
@@ -53,7 +53,7 @@ class Particles:
         self._fix()
 
     def _fix(self) -> None:
-        """From now on nothing can be set."""
+        """Make all attributes read-only."""
         for name, array in vars(self).items():
             if isinstance(array, np.ndarray):
                 vars(self)[name] = _fixed(name, array)
@@ -61,27 +61,30 @@ class Particles:
 
     @property
     def size(self) -> float:
-        """A length that is typical of them [m], for relative residuals of things that have none of their own."""
+        """A typical length of the scene [m], for relative residuals of constraints without a length of their own."""
         return max(self.extent) or float(self.radius.max(initial=0.0)) or 1.0
 
     @property
     def extent(self) -> list[float]:
-        """Of the box around them [m]. Axis by axis: NumPy is ten times as fast as with all at once."""
+        """The size of the bounding box of all centers [m]. Axis by axis: NumPy is ten times as fast as with all axes at once."""
         columns = np.ascontiguousarray(np.asarray(self.position).T)
         return [float(x.max() - x.min()) if self.count else 0.0 for x in columns]
 
     @property
     def axes(self) -> int:
-        """Of rotation: 1 in 2D, 3 in 3D."""
+        """The number of axes of rotation: 1 in 2D, 3 in 3D."""
         return 2 * self.dim - 3
 
     @property
     def spins(self) -> bool:
-        """Whether they spin."""
+        """Whether particles spin."""
         return self.spin is not None
 
     def regrouped(self, some: np.ndarray, added: "Particles | None" = None, position: np.ndarray | None = None) -> "Particles":
-        """Those in the mask `some` and then `added` ones; position: where those are, if not where they were."""
+        """Return the particles in the mask `some`, then the `added` ones.
+
+        position: present positions of all old particles, (n, dim) [m]; None for those of this object.
+        """
         names, own = ("velocity", "mass", "radius", "pinned", "group", "inv_mass"), vars(self)
         both: dict[str, np.ndarray] = {"position": self.position if position is None else position}
         both |= {name: own[name] for name in names}
@@ -90,20 +93,23 @@ class Particles:
             both |= {name: values.take(stay, axis=0) for name, values in both.items() if position is None or name != "position"}
         if added is not None:
             both = {name: np.concatenate([values, vars(added)[name]]) for name, values in both.items()}
-        new = object.__new__(Particles)  # of what was checked when it came
+        new = object.__new__(Particles)  # without __init__: all values were checked before
         vars(new).update(both, count=len(both["position"]), dim=self.dim)
         vars(new).update(self._turning_of(some, added))
         new._fix()
         return new
 
     def placed(self, position: np.ndarray) -> "Particles":
-        """The same particles, at other places, (n, dim) [m]."""
+        """Return the same particles at other positions, (n, dim) [m]."""
         new = object.__new__(Particles)
         vars(new).update(vars(self), position=_fixed("position", position))
         return new
 
     def _turning_of(self, some: np.ndarray, added: "Particles | None") -> dict[str, np.ndarray | None]:
-        """How those in the mask and the added ones spin; where only some do, the others do from now on, starting without."""
+        """Return spin, inertia and orientation of the particles in the mask and the added ones.
+
+        If only some of them spin, the others spin from now on, starting at rest.
+        """
         groups = [(self, some), *([(added, np.ones(len(added), dtype=bool))] if added is not None else [])]
         if not any(p.spins for p, _ in groups):
             return dict.fromkeys(TURNING)
@@ -133,13 +139,13 @@ class Particles:
 
 
 def _fixed(name: str, array: np.ndarray) -> np.ndarray:
-    """An array of Particles that is structure."""
+    """Make an array of Particles read-only."""
     live = f" To move particles, assign to world.{name}." if name in ("position", "velocity") else ""
     return read_only(array, structure("Particles", name) + live)
 
 
 def in_range(who: str, name: str, position: np.ndarray) -> None:
-    """Refuse coordinates whose squares would overflow in f32."""
+    """Raise ValueError for coordinates above LARGEST, whose squares might overflow in f32."""
     if np.abs(position).max(initial=0.0) > LARGEST:
         far = np.abs(position) > LARGEST
         i, k = np.unravel_index(int(np.argmax(far)), far.shape)
@@ -154,7 +160,7 @@ BODIES = {"disc": 0.5, "ring": 1.0, "sphere": 0.4, "shell": 2 / 3}  # I / (m r^2
 
 
 def at_rest(name: str, particles: "Particles") -> np.ndarray:
-    """What particles have of TURNING that start without: no spin, the inertia of discs or spheres, not turned."""
+    """Return the default of an attribute in TURNING: no spin, the inertia of discs or spheres, not turned."""
     n, flat = particles.count, particles.dim == 2
     if name == "spin":
         return np.zeros(n) if flat else np.zeros((n, 3))
@@ -164,7 +170,7 @@ def at_rest(name: str, particles: "Particles") -> np.ndarray:
 
 
 def turning(particles: "Particles", spin, inertia, orientation) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
-    """What was given of TURNING, checked, for each particle; None for all that there is not."""
+    """Return the checked arguments in TURNING for each particle; None for those that are absent."""
     who, n = "Particles", particles.count
     if spin is None and inertia is None and orientation is None:
         return None, None, None
@@ -180,7 +186,7 @@ def turning(particles: "Particles", spin, inertia, orientation) -> tuple[np.ndar
 
 
 def spin_of(who: str, spin, particles: "Particles") -> np.ndarray:
-    """Angular velocities of particles, checked: (n,) in 2D, (n, 3) in 3D [rad/s]. A point does not spin."""
+    """Return checked angular velocities: (n,) in 2D, (n, 3) in 3D [rad/s]. Points must not spin."""
     n, zero = particles.count, at_rest("spin", particles)
     if particles.dim == 2:
         rates = checks.per_item(who, "spin", spin, n)
@@ -199,7 +205,7 @@ def spin_of(who: str, spin, particles: "Particles") -> np.ndarray:
 
 
 def orientation_of(who: str, orientation, particles: "Particles") -> np.ndarray:
-    """How particles are turned, checked: angles (n,) in 2D [rad], unit quaternions (n, 4) in 3D."""
+    """Return checked orientations: angles (n,) in 2D [rad], unit quaternions (n, 4) in 3D."""
     n, zero = particles.count, at_rest("orientation", particles)
     if particles.dim == 2:
         return np.array(checks.per_item(who, "orientation", orientation, n))

@@ -1,4 +1,4 @@
-"""Numbers of particles on the device: one for all where they are equal."""
+"""Numbers per particle on the device, stored once if they are all equal."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class PerParticle:
-    """A number for each particle: a single one where all are equal, a field otherwise. number: of particles."""
+    """A number for each particle: a single one if all are equal, else a field. number: the number of particles, on the device."""
 
     constant: Any = OnDevice()
 
@@ -25,23 +25,26 @@ class PerParticle:
             self.field = memory.field(name, number, values=values)
 
     def can_be(self, values: np.ndarray) -> bool:
-        """Whether its kernels are those for other values, too."""
+        """Whether these values need the same kernels as the present ones."""
         uniform = bool(len(values) == 0 or (values == values[0]).all())
         return uniform == self.uniform and (uniform and bool(len(values) and values[0] > 0)) == self.all_positive
 
     def become(self, memory: "Memory", values: np.ndarray) -> None:
-        """Take other values, as can_be() says."""
+        """Write other values, for which can_be() is true."""
         if self.uniform:
             self.constant = float(values[0]) if len(values) else 0.0
         else:
             memory.write(self.field, values)
 
     def can_change(self, values: np.ndarray, some: np.ndarray) -> bool:
-        """The same as can_be(), where others than `some` are what they are; where these differ, nobody looks at all."""
+        """Return can_be() for values that differ from the present ones only at `some`.
+
+        If the values at `some` differ from each other, the others need no comparison.
+        """
         return (not self.uniform and len({*values[some].tolist()}) > 1) or self.can_be(values)
 
     def change(self, memory: "Memory", values: np.ndarray, some: np.ndarray) -> None:
-        """The same as become(), for an elastic memory."""
+        """Write the values at `some`, for which can_change() is true, in an elastic memory."""
         if self.uniform:
             self.become(memory, values)
         else:
@@ -49,17 +52,17 @@ class PerParticle:
 
     @inline
     def of(self, i):
-        """That of particle i."""
+        """Return the number of particle i."""
         return ti.cast(self.constant, self.real) if self.uniform else at(self.field, i)
 
     @inline
     def positive(self, i):
-        """Whether it is above 0 for particle i; where it is for all, no branch is left."""
+        """Whether the number of particle i is above 0. Compiles to no branch if all are."""
         return ti.cast(1, ti.i32) > 0 if self.all_positive else self.of(i) > 0
 
 
 class Radii:
-    """Radii on the device."""
+    """Radii of particles on the device."""
 
     least: Any = OnDevice()
 
@@ -71,27 +74,27 @@ class Radii:
 
     @staticmethod
     def _kinds(radius: np.ndarray) -> tuple[float, bool, bool]:
-        """The least radius that is not 0, and whether there are points and discs."""
+        """Return the least radius above 0, and whether there are points and discs."""
         positive = radius[radius > 0]
         return float(positive.min()) if len(positive) else 0.0, bool((radius == 0).any()), bool(len(positive))
 
     def can_be(self, values: np.ndarray) -> bool:
-        """Whether its kernels are those for other radii, too."""
+        """Whether these radii need the same kernels as the present ones."""
         return self.each.can_be(values) and self._kinds(values)[1:] == (self.points, self.discs)
 
     def become(self, memory: "Memory", values: np.ndarray) -> None:
-        """Take other radii, as can_be() says."""
+        """Write other radii, for which can_be() is true."""
         self.each.become(memory, values)
         self.least = self._kinds(values)[0]
 
     @inline
     def of(self, i):
-        """That of particle i."""
+        """Return the radius of particle i."""
         return self.each.of(i)
 
     @ti.func
     def stride(self, i):
-        """The longest step with which particle i cannot pass another: two such steps never exceed r_i + r_j."""
+        """Return the longest step with which particle i cannot pass another: two such steps never exceed r_i + r_j."""
         least = ti.cast(self.least, self.real)
         step = least / 2
         if ti.static(not self.points):

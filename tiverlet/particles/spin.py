@@ -1,4 +1,4 @@
-"""Particles that spin: what a world keeps of it on the device."""
+"""Spin: the rotation of particles, as a world keeps it on the device."""
 
 from typing import Any
 
@@ -13,16 +13,17 @@ from .per_particle import PerParticle
 
 
 class Spin:
-    """The rotation of particles, as State is their motion.
+    """The rotation of particles, as State is their translation.
 
-    s = r phi is how far the surface of a particle has turned in the last substep [m], with phi the angle (2D) or the rotation
-    vector (3D): a displacement as d is, and at a start a velocity, r omega. share: k = m r^2 / I, 2 for discs, 5/2 for spheres.
-    With these no radius is left in the laws of friction. An impulse h p [kg m] at the point -r n from the middle changes d by
-    p / m and s by -k n x p / m; the surface there moves by d - s x n, which changes by (1 + k) p / m across n.
+    s = r phi is the distance that the surface of a particle turned in the last substep [m], with phi the angle (2D) or the
+    rotation vector (3D). It is a displacement as d is; before a start (the first substep after velocities were set) it is a
+    velocity, r omega. share: k = m r^2 / I, 2 for discs, 5/2 for spheres. With s and k, the laws of friction contain no radius.
+    An impulse h p [kg m] at the point -r n from the center changes d by p / m and s by -k n x p / m. The surface there moves by d
+    - s x n, which changes by (1 + k) p / m across n.
 
-    Nothing but contacts and walls turns a particle, so between these s stays as it is: that is exact.
+    Only contacts and walls turn a particle. Between these s is constant, which is exact.
 
-    axes: 1 in 2D, 3 in 3D. orients: whether it is known how far particles have turned since the start.
+    axes: 1 in 2D, 3 in 3D. orients: whether orientations are tracked.
     """
 
     def __init__(self, memory: Memory, particles: Particles, inv_mass: np.ndarray, number: Number):
@@ -38,14 +39,14 @@ class Spin:
             self.inverse_radius = PerParticle(memory, "inverse_radius", inverse(particles.radius), number)
 
     def can_regroup(self, change: Regrouping) -> bool:
-        """Whether particles can come and go where it is."""
+        """Whether particles can be added and removed in place."""
         now = change.now
         if (now.orientation is not None) != self.orients or not self.share.can_be(shares(now, change.inv_mass)):
             return False
         return not self.orients or self.inverse_radius.can_be(inverse(now.radius))
 
     def regroup(self, memory: Memory, change: Regrouping) -> None:
-        """They came and went, see State."""
+        """Set spin and orientation of added particles, see State.regroup()."""
         now, first = change.now, change.kept
         self.radius = now.radius
         self.share.become(memory, shares(now, change.inv_mass))
@@ -55,26 +56,26 @@ class Spin:
             memory.write_from(self.orientation, first, np.asarray(now.orientation).reshape(now.count, -1)[first:])
 
     def can_weigh(self, particles: Particles, inv_mass: np.ndarray) -> bool:
-        """Whether the same particles can have other inverse masses where it is."""
+        """Whether other inverse masses of the same particles can be written in place."""
         return self.share.can_be(shares(particles, inv_mass))
 
     def weigh(self, memory: Memory, particles: Particles, inv_mass: np.ndarray) -> None:
-        """They have these."""
+        """Write other inverse masses, for which can_weigh() is true."""
         self.share.become(memory, shares(particles, inv_mass))
 
     def from_rates(self, rates: Any) -> np.ndarray:
-        """r omega [m/s] of angular velocities [rad/s], (n, axes)."""
+        """Convert angular velocities [rad/s] to r omega [m/s], (n, axes)."""
         return self.radius[:, None] * np.asarray(rates).reshape(-1, self.axes)
 
     def to_rates(self, surface: np.ndarray) -> np.ndarray:
-        """Angular velocities [rad/s] of r omega [m/s]: (n,) in 2D, (n, 3) in 3D."""
+        """Convert r omega [m/s] to angular velocities [rad/s]: (n,) in 2D, (n, 3) in 3D."""
         r = self.radius[:, None]
         out = np.divide(surface, r, out=np.zeros_like(surface), where=r > 0)
         return out[:, 0] if self.axes == 1 else out
 
     @ti.func
     def surface(self, s, n):
-        """s x n: what a point at -r n moves less, and one at r n more, because the particle turns."""
+        """Return s x n: rotation moves a surface point at r n by this much more, and one at -r n by this much less."""
         out = ti.Vector.zero(self.real, self.dim)
         if ti.static(self.dim == 2):
             out = ti.Vector([-s[0] * n[1], s[0] * n[0]])
@@ -84,7 +85,7 @@ class Spin:
 
     @ti.func
     def moment(self, n, p):
-        """n x p."""
+        """Return n x p."""
         out = ti.Vector.zero(self.real, self.axes)
         if ti.static(self.dim == 2):
             out[0] = n[0] * p[1] - n[1] * p[0]
@@ -94,7 +95,7 @@ class Spin:
 
     @ti.func
     def along(self, s, n):
-        """The part of s about the axis n, which there is in 3D."""
+        """Return the part of s about the axis n; 0 in 2D."""
         out = 0 * s
         if ti.static(self.dim == 3):
             out = s.dot(n) * n
@@ -102,7 +103,7 @@ class Spin:
 
     @ti.func
     def energy(self, i):
-        """I phi^2 / 2 of particle i, per mass [m^2], f64."""
+        """Return I phi^2 / 2 of particle i per mass [m^2], f64."""
         k, s, out = self.share.of(i), self.s[i] * ti.cast(1, ti.f64), ti.cast(0, ti.f64)
         if k > 0:
             out = 0.5 * s.dot(s) / k
@@ -110,17 +111,17 @@ class Spin:
 
     @ti.func
     def begin(self, i, h):
-        """At a start: from the velocity of the surface to its displacement."""
+        """At a start, turn the velocity of the surface into its displacement."""
         self.s[i] = h * self.s[i]
 
     @ti.func
     def end(self, i, h):
-        """And back."""
+        """Turn the displacement of the surface into its velocity."""
         self.s[i] = self.s[i] / h
 
     @ti.func
     def turn(self, i):
-        """At the end of a substep: the orientation follows. In 3D q' = (phi / |phi| sin |phi| / 2, cos |phi| / 2) q."""
+        """Update the orientation at the end of a substep. In 3D q' = (phi / |phi| sin |phi| / 2, cos |phi| / 2) q."""
         phi = self.inverse_radius.of(i) * self.s[i]
         if ti.static(self.dim == 2):
             self.orientation[i] = self.orientation[i] + ti.cast(phi, ti.f64)
@@ -135,18 +136,18 @@ class Spin:
 
 
 def inverse(radius: np.ndarray) -> np.ndarray:
-    """1 / r of each particle [1/m], 0 for points."""
+    """Return 1 / r of each particle [1/m], 0 for points."""
     return np.divide(1, radius, out=np.zeros(len(radius)), where=radius > 0)
 
 
 def shares(particles: Particles, inv_mass: np.ndarray) -> np.ndarray:
-    """k = m r^2 / I of each particle, 0 for points and for what cannot move."""
+    """Return k = m r^2 / I of each particle, 0 for points and for particles that cannot move."""
     inertia = at_rest("inertia", particles) if particles.inertia is None else np.asarray(particles.inertia)
     return np.where((particles.radius > 0) & (inv_mass > 0), 1 / inertia, 0.0)
 
 
 def moments(particles: Particles) -> np.ndarray:
-    """Moments of inertia [kg m^2] of the particles that can move, (n,); 0 for others, and for those whose is infinite."""
+    """Return the moments of inertia [kg m^2], (n,); 0 for particles that cannot move or have infinite inertia."""
     if particles.inertia is None:
         return np.zeros(particles.count)
     there = (particles.inv_mass > 0) & np.isfinite(particles.inertia)

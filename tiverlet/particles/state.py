@@ -1,4 +1,4 @@
-"""The state of particles that a world keeps on the device."""
+"""The moving state of particles on the device."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 class State:
     """The moving state on the device: position x, displacement d of the last substep, inverse mass w.
 
-    Displacement form (numerics: "summed" Verlet): every correction goes to x and to d alike, so that x - d is the
-    start of the substep and d / h the velocity half a substep ago, without the cancellation of x_n - x_(n-1).
-    With `compensated`, x has a second word, `low`. With `carries`, what rounding takes from the sums in x and d is carried along
-    in `low` and `d_low` (two-sum, Knuth): in f32, where rounding is the error that is left, the larger the shorter substeps are.
-    So `low` is there with either of them, but what only reads x does without where it is not `compensated`.
+    Displacement form ("summed" Verlet in numerics): every correction is added to both x and d. So x - d is the start of the
+    substep, and d / h is the velocity half a substep ago, without the cancellation of x_n - x_(n-1).
+    With `compensated`, x has a second word, `low`. With `carries`, rounding errors of the sums in x and d are carried along in
+    `low` and `d_low` (two-sum, Knuth). In f32 these rounding errors are the remaining error, and grow as substeps get shorter.
+    Either of the two declares `low`, but code that only reads x ignores `low` unless `compensated` is set.
     """
 
     host_only = ("count", "number")
-    spin: Any  # where particles spin: the same for their rotation, see spin.py
+    spin: Any  # the Spin, if particles spin
 
     def __init__(self, memory: "Memory", particles: "Particles", inv_mass: np.ndarray, compensated: bool):
         n, dim = particles.count, particles.dim
@@ -32,13 +32,13 @@ class State:
         self.real, self.double = memory.real, memory.real == ti.f64
         self.count, self.dim = n, dim
         self.starts = self.befores = self.keeps_wall_push = self.carries = self.spins = False
-        self.images: Any = None  # where the world has a periodic box, see neighbours/periodic.py
-        self.sleepers: Any = None  # where particles may fall asleep, see step/sleep.py
+        self.images: Any = None  # set in a periodic box, see neighbours/periodic.py
+        self.sleepers: Any = None  # set if particles may sleep, see step/sleep.py
         self.number = memory.number(n)  # of particles
         self.x = memory.field("position", self.number, width=dim, values=particles.position, state=True)
         self.d = memory.field("displacement", self.number, width=dim, values=particles.velocity, state=True)
         self.w = PerParticle(memory, "inv_mass", inv_mass, self.number)
-        self.sums = compensated  # x in two words
+        self.sums = compensated  # whether x has two words
         if compensated:
             self._add_low(memory, particles)
 
@@ -47,19 +47,19 @@ class State:
         self.low = memory.field("position_low", self.number, width=self.dim, values=low, state=True)
 
     def carry(self, memory: "Memory", particles: "Particles") -> None:
-        """Declare the low words of displacements, and of positions where there are none."""
+        """Declare the low words of displacements, and those of positions if there are none."""
         self.d_low = memory.field("displacement_low", self.number, width=self.dim, state=True)
         if not self.sums:
             self._add_low(memory, particles)
         self.carries = self.sums = True
 
     def can_regroup(self, change: Regrouping) -> bool:
-        """Whether particles can come and go where it is."""
+        """Whether particles can be added and removed in place."""
         spins = change.now.spins == self.spins and (not self.spins or self.spin.can_regroup(change))
         return spins and self.w.can_be(change.inv_mass)
 
     def regroup(self, memory: "Memory", change: Regrouping) -> None:
-        """They came and went: give new ones their places and velocities. The memory has the rows of those that stay."""
+        """Set position and velocity of added particles. `memory` already holds only the rows of the remaining ones."""
         self.count, first = change.now.count, change.kept
         self.w.become(memory, change.inv_mass)
         x = change.now.position[first:]
@@ -71,22 +71,22 @@ class State:
             self.spin.regroup(memory, change)
 
     def can_weigh(self, particles: "Particles", inv_mass: np.ndarray, some: np.ndarray) -> bool:
-        """Whether the same particles can have other inverse masses where it is. some: those of which they may differ."""
+        """Whether other inverse masses can be written in place. some: the particles whose inverse mass may differ."""
         return self.w.can_change(inv_mass, some) and (not self.spins or self.spin.can_weigh(particles, inv_mass))
 
     def weigh(self, memory: "Memory", particles: "Particles", inv_mass: np.ndarray, some: np.ndarray) -> None:
-        """They have these."""
+        """Write other inverse masses, for which can_weigh() is true."""
         self.w.change(memory, inv_mass, some)
         if self.spins:
             self.spin.weigh(memory, particles, inv_mass)
 
     def get(self, memory: "Memory") -> np.ndarray:
-        """A copy of the positions, low words added in f64."""
+        """Return a copy of the positions, low words added in f64."""
         out = memory.read(self.x, np.float64)
         return (out + memory.read(self.low) if self.sums else out)[..., : self.count, :]
 
     def get_some(self, memory: "Memory", some: np.ndarray) -> np.ndarray:
-        """The same of some particles, by their numbers; of a world alone."""
+        """Return the positions of the particles `some`, by their numbers, as get() does. For a single world."""
         out = memory.seen(self.x)[some].astype(np.float64)
         return out + memory.seen(self.low)[some] if self.sums else out
 
@@ -97,14 +97,14 @@ class State:
             memory.write(self.low, position - position.astype(np.float32))
 
     def start(self, memory: "Memory", velocity: np.ndarray) -> None:
-        """Overwrite the displacements with velocities, which they are at a start."""
+        """Overwrite the displacements with velocities, before a start (the first substep after velocities were set)."""
         memory.write(self.d, velocity)
         if self.carries:
             memory.write(self.d_low, np.zeros_like(velocity))
 
     @inline
     def awake(self, i):
-        """Whether particle i is awake; where none can sleep, no branch is left."""
+        """Whether particle i is awake. Compiles to no branch if none can sleep."""
         return self.sleepers.awake(i) if self.sleepers else ti.cast(1, ti.i32) > 0
 
     @inline
@@ -116,20 +116,20 @@ class State:
 
     @inline
     def stirs(self, begin, end):
-        """1 unless all blocks of particles from `begin` up to `end` sleep."""
+        """Return 0 if all blocks of particles from `begin` up to `end` sleep, else 1."""
         return self.sleepers.stirs(begin, end) if self.sleepers else 1
 
     @inline
     def apart(self, i, j):
-        """x_i - x_j, with the low words where there are any; in a periodic box that of the nearest images."""
-        if self.images and self.compensated:  # the difference of what is boxes apart is not known in f32
+        """Return x_i - x_j, with any low words; in a periodic box the difference of the nearest images."""
+        if self.images and self.compensated:  # f32 cannot resolve the difference of particles many boxes apart
             return ti.cast(self.between(i, j), self.real)
         r = at(self.x, i) - at(self.x, j)
         return self.nearest(r + (at(self.low, i) - at(self.low, j)) if self.compensated else r)
 
     @ti.func
     def between(self, i, j):
-        """x_i - x_j in f64."""
+        """Return x_i - x_j in f64."""
         r = ti.cast(self.x[i], ti.f64) - ti.cast(self.x[j], ti.f64)
         if ti.static(self.sums):
             r += ti.cast(self.low[i], ti.f64) - ti.cast(self.low[j], ti.f64)
@@ -137,40 +137,42 @@ class State:
 
     @inline
     def nearest(self, r):
-        """A difference of places, between nearest images in a periodic box."""
+        """Map a difference of positions to that of the nearest images, in a periodic box."""
         return self.images.nearest(r) if self.images else r
 
     @inline
     def around(self, x, middle):
-        """Of a place, the image nearest to another one in a periodic box."""
+        """Return the image of x nearest to `middle`, in a periodic box."""
         return middle + self.images.nearest(x - middle) if self.images else x
 
     @inline
     def inside(self, x):
-        """Of a place, the image in a periodic box."""
+        """Return the image of x inside the periodic box."""
         return self.images.inside(x) if self.images else x
 
     @inline
     def slid(self, moved, i, j):
-        """How much further particle i moved than particle j did, as images of a box that may be sheared."""
+        """Return how much further particle i moved than particle j, as images of a periodic box that may be sheared."""
         return self.images.slid(moved, at(self.x, i) - at(self.x, j)) if self.images and self.images.sheared else moved
 
     @inline
     def place(self, i):
-        """x_i as one number per axis."""
+        """Return x_i as one number per axis."""
         return at(self.x, i) + at(self.low, i) if self.compensated else at(self.x, i)
 
     @ti.func
     def begin(self, i):
-        """Where particle i was at the start of the substep, as one number per axis."""
+        """Return the position of particle i at the start of the substep, as one number per axis."""
         x = self.x0[i]
         if ti.static(self.compensated):
             x += self.low0[i]
         return x
 
     def remember(self, memory: "Memory", start: bool, before: bool, wall_push: bool) -> None:
-        """Declare what friction, swept walls and bounces need, position and displacement at the start of the substep, and how far
-        walls have pushed since then."""
+        """Declare what friction, swept walls and bounces need.
+
+        start, before: position and displacement at the start of the substep. wall_push: how far walls have pushed since then.
+        """
         self.starts, self.befores, self.keeps_wall_push = start, before, wall_push
         if wall_push:
             self.wall_push = memory.field("wall_push", self.number, width=self.dim)
@@ -183,7 +185,7 @@ class State:
 
     @ti.func
     def digits(self, i):
-        """What the last two binary digits of the coordinates of particle i amount to [m]."""
+        """Return the size of the last two binary digits of the coordinates of particle i [m]."""
         x = self.x[i]
         size = ti.abs(x[0])
         for k in ti.static(range(1, self.dim)):
@@ -192,7 +194,7 @@ class State:
 
     @ti.func
     def restart(self, i):
-        """x = start + d in one sum: a particle whose d has come to nothing is where it was, to the bit."""
+        """Set x = start + d in one sum: a particle with d = 0 is where it was, bit for bit."""
         self.x[i] = self.x0[i]
         if ti.static(self.sums):
             self.low[i] = self.low0[i]
@@ -200,8 +202,11 @@ class State:
 
     @ti.func
     def sum(self, a, low, b):
-        """a + low + b in two words. Where it `carries`, what rounding takes is found in half of the time (Dekker); for |b| > |a|
-        some of it may be missed, which is no worse than without."""
+        """Return a + low + b in two words.
+
+        With `carries`, the rounding error is computed in half of the time (Dekker). For |b| > |a| some of it may be lost, which
+        is no worse than without.
+        """
         s = a + b
         part = s - a
         if ti.static(self.carries):
@@ -213,15 +218,22 @@ class State:
 
     @ti.func
     def advance(self, i, d):
-        """x_i += d."""
+        """Add d to x_i."""
         if ti.static(self.sums):
             self.x[i], self.low[i] = self.sum(self.x[i], self.low[i], d)
         else:
             self.x[i] = self.x[i] + d
 
     @ti.func
+    def bring(self, i, place):
+        """Particle i goes to a place in f64, where positions are sums."""
+        self.d[i] = ti.cast(place - ti.cast(self.x[i], ti.f64) - ti.cast(self.low[i], ti.f64), self.real)
+        self.x[i] = ti.cast(place, self.real)
+        self.low[i] = ti.cast(place - ti.cast(self.x[i], ti.f64), self.real)
+
+    @ti.func
     def shift(self, i, move):
-        """A correction: the same move to x_i and to d_i, so that x - d stays the start of the substep."""
+        """Add a correction to both x_i and d_i, so that x - d stays the start of the substep."""
         if ti.static(self.carries):
             self.d[i], self.d_low[i] = self.sum(self.d[i], self.d_low[i], move)
         else:

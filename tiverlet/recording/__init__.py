@@ -1,4 +1,4 @@
-"""Recordings for the rerun viewer, and their replay. The only part of tiverlet that imports rerun, and only when it is used."""
+"""Recordings for the rerun viewer, and their replay. Only this part of tiverlet imports rerun, and only when it is used."""
 
 from .recorder import Recorder
 from .replay import Replay, Verdict, replay

@@ -15,8 +15,8 @@ from ..step.step_report import StepReport
 if TYPE_CHECKING:
     from ..world import World
 
-# Views of curves, by title: the end of the path of their rows; and for each number of a row its name, its label and its colour.
-# Curves of one view share rows: a row takes 14 bytes beside its numbers.
+# Views of curves, by title: the last part of the path of their rows, and name, label and colour of each number in a row. Curves
+# of one view share rows, since a row takes 14 bytes in addition to its numbers.
 CURVES = {
     "Worst violation": ("violation", {
         "residual": ("of constraints", [230, 120, 60]), "overlap": ("overlap [radii]", [90, 160, 230]),
@@ -28,18 +28,18 @@ CURVES = {
     "Substeps": ("substeps", {"substeps": ("substeps", [150, 160, 175])}),
     "Time per frame [ms]": ("milliseconds", {"milliseconds": ("ms", [190, 140, 220])}),
 }  # fmt: skip
-# Where particles spin: of the axes the first one in 2D.
+# Added if particles spin; in 2D only the first axis.
 SPIN = {
     "Angular momentum [kg m^2/s]": ("angular_momentum", {
         "angular momentum/z": ("z", [110, 150, 240]), "angular momentum/x": ("x", [235, 110, 100]),
         "angular momentum/y": ("y", [130, 200, 110]),
     }),
 }  # fmt: skip
-OWN = "own"  # the begin of the paths of quantities of the user's
+OWN = "own"  # first part of the paths of the user's quantities
 
 
 def curves_of(world: "World") -> dict[str, tuple[str, dict[str, Any]]]:
-    """CURVES, and where particles spin their angular momentum about the origin."""
+    """Return CURVES; if particles spin, also their angular momentum about the origin."""
     if not world.particles.spins:
         return CURVES
     ((title, (end, curves)),) = SPIN.items()
@@ -47,8 +47,9 @@ def curves_of(world: "World") -> dict[str, tuple[str, dict[str, Any]]]:
 
 
 def shown(world: "World") -> dict[str, tuple[str, list[bool]]]:
-    """Views of curves that say something of this scene, by title: the end of the path of their rows, and which of them show. No
-    overlap without contacts, no momentum where walls or pins take it, no substeps where they are given.
+    """Return the views of curves that are informative for this scene, by title: last part of the path, and which curves to show.
+
+    Left out are overlap without contacts, momentum where walls or pins change it, and substeps if their number is fixed.
     """
     held = bool((world.particles.inv_mass == 0).any()) or any(isinstance(f, (Collider, Anchored)) for f in world.features)
     hidden = {
@@ -64,12 +65,12 @@ def shown(world: "World") -> dict[str, tuple[str, list[bool]]]:
 
 
 def _names(curves: dict[str, Any], world: "World") -> list[str]:
-    """Of the curves of a view, at most one for each dimension."""
+    """Return the names of the curves of a view: as many as the dimension, at least two."""
     return list(curves)[: max(2, world.particles.dim)]
 
 
 class Curves:
-    """Collects the figures of frames, and sends them on together, which takes a fifth of the time of sending each."""
+    """Collects the figures of frames and sends them together, which takes a fifth of the time of sending each."""
 
     def __init__(self, world: "World", stream: Any):
         import rerun as rr
@@ -79,7 +80,7 @@ class Curves:
         self.weigh(world)
         self._rows: dict[str, list[tuple[int, float, list[float]]]] = {}
         self._begun = False
-        self.own: list[str] = []  # quantities of the user's
+        self.own: list[str] = []  # names of the user's quantities
         for title, (end, curves) in self._curves.items():
             titles, colors = zip(*(curves[name] for name in _names(curves, world)), strict=True)
             _, those = shown(world).get(title, (end, [False] * len(titles)))
@@ -87,21 +88,21 @@ class Curves:
             stream.log(f"figures/{end}", lines, static=True, strict=True)
 
     def weigh(self, world: "World") -> None:
-        """Look at the masses; there may be others when particles were added or removed."""
+        """Read the masses again; they change when particles are added or removed."""
         p = world.particles
         self._mass = np.where(p.inv_mass > 0, p.mass, 0.0)
-        # What is multiplied by r omega to make I omega.
+        # Factors that turn r omega into I omega.
         self._lever = np.divide(moments(p), p.radius, out=np.zeros(len(p)), where=p.radius > 0)
 
     def add(self, frame: int, report: StepReport, now: Checkpoint) -> None:
-        """The figures of a frame. The momentum is that of the displacements, half a substep ago, as the energy is."""
+        """Add the figures of a frame. Momentum is that of the displacements, half a substep ago, like energy."""
         scale = 1.0 if now.clock.d_is_velocity else 1 / now.clock.h
         momentum = scale * (self._mass @ now.values["displacement"][: len(self._mass)])
         figures = {name: getattr(report, name) for name in ("residual", "overlap", "energy", "substeps")}
         figures |= {f"momentum/{axis}": p for axis, p in zip("xyz", momentum.tolist(), strict=False)}
         if "spin" in now.values:
             figures |= self._angular(now, scale)
-        if self._begun:  # the first frame compiles the kernels, and would dwarf all others
+        if self._begun:  # the first frame also compiles the kernels, and its time would dwarf all others
             figures["milliseconds"] = report.seconds * 1e3
         self._begun = True
         for end, curves in self._curves.values():
@@ -109,14 +110,14 @@ class Curves:
                 self._rows.setdefault(end, []).append((frame, now.clock.time, values))
 
     def _angular(self, now: Checkpoint, scale: float) -> dict[str, float]:
-        """The angular momentum about the origin, of displacements likewise: m x (x_n - d) x d / h + I omega."""
+        """Return the angular momentum about the origin, half a substep ago as well: m x (x_n - d) x d / h + I omega."""
         n = len(self._mass)
         d, spin = scale * now.values["displacement"][:n].astype(np.float64), scale * now.values["spin"][:n]
         total = self._lever @ spin + moment_sum(now.position(n), self._mass[:, None] * d)
         return {f"angular momentum/{axis}": float(v) for axis, v in zip("z" if len(total) == 1 else "xyz", total, strict=True)}
 
     def log(self, frame: int, time: float, numbers: dict[str, float]) -> None:
-        """Quantities of the user's."""
+        """Add the user's quantities."""
         for name, value in numbers.items():
             if name not in self.own:
                 self.own.append(name)
@@ -124,7 +125,7 @@ class Curves:
             self._rows.setdefault(f"{OWN}/{name}", []).append((frame, time, [value]))
 
     def send(self) -> None:
-        """Log what was collected."""
+        """Log all collected figures."""
         rr = self._rr
         for end, rows in self._rows.items():
             frames, times, values = zip(*rows, strict=True)

@@ -1,4 +1,4 @@
-"""What of a world is drawn, and how: particles, links by their strain, walls, contacts, breaks."""
+"""Draws a world: particles, links coloured by their strain, walls, contacts, breaks."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
@@ -26,21 +26,21 @@ if TYPE_CHECKING:
     from ..world import World
     from .scene import Parts
 
-POINT = -2.5  # a particle without radius is drawn as a dot of so many pixels (negative: screen units)
-MANY = 5000  # links that are drawn as lines; of more, an even selection
-WALL = np.array([[92, 97, 112]], dtype=np.uint8)  # of surfaces of walls
-OPEN = (60, 63, 70)  # of a wall that is switched off
-EDGES = (150, 120, 70)  # of a periodic box
-HELD, PINS = (225, 228, 235), 200  # the marks of particles that are held, and up to how many are marked
-MARK, SPOT = (24, 26, 32), 0.5  # of particles that have turned; the radius of a spot that is a cap of the sphere
-LABEL = (118, 122, 132)  # can be read on black and on white
-BELOW, ABOVE = 5.0, 40.0  # the order in which a plane is drawn: before lines (20) and particles (30), and after them
-FEW = 1500  # particles up to which contacts are drawn; finding them would take too much of the frame beyond
-TOUCH = 4  # one contact is drawn for so many particles, those that push most
+POINT = -2.5  # radius of the dot for a particle without radius (negative: pixels)
+MANY = 5000  # most links drawn as lines; of more, an even selection
+WALL = np.array([[92, 97, 112]], dtype=np.uint8)  # colour of surfaces of walls
+OPEN = (60, 63, 70)  # colour of an inactive wall
+EDGES = (150, 120, 70)  # colour of a periodic box
+HELD, PINS = (225, 228, 235), 200  # colour of the marks of fixed particles; no marks if there are more of them
+MARK, SPOT = (24, 26, 32), 0.5  # marks that show rotation: their colour, and the radius of a spot on a sphere, in radii
+LABEL = (118, 122, 132)  # legible on black and on white
+BELOW, ABOVE = 5.0, 40.0  # draw orders in 2D: before and after lines (20) and particles (30)
+FEW = 1500  # most particles for drawing contacts; with more, finding them takes too much of a frame
+TOUCH = 4  # particles per drawn contact; those with the largest impulses are drawn
 
 
 class Drawing:
-    """The picture of a world in a rerun stream. `bytes` is about what was logged, uncompressed."""
+    """The picture of a world in a rerun stream. `bytes` is about the size of the logged data, uncompressed."""
 
     def __init__(self, world: "World", stream: Any, extent: tuple[np.ndarray, np.ndarray], overlays: Overlays):
         import pyarrow
@@ -52,25 +52,28 @@ class Drawing:
         self._arrows: Any = rr.Arrows2D if flat else rr.Arrows3D
         self._strips: Any = rr.LineStrips2D if flat else rr.LineStrips3D
         self._flat = flat
-        self._above = {"draw_order": ABOVE} if flat else {}  # in 3D what is nearer hides the rest
+        self._above = {"draw_order": ABOVE} if flat else {}  # in 3D the depth decides
         point = pyarrow.list_(pyarrow.field("item", pyarrow.float32(), nullable=False), world.particles.dim)
-        self._strip = pyarrow.list_(pyarrow.field("item", point, nullable=False))  # of rerun's lines
+        self._strip = pyarrow.list_(pyarrow.field("item", point, nullable=False))  # the type of rerun's line strips
         self.bytes = 0
         self.extent, self._overlays = extent, overlays
-        self.hues: np.ndarray | None = None  # of particles in the coming frame, where they are not always the same
-        self.scenes = 0  # that were begun
+        self.hues: np.ndarray | None = None  # colours of particles in the coming frame, if they change
+        self.scenes = 0  # how many scenes were begun
         self._places = InBox()
         self._touched = self._torn = False
 
     def static(self, entity: str, *what: Any) -> None:
-        """Log what holds for all frames."""
+        """Log data that hold for all frames."""
         self._stream.log(entity, *what, static=True, strict=True)
 
     def _log(self, entity: str, *what: Any) -> None:
         self._stream.log(entity, *what, strict=True)
 
     def begin(self) -> None:
-        """What does not change until particles or features come or go; then all is drawn anew, under another name."""
+        """Log everything that does not change until particles or features are added or removed.
+
+        Then all of it is logged again, under another name.
+        """
         world, p = self.world, self.world.particles
         self._root = f"{SCENE}/scene{self.scenes}" if self.scenes else SCENE
         if self.scenes:
@@ -82,8 +85,8 @@ class Drawing:
         self._join(hues)
         radii = np.where(p.radius > 0, p.radius, POINT)
         if self._surface:
-            radii[covered(world, self._surface.triangles) & (p.inv_mass > 0)] = 0.0  # what is under a surface is not seen
-        fixed = {} if self._overlays.color else {"colors": hues}  # what is static hides what is not
+            radii[covered(world, self._surface.triangles) & (p.inv_mass > 0)] = 0.0  # hidden by the surface
+        fixed = {} if self._overlays.color else {"colors": hues}  # static colours would override those of each frame
         what = [self._points.from_fields(radii=radii, **fixed)]
         what += [self._rr.Mesh3D.from_fields(triangle_indices=self._surface.triangles.astype(np.uint32))] if self._surface else []
         what += [self._strips.from_fields(radii=[-1.2])] if self._lines else []
@@ -92,7 +95,7 @@ class Drawing:
         if 0 < len(held) <= PINS:
             at = self.shown(world.position)[held].astype(np.float32)
             marks = self._points.from_fields(positions=at, radii=[-3.5], colors=[HELD], **self._above)
-            self._log(f"{self._root}/held", marks)  # not static: nothing clears that when a scene ends
+            self._log(f"{self._root}/held", marks)  # not static, since static data cannot be cleared when the scene ends
         if box := box_of(world):
             edges = box.outline(*self.extent).astype(np.float32)
             self.static(f"{self._root}/box", self._strips(edges, colors=[EDGES], radii=[-0.8]))
@@ -107,7 +110,7 @@ class Drawing:
             )
 
     def _join(self, hues: np.ndarray) -> None:
-        """All links together: in the colours of surfaces those that are part of one, and the others as lines."""
+        """Collect all links: those that are part of a surface colour it, and the others are drawn as lines."""
         world = self.world
         found = links(world)
         none = np.zeros((0, 2), dtype=np.int64)
@@ -119,7 +122,7 @@ class Drawing:
         ))  # fmt: skip  # of the feature, and of the link in it
         self._surface, inside = None, np.zeros(0, dtype=np.int64)
         corners = np.zeros((0, 3), dtype=np.int64) if self._flat else triangles(world)
-        under = np.isin(self._pairs, corners).all(axis=1)  # links that are not drawn as lines
+        under = np.isin(self._pairs, corners).all(axis=1)  # links of surfaces, which are not drawn as lines
         loops = outlines(world) if self._flat else []
         if loops:
             inside, breaks = within(world, loops), np.isin(number, list(self._broken))
@@ -131,7 +134,7 @@ class Drawing:
         if not under.any():
             self._pairs, self._rest, number, row = (each[some] for each in (self._pairs, self._rest, number, row))
             some, under = np.arange(len(some)), np.zeros(len(some), dtype=bool)
-        under &= ~np.isin(number, [k for k, f in found if np.any(getattr(f, "compliance", 0))])  # what is meant to give way
+        under &= ~np.isin(number, [k for k, f in found if np.any(getattr(f, "compliance", 0))])  # compliant links show no strain
         if len(corners):
             self._surface = Surface(corners, hues, self._pairs[under], upwards(world))
         self._fill = None
@@ -142,14 +145,16 @@ class Drawing:
         self._tears = [(k, np.flatnonzero(number == k), row[number == k]) for k, _ in found if k in self._broken]
 
     def shown(self, x: np.ndarray) -> np.ndarray:
-        """Where particles at x, (n, dim) [m], are drawn: in the box, if there is one."""
+        """Return where particles at x, (n, dim) [m], are drawn: inside the periodic box, if there is one."""
         return self._places.places(self.world, x)
 
     def frame(self, x: np.ndarray, x32: np.ndarray, turned: Iterable[int], torn: bool) -> None:
-        """Draw a frame. x: (n, dim), and rounded to f32. turned: features that are not as they were in the last one. torn: if
-        something broke since then.
+        """Draw a frame.
+
+        x, x32: positions, (n, dim) [m], in full and in f32. turned: numbers of features with other knobs than in the last frame.
+        torn: whether something broke since then.
         """
-        # All in one row: then LZ4 finds the points of lines and sheets among those of the particles.
+        # Log everything in one row, so that LZ4 matches the points of lines and sheets with those of the particles.
         colored = {}
         if self._overlays.color:
             hues = self.hues
@@ -182,7 +187,7 @@ class Drawing:
             self._torn = torn
 
     def _mark(self, x: np.ndarray) -> None:
-        """How far particles have turned: a line from the middle to the rim of a disc, two dots on a sphere."""
+        """Draw how far particles have turned: a line from the centre to the rim of a disc, two dots on a sphere."""
         marks = marked(x, self.world.particles.radius, self.world.orientation)
         at = marks.astype(np.float32)
         if self._flat:
@@ -195,7 +200,7 @@ class Drawing:
         self._log(f"{self._root}/marks", what)
 
     def _link(self, x: np.ndarray, x32: np.ndarray) -> list[Any]:
-        """Links, coloured by their strain; strips go to rerun in its own layout, which is ten times as fast."""
+        """Return links, coloured by their strain. Strips go to rerun in its own layout, which is ten times as fast."""
         r = x[self._pairs[:, 0]] - x[self._pairs[:, 1]]
         with np.errstate(divide="ignore", invalid="ignore"):
             level = levels(np.sqrt(np.einsum("ij,ij->i", r, r)) / self._rest - 1)
@@ -221,26 +226,26 @@ class Drawing:
         return row
 
     def _packed(self, points: np.ndarray, ends: np.ndarray) -> Any:
-        """Strips of points (k, dim) in f32, the s-th from ends[s] to ends[s + 1], in rerun's own layout."""
+        """Return strips of points (k, dim) in f32, the s-th from ends[s] to ends[s + 1], in rerun's own layout."""
         self.bytes += points.nbytes + ends.nbytes
         pa = self._pa
         listed = pa.FixedSizeListArray.from_arrays(pa.array(points.ravel()), type=self._strip.value_type)
         return pa.ListArray.from_arrays(pa.array(ends.astype(np.int32)), listed, type=self._strip)
 
     def _wall(self, k: int) -> None:
-        """A wall or a path, where it is now."""
+        """Draw a wall or a path at its present place."""
         wall = self.world.features[k]
         if isinstance(wall, (Collider, Path)):
             if self._solid(k, wall):
                 return
             strips, thickness = wall.outline(*self.extent)
-            radius = thickness if thickness else -1.5  # half the width in the scene, or pixels
+            radius = thickness if thickness else -1.5  # half the width [m], or pixels (negative)
             hue = OPEN if isinstance(wall, Collider) and not wall.active else (120, 125, 140)
             self._log(f"{self._root}/walls/{k}", self._strips(strips, colors=[hue], radii=[radius]))
             self.bytes += strips.nbytes
 
     def _solid(self, k: int, wall: Any) -> bool:
-        """Draw a wall of a 3D scene as a surface in light from above; whether it has one."""
+        """Draw a wall of a 3D scene as a surface lit from above. Returns whether it has a surface."""
         if self._flat or not isinstance(wall, Collider):
             return False
         vertices, faces = wall.solid(*self.extent)
@@ -254,7 +259,7 @@ class Drawing:
         return bool(len(faces))
 
     def _contact(self) -> None:
-        """Where particles touch: between the two."""
+        """Draw the points of contact."""
         world = self.world
         middle = np.zeros((0, world.particles.dim))
         if world._clock.h:
@@ -270,7 +275,7 @@ class Drawing:
         self.bytes += middle.nbytes // 2
 
     def _load(self, x: np.ndarray) -> None:
-        """What contacts bear."""
+        """Draw the loads of contacts."""
         strips, radii = loads(self.world, x)
         if len(strips) or self._touched:
             self._touched = bool(len(strips))
@@ -281,12 +286,12 @@ class Drawing:
             self.bytes += strips.nbytes
 
     def color(self, values: np.ndarray) -> None:
-        """Draw the coming frames in the colours of a quantity of particles, (n,)."""
+        """Set the colours of the coming frames from a quantity of particles, (n,)."""
         assert self._overlays.color
         self.hues = ramp(values, *self._overlays.color[1:])
 
     def _breaks(self, x: np.ndarray) -> None:
-        """A mark where something broke since the last frame, and a line in the list of events."""
+        """Draw a mark where a constraint broke since the last frame, and add a line to the list of events."""
         marks = [np.zeros((0, x.shape[1]))]
         for k, before in self._broken.items():
             f = self.world.features[k]
@@ -303,13 +308,13 @@ class Drawing:
         self._log(f"{self._root}/breaks", self._points(at, radii=[-7.0], colors=[[255, 60, 60, 180]]))
 
     def event(self, text: str, level: str = "INFO") -> None:
-        """A line in the list of events."""
+        """Add a line to the list of events."""
         self._log("events", self._rr.TextLog(text, level=level))
         self.bytes += len(text)
 
 
 def marked(x: np.ndarray, radius: np.ndarray, orientation: np.ndarray) -> np.ndarray:
-    """Where marks of particles that are turned like this are, (n, 2, dim): the ends of a line, or two places on the surface."""
+    """Return the marks of particles with these orientations, (n, 2, dim): the ends of a line, or two places on the surface."""
     if x.shape[1] == 2:
         rim = x + radius[:, None] * np.stack([np.cos(orientation), np.sin(orientation)], axis=1)
         return np.stack([x, rim], axis=1)
@@ -321,7 +326,7 @@ def marked(x: np.ndarray, radius: np.ndarray, orientation: np.ndarray) -> np.nda
 
 
 def upwards(world: "World | Parts") -> np.ndarray:
-    """Against gravity, (dim,); along y without."""
+    """Return the direction against gravity, (dim,); along y without gravity."""
     dim = world.particles.dim
     up = np.zeros(dim)
     for f in world.features:
@@ -333,7 +338,7 @@ def upwards(world: "World | Parts") -> np.ndarray:
 
 
 def colors(world: "World | Parts") -> np.ndarray:
-    """Hues, (n, 3): one for each body and for each loose particle; grey for what cannot move."""
+    """Return hues, (n, 3): one for each body and each loose particle; grey for fixed particles."""
     body = bodies(world)
     hues = golden_colors(len(body))[body]
     hues[world.particles.inv_mass == 0] = (140, 140, 150)
@@ -341,12 +346,12 @@ def colors(world: "World | Parts") -> np.ndarray:
 
 
 def links(world: "World | Parts") -> list[tuple[int, Batch]]:
-    """The features that are drawn as lines between two particles, with their numbers."""
+    """Return the features drawn as lines between two particles, with their numbers."""
     return [(k, f) for k, f in enumerate(world.features) if isinstance(f, Batch) and f.arity == 2 and f.count]
 
 
 def walled(features: Iterable[Feature], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two corners [m], and what there is of walls and paths of finite size around them."""
+    """Extend the box between two corners [m] by the walls and paths of finite size."""
     for f in features:
         if isinstance(f, (Ball, Capsule, Mesh, Path, Polygon)):
             strips, thickness = f.outline(low, high)
@@ -363,8 +368,9 @@ def walled(features: Iterable[Feature], low: np.ndarray, high: np.ndarray) -> tu
 
 
 def bounds(world: "World") -> tuple[np.ndarray, np.ndarray]:
-    """A box around what will be seen: the particles and where they can get to, as far as that is known beforehand: finite walls,
-    the ground below, and around a place where a body hangs.
+    """Return a box around everything that will be visible: the particles and where they can get to, as far as known beforehand.
+
+    The box includes finite walls, the ground below, and the circle around the point from which a body hangs.
     """
     x, r = InBox().places(world, world.position), world.particles.radius[:, None]
     low = (x - r).min(axis=0, initial=np.inf) if len(x) else np.zeros(world.particles.dim)
@@ -378,7 +384,7 @@ def bounds(world: "World") -> tuple[np.ndarray, np.ndarray]:
     for k in np.unique(body[fixed]):
         held, all_of_it = x[fixed & (body == k)], x[body == k]
         reach = float(np.linalg.norm(all_of_it - held.mean(axis=0), axis=1).max())
-        if np.ptp(held, axis=0).max() < 0.1 * reach:  # it swings
+        if np.ptp(held, axis=0).max() < 0.1 * reach:  # the body is held at nearly one point, so it can swing
             swing = held.mean(axis=0) - reach, held.mean(axis=0) + reach
             for f in world.features:
                 if isinstance(f, Box):

@@ -1,4 +1,4 @@
-"""Bodies in the plane, filled: the viewer has no areas in 2D, but lines of any width."""
+"""Filled bodies in 2D: the viewer has no filled areas in 2D, but lines of any width."""
 
 from typing import TYPE_CHECKING
 
@@ -12,15 +12,15 @@ from .surfaces import bodies
 if TYPE_CHECKING:
     from ..world import World
 
-INSETS = np.array([0.2, 0.6, 0.9])  # of the way from the side of a body to its middle: where lines lie
-HALF = np.array([0.2, 0.3, 0.2])  # and half of their widths, which overlap, so that no seam shows
-SHADE = 0.6  # of the colour of a body, so that its particles and links show before it
-STEEP = 3.0  # how far a corner goes in, at most, for each step that its sides go in
-MANY = 600  # bodies that are filled; more are small to the eye
+INSETS = np.array([0.2, 0.6, 0.9])  # positions of the lines, as shares of the way from a body's side to its centre
+HALF = np.array([0.2, 0.3, 0.2])  # half of their widths; they overlap, so that no seam shows
+SHADE = 0.6  # share of a body's colour, so that its particles and links stand out
+STEEP = 3.0  # how far a corner moves inwards, at most, relative to its sides
+MANY = 600  # most filled bodies; of more, each is too small for it to matter
 
 
 def outlines(world: "World") -> list[np.ndarray]:
-    """Particles around each body in the plane, counterclockwise."""
+    """Return the particles around each body in 2D, counterclockwise."""
     found = []
     for f in world.features:
         if isinstance(f, Polygons):
@@ -35,7 +35,10 @@ def outlines(world: "World") -> list[np.ndarray]:
 
 
 def within(world: "World", loops: list[np.ndarray]) -> np.ndarray:
-    """Of each particle the number of the loop that it is in, (n,), or -1: all of a body that has one, the corners of others."""
+    """Return the number of the loop that each particle is in, (n,), or -1.
+
+    If a body has one loop, all of its particles are in it. If it has several, only their corners are.
+    """
     label, out = bodies(world), np.full(len(world.particles), -1)
     labels = np.array([label[loop[0]] for loop in loops], dtype=np.int64)
     for k, loop in enumerate(loops):
@@ -46,8 +49,9 @@ def within(world: "World", loops: list[np.ndarray]) -> np.ndarray:
 class Fill:
     """Lines that fill bodies: their outlines, moved inwards step by step.
 
-    loops: particles around each body, counterclockwise. x: their places at first, which say how wide lines are. hues: (n, 3), of
-    particles. body: (m,), of each link within a body, whose strain shows in the colour, from 1 % on.
+    loops: particles around each body, counterclockwise. x: their positions at first, which set the widths of lines. hues: colours
+    of particles, (n, 3). body: for each link inside a body the number of the body, (m,); the link's strain shows in the colour,
+    from 1 % on.
     """
 
     def __init__(self, loops: list[np.ndarray], x: np.ndarray, hues: np.ndarray, body: np.ndarray):
@@ -70,13 +74,13 @@ class Fill:
         self._body = body
 
     def _inwards(self, p: np.ndarray) -> np.ndarray:
-        """The normal of the side that begins at each corner."""
+        """Return the inward normal of the side that begins at each corner."""
         along = p[self._next] - p
         length = np.linalg.norm(along, axis=1)
         return np.stack([-along[:, 1], along[:, 0]], axis=1) / np.where(length > 0, length, 1)[:, None]
 
     def strips(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of a frame: the points of all lines one after the other, (k, 2) in f32, and where each begins and ends, (s + 1,)."""
+        """Return, for a frame, the points of all lines, (k, 2) in f32, and where each line begins and ends, (s + 1,)."""
         p = x[self._corner]
         n = self._inwards(p)
         m = n[self._before]
@@ -87,7 +91,7 @@ class Fill:
         return points.astype(np.float32), np.concatenate([*turns, [len(points)]])
 
     def colors(self, level: np.ndarray) -> np.ndarray:
-        """RGBA as u32 of all lines. level: of the strain of each link, (m,); the worst in a body shows."""
+        """Return RGBA of all lines as u32. level: the level of the strain of each link, (m,); each body shows its worst."""
         hues, off = self._hues, level - LEVELS
         if len(off):
             most = np.zeros(len(hues), dtype=np.int64)

@@ -1,17 +1,18 @@
-"""The journal of a recording: what happened to a world, entry by entry, so that it can happen again.
+"""The journal of a recording: everything that happened to a world, entry by entry, so that it can be repeated.
 
-    scene     particles, features, settings, versions; another one where particles or features came or went. A state follows.
-    state     an exact state, to continue from
-    taken     the state after a step that an exception has ended; to be taken as it is, since no whole steps lead to it
-    turned    knobs that the user turned, before the next step
-    assigned  positions or velocities that the user assigned
+    scene     particles, features, settings, versions; a new one when particles or features were added or removed.
+              A state follows.
+    state     an exact state to continue from
+    taken     the state after a step that ended in an exception; taken as recorded, since no complete steps lead to it
+    turned    knobs that the user set before the next step
+    assigned  positions, velocities or spins that the user assigned
     logged    quantities of the user's, for the next frame
-    frame     a frame of the picture, and the hash of the state then
-    thinned   of all frames before, only one of `stride` is still in the picture
+    frame     a frame of the picture, and the hash of its state
+    thinned   of all earlier frames, only one of `stride` is left in the picture
     end       the recording was closed
 
-Each entry also says which steps were made since the one before. Each row of the file is an entry, or, once it was closed, one or
-more of frames, line by line; and carries a checksum of itself and of all before it.
+Each entry also lists the steps made since the one before. A row of the file is one entry; once the file is closed, a row may hold
+several entries of frames, line by line. Each row carries a checksum of itself and of all rows before.
 """
 
 import base64
@@ -30,16 +31,16 @@ if TYPE_CHECKING:
     from ..step.step_report import StepReport
 
 FORMAT = 8
-GUARD = {"stuck", "substeps-capped"}  # flags that do not follow from the steps: the StepController knows what it tried in vain
+GUARD = {"stuck", "substeps-capped"}  # flags that depend on the StepController's failed tries, not on the recorded steps
 JOURNAL = "tiverlet/journal"
 SCENE = "world/scene"
-PARTED = "clock.parted"  # the array of the clock, see Clock
-PARTICLES = "particles"  # the end of the entities that have the positions of frames
-WORLDS = re.compile(r"worlds/\d{1,9}/")  # how entities of many worlds begin, see side_by_side.py
+PARTED = "clock.parted"  # name of the clock's array, see Clock
+PARTICLES = "particles"  # last part of the entities with the positions of frames
+WORLDS = re.compile(r"worlds/\d{1,9}/")  # first part of entities of many worlds, see side_by_side.py
 
 
 class Changed(ValueError):
-    """A recording was changed after it was written. frames: how many were good before the place."""
+    """Raised if a recording was changed after it was written. frames: how many frames before that place are unchanged."""
 
     def __init__(self, text: str, frames: int = 0):
         super().__init__(text)
@@ -48,9 +49,9 @@ class Changed(ValueError):
 
 @dataclass
 class Entry:
-    """What happened, after `steps`: rows of dt [s], substeps, iterations, and how many such steps.
+    """One entry: an event after `steps`, which are rows of dt [s], substeps, iterations, and the number of such steps.
 
-    data["now"]: substeps, iterations and the memory of the controller after it, where they are not those of the entry before.
+    data["now"]: substeps, iterations and the memory of the controller after the event, if they differ from the entry before.
     """
 
     kind: str
@@ -60,7 +61,7 @@ class Entry:
     steps: list[list] = field(default_factory=list)
 
     def pack(self, serial: int) -> tuple[str, bytes]:
-        """The entry as text and bytes."""
+        """Return the entry as text and bytes."""
         arrays = {name: np.asarray(a, dtype=a.dtype.newbyteorder("<")) for name, a in self.arrays.items()}
         table = [[name, a.dtype.str, list(a.shape)] for name, a in arrays.items()]
         parts = {"serial": serial, "kind": self.kind, "frame": self.frame, "steps": self.steps, "data": self.data}
@@ -68,7 +69,7 @@ class Entry:
 
     @staticmethod
     def unpack(text: str, blob: bytes) -> "Entry":
-        """The entry that pack() was given."""
+        """Return the entry that pack() encoded."""
         parts, arrays, at = json.loads(text), {}, 0
         for name, kind, shape in parts["arrays"]:
             dtype = np.dtype(str(kind))
@@ -83,24 +84,24 @@ class Entry:
 
 
 def checksum(before: str, text: str, blob: bytes) -> str:
-    """Of an entry and all before it."""
+    """Return the checksum of an entry and all before it."""
     return brief(hashlib.sha256(b"\n".join([before.encode(), text.encode(), blob])).hexdigest())
 
 
 def brief(digest: str) -> str:
-    """The first 128 bits of a digest in 20 characters: LZ4 cannot make digits of noise any shorter; each takes a byte."""
+    """Return the first 128 bits of a digest in 20 characters. LZ4 cannot compress random digits, each of which takes a byte."""
     return base64.b85encode(bytes.fromhex(digest)[:16]).decode()
 
 
 def said(report: "StepReport | None") -> dict[str, Any]:
-    """The flags of a report, if some do not follow from the steps alone."""
+    """Return flags and notes of a report if some flags do not follow from the steps alone; otherwise nothing."""
     return {"flags": sorted(report.flags), "notes": list(report.notes)} if report and report.flags & GUARD else {}
 
 
 def read(path: str, contents: rrd.Contents) -> tuple[list[Entry], str, int | None]:
-    """The entries in order, checked; why they end where they do, if something is missing; and how many frames follow it.
+    """Return the entries in order, checked; why they end early, if they do; and then how many frames follow the gap.
 
-    Raises ValueError for what is no recording, or of another format, and Changed where a checksum is wrong.
+    Raises ValueError if the file is no recording or has another format, and Changed if a checksum is wrong.
     """
     rows = []
     for number, (ident, text, blob, mark) in enumerate(contents.journal()):
@@ -140,7 +141,7 @@ def read(path: str, contents: rrd.Contents) -> tuple[list[Entry], str, int | Non
     ids = [row[1] for row in rows]
     if ids != sorted(ids) or len(set(ids)) < len(ids):
         raise Changed(f"replay: {path} was changed after it was recorded: entries of the journal were written in another order.")
-    if entries[-1].kind == "scene":  # its state was not flushed
+    if entries[-1].kind == "scene":  # the state that belongs to it was not flushed
         entries.pop()
     if not entries:
         raise ValueError(f"replay: {path} was cut short before anything that can be replayed.")

@@ -1,4 +1,4 @@
-"""Who watches a world and writes the journal of its recording."""
+"""Observes a world and writes the journal of its recording."""
 
 import contextlib
 import copy
@@ -20,32 +20,32 @@ Write = Callable[[str, np.ndarray, str], None]
 
 
 class Journal:
-    """Watches a world and writes entries."""
+    """Writes an entry for every change of the world that it observes."""
 
     def __init__(self, world: "World", write: Write, told: dict[str, Any]):
-        self._told = told  # what is in the picture and follows from nothing else
+        self._told = told  # what the picture contains beyond scene and steps
         self.world, self.frame, self.bytes = world, 0, 0
-        self.worst: StepReport | None = None  # of the whole recording
-        self.recent: StepReport | None = None  # since the last frame
-        self.stirred: set[int]  # features that were turned since then
+        self.worst: StepReport | None = None  # the worst report of the whole recording
+        self.recent: StepReport | None = None  # the worst report since the last frame
+        self.stirred: set[int]  # features whose knobs were set since the last frame
         self._write, self._serial, self._sum = write, 0, ""
         self._steps: list[list] = []
-        self.scenes = self.size = 0  # how many there were, and the size of the last state [bytes]
+        self.scenes = self.size = 0  # the number of scenes, and the size of the last state [bytes]
         self._last: list | None = None
         self.regrouped()
         world._watchers.append(self)
 
     def regrouped(self) -> None:
-        """Write the scene and its state: at the begin, and when the user has added or removed something."""
+        """Write the scene and its state: at the begin, and when the user has added or removed particles or features."""
         data, arrays = scene.describe(self.world)
         self._known = [copy.deepcopy(scene.knobs(f)) for f in self.world.features]
         self.put("scene", {"format": FORMAT, **data, **self._told}, arrays)
         self.size = self.state()
         self.scenes += 1
-        self.stirred = set(range(len(self.world.features)))  # all are to be drawn
+        self.stirred = set(range(len(self.world.features)))  # draw all features
 
     def put(self, kind: str, data: dict[str, Any], arrays: dict[str, np.ndarray] | None = None) -> int:
-        """Write an entry; returns its size [bytes]."""
+        """Write an entry; return its size [bytes]."""
         now = self._now()
         if now != self._last:
             data["now"], self._last = now, now
@@ -57,25 +57,25 @@ class Journal:
         return len(text) + len(blob)
 
     def rounded(self) -> StepReport | None:
-        """The worst report since the last frame, with as many digits of its seconds as mean something."""
+        """Return the worst report since the last frame, with its seconds rounded to three digits."""
         if self.recent:
             self.recent = replace(self.recent, seconds=float(f"{self.recent.seconds:.3g}"))
         return self.recent
 
     def frame_drawn(self, data: dict[str, Any]) -> None:
-        """A frame was drawn."""
+        """Write the entry of a frame that was drawn."""
         took = {"seconds": self.recent.seconds} if self.recent else {}
         self.put("frame", {**data, **took, **said(self.recent)})
         self.recent = None
         self.stirred.clear()
 
     def _now(self) -> list:
-        """What the user has set for the next step, and what the controller remembers."""
+        """Return the user's settings for the next step, and the memory of the controller."""
         settings = self.world.settings
         return [settings["substeps"], settings["iterations"], list(self.world._controller.memory)]
 
     def state(self, kind: str = "state") -> int:
-        """Write the exact state; returns the size of the entry [bytes]."""
+        """Write the exact state; return the size of the entry [bytes]."""
         kept, world = checkpoint.keep(self.world), self.world
         more = {"flags": checkpoint.flags(world), "reach": world._runner.scene.reach}
         more["once"] = [sorted(f.once) for f in world.features]
@@ -84,7 +84,7 @@ class Journal:
         return self.put(kind, {"clock": kept.clock.named() | {"_parted": None}, **more}, arrays)
 
     def before(self) -> None:
-        """A step begins: write down what was turned since the last one."""
+        """Before a step: write the knobs that were set since the last one."""
         arrays: dict[str, np.ndarray] = {}
         turned = {}
         for k, feature in enumerate(self.world.features):
@@ -98,7 +98,7 @@ class Journal:
             self.put("turned", {"features": turned}, arrays)
 
     def after(self, dt: float, report: StepReport) -> None:
-        """A step was made."""
+        """After a step: record it."""
         step = [dt, report.substeps, report.iterations]
         if self._steps and self._steps[-1][:3] == step:
             self._steps[-1][3] += 1
@@ -108,22 +108,22 @@ class Journal:
         self.recent = report if self.recent is None else self.recent.worse(report)
 
     def broken_off(self) -> None:
-        """A step ended with an exception."""
-        with contextlib.suppress(RuntimeError):  # a world whose fields are gone has no state
+        """After a step that ended in an exception: write the state."""
+        with contextlib.suppress(RuntimeError):  # a world whose fields were freed has no state
             self.state("taken")
 
     def assigned(self, name: str, value: np.ndarray) -> None:
-        """The user assigned positions or velocities."""
+        """Write an array that the user assigned: positions, velocities or spins."""
         self.put("assigned", {"name": name}, {"value": value})
 
     def close(self) -> None:
-        """Look away."""
+        """Stop observing the world."""
         if self in self.world._watchers:
             self.world._watchers.remove(self)
 
 
 def _same(value: Any, known: Any) -> bool:
-    """Whether two settings are equal, the signs of zeros too: 0 and -0 are other bits in kernels and in hashes."""
+    """Whether two settings are equal, including the signs of zeros: 0 and -0 have different bits in kernels and hashes."""
     if not np.array_equal(value, known):
         return False
     return np.asarray(value).dtype.kind != "f" or np.array_equal(np.signbit(value), np.signbit(known))

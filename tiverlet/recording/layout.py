@@ -1,4 +1,4 @@
-"""How a recording opens in the viewer."""
+"""The layout in which the viewer opens a recording."""
 
 import uuid
 
@@ -6,38 +6,45 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-SCENE_VIEW = uuid.uuid5(uuid.NAMESPACE_DNS, "scene.tiverlet")  # the view of the scene, to be found in any recording
-SCENE = "world/scene"  # the view looks at "world", so that a mirror at "world/scene" shows
+SCENE_VIEW = uuid.uuid5(uuid.NAMESPACE_DNS, "scene.tiverlet")  # id of the view of the scene in any recording
+SCENE = "world/scene"  # the view shows "world", so that a mirror transform at "world/scene" applies
 LEGEND = "legend/strain"
-WIDE = 5.0  # steps of the legend are so far apart, with a height of 1
+WIDE = 5.0  # distance of the steps of the legend, relative to its height
 
-HALF, ASPECT = 0.52, 1.5  # the tangent of half of the angle that the viewer shows from top to bottom, 55 degrees; wide to high
-MARGIN = 1.06  # of what it takes
-SEEN = 1e-2, 1e4  # sizes of scenes [m] that the viewer shows as they are
+HALF, ASPECT = 0.52, 1.5  # tangent of half the viewer's vertical angle of 55 degrees; width over height
+MARGIN = 1.06  # factor on the distance of the eye
+SEEN = 1e-2, 1e4  # least and most size of scenes [m] that the viewer shows unscaled
 
 
 def unit(low: np.ndarray, high: np.ndarray) -> float:
-    """How many times its size a scene between two corners [m] is shown, a power of ten: 1, unless the viewer would show nothing
-    of it, because it is so small or large."""
+    """Return the factor by which a scene between two corners [m] is scaled for the viewer, a power of ten.
+
+    It is 1 unless the scene is so small or large that the viewer would show nothing of it.
+    """
     size = min(float((high - low).max()), 1e30)
     return 1.0 if size < 1e-30 or SEEN[0] <= size <= SEEN[1] else 10.0 ** -np.floor(np.log10(size))
 
 
 def transform(dim: int, unit: float) -> rr.Transform3D:
-    """What stands above the data, and below the origin of the view. The viewer's 2D views have y pointing down, with no option:
-    a mirror turns it up without touching the data."""
+    """Return the transform between the data and the origin of the view.
+
+    The y axis of the viewer's 2D views points down and cannot be changed; a mirror turns it up without touching the data.
+    """
     return rr.Transform3D(scale=[unit, -unit if dim == 2 else unit, unit])
 
 
 def upright(up: np.ndarray) -> rr.components.ViewCoordinates:
-    """Which axis of a 3D scene points up, and in which sense."""
+    """Return which axis of a 3D scene points up, and its sign."""
     axis = "XYZ"[int(np.argmax(np.abs(up)))]
     return getattr(rr.ViewCoordinates, f"RIGHT_HAND_{axis}_{'UP' if up.max() > -up.min() else 'DOWN'}")
 
 
 def eye_axes(up: np.ndarray) -> np.ndarray:
-    """Of an eye in 3D, in front of the scene, aside and above: unit vectors to the right, up and out of the scene, (3, 3)."""
-    k = int(np.argmax(np.abs(up)))  # in a turn that keeps the senses of the axes
+    """Return the axes of an eye in 3D: unit vectors to the right, up and out of the scene, (3, 3).
+
+    It looks from the front, the side and above.
+    """
+    k = int(np.argmax(np.abs(up)))  # the axes are permuted cyclically, which keeps their handedness
     aside, front = np.roll(np.eye(3)[0], k - 1), np.roll(np.eye(3)[2], k - 1)
     back = 0.45 * aside + 0.35 * up + 0.82 * front
     back /= np.linalg.norm(back)
@@ -47,14 +54,17 @@ def eye_axes(up: np.ndarray) -> np.ndarray:
 
 
 def distance(size: np.ndarray, axes: np.ndarray) -> float:
-    """How far from its middle [m] an eye sees all of a box of this size [m]. axes: see eye_axes()."""
+    """Return how far from its centre [m] an eye sees the whole of a box of this size [m]. axes: see eye_axes()."""
     corners = np.stack(np.meshgrid(*np.stack([-size, size], axis=1) / 2), axis=-1).reshape(-1, 3)
     right, above, back = axes @ corners.T
     return MARGIN * float((np.maximum(np.abs(right) / ASPECT, np.abs(above)) / HALF + back).max())
 
 
 def scene_view(low: np.ndarray, high: np.ndarray, up: np.ndarray, origin: str = "world", name: str = "Scene") -> rrb.View:
-    """The view of a scene within the corners low and high [m]; up: against gravity. origin: below which entities it is."""
+    """Return the view of a scene within the corners low and high [m].
+
+    up: the direction against gravity. origin: the entity above the scene.
+    """
     size = np.maximum(high - low, 1e-9)
     if len(low) == 2:
         edge = 0.05 * size.max()
@@ -71,7 +81,7 @@ def scene_view(low: np.ndarray, high: np.ndarray, up: np.ndarray, origin: str = 
 
 
 def legend_view(title: str, origin: str = "legend") -> rrb.View:
-    """The scale of colours."""
+    """Return the view of the colour scale."""
     bounds = rrb.VisualBounds2D(x_range=[-0.6 * WIDE, 6.6 * WIDE], y_range=[-1.3, 1.5])
     return rrb.Spatial2DView(origin=origin, name=title, visual_bounds=bounds)
 
@@ -79,8 +89,9 @@ def legend_view(title: str, origin: str = "legend") -> rrb.View:
 def blueprint(
     low: np.ndarray, high: np.ndarray, legend: str | None, figures: dict[str, tuple[str, list[bool]]], up: np.ndarray
 ) -> rrb.Blueprint:
-    """The scene on the left, curves and text on the right, for a scene within the corners low and high [m]. figures: see shown()
-    in curves.py. legend: the title of the scale of colours, None where there is none. up: against gravity.
+    """Return the layout of a scene within the corners low and high [m]: the scene on the left, curves and text on the right.
+
+    figures: see shown() in curves.py. legend: the title of the colour scale, or None. up: the direction against gravity.
     """
     view = scene_view(low, high, up)
     curves = [
@@ -102,7 +113,7 @@ def blueprint(
 
 
 def grid(views: list[rrb.View], legend: rrb.View | None) -> rrb.Blueprint:
-    """Views side by side, above a scale of colours."""
+    """Return a layout with views side by side, above a colour scale."""
     side = rrb.Grid(*views)
     whole = rrb.Vertical(side, legend, row_shares=[11, 1.0]) if legend else side
     _name(whole, "grid")
@@ -110,7 +121,7 @@ def grid(views: list[rrb.View], legend: rrb.View | None) -> rrb.Blueprint:
 
 
 def opened(whole: rrb.Container) -> rrb.Blueprint:
-    """A layout with nothing around it but the time."""
+    """Return a layout without the viewer's panels, except for the time."""
     return rrb.Blueprint(
         whole,
         rrb.TimePanel(state="collapsed", timeline="time"),

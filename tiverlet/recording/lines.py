@@ -1,4 +1,4 @@
-"""How links are drawn with few points: as long strips, with the colours of their strain; and which of them are a sheet."""
+"""Links as few points: long strips coloured by strain. Also finds which links form a sheet."""
 
 from collections import defaultdict
 from itertools import combinations
@@ -7,23 +7,27 @@ import numpy as np
 
 from .strain import SCALE
 
-FLAT = 0.1  # the diagonals of a cell pass each other within so much of their length
-STRAIGHT = 1e-3  # a link that passes a particle within so much of its length lies on the two links to it
+FLAT = 0.1  # the diagonals of a cell pass each other within this share of their length
+STRAIGHT = 1e-3  # a link that passes a particle within this share of its length lies on the two links to it
 
 
 class Lines:
-    """Links as strips. pairs: (m, 2), particles. Every link is in one strip, and strips are as long as they can be, so that most
-    particles are there once. In a frame a strip ends where the colour changes.
+    """Links as strips. pairs: particles, (m, 2).
+
+    Every link is in one strip. Strips are as long as possible, so that most particles occur once. In a frame, a strip ends where
+    the colour changes.
     """
 
     def __init__(self, pairs: np.ndarray):
         self.particles, self._link = trails(pairs)
 
     def strips(self, level: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of a frame: the particles of all strips one after the other, (k,), where each strip begins and ends, (s + 1,), and its
-        colour as u32, (s,). level: (m,), of the colour of each link; -1 for one that is not drawn.
+        """Return the strips of a frame: the particles of all strips, (k,), their ends, (s + 1,), and their colours as u32, (s,).
+
+        Strip k has the particles from ends[k] to ends[k + 1]. level: the colour level of each link, (m,); -1 for one that is not
+        drawn.
         """
-        here = np.where(self._link < 0, -1, level[self._link])  # of the line from each particle to the next
+        here = np.where(self._link < 0, -1, level[self._link])  # the level from each particle to the next
         edge = np.flatnonzero(np.diff(here, prepend=-1, append=-1))
         begin, end = edge[:-1], edge[1:]
         drawn = here[begin] >= 0 if len(begin) else np.zeros(0, dtype=bool)
@@ -35,13 +39,13 @@ class Lines:
 
 
 def trails(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Walks along links that take each once: the particles on them, and the link from each to the next, -1 where a walk ends.
+    """Return walks along links that use each link once: the particles on them, and the link to the next particle, -1 at the end.
 
-    A walk goes on with the same step in the numbers of particles where it can: so it goes straight along rows of a sheet, and has
-    the particles in the order in which they are sent.
+    Where it can, a walk continues with the same increment of the particle number. So it follows the rows of a sheet, in the order
+    in which particles are sent.
     """
-    ways: dict[int, dict[int, int]] = defaultdict(dict)  # of each particle: the others, and the links to them
-    again = []  # links between particles that have one already
+    ways: dict[int, dict[int, int]] = defaultdict(dict)  # for each particle: its neighbours, and the links to them
+    again = []  # further links between the same two particles
     for link, (i, j) in enumerate(pairs.tolist()):
         if i == j or j in ways[i]:
             again.append(link)
@@ -68,7 +72,7 @@ def trails(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cells(pairs: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which links are part of a sheet, (m,), and its cells of four particles with six links, round their sides, (c, 4)."""
+    """Return which links are part of a sheet, (m,), and its cells, (c, 4): four particles in order around, with six links."""
     near: dict[int, set[int]] = defaultdict(set)
     for i, j in pairs.tolist():
         near[i].add(j)
@@ -83,7 +87,7 @@ def cells(pairs: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         near[i].discard(j)
         near[j].discard(i)
     found = []
-    for i, j in pairs[~lies].tolist():  # as a diagonal; the other one is k to l
+    for i, j in pairs[~lies].tolist():  # i to j as one diagonal; k to m is the other
         for k, m in combinations(sorted(near[i] & near[j]), 2):
             if m in near[k] and min(i, j) < min(k, m):
                 off = np.linalg.norm(x[i] + x[j] - x[k] - x[m]) / 2

@@ -1,6 +1,6 @@
-"""How worlds, reports, features and recordings look in a notebook: HTML of a few lines, with a small picture of the scene.
+"""HTML of worlds, reports, features and recordings for notebooks: a few lines, with a small picture of the scene.
 
-Nothing is loaded from elsewhere, and no script runs, so it shows in a notebook that is only read, too.
+The HTML loads nothing and runs no script, so it also shows in a notebook that is only read.
 """
 
 from collections.abc import Mapping
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from ..world import World
     from .replay import Replay
 
-MANY = 800  # particles that are drawn; of more, an even selection
+MANY = 800  # most particles drawn; of more, an even selection
 SIZE = 280  # pixels of the longer side of a picture
-GREY = "#8a8f9c"  # can be seen on black and on white
+GREY = "#8a8f9c"  # visible on black and on white
 
 
 def table(rows: Mapping[str, Any], title: str = "") -> str:
-    """Names and values, as rows."""
+    """Return names and values as rows of a table."""
     head = f"<caption style='text-align:left;font-weight:bold'>{escape(title)}</caption>" if title else ""
     cells = "".join(
         f"<tr><td style='text-align:left'>{escape(name)}</td><td style='text-align:left'>{escape(shown(value))}</td></tr>"
@@ -37,7 +37,7 @@ def table(rows: Mapping[str, Any], title: str = "") -> str:
 
 
 def shown(value: Any) -> str:
-    """A value in a few words: of arrays, what they are."""
+    """Return a value in a few words; for a large array its shape and range."""
     if isinstance(value, np.ndarray) and value.size > 8:
         ends = f", {np.nanmin(value):.4g} ... {np.nanmax(value):.4g}" if value.dtype.kind in "biuf" else ""
         return f"array {value.shape}{ends}"
@@ -47,7 +47,7 @@ def shown(value: Any) -> str:
 
 
 def of_report(report: "StepReport") -> str:
-    """A frame: its figures, and each flag with its note."""
+    """Return the HTML of a report: its figures, and each flag with its note."""
     names = ("time", "substeps", "iterations", "residual", "overlap", "contacts", "energy", "energy_change", "broken", "tries")
     notes = "".join(f"<li>{escape(note)}</li>" for note in report.notes)
     flags = ", ".join(sorted(report.flags)) or "none"
@@ -57,29 +57,29 @@ def of_report(report: "StepReport") -> str:
 
 
 def of_feature(feature: "Feature") -> str:
-    """A feature: the arguments that it was made with."""
+    """Return the HTML of a feature: the arguments that it was made with."""
     return table({name: value for name, value in feature.arguments.items() if value is not None}, repr(feature))
 
 
 def of_world(world: "World") -> str:
-    """A world: its picture, and what explain() says, folded."""
+    """Return the HTML of a world: its picture, and the text of explain(), folded."""
     try:
         more = f"<details><summary>explain()</summary><pre>{escape(world.explain())}</pre></details>"
         image = picture(world, InBox().places(world, world.position))
-    except RuntimeError:  # it was closed
+    except RuntimeError:  # the world was closed
         return f"<code>{escape(repr(world))}</code>"
     return f"<div><code>{escape(repr(world))}, {world.time:.4g} s</code><br>{image}{more}</div>"
 
 
 def of_replay(replay: "Replay") -> str:
-    """A recording: what it is."""
+    """Return the HTML of a recording: its description."""
     names = {"frames": len(replay.frames), "seconds": float(replay.times[-1]) if len(replay.times) else 0.0}
     rows = names | {"complete": replay.complete, "curves": ", ".join(replay.curves)}
     return table(rows, replay.path) + f"<p>{escape(replay.text)}</p>"
 
 
 def picture(world: "World", x: np.ndarray) -> str:
-    """Particles at x (n, dim), links, walls and paths as SVG; a scene in 3D as seen from the front and a little above."""
+    """Return particles at x (n, dim), links, walls and paths as SVG; a 3D scene is seen from the front and a little above."""
     low, high = bounds(world)
     view = np.eye(2) if len(low) == 2 else eye_axes(upwards(world))
     some = np.arange(0, len(x), -(-len(x) // MANY) or 1)
@@ -89,7 +89,7 @@ def picture(world: "World", x: np.ndarray) -> str:
     scale = SIZE / max(wide, tall)
 
     def place(points: np.ndarray) -> np.ndarray:
-        """Pixels."""
+        """Return pixels."""
         flat = (points @ view.T)[..., :2]
         return np.stack([(flat[..., 0] - left) * scale, (tall - flat[..., 1] + top) * scale], axis=-1) + 2
 

@@ -1,4 +1,4 @@
-"""The messages of an .rrd file, as far as it takes to write one: rows of data go through here on their way to the file."""
+"""The messages of an .rrd file, as far as writing needs them: rows pass through here on their way to the file."""
 
 import struct
 from collections import defaultdict
@@ -10,17 +10,17 @@ import numpy as np
 from . import journal, reader
 
 HEADER = 12  # bytes of a file before its first message
-HEAD = struct.Struct("<QQ")  # of a message: its kind, and the bytes that follow
-END, STORE, CHUNK, SHOWN = range(4)  # kinds: the last message, a store, rows of an entity, and which layout is shown
-LAYOUT = 2  # the kind of a store that has one
-COMPRESSION, SIZE, PAYLOAD = 2, 3, 5  # fields of the latter: how its bytes are compressed, how many they are without it, and they
+HEAD = struct.Struct("<QQ")  # head of a message: its kind, and how many bytes follow
+END, STORE, CHUNK, SHOWN = range(4)  # kinds: the last message, a store, rows of an entity, which layout is shown
+LAYOUT = 2  # the kind of a store with a layout
+COMPRESSION, SIZE, PAYLOAD = 2, 3, 5  # fields of a chunk: the compression, the uncompressed size, the bytes
 LZ4 = 2
-BATCH = 120_000  # bytes that are sent together: LZ4 looks back by 64 kB
-LEVEL = 9  # of LZ4: finds the points of lines among those of the particles, at 60 MB/s
-NOISE = 0.9  # what rerun's faster LZ4 leaves of noise: there is 1 % more to be found there, for 2 ms per 100 kB
-PACKED = 64  # entries of a journal in one row
-WRITTEN = "log_time"  # of rows of the layout: when they were written, which nothing looks at
-PARTS = ("particles", "fill", "contacts", "velocities", "breaks")  # of the scene, drawn in each frame or in the one after, too
+BATCH = 120_000  # bytes sent together: LZ4 finds matches within 64 kB
+LEVEL = 9  # LZ4 level that matches the points of lines with those of particles, at 60 MB/s
+NOISE = 0.9  # from this compression ratio on, LEVEL saves only 1 % over rerun's faster LZ4, for 2 ms per 100 kB
+PACKED = 64  # most entries of a journal in one row
+WRITTEN = "log_time"  # column of the layout's rows with the time of writing, which nothing reads
+PARTS = ("particles", "fill", "contacts", "velocities", "breaks")  # of the scene: drawn in each frame, or again in the next
 
 
 class Chunk:
@@ -41,7 +41,7 @@ class Chunk:
         return len(self._message)
 
     def noise(self) -> bool:
-        """Whether it can be compressed no better."""
+        """Whether better compression would gain too little."""
         packed, plain = self._number(PAYLOAD), self._number(SIZE)
         return self._number(COMPRESSION) != LZ4 or packed > NOISE * plain
 
@@ -49,7 +49,7 @@ class Chunk:
         return self._fields[field][3] if field in self._fields else 0
 
     def rows(self) -> Any:
-        """As a pyarrow.RecordBatch."""
+        """Return the rows as a pyarrow.RecordBatch."""
         import pyarrow as pa
 
         _, begin, end, _ = self._fields[PAYLOAD]
@@ -59,10 +59,10 @@ class Chunk:
         return pa.ipc.open_stream(data).read_next_batch()
 
     def holding(self, rows: Any) -> bytes:
-        """The message with other rows, compressed well. pyarrow pads them less than rerun does."""
+        """Return the message with other rows, well compressed. pyarrow pads them less than rerun does."""
         import pyarrow as pa
 
-        ids = rows.schema.field(0)  # rerun takes them for ids by their kind, and needs no name of their type beside it
+        ids = rows.schema.field(0)  # rerun recognises ids by their kind, and needs no name of their type in addition
         told = {key: value for key, value in (ids.metadata or {}).items() if not key.startswith(b"ARROW:extension")}
         rows = rows.set_column(0, ids.with_metadata(told), rows.column(0))
         out = pa.BufferOutputStream()
@@ -82,7 +82,7 @@ class Chunk:
 
 
 def smaller(message: bytes) -> bytes:
-    """A message with rows, compressed better than rerun does it in its hurry; as it is where there is nothing to gain."""
+    """Return a message with its rows compressed better than rerun does; unchanged where nothing is gained."""
     chunk = Chunk(message)
     if chunk.noise():
         return message
@@ -92,24 +92,25 @@ def smaller(message: bytes) -> bytes:
 
 
 def droppable(frames: np.ndarray, stride: int) -> np.ndarray:
-    """Which rows of an entity may go when one of `stride` frames is kept. frames: of its rows, ascending.
+    """Return which rows of an entity may be removed if one of `stride` frames is kept. frames: the frame of each row, ascending.
 
-    Rows of the frames that are kept stay, and the last row before one that has none of its own: what it shows goes on.
+    Rows of kept frames stay. If a kept frame has no row of its own, the last row before it stays too, since the viewer shows it
+    there.
     """
     following = np.append(frames[1:], np.iinfo(np.int64).max)
     return (frames % stride != 0) & (following <= -(-frames // stride) * stride)
 
 
 def thins(entity: str) -> bool:
-    """Whether an entity is among those that lose rows."""
+    """Whether rows of an entity may be removed."""
     return entity.startswith("/figures") or (entity.startswith("/world/") and entity.rpartition("/")[2] in PARTS)
 
 
 def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[int, bytes]]:
-    """Messages (kind, bytes) with the picture of one of `stride` frames; all others as they are.
+    """Yield messages (kind, bytes) with the picture of one of `stride` frames; all other messages are unchanged.
 
-    stride = 1: nothing is left out but the layout that another one has replaced; the rows of each entity stand together, and so
-    do entries of the journal, which come first, and in pieces: what is left of a file that was cut short can be replayed.
+    With stride = 1 only replaced layouts are left out. The rows of each entity are put together. Entries of the journal are
+    packed as well and come first, in pieces, so that a file that was cut short can be replayed as far as it goes.
     """
     if stride == 1:
         messages = latest(messages)
@@ -128,7 +129,7 @@ def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[in
         numbers = np.unique(np.concatenate(numbers))
         gone[entity] = numbers[droppable(numbers, stride)]
     entries, pictures = [], []
-    waiting: dict[tuple, list] = defaultdict(list)  # rows that go together: a message of a single one takes 1 kB
+    waiting: dict[tuple, list] = defaultdict(list)  # rows to be put together: a message with a single row takes 1 kB
     for (kind, message), entity in zip(messages, found, strict=True):
         if not entity:
             yield kind, message
@@ -151,14 +152,14 @@ def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[in
 
 
 def latest(messages: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
-    """The messages without those of layouts that later ones have replaced."""
+    """Return the messages without those of replaced layouts."""
     where = [_store(kind, message) for kind, message in messages]
     layouts = [store for store in dict.fromkeys(where) if store and store[0] == LAYOUT]
     return [one for one, store in zip(messages, where, strict=True) if store not in layouts[:-1]]
 
 
 def _store(kind: int, message: bytes) -> tuple | None:
-    """The store that a message is about."""
+    """Return the store to which a message belongs."""
     if kind == STORE:
         message = reader.record(reader.record(message, "1 2").get(2, b""), "2 5 6")[2]
         return tuple(reader.store_of(message))
@@ -166,9 +167,9 @@ def _store(kind: int, message: bytes) -> tuple | None:
 
 
 def _packed(entries: list[tuple[Chunk, Any]]) -> Iterator[bytes]:
-    """Messages with rows of a journal: the first by itself, so that it is there as soon as can be, the others together."""
+    """Yield messages with rows of a journal: the first row by itself, so that it is written early, the others together."""
     pieces, size, mark = [], BATCH, ""
-    whole = max((rows.schema for _, rows in entries), key=len, default=None)  # entries without bytes have no column for them
+    whole = max((rows.schema for _, rows in entries), key=len, default=None)  # entries without bytes lack that column
     entries = _in_order([(chunk, _with_all(rows, whole)) for chunk, rows in entries])
     for chunk, rows in entries:
         size += rows.nbytes
@@ -182,7 +183,7 @@ def _packed(entries: list[tuple[Chunk, Any]]) -> Iterator[bytes]:
 
 
 def _in_order(entries: list[tuple[Chunk, Any]]) -> list[tuple[Chunk, Any]]:
-    """The same rows by their ids: those with and without bytes come in messages of their own, and may have passed each other."""
+    """Sort rows by their ids. Rows with and without bytes come in separate messages, which may overtake each other."""
     ids = [rows.column(0).to_pylist() for _, rows in entries]
     together = [one for part in ids for one in part]
     if together == sorted(together):
@@ -194,7 +195,7 @@ def _in_order(entries: list[tuple[Chunk, Any]]) -> list[tuple[Chunk, Any]]:
 
 
 def _with_all(rows: Any, whole: Any) -> Any:
-    """Rows with all columns of a schema, empty where they have none."""
+    """Return rows with all columns of a schema; missing ones are empty."""
     import pyarrow as pa
 
     if rows.schema.equals(whole):
@@ -204,9 +205,9 @@ def _with_all(rows: Any, whole: Any) -> Any:
 
 
 def _in_runs(rows: Any, mark: str) -> tuple[Any, str]:
-    """Rows of a journal with entries of frames that follow each other in one: a row takes 60 bytes beside its text.
+    """Merge successive entries of frames into one row, since a row takes 60 bytes in addition to its text.
 
-    mark: the checksum of the row before. Returns that of the last row, too.
+    mark: the checksum of the row before. Returns the rows and the checksum of the last one.
     """
     import pyarrow as pa
 
@@ -231,7 +232,7 @@ def _in_runs(rows: Any, mark: str) -> tuple[Any, str]:
 
 
 def _together(parts: list[tuple[Chunk, Any]]) -> Any:
-    """The rows of some messages as those of the first."""
+    """Join the rows of several messages, with the schema of the first."""
     import pyarrow as pa
 
     first = parts[0][1]
@@ -244,7 +245,7 @@ def _joined(parts: list[tuple[Chunk, Any]]) -> bytes:
 
 
 def split(data: bytes) -> list[tuple[int, bytes]]:
-    """The messages of a file, each with its kind."""
+    """Return the messages of a file, each with its kind."""
     out, at = [], HEADER
     while at + HEAD.size <= len(data):
         kind, length = HEAD.unpack_from(data, at)
@@ -254,7 +255,7 @@ def split(data: bytes) -> list[tuple[int, bytes]]:
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
-    """A number of seven bits to a byte, and where the next begins."""
+    """Decode a number of seven bits per byte; return it and the index behind it."""
     number = shift = 0
     while True:
         byte = data[at]

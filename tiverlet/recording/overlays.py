@@ -1,4 +1,4 @@
-"""What is drawn only where it is asked for: strain, loads of contacts, velocities, and a quantity of the user's in colours."""
+"""What is drawn on request: strain, loads of contacts, velocities, and a quantity of the user's as colours."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -13,16 +13,16 @@ from .strain import legend
 if TYPE_CHECKING:
     from ..world import World
 
-AHEAD = 0.05  # [s] for which an arrow shows the way
-WIDEST = 0.2  # half the width of the line of a load, in radii
-COMMON = 0.95  # of all loads of a frame, what is no more than the one that has that width
+AHEAD = 0.05  # [s] an arrow shows the path of so much time
+WIDEST = 0.2  # half the width of the line of a load at the quantile COMMON, in radii
+COMMON = 0.95  # quantile of the loads of a frame
 LOAD, ARROW = (255, 150, 60), (240, 240, 160)
 RAMP = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], dtype=np.float64)  # viridis
 
 
 @dataclass(frozen=True)
 class Overlays:
-    """What a Recorder was asked for. color: name, least and most of a quantity of particles."""
+    """The overlays requested of a Recorder. color: name, least and most value of a quantity of particles."""
 
     strain: bool = True
     forces: bool = False
@@ -30,13 +30,13 @@ class Overlays:
     color: tuple[str, float, float] | None = None
 
     def title(self, links: bool) -> str | None:
-        """Of the scale of colours; None where there is none. links: whether there are any."""
+        """Return the title of the colour scale, or None without a scale. links: whether the scene has any."""
         if self.color:
             return self.color[0]
         return "Strain of links" if links and self.strain else None
 
     def scale(self, links: bool) -> tuple[np.ndarray, list[str]] | None:
-        """Colours and labels of that scale."""
+        """Return colours and labels of the scale, or None."""
         if self.color:
             at = np.linspace(*self.color[1:], 7)
             return ramp(at, *self.color[1:]), [f"{value:.4g}" for value in at]
@@ -44,13 +44,13 @@ class Overlays:
 
     @staticmethod
     def of(told: dict[str, Any]) -> "Overlays":
-        """As a recording tells it."""
+        """Return the overlays stored in a recording."""
         color = told["color"]
         return Overlays(told["strain"], told["forces"], told["velocities"], None if color is None else (*color,))  # type: ignore[arg-type]
 
 
 def checked_color(value: Any) -> tuple[str, float, float] | None:
-    """The argument `color` of a Recorder: None, or (name, least, most)."""
+    """Check the argument `color` of a Recorder: None, or (name, least, most)."""
     if value is None:
         return None
     if not (isinstance(value, (tuple, list)) and len(value) == 3 and isinstance(value[0], str)):
@@ -64,7 +64,7 @@ def checked_color(value: Any) -> tuple[str, float, float] | None:
 
 
 def checked_quantities(given: dict[str, Any], count: int) -> dict[str, Any]:
-    """Quantities of the user's as floats, and arrays (count,) in f64."""
+    """Check the user's quantities; return them as floats and arrays (count,) in f64."""
     taken = {name for _, curves in (CURVES | SPIN).values() for name in curves}
     out: dict[str, Any] = {}
     for name, value in given.items():
@@ -81,7 +81,7 @@ def checked_quantities(given: dict[str, Any], count: int) -> dict[str, Any]:
 
 
 def ramp(values: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Colours, (n, 3), of numbers (n,) between two ends; grey for what is not finite."""
+    """Return colours, (n, 3), of numbers (n,) between two limits; grey where they are not finite."""
     with np.errstate(invalid="ignore"):
         at = np.clip((values - low) / (high - low), 0, 1) * (len(RAMP) - 1)
     known = np.isfinite(at)
@@ -92,8 +92,9 @@ def ramp(values: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def loads(world: "World", x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The loads of contacts as lines from centre to centre, (m, 3, dim), and half their widths [m]: as wide as the load, next to
-    those of the frame. x: positions, (n, dim).
+    """Return the loads of contacts as lines from centre to centre, (m, 3, dim), and half their widths [m].
+
+    Widths are proportional to the loads, relative to the other loads of the frame. x: positions, (n, dim).
     """
     dim = x.shape[1]
     if not world._clock.h:
@@ -110,7 +111,7 @@ def loads(world: "World", x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if not len(load):
         return np.zeros((0, 3, dim)), np.zeros(0)
     point, box = found.point[some], world._runner.scene.periodic
-    if box is not None:  # as seen from the first of each pair
+    if box is not None:  # the images nearest to the first particle of each pair
         b, point = a - box.difference(a, b), a - box.difference(a, point)
     size = np.linalg.norm(a - point, axis=1).mean()
     return np.stack([a, point, b], axis=1), WIDEST * size * load / max(np.quantile(load, COMMON), 1e-300)

@@ -1,6 +1,6 @@
-"""What the viewer shows of a world, as rows of a rerun stream.
+"""The picture of a world in the viewer, as rows of a rerun stream.
 
-All of it follows from the world, its reports and what the journal says, so that it can be drawn again and compared.
+Everything in it follows from the world, its reports and the journal, so that verify() can draw it again and compare.
 """
 
 from collections.abc import Iterable
@@ -15,13 +15,15 @@ from .overlays import Overlays
 if TYPE_CHECKING:
     from ..world import World
 
-NEAR = 0.35  # of the size of what moved: how far around it the view goes where there are walls
-FLOWN = 100.0  # times the size of the scene: what went further is not looked for
+NEAR = 0.35  # walls are in view up to this share of the size of the region in which particles moved
+FLOWN = 100.0  # particles beyond this multiple of the scene's size are ignored by the view
 
 
 class Picture:
-    """The scene, its figures as curves, events, and a page about it. explained: what world.explain() says. environment: what it
-    was recorded with, see scene.environment(). overlays: what is drawn on request.
+    """The scene, its figures as curves, events, and a page about it.
+
+    explained: the text of world.explain(). environment: the environment of the recording, see scene.environment(). overlays: what
+    is drawn on request.
     """
 
     def __init__(self, world: "World", stream: Any, explained: str, environment: dict[str, Any], overlays: Overlays):
@@ -33,13 +35,13 @@ class Picture:
         self.world, self._stream, self._explained, self._environment = world, stream, explained, environment
         self._overlays = overlays
         self.drawing = Drawing(world, stream, bounds(world), overlays)
-        self._low, self._high = np.full((2, world.particles.dim), [[np.inf], [-np.inf]])  # of all that was drawn
+        self._low, self._high = np.full((2, world.particles.dim), [[np.inf], [-np.inf]])  # corners of everything drawn
         self._unit, dim = unit(*self.drawing.extent), world.particles.dim
         about = [transform(dim, self._unit)] if dim == 2 or self._unit != 1 else []
         self.drawing.static(SCENE, *about, *([upright(upwards(world))] if dim == 3 else []))
         self.curves = Curves(world, stream)
         self._about(None, 0, "")
-        self._seen: set[str] = set()  # flags
+        self._seen: set[str] = set()  # flags reported as events already
 
     def _about(self, worst: StepReport | None, frames: int, note: str) -> None:
         import rerun as rr
@@ -48,11 +50,11 @@ class Picture:
         self.drawing.static("about", rr.TextDocument(text, media_type="text/markdown"))
 
     def follow(self, world: "World") -> None:
-        """Draw another world from now on, which is the same to the viewer."""
+        """Draw another world from now on; the viewer shows no difference."""
         self.world = self.drawing.world = world
 
     def stamp(self, number: int) -> None:
-        """What is logged from now on belongs to this frame."""
+        """Set the frame of everything logged from now on."""
         self._stream.set_time("frame", sequence=number)
         self._stream.set_time("time", duration=self.world.time)
 
@@ -60,8 +62,10 @@ class Picture:
         self, number: int, now: Checkpoint, x: np.ndarray, x32: np.ndarray, report: StepReport | None, scenes: int,
         stirred: Iterable[int],
     ) -> None:  # fmt: skip
-        """Draw a frame. now: its state. x, x32: positions, (n, dim), and rounded to f32. report: the worst of the steps since the
-        last one. scenes: how many there were. stirred: features that were turned since the last frame.
+        """Draw a frame.
+
+        now: the world's state. x, x32: positions, (n, dim), in full and in f32. report: the worst of the steps since the last
+        frame. scenes: the number of scenes so far. stirred: features whose knobs were set since the last frame.
         """
         if scenes > self.drawing.scenes:
             self.curves.weigh(self.world)
@@ -75,14 +79,14 @@ class Picture:
                 self.drawing.event(" ".join(report.notes), "WARN")
 
     def log(self, number: int, values: dict[str, Any]) -> None:
-        """Quantities of the user's, for the coming frame: numbers, and arrays of one for each particle, (n,)."""
+        """Add the user's quantities for the coming frame: numbers, and arrays of one number per particle, (n,)."""
         self.curves.log(number, self.world.time, {name: value for name, value in values.items() if np.ndim(value) == 0})
         color = self._overlays.color
         if color and np.ndim(values.get(color[0], 0.0)):
             self.drawing.color(values[color[0]])
 
     def _frame_all(self, x: np.ndarray) -> None:
-        """Remember where particles are, for layout()."""
+        """Extend the region of all particles so far, for layout()."""
         radius = self.world.particles.radius[:, None]
         some = np.isfinite(x).all(axis=1)
         if some.any():
@@ -90,20 +94,22 @@ class Picture:
             self._high = np.maximum(self._high, (x + radius)[some].max(axis=0))
 
     def layout(self) -> Any:
-        """How the recording opens, once all of it is known: the view frames the whole run."""
+        """Return the layout in which the finished recording opens: the view frames the whole run."""
         extent = framed(self.drawing.extent, self._low, self._high)
         return layout(self.world, self._overlays, (extent, self._unit), self.curves.own)
 
     def end(self, worst: StepReport | None, frames: int, note: str) -> None:
-        """The page about all frames."""
+        """Write the page about all frames."""
         self._about(worst, frames, note)
 
 
 def layout(
     world: "World", overlays: Overlays, seen: tuple[tuple[np.ndarray, np.ndarray], float] | None = None, own: Iterable[str] = ()
 ) -> Any:
-    """How it opens in the viewer. seen: the corners of what is to be seen [m], and how many times its size; None for what is
-    known beforehand. own: quantities of the user's that have curves.
+    """Return the layout in which the viewer opens a recording.
+
+    seen: corners of the visible region [m], and the factor of scale; None for what is known beforehand. own: names of the user's
+    quantities that have curves.
     """
     from .curves import OWN, shown
     from .drawing import bounds, links, upwards
@@ -115,9 +121,9 @@ def layout(
 
 
 def framed(extent: tuple[np.ndarray, np.ndarray], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The corners of the view of a run whose particles were between `low` and `high`: these, and what of the scene is near.
+    """Return the corners of the view of a run: the region between `low` and `high` where particles were, and the scene near it.
 
-    What flew out so far that the rest would be a speck is left out.
+    Particles that flew so far away that the rest would shrink to a speck are left out.
     """
     if not (low <= high).all():
         return extent
@@ -130,7 +136,7 @@ def framed(extent: tuple[np.ndarray, np.ndarray], low: np.ndarray, high: np.ndar
 def about(
     world: "World", explained: str, environment: dict[str, Any], worst: StepReport | None = None, frames: int = 0, note: str = ""
 ) -> str:
-    """A page about the scene, and about all frames once there are some."""
+    """Return a page about the scene, and about all frames once there are some."""
     rows = [
         f"# {len(world.particles)} particles in {world.particles.dim}D",
         "",

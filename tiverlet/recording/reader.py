@@ -1,13 +1,13 @@
-"""The rows of an .rrd file, read in a process of its own, since a file may come from anyone. See rrd.py, which starts it.
+"""Reads the rows of an .rrd file in a process of its own, since a file may come from an untrusted source. rrd.py starts it.
 
-It runs as a script, without the rest of the package: that takes 0.1 s. What it finds goes to a file that it was given: arrays,
-one behind the other; and what is where, to the standard output. It knows of rerun's format what rerun writes, and takes nothing
-else, so that the viewer can see nothing that is not seen here: messages, each a record of protobuf with a chunk of rows as a
-stream of Arrow's, compressed by LZ4.
+It runs as a script that does not import the rest of the package, so that it takes only 0.1 s. It writes arrays one behind the
+other to a given file, and their places to the standard output. It accepts only what rerun writes, so that the viewer can show
+nothing that is not read here. A file has messages, each a protobuf record with a chunk of rows as an Arrow stream, compressed by
+LZ4.
 
     file       "RRF2", version and options (12 bytes); messages; the end
-    message    kind, length (2 x u64); 1: a store, 2: a chunk of rows of a store, 3: a layout is the one to show; 0: the end, with
-               SHA-256 of all before it
+    message    kind, length (2 x u64); 1: a store, 2: a chunk of rows of a store, 3: which layout is shown; 0: the end, with
+               SHA-256 of everything before it
 """
 
 import contextlib
@@ -19,23 +19,23 @@ import sys
 
 MAGIC, OPTIONS = b"RRF2", b"\1\2\0\0"  # LZ4, protobuf
 HEADER = 12
-SEAL = b"\x7a\x20"  # in the last message, a field of 32 bytes that rerun does not know: SHA-256 of all before that message
-LZ4 = 255  # bytes that one byte may stand for
-SPARE = 256 << 20  # bytes of memory, and of what is found, in any case
-FOLD = 64  # times the size of the file that may be found
-UNTOLD = {"RecordingInfo:start_time"}  # nothing says whether it is true
+SEAL = b"\x7a\x20"  # a field of 32 bytes in the last message that rerun ignores: SHA-256 of everything before that message
+LZ4 = 255  # the largest ratio of compression
+SPARE = 256 << 20  # bytes of memory and of output that are allowed in any case
+FOLD = 64  # bytes of output that are allowed per byte of the file
+UNTOLD = {"RecordingInfo:start_time"}  # components that cannot be verified
 BROKEN = "its checksum is not that of the file"
-LAYOUTS = 2  # the number of the store of the first layout; that of the recording itself is 1
-DEEP = 16  # levels of lists in lists
+LAYOUTS = 2  # number of the first layout's store; the recording's store is 1
+DEEP = 16  # most levels of nested lists
 ROWS = {"world/scene": "Points2D:positions Points3D:positions", "figures": "Scalars:scalars"}
 
 
 class Damaged(Exception):
-    """The file is not as rerun writes it, from here on."""
+    """Raised where the file is not as rerun writes it."""
 
 
 def varint(data: bytes, at: int) -> tuple[int, int]:
-    """A number, and where the next thing begins."""
+    """Decode a number; return it and the index behind it."""
     value = shift = 0
     while shift < 64:
         byte = data[at]
@@ -46,7 +46,7 @@ def varint(data: bytes, at: int) -> tuple[int, int]:
 
 
 def record(data: bytes, known: str) -> dict:
-    """A record of protobuf: numbers and bytes by the numbers of their fields, of which each is there at most once."""
+    """Decode a protobuf record into numbers and bytes by field number. Each field may occur once, and must be in `known`."""
     at, out = 0, {}
     while at < len(data):
         key, at = varint(data, at)
@@ -67,20 +67,20 @@ def record(data: bytes, known: str) -> dict:
 
 
 def store_of(data: bytes) -> tuple[int, str, str]:
-    """Kind (1: recording, 2: layout), application and id of a store."""
+    """Return kind (1: recording, 2: layout), application and id of a store."""
     parts = record(data, "1 2 3")
     return parts.get(1, 0), record(parts.get(3, b""), "1").get(1, b"").decode(), parts.get(2, b"").decode()
 
 
 class Found:
-    """What goes to the parent: arrays one behind the other in the file, and where they are."""
+    """The output for the parent process: arrays one behind the other in the file, and their places."""
 
     def __init__(self, file: int, most: int):
         self._file, self._most, self.size = os.fdopen(file, "wb"), most, 0
         self.tables: dict[str, list] = {}
 
     def put(self, data) -> int:
-        """Write bytes; returns where they begin."""
+        """Write bytes; return where they begin."""
         begin = self.size
         self.size += len(data)
         if self.size > self._most:
@@ -89,7 +89,7 @@ class Found:
         return begin
 
     def table(self, name: str, rows: list, kind) -> None:
-        """An array that is looked up by name."""
+        """Write an array that is found by name."""
         import numpy as np
 
         array = np.array(rows, dtype=kind)
@@ -100,12 +100,12 @@ class Found:
         self.size += array.nbytes
 
     def close(self) -> None:
-        """The file is whole."""
+        """Complete the file."""
         self._file.close()
 
 
 def feed(into, array, depth: int = 0) -> None:
-    """Put what an Arrow array holds into a checksum; the same for arrays that are equal, however they lie in memory."""
+    """Add the contents of an Arrow array to a checksum. Equal arrays give equal checksums, whatever their layout in memory."""
     import numpy as np
     import pyarrow as pa
 
@@ -129,7 +129,7 @@ def feed(into, array, depth: int = 0) -> None:
 
 
 class Reader:
-    """Reads messages, and keeps what is asked for."""
+    """Reads messages, and keeps the requested parts."""
 
     def __init__(self, found: Found, rows: bool):
         import numpy as np
@@ -137,25 +137,25 @@ class Reader:
 
         self.np, self.pa, self.found, self.wants_rows = np, pa, found, rows
         self.stores: list = []
-        self.shown: list = []  # layouts that are to be shown
+        self.shown: list = []  # layouts that messages activate
         self.entities: dict[str, int] = {}
         self.journal: list = []
         self.numbers: list = []
         self.rows: list = []
-        self.trouble: list[str] = []  # what no row says, but the viewer may see
+        self.trouble: list[str] = []  # faults outside the rows that could affect the viewer
 
     def store(self, data: bytes) -> None:
-        """A message that announces a store."""
+        """Read a message that announces a store."""
         info = record(record(data, "1 2").get(2, b""), "2 5 6")
         self.stores.append(store_of(info.get(2, b"")))
 
     def show(self, data: bytes) -> None:
-        """A message that says which layout is shown."""
+        """Read a message that activates a layout."""
         parts = record(data, "1 2 3")
         self.shown.append([store_of(parts.get(1, b""))[2], parts.get(2, 0), parts.get(3, 0)])
 
     def chunk(self, data: bytes) -> None:
-        """A message with rows."""
+        """Read a message with rows."""
         np, pa = self.np, self.pa
         parts = record(data, "1 2 3 4 5 6 7")
         store, packed, size = store_of(parts.get(1, b"")), parts.get(5, b""), parts.get(3, 0)
@@ -254,14 +254,14 @@ class Reader:
         return into.digest()
 
     def write(self) -> None:
-        """Hand over what was found."""
+        """Write the tables."""
         self.found.table("journal", self.journal, "S16, i8, i8, i8, i8")
         self.found.table("numbers", self.numbers, "i4, i8, S16, i8, i8, i8, i8")
         self.found.table("rows", self.rows, "i1, i1, i4, i8, i8, S16, S16")
 
 
 def messages(file, size: int, take) -> tuple[int, str | None]:
-    """Give every message to `take`; where the last good one ends, and why no more follow. None: the file ends as it should."""
+    """Pass every message to `take`. Return where the last good one ends, and why none follows; None if the file ends properly."""
     whole, at = hashlib.sha256(), HEADER
     file.seek(0)
     whole.update(file.read(HEADER))
@@ -285,14 +285,14 @@ def messages(file, size: int, take) -> tuple[int, str | None]:
             if kind not in (1, 2, 3):
                 raise Damaged(f"there is a message of kind {kind}")
             take[kind](data)
-        except Exception as e:  # whatever Arrow, NumPy or Python find
+        except Exception as e:  # any error of Arrow, NumPy or Python means a damaged file
             return at, f"{type(e).__name__}: {e}" if not isinstance(e, Damaged) else str(e)
         at += 16 + length
     return at, "the file has no end"
 
 
 def limit(size: int) -> None:
-    """Bound what the process may take: memory, time on the CPU."""
+    """Limit the memory and the CPU time of this process."""
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource
 
@@ -305,7 +305,7 @@ def limit(size: int) -> None:
 
 
 def read(file, out: int, rows: bool, limited: bool) -> dict:
-    """What is where in the file that `out` is, of which the arrays are written there. rows: digests of all rows, too."""
+    """Return the places of the arrays that are written to the file descriptor `out`. rows: also write digests of all rows."""
     size = os.fstat(file.fileno()).st_size
     head = file.read(HEADER)
     if head[:4] != MAGIC or len(head) < HEADER:

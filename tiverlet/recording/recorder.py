@@ -1,4 +1,4 @@
-"""Writing a simulation to a file that is picture, checkpoint and proof."""
+"""Recorder: writes a simulation to a file that holds the picture, the states to continue from, and what verify() compares."""
 
 import contextlib
 import os
@@ -24,38 +24,38 @@ from .picture import Picture, layout
 from .scene import environment
 from .sink import BACKLOG, LOOK, SMALL, Sink, file_error
 
-SEND = 1.0  # [s] after which the points of curves are sent on
-SHARE = 20  # an exact state is written when the pictures since the last one weigh so many times as much, uncompressed
-SPARSE = 300  # frames after which one is written in any case
-RESERVE = 40_000  # bytes of a budget for the layout and the summary
+SEND = 1.0  # [s] between two transfers of curve points to rerun
+SHARE = 20  # an exact state is written once the pictures since the last one take so many times its bytes, uncompressed
+SPARSE = 300  # frames after which an exact state is written in any case
+RESERVE = 40_000  # bytes of a budget reserved for the layout and the summary
 
 
 class Recorder:
-    """Writes frames of a world to an .rrd file, and all that it takes to compute them again, bit for bit.
+    """Writes frames of a world to an .rrd file, and everything needed to compute them again, bit for bit.
 
         with tv.Recorder("rope.rrd", world) as recorder:
             world.step(1 / 60)
             recorder.log()
 
-    path: the file; its folder must exist. None with live: no file. world: what to record. every: log only each so many frames.
-    budget: bytes that the file may have. When they run short, every other frame is taken out of the picture of the whole run,
-    again and again, and a warning at the end says so; all steps stay in the file. overwrite: whether a file that is there may be
-    replaced; it stays as it is until the new one has its first frame.
+    path: the file; its folder must exist. None with live: no file. world: the world to record. every: log only one of so many
+    frames. budget: the most bytes of the file. When they run short, every other frame is removed from the picture of the whole
+    run, repeatedly if needed, and a warning at the end reports it; all steps stay in the file. overwrite: whether an existing
+    file may be replaced; it stays as it is until the new one has its first frame.
 
-    strain: whether links and surfaces show it. forces: draw the loads of contacts as lines, as wide as the load next to those of
-    the frame. velocities: draw arrows that show the way of 0.05 s. color: (name, least, most), a quantity of log() in whose
-    colours particles are drawn. live: show what is recorded while it is: True for a window, "web" for a page in the
-    browser, "notebook" below a cell, or the address of a viewer that runs.
+    strain: whether links and surfaces show their strain. forces: draw the loads of contacts as lines whose width is the load
+    relative to the other loads of the frame. velocities: draw arrows that show the path of the next 0.05 s. color: (name, least,
+    most), a quantity of log() by which particles are coloured. live: show the recording while it is made: True for a window,
+    "web" for a page in the browser, "notebook" below a cell, or the address of a running viewer.
 
-    Drawn are positions (f32), in the colours of bodies; surfaces where bodies have them; links, coloured by their strain;
-    walls, contacts of up to 1500 particles, what breaks, and curves. Beside that the file holds the scene with all arguments,
-    exact states to continue from, the hash of every frame drawn, every step, and what the user turned or assigned in between,
-    also between frames that are not drawn: see tv.replay.
+    The picture has positions (f32), coloured by body; surfaces of bodies that have them; links, coloured by their strain; walls,
+    contacts in scenes of up to 1500 particles, breaks, and curves. The file also holds the scene with all arguments, exact
+    states to continue from, the hash of every frame drawn, and every step. It holds every knob that the user set and every array
+    that the user assigned, also between frames that are not drawn: see tv.replay.
 
-    The file is complete when the block ends. Of a process that is killed, the first frame and all but about the last fifth of a
-    second is there (of curves, the last second), and can be replayed; what flush() has brought to the file is there in any case.
-    Open it with `rerun rope.rrd`. Raises ValueError and OSError where the file cannot be made, FileExistsError where there is one
-    already, and OSError when it cannot be written any further, or was removed; what has been written then can be read.
+    The file is complete when the block ends. If the process is killed, the first frame and everything up to about the last fifth
+    of a second (for curves, the last second) is in the file and can be replayed; whatever flush() has written is there in any
+    case. Open the file with `rerun rope.rrd`. Raises ValueError and OSError if the file cannot be made, FileExistsError if it
+    exists already, and OSError if it was removed or cannot be written any further; in the last case what it holds can be read.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Recorder:
         flags = {"strain": strain, "forces": forces, "velocities": velocities}
         given = {name: checks.flag("Recorder", name, value) for name, value in flags.items()}
         self._overlays = Overlays(color=checked_color(color), **given | ({"strain": False} if color else {}))
-        self._own: dict[str, Any] = {}  # quantities of the user's, for the next frame that is drawn
+        self._own: dict[str, Any] = {}  # the user's quantities, for the next frame that is drawn
         if path is None and not live:
             raise ValueError("Recorder: path = None is for live recordings; give a file, or live=True.")
         if live == "notebook" and path is not None:
@@ -86,9 +86,9 @@ class Recorder:
         if not os.path.isdir(folder):
             raise ValueError(f"Recorder: the folder {folder} does not exist. Make it first: os.makedirs({folder!r}).")
         self.frames = self._calls = 0
-        self._stride = self.every  # one of how many frames is drawn
-        self._each = 0  # bytes of a frame, about
-        self._note = ""  # what the budget has left out
+        self._stride = self.every  # one of so many frames is drawn
+        self._each = 0  # about the bytes of a frame
+        self._note = ""  # which frames the budget has left out
         self._full = self._closed = False  # whether the budget has ended the recording; whether close() was called
         self._open(overwrite)
 
@@ -98,18 +98,18 @@ class Recorder:
     def __exit__(self, *exc) -> None:
         self.close()
 
-    @interrupts.uncut
+    @interrupts.uninterrupted
     def _open(self, overwrite: bool) -> None:
         world = self.world
         title = "live" if self.path == os.devnull else os.path.splitext(os.path.basename(self.path))[0]
         viewer = None
         if self._live:
-            from . import watch  # which imports a server
+            from . import watch  # imported late, since it imports a server
 
             viewer = watch.address(self._live)
         opens = layout(world, self._overlays)
         self._sink = Sink(self.path, f"tiverlet_{world.particles.dim}d", opens, title, overwrite, viewer)
-        self._closing = weakref.finalize(self, self._sink.close)  # also when the process ends
+        self._closing = weakref.finalize(self, self._sink.close)  # runs also when the process ends
         self._stream = self._sink.stream
         if self._live == "notebook":
             from . import watch
@@ -127,9 +127,9 @@ class Recorder:
         self._sink.keep()
 
     def _begin(self, title: str) -> None:
-        """Write what holds for all frames, and the first one."""
+        """Write what holds for all frames, and the first frame."""
         world = self.world
-        world._adapt()  # the state is to be one of the kernels that the knobs ask for
+        world._adapt()  # rebuild for the present knobs first, so that the state belongs to their kernels
         explained = explain(world)
         self._picture = Picture(world, self._stream, explained, environment(), self._overlays)
         self._sent, self._flushed = perf_counter(), 0
@@ -138,7 +138,7 @@ class Recorder:
         self._journal = Journal(world, self._write, told)
         self._note_state(self._journal.size)
         self._frame(0)
-        self.flush()  # so that a process that dies soon leaves something
+        self.flush()  # so that a process that ends early leaves a readable file
         self._looked = perf_counter()
         if error := self._sink.error:
             raise file_error(error, f"Recorder: nothing could be written to {self.path}")
@@ -158,17 +158,19 @@ class Recorder:
 
     @property
     def bytes(self) -> int:
-        """About what the file will have when it is closed [bytes]."""
+        """About how many bytes the file will have when it is closed."""
         return self._sink.bytes + self._logged - self._flushed
 
-    @interrupts.uncut
+    @interrupts.uninterrupted
     def log(self, **quantities) -> None:
-        """Write the present frame, if it is one of `every`, and quantities of your own: numbers, which become curves, and arrays
-        of one number for each particle, (n,), for `color` and for what reads the file. See Replay.quantities.
+        """Write the present frame, if it is one of `every`, and quantities of your own.
+
+        These are numbers, which become curves, or arrays of one number per particle, (n,), for `color` and for programs that read
+        the file. See Replay.quantities.
 
             recorder.log(height=float(x[:, 1].max()), heat=heat)
 
-        Raises ValueError for what is neither, and for the name of a curve that is there.
+        Raises ValueError for any other value, and for the name of a built-in curve.
         """
         if self._full:
             return
@@ -196,9 +198,9 @@ class Recorder:
         if self._sink.error:
             self._fail()
 
-    @interrupts.uncut
+    @interrupts.uninterrupted
     def flush(self) -> None:
-        """Wait until what was logged is in the file, so that it is there whatever happens to the process."""
+        """Wait until everything logged is in the file, where it stays even if the process is killed."""
         if self._full:
             return
         self._check()
@@ -207,7 +209,7 @@ class Recorder:
         self._flushed = self._logged
 
     def _check(self) -> None:
-        """Raise RuntimeError where nothing can be written."""
+        """Raise RuntimeError if nothing can be written."""
         if self._sink.forked():
             raise RuntimeError(
                 f"Recorder: {self.path} is recorded by the process that this one was forked from. Step and record there, or "
@@ -227,14 +229,14 @@ class Recorder:
         raise file_error(error, f"Recorder: writing {self.path} failed at frame {self._calls}", f". {rest}") from None
 
     def _left(self) -> int:
-        """What is left of the budget [bytes], after all that waits to be written, and the end."""
+        """Return the free bytes of the budget, after the data that wait to be written and the end of the recording."""
         assert self.budget is not None
         return self.budget - self.bytes - RESERVE
 
     def _thin(self) -> None:
-        """Make room for more frames: keep the picture of every other one, until a quarter of the budget is free.
+        """Make room for more frames: keep the picture of every other frame, until a quarter of the budget is free.
 
-        Where there is nothing more to take out, the recording ends here.
+        Where no more frames can be removed, the recording ends.
         """
         assert self.budget is not None
         self.flush()
@@ -255,18 +257,18 @@ class Recorder:
             self._finish()
 
     def _note_state(self, size: int) -> None:
-        """An exact state of that size was written, to continue from: when the next one is due."""
+        """Schedule the next exact state, after one of `size` bytes was written."""
         self._due = SHARE * size
         self._drawn, self._last_state = self._picture.drawing.bytes, self._calls
 
-    @np.errstate(over="ignore")  # what has exploded is too far away for f32
+    @np.errstate(over="ignore")  # positions of a diverged simulation may exceed f32
     def _frame(self, number: int) -> None:
         world, journal, picture = self.world, self._journal, self._picture
         journal.frame = number
         picture.stamp(number)
         sparse = number - self._last_state >= SPARSE * self._stride // self.every
         due = picture.drawing.bytes - self._drawn > self._due or sparse
-        if number and due and not world._force_waits:  # a state does not hold the force that it came about under
+        if number and due and not world._force_waits:  # a state does not contain the force under which it was computed
             self._note_state(journal.state())
         if self._own:
             numbers = {name: value for name, value in self._own.items() if isinstance(value, float)}
@@ -281,7 +283,7 @@ class Recorder:
         journal.frame_drawn({"time": world.time, "hash": brief(checkpoint.digest(world, now)), "crc": zlib.crc32(x32.tobytes())})
         self.frames += 1
 
-    @interrupts.uncut
+    @interrupts.uninterrupted
     def close(self) -> None:
         """Write the summary and finish the file. Calling it twice does nothing."""
         if self._closed or self._sink.forked():
@@ -303,7 +305,7 @@ class Recorder:
         journal.close()
         self._picture.curves.send()
         end: dict[str, Any] = {"frames": self.frames, "time": world.time}
-        with contextlib.suppress(RuntimeError):  # a world that was closed, or whose Taichi is gone, has no state
+        with contextlib.suppress(RuntimeError):  # a closed world, or one whose Taichi was restarted, has no state
             end["hash"] = world.hash()
         if "hash" in end:
             self._picture.end(journal.worst, self.frames, self._note)

@@ -1,4 +1,4 @@
-"""Drawing a recording again, to compare it row by row with what the viewer shows of the file."""
+"""Draws a recording again, to compare it row by row with the picture in the file."""
 
 import hashlib
 from collections import Counter, defaultdict
@@ -21,32 +21,32 @@ if TYPE_CHECKING:
     from ..step.checkpoint import Checkpoint
     from ..world import World
 
-NOTHING = hashlib.blake2b(digest_size=16).digest()  # of a row without components: the time at which the file was begun
-Row = tuple[str, bool, int, int, bytes]  # entity, whether it is static, frame, time [ns], digest of its components
+NOTHING = hashlib.blake2b(digest_size=16).digest()  # digest of a row without components: the start time of the file
+Row = tuple[str, bool, int, int, bytes]  # entity, whether static, frame, time [ns], digest of the components
 
 
 class Rows:
-    """Takes the place of a rerun stream, and keeps the rows."""
+    """Replaces a rerun stream and keeps the rows."""
 
     def __init__(self):
         self.rows: list[Row] = []
         self._frame = self._time = 0
 
     def set_time(self, timeline: str, *, sequence: int = 0, duration: float = 0.0) -> None:
-        """As rerun's."""
+        """Set frame or time of the coming rows, as rerun's stream does."""
         if timeline == "frame":
             self._frame = sequence
         elif timeline == "time":
             self._time = _nanoseconds(duration)
 
     def log(self, entity: str, *what: Any, static: bool = False, strict: bool | None = None) -> None:
-        """As rerun's."""
+        """Keep one row, as rerun's stream logs it."""
         parts = {part.component_descriptor(): part.as_arrow_array() for one in what for part in one.as_component_batches()}
         frame, time = (-1, 0) if static else (self._frame, self._time)
         self.rows.append((entity.lstrip("/"), static, frame, time, _digest(parts)))
 
     def send_columns(self, entity: str, indexes: Any, columns: Any, strict: bool | None = None) -> None:
-        """As rerun's."""
+        """Keep several rows, as rerun's stream sends them."""
         times = {index.timeline_name(): index.as_arrow_array().cast("int64").to_pylist() for index in indexes}
         lists = {column.component_descriptor(): column.as_arrow_array() for column in columns}
         for k, (frame, time) in enumerate(zip(times["frame"], times["time"], strict=True)):
@@ -66,7 +66,7 @@ def _digest(parts: dict[Any, Any]) -> bytes:
 
 
 class Redraw:
-    """Draws what the journal says, of worlds that are computed again. trouble: what the journal says and is not so."""
+    """Draws the contents of a journal, from worlds that are computed again."""
 
     def __init__(self, told: dict[str, Any]):
         self._told, self._rows, self._stirred, self.scenes = told, Rows(), set[int](), 0
@@ -74,18 +74,18 @@ class Redraw:
         self._world: Any = None
         self._recent: StepReport | None = None
         self._worst: StepReport | None = None
-        self.layouts: list[list[Row]] = []  # how it opens: as was known at first, and when it had ended
+        self.layouts: list[list[Row]] = []  # the layout at the start, and the one at the end
         self.frames = 0
         self.ended = False
-        self.stride, self.thin = 1, -1  # of frames up to this one, one of so many may be all that is in the picture
+        self.stride, self.thin = 1, -1  # up to frame `thin`, the picture may have only one of `stride` frames
 
     @property
     def rows(self) -> list[Row]:
-        """All rows, in the order in which they are logged."""
+        """All rows, in the order of logging."""
         return self._rows.rows
 
     def watch(self, world: "World") -> None:
-        """From now on this is the world."""
+        """Observe this world from now on."""
         if world is self._world:
             return
         import rerun as rr
@@ -101,34 +101,34 @@ class Redraw:
         self.layouts.append(_rows_of(layout(world, overlays)))
 
     def before(self) -> None:
-        """A step begins."""
+        """Before a step: do nothing."""
 
     def after(self, dt: float, report: StepReport) -> None:
-        """A step was made."""
+        """After a step: record its report."""
         self._recent = report if self._recent is None else self._recent.worse(report)
         self._worst = report if self._worst is None else self._worst.worse(report)
 
     def assigned(self, name: str, value: np.ndarray) -> None:
-        """Positions or velocities were assigned."""
+        """After positions or velocities were assigned: do nothing."""
 
     def broken_off(self) -> None:
-        """A step has failed."""
+        """After a failed step: do nothing."""
 
     def scene(self, features: int) -> None:
-        """There is a new scene."""
+        """Begin a new scene."""
         self.scenes += 1
         self._stirred = set(range(features))
 
     def turned(self, features: dict[str, Any]) -> None:
-        """Knobs were turned."""
+        """Record which features had knobs set."""
         self._stirred.update(map(int, features))
 
     def thinned(self, entry: Entry) -> None:
-        """Frames were taken out of the picture."""
+        """Record that frames were removed from the picture."""
         self.stride, self.thin = checks.integer("replay", "stride", entry.data["stride"], least=1), entry.frame
 
     def _thinned(self, found: list[Row]) -> list[Row]:
-        """What was drawn, without what is not in the file and may be missing."""
+        """Return the drawn rows, except rows that are missing in the file because it was thinned."""
         there = Counter(found)
         frames: dict[str, list[int]] = defaultdict(list)
         for entity, static, frame, *_ in self.rows:
@@ -146,16 +146,16 @@ class Redraw:
         return out
 
     def expected(self, found: list[Row]) -> list[Row]:
-        """The rows that have to be in the file."""
+        """Return the rows that must be in the file."""
         return self.rows if self.stride == 1 else self._thinned(found)
 
     def shown(self, x: np.ndarray) -> np.ndarray:
-        """Where particles at x, (n, dim) [m], are drawn."""
+        """Return where particles at x, (n, dim) [m], are drawn."""
         assert self._picture
         return self._picture.drawing.shown(x)
 
     def frame(self, entry: Entry, now: "Checkpoint", x: np.ndarray, x32: np.ndarray) -> str | None:
-        """Draw a frame; what is wrong with what the journal says of it, if anything."""
+        """Draw a frame. Returns what is wrong with its entry in the journal, or None."""
         assert self._picture
         report = self._recent
         if report:
@@ -170,12 +170,12 @@ class Redraw:
         return None
 
     def logged(self, entry: Entry) -> None:
-        """Quantities of the user's."""
+        """Add the user's quantities."""
         assert self._picture
         self._picture.log(entry.frame, {**entry.data["numbers"], **entry.arrays})
 
     def end(self, entry: Entry) -> str | None:
-        """The last entry."""
+        """Draw the last entry. Returns what is wrong with it, or None."""
         assert self._picture
         self.ended = True
         self._picture.curves.send()
@@ -192,7 +192,7 @@ class Redraw:
         return None
 
     def send(self) -> None:
-        """What was collected of curves, where there is no end."""
+        """Send the collected curves, if the recording has no end."""
         if self._picture:
             self._picture.curves.send()
 
@@ -204,7 +204,7 @@ def _rows_of(blueprint: Any) -> list[Row]:
 
 
 def _amended(report: StepReport, told: dict[str, Any]) -> tuple[StepReport, str | None]:
-    """A report with the flags that were told, which may be more."""
+    """Return a report with the flags of the journal, which may have more, and what is wrong with these flags, or None."""
     if "flags" not in told:
         return report, None
     flags, notes = set(told["flags"]), tuple(told["notes"])
@@ -216,11 +216,11 @@ def _amended(report: StepReport, told: dict[str, Any]) -> tuple[StepReport, str 
 
 
 def compare(contents: Contents, redraw: Redraw, application: str, complete: bool) -> tuple[int | None, str] | int:
-    """The first difference between a file and what was drawn again: the frame, if it is of one, and what it is.
+    """Return the first difference between a file and the picture drawn again: its frame, if it has one, and a description.
 
-    Where there is none, the number of frames that are there whole. The viewer takes of rows at the same time the one with the
-    highest id, and static ones before all; so the rows of each entity have to be the same in the order of their ids, and those of
-    all together, but for curves, which are sent from time to time. Of a recording that is not complete rows may be missing at the
+    Without a difference, return the number of complete frames. At each time the viewer shows the row with the highest id, and
+    static rows before all others. So the rows of each entity must agree in the order of their ids, and so must the rows of all
+    entities together, except for curves, which are sent from time to time. In an incomplete recording, rows may be missing at the
     end of each entity.
     """
     if contents.trouble:
@@ -233,11 +233,11 @@ def compare(contents: Contents, redraw: Redraw, application: str, complete: bool
     shown = [(blueprint, 0, 1) for blueprint in blueprints]
     if contents.shown != shown and (complete or contents.shown != shown[:1]):
         return None, "it opens with another layout"
-    rows = np.sort(contents.rows, order="f5")  # by id
+    rows = np.sort(contents.rows, order="f5")  # f5 is the id
     if len(np.unique(rows["f5"])) != len(rows):
         return None, "two rows have the same id"
     names = contents.entities
-    last = None if complete else max((row[2] for row in redraw.rows), default=-1)  # nothing is known of later frames
+    last = None if complete else max((row[2] for row in redraw.rows), default=-1)  # later frames cannot be checked
     found: list[Row] = []
     views: list[list[tuple[str, bytes]]] = [[] for _ in blueprints]
     for store, static, entity, frame, time, _, digest in rows.tolist():
@@ -245,7 +245,7 @@ def compare(contents: Contents, redraw: Redraw, application: str, complete: bool
         if store >= LAYOUTS:
             views[store - LAYOUTS].append((names[entity], digest))
         elif names[entity] == "about" and not redraw.ended and any(row[0] == "about" for row in found):
-            continue  # the page about all frames has come into the file, but not the entry that it follows from
+            continue  # the page about all frames is in the file, but the entry that it follows from is not
         elif names[entity] != JOURNAL and digest != NOTHING and (last is None or frame <= last):
             found.append((names[entity], bool(static), frame, time, digest))
     if not _opens_so(views, redraw, complete):
@@ -254,8 +254,10 @@ def compare(contents: Contents, redraw: Redraw, application: str, complete: bool
 
 
 def _opens_so(views: list[list[tuple[str, bytes]]], redraw: Redraw, complete: bool) -> bool:
-    """Whether the layouts of a file are those of its recording: the one that was known at first, the one of the whole run, or
-    both; of what was cut short the last one may be there in part, and nothing be known of the whole run."""
+    """Whether the layouts of a file are those of its recording: the one at the start, the one of the whole run, or both.
+
+    In an incomplete recording, the last layout may be there in part, and the one of the whole run may be unknown.
+    """
     drawn = [Counter((entity, digest) for entity, *_, digest in rows) for rows in redraw.layouts]
     given = [Counter(rows) for rows in views]
     if complete:
@@ -272,7 +274,7 @@ def _first(found: list[Row], drawn: list[Row], complete: bool) -> tuple[int | No
         for row in rows:
             by.setdefault(row[0], ([], []))[k].append(row)
     differences: list[tuple[int, str]] = []
-    least: list[int] = []  # frames from which on something is missing at the end of an entity
+    least: list[int] = []  # for each entity with rows missing at its end, the first frame without them
     for entity, (there, wanted) in by.items():
         for one, other in zip(there, wanted, strict=False):
             if one != other:

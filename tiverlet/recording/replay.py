@@ -1,4 +1,4 @@
-"""Reading a recording back: its picture, a world that goes on from any frame, and the proof that both are true."""
+"""Reads a recording: its picture, a world that continues from any frame, and a check of both."""
 
 import functools
 import inspect
@@ -28,11 +28,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What verify() found; true if the recording is whole and every frame came out as recorded.
+    """The result of verify(); true if the recording is complete and every frame comes out as recorded.
 
-    kind: "intact"; "changed", where something is not what the steps lead to; or "incomplete", where nothing was changed, but not
-    all is there. frames: how many hold, of how many that are known. frame: the first that differs. particle: the first particle
-    that does, where it shows; it may show only later. text: a sentence that says so.
+    kind: "intact"; "changed" if something in the file does not follow from the steps; "incomplete" if nothing was changed, but
+    part of the recording is missing. frames: how many frames hold. of: how many are known. frame: the first that differs.
+    particle: the first particle that differs, where that shows; it may show only in a later frame. text: the verdict as a
+    sentence.
     """
 
     kind: str
@@ -50,13 +51,13 @@ class Verdict:
 
 
 def _clear(function):
-    """Let what a damaged file makes Python say become one clear error."""
+    """Turn the errors that a damaged file causes in Python into one clear ValueError."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)
     def guarded(self, *args, **kwargs):
-        """The same method; what it stumbles over in a damaged file is a ValueError that names it."""
-        signature.bind(self, *args, **kwargs)  # a call that it cannot take says so itself
+        """Call the method; errors caused by a damaged file become a ValueError that names the file."""
+        signature.bind(self, *args, **kwargs)  # a call with wrong arguments raises its own TypeError
         try:
             return function(self, *args, **kwargs)
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError, AssertionError) as e:
@@ -66,7 +67,7 @@ def _clear(function):
 
 
 class Replay:
-    """A recording that was read. See replay()."""
+    """A recording read from a file. See replay()."""
 
     def __init__(self, path: str, given: Mapping[str, Any]):
         self.path, self._given = path, given
@@ -80,7 +81,7 @@ class Replay:
         self.frames = np.array([e.frame for e in shown], dtype=np.int64)
         self.times = np.array([e.data["time"] for e in shown], dtype=np.float64)
         ends = self._entries[-1].kind == "end"
-        self._gap = gap or contents.why or ("" if ends else "the recording was not closed")  # why it is not complete
+        self._gap = gap or contents.why or ("" if ends else "the recording was not closed")  # why the recording is not complete
         self.complete = not self._gap
         self.text = self._say()
 
@@ -111,7 +112,7 @@ class Replay:
         return self._frames[frame]
 
     def position(self, frame: int) -> np.ndarray:
-        """Positions [m] as they are drawn, (n, dim), in f32. world(frame).position has all digits."""
+        """Return positions as drawn [m], (n, dim), in f32. world(frame).position has all digits."""
         entry, number = self._entry(frame), self._drawn[frame]
         dim = self._entries[0].arrays["position"].shape[1]
         x = np.zeros((0, dim), dtype=np.float32) if number < 0 else self._contents.values(number).reshape(-1, dim)
@@ -121,8 +122,10 @@ class Replay:
 
     @property
     def quantities(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """What log() was given for each particle, by name: the frames (m,) and the values (m, n); those that are numbers are in
-        .curves. Values of frames with other particles than the first of them are left out."""
+        """The arrays given to log(), by name: the frames (m,) and the values (m, n).
+
+        Numbers given to log() are in .curves. Frames with another number of particles than the first are left out.
+        """
         found: dict[str, list[tuple[int, np.ndarray]]] = {}
         for e in self._entries:
             for name, values in e.arrays.items() if e.kind == "logged" else ():
@@ -133,9 +136,9 @@ class Replay:
 
     @_clear
     def world(self, frame: int) -> "World":
-        """A world in the exact state of a frame, to go on with: computed from the nearest state before, and compared.
+        """Return a world in the exact state of a frame, computed from the nearest earlier state and compared with the recording.
 
-        Raises RuntimeError when the computation does not lead to the recorded state, as it may on another machine.
+        Raises RuntimeError if the computation does not lead to the recorded state, as may happen on another machine.
         """
         goal = self._entries.index(self._entry(frame))
         start = max(k for k, e in enumerate(self._entries[: goal + 1]) if e.kind == "state")
@@ -152,15 +155,15 @@ class Replay:
             raise
 
     @_clear
-    @np.errstate(over="ignore")  # as Recorder
+    @np.errstate(over="ignore")  # positions of a diverged simulation may exceed f32, as in Recorder
     def verify(self) -> Verdict:
         """Compute and draw everything again from the first frame on, and compare hashes, states and every row of the picture.
 
-        What the user turned, assigned, added or removed is taken as the journal says, and so are the state at the start, the
-        environment, what explain() said, and times of computing; the page about the scene and the curves have to say the same.
-        Raises RuntimeError for what was recorded with the other compiler, see device/README.md.
-        In a world with contacts, what pairs carry along is part of the hash of states and of the end, but not of that of frames,
-        where it shows in the next one.
+        Taken from the journal, not computed: knobs and arrays that the user set, particles and features that the user added or
+        removed, the state at the start, the environment, the text of explain(), and computing times. The summary page and the
+        curves have to match these. In a world with contacts, data carried by pairs of particles is part of the hash of states and
+        of the end, but not of the hash of frames; a change of it shows in the next frame. Raises RuntimeError if the recording
+        was made with the other compiler, see device/README.md.
         """
         recorded, here = _compiler(self.scene["environment"]), _compiler({"compiler": runtime.compiler()})
         if recorded != here and recorded in NAMES.values():
@@ -255,7 +258,7 @@ class Replay:
         return "Versions and machine are those of the recording, so the file was changed, or a function of the scene was."
 
     def _begin(self, start: int) -> "World":
-        """A world in the state of entry `start`."""
+        """Make a world in the state of entry `start`."""
         state, base = self._entries[start], max(k for k in range(start) if self._entries[k].kind == "scene")
         source = self._entries[base]
         before = [turned for e in self._entries[base:start] if e.kind == "turned" for turned in self._turned(e)]
@@ -267,9 +270,9 @@ class Replay:
         return world
 
     def _run(self, start: int, end: int) -> Iterator[tuple["World", Entry]]:
-        """Do what the entries from `start` (a state) to `end` say; the world after each. The caller closes the last one.
+        """Apply the entries from `start` (a state) to `end`; yield the world after each. The caller closes the last world.
 
-        Where particles or features came or went there is a new scene, and its state is taken as it was recorded.
+        Where particles or features were added or removed, a new scene begins, and its state is taken as recorded.
         """
         world = self._begin(start)
         yield world, self._entries[start]
@@ -281,7 +284,7 @@ class Replay:
             yield world, self._entries[k]
 
     def _apply(self, world: "World", entry: Entry) -> None:
-        """Make the steps of an entry, and then what it says."""
+        """Make the steps of an entry, then apply the change that it records."""
         settings = world.settings
         for dt, substeps, iterations, count in entry.steps:
             world.substeps, world.iterations = checks.integer("replay", "substeps", substeps, least=1), iterations
@@ -310,8 +313,9 @@ class Replay:
     @property
     @_clear
     def scenes(self) -> list[tuple[Entry, list[int], list[tuple[int, int, dict[str, Any]]]]]:
-        """The entry of each scene, the frames that show it, and what was turned in it: before which frame, the number of the
-        feature, and its knobs. Another scene begins where particles or features came or went.
+        """The entry of each scene, the frames that show it, and the knobs set in it: (frame, number of the feature, knobs).
+
+        Knobs hold from that frame on. A new scene begins where particles or features were added or removed.
         """
         out, waiting = [], []
         for e in self._entries:
@@ -328,29 +332,29 @@ class Replay:
 
     @_clear
     def parts(self, entry: Entry) -> scene.Parts:
-        """Particles and features of the entry of a scene, without a world: to be looked at."""
+        """Return particles and features of a scene, by its entry, for inspection without a world."""
         return scene.parts(entry.data, entry.arrays)
 
     def export(self, path: str | os.PathLike, shape: Shape | None = None) -> list[str]:
-        """Write the recording for other programs, as the ending of `path` says; returns the names of the files.
+        """Write the recording for other programs, in the format of the ending of `path`. Returns the names of the files.
 
             .npz          positions [m], times [s], masses [kg], radii [m] and curves, for numpy
             .csv          positions, a row for each particle in each frame
-            .xyz          extended XYZ for OVITO and ASE: positions, and radii where particles neither come nor go
+            .xyz          extended XYZ for OVITO and ASE: positions, and radii if no particles are added or removed
             .glb, .gltf   an animated mesh, y up, for Blender and browsers
-            .obj          a file for each frame, named a_0000.obj, a_0001.obj ..., or as a %d in the name says
-            .pvd          the same for ParaView, a_0000.vtu ..., with radii, masses, links and faces
+            .obj          a file for each frame, named a_0000.obj, a_0001.obj ..., or by a %d in the name
+            .pvd          a file for each frame for ParaView, a_0000.vtu ..., with radii, masses, links and faces
             .gif, .webp, .mp4  a film in the scene's own time, 25 pictures a second
 
-        Faces are those of the picture. shape: what the particles were made of, of which meshes and films take the faces
-        instead: with their quads and texture coordinates, where the shape came from a file that has them. Features with functions
-        of the user's are not asked for faces and links.
+        Faces are those of the picture. shape: the shape that the particles were made from; meshes and films then use its faces,
+        with their quads, and its texture coordinates if the shape came from a file that has them. Features with the user's
+        functions contribute no faces and links.
 
-        Raises ValueError for another ending, for particles that come and go where a format cannot hold it, and for a shape of
-        other particles; FileNotFoundError where the folder is missing; ImportError for .glb, .gltf and .mp4 without
+        Raises ValueError for another ending, for added or removed particles in a format that cannot hold them, and for a shape of
+        other particles; FileNotFoundError if the folder is missing; ImportError for .glb, .gltf and .mp4 without
         tiverlet[export].
         """
-        from . import exports  # which imports rerun
+        from . import exports  # imported late, since it imports rerun
 
         return exports.export(self, os.fspath(path), shape)
 
@@ -360,22 +364,21 @@ def replay(path, given: Iterable[Any] | Mapping[str, Any] = ()) -> Replay:
 
         recording = tv.replay("rope.rrd")
         recording.position(60)                 # as drawn
-        world = recording.world(60)            # goes on from there, bit for bit
-        print(recording.verify())              # computes all again and compares
+        world = recording.world(60)            # continues from frame 60, bit for bit
+        print(recording.verify())              # computes everything again and compares
 
-    given: the user's own functions and classes that are in the scene, or a mapping from their names. Their source is in the file
-    to be read, in scene["needs"]; loading a file runs nothing that it contains. Only world() and verify() need them.
+    given: the user's own functions and classes in the scene, or a mapping from their names. Only world() and verify() need them.
+    The file holds their source to be read, in scene["needs"]; loading a file runs no code from it.
 
-    .frames: the numbers of the frames in the file. .times [s]. .curves: (frames, values) of each figure by name, your own
-    among them; .quantities: of each that log() was given for each particle. .complete:
-    whether the recording was closed; one that was cut short by a crash has all that was flushed. .text: what the file is, and
-    where it ends.
+    .frames: the numbers of the frames in the file. .times [s]. .curves: (frames, values) of each figure by name, including the
+    user's own; .quantities: the arrays given to log(). .complete: whether the recording was closed; after a crash, everything
+    that was flushed is there. .text: a description of the file, and where it ends.
 
-    A file may come from anyone: another process reads it, with limits on memory and time, and what it finds is checked before it
-    is used.
+    A file may come from an untrusted source: another process reads it, with limits on memory and time, and the result is checked
+    before it is used.
 
-    Raises FileNotFoundError, and ValueError for what is no recording of tiverlet, was written in another format, or was changed
-    after it was written, naming the place.
+    Raises FileNotFoundError, and ValueError if the file is no recording of tiverlet, has another format, or was changed after it
+    was written; the message names the place.
     """
     names = given if isinstance(given, Mapping) else {thing.__name__: thing for thing in given}
     try:
@@ -385,17 +388,17 @@ def replay(path, given: Iterable[Any] | Mapping[str, Any] = ()) -> Replay:
 
 
 def _compiler(environment: dict[str, Any]) -> str:
-    """Which one the kernels of a recording were compiled with, by its name."""
+    """Return the name of the compiler in an environment of a recording."""
     return plain(str(environment["compiler"])).partition(" ")[0]
 
 
 def _settle(world: "World", settings: list) -> None:
-    """Set what the user had set, and what the controller remembered."""
+    """Set substeps, iterations and the controller's memory as recorded."""
     world.substeps, world.iterations, world._controller.memory = *settings[:2], tuple(settings[2])
 
 
 def _brief(world: "World", kept: checkpoint.Checkpoint) -> str:
-    """The hash of a state, as entries have it."""
+    """Return the hash of a state in the short form of the journal."""
     return journal.brief(checkpoint.digest(world, kept))
 
 
@@ -408,7 +411,7 @@ def _kept(entry: Entry, world: "World") -> checkpoint.Checkpoint:
 
 
 def _pictures(contents: rrd.Contents, entries: list[Entry]) -> dict[int, int]:
-    """Of each frame the number of the row that has its positions, as the viewer finds it; -1 where there are no particles."""
+    """Return the number of the row that holds the positions of each frame, as the viewer selects it; -1 without particles."""
     rows: dict[tuple[str, int], tuple[bytes, int]] = {}
     for k, (entity, frame, ident, *_) in enumerate(contents.numbers.tolist()):
         key = (contents.entities[entity], frame)
@@ -419,7 +422,7 @@ def _pictures(contents: rrd.Contents, entries: list[Entry]) -> dict[int, int]:
             scenes, empty = scenes + 1, not len(e.arrays["position"])
         elif e.kind == "frame":
             root = journal.SCENE if scenes == 1 else f"{journal.SCENE}/scene{scenes - 1}"
-            if empty:  # rerun leaves out what is empty everywhere
+            if empty:  # rerun writes no row without points
                 out[e.frame] = -1
             elif (key := (f"{root}/{journal.PARTICLES}", e.frame)) in rows:
                 out[e.frame] = rows[key][1]
@@ -427,7 +430,7 @@ def _pictures(contents: rrd.Contents, entries: list[Entry]) -> dict[int, int]:
 
 
 def _curves(contents: rrd.Contents) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Frames and values of each figure."""
+    """Return frames and values of each figure, by name."""
     found: dict[str, dict[int, int]] = {}
     for k, (entity, frame, *_) in enumerate(contents.numbers.tolist()):
         name = contents.entities[entity]
@@ -444,7 +447,7 @@ def _curves(contents: rrd.Contents) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 def _differing(now: np.ndarray, then: np.ndarray | None) -> int | None:
-    """The first row whose bits differ."""
+    """Return the first row whose bits differ."""
     if then is None or not len(now):
         return None
     if now.shape != then.shape or now.dtype != then.dtype:

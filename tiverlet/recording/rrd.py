@@ -1,7 +1,7 @@
-"""Reading an .rrd file: whole, or what a crash has left of it.
+"""Reads an .rrd file, complete or cut short by a crash.
 
-A file may come from anyone, and one wrong byte in it may be enough to end the process that reads it. So another process does,
-with a limit on its memory and time, see reader.py; what it finds is mapped into memory, so that it takes none while nobody looks.
+A file may come from an untrusted source, and one wrong byte may end the process that reads it. So another process reads it, with
+limits on memory and time, see reader.py. Its output is mapped into memory, which takes no memory until it is used.
 """
 
 import importlib.util
@@ -19,24 +19,25 @@ import numpy as np
 
 from . import reader
 
-PATIENCE = 120.0  # [s] that reading may take, and as many more as the file has MB
+PATIENCE = 120.0  # [s] allowed for reading, plus 1 s per MB of the file
 ENOUGH = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "ARROW_DEFAULT_MEMORY_POOL": "system"}
 
 
 class Contents:
-    """What is in a file.
+    """The contents of a file.
 
-    whole: whether it ends as a recording does that was closed. why: what is wrong where it ends, if not. end: where that is.
+    whole: whether the file ends like a closed recording. why: what is wrong at its end, otherwise None. end: where the good part
+    ends [bytes].
     """
 
     def __init__(self, found: dict[str, Any], data: Any):
         self._data = data
         self.whole, self.why, self.end = found["why"] is None, found["why"], found["end"]
-        self.sealed = self.why != reader.BROKEN  # false: all is there, but not every byte is as it was
+        self.sealed = self.why != reader.BROKEN  # False: the file is complete, but some byte was changed
         self.entities: list[str] = found["entities"]
         self.stores = [tuple(store) for store in found["stores"]]
         self.shown = [tuple(one) for one in found["shown"]]
-        self.trouble: list[str] = found["trouble"]  # what the viewer may see and no row says
+        self.trouble: list[str] = found["trouble"]  # faults outside the rows that could affect the viewer
         tables = {name: self._table(*where) for name, where in found["tables"].items()}
         self.numbers, self.rows, self._journal = tables["numbers"], tables["rows"], tables["journal"]
 
@@ -44,22 +45,22 @@ class Contents:
         return np.frombuffer(self._data, np.dtype([tuple(k) for k in kind]), count, at)
 
     def journal(self) -> Iterator[tuple[bytes, bytes, bytes, bytes]]:
-        """Row id, text, blob and checksum of the entries, as they stand in the file."""
+        """Yield row id, text, blob and checksum of the entries, in the order of the file."""
         for row, at, text, blob, mark in self._journal.tolist():
             a, b, c = at + text, at + text + blob, at + text + blob + mark
             yield row, bytes(self._data[at:a]), bytes(self._data[a:b]), bytes(self._data[b:c])
 
     def values(self, number: int) -> np.ndarray:
-        """The numbers of a row of `numbers`, (n,) or (n, width)."""
+        """Return the numbers of a row of `numbers`, (n,) or (n, width)."""
         *_, at, count, width, size = self.numbers[number].tolist()
         out = np.frombuffer(self._data, f"f{size}", count, at)
         return out if width == 1 else out.reshape(-1, width)
 
 
 def read(path: str, rows: bool = False) -> Contents:
-    """What is in a file; rows: a digest of each row, too.
+    """Read a file. rows: also compute a digest of each row.
 
-    Raises ValueError for what is no .rrd file, or cannot be read at all.
+    Raises ValueError if the file is no .rrd file, or cannot be read at all.
     """
     specs = [importlib.util.find_spec(name) for name in ("numpy", "pyarrow")]
     paths = sorted({os.path.dirname(os.path.dirname(str(spec.origin))) for spec in specs if spec})
@@ -86,7 +87,7 @@ def read(path: str, rows: bool = False) -> Contents:
 
 
 def _ended(status: int, wrong: bytes) -> str:
-    """Why the process that reads ended."""
+    """Return why the reading process ended."""
     if status < 0:
         return f"it ends the process that reads it ({signal.Signals(-status).name})"
     last = (wrong.decode(errors="replace").strip().splitlines() or ["unknown"])[-1]

@@ -1,4 +1,4 @@
-"""A scene as plain data, and back: particles, features and settings by their arguments, never by code."""
+"""A scene as plain data, and back: particles, features and settings as arguments, never as code."""
 
 import inspect
 import platform
@@ -30,31 +30,31 @@ PUBLIC = {
     for name, kind in vars(module).items()
     if isinstance(kind, type) and issubclass(kind, (Feature, Solver))
 } | {"Sleep": Sleep}  # fmt: skip
-Turned = tuple[int, dict[str, Any]]  # the number of a feature, and its knobs
+Turned = tuple[int, dict[str, Any]]  # the number of a feature, and the values of its knobs
 TAKES = {
     "Force": ("function",),
     "PairForce": ("function", "potential"),
     "Constraint": ("function", "gradient"),
     "Sdf": ("function", "gradient"),
-}  # functions
-MOST = 10_000  # steps of a solver in a substep
-LONG = 8  # numbers in a list from which it is kept as an array
+}  # arguments that may be the user's functions
+MOST = 10_000  # most steps of a solver in a substep
+LONG = 8  # lists of at least so many numbers are stored as arrays
 
 
 def plain(text: str) -> str:
-    """Text of a file without what a terminal would take for a command."""
+    """Return text without the characters that a terminal would execute as commands."""
     return "".join(c if c.isprintable() or c == "\n" else "?" for c in text)
 
 
 class Needs:
-    """The user's own functions and classes in a scene: their code is kept to be read, and never run."""
+    """The user's own functions and classes in a scene: their source is stored for reading, and never run."""
 
     def __init__(self) -> None:
         self.sources: dict[str, str] = {}
         self._known: dict[str, Any] = {}
 
     def name(self, thing: Any) -> str:
-        """What it goes by in the file."""
+        """Return a thing's name in the file, and store its source."""
         plain = getattr(thing, "__name__", type(thing).__name__)
         same = [name for name, known in self._known.items() if known is thing]
         if same:
@@ -66,7 +66,7 @@ class Needs:
 
 
 def source(thing: Any) -> str:
-    """The text of a function or class, a ti.func among them; "" where there is none."""
+    """Return the source of a function, a ti.func or a class; "" if there is none."""
     plain = undecorated(thing)
     try:
         return textwrap.dedent(inspect.getsource(plain))
@@ -75,7 +75,7 @@ def source(thing: Any) -> str:
 
 
 def encode(value: Any, name: str, arrays: dict[str, np.ndarray], needs: Needs) -> Any:
-    """A value as JSON; arrays are put aside under names that begin with `name`."""
+    """Return a value as JSON; arrays are stored in `arrays` under names that begin with `name`."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, np.generic):
@@ -103,7 +103,7 @@ def _array(parts: list) -> np.ndarray | None:
 
 
 def decode(data: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """The value that encode() was given, of plain data."""
+    """Return the value that encode() was given, for plain data."""
     if isinstance(data, list):
         return [decode(part, arrays) for part in data]
     if not isinstance(data, dict):
@@ -121,12 +121,12 @@ def _key(value: Any) -> Any:
 
 
 def knobs(feature: Feature) -> dict[str, Any]:
-    """The live settings of a feature, as they are."""
+    """Return the present values of a feature's knobs."""
     return {name: vars(feature)[name] for name in knobs_of(type(feature)) if name in vars(feature)}
 
 
 def turn(feature: Feature, values: Mapping[str, Any]) -> None:
-    """Set knobs together: some are checked against each other, so the order would matter."""
+    """Set knobs together: some are checked against each other, so setting them one by one would depend on the order."""
     if wrong := set(values) - set(knobs_of(type(feature))):
         raise ValueError(f"replay: {feature!r} has no knob {sorted(wrong)[0]!r}.")
     vars(feature).update(values)
@@ -136,12 +136,12 @@ def turn(feature: Feature, values: Mapping[str, Any]) -> None:
 
 
 def describe(world: "World") -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The scene of a world as JSON and arrays."""
+    """Return the scene of a world as JSON and arrays."""
     arrays: dict[str, np.ndarray] = {}
     needs = Needs()
 
     def made(thing: Any, name: str) -> dict[str, Any]:
-        """How a particle set or a feature is made again: its class and its arguments."""
+        """Return class and arguments of a particle set, feature or solver."""
         kinds = type(thing).__mro__
         if kinds[0].__module__.partition(".")[0] == __name__.partition(".")[0]:
             kind = next(k.__name__ for k in kinds if PUBLIC.get(k.__name__) is k)
@@ -153,7 +153,7 @@ def describe(world: "World") -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     for k, feature in enumerate(world.features):
         values = {name: encode(v, f"{k}.{name} now", arrays, needs) for name, v in knobs(feature).items()}
         features.append({**made(feature, str(k)), "knobs": values})
-        if not np.array_equal(feature.start.position, world.particles.position):  # it was added later
+        if not np.array_equal(feature.start.position, world.particles.position):  # added after the start
             features[-1]["start"] = encode(feature.start.position, f"{k} start", arrays, needs)
     settings = dict(world.settings)
     settings["solver"] = made(settings["solver"], "solver")
@@ -166,7 +166,7 @@ def describe(world: "World") -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def environment() -> dict[str, Any]:
-    """What the bits may depend on besides the scene, and who started Taichi how."""
+    """Return what the bits may depend on besides the scene, and how Taichi was started."""
     from ..device import ti
 
     wanted = runtime.wanted()
@@ -180,7 +180,7 @@ def environment() -> dict[str, Any]:
 
 
 def _made(thing: dict[str, Any], base: type, arrays: Mapping[str, np.ndarray], given: Mapping[str, Any]) -> Any:
-    """A feature or solver of its arguments."""
+    """Make a feature or solver from its class and arguments."""
     name = thing["class"]
     own = isinstance(name, dict)
     kind = given[name["given"]] if own else PUBLIC.get(name)
@@ -206,7 +206,7 @@ def _made(thing: dict[str, Any], base: type, arrays: Mapping[str, np.ndarray], g
 
 @dataclass(frozen=True)
 class Parts:
-    """Particles and features without a world. numbers: of the features in the scene, of which some are left out."""
+    """Particles and features without a world. numbers: the number of each feature in the scene, from which some are left out."""
 
     particles: Particles
     features: tuple[Feature, ...]
@@ -214,8 +214,9 @@ class Parts:
 
 
 def parts(scene: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Parts:
-    """What a scene is made of, for who only looks at it. Nothing is put on a device; features with functions or classes of the
-    user's are left out.
+    """Make particles and features of a scene, for inspection only.
+
+    Nothing is placed on a device. Features with functions or classes of the user's are left out.
     """
     particles, features = _particles(scene, arrays), {}
     for k, data in enumerate(scene["features"]):
@@ -223,7 +224,7 @@ def parts(scene: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Parts:
             continue
         feature = _made(data, Feature, arrays, {})
         turn(feature, {name: decode(value, arrays) for name, value in data["knobs"].items()})
-        if isinstance(feature, Batch | Collider):  # it learns the dimension, and how surfaces have to be turned
+        if isinstance(feature, Batch | Collider):  # sets the dimension, and the orientation of surfaces
             came = Particles(decode(data["start"], arrays)) if "start" in data else particles
             feature.prepare(came, came.inv_mass.copy())
         features[k] = feature
@@ -239,8 +240,11 @@ def rebuild(
     scene: dict[str, Any], arrays: Mapping[str, np.ndarray], given: Mapping[str, Any], turned: list[Turned],
     once: list[list[str]],
 ) -> "World":  # fmt: skip
-    """A world of the scene, with what was turned since. once: of each feature, what its kernels had, though knobs may no longer
-    ask for it."""
+    """Make a world from a scene and the knobs set since.
+
+    turned: numbers of features, and their knobs. once: for each feature, the names in `compiled_for` that its kernels had, even
+    if the present knobs no longer need them.
+    """
     from ..world import World
 
     missing = sorted(set(scene["needs"]) - set(given))

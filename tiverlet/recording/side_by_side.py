@@ -1,4 +1,4 @@
-"""Some of many worlds in one recording, each in a view of its own."""
+"""WorldsRecorder: records some of many worlds in one file, each in a view of its own."""
 
 import os
 import weakref
@@ -16,27 +16,27 @@ from . import scene
 from .overlays import Overlays
 from .sink import BACKLOG, LOOK, SMALL, Sink, file_error
 
-MOST = 64  # views in a recording
-FEW = 9  # by default
+MOST = 64  # most views in a recording
+FEW = 9  # views by default
 
 
 class WorldsRecorder:
-    """Writes some of many worlds to an .rrd file, side by side: a grid of views at one scale, one for each, all at the same time.
+    """Writes some of many worlds to an .rrd file as a grid of views, all at the same scale and time.
 
         with tv.WorldsRecorder("four.rrd", worlds, [0, 250, 500, 999]) as recorder:
             for _ in range(300):
                 worlds.step(1 / 60)
                 recorder.log()
 
-    path: the file; its folder must exist. worlds: what to record. chosen: the numbers of up to 64 of them; the first nine by
-    default. every: log only each so many frames. overwrite: whether a file that is there may be replaced. strain, forces,
-    velocities: what is drawn, as by Recorder. Where worlds are reset, the time of the recording goes on.
+    path: the file; its folder must exist. worlds: the worlds to record. chosen: the numbers of up to 64 of them; the first nine
+    by default. every: log only one of so many frames. overwrite: whether an existing file may be replaced. strain, forces,
+    velocities: what is drawn, as in Recorder. If worlds are reset, the time of the recording continues.
 
-    The file is a picture: it holds no states to go on from, and tv.replay refuses it. For these record one by itself, which has
-    the same bits: tv.Recorder(path, worlds[k]), and step that. Open the file with `rerun four.rrd`.
+    The file is a picture only: it holds no states to continue from, and tv.replay refuses it. To get states, record one world by
+    itself, bit for bit the same: make tv.Recorder(path, worlds[k]), and step that world. Open the file with `rerun four.rrd`.
 
-    Raises ValueError and OSError where the file cannot be made, FileExistsError where there is one already, and OSError when it
-    cannot be written any further.
+    Raises ValueError and OSError if the file cannot be made, FileExistsError if it exists already, and OSError if it cannot be
+    written any further.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class WorldsRecorder:
         if not os.path.isdir(folder):
             raise ValueError(f"WorldsRecorder: the folder {folder} does not exist. Make it first: os.makedirs({folder!r}).")
         self.frames = self._calls = self._flushed = 0
-        self._before = self._last = 0.0  # [s] that went by before worlds were reset; when the last frame was
+        self._before = self._last = 0.0  # [s] the total time before the last reset; the time of the last frame
         self._looked = perf_counter()
         with interrupts.whole:
             self._open(overlays, overwrite)
@@ -67,7 +67,7 @@ class WorldsRecorder:
         from .drawing import bounds, links, upwards
 
         def known(world: World) -> tuple:
-            """What one of them needs in the viewer: corners, what is up, the title of its colours."""
+            """Return the corners of a world's view, the direction up, and the title of its colour scale."""
             return bounds(world), upwards(world), overlays.title(bool(links(world)))
 
         each, self._ups, titles = zip(*self.worlds.each(known, self.chosen), strict=True)
@@ -77,7 +77,7 @@ class WorldsRecorder:
         title = os.path.splitext(os.path.basename(self.path))[0]
         opens = self._layout(*self._extent)
         self._sink = Sink(self.path, f"tiverlet_worlds_{dim}d", opens, title, overwrite)
-        self._closing = weakref.finalize(self, self._sink.close)  # also when the process ends
+        self._closing = weakref.finalize(self, self._sink.close)  # runs also when the process ends
         try:
             below = iter([_Below(f"worlds/{k}", self._sink.stream) for k in self.chosen])
             self._views = self.worlds.each(lambda world: _View(world, next(below), self._extent, overlays), self.chosen)
@@ -97,7 +97,7 @@ class WorldsRecorder:
     def __exit__(self, *exc) -> None:
         self.close()
 
-    @interrupts.uncut
+    @interrupts.uninterrupted
     def log(self) -> None:
         """Write the present frame, if it is one of `every`."""
         if self._sink.forked() or self._sink.stream is None:
@@ -125,7 +125,7 @@ class WorldsRecorder:
         self.frames += 1
 
     def _layout(self, low: np.ndarray, high: np.ndarray) -> Any:
-        """How it opens in the viewer. low, high: corners of what is to be seen [m]."""
+        """Return the layout of the viewer. low, high: corners of the visible region [m]."""
         from .layout import grid, legend_view, scene_view, unit
 
         scale = unit(*self._extent)
@@ -140,7 +140,7 @@ class WorldsRecorder:
             self._closing()
             raise file_error(error, f"WorldsRecorder: writing {self.path} failed at frame {self._calls}")
 
-    @interrupts.uncut
+    @interrupts.uninterrupted
     def close(self) -> None:
         """Finish the file. Calling it twice does nothing."""
         if self._sink.forked() or self._sink.stream is None:
@@ -159,7 +159,7 @@ class WorldsRecorder:
 
 
 class _View:
-    """One world among others: a Drawing below entities of its own."""
+    """One world among others: a Drawing under entities of its own."""
 
     def __init__(self, world: World, stream: "_Below", extent: tuple[np.ndarray, np.ndarray], overlays: Overlays):
         from .drawing import Drawing, upwards
@@ -167,7 +167,7 @@ class _View:
 
         dim = world.particles.dim
         self.drawing = Drawing(world, stream, extent, overlays)
-        self.low, self.high = np.full(dim, np.inf), np.full(dim, -np.inf)  # of all that was drawn
+        self.low, self.high = np.full(dim, np.inf), np.full(dim, -np.inf)  # corners of everything drawn
         self._known: list[dict[str, Any]] = [{} for _ in world.features]
         self._broken = 0
         turn = [upright(upwards(world))] if dim == 3 else []
@@ -175,7 +175,7 @@ class _View:
         self.drawing.begin()
 
     def frame(self, world: World) -> None:
-        """Draw its present state."""
+        """Draw the world's present state."""
         self.drawing.world = world
         now = [scene.knobs(f) for f in world.features]
         turned = [i for i, (new, old) in enumerate(zip(now, self._known, strict=True)) if not old or not _equal(new, old)]
@@ -191,13 +191,13 @@ class _View:
 
 
 class _Below:
-    """A rerun stream whose entities are below one."""
+    """A rerun stream that puts all entities under one root."""
 
     def __init__(self, root: str, stream: Any):
         self._root, self._stream = root, stream
 
     def log(self, entity: str, *what: Any, **options: Any) -> None:
-        """As rerun's."""
+        """Log under the root, as rerun's stream does."""
         self._stream.log(f"{self._root}/{entity}", *what, **options)
 
 

@@ -1,4 +1,4 @@
-"""The way of a recording to its file."""
+"""The path of a recording from rerun to its file."""
 
 import errno
 import hashlib
@@ -13,23 +13,23 @@ from typing import Any
 from .messages import BATCH, CHUNK, END, HEAD, HEADER, smaller, split, thinned
 from .reader import SEAL
 
-WAIT = 10.0  # [s] that a flush may take
-PIECE = 1 << 20  # bytes that are read at a time
-LOOK = 0.2  # [s] after which the file is looked for
-BACKLOG = 32 << 20  # bytes that may wait to be written
-SMALL = 2 << 20  # bytes of a file that is written anew when it is closed: rows take less when they stand together
-TICK = 0.1  # [s] at which rerun sends what is older than that: it waits for two at most
+WAIT = 10.0  # [s] longest wait for a flush
+PIECE = 1 << 20  # bytes read at a time
+LOOK = 0.2  # [s] between checks that the file still exists
+BACKLOG = 32 << 20  # most bytes waiting to be written
+SMALL = 2 << 20  # a file of fewer bytes is rewritten when it is closed: rows take less when put together
+TICK = 0.1  # [s] rerun's interval of sending rows older than that, so a row waits for at most two intervals
 
 
 class Sink:
-    """A rerun stream into a file that says when the file cannot be written.
+    """A rerun stream into a file, with an error if the file cannot be written.
 
-    rerun's own way to a file ends with a full disk in a wait without end, when the stream is flushed, and when the process ends.
-    So rerun writes into a pipe, and a thread copies message by message from there to the file; where that fails, the rest is read
-    and dropped, and `error` is set. On the way data is compressed better, and rerun's footer is left out: an index of all chunks,
-    which takes 90 kB and which `rerun rrd optimize` makes again. Where there are no pipes by name, rerun writes the file itself.
+    With a full disk, rerun's own file writer waits forever when the stream is flushed, and when the process ends. So rerun writes
+    into a pipe, and a thread copies messages from there to the file. If that fails, the rest is read and dropped, and `error` is
+    set. On the way data are compressed better. rerun's footer is left out, an index of all chunks that takes 90 kB; `rerun rrd
+    optimize` makes it again. Without /dev/fd, rerun writes the file itself.
 
-    A file that is to be overwritten stays as it is until keep(). viewer: the address of one that shows the recording meanwhile.
+    A file to be overwritten stays as it is until keep(). viewer: the address of a viewer that shows the recording meanwhile.
     """
 
     def __init__(
@@ -45,8 +45,8 @@ class Sink:
             raise RuntimeError("Recorder: rerun is switched off by RERUN in the environment; unset it to record.")
         self.stream.set_log_time_enabled(False)
         self._pid = os.getpid()
-        self._sum = hashlib.sha256()  # of all bytes
-        self._new: str | None = None  # the name until keep(), where another file has that of the recording
+        self._sum = hashlib.sha256()  # of all bytes written
+        self._new: str | None = None  # temporary name until keep(), if a file is to be overwritten
         try:
             self._file = self._create(overwrite)
         except OSError as e:
@@ -55,7 +55,7 @@ class Sink:
             raise type(e)(e.errno, f"Recorder: {path} cannot be written ({e.strerror}); choose another place") from None
         self._look()
         self._copy: threading.Thread | None = None
-        self._rest, self._past, self._ended = bytearray(), HEADER, False  # what was read of a message; bytes to pass on
+        self._rest, self._past, self._ended = bytearray(), HEADER, False  # part of a message; bytes of the header to pass on
         self._busy = threading.Lock()
         if os.path.isdir("/dev/fd"):
             self._out, into = os.pipe()
@@ -88,12 +88,12 @@ class Sink:
             raise FileExistsError(errno.EEXIST, f"{what}name, or replace it: Recorder(path, world, overwrite=True)")
         if not os.path.isdir("/dev/fd"):
             return open(self.path, "wb", buffering=0)
-        os.close(os.open(self.path, os.O_WRONLY))  # may it be written?
+        os.close(os.open(self.path, os.O_WRONLY))  # raises if the file is not writable
         self._new = self._beside()
         return open(self._new, "xb", buffering=0)
 
     def _beside(self) -> str:
-        """A name for a file that will replace the one of the recording."""
+        """Return a name for a file that will replace the recording's."""
         folder, name = os.path.split(os.path.realpath(self.path))
         return os.path.join(folder, f".{name}.{uuid.uuid4().hex[:8]}")
 
@@ -103,13 +103,13 @@ class Sink:
         self._same = (found.st_dev, found.st_ino)
 
     def keep(self) -> None:
-        """Give the file its name."""
+        """Give the file its final name."""
         if self._new:
             os.replace(self._new, os.path.realpath(self.path))
             self._new = None
 
     def discard(self) -> None:
-        """Remove the file, if it is one; one that was to be overwritten stays."""
+        """Remove the file, if it is a regular file; one that was to be overwritten stays."""
         if self._regular and self._own(self._new or self.path):
             os.unlink(self._new or self.path)
 
@@ -121,12 +121,12 @@ class Sink:
         return (found.st_dev, found.st_ino) == self._same
 
     def check(self) -> None:
-        """Set `error` if the file was removed, or another one has its name."""
+        """Set `error` if the file was removed or replaced by another one."""
         if self._regular and self.error is None and not self._own(self._new or self.path):
             self.error = FileNotFoundError(errno.ENOENT, "the file was removed or replaced")
 
     def _pump(self) -> None:
-        """Copy messages until rerun closes the pipe. Reading and writing go under one lock, so that flush() sees both done."""
+        """Copy messages until rerun closes the pipe. Reading and writing share one lock, so that flush() waits for both."""
         while True:
             select.select([self._out], [], [])
             with self._busy:
@@ -136,7 +136,7 @@ class Sink:
                 if self.error is None:
                     try:
                         self._take(piece)
-                    except Exception as e:  # the pipe has to be read on, or rerun would wait for ever
+                    except Exception as e:  # keep reading the pipe, or rerun would wait forever
                         self.error = e
         os.close(self._out)
 
@@ -173,13 +173,13 @@ class Sink:
         self.bytes += len(data)
 
     def show(self, blueprint: Any) -> None:
-        """Let the recording open with another layout, unless the user has made one."""
+        """Set the layout in which the recording opens, unless the user has made one."""
         self.stream.send_blueprint(blueprint, make_active=False)
 
     def thin(self, stride: int) -> bool:
-        """Keep the picture of one of `stride` frames: write the file anew, and put it in the place of the old one.
+        """Keep the picture of one of `stride` frames: rewrite the file, and replace the old one by it.
 
-        To be called after flush(). Returns whether that can be done here.
+        Call it after flush(). Returns whether the file was replaced.
         """
         if not self._copy or not self._regular or self.error:
             return False
@@ -196,7 +196,7 @@ class Sink:
                     self._put(HEAD.pack(kind, len(message)) + message)
                 os.replace(new, old)
                 taken = True
-            except OSError:  # there is no room for both
+            except OSError:  # no space for both files
                 os.unlink(new)
             finally:
                 if not taken:
@@ -208,29 +208,29 @@ class Sink:
         return taken
 
     def forked(self) -> bool:
-        """Whether this is a child of the process that records: rerun does not work there, and nothing is copied."""
+        """Whether this is a child of the recording process, where rerun and the copying thread do not work."""
         return self._pid != os.getpid()
 
     def flush(self) -> None:
-        """Wait until all that was logged is in the file."""
+        """Wait until everything logged is in the file."""
         if self.error is None:
             try:
                 self.stream.flush(timeout_sec=WAIT)
-            except RuntimeError:  # the viewer was closed, which is no reason for the file to end
+            except RuntimeError:  # the user closed the viewer, but the file goes on
                 if not self._watched:
                     raise
                 sleep(3 * TICK)
             self._drain()
 
     def _drain(self) -> None:
-        """Wait until the pipe is empty, and what came out of it is written."""
+        """Wait until the pipe is empty and its data are written."""
         end = monotonic() + WAIT
         while self._copy and self._copy.is_alive() and monotonic() < end:
             with self._busy:
                 try:
                     if not select.select([self._out], [], [], 0)[0]:
                         return
-                except (OSError, ValueError):  # it was closed
+                except (OSError, ValueError):  # the pipe was closed
                     return
             sleep(0.0002)
 
@@ -247,13 +247,13 @@ class Sink:
 
 
 def is_recording(path: str) -> bool:
-    """Whether a file begins as recordings do; so does an empty one."""
+    """Whether a file begins like a recording; an empty one counts."""
     with open(path, "rb") as file:
         return file.read(4) in (b"RRF2", b"")
 
 
 def file_error(error: Exception, what: str, rest: str = "") -> OSError:
-    """The error of a file, with what it means."""
+    """Return the error of a file with an explanation."""
     if isinstance(error, OSError):
         return type(error)(error.errno, f"{what} ({error.strerror}){rest}")
     return OSError(errno.EIO, f"{what} ({error!r}){rest}")

@@ -1,15 +1,15 @@
-"""Colours for how far links are from their rest lengths."""
+"""Colours for the strain of links."""
 
 import numpy as np
 
-# Decades of |strain|: links that keep their length to LEAST look neutral, and the colour is full at MOST.
+# Range of |strain|, on a logarithmic scale: up to LEAST the colour is neutral, from MOST on it is full.
 LEAST, MOST = 1e-4, 1e-1
 LEVELS = 12  # colours on each side: four to a decade
 NEUTRAL, LONGER, SHORTER = (np.array(c, dtype=np.float64) for c in ([170, 172, 182], [255, 92, 48], [64, 140, 255]))
 
 
 def _scale() -> np.ndarray:
-    """RGBA as u32, from the shortest to the longest: grey as it should be, blue where it is shorter, red where it is longer."""
+    """Return RGBA as u32 from the most compressed to the most stretched link: blue, grey at rest, red."""
     side = np.linspace(0.0, 1.0, LEVELS + 1)[:, None]
     shorter, longer = (NEUTRAL + side * (end - NEUTRAL) for end in (SHORTER, LONGER))
     rgb = np.concatenate([shorter[:0:-1], longer]).round().astype(np.uint32)
@@ -20,14 +20,14 @@ SCALE = _scale()
 
 
 def levels(strain: np.ndarray) -> np.ndarray:
-    """The place in SCALE of each strain (m,): LEVELS as it should be and where there is none (NaN), more where it is longer."""
+    """Return the index in SCALE of each strain (m,): LEVELS at rest or without a strain (NaN), more for stretched links."""
     strain = np.nan_to_num(strain.astype(np.float32), nan=0.0)
     share = np.log2(np.clip(np.abs(strain), LEAST, MOST) / LEAST) / np.log2(MOST / LEAST)
     return LEVELS + np.rint(np.copysign(LEVELS * share, strain)).astype(np.int32)
 
 
 def legend() -> tuple[np.ndarray, list[str]]:
-    """Colours and labels of the scale, from the shortest to the longest."""
+    """Return colours and labels of the scale, from the most compressed to the most stretched."""
     decades = np.array([1e-1, 1e-2, 1e-3])
     strain = np.concatenate([-decades, [0.0], decades[::-1]])
     return SCALE[levels(strain)], [f"{100 * s:+g} %" if s else "at rest" for s in strain]

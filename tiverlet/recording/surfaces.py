@@ -1,4 +1,4 @@
-"""What is one body to the eye, and where it has a surface: for pictures."""
+"""Bodies and their surfaces, for pictures."""
 
 from collections import defaultdict
 from typing import TYPE_CHECKING
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from ..world import World
     from .scene import Parts
 
-LIGHT, DARKEST = np.array([0.45, 0.35, 0.82]), 0.3  # where it comes from, beside from above; of what is edge on
+LIGHT, DARKEST = np.array([0.45, 0.35, 0.82]), 0.3  # direction of the light, added to up; brightness of faces edge-on to it
 SHADES = 15
-MOST = 200_000  # links up to which it is asked whether they are sides of triangles
+MOST = 200_000  # most links that are searched for triangles
 
 
 def bodies(world: "World | Parts") -> np.ndarray:
-    """The body of each particle, (n,): the lowest number of those that constraints and loops join, its own where none do."""
+    """Return the body of each particle, (n,): the lowest number among the particles that constraints and loops join to it."""
     ends = [np.zeros((0, 2), dtype=np.int64)]
     for f in world.features:
         if isinstance(f, Batch) and f.count:
@@ -32,7 +32,7 @@ def bodies(world: "World | Parts") -> np.ndarray:
             ends += [np.stack([loop, np.roll(loop, 1)], axis=1) for loop in f.loops]
     a, b = np.concatenate(ends).T
     body = np.arange(len(world.particles))
-    while True:  # the lowest number on either side of each link, and then that one's: a few rounds, also along a chain
+    while True:  # take the lowest number at each link, then that particle's number: a few rounds suffice even for a chain
         low = np.minimum(body[a], body[b])
         new = body.copy()
         np.minimum.at(new, body[a], low)
@@ -45,8 +45,9 @@ def bodies(world: "World | Parts") -> np.ndarray:
 
 
 def triangles(world: "World | Parts") -> np.ndarray:
-    """Triangles of particles that cover bodies, (t, 3): loops and volumes, what bends along an edge, and links, where they are
-    the sides of triangles. They may overlap.
+    """Return triangles of particles that cover bodies, (t, 3). They may overlap.
+
+    They come from loops, volumes, dihedral angles, and links that are the sides of triangles.
     """
     x, found = np.asarray(world.particles.position), [np.zeros((0, 3), dtype=np.int64)]
     flat = world.particles.dim == 2
@@ -65,7 +66,7 @@ def triangles(world: "World | Parts") -> np.ndarray:
             found += [np.stack([a, b, c], axis=1), np.stack([b, a, d], axis=1)]
         elif isinstance(f, Batch) and f.arity == 2 and f.count and not f.breaks:
             links.append(f.indices)
-    within = [f.indices.ravel() for f in world.features if isinstance(f, Volume)]  # also what is below the skin
+    within = [f.indices.ravel() for f in world.features if isinstance(f, Volume)]  # also particles below the skin
     done = np.unique(np.concatenate([*found, *within], axis=None))
     pairs = np.concatenate(links)
     pairs = pairs[~np.isin(pairs, done).all(axis=1)]
@@ -83,11 +84,11 @@ def triangles(world: "World | Parts") -> np.ndarray:
     out = np.concatenate(found)
     a, b, c = (x[k] for k in out.T)
     sides = np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1)
-    return out[doubled(b - a, c - a) > 1e-3 * sides]  # none that are flat
+    return out[doubled(b - a, c - a) > 1e-3 * sides]  # without degenerate triangles
 
 
 def covered(world: "World | Parts", corners: np.ndarray) -> np.ndarray:
-    """Which particles are part of a surface, Boolean (n,): its corners, and in 2D what is in a body that keeps its shape."""
+    """Return which particles are part of a surface, Boolean (n,): its corners, and in 2D all of a body that keeps its shape."""
     out = np.zeros(len(world.particles), dtype=bool)
     out[corners.ravel()] = True
     for f in world.features:
@@ -97,16 +98,16 @@ def covered(world: "World | Parts", corners: np.ndarray) -> np.ndarray:
 
 
 def doubled(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Twice the areas between vectors, (m,)."""
+    """Return twice the areas between vectors, (m,)."""
     uu, vv, uv = (np.einsum("ij,ij->i", *pair) for pair in ((u, u), (v, v), (u, v)))
     return np.sqrt(np.maximum(uu * vv - uv * uv, 0))
 
 
 class Surface:
-    """Bodies as one mesh, in the colours of their particles, in light that falls from the eye's side and above.
+    """Bodies as one mesh, in the colours of their particles, lit from the eye's side and above.
 
-    triangles: (t, 3). hues: (n, 3), of particles. pairs: (m, 2), links whose strain shows in the colours of their ends, from 1 %
-    on.
+    triangles: (t, 3). hues: colours of particles, (n, 3). pairs: links whose strain shows in the colours of their ends, from 1 %
+    on, (m, 2). up: the direction against gravity.
     """
 
     def __init__(self, triangles: np.ndarray, hues: np.ndarray, pairs: np.ndarray, up: np.ndarray):
@@ -123,22 +124,25 @@ class Surface:
         self._link = (order % max(1, len(pairs))).astype(np.int64)
 
     def paint(self, hues: np.ndarray) -> None:
-        """Take other colours, (n, 3), for the particles."""
+        """Set other colours of the particles, (n, 3)."""
         self._hues = hues.astype(np.float64)
 
     def colors(self, x: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """RGBA as u32 of all particles at x, (n,). level: of the strain of each link, (m,); the worst at a particle shows."""
+        """Return RGBA of all particles at x as u32, (n,).
+
+        level: the level of the strain of each link, (m,); each particle shows its worst.
+        """
         a, b, c = (x[k] for k in self.triangles.T)
         normal = np.add.reduceat(np.cross(b - a, c - a)[self._face], self._begin, axis=0)
         size = np.sqrt(np.einsum("ij,ij->i", normal, normal))
         light = np.abs(normal @ self._light) / np.where(size > 0, size, 1)
         shade = np.ones(len(x))
-        shade[self._at] = DARKEST + (1 - DARKEST) * np.rint(SHADES * light) / SHADES  # few, so that they take few bytes
+        shade[self._at] = DARKEST + (1 - DARKEST) * np.rint(SHADES * light) / SHADES  # few shades compress well
         hues = self._hues
         if len(self._end):
             off = level[self._link] - LEVELS
             most = np.maximum.reduceat(2 * np.abs(off) + (off > 0), self._first)
-            share = np.maximum(0, 3 * (most >> 1) / LEVELS - 2)[:, None]  # from 1 % of strain on, in full at 10 %
+            share = np.maximum(0, 3 * (most >> 1) / LEVELS - 2)[:, None]  # 0 up to 1 % of strain, 1 at 10 %
             hues = hues.copy()
             hues[self._end] += share * (np.where((most & 1)[:, None], LONGER, SHORTER) - hues[self._end])
         rgb = np.rint(hues * shade[:, None]).astype(np.uint32)
@@ -146,7 +150,7 @@ class Surface:
 
 
 def cliques(pairs: np.ndarray) -> np.ndarray:
-    """Three particles that are all linked to each other, (t, 3)."""
+    """Return all triples of particles that are linked to each other, (t, 3)."""
     near: dict[int, set[int]] = defaultdict(set)
     for i, j in pairs.tolist():
         near[min(i, j)].add(max(i, j))
@@ -155,14 +159,14 @@ def cliques(pairs: np.ndarray) -> np.ndarray:
 
 
 def skin(tetrahedra: np.ndarray) -> np.ndarray:
-    """The faces that only one tetrahedron has, (t, 3)."""
+    """Return the faces that belong to one tetrahedron only, (t, 3)."""
     faces = np.concatenate([tetrahedra[:, k] for k in ([0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2])])
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     return faces[np.sort(first[count == 1])]
 
 
 def clipped(loop: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Triangles that fill a loop in the plane, (k - 2, 3), by cutting off ears."""
+    """Return triangles that fill a loop in 2D, (k - 2, 3), by ear clipping."""
     q = x[loop]
     if np.sum(q[:, 0] * np.roll(q[:, 1], -1) - q[:, 1] * np.roll(q[:, 0], -1)) < 0:
         loop = loop[::-1]
@@ -182,7 +186,7 @@ def clipped(loop: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def hull(cluster: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Triangles that fill what is around particles in the plane, (t, 3): a fan in their convex hull (Andrew 1979)."""
+    """Return triangles that fill the convex hull of particles in 2D, (t, 3), as a fan (Andrew 1979)."""
     order = cluster[np.lexsort(x[cluster].T[::-1])].tolist()
     ring: list[int] = []
     for way in (order, order[::-1]):

@@ -1,4 +1,4 @@
-"""The rerun viewer, from the command line: a window, a page for the browser, or a picture without either."""
+"""The rerun viewer, started from the command line: a window, a page in the browser, or a picture without either."""
 
 import contextlib
 import http.server
@@ -21,35 +21,35 @@ import numpy as np
 from .layout import SCENE_VIEW
 
 LOCAL = "127.0.0.1"
-NUMBER = re.compile(r"%0?\d*d")  # in a name; any other % is itself
-PATIENCE = 40.0  # [s] until a picture has to be there
-# rerun sends statistics home unless told otherwise; this is how it is told (no connection, no file), and not to chat.
+NUMBER = re.compile(r"%0?\d*d")  # in a file name; any other % stands for itself
+PATIENCE = 40.0  # [s] longest wait for a picture
+# These settings stop rerun from sending usage statistics (no connection, no file) and from printing messages.
 QUIET = {"CI": "true", "RUST_LOG": "error"}
 
 
 def launch(folder: str, *words: str, **options) -> subprocess.Popen:
-    """rerun, on this machine only. `python -m rerun` is a wrapper, so it gets a group of its own, to end both.
+    """Start rerun, reachable from this machine only. folder: for its temporary files.
 
-    folder: for what it leaves behind.
+    `python -m rerun` is a wrapper, so it gets a process group of its own, by which both processes can be ended.
     """
     command = [sys.executable, "-m", "rerun", "--bind", LOCAL, *words]
     return subprocess.Popen(command, env={**os.environ, **QUIET, "TMPDIR": folder}, start_new_session=True, **options)
 
 
 def scratch() -> tempfile.TemporaryDirectory:
-    """A folder for what a viewer leaves behind."""
+    """Return a temporary folder for a viewer."""
     return tempfile.TemporaryDirectory(prefix="tiverlet-", ignore_cleanup_errors=True)
 
 
 @contextlib.contextmanager
 def _told_to_end() -> Iterator[None]:
-    """SIGTERM, or a terminal that closes, ends the block with SystemExit, so that what was started in it is ended, too."""
+    """Within this context, SIGTERM or a closing terminal raises SystemExit, so that processes started in it are ended, too."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def leave(number: int, frame: Any) -> None:
-        """End as the signal asks, but by an exception, so that what is open is closed."""
+        """Raise SystemExit with the status of the signal, so that open resources are closed."""
         raise SystemExit(128 + number)
 
     before = [(number, signal.signal(number, leave)) for number in (signal.SIGTERM, signal.SIGHUP)]
@@ -70,7 +70,7 @@ def _wait(process: subprocess.Popen) -> int:
 
 
 def stop(process: subprocess.Popen) -> None:
-    """End a viewer that was launched, and what it started."""
+    """End a viewer that was launched, and its child processes."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, number)
@@ -79,7 +79,7 @@ def stop(process: subprocess.Popen) -> None:
 
 
 def show(path: str) -> int:
-    """Open the viewer's window, and wait until it is closed; returns its exit status."""
+    """Open the viewer's window and wait until it is closed. Returns its exit status."""
     with _told_to_end(), scratch() as folder:
         return _wait(launch(folder, "--port", str(free_port()), path))
 
@@ -87,8 +87,8 @@ def show(path: str) -> int:
 def serve(path: str, port: int) -> int:
     """Serve a recording to browsers on this machine, until interrupted.
 
-    rerun's page asks other hosts for news, fonts and examples. It comes through here, with a header by which the browser lets it
-    talk to this machine only.
+    rerun's page requests news, fonts and examples from other hosts. So it passes through here, with a header by which the browser
+    blocks all hosts but this machine.
     """
     data, page = free_port(), free_port()
     with _told_to_end(), scratch() as folder, Pages((LOCAL, port), page, data) as pages:
@@ -99,12 +99,12 @@ def serve(path: str, port: int) -> int:
 
 
 def url_of(page: int, data: int) -> str:
-    """The address of a page at one port that shows what comes from the other."""
+    """Return the address of a page at port `page` that shows the data from port `data`."""
     return f"http://{LOCAL}:{page}/?url=rerun%2Bhttp%3A%2F%2F{LOCAL}%3A{data}%2Fproxy"
 
 
 class Pages(http.server.ThreadingHTTPServer):
-    """Hands on the pages of rerun's server at port `page`; they may talk to it and to port `data`, and to nobody else."""
+    """Passes on the pages of rerun's server at port `page`. They may connect to it and to port `data`, and to no other host."""
 
     daemon_threads = True
 
@@ -122,9 +122,9 @@ class _Page(http.server.BaseHTTPRequestHandler):
     server: Pages  # type: ignore[assignment]
 
     def do_GET(self) -> None:
-        """One page."""
+        """Answer with one page."""
         name = (self.headers.get("Host") or "").rpartition(":")[0]
-        if name not in (LOCAL, "localhost"):  # a page from elsewhere, whose name was made to mean this machine
+        if name not in (LOCAL, "localhost"):  # DNS rebinding: a foreign page whose host name resolves to this machine
             self.send_error(403)
             return
         try:
@@ -143,14 +143,15 @@ class _Page(http.server.BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, *args) -> None:
-        """Say nothing."""
+        """Log nothing."""
 
 
 def picture(path: str, png: str, frames: list[int] | None = None, scene: bool = False) -> list[str]:
-    """Save pictures of frames (None: the last) without a window; returns their paths. `png` with several frames: one %d in it.
+    """Save pictures of frames (None: the last) without a window; return their paths.
 
-    scene: without curves and text. Needs a Vulkan driver; software will do (Debian: apt-get install mesa-vulkan-drivers). Raises
-    RuntimeError where there is none, and ValueError for a frame that the file does not have.
+    png: the name of the file; with several frames, it has one %d in it. scene: without curves and text. Needs a Vulkan driver;
+    one in software is enough (Debian: apt-get install mesa-vulkan-drivers). Raises RuntimeError if there is none, and ValueError
+    for a frame that the file does not have.
     """
     from .replay import replay
 
@@ -184,12 +185,12 @@ def picture(path: str, png: str, frames: list[int] | None = None, scene: bool = 
 
 
 def named(path: str, frame: int) -> str:
-    """A name with the number of a frame for %d."""
+    """Return a name with the number of a frame for %d."""
     return NUMBER.sub(lambda found: found.group() % frame, path)
 
 
 def _settled(process: subprocess.Popen, port: int, frame: int, name: str, view: str | None) -> None:
-    """Save a picture once two in a row are the same: by then everything is loaded and drawn."""
+    """Save a picture once two successive ones are equal: by then everything is loaded and drawn."""
     from rerun.experimental import ViewerClient
 
     viewer, last, end = None, None, time.monotonic() + PATIENCE
@@ -201,7 +202,7 @@ def _settled(process: subprocess.Popen, port: int, frame: int, name: str, view: 
                 viewer = viewer or ViewerClient.connect(f"rerun+http://{LOCAL}:{port}/proxy")
                 viewer.set_time("frame", sequence=frame, play_state="paused")
                 viewer.save_screenshot(shot, view_id=view)
-            except (RuntimeError, OSError):  # not up yet, or not loaded
+            except (RuntimeError, OSError):  # the viewer is not running yet, or the file not loaded
                 continue
             pixels = pixels_of(shot)
             if last is not None and pixels.shape == last.shape and (pixels == last).all() and (pixels != pixels[0, 0]).any():
@@ -212,7 +213,7 @@ def _settled(process: subprocess.Popen, port: int, frame: int, name: str, view: 
 
 
 def pixels_of(png: str) -> np.ndarray:
-    """The colours of a picture, (rows, columns, 3)."""
+    """Return the colours of a picture, (rows, columns, 3)."""
     from PIL import Image
 
     with Image.open(png) as image:
@@ -220,7 +221,7 @@ def pixels_of(png: str) -> np.ndarray:
 
 
 def free_port() -> int:
-    """A port of this machine that nobody has."""
+    """Return a free port of this machine."""
     with socket.socket() as s:
         s.bind((LOCAL, 0))
         return s.getsockname()[1]

@@ -1,4 +1,4 @@
-"""Watching a recording in rerun's viewer while it is made."""
+"""Shows a recording in rerun's viewer while it is made."""
 
 import atexit
 import socket
@@ -11,16 +11,16 @@ from typing import Any
 
 from . import viewer
 
-PATIENCE = 30.0  # [s] until a viewer has to answer
+PATIENCE = 30.0  # [s] longest wait for a viewer to start
 PLACES = (True, "web")
-_scratch: list[tempfile.TemporaryDirectory] = []  # of viewers that were launched; they go when this process ends
+_scratch: list[tempfile.TemporaryDirectory] = []  # folders of launched viewers, removed when this process ends
 
 
 def address(live: bool | str) -> str | None:
-    """Where the viewer listens that is to show a recording, started if it is not an address itself; None for a notebook, whose
-    viewer is a part of the page.
+    """Return the address of the viewer for a live recording, and start one unless `live` is an address.
 
-    Raises ValueError for what is none of these, and RuntimeError where the viewer does not start.
+    Returns None for a notebook, whose viewer is part of the page. Raises ValueError for any other value, and RuntimeError if the
+    viewer does not start.
     """
     if live == "notebook":
         return None
@@ -41,7 +41,7 @@ def address(live: bool | str) -> str | None:
     if live == "web":
         pages = viewer.Pages((viewer.LOCAL, here), page, port)
         threading.Thread(target=pages.serve_forever, daemon=True).start()
-        atexit.register(viewer.stop, process)  # a window stays; nobody else could end a server
+        atexit.register(viewer.stop, process)  # the user can close a window, but not a server
         url = viewer.url_of(here, port)
         print(f"Recorder: watch it at {url}", flush=True)
         webbrowser.open(url)
@@ -64,9 +64,9 @@ def _await(process: subprocess.Popen, port: int) -> None:
 
 
 def below_the_cell(stream: Any) -> None:
-    """Show a rerun stream, from now on, below the cell of a notebook.
+    """Show a rerun stream below the cell of a notebook, from now on.
 
-    Raises ImportError where rerun's part for notebooks is missing.
+    Raises ImportError if rerun's part for notebooks is missing.
     """
     import rerun.notebook
 

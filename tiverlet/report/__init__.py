@@ -1,4 +1,4 @@
-"""What tiverlet reports about itself: scenes with known answers, their errors and what they cost, what is extreme, and speed."""
+"""Reports about tiverlet itself: errors and costs on scenes with known answers, stiff and extreme cases, and speed."""
 
 from .accuracy.cases import CASES, METHODS
 from .accuracy.errors import ErrorReport

@@ -1,4 +1,4 @@
-"""The parts of a report, one after the other here or in the workers of an executor, and a bar meanwhile."""
+"""Run the parts of a report, one after the other here or in the workers of an executor, with a progress bar."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import as_completed
@@ -9,15 +9,15 @@ from rich.progress import Progress
 from .output import said
 
 T = TypeVar("T")
-Done = tuple[T, Any, str]  # a part, what it came to, and why it came to nothing
+Done = tuple[T, Any, str]  # a part, its result or None, and the error or ""
 
 
 def done(
     title: str, function: Callable[[T], Any], parts: Sequence[T], executor: Any, progress: bool, name: Callable[[T], str] = str
 ) -> Iterator[Done[T]]:
-    """Each part with function(part), as they are done; with None, and the error in a line, where that or its worker failed.
+    """Yield (part, function(part), "") for each part as it finishes, or (part, None, error) if it or its worker failed.
 
-    executor: with submit(), or None. progress: whether there is a bar, on which a part goes by name(part).
+    executor: an object with submit(), or None. progress: whether to show a bar. name(part): the text beside the bar.
     """
     with Progress(disable=not progress) as bar:
         shown = bar.add_task(title, total=len(parts))
@@ -40,7 +40,7 @@ def _submitted(function: Callable[[T], Any], parts: Iterable[T], executor: Any) 
     for part in parts:
         try:
             waiting[executor.submit(function, part)] = part
-        except Exception as error:  # a pool that has lost a worker takes no more
+        except Exception as error:  # a pool that has lost a worker accepts no more jobs
             yield part, None, said(error)
     for future in as_completed(waiting):
         try:

@@ -1,4 +1,4 @@
-"""What all reports print with: text, tables, Markdown, means and errors, numbers that JSON has, errors in a line, the machine."""
+"""Output of all reports: text, tables, Markdown, means with errors, numbers for JSON, errors in one line, the machine's name."""
 
 import os
 import platform
@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-Titled = tuple[str, Sequence[str], Iterable[Sequence[str]]]  # a table: its title, the heads of columns, rows of text
+Titled = tuple[str, Sequence[str], Iterable[Sequence[str]]]  # a table: title, column heads, rows of text
 
 
 def text(shown: Any, width: int) -> str:
-    """What print() of rich shows of something, in lines of `width`."""
+    """Return the text that rich's print() shows, in lines of `width` characters."""
     console = Console(width=width)
     with console.capture() as out:
         console.print(shown)
@@ -23,13 +23,13 @@ def text(shown: Any, width: int) -> str:
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """The lines of a Markdown table."""
+    """Return the lines of a Markdown table."""
     lines = ["| " + " | ".join(row) + " |" for row in (heads, *rows)]
     return [lines[0], "|" + "---|" * len(heads), *lines[1:]]
 
 
 def printed(tables: Iterable[Titled], lines: Iterable[str], left: Container[str] = ()) -> Iterator[Table | Text]:
-    """Tables, and lines below them, for rich. left: heads of columns of words, as the first one is."""
+    """Yield tables, and lines below them, for rich. left: heads of columns that are left-aligned, besides the first."""
     for title, heads, rows in tables:
         out = Table(title=title, box=SIMPLE, padding=(0, 1, 0, 0), pad_edge=False)
         for k, head in enumerate(heads):
@@ -41,7 +41,7 @@ def printed(tables: Iterable[Titled], lines: Iterable[str], left: Container[str]
 
 
 def markdown(tables: Iterable[Titled], lines: Iterable[str]) -> str:
-    """The same as Markdown."""
+    """Return tables, and lines below them, as Markdown."""
     out: list[str] = []
     for title, heads, rows in tables:
         out += [f"**{title}**", "", *table(heads, rows), ""]
@@ -49,17 +49,17 @@ def markdown(tables: Iterable[Titled], lines: Iterable[str]) -> str:
 
 
 def mean_and_error(values: np.ndarray) -> tuple[float, float]:
-    """The mean of independent values, and its standard error."""
+    """Return the mean of independent values and its standard error."""
     return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
 
 
 def plain(row: dict) -> dict:
-    """With None for numbers that JSON does not have."""
+    """Return the row with None for numbers that JSON does not have."""
     return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()}
 
 
 def canvas(folder) -> Any:
-    """The Figure of matplotlib, to plot into a folder, which is made. Raises RuntimeError where there is no matplotlib."""
+    """Create the folder for plots and return matplotlib's Figure class. Raises RuntimeError if matplotlib is not installed."""
     try:
         from matplotlib.figure import Figure  # pyright: ignore[reportMissingImports]
     except ImportError as error:
@@ -69,13 +69,13 @@ def canvas(folder) -> Any:
 
 
 def said(error: BaseException) -> str:
-    """An error in a line."""
+    """Return an error as one line of at most 200 characters."""
     text = " ".join(f"{type(error).__name__}: {error}".split())
     return text if len(text) <= 200 else text[:197] + "..."
 
 
 def machine() -> str:
-    """What the times were measured on."""
+    """Return the name of the machine: processor, cores, system and Python."""
     name = platform.processor() or platform.machine()
     try:
         with open("/proc/cpuinfo") as file:

@@ -1,4 +1,4 @@
-"""Meshes from and to OBJ and PLY files. Both formats are short enough to need no library."""
+"""Reading and writing meshes as OBJ and PLY files. Both formats are short enough to need no library."""
 
 import os
 from collections.abc import Sequence
@@ -15,13 +15,13 @@ _TYPES = {
 
 
 def load(path, dim: int = 3) -> Shape:
-    """A body from an .obj or .ply file (ascii or binary): vertices, edges, faces, and tetrahedra where there are any.
+    """Read a body from an .obj or .ply file (ascii or binary): vertices, edges, faces, and tetrahedra if there are any.
 
-    Faces of more than three corners are cut into fans. links: the edges that are given, or else those of faces and tetrahedra.
+    Faces of more than three corners are cut into fans. links: the edges in the file, or else those of faces and tetrahedra.
     PLY: elements vertex (x, y, z), edge (vertex1, vertex2), face, and tetrahedron, tetra, tet or cell (lists of indices).
-    OBJ: v, vt, l and f; what else there is, is passed over. Faces as they are, with texture coordinates, are kept in polygons and
-    uv. dim = 2 drops z. Vertices that nothing uses are kept.
-    ValueError, with the line or the element, for what cannot be understood.
+    OBJ: v, vt, l and f; all other lines are ignored. The faces of the file, with texture coordinates, are kept in polygons and
+    uv. dim = 2 drops z. Unused vertices are kept.
+    Raises ValueError, with the line or the element, for what it cannot parse.
     """
     name = os.fspath(path)
     kind = os.path.splitext(name)[1].lower()
@@ -45,8 +45,9 @@ def load(path, dim: int = 3) -> Shape:
 
 
 def save(path, shape: Shape, binary: bool = True) -> None:
-    """Write a body to an .obj or .ply file: position, links, faces and (PLY) tetrahedra. In 2D z is 0. OBJ has faces with their
-    corners and texture coordinates as they came from a file, PLY triangles.
+    """Write a body to an .obj or .ply file: position, links, faces and (PLY) tetrahedra.
+
+    In 2D z is 0. OBJ keeps the polygons and texture coordinates that came from a file; PLY has triangles.
     """
     name = os.fspath(path)
     kind = os.path.splitext(name)[1].lower()
@@ -67,7 +68,7 @@ def save(path, shape: Shape, binary: bool = True) -> None:
 
 
 def obj_faces(faces: Sequence[np.ndarray], uv: Sequence[np.ndarray]) -> list[str]:
-    """The lines vt and f of an .obj file. uv: for each face the texture coordinates of its corners, or (0, 2)."""
+    """Return the lines vt and f of an .obj file. uv: for each face the texture coordinates of its corners, or (0, 2)."""
     number: dict[tuple[float, float], int] = {}
     lines = []
     for face, at in zip(faces, uv, strict=True):
@@ -89,7 +90,7 @@ def _obj(name: str, data: bytes):
     points, places, edges, polygons, textures = [], [], [], [], []
 
     def numbers(words: list[str], count: int) -> list[int]:
-        """Numbers of vertices from 0 on; -1 where there is none."""
+        """Convert vertex numbers of a file to indices from 0; -1 for the invalid number 0."""
         found = [int(w) for w in words]
         return [i - 1 if i > 0 else count + i if i < 0 else -1 for i in found]
 
@@ -132,7 +133,7 @@ def _obj(name: str, data: bytes):
 
 
 def _header(name: str, data: bytes):
-    """The format, the elements [(name, count, [(property, type, list count type or None)])], and where the body begins."""
+    """Return the format, the elements [(name, count, [(property, type, list count type or None)])], and the start of the body."""
     stop = data.find(b"end_header")
     if not data.startswith(b"ply") or stop < 0:
         raise ValueError(f"load: {name} is not a PLY file; it has no header.")
@@ -162,7 +163,7 @@ def _ply(name: str, data: bytes):
     found: dict[str, dict[str, list]] = {}
 
     def take(form: str, count: int) -> list:
-        """The next `count` numbers."""
+        """Read the next `count` numbers."""
         nonlocal here, at
         if kind == "ascii":
             here += count

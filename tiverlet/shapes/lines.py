@@ -1,4 +1,4 @@
-"""Bodies of one dimension."""
+"""Bodies made of lines: rope, chain, bridge, tree."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ def _in_line(n: int) -> dict:
 
 
 def rope(start, end, points: int) -> Shape:
-    """`points` particles in a straight line from `start` to `end` [m], both included, each linked to the next."""
+    """Make `points` particles in a straight line from `start` to `end` [m], both included, each linked to the next."""
     checks.integer("rope", "points", points, least=2)
     a, b = ends("rope", start, end)
     amount = np.linspace(0.0, 1.0, points)[:, None]
@@ -21,9 +21,9 @@ def rope(start, end, points: int) -> Shape:
 
 
 def chain(start, end, length: float, points: int) -> Shape:
-    """A chain of a given length that hangs from `start` to `end` along its catenary, gravity along -y.
+    """Make a chain of a given length that hangs from `start` to `end` along its catenary, gravity along -y.
 
-    length: along the curve [m], more than the distance. The particles are equally far apart along it.
+    length: along the curve [m], more than the distance of its ends. Particles are evenly spaced along the curve.
     """
     checks.integer("chain", "points", points, least=2)
     a, b = ends("chain", start, end)
@@ -32,7 +32,7 @@ def chain(start, end, length: float, points: int) -> Shape:
     width = float(np.linalg.norm(flat))
     s = np.linspace(0, length, points)
     position = np.tile(a, (points, 1))
-    if width < 1e-9 * length:  # straight down, and up again
+    if width < 1e-9 * length:  # start and end lie above each other: straight down, and up again
         low = (length - rise) / 2
         position[:, 1] += np.abs(s - low) - low
         return Shape(position, **_in_line(points))
@@ -43,7 +43,7 @@ def chain(start, end, length: float, points: int) -> Shape:
         slack = k + np.log1p(-np.exp(-2 * k)) - np.log(2 * k) < ratio
         low, high = (k, high) if slack else (low, k)
     c = width / (2 * k)
-    x0 = c * np.arctanh(rise / length) - width / 2  # the start, measured from the lowest point
+    x0 = c * np.arctanh(rise / length) - width / 2  # x of the start, from the lowest point
     x = c * np.arcsinh(s / c + np.sinh(x0 / c))
     position[:, np.arange(len(a)) != 1] += (x - x0)[:, None] * flat / width
     position[:, 1] += c * (np.cosh(x / c) - np.cosh(x0 / c))
@@ -51,7 +51,7 @@ def chain(start, end, length: float, points: int) -> Shape:
 
 
 def bridge(start, end, panels: int, height: float) -> Shape:
-    """A truss bridge: a deck from `start` to `end` [m] of `panels` panels, and a chord above it, joined by a zigzag."""
+    """Make a truss bridge: a deck of `panels` panels from `start` to `end` [m], and a chord above it, joined by a zigzag."""
     checks.integer("bridge", "panels", panels, least=1)
     height = checks.number("bridge", "height", height, above=0.0)
     a, b = ends("bridge", start, end)
@@ -64,10 +64,11 @@ def bridge(start, end, panels: int, height: float) -> Shape:
 
 
 def tree(root, height: float, levels: int = 4, branches: int = 2, segments: int = 4, spread: float = 0.6, dim: int = 2) -> Shape:
-    """A plant: a stem of `segments` links that ends in `branches` shorter ones, and so on for `levels` levels.
+    """Make a plant: a stem of `segments` links that splits into `branches` shorter ones, and so on for `levels` levels.
 
-    root: (dim,) [m]. height: of the whole, upright, roughly [m]. spread: angle between a branch and its stem [rad]; directions
-    around it, in 3D, and lengths vary with the golden ratio. links and bends run through every fork. Pin particle 0 to plant it.
+    root: (dim,) [m]. height: of the whole plant, upright, roughly [m]. spread: angle between a branch and its stem [rad].
+    Lengths, and in 3D directions around the stem, vary with the golden ratio. links and bends run through every fork. Pin
+    particle 0 to plant it.
     """
     base = point("tree", "root", root)
     height = checks.number("tree", "height", height, above=0.0)

@@ -5,7 +5,7 @@ import numpy as np
 from .. import checks
 from .shape import Shape, point
 
-# Heights and distances from the middle, of a height of 1, facing +x; and which point each part hangs on.
+# Coordinates (x, y, z) of each point for a height of 1: facing +x, y up, z away from the middle plane.
 _POINTS = {
     "head": (0.0, 0.93, 0.0), "neck": (0.0, 0.82, 0.0), "chest": (0.0, 0.70, 0.0), "hip": (0.0, 0.53, 0.0),
     "shoulder": (0.0, 0.80, 0.11), "elbow": (0.0, 0.62, 0.13), "hand": (0.0, 0.44, 0.14),
@@ -14,7 +14,7 @@ _POINTS = {
 _NAMES = ["head", "neck", "chest", "hip"] + [
     f"{side} {part}" for side in ("left", "right") for part in ("shoulder", "elbow", "hand", "joint", "knee", "foot")
 ]
-# Joints: how far the path through three points may turn [rad]; in 2D from the first to the second limit, in 3D up to the larger.
+# Joints: lower and upper limit of the signed turn at the second of three points [rad]; in 3D from 0 to the larger of both.
 _TURNS = [
     ("head", "neck", "chest", -0.6, 0.6), ("neck", "chest", "hip", -0.5, 0.5),
     ("{} shoulder", "{} elbow", "{} hand", 0.0, 2.4), ("{} joint", "{} knee", "{} foot", -2.4, 0.0),
@@ -23,9 +23,9 @@ _TURNS = [
 
 
 def ragdoll(feet, height: float = 1.8) -> Shape:
-    """A figure of 16 points that stands upright at `feet` [m], in 2D from the side, facing +x, or in 3D.
+    """Make a figure of 16 points that stands upright at `feet` [m]: in 2D from the side, facing +x, or in 3D.
 
-    links: the bones; the trunk is braced by links of its own. limits, lower and upper: neck, back, elbows, knees, hips and
+    links: the bones. braces: additional links in the trunk. limits, lower and upper: neck, back, elbows, knees, hips and
     shoulders. radius: of head, trunk and limbs. Points are named in order by tv.shapes.people.NAMES.
     """
     base = point("ragdoll", "feet", feet)
@@ -36,12 +36,12 @@ def ragdoll(feet, height: float = 1.8) -> Shape:
         x, y, z = _POINTS[part]
         position.append([x, y, -z if side == "left" else z])
     x = np.array(position) * height
-    if len(base) == 2:  # from the side: the two sides are a hair apart, so that no link has length 0
+    if len(base) == 2:  # from the side: left and right are slightly apart, so that no link has length 0
         x = x[:, :2] + 0.005 * height * np.sign(x[:, 2:])
     number = {name: k for k, name in enumerate(NAMES)}
 
     def pairs(*names):
-        """Numbers of two points each, by their names."""
+        """Return pairs of indices of points, by their names."""
         return [(number[a], number[b]) for a, b in names]
 
     links = pairs(("head", "neck"), ("neck", "chest"), ("chest", "hip"))

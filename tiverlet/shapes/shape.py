@@ -1,4 +1,4 @@
-"""What every ready-made body is."""
+"""Shape: the type of every ready-made body."""
 
 from dataclasses import dataclass, field, fields, replace
 
@@ -13,19 +13,19 @@ def _none(width: int):
 
 @dataclass(frozen=True)
 class Shape:
-    """Points, and tuples of indices into them, each for a constraint. What a body does not have is empty.
+    """Points, and tuples of indices into them, one tuple per constraint. Parts that a body does not have are empty.
 
     position: (n, dim) [m].
     links: (m, 2), the edges: Distance.
-    braces: (m, 2), more links that keep the form, softer as a rule: diagonals, and over two edges at once.
+    braces: (m, 2), more links that keep the shape, usually softer: diagonals, and links over two edges.
     bends: (m, 3), corners along lines, the corner in the middle: Bend.
     limits: (m, 3), joints: AngleLimit, with lower and upper (m,) [rad].
-    faces: (m, 3), triangles: Area; of a closed surface, seen counterclockwise from outside: Volume.
+    faces: (m, 3), triangles: Area; of a closed surface, counterclockwise from outside: Volume.
     quads: (m, 4), two triangles with a common edge, its ends first: Dihedral.
     tetrahedra: (m, 4), of positive volume: Volume.
     loops: index arrays around areas, counterclockwise: Area.
     radius: (n,) [m].
-    polygons: index arrays around faces as they were in a file, where some have more than three corners or texture coordinates.
+    polygons: index arrays around the original faces of a file, if any has more than three corners or texture coordinates.
     uv: for each of the polygons the texture coordinates of its corners, (corners, 2), or (0, 2).
     """
 
@@ -53,17 +53,17 @@ class Shape:
 
     @property
     def surface(self) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-        """Polygons and their texture coordinates; where there are none, faces."""
+        """Polygons and their texture coordinates; without polygons, the faces."""
         if self.polygons:
             return self.polygons, self.uv
         return tuple(self.faces), (np.zeros((0, 2)),) * len(self.faces)
 
     def moved(self, by) -> "Shape":
-        """The same body, shifted by a vector [m]."""
+        """Return the body, shifted by a vector [m]."""
         return replace(self, position=self.position + checks.vector("moved", "by", by, self.position.shape[1]))
 
     def turned(self, angle: float, about=None, axis=(0.0, 0.0, 1.0)) -> "Shape":
-        """The same body, turned by an angle [rad] about a point (None: its mean), in 3D around an axis."""
+        """Return the body, turned by an angle [rad] about a point (None: its mean); in 3D around an axis."""
         angle, dim = checks.number("turned", "angle", angle), self.position.shape[1]
         center = self.position.mean(axis=0) if about is None else checks.vector("turned", "about", about, dim)
         c, s = np.cos(angle), np.sin(angle)
@@ -79,10 +79,10 @@ class Shape:
         return replace(self, position=center + (self.position - center) @ R.T)
 
     def in_order(self) -> "Shape":
-        """The same body, numbered along Morton's curve (1966): neighbours in space are neighbours in number, as are constraints.
+        """Return the body, renumbered along Morton's curve (1966): neighbours in space, and their constraints, get near numbers.
 
-        What is close is then fetched from memory together. A million discs in random order take up to twice the time, 100 000
-        1.7 times as long, 10 000 1.5 times. For particles that come without a shape: Shape(position).in_order().position.
+        Close particles are then fetched from memory together. Unsorted, a million discs take up to twice the time, 100 000 take
+        1.7 times as long, 10 000 1.5 times. For particles without a shape: Shape(position).in_order().position.
         """
         order = np.argsort(morton(self.position), kind="stable")
         number = np.empty_like(order)
@@ -103,7 +103,7 @@ LOOPS = ("loops", "polygons")
 
 
 def join(*shapes: Shape) -> tuple[Shape, list[slice]]:
-    """One shape of several, and where the particles of each are in it."""
+    """Join several shapes into one. Returns it, and the slice of each shape's particles."""
     if not shapes:
         raise ValueError("join: there is nothing to join; give one shape or more.")
     dims = {s.position.shape[1] for s in shapes}
@@ -122,7 +122,7 @@ def join(*shapes: Shape) -> tuple[Shape, list[slice]]:
 
 
 def morton(position: np.ndarray) -> np.ndarray:
-    """Where points lie along Morton's curve, (n,): the bits of their cells' coordinates, taken in turn."""
+    """Return positions along Morton's curve, (n,): the bits of the coordinates of each point's cell, interleaved."""
     n, dim = position.shape
     bits = 63 // dim
     low, size = position.min(axis=0, initial=np.inf), float(np.ptp(position, axis=0).max(initial=0.0)) if n else 0.0
@@ -135,13 +135,13 @@ def morton(position: np.ndarray) -> np.ndarray:
 
 
 def point(who: str, name: str, value) -> np.ndarray:
-    """A point in 2D or 3D."""
+    """Check a point in 2D or 3D."""
     array = checks.points(who, name, [np.asarray(value, dtype=np.float64)])
     return array[0]
 
 
 def ends(who: str, start, end) -> tuple[np.ndarray, np.ndarray]:
-    """Two points that differ."""
+    """Check two points that differ."""
     a = point(who, "start", start)
     b = checks.vector(who, "end", end, len(a))
     if (a == b).all():
@@ -150,14 +150,14 @@ def ends(who: str, start, end) -> tuple[np.ndarray, np.ndarray]:
 
 
 def edges_of(cells: np.ndarray) -> np.ndarray:
-    """The edges of triangles or tetrahedra, each once, (m, 2)."""
+    """Return the edges of triangles or tetrahedra, each once, (m, 2)."""
     k = cells.shape[1]
     pairs = [cells[:, [i, j]] for i in range(k) for j in range(i + 1, k)]
     return np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0)
 
 
 def quads_of(faces: np.ndarray) -> np.ndarray:
-    """Pairs of triangles with a common edge: the ends of the edge, then the two other corners, (m, 4)."""
+    """Return pairs of triangles with a common edge: the ends of the edge, then the two other corners, (m, 4)."""
     edges = np.concatenate([faces[:, [0, 1, 2]], faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]])
     ends_ = np.sort(edges[:, :2], axis=1)
     order = np.lexsort((ends_[:, 1], ends_[:, 0]))
@@ -167,21 +167,21 @@ def quads_of(faces: np.ndarray) -> np.ndarray:
 
 
 def surface_of(tetrahedra: np.ndarray) -> np.ndarray:
-    """The faces of tetrahedra (of positive volume) that no two share, counterclockwise from outside, (m, 3)."""
+    """Return the faces of tetrahedra (of positive volume) that no two share, counterclockwise from outside, (m, 3)."""
     faces = np.concatenate([tetrahedra[:, c] for c in ([0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2])])
     _, first, counts = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     return faces[np.sort(first[counts == 1])]
 
 
 def single_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The edges that only one triangle has: in the sense of the triangle, and sorted, (m, 2) each."""
+    """Return the edges of exactly one triangle: in the direction of the triangle, and sorted, (m, 2) each."""
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     unique, inverse, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     return edges[counts[inverse.ravel()] == 1], unique[counts == 1]
 
 
 def rims_of(triangles: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The closed loops of edges that only one triangle has, in the sense of the triangles."""
+    """Return the closed loops of edges that only one triangle has, in the direction of the triangles."""
     after = dict(single_edges(triangles)[0].tolist())
     loops = []
     while after:

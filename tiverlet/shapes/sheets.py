@@ -1,4 +1,4 @@
-"""Bodies of two dimensions, flat at the start."""
+"""Sheets: bodies of two dimensions, flat at the start."""
 
 import numpy as np
 
@@ -7,10 +7,10 @@ from .shape import Shape, point, quads_of
 
 
 def cloth(corner, along, across, points: tuple[int, int], *, shear: bool = True, bend: bool = True) -> Shape:
-    """A sheet of points[0] x points[1] particles from `corner`, spanned by the vectors `along` and `across` [m], in 2D or 3D.
+    """Make a sheet of points[0] x points[1] particles from `corner`, spanned by vectors `along` and `across` [m], in 2D or 3D.
 
     links: to the neighbours. braces: the diagonals (shear), and links over two edges (bend). faces: two triangles per cell, with
-    their quads in 3D; bends: the corners along rows and columns. Particle (i, j) is number i points[1] + j.
+    their quads in 3D. bends: the corners along rows and columns. Particle (i, j) has the number i points[1] + j.
     """
     base = point("cloth", "corner", corner)
     u, v = (checks.vector("cloth", name, value, len(base)) for name, value in (("along", along), ("across", across)))
@@ -26,7 +26,7 @@ def cloth(corner, along, across, points: tuple[int, int], *, shear: bool = True,
     k = np.arange(rows * columns).reshape(rows, columns)
 
     def tuples(*parts):
-        """Corners of many at once, a row for each."""
+        """Stack arrays of corners to rows, one row per constraint."""
         return np.stack([p.ravel() for p in parts], axis=1)
 
     links = np.concatenate([tuples(k[:-1], k[1:]), tuples(k[:, :-1], k[:, 1:])])
@@ -44,6 +44,6 @@ def cloth(corner, along, across, points: tuple[int, int], *, shear: bool = True,
 
 
 def net(corner, along, across, points: tuple[int, int]) -> Shape:
-    """A sheet as `cloth`, of nothing but links to the neighbours."""
+    """Make a sheet as cloth() does, with only the links between neighbours."""
     sheet = cloth(corner, along, across, points, shear=False, bend=False)
     return Shape(sheet.position, sheet.links)

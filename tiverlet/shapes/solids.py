@@ -10,7 +10,7 @@ from .shape import Shape, edges_of, point, quads_of, rims_of, single_edges, surf
 
 
 def polygon(center, radius: float, sides: int) -> Shape:
-    """A regular polygon of `sides` particles around `center` in 2D: a rim with its loop."""
+    """Make a regular polygon of `sides` particles around `center` in 2D: a rim with its loop."""
     middle = checks.vector("polygon", "center", center, 2)
     radius = checks.number("polygon", "radius", radius, above=0.0)
     k = np.arange(checks.integer("polygon", "sides", sides, least=3))
@@ -21,7 +21,7 @@ def polygon(center, radius: float, sides: int) -> Shape:
 
 
 def ball(center, radius: float, rings: int = 3) -> Shape:
-    """A round body, filled, in 2D or 3D: a lattice whose shells, `rings` of them, are bent into circles or spheres.
+    """Make a filled round body in 2D or 3D: a lattice with `rings` shells, which are bent into circles or spheres.
 
     2D: triangles in faces, and the rim in loops. 3D: tetrahedra, and the surface in faces. links: all edges.
     """
@@ -40,7 +40,7 @@ def ball(center, radius: float, rings: int = 3) -> Shape:
 
 
 def _disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """The triangular lattice of a hexagon, bent into the unit disc."""
+    """Return the points and triangles of a hexagonal lattice, bent into the unit disc."""
     q, r = (v.ravel() for v in np.meshgrid(*[np.arange(-rings, rings + 1)] * 2, indexing="ij"))
     ring = np.maximum(np.abs(q + r), np.maximum(np.abs(q), np.abs(r)))
     q, r, ring = (v[ring <= rings] for v in (q, r, ring))
@@ -61,15 +61,18 @@ def _disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lattice(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points of a grid (from 0 in steps of 1), and its cells cut into simplices, symmetric about the middle if they are even."""
+    """Return the points of a grid (from 0 in steps of 1), and its cells cut into simplices.
+
+    The simplices are symmetric about the middle where the numbers of cells are even.
+    """
     dim = len(cells)
     points = np.stack([v.ravel() for v in np.meshgrid(*[np.arange(n + 1) for n in cells], indexing="ij")], axis=1)
     corner = np.stack([v.ravel() for v in np.meshgrid(*[np.arange(n) for n in cells], indexing="ij")], axis=1)
-    way = np.where(2 * corner + 1 > cells, 1, -1)  # away from the middle
+    way = np.where(2 * corner + 1 > cells, 1, -1)  # direction away from the middle
     corner = corner + (way < 0)
     stride = np.array([int(np.prod(cells[k + 1 :] + 1)) for k in range(dim)])
     parts = []
-    for order in permutations(range(dim)):  # Kuhn: from the corner next to the middle to the farthest, one axis after the other
+    for order in permutations(range(dim)):  # Kuhn: from the corner nearest the middle to the farthest, axis by axis
         at = [corner]
         for axis in order:
             at.append(at[-1] + way * np.eye(dim, dtype=int)[axis])
@@ -78,7 +81,7 @@ def _lattice(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _positive(position: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """The same simplices, with positive area or volume."""
+    """Reorder the corners of simplices so that areas or volumes are positive."""
     edges = position[cells[:, 1:]] - position[cells[:, :1]]
     return np.where(np.linalg.det(edges)[:, None] < 0, np.concatenate([cells[:, 1::-1], cells[:, 2:]], axis=1), cells)
 
@@ -90,7 +93,7 @@ def _solid(position: np.ndarray, cells: np.ndarray) -> Shape:
 
 
 def truss(lower, upper, cells) -> Shape:
-    """A box of so many cells along each axis, between two corners [m], in 2D or 3D.
+    """Make a box between two corners [m], with `cells` cells along each axis, in 2D or 3D.
 
     links: along the axes. braces: the diagonals that cut each cell into triangles (in faces, with the rim in loops) or into
     tetrahedra (with the surface in faces).
@@ -115,7 +118,10 @@ def truss(lower, upper, cells) -> Shape:
 
 
 def balloon(center, radius: float, level: int = 2) -> Shape:
-    """A hollow sphere in 3D: an icosahedron, each face cut into four `level` times. faces is closed, quads for bending."""
+    """Make a hollow sphere in 3D: an icosahedron with each face cut into four, `level` times.
+
+    faces is a closed surface; quads are for bending.
+    """
     middle = checks.vector("balloon", "center", center, 3)
     radius = checks.number("balloon", "radius", radius, above=0.0)
     checks.integer("balloon", "level", level, least=0)
@@ -144,10 +150,10 @@ def balloon(center, radius: float, level: int = 2) -> Shape:
 
 
 def blob(outline, spacing: float) -> Shape:
-    """A body of any form in 2D: a closed outline (k, 2), in either sense, filled with particles about `spacing` [m] apart.
-    A corner that is given twice in a row, as where the last is the first again, counts once.
+    """Make a body of any outline in 2D, filled with particles about `spacing` [m] apart.
 
-    The inside is sampled by the golden ratio and triangulated (Delaunay). faces: triangles; loops: the rim. ValueError where the
+    outline: closed, (k, 2) [m], in either direction. Equal consecutive corners, also the last and the first, count once. The
+    inside is sampled by the golden ratio and triangulated (Delaunay). faces: triangles; loops: the rim. Raises ValueError if the
     spacing is too large to follow the outline.
     """
     corners = checks.points("blob", "outline", outline, dim=2)
@@ -180,7 +186,7 @@ def blob(outline, spacing: float) -> Shape:
 
 
 def _inside(points: np.ndarray, rim: np.ndarray) -> np.ndarray:
-    """Whether points are within a closed outline, by counting crossings."""
+    """Return which points are within a closed outline, by counting crossings."""
     a, b = rim, np.roll(rim, -1, axis=0)
     x, y = points[:, :1], points[:, 1:]
     straddles = (a[:, 1] > y) != (b[:, 1] > y)
@@ -189,7 +195,7 @@ def _inside(points: np.ndarray, rim: np.ndarray) -> np.ndarray:
 
 
 def _delaunay(points: np.ndarray) -> np.ndarray:
-    """Triangles whose circumcircles are empty (Bowyer and Watson 1981), counterclockwise, none of them flat."""
+    """Return triangles with empty circumcircles (Bowyer and Watson 1981), counterclockwise, without flat ones."""
     n, middle, size = len(points), points.mean(axis=0), 1e3 * np.ptp(points, axis=0).max()
     x = np.concatenate([points, middle + size * np.array([[-1.0, -1], [1, -1], [0, 1]])])
     triangles = np.array([[n, n + 1, n + 2]])
@@ -212,7 +218,7 @@ def _delaunay(points: np.ndarray) -> np.ndarray:
 
 
 def pile(lower, upper, radius) -> Shape:
-    """Loose discs or spheres that fill a box without touching, ready to fall.
+    """Make loose discs or spheres that fill a box without touching, ready to fall.
 
     radius: number, or (smallest, largest) for radii spread evenly between by the golden ratio [m].
     """
@@ -231,7 +237,7 @@ def pile(lower, upper, radius) -> Shape:
         )
     grid = np.stack([v.ravel() for v in np.meshgrid(*[np.arange(n) for n in counts], indexing="ij")], axis=1)
     spread = golden(np.arange(len(grid)))
-    # A lattice would stand: each one is off its place by what its own radius leaves free.
+    # A regular lattice would stand: each particle is displaced within the space that its radius leaves free.
     radii = small + (large - small) * spread
     off = (golden(np.arange(len(grid)), dim=len(low)) - 0.5) * (1.01 * large - radii)[:, None]
     return Shape(low + (high - low - step * counts) / 2 + step * (grid + 0.5) + off, radius=radii)

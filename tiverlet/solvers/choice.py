@@ -25,6 +25,7 @@ BODY = 25  # stiff constraints in a piece from which they count: in a pile of br
 STEPS = 5  # of conjugate gradients: at equal time, residuals of 5 to 20 steps are about the same; 5 take the least of a frame
 CHAIN = 2  # width of chains, trees, loops, joints of up to 3 rods
 BEAM = 5  # width of trusses, triangles on hinges, chains that bend: elimination takes two to three times as long as Jacobi
+RING = 8  # width of rings that bend: at 20 substeps Jacobi loses 0.5 to 60 % of their energy in 20 s, elimination 0 to 7 %
 LONG = 2000  # constraints in a piece up to which it is tried as a beam: refusing a larger net would take long
 
 
@@ -94,7 +95,9 @@ class Pieces:
         self.exact = not off.any() and all(_eliminates(b, scene) for b in links)
         degree = np.bincount(np.concatenate([b.indices.ravel() for b in links]), minlength=len(w))
         self.solved = self.acts & ~np.concatenate([b.relaxed_alone(scene) for b in links])
-        self.stiff = np.concatenate([_stiff(b, degree * w) for b in links]) & self.solved & ~self._any(off)
+        stiff = np.concatenate([_stiff(b, degree * w) for b in links]) & self.solved
+        self.firm = stiff | ~self.solved | np.repeat([b.arity == 2 for b in links], counts)
+        self.stiff = stiff & ~self._any(off)
         self.stands = self._stands(owner[~free], item[~free])
 
     def _any(self, some: np.ndarray) -> np.ndarray:
@@ -104,27 +107,29 @@ class Pieces:
     def _stands(self, owner: np.ndarray, item: np.ndarray) -> np.ndarray:
         """Return for each constraint, (m,), whether its piece is held in one place at most and is not overconstrained.
 
-        Any other piece may bear loads that no constraint bears to first order: a beam between two walls, a braced box between
-        contacts. (owner, item): corners that cannot move; corners that constraints join are one place. A piece of n movable
-        particles has dim n degrees of freedom, minus the rigid motions of the piece.
+        Springs of angles do not count as constraints here, because they bear any load. Any other piece may bear loads that no
+        constraint bears to first order: a beam between two walls, a braced box between contacts. (owner, item): corners that
+        cannot move; corners that constraints join are one place. A piece of n movable particles has dim n degrees of freedom,
+        minus the rigid motions of the piece.
         """
         place = components(self.count, owner, item)
         pins, places = self._number(owner, item), self._number(owner, place[owner])
         whole = np.array([3, 1, 0] if self.dim == 2 else [6, 3, 1, 0])  # rigid motions of a piece with 0, 1, 2, ... pins
         n = self._number(self.owner, self.item)
         freedoms = np.where(n + pins > 2, self.dim * n - whole[np.minimum(pins, len(whole) - 1)], 1)
-        return ((places <= 1) & (np.bincount(self.piece[self.acts], minlength=self.count) <= freedoms))[self.piece]
+        rows = np.bincount(self.piece[self.acts & self.firm], minlength=self.count)
+        return ((places <= 1) & (rows <= freedoms))[self.piece]
 
     def _number(self, owner: np.ndarray, what: np.ndarray) -> np.ndarray:
         """Return how many distinct values of `what` the constraints `owner` of each piece have, (m,)."""
         each = distinct(np.stack([self.piece[owner], what], axis=1))[0]
         return np.bincount(each[:, 0], minlength=self.count)
 
-    def _filled(self, some: np.ndarray) -> bool:
-        """Whether all loops of links in the pieces `some` consist of triangles: E links between V particles have E - V + 1 loops.
+    def _open(self, some: np.ndarray) -> np.ndarray:
+        """Return how many loops of links in each of the pieces `some` are not made of triangles.
 
-        A net held by a corner has other loops. It gains energy from elimination when it whips, up to 0.15 of m g times its
-        length.
+        E links between V particles have E - V + 1 loops. A net held by a corner has many, and gains energy from elimination when
+        it whips, up to 0.15 of m g times its length. A ring has one.
         """
         near: dict[tuple[int, int], set[int]] = defaultdict(set)
         inside = np.isin(self.piece[self.pair_of], some) & self.acts[self.pair_of]
@@ -134,24 +139,28 @@ class Pieces:
             near[k, i].add(j)
             near[k, j].add(i)
         triangles = np.array([len(near[k, i] & near[k, j]) for k, i, j in edges.tolist()], dtype=float) / 3
-        loops = np.bincount(edges[:, 0], 1 - triangles, self.count) - np.bincount([k for k, _ in near], minlength=self.count) + 1
-        return bool((loops[some] < 0.5).all())
+        particles = np.bincount([k for k, _ in near], minlength=self.count)
+        return np.rint(np.bincount(edges[:, 0], 1 - triangles, self.count) - particles + 1).astype(int)[some]
 
     def direct(self) -> tuple[Direct | None, np.ndarray]:
         """Return Direct with the largest width that is trusted, or None; and a mask of the constraints that it takes, (m,).
 
         It is None where no width is trusted, or only single links would be taken. Pieces that are wider than CHAIN or have angles
-        must satisfy _stands().
+        must satisfy _stands(), and consist of triangles or of one loop with springs of angles.
         """
         taken = np.zeros(self.count, dtype=bool)
         longest = np.bincount(self.piece[self.acts], minlength=1).max()
-        for width in (BEAM, CHAIN)[int(longest > LONG) :] if self.exact else ():
+        for width in ((CHAIN,) if longest > LONG else (RING, BEAM, CHAIN)) if self.exact else ():
             found = plan(self.count, self.owner, self.item, width)
             first = found.rows[found.part_begin[:-1]]
-            wide = np.array(found.widths, dtype=int) > CHAIN
+            widths = np.array(found.widths, dtype=int)
+            wide = widths > CHAIN
             if width > CHAIN and not self._any(self.stiff)[first[wide]].any():
                 continue
-            if self.stands[first[wide | self.bends[first]]].all() and self._filled(self.piece[first[wide]]):
+            if not self.stands[first[wide | self.bends[first]]].all():
+                continue
+            loops, ring = self._open(self.piece[first[wide]]), self.bends[first[wide]]
+            if np.where(widths[wide] > BEAM, ring & (loops == 1), loops <= ring).all():
                 taken[found.rows] = True
                 crowd = np.bincount(self.item[(taken & self.solved)[self.owner]], minlength=1)
                 return (Direct(max([CHAIN, *found.widths])) if crowd.max() > 1 else None), taken

@@ -70,26 +70,35 @@ class Slots:
         self.exact = bool(scalars) and (not self.system.steps if self.system else bool(degree.max(initial=0) <= 1))
         self._scalars = bool(scalars)
         blocks = self.system.blocks if self.system else degree
+        if self.loads or any(b.breaks for b in batches):
+            self._bodies, self._hefts = self._tied(batches, inv_mass)
         if self.loads:
-            self._bodies = self._tied(batches, inv_mass)
             self.bodies = memory.number(1 + max(int(b.max(initial=0)) for b in self._bodies.values()))
             self.bears = memory.field("slots.bears", self.bodies)
         self.split = memory.field("slots.split_mass", scene.count, values=blocks * inv_mass)
         self.relaxation = solver.relaxed_by(scene, batches, blocks * inv_mass)
 
     @staticmethod
-    def _tied(batches: list[Batch], inv_mass: np.ndarray) -> dict[int, np.ndarray]:
-        """Return the body of each constraint, by the id of its batch.
+    def _tied(batches: list[Batch], inv_mass: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray]:
+        """Return the body of each constraint, by the id of its batch, and the heft of each body, see heft() [kg].
 
-        Constraints that share movable particles, directly or through other constraints, are of one body.
+        Constraints that share movable particles, directly or through other constraints, are of one body. The heft is the root of
+        the sum of the squared masses.
         """
         ends = np.cumsum([b.count for b in batches])
-        parts = np.split(bodies_of(int(ends[-1]), *corners_of(batches), inv_mass)[0], ends[:-1])
-        return {id(b): part for b, part in zip(batches, parts, strict=True)}
+        label, body = bodies_of(int(ends[-1]), *corners_of(batches), inv_mass)
+        parts = np.split(label, ends[:-1])
+        squares = np.divide(1, inv_mass, out=np.zeros(len(inv_mass)), where=inv_mass > 0) ** 2
+        hefts = np.sqrt(np.bincount(body, weights=squares, minlength=int(ends[-1]) + 1))
+        return {id(b): part for b, part in zip(batches, parts, strict=True)}, hefts
 
     def body(self, batch: Batch) -> np.ndarray:
-        """Return the body of each constraint of a batch, (m,), where constraints learn loads."""
+        """Return the body of each constraint of a batch, (m,), where constraints learn loads or break."""
         return self._bodies[id(batch)]
+
+    def heft(self, batch: Batch) -> np.ndarray:
+        """Return the heft of the body of each constraint, (m,) [kg]: the mass that rounding of positions moves, see Strength."""
+        return self._hefts[self.body(batch)]
 
     def regroup(self, memory: Memory, change: Regrouping) -> None:
         """Adapt the slots to added and removed particles, none of which any constraint holds."""

@@ -1,4 +1,4 @@
-"""Frames that are made again with more substeps until they are good: substeps="auto", tolerance and budget."""
+"""Frames that are repeated with more substeps until they are good: substeps="auto", tolerance and budget."""
 
 from dataclasses import replace
 from time import perf_counter
@@ -19,73 +19,73 @@ if TYPE_CHECKING:
 START = 8  # substeps of the first frame
 MOST = 4096  # substeps of a frame
 PASSES = 64  # iterations of a substep
-RESIDUAL, OVERLAP = 1e-2, 0.1  # what is good where the user asks for nothing else
-TENSION = 2.0  # (omega h)^2: half the limit of stability
-FORCE = 0.06  # (omega h)^2: 25 substeps to a vibration, as molecular dynamics takes them
+RESIDUAL, OVERLAP = 1e-2, 0.1  # aims if no tolerance is given
+TENSION = 2.0  # (omega h)^2 across a tension: half the limit of stability
+FORCE = 0.06  # (omega h)^2 in forces: 25 substeps per period, as in molecular dynamics
 RISKS = {"tunnelling-risk", "stiff-force", "non-finite"}
-GAIN = 1.4  # by which twice the effort has to lower the figures; of second order they fall by 4, of first order by 2
-FEW = 16  # substeps with which what does not help yet may help later
-IDLE = {"substeps": 2, "iterations": 1}  # doublings without a gain that are enough
-ROOM = 6.0  # by which the figures have to be better than asked before less is tried
-PLENTY = 24.0  # four times that: what is left after a try has room again, and failures are forgotten
-PATIENCE = 64  # frames, at most, until it is tried again
+GAIN = 1.4  # factor by which twice the effort must lower a figure; second order lowers it by 4, first order by 2
+FEW = 16  # substeps below which more of them may still help, although two doublings did not
+IDLE = {"substeps": 2, "iterations": 1}  # doublings without a gain after which no more are tried
+ROOM = 6.0  # factor by which all figures must be better than their aims before less effort is tried
+PLENTY = 24.0  # four times that: after a try with half the effort there is still room, so failures are forgotten
+PATIENCE = 64  # most frames between two tries with less effort
 
-Figures = tuple[float, ...]  # residual, overlap, tension, turn, stiffness and energy, relative to what is asked
-TENSE, ENERGY = 2, 5  # the places of the tension and, as the last one, the energy among them
+Figures = tuple[float, ...]  # residual, overlap, tension, turn, stiffness and energy, relative to their aims
+TENSE, ENERGY = 2, 5  # the indices of the tension and of the energy, which is the last, in Figures
 NOTHING: Figures = (1.0,) * 6
 WORST: Figures = (float("inf"),) * 6
 
 
 class StepController:
-    """Chooses the substeps of a frame.
+    """Chooses the number of substeps of each frame.
 
-    A frame is undone, and made again with twice the substeps, when in one of them a constraint turned by more than 26 degrees
-    (cos < 0.9, where SHAKE's direction is no longer good), a residual above 1e-2 or an overlap above a tenth of a radius was
-    left, a tension made particles vibrate with (omega h)^2 > 2, or when it has a flag that shorter substeps remove. Where twice
-    the substeps, 16 or more, bring no gain, twice the iterations are tried; where they bring none, it is "stuck": the frame is
-    the one with the least effort of those that are as good, and what stays wrong is asked for no more in the next frames.
-    Where they bring in energy, more with each try, what is left violated could not be put right first, and the frame is the best
-    of the tries.
-    A body that turns by phi in a substep does so by phi^2 / 24 of that too fast or too slowly, a relative error as a residual is:
-    the 26 degrees above are one of 1e-2, and a tolerance that is asked for is asked of the turns of rigid constraints, too.
-    What vibrates or orbits in forces that differ from place to place is too fast by (omega h)^2 / 24 in the same way, of which
-    0.06 is allowed. Where a frame got more than a fiftieth of the energy wrong, see energy_bound.missed(), it is made again while
-    that helps. What does not help is no fault of the frame, for the energy before it was that of longer substeps.
+    A frame is undone, and repeated with twice the substeps, in these cases: a constraint turned by more than 26 degrees in a
+    substep (cos < 0.9, where SHAKE's direction is no longer good); the frame left a residual above 1e-2 or an overlap above a
+    tenth of a radius; particles vibrated across a tension with (omega h)^2 > 2; or a flag is set that shorter substeps remove. If
+    doubling the substeps, 16 or more, brings no gain, the iterations are doubled. If that brings no gain either, the frame is
+    "stuck": among the tries that are as good, the one with the least effort is kept, and the next frames no longer aim at the
+    figures that stay wrong. If each try adds more energy than the one before, violations could not be removed first, and the
+    best of the tries is kept.
+    A body that turns by phi in a substep turns too fast or too slowly by phi^2 / 24 of that. This is a relative error like the
+    residual: for the 26 degrees above it is 1e-2, and a tolerance also applies to the turns of rigid constraints.
+    In the same way, motion in forces that vary in space is too fast by (omega h)^2 / 24; by default (omega h)^2 may be 0.06. A
+    frame whose energy is wrong by more than a fiftieth of the kinetic energy, see energy_bound.missed(), is repeated as long as
+    that helps. If it does not help, the frame counts as good, since the energy before it was computed with longer substeps.
 
-    When all figures, which are of the order of h^2, leave room for it, the next frame is tried with half the effort. Each time
-    that fails, there has to be room in twice as many frames on end before the next try, up to 64, until it is room for two of
-    them: a scene that went to and fro between two numbers would lose or gain with each change.
+    All figures are of the order of h^2. If they leave room for it, the next frame is tried with half the effort. After each
+    failure there must be room in twice as many frames in a row before the next try, in up to 64, until there is room for two
+    halvings. A scene that changed back and forth between two numbers of substeps would lose or gain energy with each change.
 
-    Making a frame again needs the state at its begin, which is read back to the CPU before each frame: that is the price.
+    The cost: to repeat a frame, the state at its start is read back to the host before each frame.
     """
 
     def __init__(self):
         self.auto = False
         self.substeps, self.iterations = START, 1  # of the next frame
-        self.dt = 0.0  # of the last one
-        self.wait, self.patience = 0, 1  # frames until less is tried, and after the next failure
+        self.dt = 0.0  # of the last frame [s]
+        self.wait, self.patience = 0, 1  # frames until less effort is tried: now, and after the next failure
         self.stuck = NOTHING  # the figures that no effort improved
-        self.cost = 0.0  # measured seconds of an iteration
+        self.cost = 0.0  # measured run time of an iteration [s]
 
     @property
     def memory(self) -> tuple:
-        """What the next frames depend on."""
+        """The values on which the next frames depend."""
         stuck = NOTHING[:1] if self.stuck == NOTHING else self.stuck
         return self.substeps, self.iterations, self.dt, self.wait, self.patience, *stuck
 
     @memory.setter
     def memory(self, value: tuple) -> None:
-        """Go on from what it was at another time."""
+        """Restore the values of another time."""
         self.substeps, self.iterations, self.dt, self.wait, self.patience, *stuck = value
         self.stuck = tuple(stuck) if len(stuck) > 1 else NOTHING
 
     def advance(self, world: "World", dt: float, tolerance: float | None, budget: float | None) -> StepReport:
-        """One frame, made again until it is good, nothing helps, or there can be no more."""
+        """Run one frame, and repeat it until it is good, nothing helps, or the limit of substeps or the budget is reached."""
         tolerance = None if tolerance is None else checks.number("World.step", "tolerance", tolerance, above=0.0)
         budget = None if budget is None else checks.number("World.step", "budget", budget, above=0.0)
         end = float("inf") if budget is None else perf_counter() + budget
         self.prepare(world.iterations, dt, tolerance, budget)
-        before, flags = world._undo  # type: ignore[misc]  # of the step; where nothing was uploaded since, it is the state now
+        before, flags = world._undo  # type: ignore[misc]  # before the upload of knobs; without an upload, the present state
         kept = checkpoint.keep(world) if any(map(any, flags)) else replace(before, controller=self.memory)
         world._runner.begin(dt, self.substeps, world.iterations)
         tries = Tries(self.substeps, self.iterations, self.stuck, world._clock.energy)
@@ -104,12 +104,12 @@ class StepController:
                 break
             checkpoint.put_back(world, kept)
             world._runner.begin(dt, tries.substeps, world.iterations)
-        self.substeps, self.iterations, self.stuck = n, k, tries.stuck  # and the next frames do not try in vain
+        self.substeps, self.iterations, self.stuck = n, k, tries.stuck  # so that the next frames do not try in vain
         self.look_ahead(world.iterations, report, max(figures), tries.verdict, tries.count)
         return told(report, max(figures), risks, tries.verdict, tries.count)
 
     def prepare(self, iterations: int, dt: float, tolerance: float | None, budget: float | None) -> None:
-        """Choose the effort to begin with."""
+        """Choose the substeps and iterations of the first try."""
         self.iterations = max(self.iterations, iterations)
         if self.dt and dt != self.dt:
             self.substeps = max(1, min(round(self.substeps * dt / self.dt), MOST))
@@ -124,12 +124,12 @@ class StepController:
                 self.stuck = NOTHING
 
     def learn(self, cost: float) -> None:
-        """Keep the cost of an iteration: lower ones at once, for the first frame compiles; higher ones by and by."""
+        """Update the cost of an iteration [s]: at once if it is lower, since the first frame compiles; gradually if higher."""
         self.cost = min(cost, self.cost + 0.3 * (cost - self.cost)) if self.cost else cost
 
     def look_ahead(self, iterations: int, report: StepReport, figure: float, verdict: str, tries: int) -> None:
-        """Choose less effort for the next frame, if this one leaves room for it; wait longer with the next try where that has
-        just failed."""
+        """Choose less effort for the next frame, if this one leaves room for it; if that has just failed, wait longer before the
+        next try. figure: the largest of the figures."""
         if verdict != "good" or tries > 1:
             self.patience = min(2 * self.patience, PATIENCE) if tries > 1 else self.patience
             self.wait = self.patience
@@ -144,21 +144,22 @@ class StepController:
 
 
 class Tries:
-    """The tries of one frame, and what is tried next: `substeps` x `iterations`.
+    """The tries of one frame. The next one has `substeps` x `iterations`.
 
-    stuck: figures that need not be better. energy: before the frame [J]. verdict: how the frame ends, once that is known.
+    stuck: values that figures need not fall below. energy: before the frame [J]. verdict: how the frame ends; empty until that is
+    known.
     """
 
     def __init__(self, substeps: int, iterations: int, stuck: Figures, energy: Any):
         self.substeps, self.iterations, self.stuck = substeps, iterations, stuck
         self.verdict, self.count = "", 0
         self._best, self._idle, self._kind = WORST, 0, "substeps"
-        self._known: dict[tuple[int, int], Figures] = {}  # of those without a risk
-        self._made: dict[tuple[int, int], tuple] = {}  # how good all are, the best the least
+        self._known: dict[tuple[int, int], Figures] = {}  # of tries without a risk, by substeps and iterations
+        self._made: dict[tuple[int, int], tuple] = {}  # of all tries: a key by which the best one is the least
         self._energies, self._kinetic = [energy], 0.0
 
     def note(self, figures: Figures, risks: set[str], energy: float, kinetic: float) -> bool:
-        """Take note of a try, and of its energies [J]. Returns whether it is the last one; else it is known what comes next."""
+        """Record a try, with its energies [J]. Returns whether it is the last one; else the next one has been chosen."""
         n, k, stuck = self.substeps, self.iterations, self.stuck
         wrong = [f > max(1.0, s) for f, s in zip(figures, stuck, strict=True)]
         self.count += 1
@@ -195,7 +196,7 @@ class Tries:
 
 
 def turned(world: "World") -> float:
-    """The largest angle [rad] by which a corner of a rigid constraint turned about its first one in the last substep."""
+    """Return the largest angle [rad] by which a corner of a rigid constraint turned about its first one in the last substep."""
     state, memory = world._runner.scene.state, world._runner.memory
     x = state.get(memory)
     d, worst = memory.read(state.d)[: len(x)].astype(np.float64), 0.0
@@ -213,7 +214,7 @@ def turned(world: "World") -> float:
 
 
 def stiffness(world: "World") -> float:
-    """(omega h)^2 of the fastest motion in forces that differ from place to place."""
+    """Return (omega h)^2 of the fastest motion in forces that vary in space."""
     runner, clock = world._runner, world._clock
     probe = runner.diagnostics.force_stiffness
     if not probe or not clock.h:
@@ -222,11 +223,13 @@ def stiffness(world: "World") -> float:
         return max(probe(clock.h, clock.time), runner.sheet.item(STIFFNESS))
 
 
-@np.errstate(all="ignore")  # they may be infinite
+@np.errstate(all="ignore")  # energies may be infinite
 def pumps(energies: list[float], kinetic: float) -> bool:
-    """Whether twice the effort brought in more energy than the time before, and more than there was before the frame, the first
-    of them: what is left violated, since it cannot be put right first, is a spring that a shorter substep makes stiffer, see
-    projection.py."""
+    """Whether the last doubling of the effort added more energy than the one before, and led beyond the bound.
+
+    energies: before the frame, then after each try [J]. The bound follows from all but the last two of them, see room().
+    Violations that could not be removed first act as springs, which a shorter substep makes stiffer, see projection.py.
+    """
     if len(energies) < 4:
         return False
     first, second = np.diff(energies[-3:]).tolist()
@@ -236,8 +239,8 @@ def pumps(energies: list[float], kinetic: float) -> bool:
 def judge(
     report: StepReport, tolerance: float | None, angle: float, stiffness: float, missed: float
 ) -> tuple[Figures, set[str]]:  # fmt: skip
-    """How residual, overlap, tension, turn, stiffness and energy compare with what is asked (1: just met), and what shorter
-    substeps have to remove."""
+    """Return residual, overlap, tension, turn, stiffness and energy relative to their aims (1: just met), and the risks that
+    shorter substeps must remove."""
     risks = set(report.flags & RISKS)
     if report.turn:
         risks.add("turned")
@@ -255,10 +258,10 @@ def judge(
 
 
 def cheapest(known: dict[tuple[int, int], Figures], stuck: Figures) -> tuple[int, int]:
-    """The least effort with which all figures are as good as they have to be, or as they were with the most.
+    """Return the least effort with which all figures are as good as they have to be, or as good as with the most effort.
 
-    Where a load has hardly a direction, the most substeps: the sag that bears it falls with h^2, and would spring back if they
-    were not enough later.
+    If constraints have hardly a direction in which to bear a load, return the most substeps: the sag that bears the load falls
+    with h^2, and would spring back if the number of substeps had to rise later.
     """
     enough = [max(1.0, s) for s in stuck]
     fit = [effort for effort, figures in known.items() if all(f <= e for f, e in zip(figures, enough, strict=True))]
@@ -266,7 +269,7 @@ def cheapest(known: dict[tuple[int, int], Figures], stuck: Figures) -> tuple[int
 
 
 def told(report: StepReport, figure: float, risks: set[str], verdict: str, tries: int) -> StepReport:
-    """The report with what the controller has to say."""
+    """Return the report with the flag, the note and the number of tries of the controller."""
     if verdict == "good":
         return replace(report, tries=tries)
     wrong = sorted(risks) or [f"a figure is {figure:.3g} times what is asked"]

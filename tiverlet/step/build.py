@@ -1,4 +1,4 @@
-"""Building a world: what of its scene exists on the device, and in which order it comes to be."""
+"""Building a world: which parts of its scene exist on the device, and in which order they are made."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,22 +34,22 @@ from .step import Step
 T = TypeVar("T", bound=Feature)
 PRECISIONS = {"f32": ti.f32, "f32-compensated": ti.f32, "f64": ti.f64}
 PATHS = ("auto", "fused", "parallel")
-# Near pairs per particle, in 2D and 3D, for which a list has room at first, by whether all radii are equal. Within 1.25
+# Initial room of a neighbour list, in near pairs per particle, in 2D and 3D, by whether all radii are equal. Within 1.25
 # diameters equal discs have fewer than 6 neighbours on average: lines between these do not cross, which makes a planar graph.
 ROOM = {True: (6.5, 14), False: (12, 32)}
-# Particles and constraints from which a team of threads pays. On one thread and on two a frame took, of 8 substeps of a falling
-# pile, 0.122 and 0.136 ms with 500 discs, 0.169 and 0.170 with 1000, 0.50 and 0.37 with 4000; of 20 substeps of cloth with 225
+# Particles and constraints from which a team of threads pays. Times of a frame on one thread and on two: 8 substeps of a falling
+# pile, 0.122 and 0.136 ms with 500 discs, 0.169 and 0.170 with 1000, 0.50 and 0.37 with 4000; 20 substeps of cloth with 225
 # particles (1200 with constraints) 0.55 and 0.35; of ropes with 205 (405) 0.18 and 0.18, with 820 (1620) 0.64 and 0.40.
 CROSSOVER = 1000
-# Kernels of so many times the code of a Distance in 2D are long, or endless. A hundred figures on stairs (13) took 13 to 17 s to
-# compile when Taichi simplified them and 5 s without, and frames took as long. An hourglass (6) takes 6.5 s, and 3.0 s without
-# its search for equal expressions, which frames take 1 to 3 % more for. Discs, ropes and soft balls (5.6) take 8.2 and 3.1 s, but
-# frames 6 to 11 % more, and a pile (3.6) 1.9 s, and frames 8 % more: these are searched.
+# Code sizes, in multiples of a Distance in 2D, from which kernels are long, or endless. A hundred figures on stairs (13) compile
+# in 13 to 17 s with Taichi's simplifier and in 5 s without, and frames take as long. An hourglass (6) takes 6.5 s, and 3.0 s
+# without the search for equal expressions; frames then take 1 to 3 % longer. Discs, ropes and soft balls (5.6) take 8.2 and
+# 3.1 s, but frames 6 to 11 % longer; a pile (3.6) takes 1.9 s, and frames 8 % longer: these two are compiled with the search.
 LONG, ENDLESS = 5.8, 10.0
 MANY = 4 * FEW  # particles from which frames take so long that the search pays for long kernels
-# So many copies of a world run its kernels so often that those which are not middling are simplified, though the world is small:
-# frames of a double pendulum (1.3) take 8 to 13 % less, of 100 discs (3.6) 5 to 17 %, of discs, ropes and soft balls (6) 5 %, and
-# compile in 0.6 s, 0.7 to 1.4 s, and 7 to 14 s more.
+# From so many copies of a small world on, its kernels are simplified if they are smaller than MIDDLING, since they run so often.
+# Frames of a double pendulum (1.3) take 8 to 13 % less, of 100 discs (3.6) 5 to 17 %, of discs, ropes and soft balls (6) 5 %;
+# compiling takes 0.6 s, 0.7 to 1.4 s, and 7 to 14 s more.
 COPIES, MIDDLING = 100, 5.0
 
 
@@ -66,7 +66,7 @@ class Assembly:
     search: NeighbourSearch | None
     step: Step
     diagnostics: Diagnostics
-    frames: Frames | None  # where there are copies
+    frames: Frames | None  # for worlds with copies
 
 
 def assemble(
@@ -75,9 +75,9 @@ def assemble(
 ) -> Assembly:  # fmt: skip
     """Check the features against the particles and each other, then declare and place every field, in one tree.
 
-    particles: as they are now. starts: for each feature how they were when it came; None if it comes now. first: from this
-    number on particles come now. solver: None for the one that suits the structure. scale: of the world that this one follows.
-    copies: where there are to be many of it.
+    particles: as they are now. starts: for each feature, the particles when it was added; None if it is added now. first: number
+    from which on particles are added now. solver: None to choose one by structure. scale: of the world that this one replaces.
+    copies: set if there will be many copies of the world.
     """
     inv_mass = particles.inv_mass.copy()
     box = next((f for f in features if isinstance(f, Periodic)), None)
@@ -87,7 +87,7 @@ def assemble(
         feature.prepare(feature.start, inv_mass)
     refuse_held_twice(particles, features)
     if box:
-        from .misfits import refuse_misfits  # noqa: PLC0415  (it knows of features that there may not be)
+        from .misfits import refuse_misfits  # noqa: PLC0415  (it imports features that the scene may not have)
 
         refuse_misfits(box, particles, features)
     if any(isinstance(f, Sleep) for f in features):
@@ -123,7 +123,10 @@ def assemble(
 
 
 def _passes(particles: Particles, features: tuple[Feature, ...], scale: Scale, copies: Copies | None) -> Mapping[str, Any]:
-    """Which passes of Taichi's the kernels do without. Of walls, each has code of its own; of other features, each kind."""
+    """Return the settings by which kernels skip passes of Taichi's compiler, from the size of their code.
+
+    Each wall has code of its own; other features share code by kind.
+    """
     code = {f if isinstance(f, Collider) else type(f): f.bulk for f in features}
     bulk = sum(code.values()) * (1.5 if particles.dim == 3 else 1.0)
     often = copies is not None and copies.count >= COPIES and bulk < MIDDLING
@@ -136,7 +139,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     memory, state, particles = scene.memory, scene.state, scene.particles
 
     def of(kind: type[T]) -> list[T]:
-        """Those of one kind."""
+        """Return the features of one kind."""
         return [f for f in features if isinstance(f, kind)]
 
     for first in [*of(Periodic), *of(Sleep)]:
@@ -168,14 +171,14 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     if can_have_impacts(scene, batches) and any(w.has_restitution for w in walls):
         scene.impacts = BodyImpacts(scene, batches)
     for feature in of(Batch):
-        feature.scene = scene  # also of those that do nothing, because all of their particles are held
+        feature.scene = scene  # also for those that do nothing, because all of their particles are held
     for feature in [*accelerations, *drivers, *batches, *walls]:
         with memory.owned(feature):
             feature.bind(scene)
     searches = [(f.join(scene, team), f.room) for f in accelerations if f.pairwise]
     for feature in features:
-        feature.new_force = False  # it was given when it was made
-        feature.changed = feature in drivers  # which go to their targets in the first frame; fields have what is given
+        feature.new_force = False  # the force has been on the device from the start
+        feature.changed = feature in drivers  # they move to their targets in the first frame; other knobs are in fields already
         feature.built()
     known = contact.known if contact else None
     forces = Forces(scene, [*accelerations, known.carried] if known else accelerations)
@@ -197,7 +200,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
 
 
 def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
-    """The features of a new world, each free and listed once."""
+    """Return the features of a new world, checked: each acts in no world and is listed once."""
     features = listed("World", features)
     for k, feature in enumerate(features):
         if not isinstance(feature, Feature):
@@ -219,14 +222,14 @@ def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
 
 
 def listed(who: str, features: Any) -> tuple[Feature, ...]:
-    """Features as a tuple."""
+    """Return features as a tuple, checked."""
     if isinstance(features, Feature) or not isinstance(features, Iterable):
         raise TypeError(f"{who}: features = {features!r} is a {type(features).__name__}; write a list, [...].")
     return tuple(features)
 
 
 def checked_solver(solver: Solver | None) -> Solver | None:
-    """The solver of a new world; None to have it chosen."""
+    """Return the solver of a new world, checked; None if it is to be chosen."""
     if solver is not None and not isinstance(solver, Solver):
         hint = f"; write {solver.__name__}()" if isinstance(solver, type) else ""
         raise TypeError(f"World: solver = {solver!r} is not a solver, as tv.Jacobi() or tv.Direct() is{hint}.")
@@ -234,7 +237,7 @@ def checked_solver(solver: Solver | None) -> Solver | None:
 
 
 def check_settings(precision: str, path: str, order: int, features: tuple[Feature, ...]) -> None:
-    """Refuse what does not exist, and an order that the features do not have."""
+    """Raise ValueError for unknown settings, and for an order that the features do not support."""
     if precision not in PRECISIONS:
         raise ValueError(f"World: precision = {precision!r}, but it must be one of {', '.join(map(repr, PRECISIONS))}.")
     if path not in PATHS:
@@ -246,12 +249,12 @@ def check_settings(precision: str, path: str, order: int, features: tuple[Featur
 
 
 def sums_exactly() -> bool:
-    """Whether (a + b) - a is compiled as it stands. Taichi does not mark it so on every architecture, where drivers write b."""
+    """Whether (a + b) - a is compiled exactly. On some architectures Taichi does not mark it so, and drivers simplify it to b."""
     return runtime.architecture() in runtime.LLVM and not runtime.fast_math()
 
 
 def check_architecture(precision: str, features: tuple[Feature, ...]) -> None:
-    """Refuse what the running Taichi cannot compile, or not so that it is right."""
+    """Raise ValueError for what the running Taichi cannot compile, or not correctly."""
     arch = runtime.architecture()
     if precision == "f32-compensated" and runtime.fast_math():
         raise ValueError(
@@ -274,7 +277,7 @@ def check_architecture(precision: str, features: tuple[Feature, ...]) -> None:
 
 
 def _chosen(path: str, scale: Scale) -> str:
-    """The path for "auto": on one CPU thread while others would cost more than they do."""
+    """Return the path; for "auto", one CPU thread while a team would cost more than it saves."""
     if path != "auto":
         return path
     if runtime.architecture() != "cpu":

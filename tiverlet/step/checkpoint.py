@@ -1,4 +1,4 @@
-"""The exact state of a world: what its future depends on, its hash, and how this or another world returns to it."""
+"""The exact state of a world, on which its future depends: how to copy, hash, check and restore it."""
 
 import hashlib
 from dataclasses import dataclass
@@ -13,20 +13,20 @@ from .clock import Clock
 if TYPE_CHECKING:
     from ..world import World
 
-PAIRS, PAIR = "Contact.pairs", "Contact."  # names of the pairs that remember anything, and of what they do, before its own
-RESTS = "rests."  # and of rest values while knobs wait, before a ramp to others: with the number of the feature
+PAIRS, PAIR = "Contact.pairs", "Contact."  # name of the array of pairs with data; prefix of the names of these data
+RESTS = "rests."  # prefix of rest values while knobs wait, before a ramp to new values; the number of the feature follows
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The state at one time: of every field that the future depends on, and of the clock."""
+    """The state at one time: every field on which the future depends, by name, the clock, and the memory of the controller."""
 
     values: dict[str, np.ndarray]
     clock: Clock
     controller: tuple
 
     def position(self, count: int) -> np.ndarray:
-        """Positions [m] of `count` particles, in f64 where there is more than one word of f32."""
+        """Return the positions of `count` particles [m]; in f64 if positions have a low word."""
         x = self.values["position"][:count]
         if "position_low" in self.values:
             x = x + self.values["position_low"][:count].astype(np.float64)
@@ -34,9 +34,10 @@ class Checkpoint:
 
 
 def state(world: "World", pairs: bool = True) -> dict[str, np.ndarray]:
-    """Every field that the future depends on: not what the neighbour list looks like, but what its pairs carry.
+    """Return every field on which the future depends, by name.
 
-    Without `pairs` that is left out, which takes a fraction of the time; it shows in the next frame.
+    Of the neighbour list, this is the data of its pairs, not the layout. pairs: False leaves these data out, which takes a
+    fraction of the time; a difference in them appears in the positions of the next frame.
     """
     out = {name: values for memory in world._runner.memories for name, values in memory.state().items()}
     if world._runner.search and pairs:
@@ -46,25 +47,28 @@ def state(world: "World", pairs: bool = True) -> dict[str, np.ndarray]:
 
 
 def keep(world: "World", pairs: bool = True) -> Checkpoint:
-    """A copy of the exact state."""
+    """Return a copy of the exact state. pairs: as in state()."""
     return Checkpoint(state(world, pairs), world._clock.copy(), world._controller.memory)
 
 
 def digest(world: "World", kept: Checkpoint) -> str:
-    """SHA-256 of a state of the world, its clock, and what its controller remembers."""
+    """Return the SHA-256 hash of a state of the world, with its clock and the memory of its controller."""
     numbers = [v.item() if isinstance(v, np.generic) else v for v in (*kept.clock.hashed, *kept.controller)]
-    out = hashlib.sha256(repr(tuple(numbers)).encode())  # of NumPy's as of Python's, which recordings give back
+    out = hashlib.sha256(repr(tuple(numbers)).encode())  # Python's numbers, as recordings restore them, not NumPy's
     for name, values in _hashed(world, kept.values).items():
         out.update(name.encode())
         lost = np.isnan(values) if values.dtype.kind == "f" else np.zeros(0)
-        out.update((np.where(lost, np.nan, values) if lost.any() else values).tobytes())  # whose sign no arithmetic defines
+        out.update((np.where(lost, np.nan, values) if lost.any() else values).tobytes())  # the sign of NaN is not defined
     return out.hexdigest()
 
 
 def _hashed(world: "World", values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The state without what is for reports alone, without rest values that knobs tell as well, and without fields that were made
-    when they were needed and are 0. A pair that has just bounced may be on the list or not, by the skin: pairs that remember
-    nothing but what is for reports are left out."""
+    """Return the part of a state that is hashed.
+
+    Left out are fields for reports alone, rest values, which follow from knobs, and late fields (allocated when first needed)
+    that are 0. Pairs whose data are for reports alone are left out, too: whether a pair that has just bounced is on the list
+    depends on the skin.
+    """
     late, pieces = _late(world), _pieces(world)
     told = {e.name for memory in world._runner.memories for e in memory.entries if e.told}
     told |= {name for name, piece in pieces.items() if piece.told}
@@ -78,17 +82,17 @@ def _hashed(world: "World", values: dict[str, np.ndarray]) -> dict[str, np.ndarr
 
 
 def _late(world: "World") -> set[str]:
-    """Names of fields that are made when they are needed, and 0 before."""
+    """Return the names of fields that are allocated when first needed, and count as 0 before."""
     return {name for contact in world._runner.step.contacts for name in contact.late}
 
 
 def _pieces(world: "World") -> dict[str, Any]:
-    """What pairs remember, by its name."""
+    """Return the data of pairs that are part of the state (PairData), by name."""
     return {f"{PAIR}{piece.name}": piece for piece in world._runner.search.list.lasting} if world._runner.search else {}
 
 
 def flags(world: "World") -> list[list[bool]]:
-    """Of each feature, whether knobs wait to be uploaded, and whether a target is under way."""
+    """Return for each feature whether knobs wait to be uploaded, and whether a target is being approached."""
     return [[f.changed, f.moving] for f in world.features]
 
 
@@ -113,22 +117,22 @@ def put_back(world: "World", kept: Checkpoint) -> None:
         world._runner.sleep.rests = False
         world._runner.sleepers.review()
     if list(map(id, world._runner.memories)) != stores:
-        world._runner.renew()  # there are new fields
+        world._runner.renew()  # fields were allocated
     world._clock.put_back(kept.clock)
     world._controller.memory = kept.controller
 
 
 def install(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
-    """Give a world that was just built the state of another one of the same scene, knobs and precision, bit for bit."""
+    """Set the state of a world that was just built to that of another one, bit for bit: the same scene, knobs and precision."""
     world._upload()
     undo(world, kept, flagged)
     for k, f in enumerate(world.features):
-        if f.ramp and f.ramp.waits and f"{RESTS}{k}" not in kept.values:  # no rest value was on its way there
+        if f.ramp and f.ramp.waits and f"{RESTS}{k}" not in kept.values:  # in that world, no ramp was under way
             f.ramp.arrive()
 
 
 def check(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
-    """Raise ValueError unless a state that came from elsewhere fits the world; above all what kernels take for indices."""
+    """Raise ValueError unless a state from elsewhere fits the world, above all the values that kernels use as indices."""
     present = keep(world)
     rests = {f"{RESTS}{k}": f.ramp.shape for k, f in enumerate(world.features) if f.ramp}
     late, pieces = _late(world), _pieces(world)
@@ -152,20 +156,20 @@ def check(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
 
 
 def undo(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
-    """Return to the state before a step that was not finished; what it uploaded is uploaded again in the next one."""
+    """Return to the state before a step that was not finished. The next step uploads again what that step uploaded."""
     put_back(world, kept)
     for feature, (changed, moving) in zip(world.features, flagged, strict=True):
         feature.changed, feature.moving = changed, moving
 
 
 def transfer(old: "World", new: "World") -> None:
-    """Take over the state, bit for bit where both have the same precision."""
+    """Copy the state of a world to another one, bit for bit if both have the same precision and order."""
     kept = keep(old)
     if new._precision == old._precision and new._order == old._order:
         install(new, kept, flags(old))
-        new._runner.scene.reach = old._runner.scene.reach  # by which loads are known
+        new._runner.scene.reach = old._runner.scene.reach  # the factors from multipliers to loads
         for mine, other in zip(new.features, old.features, strict=True):
-            if isinstance(mine, Batch):  # what it noted in the last substep; walls tell of frames, and a clone made none
+            if isinstance(mine, Batch):  # its scratch data of the last substep; not those of walls, since a clone ran no frame
                 new._runner.memory.put_scratch(mine, old._runner.memory.scratch(other))
         return
     ours, theirs = new._clock, old._clock

@@ -1,4 +1,4 @@
-"""Where a world is in time, and what its displacements stand for."""
+"""The time of a world, and whether its displacements hold velocities."""
 
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -13,39 +13,39 @@ NAMES = {
     "_parting": "parting",
 }  # fmt: skip
 
-SHARE = 0.1  # of the largest kinetic energy: how much more a scene may have
-DIGITS = 1e-5  # of the energy
-CHANGED = -np.inf  # the bound of a scene on which something works in the coming frame: what it had before does not count
-SQUEEZED = 0.1  # overlap [radii] from which what something has pressed into each other pushes itself apart, too
-MET = 1e-6  # of its size: a violation that is none, but for rounding
-PARTED = 0.01  # overlap [radii] down to which what was placed into each other pushes itself apart
+SHARE = 0.1  # of the largest kinetic energy: the gain that is allowed
+DIGITS = 1e-5  # of the energy: the gain that rounding may cause
+CHANGED = -np.inf  # the bound while work is done on the scene in the coming frame: earlier energies do not count
+SQUEEZED = 0.1  # overlap [radii] from which particles that were pressed together may push themselves apart
+MET = 1e-6  # relative violation that counts as rounding
+PARTED = 0.01  # overlap [radii] down to which particles placed into each other push themselves apart
 
 
 def room(bound: Any, kinetic: Any, energy: Any) -> Any:
-    """What a passive scene can have [J], see energy_bound.py. Numbers or arrays."""
+    """The most energy that a passive scene can have [J], see energy_bound.py. Numbers or arrays."""
     return bound + SHARE * kinetic + DIGITS * abs(energy)
 
 
 def slack(inv_mass: np.ndarray, extent: np.ndarray, h: Any) -> Any:
-    """What violations with which a scene begins may become [J], for none is stored: initial_violation.py leaves as much as MET of
-    its size, and that is gone in a substep of h [s]. extent: (..., dim) [m]. Numbers or arrays."""
+    """The kinetic energy that initial violations may become [J]: initial_violation.py leaves up to MET of the extent (..., dim)
+    [m], and a substep of h [s] removes it. Numbers or arrays."""
     return (MET * np.linalg.norm(extent, axis=-1) / h) ** 2 * (1 / inv_mass[inv_mass > 0]).sum() / 2
 
 
 @dataclass
 class Clock:
-    """The time of a world, and what belongs to it.
+    """The time of a world, and the state that goes with it.
 
-    time: simulated [s]. tick, since: substeps so far, and since the last start, modulo 2^31. h: the last substep [s].
-    d_is_velocity: whether displacements are velocities, as before a start. started: whether the last substep was the first
-    after one. longest: substep [s] since violations were last taken out, see projection.py. frame: when frames of the present
-    length began [s], their length [s], their number. drag: what it makes of h, see integrator.decay(). owed: [s] of the kick
-    by rigid constraints that velocities before a start lack. lacked: the same of the start that the last substep was; 0 where
-    it was none. parted: velocities, until the next step, where constraints were removed that have a part in them, or where
-    they were assigned: a start before that starts from these. first_moved: the first of the particles that the user placed
-    and that were not looked at yet. energy: at the end of the last frame [J]; None: not known. softened: whether loads had no
-    direction in it, and were held by violations. bound, kinetic, parting: the energy that nothing should exceed [J], None
-    where it is not known; the most of it that was kinetic since; whether what was placed into each other still parts; see
+    time: simulated [s]. tick, since: number of substeps so far, and since the last start, modulo 2^31. h: the last substep [s].
+    d_is_velocity: whether displacements hold velocities, so that the next substep is a start. started: whether the last substep
+    was a start. longest: the longest substep since violations were last removed [s], see projection.py. frame: when frames of the
+    present length began [s], their length [s], their number. drag: its factors for h, see integrator.decay(). owed: the kick by
+    rigid constraints that velocities before a start lack, as a time [s]. lacked: `owed` of the last substep if it was a start,
+    else 0. parted: velocities, valid until the next step, after constraints that contribute to them were removed or velocities
+    were assigned; a start before the next step takes these. first_moved: the first particle that the user placed since the last
+    frame; None if there is none. energy: at the end of the last frame [J]; None if unknown. softened: whether violations held
+    loads that had no direction in the last frame. bound, kinetic, parting: the energy that must not be exceeded [J], None if
+    unknown; the largest kinetic energy since then [J]; whether particles that were placed into each other still part; see
     energy_bound.py.
     """
 
@@ -73,7 +73,7 @@ class Clock:
         return replace(self)
 
     def put_back(self, kept: "Clock") -> None:
-        """Return to an earlier one."""
+        """Take all values of an earlier clock."""
         for field in fields(self):
             setattr(self, field.name, getattr(kept, field.name))
 
@@ -89,17 +89,17 @@ class Clock:
         return Clock(**{own: named[name] for name, own in NAMES.items()})
 
     def forget_bound(self) -> None:
-        """The state was changed. What works on the scene in the coming frame does so all the same."""
+        """Forget the bound after the state was changed, unless work is done on the scene in the coming frame anyway."""
         if self.bound != CHANGED:
             self.bound = None
 
     def begin_with(self, energy: float, more: float) -> None:
-        """Note the energy of a scene that begins, and what it may get by itself; unless something works on it already."""
+        """Set the bound to the initial energy plus `more` [J], unless work is done on the scene in the coming frame."""
         if self.bound != CHANGED:
             self.bound, self.kinetic = float(energy + more), 0.0
 
     def exceeds(self, energy: float, kinetic: float, overlap: float) -> bool:
-        """Take note of the energy at the end of a frame, and of its kinetic part. Returns whether it may be too much."""
+        """Record total and kinetic energy [J] and overlap [radii] after a frame. Returns whether the energy exceeds its bound."""
         if self.bound is None:
             self.bound, self.kinetic = energy if self.energy is None else max(self.energy, energy), 0.0
         elif self.bound == CHANGED:
@@ -110,13 +110,13 @@ class Clock:
         return energy > room(self.bound, self.kinetic, energy)
 
     def counted(self, dt: float) -> tuple[float, float, int]:
-        """When frames of this length began, their length, and their number with the coming one. Frames of one length are counted,
-        not summed up, so that they add no rounding errors."""
+        """When frames of this length began, their length, and their number with the coming one. Counting frames of equal length,
+        instead of summing dt, adds no rounding errors."""
         since, length, count = self.frame
         return (since, dt, count + 1) if dt == length else (self.time, dt, 1)
 
     def advance(self, substeps: int, frame: tuple[float, float, int], started: bool) -> None:
-        """Note that so many substeps have gone by, and with them a frame."""
+        """Advance by so many substeps, which made one frame."""
         self.tick, self.since = (self.tick + substeps) % 2**31, (self.since + substeps) % 2**31
         self.started, self.d_is_velocity, self.parted = started, False, None
         self.lacked = self.owed if started else 0.0
@@ -124,14 +124,14 @@ class Clock:
 
     @property
     def hashed(self) -> list[Any]:
-        """What of it is hashed: what the next frames depend on."""
-        later: list[Any] = [self.longest] if self.longest > self.h else []  # seen when h changes
+        """The values that the next frames depend on, for the hash."""
+        later: list[Any] = [self.longest] if self.longest > self.h else []  # matters when h changes
         later += ["softened"] if self.softened else []
         later += [] if self.parted is None else [np.asarray(self.parted, dtype=np.float64).tobytes()]
         return [self.time, self.tick, self.since, self.h, self.d_is_velocity, *later]
 
     def sound(self, particles: int, dim: int) -> bool:
-        """Whether it can be that of a world of so many particles."""
+        """Whether these values are valid for a world of so many particles."""
         if self.parted is not None and (np.shape(self.parted) != (particles, dim) or not np.isfinite(self.parted).all()):
             return False
         right = [type(k) is int and 0 <= k < 2**31 for k in (self.tick, self.since)]

@@ -1,4 +1,4 @@
-"""The loops over constraints: each is read once in a pass, and leaves what it wants of its particles in slots."""
+"""The loops over constraints: in a pass, each one reads its particles once, and writes the moves that it wants to slots."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from ..features.feature import Batch, Scene
 
 
 class ConstraintPass:
-    """The constraints of one world, and the systems of those that are solved together."""
+    """The loops over the constraints of one world, and over the systems of constraints that are solved together."""
 
     def __init__(self, scene: Scene, integrator: Any, batches: list[Batch], team: Team, stride: int):
         self.integrator, self.batches, self.slots, self.team = integrator, batches, scene.slots, team
@@ -29,8 +29,11 @@ class ConstraintPass:
 
     @ti.func
     def reduce_blocks(self, thread, h, h2_effective, first, fresh, some: ti.template(), newton=0):  # type: ignore[valid-type]
-        """The sums of constraints on many particles, by blocks. some: for which; those of the residual, or all. Systems have
-        none, so in later steps of Newton's method there is nothing to do."""
+        """Compute the sums, by blocks, of constraints on any number of particles each.
+
+        some: True for all of them, False for those whose residual needs the sums. Systems contain no such constraints, so later
+        Newton steps have nothing to sum.
+        """
         for f in ti.static([f for f in self.ragged if f.reweighs or some]):
             n = f.dev.corners.block_count * (1 - newton)
             for b in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
@@ -43,7 +46,7 @@ class ConstraintPass:
 
     @ti.func
     def scatter_blocks(self, thread, h, h2_effective, first, fresh, newton=0):
-        """The moves of constraints on many particles."""
+        """Write the moves of constraints on any number of particles each to the slots of their corners."""
         for f in ti.static(self.ragged):
             n = f.dev.corners.total * (1 - newton)
             for e in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
@@ -53,7 +56,7 @@ class ConstraintPass:
 
     @ti.func
     def spring_forces(self, thread, h):
-        """h^2 times what springs, at the present positions, accelerate: to the slots."""
+        """Write h^2 times the accelerations by springs at the present positions to the slots."""
         self.reduce_blocks(thread, h, h * h, -1, 0, True)
         for f in ti.static(self.batches):
             for c in range(self.team.chunk_begin(f.count, thread), self.team.chunk_end(f.count, thread)):
@@ -63,7 +66,7 @@ class ConstraintPass:
 
     @ti.func
     def note_turns(self, thread):
-        """Note how far springs that are forces turned."""
+        """Record how far springs that act as forces turned."""
         for f in ti.static(self.batches):
             if ti.static(f.soft):
                 for c in range(self.team.chunk_begin(f.count, thread), self.team.chunk_end(f.count, thread)):
@@ -71,7 +74,7 @@ class ConstraintPass:
 
     @ti.func
     def takes_part(self, f: ti.template(), c, newton):  # type: ignore[valid-type]
-        """Whether constraint c of a batch takes part: in later steps of Newton's method only what the first left unmet."""
+        """Whether constraint c of a batch is solved: in later Newton steps, only if the first step left it unmet."""
         out = f.dev.corners.awake(c)
         if ti.static(self.refines):
             if newton > 0:
@@ -86,7 +89,7 @@ class ConstraintPass:
 
     @ti.func
     def solve(self, now):
-        """Every constraint leaves the moves that it wants in its slots, or tells its system what it is about."""
+        """Every constraint writes the moves that it wants to its slots, or its row to the system that solves it."""
         fresh = now.fresh if ti.static(self.integrator.half_kick) else 0
         h2_effective = self.integrator.h2_effective(now.h, fresh)
         if ti.static(len(self.capped) > 0):
@@ -113,7 +116,7 @@ class ConstraintPass:
 
     @ti.func
     def learn(self, now):
-        """As a window ends: loads that were steady become known, the slower the more a body bears."""
+        """At the end of a window of substeps: add steady loads to the known loads, the more slowly the more a body bears."""
         if ti.static(len(self.learners) > 0):
             ends = ti.cast((now.span.since + now.s) % WINDOW == WINDOW - 1, ti.i32)
             n = ends * self.slots.bodies
@@ -134,7 +137,7 @@ class ConstraintPass:
 
     @ti.func
     def solve_systems(self, thread, newton):
-        """Find the steps of the multipliers of each system."""
+        """Compute the steps of the multipliers of each system."""
         for system in ti.static(self.systems):
             if ti.static(system.steps > 0):
                 system.start(thread)
@@ -148,19 +151,19 @@ class ConstraintPass:
 
     @ti.func
     def start_systems(self, thread):
-        """Where phases are launched: begin the systems that iterate."""
+        """On the launched path: start the iterative systems."""
         for system in ti.static(self.systems):
             system.start(thread)
 
     @ti.func
     def iterate_systems(self, thread):
-        """Where phases are launched: one iteration of theirs."""
+        """On the launched path: do one iteration of the iterative systems."""
         for system in ti.static(self.systems):
             system.iterate(thread)
 
     @ti.func
     def update_multipliers(self, now):
-        """Add the steps that systems found to the multipliers."""
+        """Add the steps that systems computed to the multipliers."""
         for system in ti.static(self.systems):
             if ti.static(system.steps > 0):
                 system.end(now.thread)
@@ -173,7 +176,7 @@ class ConstraintPass:
 
     @ti.func
     def reactions(self, h, firm, soft):
-        """Write what constraints add to h^2 a now to the slots, see Passes."""
+        """Write h^2 times the accelerations by constraints at the present positions to the slots, see Passes.push_reaction()."""
         for f in ti.static(self.batches):
             for c in range(f.count):
                 f.dev.push_reaction(c, h, firm, soft)

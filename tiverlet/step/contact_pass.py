@@ -1,4 +1,4 @@
-"""The loops over contacts: which there are, what they want, and what they remember."""
+"""The loops over contacts: they detect and solve contacts, and store what the next substep needs."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class ContactPass:
-    """The contacts of one world, of which there may be none. They are worked out from both sides, particle by particle."""
+    """The contacts of one world, if it has any. Each pair is solved from both sides, particle by particle."""
 
     n: Any = OnDevice()  # particles
 
@@ -23,14 +23,14 @@ class ContactPass:
         self.has_restitution = bool(contact) and contact.has_restitution
         self.remembers = bool(contact) and (contact.has_friction or contact.has_restitution or contact.has_events)
         self.projects_velocities = bool(contact) and contact.projects
-        if self.has_restitution and team.launched:  # where nobody asks whether any pair bounces in a round
+        if self.has_restitution and team.launched:  # the host does not read whether any pair bounces in a round
             self.bounces = scene.memory.field("Contact.bounces", None, kind=ti.i32)
 
     @ti.func
     def solve(self, now):
-        """Which contacts there are, and what they want of their particles."""
+        """Detect contacts, and compute the moves that they want of their particles."""
         for c in ti.static(self.contacts):
-            if ti.static(c.detects and not c.dev.state.sleepers):  # else it has looked for those that sleep, see Step
+            if ti.static(c.detects and not c.dev.state.sleepers):  # with Sleep, Step.look_for_sleepers() has done this
                 for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                     c.detect(i, now.first)
                 self.team.wait()
@@ -61,7 +61,7 @@ class ContactPass:
 
     @ti.func
     def struck(self):
-        """1 where a pair bounces in this substep."""
+        """Return 1 if a pair bounces in this substep, else 0."""
         out = 0
         for c in ti.static(self.contacts):
             if ti.static(c.has_restitution):
@@ -70,7 +70,7 @@ class ContactPass:
 
     @ti.func
     def rebound(self, thread):
-        """One round of restitution; struck() tells whether another one is needed."""
+        """Do one round of restitution. struck() returns whether another one is needed."""
         for c in ti.static(self.contacts):
             if ti.static(c.has_restitution):
                 self.team.wait()
@@ -94,7 +94,7 @@ class ContactPass:
 
     @ti.func
     def start_events(self, now):
-        """Note which substep it is; as a frame begins, what touched before."""
+        """Record the number of the substep, and at the start of a frame the pairs that touched before."""
         for c in ti.static(self.contacts):
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, now.thread)):
@@ -108,7 +108,7 @@ class ContactPass:
 
     @ti.func
     def finish_events(self, now):
-        """Note what sensors overlap; as a frame ends, what touches."""
+        """Record what sensors overlap, and at the end of a frame the pairs that touch."""
         for c in ti.static(self.contacts):
             if ti.static(c.dev.events.senses):
                 for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
@@ -119,7 +119,7 @@ class ContactPass:
 
     @ti.func
     def finish(self, now):
-        """Keep the slip of friction, and what bounces left over."""
+        """Store the slip of friction and the slack of restitution, and log events."""
         thread = now.thread
         for c in ti.static(self.contacts):
             if ti.static(c.has_friction or c.has_restitution):
@@ -136,7 +136,7 @@ class ContactPass:
 
     @ti.func
     def project_velocities(self, thread, k):
-        """Pass k of the projection that takes the sound out of loaded contacts."""
+        """Do pass k of the projection that damps sound in loaded contacts."""
         for c in ti.static(self.contacts):
             for p in range(self.particles.piece_count(thread)):
                 begin, end = self.particles.piece(p, thread)

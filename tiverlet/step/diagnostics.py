@@ -1,4 +1,4 @@
-"""What a frame came to: one pass over the state when it ends."""
+"""End-of-frame diagnostics: one pass over the state computes the figures of the report."""
 
 import copy
 from typing import TYPE_CHECKING, Any
@@ -20,26 +20,27 @@ from .step_report import COMPRESSED, UNCONVERGED, StepReport
 if TYPE_CHECKING:
     from .step import Step
 
-BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads; squared on a GPU
-TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR
-STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges; velocities that are to turn by as much turn far too slowly
+BLOCKS = 64  # partial sums: a fixed number, so the total is the same bit for bit on any number of threads; squared on a GPU
+TURNS = (0, 26, 41)  # degrees, for 0, BENT and FAR
+STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges; velocities that forces turn this fast turn far too slowly
 
-STEPPED, STARTED, UNSTEPPED = range(3)  # how a state came about: by a substep, by the first one after a start, by none yet
-BARE = 3  # added to one of these: nothing but energy is asked for
-# On the sheet: energy, overlap, (omega h)^2 of forces, the largest coordinate, kinetic energy, edges of the bounding box.
+# The origin of a state: an ordinary substep; a substep that was a start (the first after velocities were set); no substep yet.
+STEPPED, STARTED, UNSTEPPED = range(3)
+BARE = 3  # added to one of these if only the energy is needed
+# Indices on the sheet: energy, overlap, (omega h)^2 of forces, largest coordinate, kinetic energy, edges of the bounding box.
 ENERGY, OVERLAP, STIFFNESS, REACH, KINETIC, EXTENT = 0, 2, 3, 7, 11, 12
 
 
 @ti.data_oriented
 class Diagnostics:
-    """The figures behind a StepReport, on the sheet of a frame in the order in which report() reads them.
+    """Computes the figures of a StepReport, on the sheet of a frame, in the order in which report() reads them.
 
-    state_origin: how the state came about. A frame that is one launch ends with them; where it is launched phase by phase,
-    measure() is the last one.
+    A frame that is one launch ends with this; a frame that is launched phase by phase ends with the launch of measure().
+    state_origin: STEPPED, STARTED or UNSTEPPED, plus BARE.
     """
 
     host_only = ("sheet", "report", "details", "force_stiffness")
-    told_apart = True  # as a Feature
+    told_apart = True  # its compile time is reported by itself, as that of a Feature
     n: Any = OnDevice()  # particles
 
     def __init__(self, step: "Step", solver: Solver):
@@ -49,7 +50,7 @@ class Diagnostics:
         self.batches = step.batches
         self.contacts = step.contacts
         self.bits: Any = ti.u32 if step.real == ti.f32 else ti.u64
-        self.exponent = 0x7F800000 if step.real == ti.f32 else 0x7FF0000000000000  # of what is not finite
+        self.exponent = 0x7F800000 if step.real == ti.f32 else 0x7FF0000000000000  # of numbers that are not finite
         self.pair_forces = step.pair_forces
         self.measured = [f for f in self.pair_forces if f.potential_arity]
         self.width = 9 if self.pair_forces else 7
@@ -57,15 +58,15 @@ class Diagnostics:
         add = step.scene.memory.field
         self.blocks = BLOCKS if runtime.architecture() == "cpu" else BLOCKS**2
         if step.scene.memory.copies:
-            # As few as hold one thing each: the sums are the same, and small worlds a fifth as large.
+            # One block per particle or constraint, if there are few: the sums are the same, and small worlds a fifth as large.
             most = max([step.scene.particles.count, *(b.members.count for b in step.batches)], default=1)
             self.blocks = min(BLOCKS, 1 << max(2, (most - 1).bit_length()))
-        self.alone = step.team.size == 1 and not step.team.launched  # one thread sums up, and has no need to keep the parts
+        self.alone = step.team.size == 1 and not step.team.launched  # one thread computes all, and needs no partial sums
         if not self.alone:
             self.parts = add("survey.figures", self.blocks, width=self.width, kind=ti.f64)
             self.low = add("survey.low", self.blocks, width=self.dim, kind=ti.f64)
             self.high = add("survey.high", self.blocks, width=self.dim, kind=ti.f64)
-        self.details: dict[int, Residuals] = {}  # compiled when asked for
+        self.details: dict[int, Residuals] = {}  # by the id of a batch; compiled at the first call
         self.force_stiffness = ForceStiffness(step)
         self.sheet: Any = np.zeros(SHEET)
         self.report = Reporter(step, solver, self.sheet)
@@ -75,7 +76,7 @@ class Diagnostics:
         return "report"
 
     def of(self, step: "Step") -> "Diagnostics":
-        """The same fields, for another Step."""
+        """Return a copy with the same fields, for another Step."""
         new = copy.copy(self)
         new.step, new.details, new.force_stiffness = step, {}, ForceStiffness(step)
         step.diagnostics = new
@@ -83,7 +84,7 @@ class Diagnostics:
 
     @ti.func
     def finite(self, x):
-        """Whether x is finite, by the bits of its exponent: Taichi's comparisons with NaN are not reliable."""
+        """Return 1 if x is finite, by the bits of its exponent: Taichi's comparisons with NaN are not reliable."""
         exponent, largest = self.bits(self.exponent), self.bits(0)
         for k in ti.static(range(x.n)):
             largest = ti.max(largest, ti.bit_cast(x[k], self.bits) & exponent)
@@ -91,8 +92,10 @@ class Diagnostics:
 
     @ti.func
     def energy(self, i, x, scale, back):
-        """Kinetic and potential energy at x - back d, f64: second order at the middle of a substep, where d / h is v. Returns the
-        sum, and what is kinetic."""
+        """Return kinetic plus potential energy at x - back d, and the kinetic energy alone, in f64.
+
+        Second order in the middle of a substep, where d / h is the velocity.
+        """
         d = self.state.d[i] * ti.cast(1, ti.f64)
         out, kinetic = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         if self.state.w.positive(i):
@@ -113,7 +116,10 @@ class Diagnostics:
 
     @ti.func
     def stiffness(self, i, x, h, t):
-        """(omega h)^2 of the motion that dominates: the force's Rayleigh quotient along the last move, or how fast it turns v."""
+        """Return (omega h)^2 of the dominant motion of particle i.
+
+        This is the Rayleigh quotient of forces along the last displacement, or the rate at which they turn the velocity.
+        """
         d = self.state.d[i]
         dd, out = d.dot(d), ti.cast(0, ti.f64)
         if dd > 0 and self.state.w.positive(i):
@@ -124,7 +130,7 @@ class Diagnostics:
 
     @ti.func
     def pair_stiffness(self, i, h):
-        """The same of forces between particles, as two sums over all of them: each moves the others, too."""
+        """Return the share of particle i in the two sums of the Rayleigh quotient of pair forces, taken over all particles."""
         d, change, moved = self.state.d[i] * ti.cast(1, ti.f64), ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         if self.state.w.positive(i):
             for f in ti.static(self.pair_forces):
@@ -134,16 +140,18 @@ class Diagnostics:
 
     @ti.func
     def nothing(self):
-        """Figures before anything is summed up."""
+        """Return the figures and the bounding box of nothing, from which sums begin."""
         zero, figures = ti.Vector.zero(ti.f64, self.dim), ti.Vector.zero(ti.f64, self.width)
         figures[5] = 2.0**31
         return figures, zero + ti.math.inf, zero - ti.math.inf
 
     @ti.func
     def block(self, b, h, t, frame_fraction, fresh, begin, bare):
-        """One block of particles and constraints; where it is to be bare, figures 2 and 3 and the box are not there. Returns
-        energy, residual, overlap, stiffness, contacts, bad, kinetic energy, and where there are pair forces the two sums of
-        pair_stiffness(); low, high."""
+        """Return the figures of block b of particles and constraints, and its bounding box, low and high.
+
+        Figures: energy, residual, overlap, stiffness, contacts, bad, kinetic energy; with pair forces also the two sums of
+        pair_stiffness(). begin: 1 before the first substep. bare: 1 to leave out overlap, stiffness, contacts and the box.
+        """
         figures, low, high = self.nothing()
         scale, back = ti.cast(1, ti.f64), ti.cast(0, self.step.real)
         if begin == 0:
@@ -188,14 +196,14 @@ class Diagnostics:
 
     @ti.func
     def block_of(self, b, h64, t64, state_origin):
-        """Figures of one block, of the state at the end of a frame, or as it came about otherwise."""
+        """Return block() for a state of this origin, at the end of a frame."""
         fresh, begin = ti.cast(state_origin % BARE == STARTED, ti.i32), ti.cast(state_origin % BARE == UNSTEPPED, ti.i32)
         h, t, fraction = ti.cast(h64, self.step.real), ti.cast(t64, self.step.real), self.step.integrator.frame_fraction(0, 1)
         return self.block(b, h, t, fraction, fresh, begin, ti.cast(state_origin >= BARE, ti.i32))
 
     @ti.func
     def filled(self):
-        """How many blocks have anything in them, at most; the others would change no bit."""
+        """Return how many blocks may contain something. Empty blocks would not change a bit of the sums."""
         out = self.blocks
         if ti.static(self.blocks <= BLOCKS):
             most = ti.cast(self.n, ti.i32)
@@ -206,13 +214,13 @@ class Diagnostics:
 
     @ti.func
     def reduce_blocks(self, thread, h64, state_origin):
-        """Sum up what residuals of constraints on many particles need."""
+        """Compute the sums that residuals of constraints on any number of particles need."""
         h, fresh = ti.cast(h64, self.step.real), ti.cast(state_origin % BARE == STARTED, ti.i32)
         self.step.constraints.reduce_blocks(thread, h, self.step.integrator.h2_effective(h, fresh), 0, fresh, False)
 
     @ti.kernel
     def measure(self, sheet: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
-        """All figures, and whether the frame waits for a list."""
+        """Write all figures to the sheet, and whether the frame stopped for a list."""
         h64, t64, state_origin = sheet[H], sheet[END], integer(sheet, ORIGIN)
         self.reduce_blocks(0, h64, state_origin)
         self.sum_up(0, h64, t64, state_origin, sheet)
@@ -220,7 +228,7 @@ class Diagnostics:
 
     @ti.func
     def sum_up(self, thread, h64, t64, state_origin, sheet: ti.template()):  # type: ignore[valid-type]
-        """By blocks, by blocks of these on a GPU, then by one thread."""
+        """Write the figures to the sheet: sum up blocks; on a GPU, groups of blocks; then the rest on one thread."""
         filled = self.filled()
         if ti.static(not self.alone):
             for k in range(
@@ -236,7 +244,7 @@ class Diagnostics:
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
             for k in range(FIGURES):
-                sheet[k] = 0  # what nobody writes comes back from a GPU as it was there
+                sheet[k] = 0  # entries that no kernel writes would come back from a GPU with old values
             total, low, high = self.nothing()
             if ti.static(self.alone):
                 for b in range(filled):
@@ -269,7 +277,7 @@ class Diagnostics:
 
     @ti.func
     def fold(self, begin, step: ti.template(), count):  # type: ignore[valid-type]
-        """Sum up `count` parts, `step` apart, from `begin` on."""
+        """Return the total of `count` parts, `step` apart, from `begin` on."""
         total, low, high = self.nothing()
         for b in range(count):
             at = begin + b * step
@@ -278,7 +286,7 @@ class Diagnostics:
 
     @ti.func
     def with_part(self, total, low, high, part, lower, higher):
-        """Figures, with those of one more part."""
+        """Return figures and bounding box with those of one more part added."""
         total[0] += part[0]
         total[4] += part[4]
         for k in ti.static(range(6, self.width)):
@@ -289,7 +297,7 @@ class Diagnostics:
         return total, ti.min(low, lower), ti.max(high, higher)
 
     def residuals(self, batch, h: float, fresh: bool) -> np.ndarray:
-        """What the last substep left of each violation in a batch, (m,)."""
+        """Return the residuals of the constraints of a batch after the last substep, (m,). fresh: whether it was a start."""
         out = np.zeros(max(1, batch.count))
         if id(batch) not in self.details:
             self.details[id(batch)] = Residuals(self, batch)
@@ -299,14 +307,14 @@ class Diagnostics:
 
 @ti.data_oriented
 class Residuals:
-    """The kernel behind the residual of one batch."""
+    """The kernel that computes the residuals of one batch."""
 
     def __init__(self, diagnostics: Diagnostics, batch):
         self.diagnostics, self.step, self.batch = diagnostics, diagnostics.step, batch
 
     @ti.kernel
     def measure(self, h64: ti.f64, fresh: ti.i32, out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
-        """The residual of every constraint."""
+        """Write the residual of every constraint to `out`."""
         if ti.static(self.step.team.size == 1):
             self.diagnostics.reduce_blocks(0, h64, fresh)
         elif ti.static(len(self.step.constraints.ragged) > 0):
@@ -320,17 +328,17 @@ class Residuals:
 
 
 class Reporter:
-    """Makes a StepReport of the figures on the sheet."""
+    """Makes a StepReport from the figures on the sheet."""
 
     def __init__(self, step: "Step", solver: Solver, sheet: np.ndarray):
         self.solver, self.scene, self.batches, self._step = solver, step.scene, step.batches, step
-        self.remedy: str | None = None  # the setting that meets constraints better, known once it is asked for
+        self.remedy: str | None = None  # the setting that meets constraints better, computed when it is first needed
         self.fastest = step.integrator.fastest
         self.regroup()
         self.figures = sheet[: EXTENT + step.dim]
 
     def regroup(self) -> None:
-        """Particles or constraints came or went: take their number, and how far out they may be."""
+        """Set the number of particles and the largest valid coordinate, after particles or constraints were added or removed."""
         search, self.n, self.remedy = self._step.search, self._step.n, None
         self.farthest = min(LARGEST, search.finest * FARTHEST) if search else LARGEST
 
@@ -345,8 +353,11 @@ class Reporter:
         released: float,
         asleep: int = 0,
     ) -> tuple[StepReport, list[float]]:
-        """The report of a frame, and the size of the bounding box [m]. before: the energy one frame ago [J]. moved: how far
-        particles were moved before the first substep [m]. released: see Runner."""
+        """Return the report of a frame, and the edges of the bounding box [m].
+
+        before: the energy one frame ago [J]. moved: the longest move of a particle before the first substep [m]. released: see
+        Runner.
+        """
         energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned, _, *extent = self.figures.tolist()
         stiff = max(stiff, self.fastest * h * h)
         first = int(bad) if bad < self.n else None
@@ -380,7 +391,7 @@ class Reporter:
         return report, extent
 
     def _note(self, flag, first, reach, overlap, moved, tension, stiff, released, residual, substeps) -> str:
-        """What a flag means, and what to do, with the figures of this frame."""
+        """Return the note of a flag: its meaning and a remedy, with the figures of this frame."""
         if flag == "non-finite":
             return f"The state of particle {first} is not finite (the first of them); go back and use a smaller step."
         if flag == "out-of-range":
@@ -438,7 +449,7 @@ class Reporter:
 
 
 def risks(n, farthest, bad, reach, fast, overlap, turned, moved, tension, stiff, released, residual) -> dict[str, Any]:
-    """Which flags a frame has, in the order of their notes; of many frames, whose figures are arrays, arrays."""
+    """Return whether a frame has each flag, in the order of the notes. For arrays of figures, of many frames, return arrays."""
     return {
         "non-finite": bad < n,
         "out-of-range": reach >= farthest,

@@ -17,7 +17,7 @@ from ..contact.touches import ContactEvents
 from ..features.feature import Batch, Feature
 from ..neighbours.periodic import Periodic
 from ..particles import Particles
-from . import edit_in_place, impulse, initial_violation
+from . import edit_in_place, impulse, initial_shape, initial_violation
 from .build import check_settings, checked_features, listed
 from .sleep import Sleep
 
@@ -147,7 +147,7 @@ def change(
         edit_in_place.regroup(world, planned, added)
         world._runner.pass_on(world._runner.left, some)
         world._runner.wake()
-        tied = initial_violation.first_off([*planned.more], world.position) if planned.more else None
+        tied = _first_off(world, [*planned.more]) if planned.more else None
         _edited(world, some, added, told, seen, loose, moved, np.arange(len(features)), bool(extend), tied)
 
 
@@ -193,8 +193,16 @@ def build_again(
     again.run()
     walls = np.array([features.index(f) if f in features else -1 for f in before], dtype=np.int64)
     new = [*(f for f in again.came if f not in before), *again.extending.values()]
-    tied = initial_violation.first_off(new, world.position)
+    tied = _first_off(world, new)
     _edited(world, some, added, told, seen, loose, moved, walls, bool(again.came or again.went or new), tied)
+
+
+def _first_off(world: Any, new: list[Feature]) -> int | None:
+    """Return the first particle of added rigid constraints and clusters that are violated; None where none is."""
+    x, w = world.position, world._runner.scene.inv_mass
+    clusters = [f for f in new if isinstance(f, Batch) and f.acts]
+    off = [initial_violation.first_off(new, x), initial_shape.first_off(clusters, w, x)]
+    return min((i for i in off if i is not None), default=None)
 
 
 def _seen(

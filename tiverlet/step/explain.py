@@ -1,4 +1,4 @@
-"""What a world is made of: the text behind world.explain()."""
+"""The text of world.explain(): the parts of a world."""
 
 from itertools import groupby
 from typing import TYPE_CHECKING
@@ -24,7 +24,7 @@ MANY = 10_000  # particles from which their order in memory matters
 
 
 def explain(world: "World") -> str:
-    """Particles, features, what was left out, launches and memory, as text of a few lines."""
+    """Return a text of a few lines about particles, features, parts that were left out, launches and memory."""
     p, step = world.particles, world._runner.step
     lines = [
         f"{len(p)} particles in {p.dim}D, {int((p.inv_mass == 0).sum())} static; {world.precision} on "
@@ -57,7 +57,7 @@ def explain(world: "World") -> str:
 
 
 def compiling(world: "World") -> list[str]:
-    """How long it took, which is known where Taichi is the one that device/patches knows."""
+    """Return lines with the compile times; none where Taichi is not the version that device/patches supports."""
     times = world._runner.memory.compiler.times
     if not times.kernels:
         return ["Nothing was compiled for it, or not yet."] if patched else []
@@ -69,7 +69,7 @@ def compiling(world: "World") -> list[str]:
 
 
 def _scattered(position: np.ndarray) -> bool:
-    """Whether particles that are neighbours in space differ by a tenth of all numbers and more, in the median over a sample."""
+    """Whether the numbers of neighbours in space differ by more than a tenth of n, in the median over a sample."""
     if len(position) < MANY:
         return False
     number = np.arange(0, len(position), -(-len(position) // MANY))
@@ -120,14 +120,14 @@ def _present(world: "World") -> list[str]:
 
 
 def _pairs(f: Acceleration) -> str:
-    """How pairs are found that a force acts on."""
+    """Return how a pair force finds its pairs."""
     if not f.dev.search:
         return f"{f!r}: all pairs, before the loop over particles"
     return f"{f!r}: before the loop over particles; {_listed(f.dev.search)}"
 
 
 def _listed(search: NeighbourSearch) -> str:
-    """How near pairs are found."""
+    """Return how near pairs are found."""
     sizes = ", ".join(f"{size:.3g}" for size in search.cells.sizes)
     return f"grid with cells of {sizes} m, neighbour list with a skin of {search.skin:.3g} m"
 

@@ -1,4 +1,4 @@
-"""Frames of many copies of a world, and many frames of each, in one launch."""
+"""Frames of many copies of a world in one launch, and many frames of each copy."""
 
 import copy
 from collections.abc import Callable
@@ -37,17 +37,18 @@ from .span import SUBSTEPS as STAGES
 if TYPE_CHECKING:
     from .step import Step
 
-# What a launch is given: how many copies, how many frames each, the substeps of one; of how many frames one is kept on the track,
-# how many were made before, how many the track has room for; whether figures are kept; how many copies, one beside the other, a
+# The arguments of a launch: number of copies, frames of each, substeps of a frame; every how many frames one is kept on the track
+# (0: none), frames before this launch, frames that the track has room for; whether figures are kept; adjacent copies that a
 # thread takes at a time.
 COUNT, FRAMES, SUBSTEPS, EVERY, BEFORE, ROWS, KEEPS, GRAIN = range(8)
 PLAN = GRAIN + 1
-DATES = 4  # of a copy: when frames of the present length began [s], their length [s], how many there were; frames of the launch
-WRAP = 2.0**31  # substeps are counted up to it
+DATES = 4  # per copy: when frames of the present length began [s], their length [s], their number; frames done in this launch
+WRAP = 2.0**31  # substeps are counted modulo this
 
 
 def sheets(h, start, end, tick, since, fresh, owed, origin, substeps: int, passes: int) -> np.ndarray:
-    """What frames are given, one row for each copy, see Span: arrays with a value for each, and what is the same for all."""
+    """Return the sheets of frames, one row per copy, see Span. Arguments: arrays with a value per copy; substeps and passes are
+    the same for all."""
     out = np.zeros((len(h), SHEET))
     dates = (H, h), (START, start), (END, end), (TICK, tick), (SINCE, since)
     for k, values in (*dates, (FRESH, fresh), (OWED, owed), (ORIGIN, origin)):
@@ -58,20 +59,20 @@ def sheets(h, start, end, tick, since, fresh, owed, origin, substeps: int, passe
 
 
 def waits(some: np.ndarray) -> np.ndarray:
-    """Which rows are of frames that stopped to have a list grown, or built."""
+    """Return the mask of the rows whose frames stopped for a list to be grown or built."""
     return some[:, HALT] != 0
 
 
 def resume(row: np.ndarray, resumed: int, begin: int, half: int) -> None:
-    """Have a frame go on in the substep, and before the half of a pass, in which it stopped."""
+    """Set a sheet so that its frame resumes in the substep, and before the half of a pass, in which it stopped."""
     row[RESUMED], row[BEGIN], row[HALF] = resumed, begin, half
 
 
 @ti.data_oriented
 class Frames:
-    """The kernel that takes copies from frame to frame, each on one thread, and what it is told and tells.
+    """The kernels that advance copies frame by frame, each copy on one thread, with their arguments and results.
 
-    sheet: of each copy, see span.py. dates: see DATES.
+    sheet: of each copy, see span.py. dates: of each copy, see DATES. next: the next copy that no thread has taken.
     """
 
     kernels_read = ("step", "memory", "copies", "sheet", "dates", "next", "lanes", "spread")
@@ -82,30 +83,33 @@ class Frames:
         self.sheet = memory.field("frames.sheet", SHEET, kind=ti.f64)
         self.dates = memory.field("frames.dates", DATES, kind=ti.f64)
         self.next = memory.field("frames.next", None, kind=ti.i32, shared=True)
-        # On a CPU each thread takes one copy after the other, as it gets done; elsewhere each has one.
+        # On a CPU, a thread that has finished takes the next copies; elsewhere each thread has one copy.
         on_cpu = runtime.architecture() == "cpu"
         self.lanes, self.spread = (runtime.cores(), LEAST) if on_cpu else (self.copies.count, 1)
 
     def of(self, step: "Step") -> "Frames":
-        """The same fields, for another Step."""
+        """Return a copy with the same fields, for another Step."""
         new = copy.copy(self)
         new.step = step
         return new
 
     def grain(self, copies: int) -> int:
-        """How many of so many copies a thread is to take at a time: those that share lines of the cache would hold up each other,
-        and all threads are to be done at the same time."""
+        """Return how many copies, out of `copies`, a thread takes at a time.
+
+        Several, since threads that write to the same cache line slow each other down; not too many, so that all threads end at
+        about the same time.
+        """
         return min(64, max(1, copies // (8 * self.lanes)))
 
     def launch_one(self, sheet: np.ndarray) -> Callable[[], None]:
-        """A launch of the chosen copy alone, for a frame as it stands on this sheet, as Step.fused takes and leaves it."""
+        """Return a function that runs the frame on this sheet for the chosen copy alone, in place of Step.fused."""
         plan, which = np.zeros(PLAN, dtype=np.int32), np.zeros(1, dtype=np.int32)
         plan[COUNT] = plan[FRAMES] = plan[GRAIN] = 1
         none = np.zeros(1)
         launch = CachedLaunch(self, "run", self.memory.compiler, plan, which, none, none)
 
         def launched() -> None:
-            """From the sheet to the device, and back."""
+            """Write the sheet to the device, launch, and read the sheet back."""
             assert self.copies.chosen is not None
             which[0] = self.copies.chosen
             self.memory.write(self.sheet, sheet)
@@ -121,7 +125,7 @@ class Frames:
         self, plan: ti.types.ndarray(ti.i32, 1), which: ti.types.ndarray(ti.i32, 1), figures: ti.types.ndarray(ti.f64, 1),  # type: ignore[valid-type]
         track: ti.types.ndarray(ti.f64, 1),  # type: ignore[valid-type]
     ):  # fmt: skip
-        """All frames of all copies that are listed."""
+        """Run all frames of the copies listed in `which`. plan, figures, track: see COUNT ... GRAIN, and keep()."""
         for _ in range(1):
             self.next[None] = 0
         for lane in range(self.lanes * self.spread):
@@ -137,20 +141,22 @@ class Frames:
         self, count: ti.i32, which: ti.types.ndarray(ti.i32, 1), given: ti.types.ndarray(ti.f64, 2),  # type: ignore[valid-type]
         out: ti.types.ndarray(ti.f64, 1),  # type: ignore[valid-type]
     ):  # fmt: skip
-        """Velocities of the copies that are listed, as the user sees them. given: of each, h, t, and firm
-        and soft of Batch.push_reaction; and firm for contacts and walls."""
+        """Write the velocities, as the user sees them, of the copies listed in `which` to `out`.
+
+        given: for each, h, t, `firm` and `soft` of Passes.push_reaction(), and `firm` for contacts and walls.
+        """
         for k in range(count):
             w = which[k]
             self.copies.enter(w)
             self.step.write_reactions(given[k, 0], given[k, 2], given[k, 3])
             for i in range(self.step.n):
-                v = self.step.velocity_of(i, given[k, 0], given[k, 1], given[k, 4])
+                v = self.step.velocity_of(i, given[k, 0], given[k, 1], given[k, 4], given[k, 3])
                 for a in ti.static(range(self.step.dim)):
                     out[(w * self.step.n + i) * self.step.dim + a] = v[a]
 
     @ti.func
     def go_through(self, w, plan: ti.template(), figures: ti.template(), track: ti.template()):  # type: ignore[valid-type]
-        """The frames of one copy, up to one that has to wait for a longer list."""
+        """Run the frames of copy w, up to one that has to wait for a longer list."""
         self.copies.enter(w)
         f, waits = ti.cast(self.dates[3], ti.i32), 0
         while f < plan[FRAMES] and waits == 0:
@@ -164,7 +170,7 @@ class Frames:
 
     @ti.func
     def keep(self, w, f, plan: ti.template(), figures: ti.template(), track: ti.template()):  # type: ignore[valid-type]
-        """Keep what the frame came to, and where particles are after it."""
+        """Store the figures of frame f of copy w, and the positions at its end if this frame is kept on the track."""
         if plan[KEEPS] != 0:
             for k in range(FIGURES):
                 figures[(w * plan[FRAMES] + f) * FIGURES + k] = self.sheet[k]

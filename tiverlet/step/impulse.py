@@ -161,11 +161,13 @@ def tells(runner: Any) -> bool:
     return not runner.probe and (runner.clock.drag or FREE)[0] >= WEAK
 
 
-def steer(runner: Any, want: np.ndarray, seen: np.ndarray, change: np.ndarray, iterations: int) -> bool:
+def steer(
+    runner: Any, want: np.ndarray, seen: np.ndarray, change: np.ndarray, iterations: int, spun: np.ndarray | None = None
+) -> bool:  # fmt: skip
     """Set the velocities of movable particles with a `change` of velocity or spin, (n, any) [m/s], between two substeps.
 
-    want: the new velocities, (n, dim) [m/s]. seen: the present ones. Returns whether displacements were found that give the new
-    velocities; if not, the caller must take a start.
+    want: the new velocities, (n, dim) [m/s]. seen: the present ones. spun: the result of Runner.spin(), if it is known. Returns
+    whether displacements were found that give the new velocities; if not, the caller must take a start.
     """
     some, clock, drag = (change != 0).any(axis=1), runner.clock, np.array([runner.clock.drag or FREE])
     if clock.d_is_velocity or not tells(runner):
@@ -184,21 +186,25 @@ def steer(runner: Any, want: np.ndarray, seen: np.ndarray, change: np.ndarray, i
             )  # fmt: skip
         if not found[0]:
             return False
-        turn_on(runner, first, share[0])
+        turn_on(runner, first, share[0], spun)
     runner.wake(np.flatnonzero(some))
     clock.energy, clock.parted = None, want.copy()
     return True
 
 
-def turn_on(runner: Any, first: int, share: np.ndarray) -> None:
-    """Give particles from `first` on back the part of friction's turn in half a substep that has ended. share: (m, 1)."""
+def turn_on(runner: Any, first: int, share: np.ndarray, spun: np.ndarray | None = None) -> None:
+    """Give particles from `first` on back the part of friction's turn in half a substep that has ended. share: (m, 1).
+
+    spun: the result of Runner.spin(), if it is known.
+    """
     state, memory, step = runner.scene.state, runner.memory, runner.step
     turned = [c.dev.forces.turned for c in step.contacts if c.dev.forces.spins]
     turned += [step.particles.wall_turn] if step.particles.turned_by_walls else []
     if not (state.spins and turned and share.any()):
         return
     with memory.compiler():
-        half = runner.clock.h * runner.spin() - memory.read(state.spin.s)[: runner.n]
+        spun = runner.spin() if spun is None else spun
+    half = runner.clock.h * spun - memory.read(state.spin.s)[: runner.n]
     rows, s = slice(first, first + len(share)), memory.read(state.spin.s)
     s[rows] += share * half[rows]
     memory.write(state.spin.s, s)

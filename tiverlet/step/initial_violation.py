@@ -21,7 +21,7 @@ In a running world, part of a violation, -W lam, bears the load of the last subs
 That part stays for constraints whose particles were not placed.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -68,13 +68,35 @@ def left(batches: list[Batch], x: np.ndarray) -> list[tuple[Batch, np.ndarray]]:
 
 
 def first_off(features: list[Feature], x: np.ndarray) -> int | None:
-    """The first particle of rigid constraints that are off by more than SEEN at x, (n, dim); None where none is."""
-    out = []
-    for b in _rigid([f for f in features if isinstance(f, Batch)]):
-        C = b.violation(x) * b.inverse_size(x) * (b.compliance == 0)
-        off = (np.abs(C) if b.side == 0 else C * b.side) > SEEN
-        out += b.indices.ravel()[off[b.owner]].tolist()
-    return min(out, default=None)
+    """Return the first particle of rigid constraints that are violated by more than SEEN at x, (n, dim); None without any."""
+    rigid = _rigid([f for f in features if isinstance(f, Batch)])
+    return min((i for b in rigid for i in _off_corners(b, x, b.compliance == 0)), default=None)
+
+
+def first_stiffened(features: Sequence[Feature], x: np.ndarray) -> int | None:
+    """Return the first particle of constraints that become rigid and are violated at x, (n, dim); None without any.
+
+    These are still springs on the device, but a compliance of 0 was assigned. Their violations would act as blows.
+    """
+    stiffened = []
+    for b in _rigid([f for f in features if isinstance(f, Batch) and f.acts]):
+        if b.dev.spring.soft:
+            alpha = b.scene.memory.read(b.dev.spring.alpha)[: b.count]
+            stiffened += _off_corners(b, x, (b.compliance == 0) & (alpha > 0))
+    for b in features:
+        if isinstance(b, Batch) and b.clusters and b.acts and b.dev.spring.soft:  # type: ignore[attr-defined]
+            alpha = b.scene.memory.read(b.dev.spring.alpha)[: b.count]
+            stiffened += b.indices[((b.compliance == 0) & (alpha > 0))[b.owner]].tolist()  # type: ignore[attr-defined]
+    return min(stiffened, default=None)
+
+
+def _off_corners(batch: Scalar, x: np.ndarray, some: np.ndarray) -> list[int]:
+    """Return the particles of constraints in the mask `some`, (m,), that are violated by more than SEEN at x, (n, dim)."""
+    if not some.any():
+        return []
+    C = batch.violation(x) * batch.inverse_size(x) * some
+    off = (np.abs(C) if batch.side == 0 else C * batch.side) > SEEN
+    return batch.indices.ravel()[off[batch.owner]].tolist()
 
 
 def _rigid(batches: list[Batch]) -> list[Scalar]:

@@ -1,4 +1,4 @@
-"""How one particle moves on its own: position Verlet in displacement form, with drag that is exact."""
+"""The motion of a single particle under forces: position Verlet in displacement form, with exact linear drag."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -11,15 +11,19 @@ from ..tools import golden_steps
 if TYPE_CHECKING:
     from .clock import Clock
 
-# Multiples of the golden ratio of two dimensions, mod 1, are the most even sequence of pairs: one for each of the two sums.
+# Multiples of the golden ratio of two dimensions, mod 1, are the most even sequence of pairs. Each of the two sums takes one.
 DITHER = golden_steps(2)
-ALIKE = {ti.f32: 2.0**-12, ti.f64: 2.0**-26}  # of a velocity: by how much it is varied at least, the root of its rounding
-TINY = 1e-18  # [m/s], [m/s^2]: keeps what is divided by from 0
-LEAST = 0.25  # pivot with which a velocity is solved for; where a force feeds motion faster, it is taken as it is
+ALIKE = {ti.f32: 2.0**-12, ti.f64: 2.0**-26}  # least variation of a velocity, relative: the square root of its rounding error
+TINY = 1e-18  # [m/s], [m/s^2]: keeps divisors from being 0
+LEAST = 0.25  # least pivot with which a velocity is solved for; a force that feeds motion faster is taken explicitly
 
 
 class Forces:
-    """What accelerates the particles of one world, and what slows them."""
+    """The forces and drags of one world.
+
+    all: forces. common: those that are the same for all particles. others: the rest, `positional` or `velocity_dependent`.
+    pairwise: forces between particles. drags: features with a drag rate. uneven: forces that vary in space.
+    """
 
     def __init__(self, scene: Scene, accelerations: list[Acceleration]):
         self.real, self.dim = scene.real, scene.particles.dim
@@ -33,7 +37,7 @@ class Forces:
 
     @ti.func
     def change_along(self, i, x, d, h, t):
-        """How much what accelerates particle i has changed along its last move d, in a substep h."""
+        """Return the change of the acceleration of particle i along its last displacement d, in a substep h."""
         change = 0 * d
         for f in ti.static(self.uneven):
             change += f.acceleration(i, x, d / h, t) - f.acceleration(i, x - d, d / h, t)
@@ -41,7 +45,7 @@ class Forces:
 
     @ti.func
     def pull(self, t):
-        """The sum of what accelerates all particles alike."""
+        """Return the sum of the accelerations that all particles have in common, at time t."""
         a = ti.Vector.zero(self.real, self.dim)
         for f in ti.static(self.common):
             a += f.acceleration(0, a, a, t)
@@ -49,7 +53,7 @@ class Forces:
 
     @ti.func
     def accelerate(self, i, x, v, t, pull):
-        """The sum of what accelerates particle i. pull: what pull() returned."""
+        """Return the acceleration of particle i by forces. pull: the result of pull()."""
         a = pull
         for f in ti.static(self.others):
             a += f.acceleration(i, x, v, t)
@@ -57,7 +61,7 @@ class Forces:
 
     @ti.func
     def reads_velocity_of(self, i):
-        """Whether any of the forces that read velocities acts on particle i."""
+        """Whether any force that reads velocities acts on particle i."""
         out = False
         for f in ti.static(self.velocity_dependent):
             out = out or f.acts_on(i)
@@ -65,7 +69,7 @@ class Forces:
 
     @ti.func
     def velocity_part(self, i, x, v, t):
-        """The part of accelerate() that reads velocities."""
+        """Return the part of accelerate() that reads velocities."""
         a = 0 * x
         for f in ti.static(self.velocity_dependent):
             a += f.acceleration(i, x, v, t)
@@ -73,10 +77,10 @@ class Forces:
 
     @ti.func
     def velocity_slope(self, i, x, v, t, a, c):
-        """c times the derivatives of velocity_part() by v, where it is a.
+        """Return c times the matrix of derivatives of velocity_part() by v, where velocity_part() is a.
 
-        They are differences over the way that v is about to go: |c a|, less where it brakes, and at most as far beyond rest as v
-        is from it. A kink on this way, as of friction at rest, is seen as a slope.
+        They are finite differences over the change of v to come: |c a|, less if the force brakes, and at most twice |v|, as far
+        beyond rest as v is from rest. A kink within this range, as of friction at rest, appears as a slope.
         """
         size, speed = a.norm(), v.norm()
         least = ti.max(ti.static(ALIKE[self.real]) * speed, TINY)
@@ -96,9 +100,10 @@ class Forces:
 
     @ti.func
     def velocity_stiffness(self, i, x, v, t, h):
-        """(omega h)^2 of what turns velocities faster than it brakes them, or feeds them; what brakes settles, however hard.
+        """Return (omega h)^2 of forces that turn a velocity faster than they brake it, or that feed motion.
 
-        The trace of the square of h da/dv is that of what brakes less that of what turns; a kink, seen in one column, adds none.
+        Braking forces do not count: they settle, however strong they are. The trace of (h da/dv)^2 is the part that brakes minus
+        the part that turns. A kink, which appears in one column only, adds nothing.
         """
         a = self.velocity_part(i, x, v, t)
         slope = self.velocity_slope(i, x, v, t, a, h)
@@ -107,10 +112,11 @@ class Forces:
 
     @ti.func
     def accelerate_implicitly(self, i, x, u, c, part, t, pull):
-        """What accelerates particle i at the velocity that this gives it itself, v = u + (part + theta) c a(x, v), by one step of
-        Newton's method, which is exact where a is linear in v. part: 1, or 0 at a start, where u is v_n.
+        """Return the acceleration a of particle i at the velocity that it gives itself, v = u + (part + theta) c a(x, v).
 
-        With theta = 0 a force that turns v leaves |v| as it is, whatever c is. Drag would overshoot from c rate = 1 on, so
+        It takes one step of Newton's method, which is exact if a is linear in v. part: 1, or 0 at a start (the first substep
+        after velocities were set), where u is v_n.
+        With theta = 0, a force that turns v conserves |v|, whatever c is. But drag would overshoot from c rate = 1 on. So
         theta = q^2 / (1 + q^2), where q is c times the rate at which a brakes: third order in h, and 1 where drag is stiff.
         """
         still = pull
@@ -123,9 +129,9 @@ class Forces:
         theta = 1 - 1 / (1 + q * q)
         left, more = -(part + theta) * slope, slope @ ((part + theta) * a + theta * still)
         regular = ti.cast(1, ti.i32)
-        for k in ti.static(range(self.dim)):  # Gauss; what brakes and turns has pivots of 1 or more
+        for k in ti.static(range(self.dim)):  # Gaussian elimination; forces that brake or turn give pivots of 1 or more
             left[k, k] += 1
-            regular &= ti.cast(left[k, k] > LEAST, ti.i32)  # nor is NaN, as of v / |v| where v + way comes to be 0
+            regular &= ti.cast(left[k, k] > LEAST, ti.i32)  # false for NaN, as from v / |v| if v + way is 0
             for j in ti.static(range(k + 1, self.dim)):
                 share = left[j, k] / left[k, k]
                 more[j] -= share * more[k]
@@ -140,14 +146,17 @@ class Forces:
 
 
 class Verlet:
-    """d += h^2 a, x += d: the substep of order 2. It is one stage; see high_order.Composition for more."""
+    """d += h^2 a, x += d: the substep of order 2, which is one stage; see high_order.Composition for more.
 
-    stages = 1  # of a substep
-    first = 1.0  # the share of the first of them
-    h2_factor = 1.0  # what accelerates in the last of them, per h^2
-    fastest = 0.0  # omega^2 of springs that act as forces [1/s^2]
-    springs_pull = False  # springs act as forces in every stage, and not only at starts
-    half_kick = True  # at a start, constraints know that the force acts for half of the substep
+    A *start* is the first substep after velocities were set or h has changed: there, d holds a velocity.
+    """
+
+    stages = 1  # in a substep
+    first = 1.0  # length of the first stage, as a share of the substep
+    h2_factor = 1.0  # displacement by a constant acceleration of 1 in the last stage, per h^2
+    fastest = 0.0  # bound on omega^2 of springs that act as forces [1/s^2]
+    springs_pull = False  # whether springs act as forces in every stage, and not only at starts
+    half_kick = True  # whether constraints take into account that forces act for half of the substep at a start
 
     def __init__(self, scene: Scene, forces: Forces, touches: bool):
         self.forces, self.state, self.touches = forces, scene.state, touches
@@ -161,23 +170,23 @@ class Verlet:
             self.decay = scene.memory.field("decay", None, width=5)
 
     def passes(self, iterations: int) -> int:
-        """Passes over the constraints in each stage."""
+        """Return the number of passes over the constraints in each stage."""
         return iterations
 
     @ti.func
     def times(self, at, s):
-        """Of substep s: its length, that of the one before [s], its start [s], and where it starts and ends in the frame."""
+        """Return the length of substep s and of the one before [s], its start [s], and the fractions of the frame at its ends."""
         h = ti.cast(at.h64, self.real)
         return h, h, ti.cast(at.start + s * at.h64, self.real), self.frame_fraction(s, at.substeps)
 
     @ti.func
     def frame_fraction(self, s, substeps):
-        """The fractions of the frame at the start and the end of substep s."""
+        """Return the fractions of the frame at the start and the end of substep s."""
         return ti.Vector([ti.cast(s, self.real) / substeps, ti.cast(s + 1, self.real) / substeps])
 
     @ti.func
     def advance(self, first, end, now):
-        """Integrate some particles. Short loops, so that it is done for several of them at once."""
+        """Integrate the particles from `first` to `end` - 1, in a short loop that the compiler can vectorize."""
         pull, share, h2_effective = self.forces.pull(now.time), ti.cast(1, self.real), self.h2_effective(now.h, now.fresh)
         if now.fresh != 0:
             share = now.h
@@ -188,9 +197,10 @@ class Verlet:
 
     @ti.func
     def acceleration_at(self, i, h, t, fresh, pull):
-        """What forces accelerate particle i by at x_n and v_n; at a start, d is v_n. pull: what Forces.pull() returned.
+        """Return the acceleration of particle i by forces at x_n and v_n; at a start, d is v_n.
 
-        v_n is what velocity_after() gives with the reaction of the last substep: the part of d that forces did not bring about.
+        v_n is the velocity that velocity_after() returns with the reaction of the last substep, see reaction_before(). pull: the
+        result of Forces.pull().
         """
         x, u = self.state.place(i), self.state.d[i]
         a = ti.zero(u)
@@ -210,8 +220,11 @@ class Verlet:
 
     @ti.func
     def reaction_before(self, i, x, h, t, pull):
-        """What of d did not come from forces; 0 where it is larger than d, and than twice what they do: a blow, which is over.
-        So are those of contacts, which may be slight, and are not told from what leans on them."""
+        """Return the reaction of the last substep: the part of d that forces did not cause.
+
+        It is 0 if it is larger than d and than twice the displacement by forces: this is a blow, which does not continue. It is
+        also 0 in scenes with contacts, where a slight blow cannot be told from a load.
+        """
         d = self.state.d[i]
         reaction = ti.zero(d)
         if ti.static(not self.touches):
@@ -222,12 +235,12 @@ class Verlet:
 
     @ti.func
     def dithered(self, big, small, tick, step: ti.template()):  # type: ignore[valid-type]
-        """`small`, to be added to `big`.
+        """Return `small` with a dither, before it is added to `big`.
 
-        In f32 the rounding of such a sum, always to the same side while `small` is constant, would be the largest error of all:
-        of a free fall, and of a body in uniform motion. So `small` is dithered: it gets a fraction in (-1/2, 1/2) of the last
-        digit of `big`, taken from the golden sequence. The rounded sums then follow the true one, with an error that grows like
-        the logarithm of the number of steps instead of that number.
+        In f32, while `small` is constant, such a sum would always be rounded to the same side. In free fall and in uniform motion
+        this would be the largest error. So `small` gets a fraction in (-1/2, 1/2) of the last digit of `big`, from the golden
+        sequence. The rounded sums then follow the exact one, with an error that grows like the logarithm of the number of steps
+        instead of that number.
         """
         if ti.static(self.dithers):
             u = ti.cast(ti.cast(tick, ti.u32) * ti.u32(step), ti.f32) * ti.static(2.0**-32) - 0.5
@@ -240,9 +253,9 @@ class Verlet:
 
     @ti.func
     def integrate(self, i, now, pull, share, h2_effective):
-        """d += h^2 a, x += d; at a start (d is v) x += h v + h^2 a / 2. Linear drag is exact in both.
+        """Integrate particle i: d += h^2 a, x += d; at a start (d is v) x += h v + h^2 a / 2. Linear drag is exact in both.
 
-        Only the writes depend on whether it moves, so that several particles are integrated at once.
+        Only the writes depend on whether the particle moves, so that the compiler can vectorize over particles.
         """
         live, x, d, h = self.state.moves(i), self.state.x[i], self.state.d[i], now.h
         a = self.acceleration_at(i, h, now.time, now.fresh, pull)
@@ -252,7 +265,7 @@ class Verlet:
         if ti.static(self.decays or len(self.forces.all) > 0):
             kick = h2_effective * a
             if ti.static(self.decays):
-                # d' = exp(-z) d + phi1 h^2 a, as a small change of d, which f32 holds to more digits.
+                # d' = exp(-z) d + phi1 h^2 a, computed as a small change of d, of which f32 keeps more digits.
                 kick -= ti.select(now.fresh != 0, ti.zero(d), self.decay[None][4] * d)
             d *= share
             if ti.static(self.state.carries):
@@ -282,7 +295,7 @@ class Verlet:
 
     @ti.func
     def h2_effective(self, h, fresh):
-        """What a constant acceleration adds to the displacement in a substep, per m/s^2: h^2, half of it at a start."""
+        """Return what a constant acceleration of 1 m/s^2 adds to the displacement: h^2, half of it at a start; less with drag."""
         h2_effective = h * h
         if ti.static(self.decays):
             h2_effective *= ti.select(fresh != 0, self.decay[None][2], self.decay[None][1])
@@ -292,8 +305,11 @@ class Verlet:
 
     @ti.func
     def h2_rigid(self, h, fresh, owed):
-        """The same of a rigid constraint: at a start it also makes up for `owed` [s] of its kick, which velocities lack, see
-        to_velocity(). That is h (h + h_old) / 2: h times what is between the middles of two substeps."""
+        """Return h2_effective() for a rigid constraint, which at a start also supplies the kick that velocities lack.
+
+        owed: this kick as a time [s], see Step.to_velocity(). The sum is h (h + h_old) / 2: h times the time between the middles
+        of two substeps.
+        """
         late = h * owed
         if ti.static(self.decays):
             late *= self.decay[None][1]
@@ -301,9 +317,9 @@ class Verlet:
 
     @ti.func
     def velocity_after(self, i, h, t, reaction):
-        """v_n from d_n and the acceleration at x_n: d / h + (h a + reaction / h) / 2, or what the solution with drag makes of it.
+        """Return v_n from d_n and the acceleration at x_n: d / h + (h a + reaction / h) / 2; with drag, from its exact solution.
 
-        reaction: h^2 times the acceleration by constraints.
+        reaction: h^2 times the acceleration by constraints, contacts and walls.
         """
         d = self.state.d[i]
         v = d / h
@@ -317,13 +333,13 @@ class Verlet:
 
 
 def decay(rate: float, h: float) -> list[float]:
-    """What drag makes of a substep, for z = rate h.
+    """Return the factors of drag in a substep h [s], with z = rate h.
 
     share = z / (exp(z) - 1), phi1 = (1 - exp(-z)) / z, phi2 = (z - 1 + exp(-z)) / z^2, rest = (1 - share) / z, 1 - exp(-z).
-    The velocity at its end is (share d + rest h^2 a) / h; no exp(z) is left in it, which leaves f32 at z = 88.
+    The velocity at the end of the substep is (share d + rest h^2 a) / h. It contains no exp(z), which overflows f32 at z = 88.
     """
     z = rate * h
-    if z < 1e-3:  # series: the closed forms cancel
+    if z < 1e-3:  # series, since terms of the closed forms cancel
         share = 1 - z / 2 + z * z / 12
         phi1 = 1 - z / 2 + z * z / 6 - z**3 / 24
         phi2 = 1 / 2 - z / 6 + z * z / 24 - z**3 / 120
@@ -336,22 +352,25 @@ def decay(rate: float, h: float) -> list[float]:
     return [float(share), float(phi1), float(phi2), float(rest), float(-np.expm1(-z))]
 
 
-FREE = decay(0.0, 1.0)  # what no drag makes of a substep
+FREE = decay(0.0, 1.0)  # the factors without drag
 
 
 def h2_effective_of(clock: "Clock") -> float:
-    """What a constant acceleration added to the displacement in the last substep, per m/s^2 [s^2]."""
+    """Return what a constant acceleration of 1 m/s^2 added to the displacement in the last substep [s^2]."""
     return clock.h**2 * (clock.drag or FREE)[2 if clock.started else 1]
 
 
 def h2_rigid_of(clock: "Clock") -> float:
-    """The same of a rigid constraint, which in a start also made up for the kick that velocities lacked [s^2]."""
+    """Return h2_effective_of() for a rigid constraint, which at a start also supplied the kick that velocities lacked [s^2]."""
     return h2_effective_of(clock) + clock.h * clock.lacked * (clock.drag or FREE)[1]
 
 
 def shares_of(h: Any, started: Any, lacked: Any, drag: np.ndarray) -> tuple[Any, Any]:
-    """By what multipliers of a substep h become h^2 times accelerations, for rigid and for soft constraints: h^2 over what a
-    constant acceleration added to the displacement. In a start from velocities that lacked half a kick of rigid constraints,
-    these gave that, too. Of one world, or arrays of many, with drag (..., 5) of each."""
+    """Return the factors from multipliers of the last substep to h^2 times accelerations, for rigid and for soft constraints.
+
+    Each is h^2 divided by what a constant acceleration of 1 m/s^2 added to the displacement. At a start from velocities that
+    lacked half a kick of rigid constraints, these constraints also supplied that kick. Arguments: of one world, or arrays of many
+    worlds; drag, (..., 5): factors as decay() returns them.
+    """
     whole, half = drag[..., 1], drag[..., 2]
     return 1 / np.where(started, half + whole * lacked / h, whole), 1 / np.where(started, half, whole)

@@ -1,4 +1,4 @@
-"""A frame phase by phase, each launched: what stands for a Step where no kernel goes through a whole frame."""
+"""A frame that is launched phase by phase: takes the place of a Step in frame() if no kernel runs a whole frame."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -11,10 +11,11 @@ if TYPE_CHECKING:
 
 
 class Launcher:
-    """Goes through frame() where each phase is launched, as on a GPU, which does not wait for the host, nor the host for it.
+    """Launches the phases of frame(), as on a GPU. Neither the device nor the host waits for the other.
 
-    Phases of one half of a pass go together in one launch. What a scene does not have is left out. Where the list of neighbours
-    is stale, all that is launched behind does nothing, and the frame goes on there when the host has had it built, see run().
+    Phases of one half of a pass share one launch. Phases that the scene does not need are skipped. If the neighbour list is
+    stale, all later launches of the frame do nothing. The host then has the list rebuilt, and launches again from there, see
+    Runner._launch().
     """
 
     def __init__(self, runner: "Runner"):
@@ -29,10 +30,10 @@ class Launcher:
         self.impacts = step.impacts
         self.looks, self.applies_first = step.looks, step.particles.applies_first
         self.waiting: list[str] = []
-        self.now: Any = None  # the half of a pass that they are in
+        self.now: Any = None  # the half of a pass of the waiting phases
 
     def flush(self) -> None:
-        """Launch the phases that wait."""
+        """Launch the waiting phases."""
         if self.waiting:
             names, now, span = template(" ".join(self.waiting)), self.now, self.now.span
             self.waiting = []
@@ -42,8 +43,10 @@ class Launcher:
             )  # fmt: skip
 
     def put(self, now: Moment, name: str, there: bool = True) -> None:
-        """Have one more phase wait for the next launch, if the scene has it. Phases of another half of a pass are launched
-        before. In the second step of Newton's method its name ends with a stroke."""
+        """Add a phase to those that wait for the next launch, unless `there` is false.
+
+        If waiting phases belong to another half of a pass, launch them first. In the second Newton step, the name ends with '.
+        """
         if there:
             if self.waiting and (self.now.s, self.now.half) != (now.s, now.half):
                 self.flush()
@@ -51,19 +54,19 @@ class Launcher:
             self.now = now
 
     def again(self, now: Moment) -> bool:
-        """Whether the substep goes on in the middle."""
+        """Whether the substep resumes in the middle."""
         return bool(now.span.resumed) and now.s == now.span.begin
 
     def moment(self, span: Span, s: int) -> Moment:
-        """Substep s, as far as the host has to know of it."""
+        """Return the Moment of substep s, with the values that the host needs."""
         return Moment(span, s, damps=(span.since + s) % EVERY == EVERY - 1)
 
     def turn(self, now: Moment, half: int) -> Moment:
-        """A pass, by one of its halves."""
+        """Return the Moment of one half of a pass."""
         return now.of(half // self.halves, half < self.halves, half=half)
 
     def works(self, now: Moment) -> bool:
-        """Always; between two substeps signals are handled."""
+        """Always true. Handles signals between two substeps."""
         self.runner.raise_signals()
         return True
 
@@ -72,30 +75,30 @@ class Launcher:
         return now.s < now.span.substeps and not self.again(now)
 
     def solves(self, now: Moment) -> bool:
-        """Whether there is such a substep."""
+        """Whether this is a substep, not the round after all substeps."""
         return now.s < now.span.substeps
 
     leaves = solves
 
     def ends(self, now: Moment) -> bool:
-        """Whether all are done."""
+        """Whether all substeps are done."""
         return now.s >= now.span.substeps
 
     def first_half(self, now: Moment) -> int:
-        """The half of a pass in which the substep begins or goes on."""
+        """Return the half of a pass in which the substep begins or resumes."""
         return now.span.half if self.again(now) else 0
 
     def last_half(self, now: Moment) -> int:
-        """The one before which it ends; one more for the list after all of them."""
+        """Return the half of a pass before which the substep ends. The round after all substeps has one half, for the list."""
         passes = now.span.iterations + (self.impacts.passes if self.impacts else 0)
         return passes * self.halves if now.s < now.span.substeps else 1
 
     def regular(self, now: Moment, half: int) -> bool:
-        """Whether this half of a pass is one of those that every substep has."""
+        """Whether every substep has this half of a pass; bodies that struck walls add further ones."""
         return half < now.span.iterations * self.halves or now.s >= now.span.substeps
 
     def goes_on(self, now: Moment, half: int) -> bool:
-        """Whether there is this half of a pass. The host has to ask where there are bodies that may bounce off walls."""
+        """Whether this half of a pass is run. If bodies may bounce off walls, the host has to wait for the answer."""
         if self.regular(now, half):
             return True
         it = half // self.halves - now.span.iterations
@@ -103,24 +106,24 @@ class Launcher:
         return bool(self.runner.memory.read(self.impacts.open)[it])
 
     def begins(self, now: Moment) -> bool:
-        """Whether the substep, or what comes after all of them, begins here."""
+        """Whether this round (a substep, or the one after all substeps) begins here instead of resuming."""
         return not self.again(now)
 
     def evaluate_pair_forces(self, now: Moment) -> None:
-        """The first phases of a substep; the frame may have to wait for lists."""
+        """Add the first phases of a substep. The frame may stop here until lists are rebuilt."""
         self.put(now, "ask_for_pairs", self.lists_pairs)
         self.put(now, "sum_pair_forces")
 
     def integrate(self, now: Moment) -> None:
-        """Put the phase of this name; so do those below, where the scene has it."""
+        """Add the phase integrate."""
         self.put(now, "integrate")
 
     def drive(self, now: Moment) -> None:
-        """Where anything is driven."""
+        """Add the phase drive, if there are driven particles."""
         self.put(now, "drive", self.drives)
 
     def update_neighbours(self, now: Moment, half: int) -> None:
-        """Have the list checked; the frame may have to wait for a new one here."""
+        """Add the check of the neighbour list. The frame may stop here until the list is rebuilt, or islands are woken."""
         if half and not half % self.halves:
             self.runner.raise_signals()
         self.put(self.turn(now, half), "ask_for_list", bool(self.runner.search))
@@ -129,11 +132,11 @@ class Launcher:
             self.put(self.turn(now, half), "ask_to_wake")
 
     def solve_constraints(self, now: Moment) -> None:
-        """Where there are constraints."""
+        """Add the phase solve_constraints, if there are constraints."""
         self.put(now, "solve_constraints", self.constrains)
 
     def solve_systems(self, now: Moment) -> None:
-        """Iterations of systems are launches of their own."""
+        """Add the phases that solve systems. Each iteration of an iterative system is a launch of its own."""
         self.put(now, "start_systems" if self.steps else "solve_systems", self.systems)
         for _ in range(self.steps):
             self.flush()
@@ -142,45 +145,45 @@ class Launcher:
             self.flush()
 
     def update_multipliers(self, now: Moment) -> None:
-        """Where there are systems."""
+        """Add the phase update_multipliers, if there are systems."""
         self.put(now, "update_multipliers", self.systems)
 
     def apply_constraints(self, now: Moment) -> None:
-        """Where they are not moved once, as the pass ends."""
+        """Add the phase apply_constraints, unless particles move only once, at the end of the pass."""
         self.put(now, "apply_constraints", self.applies_first)
 
     def unmet(self, now: Moment) -> bool:
-        """Where there is one pass: the host asks no more, and where all are met a step of Newton's method does nothing."""
+        """Whether there is only one pass. The host reads no result; if all systems are met, a second Newton step does nothing."""
         return now.span.iterations == 1
 
     def solve_contacts(self, now: Moment) -> None:
-        """The first phase of the second half."""
+        """Add the phase solve_contacts, if there are contacts."""
         self.put(now, "solve_contacts", self.touches)
 
     def struck(self) -> bool:
-        """Always: the host does not ask whether a pair bounces, and rounds in which none does do nothing."""
+        """Always true. The host does not read whether a pair bounces; a round without a bounce does nothing."""
         return True
 
     def rebound(self, now: Moment) -> None:
-        """One launch for every round."""
+        """Launch one round of restitution."""
         self.flush()
         self.put(now, "rebound")
         self.flush()
 
     def apply_corrections(self, now: Moment) -> None:
-        """The last phase of a pass."""
+        """Add the last phase of a pass, if particles have corrections to apply."""
         self.put(now, "apply_corrections", self.acts)
 
     def finish_substep(self, now: Moment) -> None:
-        """Once, after the last pass."""
+        """Add the phase finish_substep, after the last pass."""
         self.put(self.now if self.waiting else now, "finish_substep")
 
     def project_contact_velocities(self, now: Moment) -> None:
-        """A launch for each pass."""
+        """Add one pass of project_contact_velocities, in a launch of its own."""
         self.flush()
         self.put(now.of(now.it, half=now.it * self.halves), "project_contact_velocities")
 
     def diagnose(self, now: Moment) -> None:
-        """The last launch of a frame."""
+        """Launch the diagnostics, the last launch of a frame."""
         self.flush()
         self.runner.measure(now.span.end, now.span.state_origin)

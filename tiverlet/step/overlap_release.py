@@ -44,7 +44,7 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
     x, contact = state.get(memory), next(iter(step.contacts), None)
     if not (contact or step.walls) or not np.isfinite(x).all():
         return False
-    solids = Solids(runner, x, ratio)
+    solids = Solids.loaded(runner, x, ratio)
     if not (contact or solids.count):
         return False
     energy, overlap = seen_before(runner)

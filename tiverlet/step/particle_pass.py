@@ -1,5 +1,4 @@
-"""What happens to a tile of particles: loops so short that their state stays in a cache, and so simple that several are done at
-once."""
+"""The loops over particles, tile by tile: the state of a tile stays in the cache, and simple loops can be vectorized."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -13,16 +12,17 @@ from ..features.feature import Batch, Scene
 if TYPE_CHECKING:
     from ..colliders.collider import Collider
 
-TILE = 256  # particles that a thread takes at a time, through several loops: their state stays in its cache
-SWEEPS = 8  # rounds over the walls, for particles that several of them push
-LEAVES = 1 / 16  # of a blow: what goes away from a wall less fast after it lies there
-ROUNDS = 32  # more of them, without friction and bounces
+TILE = 256  # particles that a thread takes through several loops at a time, so that their state stays in its cache
+SWEEPS = 8  # rounds over the walls, for particles that several walls push
+LEAVES = 1 / 16  # of a blow: a particle that leaves a wall more slowly than this after it lies on the wall
+ROUNDS = 32  # further rounds, without friction and bounces
 
 
 class ParticlePass:
-    """The motion of particles, and what they gather of constraints, contacts and walls. contact and search may be None.
+    """Integrates particles, and applies to them the corrections of constraints, contacts and walls.
 
-    n: particles. pieces: of them, see Team. tile: particles in one. each: tiles of a piece.
+    contact and search may be None. n: number of particles. pieces: number of pieces that they are divided into, see Team. tile:
+    particles in a tile. each: tiles in a piece.
     """
 
     n: Any = OnDevice()
@@ -36,10 +36,10 @@ class ParticlePass:
         number = scene.memory.number
         self.pieces, self.tile, self.each = map(number, self._parts(scene.particles.count, team))
         self.few = scene.memory.compiler.few
-        self.whole = team.size == 1 and not team.launched  # all particles are one piece,
-        self.undivided = self.whole and self.few  # and one tile: no loop over them is compiled
+        self.whole = team.size == 1 and not team.launched  # all particles are one piece
+        self.undivided = self.whole and self.few  # and one tile: no loop over tiles is compiled
         self.slots, self.search, self.walls, self.radius = scene.slots, search, walls, scene.radius
-        self.applies_first = bool(batches) and (bool(contact) or scene.slots.refines)  # what constraints want, before all else
+        self.applies_first = bool(batches) and (bool(contact) or scene.slots.refines)  # moves of constraints, before all others
         self.gathers = bool(batches) and not self.applies_first
         self.held = bool(batches)
         self.contacts = [contact] if contact else []
@@ -57,22 +57,22 @@ class ParticlePass:
 
     @staticmethod
     def _parts(n: int, team: Team) -> tuple[int, int, int]:
-        """How many pieces n particles are, how many of them a tile is, and tiles a piece."""
+        """Return the number of pieces of n particles, of particles in a tile, and of tiles in a piece."""
         tile = min(TILE, team.piece)
         return -(-n // team.piece), tile, -(-team.piece // tile)
 
     def regroup(self, n: int) -> None:
-        """There are n particles now, and the team knows."""
+        """Set the number of particles to n, after Team.regroup()."""
         self.pieces, self.tile, self.each = self._parts(n, self.team)
 
     @inline
     def piece_count(self, thread):
-        """How many pieces fall to a thread."""
+        """Return the number of pieces of a thread."""
         return 1 if self.whole else self.team.dealt_count(self.pieces, 1, thread)
 
     @ti.func
     def piece(self, k, thread):
-        """The particles of the k-th piece of a thread: the first, and where they end."""
+        """Return the first particle of the k-th piece of a thread, and the one behind its last."""
         first, end = self.team.chunk_begin(self.n, thread), self.n
         if ti.static(not self.whole):
             first = self.team.dealt_index(k, 1, thread) * self.team.piece
@@ -81,12 +81,12 @@ class ParticlePass:
 
     @inline
     def tile_count(self, thread):
-        """How many tiles fall to a thread."""
+        """Return the number of tiles of a thread."""
         return 1 if self.undivided else self.team.dealt_count(self.pieces * self.each, self.each, thread)
 
     @ti.func
     def tile_of(self, k, thread):
-        """The particles of the k-th tile of a thread."""
+        """Return the first particle of the k-th tile of a thread, and the one behind its last."""
         first, end = self.team.chunk_begin(self.n, thread), self.n
         if ti.static(not self.undivided):
             first, end = self._tile_of(k, thread)
@@ -94,7 +94,7 @@ class ParticlePass:
 
     @ti.func
     def _tile_of(self, k, thread):
-        first, end = k * self.tile, self.n  # of the one piece that there is, without a division
+        first, end = k * self.tile, self.n  # for one piece, without a division
         if ti.static(self.team.size > 1):
             tile = self.team.dealt_index(k, self.each, thread)
             piece = tile // self.each
@@ -103,7 +103,7 @@ class ParticlePass:
 
     @ti.func
     def integrate(self, now):
-        """All particles."""
+        """Integrate all particles."""
         for k in range(self.tile_count(now.thread)):
             first, end = self.tile_of(k, now.thread)
             if self.state.stirs(first, end) != 0:
@@ -111,7 +111,7 @@ class ParticlePass:
 
     @ti.func
     def advance(self, first, end, now):
-        """Integrate a tile of particles. Short loops, so that each is done for several particles at once."""
+        """Integrate a tile of particles, in short loops that the compiler can vectorize."""
         for c in ti.static(self.contacts):
             if now.final != 0:
                 scale = ti.select(now.fresh != 0, now.h, ti.cast(1, self.real))
@@ -153,7 +153,7 @@ class ParticlePass:
 
     @ti.func
     def look_ahead(self, begin, end, now):
-        """Where pairs know their loads: for contacts to see, particles that touch others go to where walls will leave them."""
+        """If contacts have known loads: before contacts are solved, move particles in contact to where walls will leave them."""
         for c in ti.static(self.contacts):
             for b in range(blocks(begin, end)):
                 low, high = block(b, begin, end)
@@ -167,7 +167,7 @@ class ParticlePass:
 
     @ti.func
     def leave_walls(self, i, now):
-        """Take particle i out of the walls, without friction and bounces; how far."""
+        """Move particle i out of the walls, without friction and bounces. Returns the move [m]."""
         d = self.state.d[i]
         before, wall_push = self.traces(i)
         moving = True
@@ -179,7 +179,7 @@ class ParticlePass:
 
     @ti.func
     def look_back(self, begin, end):
-        """Particles go back to where they were before walls were looked at."""
+        """Undo look_ahead(): move particles back to where they were."""
         for c in ti.static(self.contacts):
             for i in range(begin, end):
                 lean = c.dev.known.lean[i]
@@ -188,7 +188,7 @@ class ParticlePass:
 
     @ti.func
     def apply_constraints(self, now):
-        """Move particles as constraints want, before their contacts are solved; the list has to hear of it."""
+        """Apply the corrections of constraints to particles before contacts are solved, and check the neighbour list."""
         for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
             self.gather(i, now.newton)
             for c in ti.static(self.contacts):
@@ -197,7 +197,7 @@ class ParticlePass:
 
     @ti.func
     def gather(self, i, newton):
-        """Move particle i as constraints want."""
+        """Apply the corrections of constraints to particle i."""
         if self.state.awake(i):
             for impacts in ti.static(self.impacts):
                 d = self.state.d[i]
@@ -209,7 +209,7 @@ class ParticlePass:
 
     @ti.func
     def apply_corrections(self, now):
-        """Move particles as constraints or contacts want, and walls after that."""
+        """Apply the corrections of constraints and contacts to particles, then those of walls."""
         if ti.static(self.acts):
             for k in range(self.tile_count(now.thread)):
                 begin, end = self.tile_of(k, now.thread)
@@ -219,7 +219,7 @@ class ParticlePass:
 
     @ti.func
     def move(self, begin, end, now):
-        """What a tile of particles gathers."""
+        """Apply corrections to a tile of particles."""
         if ti.static(self.gathers):
             for i in range(begin, end):
                 self.gather(i, 0)
@@ -227,7 +227,7 @@ class ParticlePass:
             if now.first != 0:
                 self.look_back(begin, end)
         for c in ti.static(self.contacts):
-            if now.it < now.span.iterations:  # else there are none but walls, see BodyImpacts
+            if now.it < now.span.iterations:  # further passes have no contacts, see BodyImpacts
                 for b in range(blocks(begin, end)):
                     low, high = block(b, begin, end)
                     if c.busy(low) != 0:
@@ -282,11 +282,12 @@ class ParticlePass:
 
     @ti.func
     def forget_blow(self, i):
-        """Of particle i, if it bounced in this substep: keep of what walls did only what is across the blow.
+        """If particle i bounced in this substep: remove the part along the blow from the push of walls that counts as a reaction.
 
-        A blow b at the part s of the substep leaves the particle -s b from where its displacement says, see Surface.bounce(), and
-        the velocity has all of it. What it leans on meanwhile, as on a floor while it bounces off a side, is across. What rests
-        with restitution bounces, too, by rounding, but does not leave.
+        A blow b at the fraction s of the substep leaves the particle -s b away from where its displacement says, see
+        Surface.bounce(). The velocity already contains all of b. The push of a wall on which the particle leans meanwhile, such
+        as a floor while it bounces off a side wall, is across b and stays. A particle that rests on a wall with restitution also
+        bounces, by rounding errors, but it does not leave the wall.
         """
         lift = self.state.place(i) - self.state.begin(i) - self.state.d[i]
         if lift.norm() > 4 * self.state.digits(i):
@@ -299,7 +300,7 @@ class ParticlePass:
 
     @ti.func
     def near_walls(self, begin, end):
-        """0 where no wall is near any of some particles."""
+        """Return 0 if no wall is near any of the particles from `begin` to `end` - 1."""
         near = 0
         for i in range(begin, end):
             for f in ti.static(self.walls):
@@ -308,7 +309,7 @@ class ParticlePass:
 
     @ti.func
     def confine(self, i, h, frame_fraction):
-        """The walls, which have the last word; they take turns until they agree, see Collider."""
+        """Apply the corrections of walls to particle i, in turn, until none changes anything, see Collider."""
         if self.state.moves(i):
             if ti.static(len(self.walls) == 1 and not self.walls[0].repeats):
                 for f in ti.static(self.walls):
@@ -320,7 +321,7 @@ class ParticlePass:
                         if k == SWEEPS + ROUNDS:
                             self.stay(i)
                         settled = self.touch_all(i, h, frame_fraction, turn)
-                        # With friction or bounces a round may come back to where it began, and not be free there.
+                        # A round with friction or bounces may return to where it began, although the particle is in a wall there.
                         moving = not (settled and (turn == GENTLY or ti.static(not self.rough)))
                         turn = FIRST if ti.static(len(self.walls) > 1) else AGAIN
                         if settled or k + 1 >= SWEEPS:
@@ -328,7 +329,7 @@ class ParticlePass:
 
     @ti.func
     def touch_all(self, i, h, frame_fraction, turn):
-        """Ask every wall once; returns whether none changed anything."""
+        """Apply the correction of every wall once. Returns whether none changed anything."""
         x, d = self.state.x[i], self.state.d[i]
         for f in ti.static(self.walls):
             self.touch(f, i, h, frame_fraction, turn)
@@ -336,7 +337,7 @@ class ParticlePass:
 
     @ti.func
     def traces(self, i):
-        """What walls change of particle i beside its position and displacement."""
+        """Return the values of particle i that walls change, besides its position and displacement."""
         before = wall_push = ti.zero(self.state.d[i])
         if ti.static(self.state.befores):
             before = self.state.before[i]
@@ -346,7 +347,7 @@ class ParticlePass:
 
     @ti.func
     def leave_traces(self, i, before, wall_push):
-        """Take back what walls changed: give particle i what traces() returned."""
+        """Restore the values of particle i that traces() returned."""
         if ti.static(self.state.befores):
             self.state.before[i] = before
         if ti.static(self.state.keeps_wall_push):
@@ -354,7 +355,7 @@ class ParticlePass:
 
     @ti.func
     def touch(self, wall: ti.template(), i, h, frame_fraction, turn):  # type: ignore[valid-type]
-        """Ask one wall, if it is there."""
+        """Apply the correction of one wall, if it is switched on."""
         if ti.static(wall.dev.surface.has_switch):
             if wall.dev.surface.active[None] != 0:
                 wall.confine(i, self.radius.of(i), h, frame_fraction, turn)
@@ -363,7 +364,7 @@ class ParticlePass:
 
     @ti.func
     def stop(self, i, move):
-        """Walls stop particle i, which the host has moved by `move` from x0. Only its position changes: no time goes by."""
+        """Stop particle i at walls, after the host moved it by `move` from x0. Only its position changes: no time passes."""
         d = self.state.d[i]
         d_low = ti.zero(d)
         if ti.static(self.state.carries):
@@ -383,7 +384,7 @@ class ParticlePass:
 
     @ti.func
     def stay(self, i):
-        """Put particle i back to where it was at the start of the substep, at rest."""
+        """Move particle i back to where it was at the start of the substep, at rest."""
         if ti.static(self.state.starts):
             if ti.static(self.state.befores):
                 self.state.before[i] = self.state.before[i] - self.state.d[i]
@@ -393,18 +394,19 @@ class ParticlePass:
             self.state.shift(i, -self.state.d[i])
 
     @ti.func
-    def reaction(self, i, h, t, firm):
-        """h^2 times what constraints (from Slots), contacts and walls accelerated particle i by in the last substep; and which
-        part of what walls did is in it. firm: see Batch.push_reaction(); with 0, loads that contacts know are taken out, too.
+    def reaction(self, i, h, t, firm, soft):
+        """Return h^2 times the acceleration of particle i by constraints (from Slots), contacts and walls in the last substep.
 
-        Walls count as far as they balance the rest: a body at rest has velocity 0, but one that has just bounced is not credited
-        with half of the blow, nor is any of the body that it belongs to.
+        Also returns the share of the push of walls that it contains. firm, soft: see Passes.push_reaction(); with firm = 0, known
+        loads of contacts are subtracted, too.
+        The push of walls counts as far as it balances all other forces. So a body at rest has velocity 0, but half of a blow is
+        not added to the velocity of a particle that has just bounced, nor to the other particles of its body.
         """
         reaction, part = 0 * self.state.d[i], 1 + 0 * h
         if ti.static(self.held):
             reaction = self.slots.total_of(i)
         for c in ti.static(self.contacts):
-            reaction += firm * c.reaction(i, h)
+            reaction += firm * c.reaction(i, h, soft)
             if ti.static(self.knows_loads):
                 reaction -= ti.select(firm == 0, h * h, 0 * h) * c.dev.known.carried.field[i]
         if ti.static(len(self.walls) > 0):
@@ -412,7 +414,7 @@ class ParticlePass:
             v = self.state.d[i] / h
             load = (h * h * self.forces.accelerate(i, self.state.place(i), v, t, self.forces.pull(t)) + reaction).norm()
             limit, size = load, push.norm()
-            for f in ti.static([f for f in self.walls if f.has_friction]):  # which comes on top of what is borne
+            for f in ti.static([f for f in self.walls if f.has_friction]):  # the wall's push is load and friction together
                 limit = ti.max(limit, load * ti.sqrt(1 + f.dev.surface.static() ** 2))
             if size > limit:
                 part = limit / size
@@ -424,13 +426,13 @@ class ParticlePass:
         return reaction, part
 
     @ti.func
-    def surface_velocity(self, i, h, t, firm):
-        """r omega of particle i at the end of the last substep: s / h, and half a substep of what forces turned it by."""
+    def surface_velocity(self, i, h, t, firm, soft):
+        """Return r omega of particle i at the end of the last substep: s / h plus half of what moments of forces added to it."""
         turned = 0 * self.state.spin.s[i]
         for c in ti.static(self.contacts):
             if ti.static(c.has_friction):
                 turned += c.dev.forces.turned[i]
         if ti.static(self.turned_by_walls):
-            _reaction, part = self.reaction(i, h, t, firm)
+            _reaction, part = self.reaction(i, h, t, firm, soft)
             turned += part * self.wall_turn[i]
         return (self.state.spin.s[i] + firm / 2 * turned) / h

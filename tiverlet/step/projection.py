@@ -58,7 +58,8 @@ TURNS = 16  # with walls, at most: a link that stands on a wall halves its viola
 WORSE = 2.0  # times the energy stored before: a result that stores more is discarded
 BETTER = 0.5  # times that energy, of links and contacts: the limit where contacts move, too
 TOGETHER = 4  # rounds in which links and contacts move together: each may lead into further contacts
-HELD = 1e3  # of its mass: how firmly a wall holds a particle that it has stopped
+HELD = 1e3  # of its mass: the stiffness with which a wall holds a particle that it has stopped
+GRIP = 1e-3  # of the push of a wall: the tangential part from which on friction holds a particle
 
 
 class Aims(NamedTuple):
@@ -117,7 +118,7 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     energy, overlap = seen_before(runner)
     finest = ratio**4 if frail else ratio**2  # by loads, or by energies
     aims = Aims(LEFT * finest, steps, 0.0 if frail else slight, SHARED if contacts else PRODUCTS, DONE[frail])
-    rows, stopped = _moved(runner, start, rows, aims)
+    rows, stopped = _moved(runner, start, _leaning(runner, rows, 1 - ratio**2), aims)
     left = 0.0
     if contacts:
         rows, stopped, left = _together(runner, start, rows, stopped, contacts.stored(before, w), batches[:-1], aims)
@@ -142,23 +143,44 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     return True
 
 
+def _leaning(runner: "Runner", rows: "Rows", share: float) -> "Rows":
+    """Return the rows with particles that walls bear held on these walls, and held along them by friction.
+
+    So a standing body does not turn over its feet, nor walk. share: the part of the pull of links that the rows give up.
+    """
+    if not runner.step.walls:
+        return rows
+    state, memory = runner.scene.state, runner.memory
+    push = memory.read(runner.step.particles.wall_displacement)[: rows.n].astype(np.float64)
+    state.put(memory, rows.x - push)
+    sent = state.get(memory)
+    runner.stop_at_walls(rows.x)
+    normal = _units(state.get(memory) - sent)
+    state.put(memory, rows.x)
+    along = np.linalg.norm(push - (push * normal).sum(axis=1)[:, None] * normal, axis=1)
+    rubs = any(w.has_friction for w in runner.step.walls)
+    return rows.leaning(normal, push, share, rubs & (along > GRIP * np.linalg.norm(push, axis=1)))
+
+
 def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: Aims) -> tuple["Rows", np.ndarray]:
     """Move particles by _newton(), in turns with walls. Returns the rows there, and a mask of particles that walls stopped.
 
     start: the rows whose stored energy aims.share refers to.
     """
     state, memory, before = runner.scene.state, runner.memory, rows.x
-    enough, stopped = aims.share * start.stored, np.zeros(rows.n, dtype=bool)
+    enough = aims.share * start.stored
+    stopped: np.ndarray = rows.wall.any(axis=1)
     for _ in range(TURNS):
         state.put(memory, _newton(rows, enough, aims))
         sent = state.get(memory)
         runner.stop_at_walls(before)
         x = state.get(memory)
         stopped |= (x != sent).any(axis=1)
-        last, rows = rows, rows.at(x)  # what walls stop is lifted by the others
-        if (x == sent).all() or rows.matrix.products > aims.products:
+        last, rows = rows, rows.at(x)  # other particles lift those that walls stop
+        slips = rows.sticks.any() and rows.stored > enough  # friction does not hold two feet against each other
+        if ((x == sent).all() and not slips) or rows.matrix.products > aims.products:
             break
-        if rows.stored > last.stored or last.wall.any():  # what lies on them would be sent back there again and again
+        if rows.stored > last.stored or last.wall.any():  # particles on walls would be sent into them again and again
             rows = rows.held(last.wall, x - sent)
             if rows.stored <= enough:
                 break
@@ -243,6 +265,12 @@ def sizes(batch: Scalar | RigidRows | ContactRows) -> np.ndarray:
     return np.bincount(batch.owner, minlength=batch.count)
 
 
+def _units(a: np.ndarray) -> np.ndarray:
+    """Return vectors (n, dim) scaled to length 1; 0 for zero vectors."""
+    size = np.linalg.norm(a, axis=1)[:, None]
+    return a * _over(np.ones_like(size), size)
+
+
 def _over(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return a / b; 0 where b is 0."""
     return np.divide(a, b, out=np.zeros_like(a), where=b > 0)
@@ -283,6 +311,8 @@ class Rows:
         self.pairs = self.row[first], self.who[first], self.who[first + 1]
         self.arity = arity
         self.wall = np.zeros_like(x)  # normals of the walls that hold particles; 0 where none does
+        self.sticks = np.zeros(self.n, dtype=bool)  # whether friction holds them along walls, too
+        self.rest = np.zeros_like(x)  # moves of particles on walls in a substep, by forces other than links
         self._measure(x)
 
     def _each(self, values: list[np.ndarray]) -> np.ndarray:
@@ -341,15 +371,32 @@ class Rows:
         other |= self.arity[np.maximum(self.row - 1, 0)] != self.arity[self.row]  # the last of more corners are others
         return np.split(np.arange(self.m), np.flatnonzero(np.bincount(self.row, other, minlength=self.m))[1:])
 
-    def held(self, wall: np.ndarray, back: np.ndarray) -> "Rows":
-        """The same rows where walls, of these normals, and of those along which particles were moved `back`, (n, dim), hold what
-        is not drawn off them."""
-        far = np.linalg.norm(back, axis=1)[:, None]
-        wall = np.where(far > 0, back * _over(np.ones_like(far), far), wall)
-        pull = -self.jacobian.gathered(self.J * (_over(self.weight, self.diagonal) * self.C)[self.row, None])
+    def leaning(self, wall: np.ndarray, push: np.ndarray, share: float, sticks: np.ndarray) -> "Rows":
+        """Return these rows with walls of normals `wall`, (n, dim), that bear particles.
+
+        push: (n, dim) [m], the moves by walls in the last substep. They balance the pull of links and all other forces. share:
+        the part of the pull of links that the rows have. sticks: (n,), whether friction holds a particle.
+        """
         new = copy.copy(self)
-        new.wall = wall * ((pull * wall).sum(axis=1) <= 0)[:, None]
+        new.wall, new.sticks = wall, sticks
+        new.rest = -(push + self.w[:, None] * self.pull() / share) * wall.any(axis=1)[:, None]
         return new
+
+    def held(self, wall: np.ndarray, back: np.ndarray) -> "Rows":
+        """Return these rows with walls that hold particles which are not drawn off them, without friction.
+
+        wall: (n, dim) the normals so far. back: (n, dim), by how much walls moved particles back, which gives further normals.
+        """
+        unit = _units(back)
+        wall = np.where(unit.any(axis=1)[:, None], unit, wall)
+        new = copy.copy(self)
+        drawn = ((self.w[:, None] * self.pull() + self.rest) * wall).sum(axis=1)
+        new.wall, new.sticks = wall * (drawn <= 0)[:, None], np.zeros(self.n, dtype=bool)
+        return new
+
+    def pull(self) -> np.ndarray:
+        """Return the pull of the stored energy on particles, (n, dim)."""
+        return -self.jacobian.gathered(self.J * (_over(self.weight, self.diagonal) * self.C)[self.row, None])
 
     def at(self, x: np.ndarray) -> "Rows":
         """Return these rows at other positions."""
@@ -422,8 +469,10 @@ class Rows:
         return float((self.mass[:, None] * move**2).sum())
 
     def step(self, mu: float) -> np.ndarray:
-        """Moves p that minimize sum (C + J p)^2 / (2 D) + p^T M (mu + HELD n n^T) p / 2 + p^T K p / 2, with D the diagonal of
-        J w J^T and n the normals of walls that hold particles: else these are sent into them again, and stopped again.
+        """Return moves p that minimize sum (C + J p)^2 / (2 D) + p^T M (mu + HELD n n^T) p / 2 + p^T K p / 2.
+
+        D is the diagonal of J w J^T. n are the normals of walls that hold particles; n n^T is 1 where friction does. Without this
+        term, particles would be sent into walls and stopped again and again.
 
         K is the transverse stiffness of links under tensions C / D. Without it, links in one line have no direction to give way
         in, and the step that should straighten a taut rope throws it into a zigzag.
@@ -436,8 +485,9 @@ class Rows:
         taut = _over(np.maximum(self.C[row], 0.0) * stiff[row], length)
         one, (a, b) = np.eye(self.dim), self.corners
         sides = taut[:, None, None] * (one - across[:, :, None] * across[:, None, :])
-        wall = self.wall[self.inside]
-        held = wall[:, :, None] * wall[:, None, :] + (self.rails.across(self.n)[self.inside] if self.rails else 0.0)
+        wall, sticks = self.wall[self.inside], (self.sticks & self.wall.any(axis=1))[self.inside]
+        held = np.where(sticks[:, None, None], one, wall[:, :, None] * wall[:, None, :])
+        held = held + (self.rails.across(self.n)[self.inside] if self.rails else 0.0)
         mass = (mu * one + HELD * held) / self.w[self.inside][:, None, None]
         along = [(stiff[self.row[a], None] * self.J[a])[:, :, None] * self.J[b][:, None, :]]
         for corners in self.alike:

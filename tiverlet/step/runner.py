@@ -1,4 +1,4 @@
-"""How frames get to the device: in one launch, with lists that grow, and kernels that are made anew for it."""
+"""How frames are run on the device: in one launch, which resumes after lists have grown and kernels were made for them."""
 
 import copy
 import functools
@@ -11,7 +11,7 @@ from ..contact.initial_overlap import overlapping
 from ..device.interrupts import whole
 from ..device.patches.compiler import CachedLaunch
 from ..particles.spin import moments
-from . import high_order, initial_violation
+from . import high_order, initial_shape, initial_violation
 from .clock import Clock, slack
 from .contact_rows import ContactRows
 from .diagnostics import BARE, EXTENT, STARTED, STEPPED, UNSTEPPED
@@ -24,20 +24,20 @@ from .span import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Span
 from .step import frame
 from .step_report import StepReport
 
-KEPT = 100_000  # particles: up to so many, the array for velocities is kept; for more, making one costs next to nothing
-LONG = 10_000_000  # particles and constraints, times passes, in a launch: it takes about a second
+KEPT = 100_000  # particles up to which the array for velocities is kept; above, allocating it costs next to nothing
+LONG = 10_000_000  # (particles + constraints) x passes in one launch at most: it takes about a second
 
 
-@functools.lru_cache(16)  # they are asked for several times between two frames
+@functools.lru_cache(16)  # read several times between two frames
 def _shares(h: float, started: bool, lacked: float, drag: tuple[float, ...]) -> tuple[float, float]:
     firm, soft = shares_of(h, started, lacked, np.array(drag))
     return float(firm), float(soft)
 
 
 class Runner:
-    """Takes the parts of a world from frame to frame.
+    """Advances the parts of a world frame by frame.
 
-    A frame is one launch, resumed where the list of neighbours had to grow, or some launches for each substep, see Launcher.
+    A frame is one launch, resumed if the neighbour list had to grow, or some launches for each substep, see Launcher.
     """
 
     def __init__(self, parts: Any, clock: Clock):
@@ -45,31 +45,32 @@ class Runner:
         self.step, self.diagnostics, self.path, self.solver = parts.step, parts.diagnostics, parts.path, parts.solver
         self.frames: Frames | None = parts.frames
         self.clock = clock
-        self.left: np.ndarray | None = None  # displacements of the last substep, where they have become velocities between frames
-        self.moved = 0.0  # how far the coming frame has had to move a particle to where its constraints are met [m]
-        self.jumped = False  # whether that was further than a particle is large
+        self.left: np.ndarray | None = None  # displacements of the last substep, if they became velocities between frames
+        self.moved = 0.0  # the longest move of a particle to meet its constraints before the coming frame [m]
+        self.jumped = False  # whether any such move was longer than the radius of its particle
         self.sleepers, self.sleep = parts.scene.state.sleepers, parts.step.sleep
-        self.released = 0.0  # the violation that a shorter substep turns into energy, as a share of the constraint's size
-        self.ramping: list[Any] = []  # batches whose rest values go to others in the coming frame
-        self.ramps: list[Any] = []  # the memories of what ramps need
-        self.structure: Any = None  # a digest of what kernels could read of constraints, once it was asked for
-        self.interruptible = False  # whether a frame is undone when a handler of a signal raises in the middle of it
-        # Every frame reads these, and Taichi checks each attribute that is read of an object with kernels.
+        self.released = 0.0  # the violation that a shorter substep would turn into energy, relative to the constraint's size
+        self.ramping: list[Any] = []  # batches whose rest values change in the coming frame
+        self.ramps: list[Any] = []  # the memories of ramps
+        self.structure: Any = None  # a digest of all that kernels can read of constraints, once computed
+        self.interruptible = False  # whether a frame is undone if a signal handler raises in the middle of it
+        # Copied here because every frame reads them, and Taichi checks each attribute read of an object with kernels.
         step = self.step
         self.n, self.launched, self.team, self.integrator = step.n, step.launched, step.team, step.integrator
         self.driven = [b for b in self.batches if b.driven]
         self.paths = [f for f in step.drivers if isinstance(f, Path)]
-        self.known = [c.known for c in step.contacts if c.known]  # loads of contacts
+        self.known = [c.known for c in step.contacts if c.known]  # KnownLoads of contacts
         self.logs: list[Any] = [*(c.dev.events for c in step.contacts if c.dev.events), *step.wall_logs]  # of events
         self.semi_iterations, self.drags = step.constraints.semi_iterations, step.integrator.forces.drags
         self.probe = high_order.Probe(step) if self.scene.order > 2 else None
         self.passes_at_once = self._passes_at_once()
         self.asks_velocities = any(wall.has_switch for wall in step.walls)
+        self.bounces = any(f.has_restitution for f in (*step.walls, *step.contacts))
         self.launcher = Launcher(self)
         self._prepare()
 
     def _prepare(self) -> None:
-        """The kernels that are launched in every frame."""
+        """Make the launches of every frame."""
         self.sheet = self.diagnostics.sheet
         if self.sleep:
             self.sleep = self.step.sleep = self.sleep.of(self.step)
@@ -79,24 +80,24 @@ class Runner:
             self.frames = self.frames.of(self.step)
             self._fused = self.frames.launch_one(self.sheet)
         self._measure = CachedLaunch(self.diagnostics, "measure", self.memory.compiler, self.sheet)
-        self._velocity: CachedLaunch | None = None  # once it is asked for
-        self._spin: CachedLaunch | None = None  # likewise
+        self._velocity: CachedLaunch | None = None  # made when velocities are first read
+        self._spin: CachedLaunch | None = None  # made when spins are first read
         self._turned = np.zeros(2)
         self._to_velocity = CachedLaunch(self.step, "to_velocity", self.memory.compiler, self._turned)
         self._data, self._given, self._reporter = self.sheet.data, self.sheet.data[H:], self.diagnostics.report
 
     def renew(self) -> None:
-        """Make kernels anew that know of a new field: Taichi compiles them for each Step."""
+        """Make kernels that include a new field. Taichi compiles kernels for each Step, so the Step is copied."""
         self.step = copy.copy(self.step)
         self.diagnostics = self.diagnostics.of(self.step)
         self._prepare()
 
     def _passes_at_once(self) -> int:
-        """How many passes over the constraints a launch makes."""
+        """The largest number of passes over the constraints in one launch."""
         return max(1, LONG // (1 + self.n + sum(b.count for b in self.batches)))
 
     def regroup(self) -> None:
-        """Particles came and went, and the parts know."""
+        """Take the new number of particles, after the parts were edited in place."""
         self.n = self.step.n
         self.passes_at_once = self._passes_at_once()
         self.diagnostics.report.regroup()
@@ -106,8 +107,8 @@ class Runner:
     # Frames.
 
     def begin(self, dt: float, substeps: int, iterations: int) -> None:
-        """Begin a frame of dt [s]. Where the length of substeps differs from the last one, displacements stand for other
-        velocities: they are turned into velocities first, and the frame is a start."""
+        """Prepare a frame of dt [s]. If the substep has another length than the last one, displacements become velocities, and
+        the frame is a start."""
         if self.prepare(dt, substeps, iterations):
             clock, placed = self.clock, self.clock.first_moved is not None
             if clock.energy is None:
@@ -116,7 +117,7 @@ class Runner:
                 if self.sleep:
                     with self.memory.compiler():
                         self.sleep.compile(clock)
-                if self.asks_velocities:  # compile its kernel now, so that nobody waits for it later
+                if self.asks_velocities:  # compile the kernel now; switching a wall off will need it
                     self._velocities()
                     self.asks_velocities = False
                 if placed:
@@ -130,7 +131,7 @@ class Runner:
             self.placed()
 
     def prepare(self, dt: float, substeps: int, iterations: int) -> bool:
-        """The first half of begin(). Returns whether there is a second: the state was changed, and has to be diagnosed."""
+        """The first half of begin(). Returns whether the second half is needed: the state has changed and must be diagnosed."""
         h, clock, self.released, self.jumped = dt / substeps * self.integrator.first, self.clock, 0.0, False
         drag = decay(sum(f.rate for f in self.drags), h) if self.drags else None
         if h == clock.h and drag == clock.drag and not clock.d_is_velocity and clock.first_moved is None:
@@ -144,7 +145,7 @@ class Runner:
                 if h < clock.longest and not self.probe:
                     released = release(self, h, clock.longest)
                     projected = project(self, h, clock.longest)
-                    # Links and contacts have to move together. Where frames are of slightly uneven length, stacks would walk off.
+                    # Links and contacts must move together. With frames of slightly uneven length, stacks would creep sideways.
                     if projected is None and (dt == clock.frame[1] or 2 * h <= clock.longest):
                         projected = project(self, h, clock.longest, ContactRows.of(self))
                     if projected is None and not released:
@@ -158,14 +159,18 @@ class Runner:
                 for b in self.driven:
                     b.start_at(self.scene.state.get(self.memory), clock.first_moved)
                 ratio = h / (clock.h or h)
-                removed = initial_violation.remove(self.scene, self.batches, clock.first_moved, ratio, self.stop_at_walls)
-                if removed is not None:
-                    way, share = removed
-                    self.moved = float(way.max()) if share > initial_violation.SEEN else 0.0
-                    self.jumped = bool((way > self.scene.particles.radius).any()) and self.moved > 0
-                    self.invalidate()
+                for removed in (
+                    initial_shape.restore(self, clock.first_moved),
+                    initial_violation.remove(self.scene, self.batches, clock.first_moved, ratio, self.stop_at_walls),
+                ):
+                    if removed is not None:
+                        way, share = removed
+                        seen = float(way.max()) if share > initial_violation.SEEN else 0.0
+                        self.moved = max(self.moved, seen)
+                        self.jumped = self.jumped or (bool((way > self.scene.particles.radius).any()) and seen > 0)
+                        self.invalidate()
                 bare = clock.first_moved < self.n and not any((b.indices >= clock.first_moved).any() for b in self.batches)
-                if self.scene.slots.system and not bare:  # it has nothing to do with particles that came without constraints
+                if self.scene.slots.system and not bare:  # particles added without constraints do not concern it
                     system, x = self.scene.slots.system, self.scene.state.get(self.memory)
                     left = initial_violation.left(self.batches, x) if system.steps else []
                     self.released = max(self.released, *(float(share.max()) for _, share in left), 0.0)
@@ -174,21 +179,21 @@ class Runner:
         return True
 
     def looked(self, energy: float, overlap: float) -> None:
-        """The second half of begin(), with the energy [J] and the overlap of the state that the frame starts from."""
+        """The second half of begin(), with the energy [J] and the overlap of the initial state of the frame."""
         self.clock.energy, self.clock.parting = energy, overlap > 0
         if overlap > 0 and self.clock.first_moved is not None:
             with self.memory.compiler():
                 self.ease(self.clock.first_moved)
 
     def placed(self) -> None:
-        """The end of begin(): nothing is left to be done about particles that were placed anew."""
+        """The end of begin(): particles that were placed have been dealt with."""
         if self.jumped:
-            for contact in self.step.contacts:  # for the report of the frame: others may have been passed
+            for contact in self.step.contacts:  # the report must say that they may have passed other particles
                 self.memory.write(contact.dev.fast, 1)
         self.clock.first_moved = None
 
     def advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
-        """One frame from where begin() left off."""
+        """Run one frame, after begin()."""
         self.set_out()
         for semi_iteration in self.semi_iterations:
             with self.memory.compiler():
@@ -207,23 +212,23 @@ class Runner:
         return report
 
     def know_reach(self) -> None:
-        """Have loads read from the multipliers of the last substep."""
+        """Set the factors by which loads follow from the multipliers of the last substep."""
         factor = self.integrator.h2_factor
         self.scene.reach = factor * h2_rigid_of(self.clock), factor * h2_effective_of(self.clock)
 
     def find_ramps(self) -> None:
-        """After knobs were uploaded: find the batches whose rest values are others now."""
+        """After knobs were uploaded: find the batches with new rest values."""
         self.ramping = [b for b in self.batches if b.ramp and b.ramp.under_way]
 
     def _jump(self) -> None:
-        """Have rest values jump to what was assigned, in bodies of which a particle was placed anew."""
+        """Set new rest values at once in bodies of which a particle was placed; elsewhere they change during the frame."""
         if self.ramping and self.clock.first_moved is not None:
             tied = initial_violation.tied(self.scene, self.batches, self.clock.first_moved)
             for b in self.ramping:
                 b.ramp.jump(np.bincount(b.owner, tied[b.indices.ravel()], minlength=b.count) > 0)
 
     def set_out(self) -> None:
-        """Have rest values that were assigned go there in the coming frame."""
+        """Start the ramps of assigned rest values, which they reach during the coming frame."""
         if self.ramping:
             new = [b.ramp.memory for b in self.ramping if b.ramp.set_out()]
             self.ramping = [b for b in self.ramping if b.ramp.under_way]
@@ -232,13 +237,13 @@ class Runner:
                 self.renew()
 
     def arrive(self) -> None:
-        """End the ramps of rest values: the frame is over, and is not made again."""
+        """End the ramps of rest values, after a frame that will not be repeated."""
         for b in self.ramping:
             b.ramp.arrive()
         self.ramping = []
 
     def settle(self, dt: float) -> None:
-        """After a frame of dt [s]: find out who is slow, and let islands fall asleep."""
+        """After a frame of dt [s]: find slow particles, and put islands to sleep."""
         sleep, clock = self.sleep, self.clock
         if sleep.rests and not sleep.watches:
             return
@@ -248,19 +253,19 @@ class Runner:
             sleep.rests = sleep.finish(dt, clock)
 
     def wake(self, particles: np.ndarray | None = None) -> None:
-        """Have all that sleeps wake, or the islands of some particles."""
+        """Wake all sleeping particles, or the islands of some particles."""
         if self.sleep:
             self.sleep.rests = False
             self.sleepers.wake(particles)
 
     def set_substep(self, h: float, drag: list[float] | None) -> None:
-        """Take h, and the factors of drag for it."""
+        """Set the substep h [s], and the factors of drag for it."""
         if drag and drag != self.clock.drag:
             self.memory.write(self.integrator.decay, drag)
         self.clock.h, self.clock.drag = h, drag
 
     def place(self, position: np.ndarray, iterations: int) -> None:
-        """Put particles elsewhere, (n, dim) [m], with the velocities that they have."""
+        """Set positions, (n, dim) [m], and keep velocities."""
         with self.memory.compiler():
             self.restart(iterations)
             self.forget_loads(position)
@@ -268,24 +273,30 @@ class Runner:
         self.clock.energy, self.clock.first_moved = None, 0
 
     def forget_loads(self, position: np.ndarray) -> None:
-        """Before particles are put elsewhere: forget known loads of constraints and contacts that this changes."""
+        """Before positions are set: forget the known loads of constraints and contacts that the new positions change."""
         initial_violation.forget(self.scene, self.batches, position)
         for known in self.known:
             known.forget(self.scene, position)
 
     def carry_loads(self) -> None:
-        """After particles came or went, or are held by others: tell them the loads that their contacts know."""
+        """After particles were added, removed or pinned: sum the known loads of their contacts again for each particle."""
         for known in self.known:
             known.carry(self.scene, self.scene.state.get(self.memory), *self.search.list.lasting_data())
 
     def restart(self, iterations: int) -> None:
-        """Turn displacements into velocities, so that the next substep starts from the state at this time. iterations: of the
-        substep, for velocities of higher order."""
+        """Turn displacements into velocities, so that the next substep is a start from the present state. iterations: of the
+        substep, for velocities of higher order.
+
+        d / h of a particle at rest stands for -g h / 2 without its support. Without restitution the next substep stops it all the
+        same. With restitution it would leave at e g h / 2, which a shorter substep does not take for rest. So in worlds with
+        restitution the velocities are those that users read.
+        """
         clock = self.clock
         if not clock.d_is_velocity:
-            if clock.parted is not None:
-                held = (self.scene.inv_mass == 0)[:, None]
-                self.start(np.where(held, self.memory.read(self.scene.state.d)[: self.n] / clock.h, clock.parted))
+            if clock.parted is not None or self.bounces:
+                held, seen = (self.scene.inv_mass == 0)[:, None], clock.parted
+                seen = self.velocity(iterations) if seen is None else seen
+                self.start(np.where(held, self.memory.read(self.scene.state.d)[: self.n] / clock.h, seen))
             elif self.probe:
                 self.memory.write(self.scene.state.d, high_order.velocity(self.probe, clock, self.memory, iterations))
             else:
@@ -295,7 +306,7 @@ class Runner:
             clock.d_is_velocity, clock.parted = True, None
 
     def start(self, velocity: np.ndarray) -> None:
-        """Have the next substep start from these velocities, (n, dim), and the present spins; with memory.compiler()."""
+        """Make the next substep a start from these velocities, (n, dim), and the present spins; with memory.compiler()."""
         clock, state = self.clock, self.scene.state
         if state.spins and not clock.d_is_velocity:
             self.memory.write(state.spin.s, self.spin())
@@ -303,7 +314,7 @@ class Runner:
         clock.d_is_velocity, clock.owed, clock.parted = True, 0.0, None
 
     def restart_between(self, iterations: int) -> None:
-        """The same between frames: what residuals of the last substep go by stays known."""
+        """Call restart() between frames, and keep the data from which residuals of the last substep are computed."""
         noted = {b: self.memory.scratch(b) for b in self.batches}
         self.note_displacements()
         self.restart(iterations)
@@ -311,18 +322,18 @@ class Runner:
             self.memory.put_scratch(b, rows)
 
     def note_displacements(self) -> None:
-        """Keep displacements that are about to become velocities."""
+        """Store displacements that are about to become velocities."""
         if self.batches and not self.clock.d_is_velocity:
             self.left = self.memory.read(self.scene.state.d)[: self.n]
 
     def pass_on(self, left: np.ndarray | None, some: np.ndarray) -> None:
-        """Take over what was left of particles in the mask `some`, which are the first ones now."""
+        """Keep the stored displacements of particles in the mask `some`, which come first now."""
         if left is not None:
             self.left = np.zeros((self.n, left.shape[1]), dtype=left.dtype)
             self.left[: np.count_nonzero(some)] = left[some]
 
     def stop_at_walls(self, before: np.ndarray) -> None:
-        """Let walls stop particles that the host has moved from `before`, (n, dim); with memory.compiler()."""
+        """Stop particles at walls that the host has moved from `before`, (n, dim); with memory.compiler()."""
         if self.step.walls:
             self.step.stopped(before)
 
@@ -335,8 +346,11 @@ class Runner:
         links: bool = True,
         touches: bool = True,
     ) -> np.ndarray:
-        """Velocities as the user sees them, to the order of the world; of particles from number `first` on, up to `end`. came:
-        they touch nothing yet. links, touches: with what rigid constraints, and contacts and walls, give to them."""
+        """Velocities as the user sees them, to the order of the world, of particles `first` to `end` - 1, (end - first, dim).
+
+        came: whether these were just added, and touch nothing yet. links: whether reactions of rigid constraints count. touches:
+        whether reactions of contacts and walls count.
+        """
         clock = self.clock
         if clock.d_is_velocity:
             out = self.memory.read(self.scene.state.d).astype(np.float64)
@@ -352,7 +366,7 @@ class Runner:
         return out[first : self.n if end is None else end]
 
     def _velocities(self, first: int = 0, end: int | None = None, links: bool = True, touches: bool = True) -> np.ndarray:
-        """Have the kernel make velocities of displacements."""
+        """Launch the kernel that computes velocities from displacements."""
         launch = self._with_room(self._velocity, "velocities", 7, self.step.dim)
         self._velocity = launch if self.n <= KEPT else None
         given, out = launch.arrays
@@ -363,19 +377,19 @@ class Runner:
         return out[first:end].copy()
 
     def _with_room(self, launch: CachedLaunch | None, kernel: str, numbers: int, axes: int) -> CachedLaunch:
-        """A launch of a kernel that is given so many numbers, and has room for a row of each particle; the same, if it has."""
+        """The launch of a kernel with so many arguments and an output row per particle; `launch` itself if it is large enough."""
         if launch is not None and len(launch.arrays[1]) >= self.n:
             return launch
         room = np.zeros((1 << self.n.bit_length(), axes))
         return CachedLaunch(self.step, kernel, self.memory.compiler, np.zeros(numbers), room)
 
     def _list_again(self) -> None:
-        """After a state was put back: build the neighbour list, which reactions of contacts need."""
+        """After a state was restored: build the neighbour list, which the reactions of contacts need."""
         if self.search and self.memory.read(self.search.list.old_saved)[0]:
             self.list_neighbours()
 
     def spin(self) -> np.ndarray:
-        """Velocities r omega of the surfaces of particles, (n, axes) [m/s], of the same order as velocity()."""
+        """Surface velocities r omega, (n, axes) [m/s], of the same order as velocity()."""
         clock, spin = self.clock, self.scene.state.spin
         if clock.d_is_velocity:
             return self.memory.read(spin.s).astype(np.float64)[: self.n]
@@ -388,7 +402,7 @@ class Runner:
         return out[: self.n].copy()
 
     def torque(self) -> np.ndarray:
-        """Moments of contacts and walls in the last substep, (n, axes) [N m]: I alpha, by r omega = s / h + r alpha h / 2."""
+        """Moments of contacts and walls in the last substep, (n, axes) [N m]: I alpha, from r omega = s / h + r alpha h / 2."""
         clock, particles = self.clock, self.scene.particles
         if not self.scene.state.spins or clock.d_is_velocity:
             return np.zeros((self.n, particles.axes))
@@ -397,13 +411,13 @@ class Runner:
         return np.divide(moments(particles), r, out=np.zeros(len(r)), where=r > 0)[:, None] * half * (2 / clock.h)
 
     def shares(self) -> tuple[float, float]:
-        """Those of the last substep, for rigid and for soft constraints, see shares_of()."""
+        """The shares of rigid and of soft constraints in velocities after the last substep, see shares_of()."""
         return _shares(self.clock.h, self.clock.started, self.clock.lacked, tuple(self.clock.drag or FREE))
 
     # Launches.
 
     def run(self, substeps: int, iterations: int, end: float, state_origin: int) -> None:
-        """All substeps of a frame, and the diagnostics."""
+        """Run all substeps of a frame, and the diagnostics."""
         clock, stages = self.clock, self.integrator.stages * substeps
         passes = self.integrator.passes(iterations)
         if self.launched:
@@ -441,7 +455,7 @@ class Runner:
             self.raise_signals()
 
     def wake_called(self, substeps: int, passes: int, s: int, half: int) -> None:
-        """Where the frame stopped in substep s for islands that were touched: wake them."""
+        """Wake the islands for which the frame stopped in substep s."""
         if self.sleep and self.memory.read(self.sleepers.calls)[0]:
             clock = self.clock
             with self.memory.compiler():
@@ -450,13 +464,13 @@ class Runner:
                 )
 
     def stopped(self) -> tuple[int, int, int]:
-        """Where the frame stopped, as Span has it; and let it go on, for the host is about to do what it waits for."""
+        """Return where the frame stopped (resumed, begin, half of Span), and clear the stop, which the host handles next."""
         self.memory.write(self.step.halt, 0)
         resumed, begin, half = (int(v) for v in self._data[HALT:ACTIVE_THREADS])
         return (0, begin, 0) if half == BEFORE else (resumed, begin, half)
 
     def _launch(self, span: Span) -> None:
-        """Phase by phase. Once all is launched, the host asks one thing: whether the frame waits for a list."""
+        """Launch a frame phase by phase. At the end, the host reads one result: whether the frame waits for a list."""
         try:
             frame(self.launcher, span)
             while self.step.searches and self._data[HALT]:
@@ -476,12 +490,12 @@ class Runner:
         self._measure()
 
     def raise_signals(self) -> None:
-        """In a long frame: call the handlers of signals that came. What they raise undoes the frame, see World.step."""
+        """In a long frame: call the handlers of pending signals. If one raises, the frame is undone, see World.step."""
         if self.interruptible:
             whole.raise_pending()
 
     def look(self, bare: bool = False) -> None:
-        """Diagnose the state where no frame did. bare: nothing but its energy is asked for, which takes a third of the time."""
+        """Diagnose a state that no frame has diagnosed. bare: compute only its energy, in a third of the time."""
         clock = self.clock
         origin = UNSTEPPED if clock.d_is_velocity else STARTED if clock.started else STEPPED
         self.run(0, 1, clock.time, origin + BARE if bare else origin)
@@ -490,7 +504,7 @@ class Runner:
         """Build the lists, growing them until everything fits."""
         if not self.launched:
             self.invalidate()
-            self.look()  # whose kernel is there anyway, and lists
+            self.look()  # its kernel is compiled anyway, and builds lists
             return
         with self.memory.compiler():
             for k, search in enumerate(self.step.searches):
@@ -498,14 +512,14 @@ class Runner:
                     self.grow()
 
     def grow(self) -> None:
-        """More room for near pairs, and kernels that know of it. Nothing is lost: what did not fit was counted."""
+        """Grow the lists that are too short, and make kernels for them. No pair is lost: pairs that did not fit were counted."""
         lists = [search.list for search in self.step.searches]
         short = [each for each in lists if self.memory.read(each.need)[0] > each.capacity]
         if any([each.grow() for each in short]):
             self.renew()
 
     def invalidate(self, some: np.ndarray | None = None) -> None:
-        """Have lists of neighbours built anew in the next frame; of some copies, where there are many."""
+        """Mark neighbour lists as stale; with many copies of a world, those of some copies."""
         for search in self.step.searches:
             if some is None:
                 search.list.invalidate()
@@ -513,17 +527,18 @@ class Runner:
                 self.memory.write_some(search.list.stale, 1, some)
 
     def ease(self, first: int) -> None:
-        """Let particles part gently that the user put into each other, from number `first` on."""
+        """Let particles from number `first` on that the user placed into others part gently."""
         contact = self.step.contacts[0]
         if not contact.shrinks:
-            if first and overlapping(self.scene, self.batches, self.scene.state.get(self.memory), first) is False:
-                return  # what overlaps does so under its load
+            x = self.scene.state.get(self.memory) if first else None
+            if x is not None and overlapping(self.scene, self.batches, contact.table, x, first) is False:
+                return  # overlap under a load is no error of placing
             contact.enable_shrink()
             self.renew()
         self.step.shrunk(first)
 
     def report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
-        """What the diagnostics found."""
+        """The StepReport of the last diagnostics."""
         clock = self.clock
         asleep = int(self.memory.read(self.sleepers.count)[0]) if self.sleepers else 0
         report, extent = self._reporter(
@@ -534,7 +549,7 @@ class Runner:
         return report
 
     def residuals(self, batch) -> np.ndarray:
-        """What the last substep left of each violation in a batch, by the displacements that particles had in it."""
+        """The violations that the last substep left in a batch, relative, from the displacements of that substep."""
         self.memory.check()
         if not self.clock.h:
             raise RuntimeError(f"{batch!r}.residual: there is none before the world has been stepped.")
@@ -550,6 +565,6 @@ class Runner:
 
     @property
     def memories(self) -> list[Any]:
-        """The trees of fields: one from the start, others where a list or a need has grown."""
+        """All trees of fields: the first one, and those of lists, contacts and ramps that were added later."""
         grown = [*(search.list.store for search in self.step.searches), *(c.store for c in self.step.contacts)]
         return [self.memory, *(m for m in grown if m), *self.ramps]

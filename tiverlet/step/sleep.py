@@ -1,4 +1,4 @@
-"""Sleep: particles that have come to rest are left out of the substep until something reaches them."""
+"""Sleep: particles that have come to rest are skipped until something reaches them."""
 
 import copy
 from typing import TYPE_CHECKING, Any
@@ -17,36 +17,39 @@ if TYPE_CHECKING:
     from .clock import Clock
     from .step import Step
 
-TRIES = 4  # in `time`, to find what can fall asleep
+TRIES = 4  # searches for islands that can fall asleep, in each `time`
 
 
 class Sleep(Feature):
-    """Particles that have come to rest are left out of the substep until something reaches them.
+    """Skips particles that have come to rest, until something reaches them.
 
-    speed: [m/s] that a particle has to stay below, of its center and of the surface that it turns. time: [s] for which it has to.
+    speed: [m/s] below which a particle is slow, both its center and its turning surface. time: [s] for which it must be slow.
     Both are live.
 
-    Particles that press on each other, or are linked, are an island: it falls asleep as a whole, once each of them has been slow
-    for `time`. What sleeps is as it was in its last substep, to the bit: place, displacement, spin, loads, slip of friction. So
-    its energy and momentum do not change, and it goes on from there when it is woken, whole, in the substep in which
+    Particles that press on each other, or are linked, form an island. An island falls asleep as a whole, once each of its
+    particles has been slow for `time`. A sleeping particle keeps the state of its last substep bit for bit: position,
+    displacement, spin, loads, slip of friction. So its energy and momentum do not change, and it continues from this state when
+    it wakes. An island wakes as a whole when
 
-    - a particle that moves, or a driven one, touches it: before that contact is solved;
-    - a force on it is another one than it was when it fell asleep (those of the user's own, in frames);
-    - it, or another of its island, is given another velocity or spin (all wake where a start is made of it);
+    - a moving or a driven particle touches it: in that substep, before the contact is solved;
+    - the force on one of its particles differs from the force with which it fell asleep: compared at the end of each frame, for
+      forces that are not uniform;
+    - one of its particles is given another velocity or spin (all islands wake if this makes a start of the whole world).
 
-    and before a frame in which a wall is moved, a knob is changed, positions are assigned, particles or features come or go, or
-    substeps become shorter or longer. Against a world that never sleeps, it is off by less than speed
-    times time where it sleeps, for it would have crept by less.
+    All islands wake before a frame in which a wall is moved, a knob is changed (other than the target of a driven particle),
+    positions are assigned, particles or features are added or removed, or the length of substeps changes. Compared with a world
+    without Sleep, a sleeping particle is off by less than speed times time, since it would have crept by less.
 
-    Decided by the state alone: on the same bits everywhere, in clones and replays too. What is pinned does not join two islands.
-    Never asleep are particles of motors and winches, and what is linked to what is driven.
+    Sleep depends on the state alone: it is the same bit for bit on all paths, in clones and in replays. Pinned particles do not
+    join two islands. Particles of motors and winches, and particles that are linked to driven ones, never sleep.
 
-    World.events() tells of what sleeps that it goes on touching what it touched, without impulses.
+    World.events() reports that sleeping particles go on touching what they touched, without impulses.
 
-    StepReport.asleep says how many sleep. Where all do, a frame is not computed at all. (Box2D and others: sleeping islands.)
+    StepReport.asleep is the number of sleeping particles. If all of them sleep, frames are not computed at all. (Box2D and
+    others: sleeping islands.)
 
-    Raises ValueError beside PairForce and a sheared Periodic box, which islands do not know of, in order above 2, and in Worlds.
-    A world has at most one.
+    Raises ValueError with a PairForce or a sheared Periodic box, which islands do not take into account, in orders above 2, and
+    in Worlds. A world has at most one.
     """
 
     speed = Knob(lambda f, v: checks.number("Sleep", "speed", v, above=0.0), "Below which a particle is slow [m/s].")
@@ -57,7 +60,7 @@ class Sleep(Feature):
         self.speed, self.time = speed, time
 
     def bind(self, scene: Scene) -> None:
-        """The fields, which the state then knows of."""
+        """Declare the fields, and make them part of the state."""
         if scene.memory.copies:
             raise ValueError("Worlds: Sleep is for a world alone, where frames that are not computed take no time. Leave it out.")
         self.scene = scene
@@ -65,32 +68,32 @@ class Sleep(Feature):
         self.changed = False
 
     def can_regroup(self, change: Regrouping) -> bool:
-        """Particles can come and go, and all wake then."""
+        """Always true: particles can be added and removed in place. All of them wake then."""
         return True
 
     def regroup(self, change: Regrouping) -> None:
-        """They came and went."""
+        """Resize the fields after particles were added and removed."""
         self.dev.islands.regroup()
 
     def upload(self) -> None:
-        """Write both."""
+        """Write speed and time to the device."""
         islands = self.dev.islands
         islands.time = self.time
         self.scene.memory.write(islands.limits, [self.speed, self.time])
 
 
 def blocks_of(n: int) -> int:
-    """Blocks that n particles are."""
+    """Return the number of blocks of n particles."""
     return -(-max(1, n) // BLOCK)
 
 
 class Sleepers:
-    """Who sleeps, in one world on the device. time: [s] of Sleep.
+    """The sleeping particles of one world, on the device. time: [s] of Sleep.
 
-    asleep: 1 where a particle sleeps. still: for how long it has been slow [s]. island: one particle of the island that it sleeps
-    in, by which all of them know it. called: islands, by that particle, that are to wake; calls: whether there are any.
-    blocks: 0 where a whole block of particles sleeps. count: of those that sleep. pull: the acceleration when it fell asleep,
-    where forces may change by themselves.
+    asleep: 1 if a particle sleeps. still: for how long it has been slow [s]. island: the particle that stands for the island of a
+    sleeping particle, the same for the whole island. called: 1 for islands that are to wake, by the particle that stands for
+    them. calls: whether there are any. blocks: 0 for blocks of particles that all sleep. count: number of sleeping particles.
+    pull: the acceleration with which a particle fell asleep, if forces may change by themselves.
     """
 
     host_only = ("scene", "time")
@@ -116,7 +119,7 @@ class Sleepers:
 
     @ti.func
     def stirs(self, begin, end):
-        """1 if any block of particles from `begin` up to `end` has one that is awake."""
+        """Return 1 if any block of particles from `begin` up to `end` contains an awake particle, else 0."""
         out = 0
         for b in range(begin // BLOCK, (end + (BLOCK - 1)) // BLOCK):
             out |= self.blocks[b]
@@ -124,7 +127,10 @@ class Sleepers:
 
     @ti.func
     def root(self, i):
-        """The particle by which the island of particle i is known, while islands are found (union-find, path compression)."""
+        """Return the particle that stands for the island of particle i, while islands are found.
+
+        Union-find with path compression.
+        """
         r, k = i, i
         while self.island[r] != r:
             r = self.island[r]
@@ -136,12 +142,12 @@ class Sleepers:
 
     @ti.func
     def join(self, i, j):
-        """Particles i and j are in the same island."""
+        """Merge the islands of particles i and j."""
         a, b = self.root(i), self.root(j)
         self.island[ti.max(a, b)] = ti.min(a, b)
 
     def wake(self, particles: Any = None) -> None:
-        """Have the islands of some particles wake; None: all."""
+        """Wake the islands of some particles; None: all."""
         memory = self.scene.memory
         if particles is None and not memory.read(self.count)[0]:
             memory.write(self.still, 0.0)
@@ -158,12 +164,12 @@ class Sleepers:
         self.review()
 
     def regroup(self) -> None:
-        """Particles came and went: take their number, and note who sleeps."""
+        """Take the new number of particles, and count the sleeping ones, after particles were added and removed."""
         self.scene.memory.resize(self.blocks, blocks_of(self.scene.particles.count))
         self.review()
 
     def review(self) -> None:
-        """Note how many sleep, and of which blocks all do."""
+        """Count sleeping particles, and mark the blocks of which all sleep."""
         memory, n = self.scene.memory, self.scene.particles.count
         asleep = memory.read(self.asleep)
         padded = np.zeros(blocks_of(n) * BLOCK, dtype=asleep.dtype)
@@ -172,17 +178,23 @@ class Sleepers:
         memory.write(self.count, int((asleep[:n] != 0).sum()))
 
 
-DT, H, TIME, AWAKE, READY, CALLED = range(6)  # of the sheet of a frame: what is given, and counts of particles
+# The sheet of settle(): its arguments, then the numbers of awake particles and of those that have been slow for long enough, and
+# whether any island is called.
+DT, H, TIME, AWAKE, READY, CALLED = range(6)
 
 
 @ti.data_oriented
 class SleepPass:
-    """The kernels of one world: who is slow, who falls asleep, who wakes."""
+    """The kernels of Sleep in one world: they find slow particles, put islands to sleep, and wake them.
+
+    watches: whether forces on sleeping particles may change by themselves. rests: whether all particles slept in the last frame
+    and nothing else moves. goes_on: whether something moves although all particles sleep.
+    """
 
     host_only = ("sheet", "rests", "goes_on")
-    told_apart = True  # as a Feature
+    told_apart = True  # its compile time is reported by itself, as that of a Feature
     n: Any = OnDevice()  # particles
-    links: Any = OnDevice()  # pairs of them that constraints hold together
+    links: Any = OnDevice()  # pairs of particles that constraints hold together
 
     def __init__(self, step: "Step", sleepers: Sleepers, drivers: list[Batch], batches: list[Batch]):
         self.step: Any = step
@@ -191,7 +203,7 @@ class SleepPass:
         self.watches = any(not f.uniform for f in self.forces.all)
         memory, n = step.scene.memory, step.scene.count
         kept, pairs = linked(step.scene.inv_mass, drivers, batches, step.contacts)
-        self.restless = memory.field("Sleep.restless", n, kind=ti.i32)  # by islands, while they are found
+        self.restless = memory.field("Sleep.restless", n, kind=ti.i32)  # 1 for islands that stay awake, while they are found
         self.kept_awake = memory.field("Sleep.kept_awake", n, kind=ti.i32, values=kept)
         self.links = memory.number(len(pairs))
         self.pairs = memory.field("Sleep.links", len(pairs), width=2, kind=ti.i32, values=pairs)
@@ -204,12 +216,15 @@ class SleepPass:
         return "sleep"
 
     def regroup(self) -> None:
-        """Of the particles that there are: what is driven goes on; what cannot move keeps turning, where that is asked for."""
+        """Find out, for the present particles, whether something moves although all sleep.
+
+        Driven particles do, and static particles turn on if orientations are computed.
+        """
         turns = self.step.orients and bool((self.step.scene.inv_mass == 0).any())
         self.goes_on = turns or bool(self.step.drivers)
 
     def bind_again(self, drivers: list[Batch], batches: list[Batch]) -> None:
-        """Constraints came or went: who is linked now, and who never sleeps."""
+        """Take the links, and the particles that never sleep, after constraints were added or removed."""
         memory = self.step.scene.memory
         kept, pairs = linked(self.step.scene.inv_mass, drivers, batches, self.contacts)
         memory.write(self.kept_awake, kept)
@@ -218,17 +233,19 @@ class SleepPass:
         self.links = len(pairs)
 
     def compile(self, clock: "Clock") -> None:
-        """Now, so that nobody waits for it later: nothing is ready to sleep yet, and none is called."""
+        """Compile the kernels by launching them now, when no island is ready to sleep and none is called."""
         self.fall_asleep(clock.time)
         self.wake_called(clock.h, clock.time, 0, 0, 0, 1, 1, 1, 0)
 
     def begin(self, dt: float, clock: "Clock") -> None:
-        """Before settle(), after a frame of dt [s]."""
+        """Write the arguments of settle(), after a frame of dt [s]."""
         self.sheet[:] = dt, clock.h, clock.time, 0, 0, 0
 
     def finish(self, dt: float, clock: "Clock") -> bool:
-        """After it: have islands fall asleep, or wake. Returns whether all slept in the frame that has gone by, and nothing else
-        goes on."""
+        """After settle(): put islands to sleep, and wake those that were called.
+
+        Returns whether all particles slept in the last frame, and nothing else moves.
+        """
         awake, ready, called = self.sheet[AWAKE:].tolist()
         if called:
             self.wake_called(clock.h, clock.time, 0, 0, 0, 1, 1, 1, 0)
@@ -238,14 +255,14 @@ class SleepPass:
         return awake == 0 and not called and not self.goes_on
 
     def of(self, step: "Step") -> "SleepPass":
-        """The same fields, for another Step."""
+        """Return a copy with the same fields, for another Step."""
         new = copy.copy(self)
         new.step, new.contacts = step, step.contacts
         return new
 
     @ti.kernel
     def settle(self, sheet: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
-        """As a frame ends: for how long each particle has been slow, and whether forces on those asleep have changed."""
+        """At the end of a frame: count for how long each particle has been slow, and call islands whose forces have changed."""
         for b in range((self.n + (BLOCK - 1)) // BLOCK):
             awake, ready = 0, 0
             for i in range(b * BLOCK, ti.min((b + 1) * BLOCK, self.n)):
@@ -263,7 +280,7 @@ class SleepPass:
 
     @ti.func
     def time_still(self, i, dt, h):
-        """Count one more frame in which particle i was slow, or begin anew if it was not."""
+        """Count one more frame in which particle i was slow, or start again from 0 if it was not."""
         d = self.state.d[i]
         way = d.dot(d)
         if ti.static(self.state.spins):
@@ -277,20 +294,22 @@ class SleepPass:
 
     @ti.func
     def pull(self, i, t):
-        """What accelerates particle i at rest."""
+        """Return the acceleration of particle i by forces, at rest."""
         time = ti.cast(t, self.real)
         return self.forces.accelerate(i, self.state.place(i), 0 * self.state.d[i], time, self.forces.pull(time))
 
     @ti.func
     def call(self, i):
-        """The island of particle i is to wake."""
+        """Mark the island of particle i, so that it wakes."""
         self.sleepers.called[self.sleepers.island[i]] = 1
         self.sleepers.calls[None] = 1
 
     @ti.kernel
     def fall_asleep(self, t: ti.f64):
-        """Find islands of those that are awake, and let those sleep that have been slow for long enough. By one thread: it takes
-        some 0.1 us for each particle, and is done a few times a second at most."""
+        """Find the islands of awake particles, and put those to sleep that have been slow for long enough.
+
+        On one thread: it takes some 0.1 us per particle, and runs a few times per second at most.
+        """
         ti.loop_config(serialize=True)
         for _ in range(1):
             for i in range(self.n):
@@ -316,7 +335,7 @@ class SleepPass:
                 if self.drifts(i):
                     root = self.sleepers.root(i)
                     if self.restless[root] != 1:
-                        self.restless[i] = -1  # asleep in a moment: others still look for the root
+                        self.restless[i] = -1  # asleep after this loop: other particles still need the root
             for i in range(self.n):
                 if self.drifts(i):
                     if self.restless[i] == -1:
@@ -333,7 +352,7 @@ class SleepPass:
 
     @ti.func
     def note_blocks(self):
-        """Of which blocks all sleep."""
+        """Mark the blocks with an awake particle."""
         for b in range((self.n + (BLOCK - 1)) // BLOCK):
             stirs = 0
             for i in range(b * BLOCK, ti.min((b + 1) * BLOCK, self.n)):
@@ -342,9 +361,11 @@ class SleepPass:
 
     @ti.func
     def look(self, i, before):
-        """Call the islands that particle i touches; if it is driven, also those that it touched as the substep began. before: 1
-        if constraints come first: also those that it would touch if they moved it as far as it moves by itself, for what wakes
-        after them has gone without them."""
+        """Call the sleeping islands that particle i touches; if it is driven, also those that it touched at the substep's start.
+
+        before: 1 if constraints are solved before contacts in this pass. Then also call islands that the particle would touch if
+        constraints moved it as far as it moved by itself: islands that wake after constraints were solved would miss them.
+        """
         drifts, d = self.drifts(i), self.state.d[i]
         margin = before * d.norm()
         for c in ti.static(self.contacts):
@@ -356,7 +377,7 @@ class SleepPass:
 
     @ti.func
     def note_wake(self, i, s):
-        """Tell of particle i that it wakes in substep s of a frame."""
+        """Record in the logs of events that particle i wakes in substep s of a frame."""
         for c in ti.static(self.contacts):
             if ti.static(c.dev.has_events):
                 c.dev.events.wake(i, s)
@@ -368,7 +389,7 @@ class SleepPass:
         self, h64: ti.f64, start: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32, s: ti.i32, substeps: ti.i32,
         iterations: ti.i32, half: ti.i32,
     ):  # fmt: skip
-        """Wake the islands that were called. In substep s they move as all others have done; where s = substeps, they do not."""
+        """Wake the called islands, and integrate their particles as all others were in substep s; not if s = substeps."""
         now = self.step.turn(self.step.moment(Span(h64, start, start, tick, since, fresh, 0.0, 0, substeps, iterations), s), half)
         for i in range(self.n):
             if not self.sleepers.awake(i):
@@ -389,8 +410,8 @@ class SleepPass:
 
 
 def linked(inv_mass: np.ndarray, drivers: list[Batch], batches: list[Batch], contacts: list) -> tuple[np.ndarray, np.ndarray]:
-    """Which particles never sleep, a mask, because of constraints on them; and pairs of those that constraints and bodies hold
-    together, of what can move."""
+    """Return the mask of particles that never sleep because of constraints, (n,), and pairs of particles that can move and are
+    held together by constraints or bodies, (m, 2)."""
     pairs, (driven, kept) = [np.zeros((0, 2), dtype=np.int64)], np.zeros((2, len(inv_mass)), dtype=bool)
     for b in drivers:
         driven[b.indices] = True

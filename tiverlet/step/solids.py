@@ -11,37 +11,68 @@ from .rigid_rows import HEAVY
 
 
 class Solids:
-    """The clusters of a world that share no particle with another one, at positions x (n, dim).
+    """Clusters that share no particle with another one, with the shapes that they have at rest or under their loads.
 
-    Each keeps the shape that it has there, but for what passes have left undone of it, Z as in projection.py: ratio^2 of that
-    stays. Particle k belongs to owner[k] and is who[k], of mass m[k]. worst: |Z|, as a share of the radius of its cluster.
+    Corner k belongs to cluster owner[k] and is particle who[k], of mass m[k]. worst: the largest deformation that passes have
+    left in a cluster, as a share of its radius.
     """
 
-    def __init__(self, runner: Any, x: np.ndarray, ratio: float):
-        w, h, clusters = runner.scene.inv_mass, runner.clock.h, [b for b in runner.batches if b.clusters and b.count]
-        degree = np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices for b in clusters)]), minlength=len(w))
-        self.count, self.free, self.worst = 0, (w > 0)[:, None], 0.0
-        parts = []
-        for b in clusters:
-            some = (np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) == 1) & ~b.idle(w) & ~b.broken
-            if some.any():
-                owner = self.count + np.cumsum(some) - 1
-                columns = b.indices, owner[b.owner], *_state(b, w, h, h2_effective_of(runner.clock))
-                parts.append([column[some[b.owner]] for column in columns])
-                self.count += int(some.sum())
+    def __init__(self, w: np.ndarray, parts: list[tuple[np.ndarray, ...]]):
+        """Declare bodies. w: (n,) inverse masses. parts: for each batch the particle, cluster and rest shape of each corner."""
+        self.count, self.free, self.worst = sum(1 + int(owner.max()) for _, owner, *_ in parts), (w > 0)[:, None], 0.0
         if not self.count:
             return
-        self.who, self.owner, q, last, pull, now, give = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        first = np.cumsum([0, *(1 + int(owner.max()) for _, owner, *_ in parts)])
+        self.who, q = (np.concatenate([part[k] for part in parts]) for k in (0, 2))
+        self.owner = np.concatenate([owner + k for (_, owner, *_), k in zip(parts, first, strict=False)])
         m = np.divide(1, w[self.who], out=np.zeros(len(self.who)), where=w[self.who] > 0)
         self.m = np.where(m > 0, m, HEAVY * np.bincount(self.owner, m)[self.owner])
         self.total = np.bincount(self.owner, self.m)
         self.shape = q - self._means(q)
-        off, turn = x[self.who] - self._placed(x), self.turn[self.owner]
-        off, pull = np.einsum("kba,kb->ka", turn, off), np.einsum("kba,kb->ka", turn, pull)
-        undone = now[:, None] * off + (1 - now)[:, None] * last + give[:, None] * pull
-        radius = np.sqrt(np.bincount(self.owner, self.m * (self.shape**2).sum(axis=1)) / self.total)[self.owner]
-        self.worst = float(np.divide(np.linalg.norm(undone, axis=1), radius, out=np.zeros_like(radius), where=radius > 0).max())
-        self.shape = self.shape + off - (1 - ratio**2) * undone
+        self.radius = np.sqrt(np.bincount(self.owner, self.m * (self.shape**2).sum(axis=1)) / self.total)[self.owner]
+
+    @staticmethod
+    def loaded(runner: Any, x: np.ndarray, ratio: float) -> "Solids":
+        """Return the clusters with the shapes that they have at x, (n, dim), without a part of their residual deformation.
+
+        The residual Z of passes is that of projection.py; ratio^2 of it stays.
+        """
+        w, h, h2_effective = runner.scene.inv_mass, runner.clock.h, h2_effective_of(runner.clock)
+        found = [(b, some) for b, some in _apart(runner.batches, w) if some.any()]
+        columns = [(b.indices, b.owner, *_state(b, w, h, h2_effective)) for b, _ in found]
+        parts = [_of(b, some, rows) for (b, some), rows in zip(found, columns, strict=True)]
+        out = Solids(w, parts)
+        if out.count:
+            last, pull, now, give = (np.concatenate([part[k] for part in parts]) for k in range(3, 7))
+            off, turn = x[out.who] - out._placed(x), out.turn[out.owner]
+            off, pull = np.einsum("kba,kb->ka", turn, off), np.einsum("kba,kb->ka", turn, pull)
+            undone = now[:, None] * off + (1 - now)[:, None] * last + give[:, None] * pull
+            out.worst = float(out._shares(undone).max())
+            out.shape = out.shape + off - (1 - ratio**2) * undone
+        return out
+
+    @staticmethod
+    def rigid(batches: list[Any], w: np.ndarray, first: int = 0) -> "Solids":
+        """Return the rigid clusters with any particle from `first` on, with their rest shapes. worst: deformation by loads."""
+        parts = []
+        for b, some in _apart(batches, w):
+            some &= (b.compliance == 0) & (np.maximum.reduceat(b.indices, b.members.starts[:-1]) >= first)
+            if some.any():
+                read, corners = b.scene.memory.read, len(b.owner)
+                columns = b.indices, b.owner, read(b.dev.shape)[:corners], read(b.dev.pull)[:corners].astype(np.float64)
+                parts.append(_of(b, some, columns))
+        out = Solids(w, parts)
+        if out.count:  # passes undo in each substep the deformation that loads have caused
+            out.worst = float(out._shares(np.concatenate([part[3] for part in parts])).max())
+        return out
+
+    def _shares(self, way: np.ndarray) -> np.ndarray:
+        """Return the lengths of vectors of corners, as shares of the radius of their cluster, (corners,)."""
+        return np.divide(np.linalg.norm(way, axis=1), self.radius, out=np.zeros_like(self.radius), where=self.radius > 0)
+
+    def far(self, x: np.ndarray) -> np.ndarray:
+        """Return how far movable particles at x are from the best fit of their cluster's shape, as shares of its radius."""
+        return self._shares(np.where(self.free, x - self.fitted(x), 0.0)[self.who]) if self.count else np.zeros(0)
 
     def _means(self, values: np.ndarray) -> np.ndarray:
         """Return the mass-weighted mean over its body, for each particle."""
@@ -94,6 +125,19 @@ class Solids:
             return np.where(self.free, out, moves)
 
         return project
+
+
+def _apart(batches: list[Any], w: np.ndarray) -> list[tuple[Any, np.ndarray]]:
+    """Return each batch of clusters, and a mask, (m,), of those that share no particle, are not broken, and can move."""
+    clusters = [b for b in batches if b.clusters and b.count]
+    degree = np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices for b in clusters)]), minlength=len(w))
+    return [(b, (np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) == 1) & ~b.idle(w) & ~b.broken) for b in clusters]
+
+
+def _of(batch: Any, some: np.ndarray, columns: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+    """Return the columns (particles, owners, others) for the clusters in the mask `some`, (m,), with owners renumbered."""
+    who, owner, *others = (column[some[batch.owner]] for column in columns)
+    return who, (np.cumsum(some) - 1)[owner], *others
 
 
 def _state(batch: Any, w: np.ndarray, h: float, h2_effective: float) -> tuple[np.ndarray, ...]:

@@ -1,21 +1,21 @@
-"""What a launch, and each phase in it, is told: spans, moments, and the sheet on which the host writes them."""
+"""The arguments of launches and phases: Span (which part of a frame), Moment (where in it), and the sheet of host and device."""
 
 from struct import Struct
 
 from ..device import at, inline, record, ti
 
-BEFORE = -1  # the half of a pass in which a substep is that has not begun
+BEFORE = -1  # the `half` of a substep that has not begun
 
 
 @record
 class Span:
-    """What a launch is to do.
+    """The part of a frame that a launch covers.
 
-    h64: the substep (of orders above 2: its first stage) [s]. start, end: of the frame [s]. tick, since: substeps so far, and
-    since the last start. fresh: whether displacements are velocities; owed: [s] of the kick by rigid constraints that these lack.
-    state_origin: how the state that it leaves came about, see
-    Diagnostics. substeps, iterations: of the frame. begin, until: substeps of it that this launch makes. part: iterations of the
-    last of these. resumed: 1 where `begin` was interrupted before its `half`-th half of a pass.
+    h64: length of the substep (in orders above 2, of its first stage) [s]. start, end: of the frame [s]. tick, since: number of
+    substeps so far, and since the last start. fresh: whether displacements hold velocities. owed: the kick by rigid constraints
+    that these velocities lack, as a time [s]. state_origin: how the state came about, see Diagnostics. substeps, iterations: of
+    the frame. begin, until: the substeps of this launch. part: iterations in the last of them. resumed: 1 if substep `begin` was
+    interrupted before its half of a pass number `half`.
     """
 
     def __init__(
@@ -30,12 +30,13 @@ class Span:
 
 @record
 class Moment:
-    """What phases have to know of the substep, and of the pass over the constraints, in which they are.
+    """The substep, and the pass over the constraints, in which a phase runs.
 
-    s, h, last, time: number, length, length of the one before, start [s]. frame_fraction: where it starts and ends in the frame.
-    fresh: whether it is a start. damps: whether sound is taken out after it. final: whether it is the last of the frame.
-    it: the pass. first: whether multipliers begin in it. checks_list: whether it is checked after it if the list is stale; the
-    next substep does so, too. half: of the passes, counted through. newton: the step of Newton's method in the pass, 0 or 1.
+    s, h, last, time: number of the substep, its length, the length of the one before, its beginning [s]. frame_fraction: where it
+    begins and ends in the frame. fresh: whether it is a start. damps: whether sound is damped after it. final: whether it is the
+    last of the frame. it: number of the pass. first: whether multipliers begin in this pass. checks_list: whether the pass ends
+    with a check for a stale list (every substep begins with one, too). half: number of the half, counted through all passes.
+    newton: the Newton step within the pass, 0 or 1.
     """
 
     def __init__(
@@ -48,7 +49,7 @@ class Moment:
 
     @inline
     def of(self, it, first=0, checks_list=0, half=0, newton=0):
-        """The same, in a pass."""
+        """The same substep, in this pass."""
         return Moment(
             self.span, self.s, self.h, self.last, self.time, self.tick, self.frame_fraction, self.fresh, self.damps, self.final,
             it, first, checks_list, half, newton,
@@ -56,30 +57,30 @@ class Moment:
 
     @inline
     def newton_step(self, k):
-        """The same, in the k-th step of Newton's method in its pass."""
+        """The same pass, in its k-th Newton step."""
         return self.of(self.it, self.first * (1 - k), self.checks_list, self.half, k)
 
 
-# The sheet of a frame, one array, since a launch takes 0.25 us more for each. First what the frame came to, see Diagnostics; then
-# how it ended: whether, in which substep and before which half of a pass it stopped to have the list grown; how many threads of a
-# team were at work. Then what it is given, see Span, and the number of the first thread.
+# The sheet of a frame is one array, since each further array costs 0.25 us per launch. First the figures of the report, see
+# Diagnostics. Then how the frame ended: whether it stopped, in which substep, before which half of a pass; and how many threads
+# of the team were active. Then its arguments, see Span, with the number of the first thread.
 FIGURES = 15
 HALT, ACTIVE_THREADS = FIGURES, FIGURES + 3
 GIVEN = tuple(range(ACTIVE_THREADS + 1, ACTIVE_THREADS + 17))
 H, START, END, TICK, SINCE, FRESH, OWED, SUBSTEPS, ITERATIONS, BEGIN, HALF, RESUMED, FIRST, ORIGIN, UNTIL, PART = GIVEN
 SHEET = PART + 1
-GIVE = Struct(f"{len(GIVEN)}d").pack_into  # in a third of the time of an assignment to an array
+GIVE = Struct(f"{len(GIVEN)}d").pack_into  # takes a third of the time of an array assignment
 
 
 @inline
 def integer(sheet, k):
-    """An integer on it."""
+    """Entry k of a sheet as an integer."""
     return ti.cast(at(sheet, k), ti.i32)
 
 
 @ti.func
 def span_on(sheet: ti.template(), thread):  # type: ignore[valid-type]
-    """The span that is on it, for a thread."""
+    """Read the Span of a thread from a sheet."""
     h64, start, end = sheet[H], sheet[START], sheet[END]
     tick, since, fresh = integer(sheet, TICK), integer(sheet, SINCE), integer(sheet, FRESH)
     owed, state_origin = sheet[OWED], integer(sheet, ORIGIN)

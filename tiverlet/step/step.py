@@ -1,8 +1,9 @@
 """The step from top to bottom, and its kernels.
 
-frame() and substep() are the order of the phases, for every path. Taichi compiles them into one kernel, where `do` is a Step:
-a whole frame in one launch, by one CPU thread or a team of them ("fused" and "parallel"). Where each phase is launched by itself,
-as on a GPU, Python runs the same lines, and `do` is a Launcher (launcher.py). Higher orders differ in the integrator alone.
+frame() and substep() define the order of the phases for every path. On the fused and the parallel path, Taichi compiles them into
+one kernel: `do` is a Step, and one launch makes a whole frame, on one CPU thread or a team of threads. On the launched path, as
+on a GPU, Python runs the same lines: `do` is a Launcher (launcher.py), and each phase is a launch. Higher orders differ only in
+the integrator.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -21,12 +22,12 @@ from .span import ACTIVE_THREADS, BEFORE, FIRST, HALT, Moment, Span, integer, sp
 if TYPE_CHECKING:
     from ..colliders.collider import Collider
 
-REBOUNDS = 8  # rounds of restitution in a substep, at most
+REBOUNDS = 8  # most rounds of restitution in a substep
 
 
 @ti.pyfunc
 def frame(do, span):
-    """A frame: its substeps, and what they came to. The last round is for the list that diagnose() needs."""
+    """One frame: its substeps, then the report. The last round of the loop is for the neighbour list that diagnose() needs."""
     for s in range(span.begin, span.until):
         now = do.moment(span, s)
         if do.works(now):
@@ -37,8 +38,11 @@ def frame(do, span):
 
 @ti.pyfunc
 def substep(do, now):
-    """A substep. Where there are constraints and contacts, a pass has two halves, and each begins with a good list. In the first,
-    constraints may need a second step of Newton's method."""
+    """One substep.
+
+    In scenes with constraints and contacts a pass has two halves, constraints and then contacts. Each half begins with a valid
+    neighbour list. Constraints may take a second Newton step in the first half.
+    """
     if ti.static(do.has_pair_forces):
         if do.begins(now):
             do.evaluate_pair_forces(now)
@@ -78,13 +82,13 @@ def substep(do, now):
 class Step:
     """The phases as loops on the device, and the kernels of one world.
 
-    A `thread` goes through each of them, see Team. Where there is no team, loops are serial inside the fused kernel, and Taichi
-    spreads them over threads at the top of the others.
+    Every thread of the team runs each phase on its own share, see Team. Without a team, loops are serial inside the fused kernel,
+    and Taichi spreads the outermost loops of other kernels over threads.
     """
 
-    diagnostics: Any  # what sums up a frame; given once it is there
-    sleep: Any = None  # the SleepPass, where there is one
-    n: Any = OnDevice()  # particles
+    diagnostics: Any  # computes the report of a frame; set after construction
+    sleep: Any = None  # the SleepPass, in worlds with Sleep
+    n: Any = OnDevice()  # number of particles
 
     def __init__(
         self, scene: Scene, integrator: Any, batches: list[Batch], drivers: list[Batch], contact: Any, search: Any,
@@ -98,23 +102,23 @@ class Step:
         self.sheared = bool(scene.state.images and scene.state.images.sheared)
         self.breakers: list[Any] = [b for b in batches if b.breaks]
         self.launched = team.launched
-        # Iterations of a loop for each of few pieces of work: to each CPU thread Taichi gives LEAST of them, at least.
+        # Loop iterations per piece of work in short loops: Taichi gives each CPU thread at least LEAST iterations.
         self.stride = LEAST if self.launched and runtime.architecture() == "cpu" else 1
         self.particles = ParticlePass(scene, integrator, batches, contact, search, walls, team)
         self.constraints = ConstraintPass(scene, integrator, batches, team, self.stride)
         self.contact_pass = ContactPass(scene, contact, self.particles, team)
         self.contacts = self.particles.contacts
-        self.halves = 2 if batches and contact else 1  # of a pass, each with a list that is good
+        self.halves = 2 if batches and contact else 1  # of a pass; each begins with a valid list
         self.impacts: Any = scene.impacts
         self.has_impacts = bool(scene.impacts)
-        self.newton_steps = 2 if scene.slots and scene.slots.refines else 1  # in a pass, at most
+        self.newton_steps = 2 if scene.slots and scene.slots.refines else 1  # most of them in a pass
         self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
         self.orients = self.state.spins and self.state.spin.orients
         keeps = self.contact_pass.remembers or bool(self.breakers)
         self.finishes = keeps or self.orients or bool(self.wall_logs) or bool(self.constraints.learners)
         self.hashes = bool(search)
         self.sleepers = scene.state.sleepers
-        self.looks = bool(search) and bool(self.sleepers)  # for what touches those that sleep
+        self.looks = bool(search) and bool(self.sleepers)  # for contacts between awake and sleeping particles
         self.detects = any(c.detects for c in self.contacts)
         apart = search and search.lone and not self.launched and not scene.memory.compiler.few
         self.strays: Any = Strays(scene, search, team) if apart else None
@@ -129,7 +133,7 @@ class Step:
 
     @ti.kernel
     def fused(self, sheet: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
-        """All substeps of a frame, in one launch, and what it came to; without substeps that alone."""
+        """Run all substeps of a frame and its diagnostics in one launch; with 0 substeps, only the diagnostics."""
         ti.loop_config(serialize=self.team.size == 1)
         for thread in range(self.team.spread):
             if thread % LEAST == 0:
@@ -137,8 +141,10 @@ class Step:
 
     @ti.func
     def run(self, thread, sheet: ti.template()):  # type: ignore[valid-type]
-        """What a thread does of a frame. All threads of a team take the same branches, for what they depend on is written only
-        where the others wait."""
+        """Run one thread's share of a frame.
+
+        All threads of a team take the same branches: the values that branches depend on are written only while the others wait.
+        """
         read_all(self.numbers)
         frame(self, span_on(sheet, thread))
         if thread == 0:
@@ -151,18 +157,18 @@ class Step:
         self, names: ti.template(), h64: ti.f64, start: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32,  # type: ignore[valid-type]
         owed: ti.f64, s: ti.i32, substeps: ti.i32, iterations: ti.i32, half: ti.i32,
     ):  # fmt: skip
-        """Some phases of a substep, by their names. Nothing is returned: that would be waited for."""
+        """Run some phases of a substep, by name. It returns nothing, because the host would have to wait for a result."""
         now = self.turn(self.moment(Span(h64, start, start, tick, since, fresh, owed, 0, substeps, iterations), s), half)
         for phase, k in ti.static(self.named(names)):
             phase(now.newton_step(k))
 
     def named(self, names: str) -> list[tuple[Any, int]]:
-        """The phases of these names, one after the other, and in which step of Newton's method."""
+        """The phases with these names, in order, each with the number of its Newton step (1 for names that end in ')."""
         return [(getattr(self, name.rstrip("'")), int(name.endswith("'"))) for name in names.split()]
 
     @ti.func
     def moment(self, span, s):
-        """Substep s of a frame; where s = span.substeps, what comes after them."""
+        """The Moment of substep s of a frame; s = span.substeps is the round after the last substep."""
         h, last, time, frame_fraction = self.integrator.times(span, s)
         tick, fresh, final = span.tick + s, ti.select(s == 0, span.fresh, 0), ti.cast(s == span.substeps - 1, ti.i32)
         damps = ti.cast((span.since + s) % EVERY == EVERY - 1, ti.i32)
@@ -170,26 +176,26 @@ class Step:
 
     @ti.func
     def turn(self, now, half):
-        """A pass over the constraints, by its first or second half."""
+        """The Moment of one half of a pass; halves are counted through all passes of the substep."""
         it = half // self.halves
         first = ti.cast(it == 0, ti.i32)
-        another = it + 1 < now.span.iterations or self.has_impacts  # there may be
+        another = it + 1 < now.span.iterations or self.has_impacts  # a further pass may follow
         checks_list = ti.select(another, 1, now.final)
         return now.of(it, first, checks_list, half)
 
     @ti.func
     def works(self, now):
-        """Whether the thread takes part in this substep; all must ask."""
+        """Whether this thread takes part in the substep. All threads must call it."""
         return self.team.works(now.thread) and self.halted() == 0
 
     @ti.func
     def again(self, now):
-        """1 where the substep goes on in the middle."""
+        """1 if the substep resumes in the middle, after the frame stopped there."""
         return ti.select(now.s == now.span.begin, now.span.resumed, 0)
 
     @ti.func
     def enters(self, now):
-        """Whether the substep begins here, with what it needs."""
+        """Whether the substep begins here, with valid lists."""
         out = now.s < now.span.substeps and self.again(now) == 0
         if ti.static(len(self.listed_forces) > 0):
             out = out and self.halted() == 0
@@ -197,17 +203,17 @@ class Step:
 
     @ti.func
     def begins(self, now):
-        """Whether the substep, or what comes after all of them, begins here."""
+        """Whether this round (a substep, or the one after all substeps) begins here instead of resuming."""
         return self.again(now) == 0
 
     @ti.func
     def first_half(self, now):
-        """The half of a pass in which it begins or goes on."""
+        """The half of a pass in which the substep begins or resumes."""
         return ti.select(self.again(now) != 0, now.span.half, 0)
 
     @ti.func
     def last_half(self, now):
-        """The one before which it ends; after all substeps there is one more for the list."""
+        """The half of a pass before which the substep ends. The round after all substeps has one half, for the list."""
         passes = now.span.part
         if ti.static(self.has_impacts):
             passes += ti.select(now.span.part == now.span.iterations, self.impacts.passes, 0)
@@ -215,7 +221,7 @@ class Step:
 
     @ti.func
     def regular(self, now, half):
-        """Whether this half of a pass is one of those that every substep has."""
+        """Whether every substep has this half of a pass; bodies that struck walls add further ones."""
         out = True
         if ti.static(self.has_impacts):
             out = half < now.span.iterations * self.halves or now.s >= now.span.substeps
@@ -223,7 +229,7 @@ class Step:
 
     @ti.func
     def goes_on(self, now, half):
-        """Whether there is this half of a pass: beyond those of every substep, only where bodies struck walls."""
+        """Whether this half of a pass is run: always if it is regular, else only if bodies struck walls."""
         out = True
         if ti.static(self.has_impacts):
             if not self.regular(now, half):
@@ -232,7 +238,7 @@ class Step:
 
     @ti.func
     def solves(self, now):
-        """Whether there is a pass to go through, with a good list."""
+        """Whether there is a pass to run, with a valid list."""
         return now.s < now.span.substeps and self.halted() == 0
 
     @ti.func
@@ -247,15 +253,14 @@ class Step:
 
     @ti.func
     def evaluate_pair_forces(self, now):
-        """What particles do to each other where they are now, before any of them moves."""
+        """Compute the forces between pairs of particles at the present positions, before any particle moves."""
         self.list_pairs(now)
         if self.halted() == 0:
             self.sum_pair_forces(now)
 
     @ti.func
     def list_pairs(self, now):
-        """Build the lists of forces between particles anew where they are stale. Where one has no room for all pairs, the frame
-        stops."""
+        """Rebuild the stale neighbour lists of pair forces. If a list has no room for all pairs, the frame stops."""
         self.look_for_motion(now)
         for f in ti.static(self.listed_forces):
             if f.dev.list.stale[None] != 0:
@@ -266,7 +271,7 @@ class Step:
 
     @ti.func
     def look_for_motion(self, now):
-        """Find out which of these lists are stale."""
+        """Mark the lists of pair forces that are stale."""
         for f in ti.static(self.listed_forces):
             for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                 if f.dev.search.moved_too_far(i) != 0:
@@ -275,7 +280,7 @@ class Step:
 
     @ti.func
     def ask_for_pairs(self, now):
-        """Where phases are launched: have their lists built that are stale, see ask_for_list()."""
+        """On the launched path: stop the frame so that the host rebuilds stale lists of pair forces, see ask_for_list()."""
         self.look_for_motion(now)
         for f in ti.static(self.listed_forces):
             ti.loop_config(serialize=True)
@@ -285,7 +290,7 @@ class Step:
 
     @ti.func
     def sum_pair_forces(self, now):
-        """Sum up the forces between particles, with good lists."""
+        """Sum the forces between pairs of particles, with valid lists."""
         for f in ti.static(self.pair_forces):
             for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                 f.evaluate(i)
@@ -293,7 +298,7 @@ class Step:
 
     @ti.func
     def integrate(self, now):
-        """Particles move on their own. Walls go to where they are in this substep."""
+        """Move every particle by its displacement and forces, and pose moving walls for this substep."""
         if ti.static(self.integrator.springs_pull):
             self.constraints.spring_forces(now.thread, now.h)
             if now.s % self.integrator.stages == self.integrator.longest + 1:
@@ -324,13 +329,13 @@ class Step:
 
     @ti.func
     def drive(self, now):
-        """Driven particles go to where they are to be."""
+        """Put driven particles at their targets."""
         for f in ti.static(self.drivers):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                 f.dev.place.drive(c, now.h, now.frame_fraction[1])
-                if ti.static(self.state.befores):  # at the velocity with which it is driven, others meet it
+                if ti.static(self.state.befores):  # impacts see the velocity with which the particle is driven
                     self.state.before[f.dev.corners.member(c, 0)] = self.state.d[f.dev.corners.member(c, 0)]
-                if ti.static(self.integrator.uses_velocity):  # nothing else acts on it, should it be let go
+                if ti.static(self.integrator.uses_velocity):  # no reaction is counted if the particle is released
                     self.integrator.free[f.dev.corners.member(c, 0)] = self.state.d[f.dev.corners.member(c, 0)]
                 for k in ti.static(self.contacts):
                     k.note_motion(self.search.moved_too_far(f.dev.corners.member(c, 0)), k.overshoots(f.dev.corners.member(c, 0)))
@@ -338,7 +343,7 @@ class Step:
 
     @ti.func
     def update_neighbours(self, now, half):
-        """Build the list of neighbours anew where it is stale. Where it has no room for all of them, the frame stops."""
+        """Rebuild the neighbour list if it is stale. If it has no room for all pairs, the frame stops."""
         if ti.static(self.hashes):
             if self.halted() == 0 and self.is_stale() != 0:
                 if ti.static(bool(self.strays)):
@@ -356,12 +361,12 @@ class Step:
     @called
     @ti.func
     def list_particles(self, thread: ti.i32):
-        """Build it."""
+        """Build the neighbour list."""
         self.search.build(thread)
 
     @ti.func
     def look_for_sleepers(self, now):
-        """Call those that are touched; the frame stops for them to wake, before contacts are solved."""
+        """Mark sleeping particles that are touched. The frame stops to wake them before contacts are solved."""
         for c in ti.static(self.contacts):
             if ti.static(c.detects):
                 n = ti.select(now.half % self.halves == self.halves - 1 or self.sleepers.count[None] > 0, self.n, 0)
@@ -375,7 +380,7 @@ class Step:
 
     @ti.func
     def ask_to_wake(self, now):
-        """Where phases are launched: have the frame stop for those that were called."""
+        """On the launched path: stop the frame if sleeping particles were marked."""
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, now.thread)):
             if self.sleepers.calls[None] != 0:
@@ -383,7 +388,7 @@ class Step:
 
     @ti.func
     def ask_for_list(self, now):
-        """Where phases are launched: have a list built that is stale. The frame waits for it, see Team."""
+        """On the launched path: stop the frame if the list is stale, so that the host rebuilds it, see Team."""
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, now.thread)):
             if self.is_stale() != 0:
@@ -391,45 +396,45 @@ class Step:
 
     @ti.func
     def solve_constraints(self, now):
-        """Every constraint leaves the moves that it wants, or tells its system what it is about."""
+        """Every constraint writes the moves that it wants to its slots, or its row to the system that solves it."""
         self.constraints.solve(now)
 
     @ti.func
     def solve_systems(self, now):
-        """Chains and cloth are solved together."""
+        """Solve systems of coupled constraints: chains, cloth."""
         if ti.static(len(self.constraints.systems) > 0):
             self.solve_each(now.thread, now.newton)
 
     @called
     @ti.func
     def solve_each(self, thread: ti.i32, newton: ti.i32):
-        """Each system."""
+        """Solve each system, in the Newton step `newton`."""
         self.constraints.solve_systems(thread, newton)
 
     @ti.func
     def start_systems(self, now):
-        """Where phases are launched: begin the systems that iterate."""
+        """On the launched path: start the iterative systems."""
         self.constraints.start_systems(now.thread)
 
     @ti.func
     def iterate_systems(self, now):
-        """Where phases are launched: one iteration of theirs."""
+        """On the launched path: one iteration of the iterative systems."""
         self.constraints.iterate_systems(now.thread)
 
     @ti.func
     def update_multipliers(self, now):
-        """Add the steps that systems found to the multipliers."""
+        """Add the steps that systems computed to the multipliers."""
         self.constraints.update_multipliers(now)
 
     @ti.func
     def apply_constraints(self, now):
-        """Particles move as constraints want before contacts are solved, or the next step of Newton's method is taken."""
+        """Move particles as constraints want, before contacts are solved or the next Newton step is taken."""
         if ti.static(self.particles.applies_first):
             self.particles.apply_constraints(now)
 
     @ti.func
     def unmet(self, now):
-        """Whether any system is to take a second step of Newton's method. Where there are more passes, these are such steps."""
+        """Whether any system needs a second Newton step. With several iterations it does not: every pass is a Newton step."""
         out = False
         if ti.static(self.newton_steps > 1):
             out = now.span.iterations == 1 and self.slots.system.any_unmet[None] != 0
@@ -437,12 +442,12 @@ class Step:
 
     @ti.func
     def solve_contacts(self, now):
-        """Every pair in contact is worked out from both sides."""
+        """Solve every pair in contact, from both sides."""
         self.contact_pass.solve(now)
 
     @ti.func
     def struck(self):
-        """1 when a pair bounces in this substep."""
+        """1 if a pair bounces in this substep."""
         return self.contact_pass.struck()
 
     @ti.func
@@ -452,15 +457,16 @@ class Step:
 
     @ti.func
     def apply_corrections(self, now):
-        """Particles move as contacts, or constraints, want; walls have the last word."""
+        """Move particles as contacts and constraints want; walls have the last word."""
         self.particles.apply_corrections(now)
 
     @ti.func
     def finish_substep(self, now):
-        """What bears too much breaks; loads become known; contacts keep what friction and restitution need; the orientation of
-        what spins follows; as a frame ends, walls keep what touches them.
+        """Break overloaded constraints, learn loads, store what friction and restitution need, and turn orientations. In the last
+        substep of a frame, walls close their logs of events.
 
-        At a start loads act for half a kick, and rigid constraints do what velocities lack, too: see Integrator.h2_rigid().
+        At a start loads act for half a kick, and rigid constraints also supply the kick that velocities lack: see
+        Integrator.h2_rigid().
         """
         h2_effective = self.integrator.h2_effective(now.h, now.fresh)
         h2_rigid = self.integrator.h2_rigid(now.h, now.fresh, ti.cast(now.span.owed, self.real))
@@ -481,25 +487,25 @@ class Step:
 
     @ti.func
     def project_contact_velocities(self, now):
-        """Every 32 substeps: take the sound out of loaded contacts."""
+        """Every 32 substeps: damp sound in loaded contacts."""
         self.damp_sound(now.thread, now.it)
 
     @called
     @ti.func
     def damp_sound(self, thread: ti.i32, it: ti.i32):
-        """One pass of it."""
+        """One pass of project_contact_velocities()."""
         self.contact_pass.project_velocities(thread, it)
 
     @ti.func
     def diagnose(self, now):
-        """Sum up the figures of the frame."""
+        """Reduce the state to the figures of the frame's report."""
         self.diagnostics.reduce_blocks(now.thread, now.span.h64, now.span.state_origin)
         self.diagnostics.sum_up(now.thread, now.span.h64, now.span.end, now.span.state_origin, now.span.sheet)
         self.team.reset_wait_count()
 
     @ti.func
     def is_stale(self):
-        """1 when the neighbour list has to be built anew."""
+        """1 if the neighbour list has to be rebuilt."""
         out = 0
         if ti.static(self.hashes):
             out = self.search.list.stale[None]
@@ -507,14 +513,14 @@ class Step:
 
     @ti.func
     def tell_halt(self, sheet: ti.template()):  # type: ignore[valid-type]
-        """Write on the sheet whether, and where, the frame stopped to have the list grown, or built."""
+        """Write to the sheet whether and where the frame stopped, for the host to grow or build a list."""
         if ti.static(len(self.searches) > 0):
             for k in ti.static(range(3)):
                 sheet[HALT + k] = self.halt[None][k]
 
     @ti.func
     def halted(self):
-        """1 when the frame waits for a longer list."""
+        """1 if the frame has stopped and waits for the host."""
         out = 0
         if ti.static(len(self.searches) > 0):
             out = self.halt[None][0]
@@ -522,20 +528,20 @@ class Step:
 
     @ti.kernel
     def listed(self, k: ti.template()) -> ti.i32:  # type: ignore[valid-type]
-        """Build the k-th neighbour list where frames do not; returns the largest number of entries that a block needs."""
+        """Build the k-th neighbour list outside of a frame. Returns the largest number of entries that a block needs."""
         self.searches[k].build(0)
         return self.searches[k].list.need[None]
 
     @ti.kernel
     def shrunk(self, first: ti.i32):
-        """Make particles that overlap with those from number `first` on small enough to fit, from where they grow back."""
+        """Shrink particles that overlap any of number `first` or above until they fit; contacts let them grow back."""
         for c in ti.static(self.contacts):
             for i in range(self.n):
                 c.shrink(i, first)
 
     @ti.kernel
     def stopped(self, old: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
-        """Walls, where they are as a frame begins, stop what the host has moved from `old`, (n, dim), between two substeps."""
+        """Stop particles at walls, posed as at the beginning of a frame, after the host moved them from `old`, (n, dim)."""
         for w in ti.static(self.posed):
             for _ in range(1):
                 w.pose(ti.Vector([0, 0], self.real))
@@ -557,18 +563,18 @@ class Step:
     def to_velocity(self, given: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """Turn displacements into velocities, for a start with another h or another state. given: h, t.
 
-        Springs count with their force at x_n. Rigid links do not: the part of v_n along them is what the next substep corrects,
-        and across them d / h + h a / 2 is what RATTLE has, so nothing is lost to second order nor to any other.
+        Springs count with their force at x_n. Rigid links do not count: the next substep corrects the part of v_n along them, and
+        across them d / h + h a / 2 is the velocity of RATTLE, so no order of accuracy is lost.
         """
         if ti.static(self.particles.whole):
-            if given[0] > 0:  # loops inside of a branch wake no threads
+            if given[0] > 0:  # Taichi wakes no threads for loops inside a branch
                 self.turn_to_velocity(given[0], given[1])
         else:
             self.turn_to_velocity(given[0], given[1])
 
     @ti.func
     def turn_to_velocity(self, h64, t64):
-        """To where displacements are."""
+        """Overwrite displacements with velocities, after a substep h at time t."""
         h, t = ti.cast(h64, self.real), ti.cast(t64, self.real)
         if ti.static(self.constraints.springs):
             if ti.static(self.team.size == 1):
@@ -590,55 +596,55 @@ class Step:
 
     @ti.kernel
     def spins(self, given: ti.types.ndarray(ti.f64, 1), out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
-        """Velocities r omega of surfaces, (n, axes). given: h, t, firm and soft, as those of velocities()."""
+        """Write surface velocities r omega to `out`, (n, axes). given: h, t, firm, soft, as in velocities()."""
         if ti.static(self.particles.whole):
-            if given[0] > 0:  # loops inside of a branch wake no threads
+            if given[0] > 0:  # Taichi wakes no threads for loops inside a branch
                 self.write_spins(given, out)
         else:
             self.write_spins(given, out)
 
     @ti.func
     def write_spins(self, given: ti.template(), out: ti.template()):  # type: ignore[valid-type]
-        """To an array."""
+        """Body of spins()."""
         self.write_reactions(given[0], given[2], given[3])
         for i in range(self.n):
             h, time, firm = ti.cast(given[0], self.real), ti.cast(given[1], self.real), ti.cast(given[2], self.real)
-            v = self.particles.surface_velocity(i, h, time, firm)
+            v = self.particles.surface_velocity(i, h, time, firm, ti.cast(given[3], self.real))
             for k in ti.static(range(self.state.spin.axes)):
                 out[i, k] = v[k]
 
     @ti.kernel
     def velocities(self, given: ti.types.ndarray(ti.f64, 1), out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
-        """Velocities as the user sees them. given: h, t, firm and soft of Batch.push_reaction, of which particles: the first of
-        them, and that behind the last; and firm for contacts and walls.
+        """Write velocities as the user sees them to `out`, (n, dim). given: h, t, the shares `firm` and `soft` of
+        Passes.push_reaction, the first particle, the one behind the last, and `firm` for contacts and walls.
 
-        With the forces of constraints at x_n along the directions there they are second order, and have the momentum and the
-        angular momentum of the motion, sum m x_n x (x_n - x_(n-1)) / h and what forces from outside add in h / 2. Springs are
-        asked for their force at x_n, so that a start from these velocities neither pumps nor brakes them.
+        With the forces of constraints at x_n, along the directions at x_n, velocities are second order. They have the momentum
+        and the angular momentum of the motion, sum m x_n x (x_n - x_(n-1)) / h plus what external forces add in h / 2. Springs
+        enter with their force at x_n, so that a start from these velocities neither pumps nor brakes them.
         """
         if ti.static(self.particles.whole):
-            if given[0] > 0:  # loops inside of a branch wake no threads
+            if given[0] > 0:  # Taichi wakes no threads for loops inside a branch
                 self.write_velocities(given, out)
         else:
             self.write_velocities(given, out)
 
     @ti.func
     def write_velocities(self, given: ti.template(), out: ti.template()):  # type: ignore[valid-type]
-        """To an array."""
+        """Body of velocities()."""
         self.write_reactions(given[0], given[2], given[3])
         for i in range(integer(given, 4), integer(given, 5)):
-            v = self.velocity_of(i, given[0], given[1], given[6])
+            v = self.velocity_of(i, given[0], given[1], given[6], given[3])
             for k in ti.static(range(self.dim)):
                 out[i, k] = v[k]
 
     @ti.func
     def write_reactions(self, h64, firm64, soft64):
-        """What constraints accelerate by, to the slots."""
+        """Write the accelerations by constraints to their slots."""
         self.constraints.reactions(ti.cast(h64, self.real), ti.cast(firm64, self.real), ti.cast(soft64, self.real))
 
     @ti.func
-    def velocity_of(self, i, h64, t, firm64):
-        """The velocity of one particle, once reactions() of constraints are in the slots."""
+    def velocity_of(self, i, h64, t, firm64, soft64):
+        """The velocity of particle i, once write_reactions() has filled the slots."""
         h, time, firm = ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real)
-        reaction, _part = self.particles.reaction(i, h, time, firm)
+        reaction, _part = self.particles.reaction(i, h, time, firm, ti.cast(soft64, self.real))
         return self.integrator.velocity_after(i, h, time, reaction)

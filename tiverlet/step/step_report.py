@@ -1,40 +1,41 @@
-"""What a frame came to, as the user gets it."""
+"""The report of a frame, as the user gets it."""
 
 from dataclasses import dataclass, field
 from typing import Any
 
-UNCONVERGED = 0.1  # residual above which a frame has the flag of that name
-COMPRESSED = 0.5  # overlap above which it has that flag, in radii
+UNCONVERGED = 0.1  # residual above which a frame is flagged "unconverged"
+COMPRESSED = 0.5  # overlap above which a frame is flagged "compressed", in radii
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """The frame that world.step() has just finished.
+    """The report of the frame that world.step() has just finished.
 
     residual: worst violation of a constraint, relative to its rest value. overlap: of the worst contact, in radii of the
-    smaller particle. contacts: number of overlapping pairs. energy: kinetic and potential energy [J], of what has a
-    potential, half a substep ago, of springs by the force that they exert; energy_change: since the frame before [J]. bad:
-    index of the first particle whose state is not finite, or None. broken: number of constraints that broke; world.broken has
-    them. asleep: number of particles that sleep, see Sleep. turn: 26 or 41 where a constraint turned by more than so many degrees
-    in a substep, else 0. tension: (omega h)^2 of the fastest vibration across a tension that a solver converged to; 4 is the
-    limit of stability. tries: how often the frame was made, see StepController. seconds: what the frame took.
+    smaller particle. contacts: number of overlapping pairs. energy: kinetic and potential energy [J] in the middle of the last
+    substep; forces without a potential do not count, and stiff springs count with the force that they exert. energy_change:
+    since the frame before [J]. bad: index of the first particle whose state is not finite, or None. broken: number of constraints
+    that broke in the frame; world.broken lists them. asleep: number of sleeping particles, see Sleep. turn: 26 or 41 if a
+    constraint turned by more than that many degrees in a substep, else 0. tension: (omega h)^2 of the fastest vibration across a
+    tension, where a solver converges in a substep; 4 is the limit of stability. tries: how often the frame was computed, see
+    StepController. seconds: run time of the frame.
 
-    flags: words for what the user should know; notes: one sentence for each, with the cause and a remedy.
+    flags: words for what the user should know. notes: one sentence for each flag, with the cause and a remedy.
         "non-finite"        a position or displacement is NaN or infinite
         "out-of-range"      a coordinate is too large for the precision, or for the cells of the contact grid
         "tunnelling-risk"   a particle moved by more than its own size in one substep, so it may have passed another
         "compressed"        a contact overlaps by more than half of the radius of the smaller particle
-        "stiff-force"       a force changes too fast for the substep (omega h > 2): with place it makes energy grow, with
-                            velocity it turns motion by far too little
-        "energy-gain"       the scene has more energy than it had, by a tenth of its kinetic energy, though nothing works on it
-        "softened"          a system was made to give way, because its tension is too large for the substep
+        "stiff-force"       a force changes too fast for the substep (omega h > 2): one that depends on position makes energy
+                            grow; one that depends on velocity turns motion far too little
+        "energy-gain"       the scene gained more than a tenth of its largest kinetic energy, though nothing does work on it
+        "softened"          a solver let constraints give way, because their tension is too large for the substep
         "unconverged"       the residual is above 0.1: a link is off by a tenth of its length, an angle by a tenth of a radian
                             (or large clusters that share particles gained energy, because a substep became shorter)
-        "turned"            a constraint turned by more than 41 degrees in a substep and lost its second order there; it
-                            takes energy out, or, as a spring that the substep resolves, keeps it on average
-        "moved"             what was placed off its rigid constraints by a thousandth of their size or more went to where they are
-                            met before the frame, without velocity
-        "substeps-capped"   the controller would have taken more substeps, but they are at most 4096, or the budget was spent
+        "turned"            a constraint turned by more than 41 degrees in a substep and lost its second order there; a rigid one
+                            dissipates energy, a spring that the substep resolves conserves it on average
+        "moved"             particles violated rigid constraints by a thousandth of their size or more; before the frame they were
+                            moved to meet the constraints, without velocity
+        "substeps-capped"   more substeps were needed, but there are at most 4096, or the budget was spent
         "stuck"             neither more substeps nor more iterations bring the residual or the overlap to the tolerance
     """
 
@@ -58,8 +59,10 @@ class StepReport:
 
     @staticmethod
     def of(figures: dict[str, Any]) -> "StepReport":
-        """A report of all its fields, by name, in a third of the constructor's time: that of a frozen dataclass sets them one by
-        one, past what keeps others from it."""
+        """Return a report with these fields, all of them, by name.
+
+        Takes a third of the constructor's time: a frozen dataclass sets its fields one by one, around its own write protection.
+        """
         new = object.__new__(StepReport)
         new.__dict__.update(figures)
         return new
@@ -71,11 +74,11 @@ class StepReport:
 
     @property
     def clean(self) -> bool:
-        """Whether nothing was flagged."""
+        """Whether there are no flags."""
         return not self.flags
 
     def worse(self, other: "StepReport") -> "StepReport":
-        """The later of two reports, with the worst figures of both."""
+        """Return the later of two reports, with the worst figures of both."""
         first, last = (self, other) if self.time <= other.time else (other, self)
         return StepReport(
             last.time, max(first.substeps, last.substeps), max(first.iterations, last.iterations),

@@ -1,4 +1,4 @@
-"""Many worlds: copies that are stepped together, their derivatives, and sweeps over processes and machines."""
+"""Many worlds: copies stepped together, derivatives by central differences, and sweeps over processes and machines."""
 
 from .gradient import Gradient, gradient
 from .report import WorldsReport

@@ -1,20 +1,20 @@
-"""Where each of many worlds is in time: what Clock has, as arrays."""
+"""The clocks of many worlds, as arrays; see Clock."""
 
 import numpy as np
 
 from ..step.clock import Clock
 from ..step.integrator import FREE
 
-# As they are in a Clock.
+# Attributes with the same name and meaning in Clock.
 PLAIN = "time", "tick", "since", "h", "d_is_velocity", "started", "longest", "owed", "lacked", "softened", "kinetic", "parting"
-NONE = -1  # for first_moved
+NONE = -1  # first_moved where no particle was placed
 
 
 class Clocks:
-    """Arrays with one value for each world; see Clock for what they mean.
+    """The values of a Clock for each of many worlds, as arrays; see Clock for their meaning.
 
-    energy, bound: NaN where it is not known. first_moved: NONE where nothing was placed. frame: (worlds, 3). asks_drag: whether
-    knobs may ask for other factors of drag than a clock and the device have.
+    energy, bound: NaN where unknown. first_moved: NONE where no particle was placed. frame: (worlds, 3). asks_drag: whether knobs
+    may need drag factors other than those in the clock and on the device.
     """
 
     def __init__(self, clocks: list[Clock]):
@@ -26,7 +26,7 @@ class Clocks:
         self.known = np.array([clock.energy is not None for clock in clocks])
         self.bound = np.array([np.nan if clock.bound is None else clock.bound for clock in clocks], dtype=np.float64)
         self.first_moved = np.array([NONE if clock.first_moved is None else clock.first_moved for clock in clocks])
-        # What differs from world to world in rare cases only, or is the same for all.
+        # Lists, since these values rarely differ from world to world.
         self.drag = [clock.drag for clock in clocks]
         self.asks_drag = np.zeros(self.count, dtype=bool)
         self.parted = {k: clock.parted for k, clock in enumerate(clocks) if clock.parted is not None}
@@ -45,7 +45,7 @@ class Clocks:
     parting: np.ndarray
 
     def of(self, k: int) -> Clock:
-        """The clock of one world."""
+        """Return the clock of world k."""
         out = Clock(**{name: getattr(self, name)[k].item() for name in PLAIN})
         since, length, count = self.frame[k].tolist()
         out.frame, out.drag, out.parted = (since, length, int(count)), self.drag[k], self.parted.get(k)
@@ -56,11 +56,11 @@ class Clocks:
 
     @property
     def drags(self) -> np.ndarray:
-        """What drag makes of the substep of each, (worlds, 5)."""
+        """The drag factors of each world's substep, (worlds, 5), see integrator.decay()."""
         return np.array([drag or FREE for drag in self.drag])
 
     def put(self, k: int, clock: Clock) -> None:
-        """Take what a clock of one world says now."""
+        """Store the values of a clock for world k."""
         for name in PLAIN:
             getattr(self, name)[k] = getattr(clock, name)
         self.frame[k], self.drag[k] = clock.frame, clock.drag
@@ -74,11 +74,11 @@ class Clocks:
             self.parted[k] = clock.parted
 
     def copy(self) -> "Clocks":
-        """The same, to return to."""
+        """Return a copy, for return_to()."""
         return Clocks([self.of(k) for k in range(self.count)])
 
     def return_to(self, other: "Clocks", some: np.ndarray) -> None:
-        """Give some the times of others."""
+        """Set the worlds in `some` to the values of other clocks."""
         for name in (*PLAIN, "frame", "energy", "bound", "known", "first_moved"):
             getattr(self, name)[some] = getattr(other, name)[some]
         for k in map(int, some):
@@ -89,12 +89,12 @@ class Clocks:
                 self.parted[k] = other.parted[k]
 
     def count_frame(self, dt: float, some: np.ndarray) -> None:
-        """Some worlds begin frames of this length, see Clock.counted(); the first of these has number 1."""
+        """Begin frames of length dt [s] in the worlds in the mask `some`, see Clock.counted(); the first of them is number 1."""
         new = some & (self.frame[:, 1] != dt)
         self.frame[new, 0], self.frame[new, 1], self.frame[new, 2] = self.time[new], dt, 0
 
     def advance(self, substeps: int, frames: int, started: np.ndarray) -> None:
-        """So many frames of so many substeps have gone by for all. started: see Clock, where it is one frame."""
+        """Advance all worlds by `frames` frames of `substeps` substeps. started: as in Clock, for a launch of one frame."""
         for count in (self.tick, self.since):
             count[...] = (count.astype(np.int64) + substeps * frames) % 2**31
         self.frame[:, 2] += frames

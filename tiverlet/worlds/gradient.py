@@ -1,4 +1,4 @@
-"""How what worlds come to depends on the numbers that they are made of: central differences, all worlds in one launch."""
+"""Derivatives of a figure of worlds with respect to parameters: central differences, all worlds in one launch."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -10,8 +10,11 @@ from .worlds import Worlds
 
 
 class Gradient(NamedTuple):
-    """What gradient() returns. value: the figure of the world as it is, a number or an array. derivative: by the name of the
-    parameter, an array of the figure's shape followed by the parameter's; a number where both are numbers."""
+    """The result of gradient().
+
+    value: the figure of the world with the given parameters, a number or an array. derivative: by name of the parameter, an array
+    of the figure's shape followed by the parameter's; a number where both are numbers.
+    """
 
     value: Any
     derivative: dict[str, Any]
@@ -23,7 +26,7 @@ def gradient(
     figure: Callable[[Worlds], Any],
     step: float | Mapping[str, Any] | None = None,
 ) -> Gradient:
-    """A figure of a world, and its derivatives with respect to the numbers that the world is made of.
+    """Compute a figure of a world, and its derivatives with respect to numbers from which the world is made.
 
         def make(speed, angle):
             velocity = (speed * np.cos(angle), speed * np.sin(angle))
@@ -36,23 +39,23 @@ def gradient(
         value, derivative = tv.gradient(make, {"speed": 7.0, "angle": 0.8}, height)
         derivative["angle"]
 
-    make: called with the parameters by name; a new World at each call, of the same structure. parameters: numbers or arrays of
-    numbers. figure: called once with a Worlds; steps them, and returns a number for each world, (worlds,), or an array for each,
-    (worlds, ...). step: how far a parameter is varied to either side, for all or by name; of an array one step, or one for each
-    number. By default a share of the value, eps^(1/3): 6e-6 in f64, 5e-3 in f32 and f32-compensated. Where the value is 0, it is
-    that share of the largest number of the parameter; where all are 0, of 1.
+    make: called with the parameters by name; returns a new World at each call, always of the same structure. parameters: numbers
+    or arrays of numbers. figure: called once with a Worlds; steps it, and returns one number per world, (worlds,), or one array
+    per world, (worlds, ...). step: how far a parameter is varied to either side, for all or by name; for an array one step, or
+    one for each number. The default is eps^(1/3) times the value: 6e-6 in f64, 5e-3 in f32 and f32-compensated. For a value of 0
+    it is that share of the parameter's largest number; if all are 0, of 1.
 
-    n numbers take 2n + 1 worlds: (f(p + h) - f(p - h)) / 2h. The error is h^2 f''' / 6, and eps |f| / h of rounding, where
-    eps is the figure's own, relative: about 1e-16 in f64 and 1e-7 in f32, more after many substeps. The default step balances the
-    two where f changes over lengths like p; where it changes faster, as in chaos, give a smaller one. All copies have the same
-    bits where they have the same numbers: the derivative for a parameter that nothing depends on is exactly 0.
+    n numbers take 2n + 1 worlds: (f(p + h) - f(p - h)) / 2h. The error is h^2 f''' / 6, and eps |f| / h of rounding, where eps is
+    the relative rounding error of the figure: about 1e-16 in f64 and 1e-7 in f32, more after many substeps. The default step
+    balances the two where f changes over lengths like p. Give a smaller step where f changes faster, as in chaos. Worlds with
+    equal numbers agree bit for bit, so the derivative with respect to an unused parameter is exactly 0.
 
-    It takes no tape and no memory beside the copies, and sees through all that acts: contacts, friction, breaks. Automatic
-    differentiation in reverse takes some 3 to 5 runs for any n, and the tape of all substeps. Where the figure jumps or has a
-    kink, as when a contact comes or goes between p - h and p + h, the difference is no derivative: search with copies instead.
+    It needs no tape and no memory but that of the worlds, and includes all features: contacts, friction, breaks. Reverse-mode
+    automatic differentiation costs some 3 to 5 runs for any n, and a tape of all substeps. Where the figure jumps or has a kink,
+    as when a contact begins or ends between p - h and p + h, the difference is no derivative: search with many worlds instead.
 
-    Raises ValueError or TypeError for parameters that are no finite numbers, steps that are not positive or vanish beside the
-    value, worlds of different structure, and figures that do not have a row for each world.
+    Raises ValueError or TypeError for parameters that are no finite numbers, for steps that are not positive or vanish beside the
+    value, for worlds of different structure, and for figures without a row per world.
     """
     if not isinstance(parameters, Mapping) or not parameters:
         raise ValueError(f'gradient: parameters = {parameters!r}, but it must be a dict of numbers, such as {{"mass": 1.0}}.')
@@ -83,7 +86,7 @@ def gradient(
     out, at = {}, 1
     for name, value in values.items():
         less, more = figures[at : at + 2 * value.size].reshape(-1, 2, *figures.shape[1:]).swapaxes(0, 1)
-        ways = ((value + steps[name]) - (value - steps[name])).reshape(-1)  # as they come out in f64
+        ways = ((value + steps[name]) - (value - steps[name])).reshape(-1)  # the differences as rounded in f64
         out[name] = _plain((np.moveaxis(more - less, 0, -1) / ways).reshape(figures.shape[1:] + value.shape))
         at += 2 * value.size
     return Gradient(_plain(figures[0]), out)
@@ -100,7 +103,7 @@ def _numbers(name: str, value: Any) -> np.ndarray:
 
 
 def _made(make: Callable[..., World], parameters: Mapping[str, Any], before: list[World]) -> World:
-    """A world of its own for these parameters."""
+    """Call make for these parameters, and check that it returns a new World."""
     said = ", ".join(f"{name} = {value!r}" for name, value in parameters.items())
     try:
         world = make(**parameters)
@@ -115,7 +118,7 @@ def _made(make: Callable[..., World], parameters: Mapping[str, Any], before: lis
 
 
 def _steps(values: dict[str, np.ndarray], step: Any, eps: float) -> dict[str, np.ndarray]:
-    """How far each number is varied."""
+    """Return how far each number is varied."""
     if isinstance(step, Mapping) and (unknown := set(step) - set(values)):
         raise ValueError(f"gradient: step has {sorted(unknown)[0]!r}, but parameters are {', '.join(values)}.")
     out = {}

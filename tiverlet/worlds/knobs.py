@@ -14,36 +14,36 @@ if TYPE_CHECKING:
 
 
 class Knobs:
-    """Of the features of one World that stands for `count`: knobs that differ from world to world, what each has of them, and
-    what waits to be uploaded for the next frame.
+    """The knobs of the features of one World that stands for `count` worlds.
 
-    worlds: those that they were made of.
+    Holds the knobs that differ from world to world, the value of each world, and which knobs wait to be uploaded for the next
+    frame. worlds: the worlds from which they were made.
     """
 
     def __init__(self, features: tuple[Feature, ...], worlds: "list[World]", count: int):
         self.features, self.count = features, count
-        self._given = _other_knobs(worlds)  # by feature and knob: what each world has of it
-        self._waiting = [[_flags(f) for f in world.features] for world in worlds]  # of each, for the first frame
-        self._set: dict[int, np.ndarray] = {}  # by feature, the worlds in which set() gave it other knobs
-        self._forced: set[Feature] = set()  # of these, whose forces changed
+        self._given = _other_knobs(worlds)  # (feature, knob) -> the value of each world
+        self._waiting = [[_flags(f) for f in world.features] for world in worlds]  # flags per world, for frame 1
+        self._set: dict[int, np.ndarray] = {}  # feature -> mask of the worlds in which set() changed its knobs
+        self._forced: set[Feature] = set()  # those of these features whose force changed
         for f, *each in zip(features, *self._waiting, strict=True):
             changed, moving, new_force = (any(flags) for flags in zip(*each, strict=True))
             _set_flags(f, (changed, moving, new_force))
 
     def forget_assigned(self) -> None:
-        """What was assigned for all, since it was set for some, differs no more."""
+        """Drop values per world of knobs that were assigned for all worlds since."""
         for i, name in [*self._given]:
             if vars(self.features[i])[name] is not self._given[i, name]:
                 del self._given[i, name]
 
     def show(self, k: int | None) -> None:
-        """Features have the knobs of the k-th; None: of all, as they are to be seen."""
+        """Give features the knobs of world k; None: those of all worlds, as the user sees them."""
         for (i, name), values in self._given.items():
             self.features[i].__dict__[name] = values if k is None else values[k]
 
     @contextlib.contextmanager
     def shown(self, k: int) -> Iterator[None]:
-        """Meanwhile features have the knobs of the k-th."""
+        """Give features the knobs of world k while the context lasts."""
         self.show(k)
         try:
             yield
@@ -51,7 +51,7 @@ class Knobs:
             self.show(None)
 
     def set(self, i: int, chosen: np.ndarray, knobs: dict[str, Any]) -> None:
-        """Give knobs of the i-th feature other values in the chosen worlds, see Worlds.set()."""
+        """Set knobs of feature i in the chosen worlds, see Worlds.set()."""
         f = self.features[i]
         self.forget_assigned()
         for name, values in knobs.items():
@@ -67,7 +67,7 @@ class Knobs:
             k = -1
             try:
                 for k, value in zip(chosen, values, strict=True):
-                    with self.shown(k):  # for knobs are checked against each other
+                    with self.shown(k):  # knobs are checked against other knobs of the same world
                         every[k] = knob.check(f, value)
                         if not f.uploads_all:
                             _check_fits(f, name, every[k])
@@ -86,20 +86,20 @@ class Knobs:
                 self._forced.add(f)
 
     def check_kernels(self) -> None:
-        """Refuse what was assigned for all and asks for other kernels; of the one that is shown."""
+        """Raise ValueError if a knob that was assigned for all worlds needs other kernels; for the world that is shown."""
         for f in self.features:
             if f.changed and f.outgrown:
                 _refuse_outgrown(f)
 
     def idle(self) -> bool:
-        """Whether nothing waits to be uploaded."""
+        """Whether no knob waits to be uploaded."""
         if self._set or any(f.changed or f.moving for f in self.features):
             return False
-        self._waiting = []  # nor in any of the worlds that these were made of
+        self._waiting = []  # no flag of the original worlds waits either
         return True
 
     def upload_to_all(self) -> bool:
-        """Write those of all worlds in one go, where features can. False where each world has to be asked by itself."""
+        """Upload the knobs of all worlds at once if features can. Returns False if each world has to be uploaded by itself."""
         changed = [f for i, f in enumerate(self.features) if f.changed or i in self._set]
         able = all(f.uploads_all and not f.new_force and f not in self._forced for f in changed)
         able = able and all(f.uploads_all for f in self.features if f.moving) and len(self._waiting) <= 1
@@ -118,25 +118,25 @@ class Knobs:
 
     @property
     def turned(self) -> np.ndarray:
-        """The worlds in which a knob has another value than in the last frame."""
+        """The worlds in which a knob has another value than in the last frame, a mask."""
         if len(self._waiting) > 1 or any(f.changed for f in self.features):
             return np.ones(self.count, dtype=bool)
         return np.any([np.zeros(self.count, dtype=bool), *self._set.values()], axis=0)
 
     def waiting_of(self, feature: Feature) -> np.ndarray:
-        """The worlds in which a knob of a feature waits."""
+        """Return the mask of the worlds in which a knob of a feature waits."""
         of = self._set.get(self.features.index(feature), np.zeros(self.count, dtype=bool))
         return of | feature.changed
 
     @property
     def waiting(self) -> np.ndarray:
-        """The worlds in which something waits."""
+        """The numbers of the worlds in which a knob waits or a target moves."""
         if len(self._waiting) > 1 or any(f.changed or f.moving for f in self.features):
             return np.arange(self.count)
         return np.flatnonzero(np.any([*self._set.values()], axis=0))
 
     def note_uploaded(self, moving: list[bool]) -> None:
-        """All were asked by themselves. moving: of each feature, whether a target is under way in any world."""
+        """Note that each world was uploaded by itself. moving: for each feature, whether a target moves in any world."""
         self._set, self._waiting = {}, []
         self._forced.clear()
         for f, still in zip(self.features, moving, strict=True):
@@ -144,7 +144,7 @@ class Knobs:
 
     @contextlib.contextmanager
     def flagged(self, k: Any) -> Iterator[None]:
-        """Meanwhile features say what waits in them to be uploaded for the k-th, and not for all."""
+        """Set the flags of features to those of world k while the context lasts."""
         common = [_flags(f) for f in self.features]
         own = self._waiting[k] if len(self._waiting) > 1 else common
         for i, (f, (changed, moving, new_force)) in enumerate(zip(self.features, own, strict=True)):
@@ -158,7 +158,7 @@ class Knobs:
 
 
 def _check_fits(feature: Feature, name: str, value: Any) -> None:
-    """Refuse what asks for other kernels."""
+    """Raise ValueError if a value of a knob needs other kernels."""
     before, vars(feature)[name] = vars(feature)[name], value
     try:
         if feature.outgrown:
@@ -175,7 +175,7 @@ def _refuse_outgrown(feature: Feature) -> None:
 
 
 def _flags(feature: Feature) -> tuple[bool, bool, bool]:
-    """What waits in it to be uploaded."""
+    """Return the flags of a feature: what waits in it to be uploaded."""
     return feature.changed, feature.moving, feature.new_force
 
 
@@ -184,7 +184,7 @@ def _set_flags(feature: Feature, flags: tuple[bool, bool, bool]) -> None:
 
 
 def _other_knobs(worlds: "list[World]") -> dict[tuple[int, str], Any]:
-    """The knobs that are not the same in all of them: by the number of the feature and the name, the values."""
+    """Return the knobs that differ between the worlds: (number of the feature, name) -> the values."""
     out: dict[tuple[int, str], Any] = {}
     for i, alike in enumerate(zip(*(world.features for world in worlds), strict=True)):
         for name in knobs_of(type(alike[0])):
@@ -195,10 +195,10 @@ def _other_knobs(worlds: "list[World]") -> dict[tuple[int, str], Any]:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Whether two values of a knob are equal; of mappings, NumPy would compare the keys."""
+    """Whether two values of a knob are equal. Mappings need a case of their own: NumPy would compare their keys."""
     return one == other if isinstance(one, Mapping) else not isinstance(other, Mapping) and np.array_equal(one, other)
 
 
 def _stacked(values: list[Any]) -> Any:
-    """An array of what each world has; a list of what is no number and no array, such as (static, dynamic)."""
+    """Stack the values of all worlds to an array; to a list if they are not numbers or arrays, such as (static, dynamic)."""
     return values if any(isinstance(v, (tuple, Mapping)) for v in values) else np.array(values)

@@ -1,4 +1,4 @@
-"""What is done with one part of a sweep, in this process or in a worker: make its worlds, and take figures of them."""
+"""One part of a sweep, in this process or in a worker: make its worlds, and compute their figures."""
 
 import contextlib
 import functools
@@ -15,19 +15,19 @@ import numpy as np
 from ..device import runtime, ti
 from ..world import World
 
-Outcome = dict[str, np.ndarray] | Exception  # figures by name, or what the user's functions raised
+Outcome = dict[str, np.ndarray] | Exception  # figures by name, or the exception of the user's functions
 
 
 @dataclass(frozen=True)
 class Part:
-    """Consecutive parameters, whose worlds are stepped together. first: the number of the first."""
+    """Consecutive sets of parameters, whose worlds are stepped together. first: the number of the first set."""
 
     first: int
     rows: list[dict[str, Any]]
 
     @property
     def numbers(self) -> range:
-        """Of its parameters, in the sweep."""
+        """The numbers of its sets of parameters in the sweep."""
         return range(self.first, self.first + len(self.rows))
 
     def __str__(self) -> str:
@@ -38,16 +38,17 @@ class Part:
 
 @dataclass(frozen=True)
 class Lost:
-    """What becomes of a part whose worker died. why: what is known about it."""
+    """The outcome of a part whose worker died. why: the known cause."""
 
     why: str
 
 
 @dataclass(frozen=True)
 class Job:
-    """What is done with each part: functions and plain data, which can be sent to another process.
+    """The work for each part: functions and plain data, which can be sent to another process.
 
-    settings: of tv.init in the process that asks. built: what decides on the bits, and must be the same everywhere.
+    settings: arguments of tv.init in the process that started the sweep. built: the versions that determine results bit for bit,
+    which must be equal everywhere.
     """
 
     make: Callable[..., World]
@@ -57,20 +58,20 @@ class Job:
 
 
 def call(row: dict[str, Any]) -> str:
-    """The call of make() with these parameters, as one line."""
+    """Return the call of make() with these parameters, as one line."""
     return f"make({', '.join(f'{name}={_short(value)}' for name, value in row.items())})"
 
 
 def named(number: int, row: dict[str, Any]) -> str:
-    """One set of parameters: its number and its call."""
+    """Return the number and the call of one set of parameters."""
     return f"parameters {number}, {call(row)}"
 
 
 def compute(job: Job, part: Part, tell: Callable[[int], None] = lambda number: None) -> Outcome:
-    """The figures of a part; or the exception of the user's functions, with a note that names the parameters.
+    """Return the figures of a part, or the exception of the user's functions, with a note that names the parameters.
 
-    The exception is returned, so that one that is raised in a worker means that the worker itself failed. tell: is called with
-    the number of each world before it is made, and with -1 when all are.
+    Exceptions are returned, so that one that is raised in a worker means a failure of the worker itself. tell: called with the
+    number of each world before it is made, and with -1 after the last.
     """
     try:
         return _figures(job, part, tell)
@@ -79,10 +80,10 @@ def compute(job: Job, part: Part, tell: Callable[[int], None] = lambda number: N
 
 
 def compute_in_worker(job: Job | bytes, part: Part, attempt: int, tell: Callable[[int], None] = lambda number: None) -> Outcome:
-    """The same in a process of an executor. attempt: makes the call another one, where results are kept by arguments.
+    """Run compute() in a process of an executor. attempt: makes repeated calls differ, for executors that cache by arguments.
 
-    Taichi belongs to the thread that started it. Executors whose workers have several threads would start it in any of them, so
-    one thread does all parts there.
+    Taichi belongs to the thread that started it. Workers of some executors have several threads, so one dedicated thread does all
+    parts there.
     """
     if threading.current_thread() is threading.main_thread():
         return _prepared(job, part, tell)
@@ -129,7 +130,7 @@ def _figures(job: Job, part: Part, tell: Callable[[int], None]) -> dict[str, np.
 
 
 def _checked(found: Any, count: int) -> dict[str, np.ndarray]:
-    """Figures as arrays of their own, with one row for each world."""
+    """Return figures as new arrays, with one row for each world."""
     if not isinstance(found, Mapping):
         kind = type(found).__name__
         raise TypeError(f'sweep: figures returned a {kind}, but a dict of arrays is needed, such as {{"end": worlds.position}}.')
@@ -162,9 +163,9 @@ def _noted(note: str) -> Iterator[None]:
 
 
 def _sendable(error: Exception) -> Exception:
-    """An exception that comes out of a pickle as it was; else one that says the same. Where it was raised goes into a note."""
+    """Return an exception that survives pickling: the original, or a RuntimeError with its text. A note has the traceback."""
     error.add_note("".join(["In the worker:\n", *traceback.format_tb(error.__traceback__)]).rstrip())
-    with contextlib.suppress(Exception):  # what it takes to make it again may be anything
+    with contextlib.suppress(Exception):  # unpickling a user's exception may raise anything
         if type(pickle.loads(pickle.dumps(error))) is type(error):
             return error
     new = RuntimeError(f"{type(error).__name__}: {error}")
@@ -174,21 +175,21 @@ def _sendable(error: Exception) -> Exception:
 
 
 def settings() -> dict[str, Any]:
-    """What tv.init was asked for in this process, without the threads, of which each worker has a share."""
+    """Return the arguments of tv.init in this process, without threads: each worker gets a share of the cores."""
     if ti.cfg is None:
         return {}
     return {k: v for k, v in runtime.wanted().items() if k != "threads"} | {"arch": runtime.architecture()}
 
 
 def built() -> str:
-    """What decides on the bits: versions of tiverlet and of the compiler."""
+    """Return the versions that determine results bit for bit: of tiverlet and of the compiler."""
     from .. import __version__
 
     return f"tiverlet {__version__} on {runtime.compiler()}"
 
 
 def _cores_of_worker() -> int:
-    """Threads of a worker of somebody else's: what it was told by the variable that all such tools set, else one."""
+    """Return the threads for a worker of a user's executor: OMP_NUM_THREADS, which such tools set, else 1."""
     told = os.environ.get("OMP_NUM_THREADS", "")
     return max(1, int(told)) if told.isdecimal() else 1
 

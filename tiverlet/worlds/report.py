@@ -1,4 +1,4 @@
-"""What frames of many worlds came to: a StepReport's figures, as arrays."""
+"""The report of frames of many worlds: the figures of a StepReport, as arrays."""
 
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -7,17 +7,17 @@ import numpy as np
 
 from ..step.step_report import StepReport
 
-SUMS = ("energy_change", "broken")  # over frames
+SUMS = ("energy_change", "broken")  # summed over frames
 LAST = ("time", "energy")
-FIRST = ("bad",)  # the first that is not -1
+FIRST = ("bad",)  # the first value that is not -1
 
 
 @dataclass(frozen=True)
 class WorldsReport:
-    """The frames that worlds.step() or worlds.run() has just finished: of each world the worst figures, as in StepReport.
+    """The report of the last worlds.step() or worlds.run(): the worst figures of each world, as in StepReport.
 
-    All are arrays with one value for each world. bad: -1 where all is finite. flags: by their names, whether each world has them;
-    names that no world has are left out. seconds: what all frames of all worlds took together, one number.
+    All are arrays with one value per world. bad: -1 where all values are finite. flags: by name, which worlds have the flag;
+    flags that no world has are left out. seconds: run time of all frames of all worlds together, one number.
     """
 
     time: np.ndarray
@@ -47,7 +47,7 @@ class WorldsReport:
         return out
 
     def of(self, k: int) -> StepReport:
-        """The report of one world, without the sentences that go with its flags; worlds[k].step() has these."""
+        """Return the report of world k, without the sentences that explain its flags; those of worlds[k].step() have them."""
         k = range(len(self))[k]
         figures: dict[str, Any] = {name: getattr(self, name)[k].item() for name in ARRAYS}
         figures["bad"] = None if figures["bad"] < 0 else figures["bad"]
@@ -55,7 +55,7 @@ class WorldsReport:
         return StepReport(substeps=self.substeps, iterations=self.iterations, flags=flags, seconds=self.seconds, **figures)
 
     def worse(self, later: "WorldsReport") -> "WorldsReport":
-        """With later frames, the worst figures of both."""
+        """Combine with the report of later frames: the worst figures of both."""
         out: dict[str, Any] = {}
         for name in ARRAYS:
             a, b = getattr(self, name), getattr(later, name)

@@ -1,4 +1,4 @@
-"""Which worlds can be stepped together: those whose kernels are the same."""
+"""Which worlds can be stepped together: worlds with equal kernels."""
 
 from collections.abc import Sequence
 from itertools import zip_longest
@@ -12,13 +12,16 @@ if TYPE_CHECKING:
 
 
 def alike(worlds: "list[World]") -> "list[World]":
-    """The worlds, with clones in place of those that differ in nothing but how they were compiled: for a team of threads, for
-    knobs that have other values now, or without shrinking contacts where others have them."""
+    """Return the worlds, with clones in place of those that were compiled differently.
+
+    A world is cloned if it was compiled for a team of threads, if its knobs need other kernels now, or if it lacks shrinking
+    contacts that another world has.
+    """
     shrinks = [any(contact.shrinks for contact in world._runner.step.contacts) for world in worlds]
     out = []
     for world, has in zip(worlds, shrinks, strict=True):
         lacks = any(shrinks) and not has
-        outgrown = any(f.changed and f.outgrown for f in world.features)  # knobs ask for other kernels, which clones get
+        outgrown = any(f.changed and f.outgrown for f in world.features)  # knobs need other kernels, which a clone gets
         if lacks or outgrown or world.path != "fused":
             world = world.clone(path="fused")
         if lacks:
@@ -29,7 +32,7 @@ def alike(worlds: "list[World]") -> "list[World]":
 
 
 def check_structure(worlds: "Sequence[World]") -> None:
-    """Raise ValueError for a world that kernels of the first do not fit."""
+    """Raise ValueError for a world that does not fit the kernels of the first."""
     rule = "They may differ in numbers only, not in how many particles and constraints there are, in what acts, or on what."
     first = _structure(worlds[0])
     for k, world in enumerate(worlds[1:], 1):
@@ -48,7 +51,7 @@ def check_structure(worlds: "Sequence[World]") -> None:
 
 
 def _difference(ours: list[Any], theirs: list[Any]) -> tuple[str, str]:
-    """The first items in which they differ, in words."""
+    """Return the first items in which two lists differ, in words."""
     missing = object()
     for a, b in zip_longest(ours, theirs, fillvalue=missing):
         if a != b:
@@ -57,7 +60,7 @@ def _difference(ours: list[Any], theirs: list[Any]) -> tuple[str, str]:
 
 
 def _structure(world: "World") -> dict[str, Any]:
-    """What all of them must have in common."""
+    """Return the data that must be equal in all worlds."""
     built = [(type(f).__name__, *(f._world_for or {}).items()) for f in world.features]
     out: dict[str, Any] = {
         "settings": [(name, "=", repr(value)) for name, value in world.settings.items()],
@@ -66,13 +69,13 @@ def _structure(world: "World") -> dict[str, Any]:
         "indices": [f.indices.tobytes() for f in world.features if isinstance(f, Batch)],
         "kernels": None,
     }
-    if COMPILER == "taichi":  # whose inside is known
+    if COMPILER == "taichi":  # the only compiler whose internals are known
         out["kernels"] = _written(world)
     return out
 
 
 def _written(world: "World") -> Any:
-    """What kernels of a world are compiled from, with numbers in place of its fields."""
+    """Return the source of a world's kernels, with numbers in place of its fields."""
     from ..device.patches.sharing import Writing  # noqa: PLC0415
 
     fields = [vars(e.field) for memory in world._runner.memories for e in memory.entries]

@@ -1,4 +1,4 @@
-"""One scene with many parameters: worlds are made, stepped together and measured, here, in processes or on a cluster."""
+"""One scene with many parameters: make worlds, step them together and measure them, in processes or on a cluster."""
 
 import inspect
 import warnings
@@ -16,14 +16,15 @@ from .part import Job, Lost, Part, built, named, settings
 if TYPE_CHECKING:
     from .workers import Workers
 
-TRIES = 3  # how often a part is done whose worker dies
+TRIES = 3  # attempts at a part whose worker dies
 
 
 @dataclass(frozen=True)
 class Repeated:
-    """A part that was done again, because its worker died.
+    """A part that was repeated because its worker died.
 
-    numbers: of its parameters. parameters: their values. why: what is known of each death. by: who did it in the end.
+    numbers: of its sets of parameters. parameters: their values. why: the known cause of each death. by: the worker that finished
+    it.
     """
 
     numbers: range
@@ -38,7 +39,7 @@ class Repeated:
 class SweepResult(dict[str, np.ndarray]):
     """Figures by name, as arrays with a leading axis of parameters, in their order.
 
-    repeated: what was done again, because a worker died; empty where none did. It has no influence on the figures.
+    repeated: the parts that were repeated because a worker died; empty if none died. Repeating does not change the figures.
     """
 
     def __init__(self, figures: Mapping[str, np.ndarray], repeated: Iterable[Repeated] = ()):
@@ -55,21 +56,22 @@ def sweep(
     make: Callable[..., World], parameters: Mapping[str, Any] | Iterable[Mapping[str, Any]],
     figures: Callable[[Any], Mapping[str, Any]], executor: Any = None, at_once: int = 256, progress: bool = False,
 ) -> SweepResult:  # fmt: skip
-    """Figures of one scene for many parameters, here, in processes or on a cluster.
+    """Compute figures of one scene for many sets of parameters, here, in processes or on a cluster.
 
-    make: called as make(**row) for each set of parameters; returns a new World, all of the same structure. parameters: a dict of
-    equally long arrays or lists, or a list of dicts. figures: called with a Worlds of up to `at_once` worlds; steps them and
-    returns a dict of arrays with one row for each. Where it looks at each world by itself, the bits do not depend on executor,
-    on at_once, or on the order in which parts are done.
+    make: called as make(**row) for each set of parameters; returns a new World, always of the same structure. parameters: a dict
+    of equally long arrays or lists, or a list of dicts. figures: called with a Worlds of up to `at_once` worlds; steps them and
+    returns a dict of arrays with one row per world. If it computes each world's row from that world alone, results are the same
+    bit for bit for any executor, any at_once, and any order of the parts.
 
-    executor: None for this process; a number of processes, with a share of the cores each; or anything with submit(), as in
-    concurrent.futures: ProcessPoolExecutor (with "spawn"), Dask's Client, mpi4py's MPIPoolExecutor. A worker of those has as many
-    threads as OMP_NUM_THREADS says, else one. Processes import make and figures, which are to stand at the top of a file.
+    executor: None for this process; a number of processes, each with a share of the cores; or any object with submit(), as in
+    concurrent.futures: ProcessPoolExecutor (with "spawn"), Dask's Client, mpi4py's MPIPoolExecutor. Workers of such an object use
+    OMP_NUM_THREADS threads, by default one. Processes import make and figures, which must be defined at the top of a file.
     progress: show a bar.
 
-    A part whose worker dies is done again, at most three times in all, and is named in a warning and in .repeated; where an
-    executor takes no more parts, processes of our own do the rest. Raises RuntimeError, with the parameters, if that does not
-    help; ValueError or TypeError for arguments; and at once what make and figures raise, with a note of the parameters.
+    A part whose worker dies is done again, at most three times in all, and is named in a warning and in .repeated. If an executor
+    accepts no more parts, the sweep starts processes of its own for the rest. Raises RuntimeError, with the parameters, if that
+    fails too; ValueError or TypeError for invalid arguments. Exceptions of make and figures are raised at once, with a note of
+    the parameters.
     """
     from rich.progress import Progress  # noqa: PLC0415
 
@@ -80,7 +82,7 @@ def sweep(
     progress = checks.flag("sweep", "progress", progress)
     job = Job(make, figures, settings(), built())
     workers, least = chosen(executor, job)
-    size = _ceil(len(rows), least * _ceil(len(rows), least * at_once))  # as many parts for each process
+    size = _ceil(len(rows), least * _ceil(len(rows), least * at_once))  # the same number of parts for each process
     parts = [Part(first, rows[first : first + size]) for first in range(0, len(rows), size)]
     found: dict[int, dict[str, np.ndarray]] = {}
     repeated = []
@@ -98,7 +100,7 @@ def sweep(
 
 
 def _done(parts: list[Part], workers: "Workers") -> Iterable[tuple[Part, dict[str, np.ndarray], Repeated | None]]:
-    """Each part with its figures, as they are done."""
+    """Yield each part with its figures, as it is finished."""
     todo, deaths, why = deque(parts), Counter(), {}
     while todo or workers.busy:
         while todo and workers.free:
@@ -128,7 +130,7 @@ def _ceil(a: int, b: int) -> int:
 
 
 def _joined(parts: list[Part], found: dict[int, dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """The figures of all parts, in the order of the parameters."""
+    """Return the figures of all parts, in the order of the parameters."""
     first = found[0]
     for part in parts:
         made = found[part.first]
@@ -144,7 +146,7 @@ def _joined(parts: list[Part], found: dict[int, dict[str, np.ndarray]]) -> dict[
 
 
 def _rows(make: Any, parameters: Any, figures: Any) -> list[dict[str, Any]]:
-    """Each set of parameters, after a look at all arguments that are functions or parameters."""
+    """Check make, figures and parameters; return each set of parameters."""
     for name, function in (("make", make), ("figures", figures)):
         if not callable(function):
             raise TypeError(f"sweep: {name} = {function!r} is a {type(function).__name__}, but a function is needed.")
@@ -153,7 +155,7 @@ def _rows(make: Any, parameters: Any, figures: Any) -> list[dict[str, Any]]:
         raise ValueError("sweep: parameters are empty, so there is nothing to do. Give at least one set.")
     try:
         signature = inspect.signature(make)
-    except ValueError:  # of a builtin
+    except ValueError:  # make is a builtin
         return rows
     seen = set()
     for k, row in enumerate(rows):
@@ -168,7 +170,7 @@ def _rows(make: Any, parameters: Any, figures: Any) -> list[dict[str, Any]]:
 
 
 def _columns(parameters: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Rows of a dict of columns."""
+    """Return the rows of a dict of columns."""
     columns = {name: _column(name, values) for name, values in _names(parameters, "parameters").items()}
     lengths = {name: len(values) for name, values in columns.items()}
     if len(set(lengths.values())) > 1:
@@ -180,7 +182,7 @@ def _columns(parameters: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _column(name: str, values: Any) -> list:
-    """A parameter's values, as Python's own numbers where they are numbers."""
+    """Return the values of one parameter, with NumPy numbers converted to Python's."""
     if isinstance(values, Mapping) or not (isinstance(values, np.ndarray) or isinstance(values, Iterable)):
         raise TypeError(
             f"sweep: parameters[{name!r}] = {values!r} is a {type(values).__name__}, but a list or an array with one value for "
@@ -190,7 +192,7 @@ def _column(name: str, values: Any) -> list:
 
 
 def _dicts(parameters: Any) -> list[dict[str, Any]]:
-    """Rows of a list of dicts."""
+    """Return the rows of a list of dicts."""
     rows = checks.rows("sweep", "parameters", parameters, "a dict of arrays or a list of dicts")
     for k, row in enumerate(rows):
         if not isinstance(row, Mapping):
@@ -211,5 +213,5 @@ def _names(row: Mapping[Any, Any], where: str) -> Mapping[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Python's own number instead of NumPy's, with the same value: figures do not depend on which of them was given."""
+    """Convert a NumPy number to Python's with the same value, so that figures do not depend on which was given."""
     return value.item() if isinstance(value, np.generic) else value

@@ -1,4 +1,4 @@
-"""Who does the parts of a sweep: this process, processes of its own, or an executor of the user's."""
+"""Workers of a sweep: this process, processes that the sweep starts, or a user's executor."""
 
 import contextlib
 import multiprocessing
@@ -15,38 +15,38 @@ from .part import Job, Lost, Outcome, Part, call, compute, compute_in_worker
 
 
 class Workers(Protocol):
-    """Does parts, in any order. Only finished() waits."""
+    """Computes parts, in any order. Only finished() waits."""
 
     @property
     def name(self) -> str:
-        """Who it is, for messages."""
+        """The name for messages."""
         ...
 
     @property
     def free(self) -> bool:
-        """Whether it takes a part now."""
+        """Whether it accepts a part now."""
         ...
 
     @property
     def busy(self) -> bool:
-        """Whether a part is not finished yet."""
+        """Whether a part is unfinished."""
         ...
 
     def begin(self, part: Part) -> None:
-        """Take a part."""
+        """Accept a part."""
         ...
 
     def finished(self) -> list[tuple[Part, Outcome | Lost]]:
-        """Wait for parts, at least for one."""
+        """Wait for at least one part, and return the finished parts."""
         ...
 
     def close(self) -> None:
-        """End what is not finished."""
+        """Stop unfinished parts."""
         ...
 
 
 class ThisProcess:
-    """Does one part at a time, here."""
+    """Computes one part at a time, in this process."""
 
     name = "this process"
 
@@ -56,46 +56,46 @@ class ThisProcess:
 
     @property
     def free(self) -> bool:
-        """Whether it takes a part now."""
+        """Whether it accepts a part now."""
         return self._part is None
 
     @property
     def busy(self) -> bool:
-        """Whether a part is not finished yet."""
+        """Whether a part is unfinished."""
         return self._part is not None
 
     def begin(self, part: Part) -> None:
-        """Take a part."""
+        """Accept a part."""
         self._part = part
 
     def finished(self) -> list[tuple[Part, Outcome | Lost]]:
-        """Do it."""
+        """Compute the part."""
         part, self._part = self._part, None
         return [(part, compute(self._job, part))] if part else []
 
     def close(self) -> None:
-        """Nothing is left to end."""
+        """Do nothing: no part runs between calls."""
 
 
 class _Process:
-    """A process that does one part after the other, and tells over a pipe which world it makes."""
+    """A process that computes one part after the other, and sends over a pipe which world it makes."""
 
     def __init__(self, context: Any, job: bytes, threads: int):
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs, job, threads), daemon=True)
         self.process.start()
-        theirs.close()  # so that the pipe ends when the process does
+        theirs.close()  # so that the pipe closes when the process ends
         self.part: Part | None = None
-        self.at: int | None = None  # the world that it makes; -1 when all of the part are made
+        self.at: int | None = None  # number of the world being made; -1 after the last
 
     def begin(self, part: Part) -> None:
-        """Send it a part to make."""
+        """Send a part to the process."""
         self.part, self.at = part, None
-        with contextlib.suppress(OSError):  # where it died meanwhile, the pipe will say so
+        with contextlib.suppress(OSError):  # if the process died, receive() finds the pipe closed
             self.pipe.send(part)
 
     def receive(self) -> Outcome | Lost | None:
-        """What became of its part; None while it goes on."""
+        """Return the outcome of its part; None while the part is unfinished."""
         try:
             message = self.pipe.recv()
         except (EOFError, OSError):
@@ -108,7 +108,7 @@ class _Process:
         return message
 
     def end(self, kill: bool = False) -> None:
-        """Close the pipe, and wait for the process; `kill`: end it."""
+        """Close the pipe, and wait for the process. kill: terminate it."""
         self.pipe.close()
         if kill:
             self.process.terminate()
@@ -132,7 +132,7 @@ class _Process:
 
 
 class Processes:
-    """Processes of its own, each with a share of the cores; started anew ("spawn"), since Taichi does not survive a fork."""
+    """Processes that the sweep starts, each with a share of the cores; spawned, since Taichi does not survive a fork."""
 
     name = "another process"
 
@@ -145,16 +145,16 @@ class Processes:
 
     @property
     def free(self) -> bool:
-        """Whether it takes a part now."""
+        """Whether it accepts a part now."""
         return len(self._all) < self._count or any(p.part is None for p in self._all)
 
     @property
     def busy(self) -> bool:
-        """Whether a part is not finished yet."""
+        """Whether a part is unfinished."""
         return any(p.part is not None for p in self._all)
 
     def begin(self, part: Part) -> None:
-        """Take a part."""
+        """Accept a part."""
         idle = next((p for p in self._all if p.part is None), None)
         if idle is None:
             idle = _Process(self._context, self._job, self._threads)
@@ -162,7 +162,7 @@ class Processes:
         idle.begin(part)
 
     def finished(self) -> list[tuple[Part, Outcome | Lost]]:
-        """Wait for parts, at least for one."""
+        """Wait for at least one part, and return the finished parts."""
         out = []
         while not out:
             working = {p.pipe: p for p in self._all if p.part is not None}
@@ -176,15 +176,15 @@ class Processes:
         return out
 
     def close(self) -> None:
-        """End them; at once where they are at work."""
+        """End the processes, at once if they are computing."""
         for worker in self._all:
             worker.end(kill=worker.part is not None)
         self._all.clear()
 
 
 def _serve(pipe: Any, job: bytes, threads: int) -> None:
-    """The main function of a worker process: until the pipe ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the process that asked ends the others
+    """Run a worker process until the pipe closes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the one that started the sweep ends the others
     runtime.share = threads
     with contextlib.suppress(EOFError, OSError):
         while True:
@@ -192,16 +192,16 @@ def _serve(pipe: Any, job: bytes, threads: int) -> None:
 
 
 class Given:
-    """An executor with submit(), of the user's. When it takes no more parts after a loss, processes of our own do the rest.
+    """A user's executor with submit(). If it accepts no more parts after a loss, processes of the sweep do the rest.
 
-    A part that ended a worker is not done in this process, which it might end, too; but where make and figures cannot be sent
-    to processes of our own, there is no other place.
+    A part that ended a worker is not computed in this process, which it might end, too. The exception is a job that cannot be
+    sent to processes of the sweep: then this process is the only place left.
     """
 
     def __init__(self, executor: Any, job: Job):
         self._executor, self._job = executor, job
         self._pool = isinstance(executor, ProcessPoolExecutor)
-        # A pool of processes fails as a whole. It gets one part for each process, so that few are lost with one that dies.
+        # A pool of processes fails as a whole. It gets one part per process, so that few parts are lost with a worker.
         self._most: int = getattr(executor, "_max_workers", 1) if self._pool else 2**31
         self._waiting: dict[Any, Part] = {}
         self._submitted, self._lost = 0, False
@@ -209,23 +209,23 @@ class Given:
 
     @property
     def name(self) -> str:
-        """Who does it."""
+        """The name for messages."""
         return self._instead.name if self._instead else "the executor"
 
     @property
     def free(self) -> bool:
-        """Whether it takes a part now."""
+        """Whether it accepts a part now."""
         if self._instead:
             return not self._waiting and self._instead.free
         return len(self._waiting) < self._most
 
     @property
     def busy(self) -> bool:
-        """Whether a part is not finished yet."""
+        """Whether a part is unfinished."""
         return bool(self._waiting) or (self._instead is not None and self._instead.busy)
 
     def begin(self, part: Part) -> None:
-        """Take a part."""
+        """Accept a part."""
         if self._instead is None:
             job = sent(self._job) if self._pool else self._job
             self._submitted += 1
@@ -233,13 +233,13 @@ class Given:
                 self._waiting[self._executor.submit(compute_in_worker, job, part, self._submitted)] = part
                 return
             except Exception:
-                if not self._lost:  # it never worked
+                if not self._lost:  # the executor never worked
                     raise
             self._instead = self._successor()
         self._instead.begin(part)
 
     def finished(self) -> list[tuple[Part, Outcome | Lost]]:
-        """Wait for parts, at least for one."""
+        """Wait for at least one part, and return the finished parts."""
         if not self._waiting and self._instead:
             return self._instead.finished()
         out: list[tuple[Part, Outcome | Lost]] = []
@@ -253,11 +253,11 @@ class Given:
                 self._lost = True
                 out.append((part, Lost(f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(".: "))))
                 if isinstance(error, BrokenExecutor):
-                    done = list(self._waiting)  # which fail with it
+                    done = list(self._waiting)  # all other parts fail with the pool
         return out
 
     def close(self) -> None:
-        """Take back what has not begun. The executor is the user's."""
+        """Cancel parts that have not begun. The executor itself stays open for the user."""
         for future in self._waiting:
             with contextlib.suppress(Exception):
                 future.cancel()
@@ -268,7 +268,7 @@ class Given:
         first = next(iter(self._waiting))
         if isinstance(first, Future):
             return list(wait(self._waiting, return_when=FIRST_COMPLETED).done)
-        return [first]  # futures of other kinds are waited for in turn
+        return [first]  # futures of other kinds are awaited one by one
 
     def _successor(self) -> Workers:
         try:
@@ -278,7 +278,7 @@ class Given:
 
 
 def chosen(executor: Any, job: Job) -> tuple[Workers, int]:
-    """Who does the parts, and how many parts there should be at least."""
+    """Return the workers, and the least number of parts."""
     if executor is None:
         return ThisProcess(job), 1
     if isinstance(executor, int):
@@ -303,13 +303,13 @@ def chosen(executor: Any, job: Job) -> tuple[Workers, int]:
                 'processes, or ProcessPoolExecutor(4, mp_context=multiprocessing.get_context("spawn")).'
             )
         sent(job)
-    of_client = getattr(executor, "get_executor", None)  # Dask's; pure: what has failed once may be tried again
+    of_client = getattr(executor, "get_executor", None)  # of Dask; not pure: a failed call may be repeated
     executor = of_client(pure=False) if callable(of_client) else executor
     return Given(executor, job), 1
 
 
 def sent(job: Job) -> bytes:
-    """A job for other processes; raises TypeError where it cannot be sent."""
+    """Pickle a job for other processes. Raises TypeError if it cannot be pickled."""
     try:
         return pickle.dumps(job)
     except Exception as error:

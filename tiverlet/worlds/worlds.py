@@ -1,4 +1,4 @@
-"""Many worlds of one structure, stepped together, none of which knows of the others."""
+"""Many worlds of one structure, stepped together and independent of each other."""
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator
@@ -28,14 +28,14 @@ from .knobs import Knobs
 from .report import WorldsReport
 from .structure import alike, check_structure
 
-WORK = 30_000_000  # particles and constraints, times passes, in a launch: it takes about a second
-LOGGED = 1 << 22  # figures of frames that are kept at a time
+WORK = 30_000_000  # particles and constraints, times passes, in a launch of about a second
+LOGGED = 1 << 22  # figures of frames that are kept per launch, at most
 LIVE = ("position", "velocity", "substeps", "iterations")
-DATA = (bool, int, float, str, np.ndarray, np.generic)  # what an attribute is that differs from world to world
+DATA = (bool, int, float, str, np.ndarray, np.generic)  # types of attributes that may differ from world to world
 
 
 class Rollout(NamedTuple):
-    """What worlds.rollout() returns. time: (worlds, frames) [s]. position: (worlds, frames, n, dim) [m]."""
+    """The result of worlds.rollout(). time: (worlds, frames) [s]. position: (worlds, frames, n, dim) [m]."""
 
     time: np.ndarray
     position: np.ndarray
@@ -45,16 +45,17 @@ class Rollout(NamedTuple):
 class Worlds:
     """Copies of a world, or worlds that differ in numbers only, stepped in one launch.
 
-    worlds: a World, of which there are to be `count` copies in its present state; or several Worlds of the same structure: the
-    same features, solver, options and numbers of particles and constraints, with other masses, places, lengths, radii.
+    worlds: a World, to be copied `count` times in its present state; or several Worlds of the same structure: the same features,
+    solver, options and numbers of particles and constraints, with other masses, positions, lengths, radii.
 
-    Each goes on to the bit as it would alone, on any number of threads; none knows of the others: what is wrong in one is flagged
-    for that one. worlds[k] is the k-th as a World of its own, in its present state. What it is made of stays as it is.
+    Each world continues bit for bit as it would alone, on any number of threads. Worlds do not influence each other: an error in
+    one is flagged for that one. worlds[k] is world k as a World of its own, in its present state. The original worlds do not
+    change.
 
-    position, velocity: (worlds, n, dim). set() gives knobs other values in each world; what is assigned to a knob of
-    worlds.features is for all of them.
+    position, velocity: (worlds, n, dim). set() gives knobs a value per world. Assigning to a knob of worlds.features sets it in
+    all worlds.
 
-    Raises ValueError or TypeError for worlds of different structure, and for substeps="auto": each would take its own time.
+    Raises ValueError or TypeError for worlds of different structure, and for substeps="auto", which would differ between worlds.
     """
 
     def __init__(self, worlds: World | Iterable[World], count: int | None = None):
@@ -65,7 +66,7 @@ class Worlds:
         else:
             count = len(sources)
         with whole:
-            self._originals = first.features  # by which the user may know those of the copies
+            self._originals = first.features  # the user may name features by these
             sources = alike(sources)
             self._copies = Copies(count)
             self._world = World._of(
@@ -88,11 +89,11 @@ class Worlds:
             self._rest()
         self._copies.closed = True
         self._last: WorldsReport | None = None
-        self._turned = np.zeros(len(self), dtype=bool)  # in which knobs were turned in the last frame
-        self._start: _Start | None = None  # what reset() returns to; from the first step on
+        self._turned = np.zeros(len(self), dtype=bool)  # worlds whose knobs changed before the last frame
+        self._start: _Start | None = None  # the state for reset(); set by the first step
 
     def _take(self, k: int, world: World) -> None:
-        """Give copy k what a world has."""
+        """Copy the state of a world to copy k."""
         runner = self._runner
         runner.memory.choose(k)
         numbers = [(search.list.capacity, search.list.pitch) for search in runner.step.searches]
@@ -106,7 +107,7 @@ class Worlds:
 
     @contextlib.contextmanager
     def _open(self) -> Iterator[None]:
-        """Meanwhile fields are those of all worlds, and signals wait."""
+        """Make fields those of all worlds, and delay signals, while the context lasts."""
         with whole, self._copies.all():
             self._runner.memory.check()
             self._knobs.forget_assigned()
@@ -114,18 +115,18 @@ class Worlds:
 
     @property
     def _kernels(self) -> kernel.Frames:
-        """The kernels that go through many worlds; after a list has grown, others than before."""
+        """The kernels for many worlds; other objects after a list has grown."""
         assert self._runner.frames
         return self._runner.frames
 
     def _rest(self) -> None:
-        """No world is chosen."""
+        """Choose no world."""
         self._runner.memory.choose(None)
         self._knobs.show(None)
 
     @contextlib.contextmanager
     def _at(self, k: Any) -> Iterator[World]:
-        """Meanwhile the world stands for the k-th."""
+        """Make the internal world stand for world k while the context lasts."""
         world, runner, k = self._world, self._runner, int(k)
         runner.memory.choose(k)
         world._clock = runner.clock = self._clocks.of(k)
@@ -142,18 +143,20 @@ class Worlds:
     # The step.
 
     def step(self, dt: float) -> WorldsReport:
-        """Advance all of them by dt [s], see World.step()."""
+        """Advance all worlds by dt [s], see World.step()."""
         dt = checks.number("Worlds.step", "dt", dt, above=0.0)
         with self._open():
             return self._launch(dt, 1, *self._begin(dt))
 
     def run(self, seconds: float, dt: float = 1 / 60, progress: bool = False) -> WorldsReport:
-        """Step all of them for `seconds` [s], to the nearest whole number of frames of dt [s], many in a launch; returns the
-        worst figures of all frames."""
+        """Step all worlds for `seconds` [s], rounded to whole frames of dt [s], with many frames per launch.
+
+        Returns the worst figures of all frames. progress: show a bar.
+        """
         return self._frames("Worlds.run", seconds, dt, 0, None, progress)
 
     def rollout(self, seconds: float, dt: float = 1 / 60, every: int = 1, progress: bool = False) -> Rollout:
-        """The same, with the track of all particles: where they are after each `every`-th frame, in f64."""
+        """Run as run() does, and record the positions of all particles after each `every`-th frame, in f64."""
         every = checks.integer("Worlds.rollout", "every", every, least=1)
         frames = _frame_count("Worlds.rollout", seconds, dt)
         n, dim = len(self._world.particles), self._world.particles.dim
@@ -170,7 +173,7 @@ class Worlds:
         return Rollout(time, position, report)
 
     def _frames(self, who: str, seconds: float, dt: float, every: int, track: np.ndarray | None, progress: bool) -> WorldsReport:
-        """Frames in launches of some of them."""
+        """Step frames, several per launch."""
         frames = _frame_count(who, seconds, dt)
         world = self._world
         work = len(self) * world.substeps * world.iterations * self._runner.integrator.stages
@@ -187,7 +190,7 @@ class Worlds:
             while done < frames:
                 with self._open():
                     moved, released = self._begin(dt)
-                    # Where a target is under way, the next frame ends it, and then the host is needed.
+                    # A target moves during one frame, then the host ends the motion: launch that frame alone.
                     some = 1 if self._runner.ramping or any(f.moving for f in world.features) else min(at_once, frames - done)
                     report = self._launch(dt, some, moved, released, every, track, done)
                 worst, done = report if worst is None else worst.worse(report), done + some
@@ -197,8 +200,10 @@ class Worlds:
         return worst
 
     def _begin(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """Make all ready for substeps of this length, see Runner.begin(). Returns of each how far particles were moved, and what
-        a shorter substep released."""
+        """Prepare all worlds for substeps of a frame of dt [s], see Runner.begin().
+
+        Returns how far particles of each world were moved, and what a shorter substep released, (worlds,) each.
+        """
         world, runner, clocks = self._world, self._runner, self._clocks
         for drag in runner.drags:
             clocks.asks_drag |= self._knobs.waiting_of(drag)
@@ -221,7 +226,7 @@ class Worlds:
             placed = clocks.first_moved[unknown] != NONE
             first = placed & (clocks.tick[unknown] == 0)
             more = slack(runner.scene.inv_mass, figures[:, EXTENT : EXTENT + world.particles.dim], h)
-            works = clocks.bound[unknown] == CHANGED  # in the coming frame
+            works = clocks.bound[unknown] == CHANGED  # something does work in the coming frame
             clocks.bound[unknown] = np.where(works, CHANGED, np.where(first, energy + more, np.nan))
             clocks.kinetic[unknown] = np.where(first, 0.0, clocks.kinetic[unknown])
             clocks.parting[unknown] = np.where(placed, overlap > 0, clocks.parting[unknown])
@@ -235,7 +240,7 @@ class Worlds:
         return moved, released
 
     def _look(self, some: np.ndarray) -> np.ndarray:
-        """The figures of some, in the state in which they are, (k, FIGURES)."""
+        """Return the figures of the worlds `some` in their present state, (k, FIGURES)."""
         clocks = self._clocks
         origin = np.where(clocks.d_is_velocity, UNSTEPPED, np.where(clocks.started, STARTED, STEPPED))
         sheets = kernel.sheets(
@@ -249,12 +254,12 @@ class Worlds:
         return figures[some, 0]
 
     def _upload(self) -> None:
-        """Bring knobs to the device: those that were assigned for all, and those that were set for some."""
+        """Write knobs to the device: those assigned for all worlds, and those set for some."""
         world, features, knobs = self._world, self._world.features, self._knobs
         if knobs.idle():
             return
         turned = knobs.turned
-        # Where something is under way, it is in those in which it was turned in the last frame.
+        # Targets move only in worlds whose knobs changed before the last frame.
         works = np.where(turned | (self._turned & any(f.moving for f in features)), CHANGED, self._clocks.bound)
         self._turned = turned
         with self._at(0):
@@ -265,6 +270,7 @@ class Worlds:
             still = np.zeros(len(features), dtype=bool)
             for k in knobs.waiting:
                 with self._at(k), knobs.flagged(k):
+                    world._find_stiffened()
                     world._upload_parameters()
                     still |= [f.moving for f in features]
             knobs.note_uploaded(still.tolist())
@@ -274,7 +280,7 @@ class Worlds:
         self, dt: float, frames: int, moved: np.ndarray, released: np.ndarray, every: int = 0, track: np.ndarray | None = None,
         before: int = 0,
     ) -> WorldsReport:  # fmt: skip
-        """Frames in one launch, and one more each time that a list has to grow. before: frames that are on the track already."""
+        """Launch frames, again for worlds that waited for a longer list. before: frames already on the track."""
         world, runner, clocks = self._world, self._runner, self._clocks
         runner.set_out()
         substeps, iterations, stages = world.substeps, world.iterations, runner.integrator.stages
@@ -301,14 +307,14 @@ class Worlds:
         energy = np.where(clocks.known, clocks.energy, np.nan)
         runner.arrive()
         clocks.advance(substeps, frames, started)
-        with np.errstate(all="ignore"):  # energies may be infinite; flags say so
+        with np.errstate(all="ignore"):  # energies may be infinite, which flags report
             self._last = self._report(figures, energy, moved, released, perf_counter() - begun)
         return self._last
 
     def _go(
         self, plan: np.ndarray, some: np.ndarray, sheets: np.ndarray, dates: np.ndarray, figures: np.ndarray, track: np.ndarray
     ) -> None:
-        """Launch frames of some worlds, and go on with those that had to wait for a longer list."""
+        """Launch frames of the worlds `some`, and relaunch those that stopped for a longer list."""
         runner, memory = self._runner, self._runner.memory
         which = some.astype(np.int32)
         memory.write(self._kernels.sheet, sheets)
@@ -316,7 +322,7 @@ class Worlds:
         while len(some):
             plan[kernel.COUNT], plan[kernel.GRAIN] = len(some), self._kernels.grain(len(some))
             which[: len(some)] = some
-            with self._knobs.shown(0):  # kernels are compiled for whether there is friction, which is the same in all
+            with self._knobs.shown(0):  # kernels depend on whether there is friction, which is the same in all worlds
                 CachedLaunch(self._kernels, "run", memory.compiler, plan, which, figures.reshape(-1), track)()
             if not runner.step.searches:
                 return
@@ -333,7 +339,7 @@ class Worlds:
     def _report(
         self, figures: np.ndarray, before: np.ndarray, moved: np.ndarray, released: np.ndarray, seconds: float
     ) -> WorldsReport:
-        """The worst of the figures of all frames, (worlds, frames, FIGURES). before: energies [J]."""
+        """Make the report from the figures of all frames, (worlds, frames, FIGURES). before: energies before them [J]."""
         world, runner, clocks = self._world, self._runner, self._clocks
         reporter, dim, n = runner.diagnostics.report, world.particles.dim, runner.n
         energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned = np.moveaxis(
@@ -364,8 +370,11 @@ class Worlds:
         return report
 
     def _gains(self, before: np.ndarray, figures: np.ndarray) -> np.ndarray:
-        """Which worlds have energy from nowhere, and in which frames: Clock.exceeds() and energy_bound.checked() of all. before:
-        energies [J]. figures: (worlds, frames, FIGURES)."""
+        """Return which worlds gained energy without work, and in which frames, (worlds, frames).
+
+        Does what Clock.exceeds() and energy_bound.checked() do, for all worlds. before: energies [J]. figures: (worlds, frames,
+        FIGURES).
+        """
         energy, overlap, stiff, reach, kinetic = (figures[..., k] for k in (ENERGY, OVERLAP, STIFFNESS, REACH, KINETIC))
         extent = figures[..., EXTENT : EXTENT + self._world.particles.dim]
         clocks, gain = self._clocks, np.empty_like(energy)
@@ -389,26 +398,25 @@ class Worlds:
                     out[k] = gain[k] > err + energy_bound.let_out(world)
         return out
 
-    # Knobs and states of some.
+    # Knobs and states of chosen worlds.
 
     def set(self, feature: Feature, some: Any = None, **knobs: Any) -> None:
-        """Give knobs of a feature other values in each world, from the next frame on.
+        """Set knobs of a feature to a value per world, from the next frame on.
 
-        feature: one of those that the World was made of, or of worlds.features. knobs: by name, a value for each world, the first
-        axis of an array, or a list. some: indices or a Boolean mask of the worlds that they are for; all by default.
+        feature: one of worlds.features, or of the original World. knobs: by name, a value for each world, as a list or along the
+        first axis of an array. some: indices or a Boolean mask of these worlds; all by default.
 
-        Raises ValueError or TypeError as an assignment to the knob does, and names the world.
+        Raises the ValueError or TypeError of an assignment to the knob, with a note that names the world.
         """
         i = self._feature(feature)
         chosen = self._chosen("Worlds.set", some)
         self._knobs.set(i, chosen, knobs)
 
     def reset(self, some: Any = None, position: Any = None, velocity: Any = None) -> None:
-        """Return to where they were before their first step: time, positions, velocities, all that the future depends on. Knobs
-        stay as they are.
+        """Return to the state before the first step: time, positions, velocities, and all else on which the future depends.
 
-        some: indices or a Boolean mask of the worlds that return; all by default. position, velocity: (some, n, dim) or (n, dim),
-        where they go on from other ones.
+        Knobs keep their values. some: indices or a Boolean mask of the worlds that return; all by default. position, velocity:
+        (some, n, dim) or (n, dim), to replace those of that state.
         """
         chosen = self._chosen("Worlds.reset", some)
         with self._open():
@@ -422,7 +430,7 @@ class Worlds:
                 self._give(self._per_particle("velocity", velocity, len(chosen)), chosen)
 
     def _feature(self, feature: Feature) -> int:
-        """Its number."""
+        """Return the number of a feature."""
         for i, (ours, theirs) in enumerate(zip(self._world.features, self._originals, strict=True)):
             if feature is ours or feature is theirs:
                 return i
@@ -431,7 +439,7 @@ class Worlds:
         )
 
     def _chosen(self, who: str, some: Any) -> np.ndarray:
-        """Numbers of worlds."""
+        """Return the numbers of the worlds `some`, checked."""
         if some is None:
             return np.arange(len(self))
         some = np.asarray(some)
@@ -452,18 +460,18 @@ class Worlds:
         return self._copies.count
 
     def __getitem__(self, k: int) -> World:
-        """The k-th as a World of its own, in its present state: what is done to it shows in no other."""
+        """Return world k as a World of its own, in its present state. Changing it does not change these worlds."""
         k = range(len(self))[k]
         with self._open(), self._at(k) as world, self._knobs.flagged(k):
             self._knobs.check_kernels()
             return world.clone(path="auto")
 
     def each(self, ask: Callable[[World], Any], some: Any = None) -> list[Any]:
-        """What a function says of each, in order, such as lambda world: world.features[1].load.
+        """Call a function on each world, and return its results in order: for example lambda world: world.features[1].load.
 
-        It is given one World after the other to look at: positions, velocities, features, contacts, in their present state. It
-        must not step or change it, nor keep it; worlds[k] is for that. some: indices or a Boolean mask of those that are asked;
-        all by default.
+        The function gets one World after the other to read: positions, velocities, features, contacts, in their present state. It
+        must not step, change or keep the World; worlds[k] is for that. some: indices or a Boolean mask of the worlds; all by
+        default.
         """
         out = []
         with self._open():
@@ -473,7 +481,7 @@ class Worlds:
         return out
 
     def hash(self, k: int) -> str:
-        """That of the k-th, see World.hash()."""
+        """Return the hash of world k, see World.hash()."""
         with self._open(), self._at(range(len(self))[k]) as world:
             return world.hash()
 
@@ -484,12 +492,15 @@ class Worlds:
             return read_only(self._runner.scene.state.get(self._runner.memory), assign_whole("Worlds", "position"))
 
     def view(self, name: str = "position") -> np.ndarray:
-        """The positions [m] of all, (worlds, n, dim), where the device has them: no copy, in their own precision, and always as
-        they are now. Read-only, and valid until close().
+        """Return the positions [m] of all worlds, (worlds, n, dim), as a view of device memory.
 
-        name: "position", or "displacement", what the last substep added (before a start: velocities). "position"
-        of "f32-compensated", and of "f32" where links are solved directly, lacks its low word. Others read it without a copy,
-        too: jnp.from_dlpack(worlds.view()), torch.from_dlpack(worlds.view()); nobody is to write there. On a GPU it is a copy.
+        It is not copied, has the precision of the device, and always shows the present state. Read-only, and valid until close().
+        On a GPU it is a copy.
+
+        name: "position", or "displacement", that of the last substep (before a start, the first substep after velocities were
+        set, it is the velocity). "position" lacks its low word in "f32-compensated", and in "f32" where links are solved
+        directly. Other packages read it without a copy, too: jnp.from_dlpack(worlds.view()), torch.from_dlpack(worlds.view());
+        they must not write to it.
         """
         state = self._runner.scene.state
         known = {"position": state.x, "displacement": state.d}
@@ -500,12 +511,12 @@ class Worlds:
 
     @position.setter
     def position(self, value) -> None:
-        """Move particles of all worlds to (worlds, n, dim), or (n, dim) for each [m]; velocities are kept."""
+        """Move particles of all worlds to (worlds, n, dim), or to (n, dim) in each [m]. Velocities are kept."""
         with self._open():
             self._place(self._per_particle("position", value, len(self)), np.arange(len(self)))
 
     def _place(self, position: np.ndarray, chosen: np.ndarray) -> None:
-        """Move particles of some to (worlds, n, dim)."""
+        """Move the particles of the chosen worlds. position: (worlds, n, dim)."""
         rows = position[chosen].reshape(-1, position.shape[2])
         in_range("Worlds", "position", rows)
         for contact in self._runner.step.contacts:
@@ -521,12 +532,15 @@ class Worlds:
 
     @property
     def velocity(self) -> np.ndarray:
-        """Velocities [m/s], (worlds, n, dim), a read-only copy in f64; of the order of the worlds. Assign to set them."""
+        """Velocities [m/s], (worlds, n, dim), a read-only copy in f64, accurate to the order of the world. Assign to set them."""
         with self._open():
             return read_only(self._velocities(), assign_whole("Worlds", "velocity"))
 
     def _velocities(self, links: bool = True, touches: bool = True) -> np.ndarray:
-        """Those of all. links, touches: with what rigid constraints, and contacts and walls, give to them."""
+        """Return the velocities of all worlds.
+
+        links, touches: whether reactions of rigid constraints, and of contacts and walls, are included.
+        """
         runner, clocks = self._runner, self._clocks
         out = runner.memory.read(runner.scene.state.d)[:, : runner.n].astype(np.float64)
         saved = runner.memory.read(runner.search.list.old_saved)[:, 0] if runner.search else np.zeros(len(self))
@@ -553,14 +567,14 @@ class Worlds:
 
     @velocity.setter
     def velocity(self, value) -> None:
-        """Have them go on with (worlds, n, dim), or (n, dim) for each [m/s]."""
+        """Set the velocities with which particles continue, (worlds, n, dim), or (n, dim) for each world [m/s]."""
         with self._open():
             self._give(self._per_particle("velocity", value, len(self)), np.arange(len(self)))
 
     def _per_particle(self, name: str, value, count: int) -> np.ndarray:
-        """An array with a row for each particle of so many worlds; (n, dim) is for all of them."""
+        """Return an array with a row per particle of `count` worlds; (n, dim) is repeated for all of them."""
         n, dim = self._runner.n, self._world.particles.dim
-        if hasattr(value, "__dlpack__") and not isinstance(value, np.ndarray):  # of PyTorch, JAX and others
+        if hasattr(value, "__dlpack__") and not isinstance(value, np.ndarray):  # from PyTorch, JAX and others
             value = np.from_dlpack(value)
         value, shape = np.asarray(value), (count, n, dim)
         if value.shape not in (shape, shape[1:]):
@@ -569,7 +583,7 @@ class Worlds:
         return value.reshape(shape)
 
     def _give(self, velocity: np.ndarray, chosen: np.ndarray) -> None:
-        """Have some go on with these velocities, (some, n, dim), see World.velocity."""
+        """Give chosen worlds these velocities, (chosen, n, dim), see World.velocity."""
         clocks, runner = self._clocks, self._runner
         seen = self._velocities()[chosen]
         change = velocity - seen
@@ -603,7 +617,7 @@ class Worlds:
         self._start_from(velocity[fresh], chosen[fresh])
 
     def _start_from(self, velocity: np.ndarray, chosen: np.ndarray) -> None:
-        """Have some go on with these velocities, (some, n, dim)."""
+        """Start chosen worlds from these velocities, (chosen, n, dim)."""
         clocks, memory, state = self._clocks, self._runner.memory, self._runner.scene.state
         for k in chosen[~clocks.d_is_velocity[chosen]] if state.spins else ():
             with self._at(k), memory.compiler():
@@ -617,22 +631,22 @@ class Worlds:
 
     @property
     def substeps(self) -> int:
-        """Substeps of a frame. Assign a number."""
+        """Substeps per frame. Assign a number."""
         return self._world.substeps
 
     @substeps.setter
     def substeps(self, value: int) -> None:
-        """At least 1, of all worlds, from the next frame on."""
+        """Set the substeps of all worlds from the next frame on: at least 1."""
         self._world.substeps = checks.integer("Worlds", "substeps", value, least=1)
 
     @property
     def iterations(self) -> int:
-        """Passes over the constraints in a substep. Assign a number."""
+        """Passes over the constraints in each substep. Assign a number."""
         return self._world.iterations
 
     @iterations.setter
     def iterations(self, value: int) -> None:
-        """At least 1, and what the solver allows, of all worlds, from the next frame on."""
+        """Set the iterations of all worlds from the next frame on: at least 1, and a number that the solver allows."""
         self._world.iterations = value
 
     @property
@@ -647,12 +661,12 @@ class Worlds:
 
     @property
     def features(self) -> tuple[Feature, ...]:
-        """What acts on the particles. A knob that is assigned here changes in all worlds, see set()."""
+        """The features that act on the particles. A knob assigned here changes in all worlds, see set()."""
         return self._world.features
 
     @property
     def fields(self) -> dict[str, int]:
-        """Every field on the device, by name, and its size for all worlds [bytes]."""
+        """The size of every field on the device for all worlds [bytes], by name."""
         return {e.name: e.bytes * max(1, e.copies) for memory in self._runner.memories for e in memory.entries}
 
     def close(self) -> None:
@@ -660,7 +674,7 @@ class Worlds:
         self._world.close()
 
     def explain(self) -> str:
-        """What one of them is made of, as World.explain() says it, and what all of them take."""
+        """Describe what one world consists of, as World.explain() does, and the memory of all worlds."""
         bytes_in_all = sum(self.fields.values())
         with self._open(), self._at(0) as world:
             said = world.explain()
@@ -692,7 +706,7 @@ class Worlds:
 
 
 class _Start:
-    """The state of all of them before their first step; one for all where they are copies of each other."""
+    """The state of all worlds before their first step; stored once where the worlds are equal copies."""
 
     def __init__(self, worlds: Worlds):
         runner, self.clocks = worlds._runner, worlds._clocks.copy()
@@ -700,13 +714,13 @@ class _Start:
         for name, values in self.values.items():
             if (values == values[:1]).all():
                 self.values[name] = values[:1].copy()
-        self.pairs: list[Any] = []  # of each, with what they remember; of copies that were not stepped yet, one for all
+        self.pairs: list[Any] = []  # pairs of each world with their data; one for all if the worlds are copies
         for k in range(len(worlds) if worlds._sources else 1) if runner.search else ():
             with worlds._at(k):
                 self.pairs.append(runner.search.list.lasting_data())
 
     def put_back(self, worlds: Worlds, chosen: np.ndarray) -> None:
-        """Return to it."""
+        """Return the chosen worlds to it."""
         runner = worlds._runner
         state = {name: values[chosen] if len(values) > 1 else values for name, values in self.values.items()}
         for memory in runner.memories:
@@ -728,7 +742,7 @@ class _Start:
 
 
 class _Source:
-    """What the host knows of one of several different worlds, without its knobs."""
+    """The host's data of one of several different worlds, without its knobs."""
 
     def __init__(self, world: World):
         self.particles, self.inv_mass = world.particles, world._runner.scene.inv_mass
@@ -739,7 +753,7 @@ class _Source:
         self.starts = [f.start for f in world.features]
 
     def put_on(self, world: World) -> None:
-        """Have another one look like it."""
+        """Give another world this data."""
         world._particles = world._runner.scene.particles = self.particles
         world._runner.scene.inv_mass = self.inv_mass
         for f, known, start in zip(world.features, self.features, self.starts, strict=True):
@@ -748,7 +762,7 @@ class _Source:
 
 
 def _checked(worlds: Any, count: int | None) -> list[World]:
-    """The worlds that it is made of."""
+    """Return the worlds from which a Worlds is made, checked."""
     if runtime.architecture() not in runtime.LLVM:
         raise ValueError(
             f"Worlds: they need an architecture for which LLVM compiles, not {runtime.architecture()}. Use tv.init(arch='cpu')."

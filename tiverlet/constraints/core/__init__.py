@@ -1,1 +1,1 @@
-"""What constraints are made of."""
+"""Parts that constraints are made of."""

@@ -1,4 +1,4 @@
-"""The passes over particles that are drawn to places, each by itself."""
+"""The passes over particles that are each drawn to a place."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -13,8 +13,10 @@ if TYPE_CHECKING:
 
 
 class Place:
-    """The contract of where particles are drawn to, on the device: C = x - place. name: as it is told apart by. in_state: what it
-    has in the exact state, by name."""
+    """The contract of the places that particles are drawn to, on the device: C = x - place.
+
+    name: distinguishes it from other features. in_state: its fields in the exact state, by name.
+    """
 
     told_apart = True
     name: str
@@ -25,17 +27,17 @@ class Place:
 
     @ti.func
     def offsets(self, c, frame_fraction, first, fresh):
-        """C at the end and at the start of the substep."""
+        """Return C at the end and at the start of the substep."""
         return 0.0, 0.0
 
     @ti.func
     def offset_now(self, c, back):
-        """C at x - back d."""
+        """Return C at x - back d."""
         return 0.0
 
     @ti.func
     def offset_change(self, c):
-        """How far C changed in the last substep by the motion of the particle."""
+        """Return how far C changed in the last substep by the motion of the particle."""
         return 0.0
 
     @ti.func
@@ -44,7 +46,7 @@ class Place:
 
 
 class AnchorPasses(Passes):
-    """The passes of an Anchored. What it drives has no multipliers and springs. start: C at the start, (m, dim)."""
+    """The passes of an Anchored. Driven particles have no multipliers and springs. start: C at the start, (m, dim)."""
 
     def __init__(self, scene: "Scene", batch: Any, start: np.ndarray):
         self.name = name = repr(batch)
@@ -59,7 +61,7 @@ class AnchorPasses(Passes):
 
     @ti.func
     def solve(self, c, h, h2_effective, frame_fraction, first, fresh):
-        """Multiplier before and after, and the size of the violation that this removes."""
+        """Return the multiplier before and after a pass, and the size of the violation that the pass removes."""
         w = self.w.of(self.corners.member(c, 0))
         C, C0 = self.place.offsets(c, frame_fraction, first, fresh)
         lam, B = self.lam[c], 0 * C
@@ -89,7 +91,7 @@ class AnchorPasses(Passes):
 
     @ti.func
     def push_spring_force(self, c, h):
-        """As in CornerPasses, for each axis."""
+        """Push h^2 times the spring acceleration, as in CornerPasses, for each axis."""
         move = ti.Vector.zero(self.real, self.state.dim)
         if ti.static(self.spring.soft):
             w, alpha = self.w.of(self.corners.member(c, 0)), self.spring.alpha[c]
@@ -101,7 +103,7 @@ class AnchorPasses(Passes):
 
     @ti.func
     def push_reaction(self, c, h, firm, soft):
-        """As in CornerPasses, for each axis."""
+        """Push the reaction, as in CornerPasses, for each axis."""
         i = self.corners.member(c, 0)
         w, pull = self.w.of(i), firm * self.lam[c]
         if ti.static(self.spring.soft):
@@ -112,13 +114,13 @@ class AnchorPasses(Passes):
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
-        """The violation that is left, relative to the size of the scene."""
+        """Return the violation that is left, relative to the size of the scene."""
         _, _, size = self.solve(c, h, h2_effective, frame_fraction, 0, fresh)
         return size / self.size.now
 
     @ti.func
     def energy(self, c, back, h2_effective, residual):
-        """|C|^2 / (2 alpha), of what bears a load: F C / 2, see Equation."""
+        """Return |C|^2 / (2 alpha), of the part of C that bears a load: F C / 2, see Equation."""
         out = ti.cast(0, ti.f64)
         if ti.static(self.spring.soft):
             alpha = self.spring.alpha[c]

@@ -1,4 +1,4 @@
-"""Particles drawn to a place, each by itself: what pins, paths and grids share."""
+"""Particles that are each drawn to a place: what pins, paths and grids share."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def one_each(who: str, indices, count: int = checks.ANY) -> FixedSize:
-    """Particles of `count`, each of which has a place."""
+    """Check particles below `count`, each of which has one place, and return them as members."""
     rows = checks.indices(who, "indices", indices, count)
     if len(rows) > 1 and len(np.unique(rows)) < len(rows):
         values, counts = np.unique(rows, return_counts=True)
@@ -26,21 +26,22 @@ def one_each(who: str, indices, count: int = checks.ANY) -> FixedSize:
 
 
 class Anchored(Batch):
-    """Constraints C(x) = x - place on one particle each, a vector, from soft to rigid: the law of Equation for each axis alike,
-    with unit vectors for gradients. What the place is on the device, says place_of() of each kind.
+    """Constraints C(x) = x - place on one particle each, a vector, from soft to rigid.
+
+    Each axis follows the law of Equation, with unit vectors for gradients. place_of() of each kind makes the place on the device.
     """
 
     arity = 1
     each = ("compliance", "damping")
     uploads_all = True
-    exclusive = False  # nothing else may hold its particles
+    exclusive = False  # no other feature may hold its particles
     compliance = Knob(lambda f, v: f._compliance(v), "Inverse stiffness [m/N].", force=True)
     damping = Knob(lambda f, v: checks.per_item(repr(f), "damping", v, f.count, least=0.0), "Of the dashpot [N s/m].", force=True)
     compiled_for = ("soft",)
     _asked: tuple[Any, bool] = (None, False)  # compliances, and whether any of them is above 0
 
     def setup(self, indices, compliance, damping) -> None:
-        """Keep the arguments of __init__."""
+        """Store the arguments of __init__."""
         self.members = one_each(repr(self), indices)
         self.compliance, self.damping = compliance, damping
 
@@ -49,23 +50,23 @@ class Anchored(Batch):
 
     @property
     def listing(self) -> np.ndarray:
-        """The particle of each constraint."""
+        """The particle of each constraint, (m,)."""
         return self.indices[:, 0]
 
     def hold_all(self, listing: Any) -> None:
-        """Act on these."""
+        """Act on these particles."""
         self._keep(members=one_each(repr(self), listing))
 
     @property
     def soft(self) -> bool:
-        """Whether any of them is a spring, or was when kernels were compiled."""
+        """Whether any of the constraints is a spring, or was when kernels were compiled."""
         rows = self.compliance
-        if rows is not self._asked[0]:  # it is asked ten times when a pin takes others
+        if rows is not self._asked[0]:  # cached: a pin that takes other particles reads it ten times
             self._asked = rows, bool((rows > 0).any())
         return self._asked[1] or "soft" in self.once
 
     def upload(self) -> None:
-        """Write new stiffnesses."""
+        """Write new stiffnesses to the device."""
         if self.acts and not self.drives:
             self.dev.spring.upload(self.compliance, self.damping)
 
@@ -78,24 +79,24 @@ class Anchored(Batch):
         return not (self.indices >= change.first).any()
 
     def regroup(self, change: Regrouping) -> None:
-        """Violations are relative to the size of the scene, which is another one now."""
+        """Update the size of the scene, which violations are relative to."""
         if self.acts:
             self.dev.size.set(self.start.size)
 
     def start_offset(self, position: np.ndarray) -> np.ndarray:
-        """C at the start, (m, dim)."""
+        """Return C at the start, (m, dim)."""
         return np.zeros((self.count, position.shape[1]))
 
     def tangents(self, x: np.ndarray) -> np.ndarray:
-        """Unit vectors along which particles at x (m, dim) can move, where the constraints are rigid; 0 where there is none."""
+        """Return unit vectors along which particles at x (m, dim) can move under rigid constraints; 0 where there is none."""
         return np.zeros_like(x)
 
     def place_of(self, scene: Scene, passes: AnchorPasses) -> Place:
-        """Where its particles are drawn to, on the device."""
+        """Make the places of the particles, on the device."""
         raise NotImplementedError
 
     def passes(self, scene: Scene) -> AnchorPasses:
-        """To their places."""
+        """Make the passes that draw particles to their places."""
         return AnchorPasses(scene, self, self.start_offset(self.start.position))
 
     @property
@@ -114,13 +115,15 @@ class Anchored(Batch):
 
 
 def refuse_held_twice(particles: "Particles", features: tuple[Feature, ...], some: Sequence[Feature] | None = None) -> None:
-    """A particle has one place: refuse pins and driven paths on one that is pinned, or that another one holds. some: those that
-    hold others than before; None for all."""
+    """Raise ValueError for pins and driven paths on a particle that is pinned, or that another feature holds.
+
+    some: the features that hold other particles than before; None for all.
+    """
     tethers = [(k, f) for k, f in enumerate(features) if isinstance(f, Anchored) and f.exclusive]
     if some is not None and len(tethers) == 1 and not particles.pinned[tethers[0][1].members.rows].any():
         return
     holder = np.full(len(particles), -1)
-    for k, f in sorted(tethers, key=lambda item: not item[1].drives):  # springs are lost on what is driven
+    for k, f in sorted(tethers, key=lambda item: not item[1].drives):  # springs last: they have no effect on driven particles
         rows = f.indices[:, 0]
         wrong = particles.pinned[rows] | (holder[rows] >= 0)
         if wrong.any():

@@ -1,4 +1,4 @@
-"""Angles: that of a path, and that between two triangles."""
+"""Angles: the angle of a path, and the angle between two triangles."""
 
 from functools import cache
 from typing import Any
@@ -12,7 +12,7 @@ from ...geometry.intervals import cross
 from .quantity import Quantity
 
 TURN = 2 * np.pi
-SHORT = 1e-24  # [m^2] squared length below which a link has no direction, in f32 and far below any in use
+SHORT = 1e-24  # [m^2] squared length below which a link has no direction: representable in f32, and far below any in use
 
 
 REST_ANGLE = Knob(lambda f, v: checks.per_item(repr(f), f.rest_name, v, f.count, least=-TURN, most=TURN), "Rest angle [rad].")
@@ -24,28 +24,47 @@ def _matrix(rows: int, columns: int, real: Any) -> Any:
 
 
 def corners_of(angle: Any) -> Any:
-    """The type of its corners, and of its gradients."""
+    """Return the matrix type of the angle's corners and gradients."""
     return _matrix(angle.arity, angle.state.dim, angle.real)
 
 
 class Angle(Quantity):
-    """Angles: those that are whole turns apart mean the same, and residuals are in radians."""
+    """Angles: values that are whole turns apart are equivalent, and residuals are in radians."""
 
-    unit, transcends, curved = 1.0, True, True
+    unit, transcends, curved, precise = 1.0, True, True, True
 
     def difference(self, f: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """How far angles are from others, in (-pi, pi]."""
+        """Return differences of angles, in (-pi, pi]."""
         return turned(f - goal)
 
     @ti.func
     def unwrap(self, f, other):
-        """f plus whole turns, within half a turn of `other`."""
+        """Return f plus whole turns, within half a turn of `other`."""
         return wrapped(f, other)
+
+    @ti.func
+    def excess(self, c, f):
+        """f - rest, to all digits of the low words, where there are any."""
+        C = f - self.rest[c]
+        if ti.static(self.state.carries):
+            C = ti.cast(wrapped(self.exactly(c), ti.cast(C, ti.f64)), self.real)
+        return C
+
+    @ti.func
+    def exactly(self, c):
+        """f - rest in f64, within half a turn of 0."""
+        q = ti.Matrix.zero(ti.f64, self.arity, self.state.dim)
+        for k in ti.static(range(1, self.arity)):
+            r = self.state.between(self.corners.member(c, k), self.corners.member(c, 0))
+            for a in ti.static(range(self.state.dim)):
+                q[k, a] = r[a]
+        f, _gradients = self.measure(c, q)
+        return wrapped(f - self.rest_exactly(c), ti.cast(0, ti.f64))
 
     @called_with(lambda self: ((ti.i32, corners_of(self)), (self.real, corners_of(self))))
     @ti.func
     def remeasure(self, c, q):
-        """As one function, for it is long and stands in up to three places."""
+        """Return measure(c, q), as one function: it is long and called from up to three places."""
         return self.measure(c, q)
 
 
@@ -56,17 +75,17 @@ class PathAngle(Angle):
     exchangeable = ((0, 2),)
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """The angles of paths."""
+        """Return the angles of the paths, (m,)."""
         return path_angles(x[:, 0], x[:, 1], x[:, 2])
 
     @ti.func
     def reach(self, q):
-        """The shorter of the two legs."""
+        """Return the length of the shorter leg."""
         return shorter_leg(q)
 
     @ti.func
     def measure(self, c, q):
-        """See path_angle(); nothing is remembered of the plane."""
+        """Return path_angle(), without memory of the plane."""
         return path_angle(q, 0 * q[0, :], False, faint(self.state, self.real))
 
 
@@ -77,45 +96,45 @@ class DihedralAngle(Angle):
     exchangeable = ((0, 1), (2, 3))
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """The angles of edges."""
+        """Return the angles of the edges, (m,)."""
         return dihedral_angles(x[:, 0], x[:, 1], x[:, 2], x[:, 3])
 
     @ti.func
     def reach(self, q):
-        """The shortest way from an end of the edge to another corner."""
+        """Return the shortest distance from one end of the edge to another corner."""
         return ti.min(q[1, :].norm(), ti.min(q[2, :].norm(), q[3, :].norm()))
 
     @ti.func
     def measure(self, c, q):
-        """See dihedral_angle()."""
+        """Return dihedral_angle()."""
         return dihedral_angle(q)
 
 
 def turned(C: np.ndarray) -> np.ndarray:
-    """Differences of angles, in (-pi, pi]."""
+    """Return differences of angles, in (-pi, pi]."""
     return C - TURN * np.round(C / TURN)
 
 
 @ti.func
 def wrapped(f, other):
-    """f plus whole turns, within half a turn of `other`."""
+    """Return f plus whole turns, within half a turn of `other`."""
     return f - ti.static(TURN) * ti.round((f - other) * ti.static(1 / TURN))
 
 
 @ti.func
 def shorter_leg(q):
-    """The shorter of the two links of a path."""
+    """Return the length of the shorter of the two links of a path."""
     return ti.min((q[1, :] - q[0, :]).norm(), (q[2, :] - q[1, :]).norm())
 
 
 @inline
 def faint(state, real):
-    """|u x v| of unit vectors below which their normal is lost in rounding."""
+    """Return |u x v| of unit vectors below which their normal is lost in rounding."""
     return ti.cast(1e-13 if state.double else 1e-6, real)
 
 
 def path_angles(i: np.ndarray, j: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """What path_angle() measures, of corners (m, dim) [m]: (m,) [rad]."""
+    """Return what path_angle() measures, of corners (m, dim) [m]: (m,) [rad]."""
     a, b = j - i, k - j
     dot = (a * b).sum(axis=1)
     if i.shape[1] == 2:
@@ -125,16 +144,16 @@ def path_angles(i: np.ndarray, j: np.ndarray, k: np.ndarray) -> np.ndarray:
 
 @ti.func
 def path_angle(q, axis, mirrored, faint):
-    """The angle by which a path of corners q = (i, j, k) turns at j, and its gradients: 0 where it is straight, pi where it folds
-    back; none where two corners coincide.
+    """Return the angle by which a path of corners q = (i, j, k) turns at j, and its gradients.
 
+    The angle is 0 where the path is straight and pi where it folds back. There is none where two corners coincide.
     f(x) = atan2(|u x v|, u . v) with the unit vectors u of a = x_j - x_i and v of b = x_k - x_j; signed in 2D, positive to the
     left. With the unit normal e of the plane (2D: out of the page),
 
         grad_i f = e x u / |a|,   grad_k f = e x v / |b|,   grad_j f = -(grad_i f + grad_k f).
 
-    In 3D the normal of a straight or folded path is undefined; `axis` takes its place there, or any where that is 0.
-    mirrored: the angle is seen from the side of `axis`, so that it is negative where the normal points away from it.
+    In 3D the normal of a straight or folded path is undefined; `axis` replaces it there, or any normal where axis is 0.
+    mirrored: the angle is measured about `axis`, so that it is negative where the normal points away from it.
     faint: |u x v| below which the normal is lost in rounding.
     """
     a, b = q[1, :] - q[0, :], q[2, :] - q[1, :]
@@ -149,7 +168,7 @@ def path_angle(q, axis, mirrored, faint):
             e, side = u.cross(v), 1 + ti.zero(aa)
             if mirrored and axis.dot(e) < 0:
                 side = -side
-            if axis.dot(axis) == 0:  # any, away from u
+            if axis.dot(axis) == 0:  # any axis away from u
                 if ti.abs(u[0]) < 0.6:
                     axis[0] = 1
                 else:
@@ -157,7 +176,7 @@ def path_angle(q, axis, mirrored, faint):
             n = side * e + faint * (axis - axis.dot(u) * u)
             n /= ti.max(n.norm(), 1e-30)
             s = e.dot(n)
-            if not mirrored:  # next to straight, where `axis` is the normal, the sign of s is rounding
+            if not mirrored:  # near straight, where `axis` is the normal, the sign of s is rounding
                 s = ti.max(s, 0)
             f = ti.atan2(s, u.dot(v))
             g, k = n.cross(u), n.cross(v)
@@ -166,7 +185,7 @@ def path_angle(q, axis, mirrored, faint):
 
 
 def dihedral_angles(i: np.ndarray, j: np.ndarray, k: np.ndarray, l: np.ndarray) -> np.ndarray:  # noqa: E741
-    """What dihedral_angle() measures, of corners (m, 3) [m]: (m,) [rad]."""
+    """Return what dihedral_angle() measures, of corners (m, 3) [m]: (m,) [rad]."""
     e, a, b = (end - i for end in (j, k, l))
     e = e / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), 1e-300)
     p, q = (r - e * (r * e).sum(axis=1, keepdims=True) for r in (a, b))
@@ -175,9 +194,9 @@ def dihedral_angles(i: np.ndarray, j: np.ndarray, k: np.ndarray, l: np.ndarray) 
 
 @ti.func
 def dihedral_angle(q):
-    """The angle between two triangles with a common edge, of corners (i, j, k, l) of which i is at the origin: the ends of the
-    edge, then the wings; and its gradients. None where an edge or a triangle has no size.
+    """Return the angle between two triangles with a common edge, and its gradients; 0 where an edge or a triangle has no size.
 
+    q: the corners (i, j, k, l), with i at the origin: the ends of the edge, then the wings.
     f = atan2(e . (p x q), -p . q) in (-pi, pi]: 0 where flat, pi where folded, positive where the wings fold towards the side of
     e x p. e: unit vector of the edge x_j - x_i; p, q: unit vectors at right angles to it towards the wings x_k and x_l, at
     distances P and Q from it, with feet at the fractions s and t of the edge (Bergou et al. 2006, eq. 7 ff.).

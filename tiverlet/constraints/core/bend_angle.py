@@ -1,4 +1,4 @@
-"""The angle of a path that remembers its plane, which a straight path in 3D does not have."""
+"""The angle of a path that remembers its plane, since a straight path in 3D does not define one."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +12,11 @@ if TYPE_CHECKING:
 
 
 class BendAngle(Angle):
-    """As PathAngle; in 3D seen about an axis, the normal as it was last, so that it has a direction and a sign while a rod swings
-    through straight. in_state: what it has in the exact state, by name."""
+    """The angle of a path, as in PathAngle, with a remembered axis in 3D.
+
+    The axis is the last normal. With it the angle has a direction and a sign while a rod swings through straight. in_state: its
+    fields in the exact state, by name.
+    """
 
     arity = 3
     exchangeable = ((0, 2),)
@@ -21,11 +24,11 @@ class BendAngle(Angle):
     in_state: dict[str, Any]
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """The angles of paths."""
+        """Return the angles of the paths, (m,)."""
         return path_angles(x[:, 0], x[:, 1], x[:, 2])
 
     def bind(self, scene: "Scene", batch: Any, equation: Any) -> "BendAngle":
-        """In 3D, with the normals as they were last."""
+        """Return the quantity for kernels; in 3D, with a field for the last normals."""
         bound = super().bind(scene, batch, equation)
         bound.in_state = {}
         if scene.state.dim == 3:
@@ -35,12 +38,12 @@ class BendAngle(Angle):
 
     @ti.func
     def reach(self, q):
-        """The shorter of the two legs."""
+        """Return the length of the shorter leg."""
         return shorter_leg(q)
 
     @ti.func
     def measure(self, c, q):
-        """See path_angle(); in 3D, about the axis that is remembered."""
+        """Return path_angle(); in 3D, about the remembered axis."""
         axis = 0 * q[0, :]
         if ti.static(self.state.dim == 3):
             axis = self.axis[c]
@@ -48,12 +51,15 @@ class BendAngle(Angle):
 
     @ti.func
     def mirrored(self, c):
-        """Whether the angle is seen from the side of its axis: where straight is the rest shape."""
+        """Whether the angle is measured about its axis: where the rest shape is straight."""
         return self.rest[c] == 0
 
     @ti.func
     def direction_reliable(self, f, f0):
-        """In 3D, the plane of a nearly straight path turns at the least motion."""
+        """Whether the path is bent by more than 0.1 rad; in 2D always True.
+
+        In 3D the plane of a nearly straight path turns with the least motion.
+        """
         out = True
         if ti.static(self.state.dim == 3):
             out = ti.max(ti.abs(f), ti.abs(f0)) > 0.1
@@ -61,7 +67,10 @@ class BendAngle(Angle):
 
     @ti.func
     def start_substep(self, c, now, start, fresh):
-        """Remember the normal, that of the end where the start is straight, and from which side it is seen."""
+        """Remember the normal, with the sign that suits the last one.
+
+        Where the path is straight at the start, the normal at the end is used.
+        """
         if ti.static(self.state.dim == 3):
             if fresh != 0:
                 self.axis[c] = ti.Vector.zero(self.real, 3)
@@ -78,5 +87,5 @@ class BendAngle(Angle):
 
 @ti.func
 def crossed(q):
-    """u x v of a path in 3D."""
+    """Return u x v of a path in 3D."""
     return (q[1, :] - q[0, :]).normalized(1e-30).cross((q[2, :] - q[1, :]).normalized(1e-30))

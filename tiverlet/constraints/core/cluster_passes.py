@@ -13,17 +13,19 @@ from .strength import Strength
 if TYPE_CHECKING:
     from ...features.feature import Scene
 
-HEAVY = 1024  # masses of the cluster: what a particle that cannot move weighs in it
-LEAST = 2.0**-46  # relative changes of a rotation that are rounding
+HEAVY = 1024  # mass of a particle that cannot move, in masses of its cluster
+LEAST = 2.0**-46  # smaller relative changes of a rotation are rounding
 
 
 class ClusterPasses(Passes):
-    """The passes of a ShapeMatch, which says what c, R and q are, in the loops of VariableCorners: blocks sum up moments, from
-    which each cluster finds where it goes, and corners move towards their places there.
+    """The passes of a ShapeMatch, in the loops of VariableCorners; ShapeMatch defines c, R and q.
 
-    turn, place: R, as few numbers, and c. pose: R as a matrix. fit, middle: R and c at the start of the substep. mean: of what
-    else pulls, which shifts nothing. pull: what a substep moved each corner by.
-    shape: at rest, about the center of each cluster, (total, dim). radius: of each cluster, (m,).
+    Blocks sum up moments, from which each cluster computes its position and rotation. Then corners move towards their places
+    there.
+
+    turn, place: R, as a quaternion or (cos, sin), and c. pose: R as a matrix. fit, middle: R and c at the start of the substep.
+    mean: of the other terms of the violation, which shift nothing. pull: the move of each corner in a substep.
+    shape: rest shape about the center of each cluster, (total, dim). radius: of each cluster, (m,).
     """
 
     def __init__(self, scene: "Scene", batch: Any, shape: np.ndarray, radius: np.ndarray):
@@ -39,14 +41,14 @@ class ClusterPasses(Passes):
         self.shape = add(f"{name}.shape", total, width=dim, values=shape, state=self.plastic)
         turn = rotation.identity(dim)
         self.pull: Any = add(f"{name}.multiplier", total, width=dim, state=True)
-        self.strength = Strength(scene, name, batch)
+        self.strength = Strength(scene, name, batch, total, dim)
         self.turn = add(f"{name}.turn", m, width=len(turn), kind=ti.f64, values=[turn] * m, state=True)
-        told = bool(scene.state.sleepers)  # what the report of a cluster that sleeps goes by, in a clone too
+        told = bool(scene.state.sleepers)  # the report reads it for clusters that sleep, in a clone too
         self.pose = add(f"{name}.pose", m, width=dim * dim, kind=ti.f64, state=told)
         self.place = add(f"{name}.place", m, width=dim, kind=ti.f64, state=told)
 
         def moment(what, width):
-            """A field with a row for each block, to be summed up."""
+            """Add a field with a row for each block, to be summed up."""
             return add(f"{name}.{what}", self.corners.block_count, width=width, kind=ti.f64)
 
         self.total = moment("total", 0)
@@ -65,26 +67,29 @@ class ClusterPasses(Passes):
 
     @ti.func
     def nothing(self) -> Any:
-        """A vector of zeros; what a field has may be no number."""
+        """Return a vector of zeros. A product of 0 and a field may be NaN."""
         return ti.Vector.zero(ti.f64, self.state.dim)
 
     @ti.func
     def arm(self, e, i0, back):
-        """Corner e relative to particle i0, at x - back d; in f64, so that places at the start and predicted ones differ by d."""
+        """Return corner e relative to particle i0, at x - back d.
+
+        It is in f64, so that positions at the start and predicted positions differ by exactly d.
+        """
         i = self.corners.members[e]
         move = ti.cast(self.state.d[i], ti.f64) - ti.cast(self.state.d[i0], ti.f64)
         return ti.cast(self.state.apart(i, i0), ti.f64) - back * move
 
     @ti.func
     def law(self, c, h, h2_effective, fresh):
-        """The coefficients of C_(n+1) (the rigid part and the rest), C_n and C_(n-1), and alpha M / h^2: alpha' of a move."""
+        """Return the coefficients of C_(n+1) (rigid part, soft part), C_n and C_(n-1), and alpha M / h^2: alpha' of a move."""
         rigid, soft = ti.cast(1, self.real), ti.cast(0, self.real)
         now, last, give = 0 * soft, 0 * soft, 0 * soft
         if ti.static(self.spring.soft):
             alpha, mass = self.spring.alpha[c], self.mass[c]
             if alpha > 0 and mass > 0:
                 soft, now, last = self.spring.law(c, h, 1 / mass, fresh)
-                if soft < 1 / 64:  # a start asks for nothing at the end where it is soft: c and R need something to go by
+                if soft < 1 / 64:  # at a start it would be 0 for soft springs, but c and R have to be determined
                     soft, now = ti.cast(1 / 64, self.real), now + soft - 1 / 64
                 rigid = ti.min(stiff(alpha, h, 1 / mass), soft)
                 soft -= rigid
@@ -93,7 +98,7 @@ class ClusterPasses(Passes):
 
     @ti.func
     def share(self, e, A, give):
-        """mu of corner e in a pass: its mass, times what a violation of 1 moves it."""
+        """Return mu of corner e in a pass: its mass, times its move for a violation of 1."""
         i = self.corners.members[e]
         w, mu = self.w.of(i), ti.cast(HEAVY * self.mass[self.corners.owner[e]], ti.f64)
         if w > 0:
@@ -102,7 +107,7 @@ class ClusterPasses(Passes):
 
     @ti.func
     def weight(self, e, c):
-        """The mass of corner e in a fit."""
+        """Return the mass of corner e in a fit."""
         w, mu = self.w.of(self.corners.members[e]), ti.cast(HEAVY * self.mass[c], ti.f64)
         if w > 0:
             mu = ti.cast(1, ti.f64) / w
@@ -110,7 +115,11 @@ class ClusterPasses(Passes):
 
     @ti.func
     def reduce_block(self, b, h, h2_effective, first, fresh):
-        """The moments of a block about the places s at the start: of shapes q, predicted places p, and of what else pulls."""
+        """Sum the moments of a block about the positions s at the start.
+
+        They are of shapes q, of predicted positions p, and of the other violation terms. With first < 0, s are the present
+        positions.
+        """
         begin, end, c = self.corners.block[b]
         i0 = self.corners.hub(c)
         rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
@@ -142,7 +151,7 @@ class ClusterPasses(Passes):
 
     @ti.func
     def moments(self, c):
-        """Sum of mu, means of p, q and s, and the moments of q and p, about these means."""
+        """Return the sum of mu, the means of p, q and s, and the moments of q and p about these means."""
         total, p, q, s = ti.cast(0, ti.f64), self.nothing(), self.nothing(), self.nothing()
         K = p.outer_product(p)
         X = 0 * K
@@ -171,7 +180,7 @@ class ClusterPasses(Passes):
 
     @ti.func
     def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
-        """Find where the cluster goes."""
+        """Compute the position and rotation of the cluster."""
         if self.mass[c] > 0:
             total, p, q, s, K, X = self.moments(c)
             rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
@@ -185,20 +194,23 @@ class ClusterPasses(Passes):
             pose = rotation.matrix(end)
             self.place[c] = p - pose @ q
             if not ti.math.isnan(end.sum()):  # type: ignore[reportOptionalCall]
-                # Else it is how it was turned when places were numbers.
+                # A NaN is not stored: the cluster keeps its last rotation.
                 self.turn[c] = end
             self.keep(self.pose, c, pose)
             self.slots.note_turn(self.slots.turn(cosine, 1.0))
             if ti.static(self.spring.soft):
                 R = rotation.matrix(start)
-                if first > 0:  # in the frame of the body
+                if first > 0:  # in the body frame
                     mean = R @ mean
                 self.middle[c], self.mean[c] = s - R @ q, mean
                 self.keep(self.fit, c, R)
 
     @ti.func
     def push_spring_force(self, c, h):
-        """Find where the cluster is; scatter_corner() then adds h^2 times what its springs do now."""
+        """Compute the present position and rotation of the cluster.
+
+        scatter_corner() then adds h^2 times the spring acceleration.
+        """
         if self.mass[c] > 0:
             total, p, q, s, K, X = self.moments(c)
             R = rotation.matrix(rotation.fit(K, self.turn[c], LEAST))
@@ -207,10 +219,10 @@ class ClusterPasses(Passes):
 
     @ti.func
     def push_reaction(self, c, h, firm, soft):
-        """What moves each corner, less its mean and its moment about the present places, as what turns the cluster, of least sum
-        m move^2.
+        """Push the move of each corner, less the mean and the moment of all moves about the present positions.
 
-        Moves have neither about the places at the start. Where something cannot move, forces from outside have one.
+        The moment is removed as the rotation of least sum m move^2. Moves have no mean and no moment about the positions at the
+        start. Where a particle cannot move, outside forces give both, and nothing is removed.
         """
         begin, end, i0 = self.corners.starts[c], self.corners.starts[c + 1], self.corners.hub(c)
         middle, center, R = self.best_fit(c, 0)
@@ -235,8 +247,10 @@ class ClusterPasses(Passes):
 
     @ti.func
     def reaction(self, e, c, middle, center, R, h, firm, soft):
-        """What moves corner e: as in the last substep, and as far as the force of its spring has changed since. middle, center,
-        R: see best_fit()."""
+        """Return the move of corner e: of the last substep, plus the change of its spring force since.
+
+        middle, center, R: see best_fit().
+        """
         move = firm * ti.cast(self.pull[e], ti.f64)
         if ti.static(self.spring.soft):
             w, mass = self.w.of(self.corners.members[e]), self.mass[c]
@@ -251,7 +265,7 @@ class ClusterPasses(Passes):
 
     @ti.func
     def best_fit(self, c, back):
-        """Of cluster c at x - back d: the mean place, that of its shape, and the rotation that fits best, where it is soft."""
+        """Return, for a soft cluster c at x - back d, the mean position, the mean of its shape, and the best-fit rotation."""
         middle, center = self.nothing(), self.nothing()
         R = middle.outer_product(center)
         if ti.static(self.spring.soft):
@@ -269,7 +283,7 @@ class ClusterPasses(Passes):
 
     @ti.func
     def off(self, e, c):
-        """C_i at the present places."""
+        """Return C_i at the present positions."""
         return self.arm(e, self.corners.hub(c), 0) - self.place[c] - self.kept(self.pose, c) @ self.shape[e]
 
     @ti.func
@@ -301,13 +315,13 @@ class ClusterPasses(Passes):
 
     @ti.func
     def wrong(self, e, c, C, rigid, soft, give):
-        """C* + alpha' lam of a soft cluster, with the soft part of C_(n+1) = C in the frame at the start."""
+        """Return C* + alpha' lam of a soft cluster, with the soft part of C_(n+1) = C in the frame at the start."""
         back = self.kept(self.fit, c) @ (self.kept(self.pose, c).transpose() @ C)
         return rigid * C + soft * back + self.spring.history[e] + give * self.pull[e] - self.mean[c]
 
     @ti.func
     def look_back(self, e, c, h, now, last, fresh):
-        """What C_n and C_(n-1) add to the violation; and flow, where the shape is plastic."""
+        """Store the terms of C_n and C_(n-1) in the violation; and let a plastic shape flow."""
         R = self.kept(self.fit, c)
         C = self.arm(e, self.corners.hub(c), 1) - self.middle[c] - R @ self.shape[e]
         self.spring.history[e] = now * C + last * (R @ self.spring.before(e, ti.cast(self.nothing(), self.real), fresh))
@@ -322,7 +336,7 @@ class ClusterPasses(Passes):
 
     @ti.func
     def spring_move(self, e, c, C, h):
-        """h^2 times the acceleration by the spring and the dashpot of corner e, as far as the step resolves them."""
+        """Return h^2 times the acceleration of corner e by spring and dashpot, as far as the step resolves them."""
         alpha, mass = self.spring.alpha[c], self.mass[c]
         out = 0 * C
         if alpha > 0:
@@ -332,21 +346,23 @@ class ClusterPasses(Passes):
 
     @ti.func
     def break_overloaded(self, c, h2_rigid, h2_effective, tick):
-        """Let cluster c fall apart if the force on one of its particles was too large."""
+        """Break cluster c if the force on one of its particles was too large, see Strength."""
         if self.strength.holds(c):
-            most = ti.cast(0, self.real)
-            for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
-                w = self.w.of(self.corners.members[e])
-                if w > 0:
-                    most = ti.max(most, self.pull[e].norm() / w)
-            w = self.mass[c]
+            w, i0, snaps = self.mass[c], self.corners.hub(c), False
             if w > 0:
                 w = 1 / w
-            self.strength.test(c, most, self.spring.reach(c, w, h2_rigid, h2_effective), tick)
+            reach = self.spring.reach(c, w, h2_rigid, h2_effective)
+            for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+                i = self.corners.members[e]
+                if self.w.of(i) > 0:
+                    past = self.strength.exceeded(c, e, self.pull[e] / self.w.of(i), reach)
+                    snaps = snaps or past > self.strength.rounding(c, i, i0)
+            if snaps:
+                self.strength.snap(c, tick)
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
-        """The largest violation that is left, by where the last pass turned the cluster, relative to its radius."""
+        """Return the largest violation that is left, relative to the radius, with the rotation of the last pass."""
         worst, total, mean, holds = ti.cast(0, ti.f64), ti.cast(0, ti.f64), self.nothing(), self.strength.holds(c)
         rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
         for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
@@ -354,7 +370,7 @@ class ClusterPasses(Passes):
             mean += self.weight(e, c) * self.off(e, c)
         for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
             if self.w.of(self.corners.members[e]) > 0 and holds:
-                C = self.off(e, c) - mean / total  # places are relative to a particle that has moved since
+                C = self.off(e, c) - mean / total  # positions are relative to a particle that has moved since
                 if ti.static(self.spring.soft):
                     C = self.wrong(e, c, C, rigid, soft, give)
                 worst = ti.max(worst, C.norm())
@@ -362,7 +378,10 @@ class ClusterPasses(Passes):
 
     @ti.func
     def energy(self, c, back, h2_effective, residual):
-        """Sum of m |C|^2 / (2 alpha M) at x - back d, about the best fit there, of what bears loads: see Spring.solved()."""
+        """Return the elastic energy [J]: the sum of m |C|^2 / (2 alpha M) at x - back d, about the best fit there.
+
+        It counts only the part that bears loads, see Spring.solved().
+        """
         out = ti.cast(0, ti.f64)
         if ti.static(self.spring.soft):
             alpha, mass, i0 = self.spring.alpha[c], self.mass[c], self.corners.hub(c)

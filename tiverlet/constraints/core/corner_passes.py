@@ -1,4 +1,4 @@
-"""The passes over constraints that are one number, of a few corners each."""
+"""The passes over constraints on one number, of a few corners each."""
 
 from typing import Any
 
@@ -11,19 +11,20 @@ from .known_load import KnownLoad
 from .passes import Passes
 from .step_limit import TRUST
 
-RESOLVED = 4.0  # alpha' / W: from where on the substep resolves a spring
-LOST = 0.015  # violation at the start of a substep, relative to the size, from where on its direction would bring in energy
+RESOLVED = 4.0  # alpha' / W: from this ratio on the substep resolves a spring
+LOST = 0.015  # relative violation at the start of a substep, beyond which its direction there would add energy
 
 
 class CornerPasses(Passes):
     """The passes of a Scalar whose constraints have a few corners; see Equation for the law.
 
-    The direction is that at the start of the step, x_n (SHAKE, Ryckaert 1977): second order and no loss of energy. When a
-    constraint turns by more than 41 degrees in a step, or has no direction at x_n, the current direction takes its place; but
-    springs that the step resolves, alpha' >= RESOLVED W, keep that of x_n, and are Verlet's kick. With the current one, a spring
-    that goes through length 0 would get the push of the other side a step too early, each time, and gain energy.
+    The constraint direction is that at the start of the step, x_n (SHAKE, Ryckaert 1977): second order and no loss of energy.
+    When a constraint turns by more than 41 degrees in a step, or has no direction at x_n, the current direction is used instead.
+    Springs that the step resolves, alpha' >= RESOLVED W, keep the direction of x_n, and act as Verlet kicks. With the current
+    direction, a spring that passes through length 0 would push to the other side a step too early, each time, and gain energy.
 
-    Where a solver takes constraints together, row says which row of its system each is, -1 for none. Others are relaxed alone.
+    `row` is the row of each constraint in a system of constraints that are solved together, -1 for none. Constraints without a
+    row are relaxed alone.
     """
 
     def __init__(self, scene: Scene, batch: Any, start: np.ndarray):
@@ -48,14 +49,16 @@ class CornerPasses(Passes):
             self.step = add(f"{name}.step", m)
         self.known = KnownLoad(scene, name, batch)
         self.impacts: Any = scene.impacts
-        self.leaves = bool(self.impacts) and not self.impacts.exact  # violations, to the next substep
+        self.leaves = bool(self.impacts) and not self.impacts.exact  # violations are left to the next substep
         if self.leaves:
-            self.left = add(f"{name}.left", m)  # of the violation, by the passes of every substep
+            self.left = add(f"{name}.left", m)  # the violation that the regular passes of the substep left
 
     @ti.func
     def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
-        """Move each corner by w_j dlam grad_j C. Where c belongs to a system, dlam comes from there: c tells it what it is about,
-        and leaves w_j grad_j C."""
+        """Move each corner by w_j dlam grad_j C.
+
+        Where c belongs to a system, dlam comes from the system: c fills in its row there, and writes w_j grad_j C into its slots.
+        """
         if ti.static(self.equation.ramp.made):
             if first != 0:
                 self.equation.ramp.follow(c, frame_fraction)
@@ -78,7 +81,7 @@ class CornerPasses(Passes):
 
     @ti.func
     def linearise(self, c, h, h2_effective, share, first, fresh):
-        """What every solver knows of constraint c in a pass; of the state it writes nothing but the memory of soft constraints.
+        """Compute what every solver needs of constraint c in a pass. It writes no state but the memory of soft constraints.
 
         Returns the violation A C + B + alpha' lam, A, alpha', lam, the mass-split weight W (0: no corner can move), directions n
         and gradients g, both (arity, dim), how far it turned, see Slots.note_turn (n is g where too far), and C_(n+1) - C_n.
@@ -90,7 +93,7 @@ class CornerPasses(Passes):
         f0, n = self.quantity.measure(c, start)
         f0 = self.quantity.unwrap(f0, self.equation.rest[c])
         f = self.quantity.unwrap(f, f0)
-        w = ti.cast(0, self.real)  # sum of w |grad|^2; then with split masses: of g . n, g . g, n . n
+        w = ti.cast(0, self.real)  # sum of w |grad|^2; the next three with split masses, of g . n, g . g, n . n
         both, here, there = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
         for k in ti.static(range(self.arity)):
             i = self.corners.member(c, k)
@@ -111,7 +114,7 @@ class CornerPasses(Passes):
             if ti.static(self.spring.soft):
                 resolved = self.spring.alpha[c] >= RESOLVED * here * h2_effective
             if resolved:
-                both = ti.max(both, here / RESOLVED)  # positive, and small beside alpha'
+                both = ti.max(both, here / RESOLVED)  # positive, and small compared with alpha'
             else:
                 n, both = g, here
         if ti.static(self.equation.driven):
@@ -132,10 +135,10 @@ class CornerPasses(Passes):
 
     @ti.func
     def motion(self, c, n, together):
-        """Of constraint c along n: the motion u in this substep, the mass-split weight W, the largest move of a corner by a
-        multiplier of 1, and the largest motion of a corner, squared.
+        """Return, for constraint c along n, the motion u, the weight W, the largest move of a corner, and its largest motion.
 
-        Motions are relative to the first corner; u is relative to the rest value, where that moves.
+        u: in this substep, relative to the rest value where that moves. W: mass-split. Largest move: by a multiplier of 1.
+        Largest motion of a corner: squared. Motions are relative to the first corner.
         together: 1 where masses are split among all constraints, though some are solved together.
         """
         u, W, longest, fastest = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
@@ -155,7 +158,7 @@ class CornerPasses(Passes):
 
     @ti.func
     def limit_step(self, c, lam, new, n, share, together):
-        """The multiplier `new`, or one that only takes out motion where StepLimit asks for it; and whether it is that."""
+        """Return the multiplier `new`, or one that only removes motion where StepLimit requires it; and whether it is limited."""
         far = False
         if self.spring.is_rigid(c):
             u, W, longest, fastest = self.motion(c, n, together)
@@ -165,7 +168,10 @@ class CornerPasses(Passes):
 
     @ti.func
     def tell_system(self, c, violation, A, alpha, lam, W, n, g, turn, moved, share):
-        """Fill in the row of constraint c, from what linearise() returns. share: of the frame, that the substep is."""
+        """Fill in the row of constraint c, from what linearise() returns.
+
+        share: the length of the substep as a share of the frame.
+        """
         row, start, weight, new = self.row[c], lam, W, lam
         if ti.static(self.limit.acts):
             if W > 0:
@@ -184,15 +190,15 @@ class CornerPasses(Passes):
             self.slots.system.limit_row(row, u, spare, most, lam - new)
         for k in ti.static(range(self.arity)):
             self.slots.system.set_gradient(self.corners.places[c][k], self.corners.member(c, k), g[k, :])
-        acts = violation != 0 and W > 0  # 0 where it is broken
-        if ti.static(self.side != 0):  # one that is slack has a direction, but does nothing along it
+        acts = violation != 0 and W > 0  # False where it is broken
+        if ti.static(self.side != 0):  # a slack constraint has a direction, but exerts no force
             acts = W > 0 and (self.side * violation > 0 or lam != 0)
         if acts:
             self.slots.note_turn(turn)
 
     @ti.func
     def relax_alone(self, c, violation, A, alpha, lam, W, n, turn, share, first):
-        """Take the step of the multiplier of constraint c, which belongs to no system. Returns the step."""
+        """Update the multiplier of constraint c, which belongs to no system. Returns the change."""
         new = self.equation.jacobi_update(c, violation, A, alpha, lam, W, turn)
         if ti.static(self.quantity.collapses > 0):
             move = ti.cast(0, self.real)
@@ -205,9 +211,9 @@ class CornerPasses(Passes):
             last, wanted = self.step[c], new
             if first != 0:
                 last = 0
-            if not self.equation.has_cusp(c):  # there the last step had another direction
+            if not self.equation.has_cusp(c):  # the last step there had another direction
                 wanted = lam + self.slots.semi_iteration.step(last, step)
-            step = self.slots.limited(wanted, self.geometric_stiffness(c, W / 2)) - lam  # W has masses that are split by two
+            step = self.slots.limited(wanted, self.geometric_stiffness(c, W / 2)) - lam  # masses in W are split by two
             new = lam + step
         if ti.static(self.limit.acts):
             if W > 0:
@@ -225,7 +231,10 @@ class CornerPasses(Passes):
 
     @ti.func
     def left_before(self, c, violation, lam):
-        """In passes for what struck a wall, see BodyImpacts: what the passes of every substep left of the violation; else 0."""
+        """Return the violation that the regular passes left.
+
+        It is 0 outside of the extra passes after impacts on walls, see BodyImpacts.
+        """
         out = 0 * violation
         if self.impacts.notes():
             self.left[c] = ti.select(ti.static(self.side == 0) or self.side * violation > 0 or lam != 0, violation, out)
@@ -235,7 +244,10 @@ class CornerPasses(Passes):
 
     @ti.func
     def known_violation(self, c, start, W, h, h2_effective):
-        """The violation that would ask for the load that constraint c knows. start: the violation at the start of the substep."""
+        """Return the violation that corresponds to the known load of constraint c.
+
+        start: the violation at the start of the substep.
+        """
         out = 0 * start
         if W > 0 and self.spring.is_rigid(c) and not self.equation.has_cusp(c):
             missing = self.slots.relaxation * start / W
@@ -246,7 +258,7 @@ class CornerPasses(Passes):
 
     @ti.func
     def weigh_load(self, c):
-        """As a window ends: see KnownLoad.weigh()."""
+        """At the end of a window: call KnownLoad.weigh()."""
         _, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
         _, _, most, _ = self.motion(c, g, 0)
         own = ti.cast(0, self.real)
@@ -256,15 +268,17 @@ class CornerPasses(Passes):
 
     @ti.func
     def learn_load(self, c, h):
-        """After that: see KnownLoad.learn()."""
+        """After weigh_load(): call KnownLoad.learn()."""
         _, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
         _, W, _, fastest = self.motion(c, g, 0)
         self.known.learn(c, h * h * W, self.equation.residual_scale(c), ti.sqrt(fastest))
 
     @ti.func
     def geometric_stiffness(self, c, W):
-        """(omega h)^2 of the fastest transverse vibration under a multiplier of 1: 4 w / l in a chain of links l, where W = 2
-        w."""
+        """Return (omega h)^2 of the fastest transverse vibration under a multiplier of 1.
+
+        In a chain of links l it is 4 w / l, where W = 2 w.
+        """
         return 2 * W * self.inverse_size[c]
 
     @ti.func
@@ -277,12 +291,12 @@ class CornerPasses(Passes):
 
     @ti.func
     def unmet(self, c):
-        """Whether constraint c belongs to a system that takes another step of Newton's method."""
+        """Whether constraint c belongs to a system that takes another Newton step."""
         return self.row[c] >= 0 and self.slots.system.is_unmet(self.row[c])
 
     @ti.func
     def update_multiplier(self, c, first):
-        """Add what the system has found to the multiplier."""
+        """Add the step that the system found to the multiplier."""
         if ti.static(self.in_system):
             row = self.row[c]
             if row >= 0:
@@ -294,8 +308,10 @@ class CornerPasses(Passes):
 
     @ti.func
     def push_spring_force(self, c, h):
-        """h^2 w_j F grad_j C, with F of Equation.spring_force(). Rigid links find their force in the next substep, but for the
-        load that they know."""
+        """Push h^2 w_j F grad_j C, with F of Equation.spring_force().
+
+        Rigid links get their force in the next substep, except for the load that they know.
+        """
         f, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
         f = self.quantity.unwrap(f, self.equation.rest[c])
         f0, w = f, ti.cast(0, self.real)
@@ -312,7 +328,7 @@ class CornerPasses(Passes):
 
     @ti.func
     def note_spring_turn(self, c):
-        """Of springs alone; one without length goes through its other end."""
+        """Record how far a spring turned. A spring without rest length is left out, since it passes through length 0."""
         if not self.spring.is_rigid(c) and (ti.static(not self.equation.cusp) or self.equation.rest[c] != 0):
             f, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
             f0, n = self.quantity.remeasure(c, self.seen.apart(c, 1))
@@ -339,7 +355,10 @@ class CornerPasses(Passes):
 
     @ti.func
     def break_overloaded(self, c, h2_rigid, h2_effective, tick):
-        """By its multiplier. The load that it knows is a force in velocities, as a spring's is."""
+        """Break constraint c if its multiplier, or the sum over many substeps, is too large, see Strength.
+
+        Velocities contain its known load, as a spring force. Where low words are carried, lengths are exact.
+        """
         lam, w = self.equation.lam[c], ti.cast(0, self.real)
         if ti.static(self.spring.soft):
             if h2_rigid > h2_effective:
@@ -347,13 +366,25 @@ class CornerPasses(Passes):
         reach = self.spring.reach(c, w, h2_rigid, h2_effective)
         if ti.static(self.known.learns):
             lam += (reach / h2_effective - 1) * self.known.given[c]
-        self.strength.test(c, ti.abs(lam), reach, tick)
+        if self.strength.holds(c):
+            past, unsure = self.strength.exceeded(c, c, lam, reach), 0 * lam
+            if past > 0:
+                if ti.static(not (self.quantity.precise and self.state.carries)):
+                    _, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
+                    for k in ti.static(range(self.arity)):
+                        if g[k, :].norm() > 0:
+                            rounding = self.strength.rounding(c, self.corners.member(c, k), self.corners.member(c, 0))
+                            unsure = ti.max(unsure, rounding / g[k, :].norm())
+                if past > unsure:
+                    self.strength.snap(c, tick)
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
-        """The violation that is left, relative to the rest value (to the batch's mean f where that is 0). W is made of the
-        current gradients alone: it cancels, unless the multiplier is bounded. Without gradients there is no way back, so all of
-        it is left; a spring pulls nowhere there, as it should."""
+        """Return the violation that is left, relative to the rest value (to the batch's mean f where that is 0).
+
+        W is computed from the current gradients alone: it cancels, unless the multiplier is bounded. Without gradients no pass
+        reduces the violation, so all of it is left; a spring correctly exerts no force there.
+        """
         f, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
         f = self.quantity.unwrap(f, self.equation.rest[c])
         w, W, free = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
@@ -371,7 +402,7 @@ class CornerPasses(Passes):
 
     @ti.func
     def energy(self, c, back, h2_effective, residual):
-        """That of its spring."""
+        """Return the energy of the constraint's spring."""
         out = ti.cast(0, ti.f64)
         if ti.static(self.spring.soft):
             if self.equation.stores(c):
@@ -381,7 +412,7 @@ class CornerPasses(Passes):
 
     @ti.func
     def weight(self, c):
-        """sum_j w_j |grad_j f|^2 where its corners are."""
+        """Return sum_j w_j |grad_j f|^2 at the present positions."""
         _, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
         w = ti.cast(0, self.real)
         for k in ti.static(range(self.arity)):

@@ -1,4 +1,4 @@
-"""The corners of constraints on the device: their particles, where these are, and the slots to which their moves go."""
+"""The corners of constraints on the device: their particles, positions, and the slots for their moves."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -10,11 +10,11 @@ from ...device.number import OnDevice
 if TYPE_CHECKING:
     from ...features.feature import Scene
 
-BLOCK = 32  # corners that one thread sums up: the order of all sums is fixed by it, not by the threads
+BLOCK = 32  # corners that one thread sums up: it fixes the order of all sums, whatever the threads
 
 
 class FixedCorners:
-    """Of constraints on `arity` particles each. count: of constraints. places: their slots, None where they have none."""
+    """Corners of constraints on `arity` particles each. count: of constraints. places: their slots, None where they have none."""
 
     count: Any = OnDevice()
 
@@ -28,12 +28,12 @@ class FixedCorners:
 
     @inline
     def member(self, c, k):
-        """The particle at corner k of constraint c."""
+        """Return the particle at corner k of constraint c."""
         return at(at(self.members, c), k)
 
     @inline
     def awake(self, c):
-        """Whether constraint c has a particle that is awake, or one that cannot move alone."""
+        """Whether no particle of constraint c is asleep. All of its particles that can move sleep, or none does."""
         sleepers = self.state.sleepers
         if not sleepers:
             return ti.cast(1, ti.i32) > 0
@@ -51,7 +51,7 @@ class FixedCorners:
 
     @ti.func
     def apart(self, c, back):
-        """Corners of constraint c relative to the first, at x - back d: near the origin, so nothing is lost in f32."""
+        """Return the corners of constraint c relative to the first, at x - back d: near the origin, where f32 loses no digits."""
         i = self.member(c, 0)
         q = ti.Matrix.zero(self.real, self.arity, self.state.dim)
         for k in ti.static(range(1, self.arity)):
@@ -63,7 +63,7 @@ class FixedCorners:
 
     @ti.func
     def now_and_start(self, c):
-        """The same, now and at the start of the substep."""
+        """Return the corners of constraint c relative to the first, now and at the start of the substep."""
         i = self.member(c, 0)
         now = ti.Matrix.zero(self.real, self.arity, self.state.dim)
         start = now
@@ -76,8 +76,9 @@ class FixedCorners:
 
 
 class VariableCorners:
-    """Of constraints of any size. A pass has three loops, so that one constraint on a hundred thousand particles is as parallel
-    as many small ones:
+    """Corners of constraints of any size.
+
+    A pass has three loops, so that one constraint on a hundred thousand particles is as parallel as many small ones:
 
         reduce_block(b)   sums over at most BLOCK corners of one constraint: block[b] = first corner, last + 1, constraint
         relax(c)   adds up its blocks, blocks[c] to blocks[c + 1], in order, and solves
@@ -111,7 +112,7 @@ class VariableCorners:
         self.block = add(f"{name}.block", blocks, width=3, kind=ti.i32, values=np.stack([begin, end, whose], axis=1))
         self.blocks = add(f"{name}.blocks", count + 1, kind=ti.i32, values=first)
         self.places = add(f"{name}.slots", size, kind=ti.i32, values=places)
-        if scene.state.sleepers:  # of each constraint a particle that can move, or else its first one: all sleep or none does
+        if scene.state.sleepers:  # a particle of each constraint that can move, else its first: all sleep or none does
             first = np.lexsort((scene.inv_mass[members] == 0, owner))[starts[:-1]]
             self.mover = add(f"{name}.mover", count, kind=ti.i32, values=members[first])
 
@@ -130,11 +131,11 @@ class VariableCorners:
 
     @ti.func
     def hub(self, c):
-        """The particle relative to which corners of constraint c are given, so that nothing is lost in f32."""
+        """Return the particle that corners of constraint c are relative to, so that f32 loses no digits."""
         return self.members[self.starts[c]]
 
     @ti.func
     def arm(self, e, i0, back):
-        """Corner e relative to particle i0, at x - back d."""
+        """Return corner e relative to particle i0, at x - back d."""
         i = self.members[e]
         return self.state.apart(i, i0) - back * (self.state.d[i] - self.state.d[i0])

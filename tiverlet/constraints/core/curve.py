@@ -1,15 +1,15 @@
-"""Curves through points, by their arc length: polylines, and smooth ones as cubic splines."""
+"""Curves through points, by their arc length: polylines, and smooth curves as cubic splines."""
 
 import numpy as np
 
-PIECES = 8  # of a smooth curve between two given points, of equal length
+PIECES = 8  # of equal length, on a smooth curve between two given points
 
 
 class Curve:
-    """Pieces P_k(r) = a + b r + c r^2 + d r^3, 0 <= r <= length_k, one after the other; r is arc length (splines: to 4th order).
+    """A curve of pieces P_k(r) = a + b r + c r^2 + d r^3, 0 <= r <= length_k; r is arc length (splines: to 4th order).
 
-    points: (k, dim) [m]. closed: the last point is joined to the first. smooth: a cubic spline, with continuous curvature and at
-    open ends the slope of the cubic through four points; otherwise straight pieces.
+    points: (k, dim) [m]. closed: the last point is connected to the first. smooth: a cubic spline, with continuous curvature and
+    at open ends the slope of the cubic through four points; otherwise straight pieces.
     """
 
     def __init__(self, points: np.ndarray, closed: bool, smooth: bool):
@@ -32,31 +32,31 @@ class Curve:
 
     @property
     def length(self) -> float:
-        """Of all pieces [m]."""
+        """Length of all pieces [m]."""
         return float(self.starts[-1])
 
     def split(self, s) -> tuple[np.ndarray, np.ndarray]:
-        """Piece and remainder of arc lengths s [m]; around a closed curve as often as it takes, and no further than open ends."""
+        """Return piece and remainder of arc lengths s [m]; s wraps around a closed curve and is clipped at open ends."""
         s = np.asarray(s, dtype=np.float64)
         s = np.mod(s, self.length) if self.closed else np.clip(s, 0.0, self.length)
         k = np.clip(np.searchsorted(self.starts, s, side="right") - 1, 0, len(self.lengths) - 1)
         return k, s - self.starts[k]
 
     def at(self, s) -> np.ndarray:
-        """Points at arc lengths s [m], (m, dim)."""
+        """Return points at arc lengths s [m], (m, dim)."""
         k, r = self.split(s)
         r = r[..., None]
         return self.a[k] + r * (self.b[k] + r * (self.c[k] + r * self.d[k]))
 
     def tangent(self, s) -> np.ndarray:
-        """Unit vectors along it at arc lengths s [m], (m, dim)."""
+        """Return unit tangents at arc lengths s [m], (m, dim)."""
         k, r = self.split(s)
         r = r[..., None]
         way = self.b[k] + r * (2 * self.c[k] + 3 * r * self.d[k])
         return way / np.linalg.norm(way, axis=-1, keepdims=True)
 
     def nearest(self, x: np.ndarray) -> np.ndarray:
-        """Arc lengths of the points of the curve that are nearest to x (m, dim), among 9 on each piece and between."""
+        """Return arc lengths of the points of the curve nearest to x (m, dim): the best of 9 on each piece, refined."""
         s = (self.starts[:-1, None] + self.lengths[:, None] * np.linspace(0, 1, 9)).ravel()
         p = self.at(np.minimum(s, self.length * (1 - 1e-15)))
         out = np.empty(len(x))
@@ -73,7 +73,7 @@ class Curve:
 
 
 def _slopes(x: np.ndarray, step: np.ndarray, closed: bool) -> np.ndarray:
-    """dP/dt of the cubic spline through x (k + 1, dim), with the steps of t (k,) between."""
+    """Return dP/dt of the cubic spline through x (k + 1, dim), with the steps of t (k,) between."""
     chord = np.diff(x, axis=0) / step[:, None]
     if closed:
         before = np.roll(step, 1)
@@ -93,13 +93,13 @@ def _slopes(x: np.ndarray, step: np.ndarray, closed: bool) -> np.ndarray:
 
 
 def _end(x: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """The slope at the first point, of the cubic through the first four."""
+    """Return the slope at the first point, of the cubic through the first four."""
     t = np.concatenate([[0.0], np.cumsum(step[:3])])
     return np.linalg.solve(np.vander(t, 4, increasing=True), x[:4])[1]
 
 
 def _parabola(x: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Slopes of the polynomial through two or three points."""
+    """Return slopes of the polynomial through two or three points."""
     t = np.concatenate([[0.0], np.cumsum(step)])
     c = np.linalg.solve(np.vander(t, len(t), increasing=True), x)
     return sum(k * c[k] * t[:, None] ** (k - 1) for k in range(1, len(t)))  # type: ignore[return-value]
@@ -132,7 +132,7 @@ def _cyclic(low, main, up, right) -> np.ndarray:
 
 
 def _by_length(x: np.ndarray, step: np.ndarray, closed: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Points on the spline through x that are equally far apart along it, PIECES for each step, and these distances."""
+    """Return points on the spline through x at equal distances along it, PIECES for each step, and these distances."""
     m, nodes = _slopes(x, step, closed), np.polynomial.legendre.leggauss(5)
     chord = np.diff(x, axis=0) / step[:, None]
     c, d = (3 * chord - 2 * m[:-1] - m[1:]) / step[:, None], (m[:-1] + m[1:] - 2 * chord) / step[:, None] ** 2
@@ -145,7 +145,7 @@ def _by_length(x: np.ndarray, step: np.ndarray, closed: bool) -> tuple[np.ndarra
     along = np.concatenate([[0.0], np.cumsum(parts)])
     place = np.concatenate([[0.0], (np.arange(len(step))[:, None] + high).ravel()])  # in steps
     want = np.linspace(0, along[-1], PIECES * len(step) + 1)
-    # Between two fine points, the cubic that has the right speeds at both.
+    # Between two fine points, the cubic with the right speeds at both.
     slope = np.linalg.norm(_derivative(m, c, d, step, place), axis=1)
     k = np.clip(np.searchsorted(along, want, side="right") - 1, 0, len(along) - 2)
     u = (want - along[k]) / (along[k + 1] - along[k])
@@ -160,7 +160,7 @@ def _by_length(x: np.ndarray, step: np.ndarray, closed: bool) -> tuple[np.ndarra
 
 
 def _derivative(m, c, d, step, place) -> np.ndarray:
-    """dP/d(place) of the spline, at places counted in steps."""
+    """Return dP/d(place) of the spline, at places counted in steps."""
     i = np.clip(place.astype(int), 0, len(step) - 1)
     r = ((place - i) * step[i])[:, None]
     return step[i, None] * (m[i] + r * (2 * c[i] + 3 * r * d[i]))

@@ -1,4 +1,4 @@
-"""Rest values that move by themselves: what turns hinges and winds ropes up."""
+"""Rest values that move by themselves: the drives of motors and winches."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -10,35 +10,35 @@ from ...device import ti
 if TYPE_CHECKING:
     from ...features.feature import Batch, Scene
 
-LARGEST = 1e30  # what stands for infinity on the device, whose compilers take numbers to be finite
-STALL = 0.25  # of its size: a violation that no spring bears, from where on the rest value waits for the constraint to follow
-APART = 0.45  # of a period: further away, a value is nearer to the next one that means the same
+LARGEST = 1e30  # stands for infinity on the device, whose compilers assume finite numbers
+STALL = 0.25  # of its size: beyond this violation, if no spring bears it, the rest value waits for the constraint
+APART = 0.45  # of a period: the largest lag, since beyond half a period an equivalent value is nearer
 
 
 def largest_load(batch: "Batch", name: str, value: Any) -> np.ndarray:
-    """The largest load as the user gives it, checked: (m,), infinite for any."""
+    """Return the largest load as the user gives it, checked: (m,), infinite for no limit."""
     return checks.per_item(repr(batch), name, value, batch.count, least=0.0, infinite=True)
 
 
 class Drive:
     """The moving rest values of a batch on the device, and the largest loads against which they move.
 
-    In a substep h the rest value goes `pace` h towards `goal`, or for ever where the drive is `endless` (pace then has a sign).
-    With a time to `settle` it nears the goal at no more than distance / settle: a body that has to be stopped by a limited load
-    would else go past the goal, and come back as fast, for ever. The multiplier is clamped to
+    In a substep h the rest value moves by `pace` h towards `goal`, or without end where the drive is `endless` (pace then has a
+    sign). With a time to `settle` it nears the goal at no more than distance / settle. Otherwise a body that a limited load has
+    to stop would overshoot, and swing back as fast, for ever. The multiplier is clamped to
 
         |lam| <= largest h^2
 
-    that is, below the largest load the constraint is what it would be with that rest value, and at the largest load it is a force
-    of that size. Then the rest value slips: it is never further away than where the multiplier reaches the limit,
-    |f - rest| <= largest h^2 (W + alpha'), so that nothing is wound up that would be given back once the load is gone.
+    Below the largest load the constraint acts as with that rest value; at the largest load it is a force of that size. The rest
+    value then slips, so that nothing is wound up that would be released once the load is gone. It stays within the distance at
+    which the multiplier reaches the limit, |f - rest| <= largest h^2 (W + alpha').
 
-    where, of a rigid constraint, h^2 is what a load of 1 N is by its multiplier in this substep: h h / 2 in a start from given
-    velocities, and h (h + h_old) / 2 where these lack half of its last kick, see Integrator.h2_rigid().
+    For a rigid constraint, h^2 stands for the multiplier of a load of 1 N in this substep: h h / 2 in a start from given
+    velocities, and h (h + h_old) / 2 where these velocities lack half of the last kick, see Integrator.h2_rigid().
 
-    The rest value is kept in f64, where slow motion is not lost in rounding. start: where it begins, (m,). largest: (m,), or None
-    where all are infinite, which costs nothing. period: of the values that mean the same, 0 for none. settle: [s]. in_state: what
-    it has in the exact state, by name.
+    The rest value is kept in f64, where slow motion is not lost in rounding. start: the initial rest values, (m,). largest: (m,),
+    or None where all are infinite, which costs nothing. period: of equivalent values, 0 for none. settle: [s]. in_state: its
+    fields in the exact state, by name.
     """
 
     def __init__(
@@ -67,35 +67,38 @@ class Drive:
             self._memory.write(self.largest, np.minimum(largest, LARGEST))
 
     def values(self) -> np.ndarray:
-        """Where the rest values are now, (m,)."""
+        """Return the current rest values, (m,)."""
         return self._memory.read(self.target)
 
     def slips(self, lam: ti.Field) -> np.ndarray:
-        """Which of the multipliers, a field, are the largest there may be, (m,): forces, which no longer hold anything."""
+        """Return which multipliers of the field `lam` have reached the largest, (m,).
+
+        These constraints act as forces and hold nothing.
+        """
         most = self._memory.read(self.most) if self.capped else np.inf
         return np.abs(self._memory.read(lam)) >= most
 
     def put(self, values: np.ndarray) -> None:
-        """Have them go on from elsewhere."""
+        """Continue from these rest values, (m,)."""
         self._memory.write(self.target, values)
 
     @ti.func
     def near(self, value, other):
-        """Of the values that mean the same, the one nearest to `other`."""
+        """Return the value equivalent to `value` that is nearest to `other`."""
         if ti.static(self.period > 0):
             value -= self.period * ti.round((value - other) * ti.static(1 / self.period))
         return value
 
     @ti.func
     def advance(self, c, f, side: ti.template(), W, alpha, lam, h, h2_effective, size):  # type: ignore[valid-type]
-        """The rest value at the end of a substep that starts at f.
+        """Move the rest value of constraint c, and return it at the end of a substep that starts at f.
 
         side, W: see Equation. alpha: compliance. lam: the multiplier of the last substep. size: of the constraint.
         """
         old, pace = self.target[c], self.pace[c]
         lag = ti.cast(f, ti.f64) - old
         lag = self.near(lag, 0 * lag)
-        start = ti.cast(f, ti.f64) - lag  # where the rest value is, next to f
+        start = ti.cast(f, ti.f64) - lag  # the rest value, as the equivalent value nearest to f
         if ti.static(self.capped):
             most = self.largest[c] * ti.select(alpha == 0, self.h2_rigid[None], h2_effective)
             self.most[c] = most
@@ -117,21 +120,21 @@ class Drive:
         if (lag > stall and way < 0) or (ti.static(side == 0) and lag < -stall and way > 0):
             way = 0 * way
         start = self.near(start + way, 0 * start)
-        if not ti.math.isnan(start):  # else it is where it was when f was a number
+        if not ti.math.isnan(start):  # a NaN is not stored: the rest value keeps its last number
             self.target[c] = start
         self.step[c] = ti.cast(way, self.real)
         return ti.cast(self.target[c], self.real)
 
     @ti.func
     def clamp_force(self, c, force):
-        """A force, at most the largest."""
+        """Return a force, limited to the largest."""
         if ti.static(self.capped):
             force = ti.max(-self.largest[c], ti.min(self.largest[c], force))
         return force
 
     @ti.func
     def clamp(self, c, lam):
-        """A multiplier, at most the largest."""
+        """Return a multiplier, limited to the largest."""
         if ti.static(self.capped):
             lam = ti.max(-self.most[c], ti.min(self.most[c], lam))
         return lam

@@ -1,4 +1,4 @@
-"""The equation of constraints that are one number, C = f - rest: one law from soft to rigid."""
+"""The equation of constraints on one number, C = f - rest: one law from soft to rigid."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -10,14 +10,14 @@ from .spring import Spring, stiff
 from .step_limit import StepLimit
 from .strength import Strength
 
-SMALLEST = 1e-6  # of the size of the scene: a length that is more than rounding
+SMALLEST = 1e-6  # of the size of the scene: a longer length is not rounding
 
 if TYPE_CHECKING:
     from ...features.feature import Scene
 
 
 class Equation:
-    """What the multiplier lam of each constraint C(x) = f(x) - rest = 0, >= 0 or <= 0 has to fulfil, on the device:
+    """The equation for the multiplier lam of each constraint C(x) = f(x) - rest = 0, >= 0 or <= 0, on the device:
 
         theta = s^4 / (1 + s^4), s^2 = (omega h)^2 = w h^2 / alpha     0: resolved by the step, 1: rigid
         C*    = (1 - theta) (C_(n+1) + 2 C_n + C_(n-1)) / 4 + theta C_(n+1)
@@ -26,13 +26,13 @@ class Equation:
 
     W = sum_j n_j w_j grad_j C(x_(n+1)) . grad_j C(x_n) is the mass-split weight: particle j belongs to n_j constraints, and
     gives each an n_j-th of its mass (Tonge 2012), which keeps the sum of all corrections stable and conserves momentum.
-    In the first substep after a start (`fresh`) the force acts for half a kick, alpha' = alpha / (h^2 / 2), and C* is made of
-    C_(n+1) and C_n. With drag, alpha' = alpha / (phi h^2) with the factor phi that the exact solution gives every other
-    acceleration.
+    A start is the first substep after velocities were set (`fresh`). Its force acts for half a kick, alpha' = alpha / (h^2 / 2),
+    and C* is made of C_(n+1) and C_n. With drag, alpha' = alpha / (phi h^2) with the factor phi that the exact solution gives
+    every other acceleration.
 
-    What f and its gradients are, say the passes that ask: CornerPasses, OutlinePasses.
+    CornerPasses and OutlinePasses compute f and its gradients, and call the methods here.
     batch: the Scalar. start: f at the start, (m,). side: 0: C = 0; 1: C <= 0; -1: C >= 0. scale: what residuals are relative to
-    where the rest value is 0. scene_sized: whether that is the size of the scene. in_state: what it has in the exact state, by
+    where the rest value is 0. scene_sized: whether that is the size of the scene. in_state: its fields in the exact state, by
     name.
     """
 
@@ -60,14 +60,14 @@ class Equation:
 
     @ti.func
     def bounded(self, value):
-        """`value` where the constraint acts on its side, else 0."""
+        """Return `value` where the constraint acts on its side, else 0."""
         if ti.static(self.side != 0):
             value = ti.max(self.side * value, 0) * self.side
         return value
 
     @ti.func
     def has_cusp(self, c):
-        """Whether constraint c is rigid and at a cusp: its directions mean nothing from one pass to the next."""
+        """Whether constraint c is rigid and at a cusp, where its directions are unrelated from one pass to the next."""
         out = False
         if ti.static(self.cusp):
             out = self.rest[c] == 0 and self.spring.is_rigid(c)
@@ -75,7 +75,10 @@ class Equation:
 
     @ti.func
     def terms(self, c, f, f0, w, W, h, h2_effective, first, fresh):
-        """A C + B + alpha' lam, A, alpha', lam and W (0 where it is broken), from f at the end and at the start, and w."""
+        """Return A C + B + alpha' lam, A, alpha', lam and W (0 for a broken constraint).
+
+        f, f0: f at the end and at the start of the substep. w: see stiff().
+        """
         if ti.static(self.strength.breaks):
             if not self.strength.holds(c):
                 W = 0
@@ -98,14 +101,14 @@ class Equation:
                     self.spring.last[c] = f0
                 else:
                     B = self.spring.history[c]
-            elif first != 0:  # it has no direction now, and may get one in a later pass
+            elif first != 0:  # without a direction now, it may get one in a later pass
                 self.spring.history[c] = 0
                 self.spring.last[c] = f0
         return A * C + B + alpha * lam, A, alpha, lam, W
 
     @ti.func
     def violation_then(self, c, f, ago: ti.template()):  # type: ignore[valid-type]
-        """f - rest with the rest value of `ago` substeps ago."""
+        """Return f - rest with the rest value of `ago` substeps ago."""
         C = f - self.rest[c]
         if ti.static(self.driven):
             C += ago * self.drive.step[c]
@@ -115,12 +118,14 @@ class Equation:
 
     @ti.func
     def postpone(self, c, f0, W, share, first):
-        """What of the violation is left for later substeps, see StepLimit. share: of the frame, that the substep is; 0 where none
-        is."""
+        """Return the part of the violation that is left for later substeps, see StepLimit.
+
+        share: the length of the substep as a share of the frame; 0 outside of a substep.
+        """
         out = ti.cast(0, self.real)
         if first != 0:
             C = f0 - self.rest[c]
-            if ti.static(self.driven):  # the way that the drive goes in this substep is not postponed
+            if ti.static(self.driven):  # the motion of the drive in this substep is not postponed
                 C += self.drive.step[c]
             if self.spring.is_rigid(c):
                 out = self.limit.postpone(c, self.bounded(C), W * ti.abs(self.lam[c]), self.residual_scale(c), share)
@@ -131,7 +136,7 @@ class Equation:
 
     @ti.func
     def multiplier_of(self, c, violation, A, alpha, lam, W):
-        """The multiplier after a Jacobi pass."""
+        """Return the multiplier after a Jacobi pass."""
         new = lam
         if W > 0:
             new = lam - self.slots.relaxation * violation / (A * W + alpha)
@@ -143,7 +148,7 @@ class Equation:
 
     @ti.func
     def jacobi_update(self, c, violation, A, alpha, lam, W, turn):
-        """The same; where it changes, how far the constraint turned is noted."""
+        """Return the multiplier after a Jacobi pass. Where it changes, record how far the constraint turned."""
         new = self.multiplier_of(c, violation, A, alpha, lam, W)
         if new != lam:
             self.slots.note_turn(turn)
@@ -151,7 +156,7 @@ class Equation:
 
     @ti.func
     def removed(self, c, violation, A, alpha, lam, W):
-        """The size of the violation that a Jacobi pass would remove."""
+        """Return the size of the violation that a Jacobi pass would remove."""
         size = ti.cast(0, self.real)
         if W > 0:
             new = self.multiplier_of(c, violation, A, alpha, lam, W)
@@ -160,7 +165,7 @@ class Equation:
 
     @ti.func
     def spring_force(self, c, f, f0, w, h):
-        """F = -(1 - theta) (C / alpha + damping dC/dt), from f now and a substep ago, for starts."""
+        """Return F = -(1 - theta) (C / alpha + damping dC/dt), from f now and a substep ago, for starts."""
         force = ti.cast(0, self.real)
         if ti.static(self.spring.soft):
             alpha = self.spring.alpha[c]
@@ -179,7 +184,10 @@ class Equation:
 
     @ti.func
     def reaction(self, c, f, w, W, h, firm, soft):
-        """h^2 F of the last substep; of a spring, with how much it has changed since. f: now. w, W: as in Spring.change()."""
+        """Return h^2 F of the last substep; for a spring, corrected by how much F has changed since.
+
+        f: now. w, W: as in Spring.change(). firm, soft: as in Passes.push_reaction().
+        """
         pull = firm * self.lam[c]
         if ti.static(self.spring.soft):
             if not self.spring.is_rigid(c):
@@ -196,14 +204,14 @@ class Equation:
 
     @ti.func
     def stores(self, c):
-        """Whether constraint c is a spring, which can store energy."""
+        """Whether constraint c is a spring that holds, and can store energy."""
         return self.spring.alpha[c] > 0 and self.strength.holds(c)
 
     @ti.func
     def energy(self, c, f, w, h2_effective, residual):
-        """Elastic energy [J] of a spring at f: F C / 2, which is C^2 / (2 alpha) once solved.
+        """Return the elastic energy [J] of a spring at f: F C / 2, which is C^2 / (2 alpha) once solved.
 
-        See Spring.solved() and Spring.energy(). h2_effective: F = -lam / h2_effective; 0 where there was no substep yet.
+        See Spring.solved() and Spring.energy(). h2_effective: F = -lam / h2_effective; 0 before the first substep.
         """
         alpha = self.spring.alpha[c]
         C = self.bounded(self.quantity.unwrap(f, self.rest[c]) - self.rest[c])
@@ -218,7 +226,7 @@ class Equation:
 
     @ti.func
     def residual_scale(self, c):
-        """What the residual of constraint c is relative to."""
+        """Return the scale of the residual of constraint c."""
         size = self.scale.now
         if ti.static(not self.quantity.unit):
             if self.rest[c] != 0:

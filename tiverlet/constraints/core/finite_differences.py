@@ -15,8 +15,8 @@ class NumericGradient:
     """function(x_0, x_1, ...) of `arity` corners in `dim` dimensions, and its gradient: given, or by central differences.
 
     function, gradient: a Taichi function, and whether it takes the number of the constraint after the corners.
-    fixed: 1 if the function does not change when all corners move together; the gradient of the first is then what the others
-    lack to a sum of 0. size, where it is asked: of the step where all corners coincide, in units of STEP [m].
+    fixed: 1 if the function does not change when all corners move together. The gradient of the first corner is then minus the
+    sum of the others. size, as an argument: scale of the step where all corners coincide, in units of STEP [m].
     """
 
     def __init__(self, function: tuple, gradient: tuple | None, arity: int, dim: int, fixed: int):
@@ -30,7 +30,7 @@ class NumericGradient:
         self.number = [[(k - fixed) * dim + a + 1 if k >= fixed else -1 for a in range(dim)] for k in range(arity)]
 
     def __call__(self, q: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Values (m,), gradients and differences (m, arity, dim) at corners q (m, arity, dim), in f64."""
+        """Return values (m,), gradients and differences (m, arity, dim) at corners q (m, arity, dim), in f64."""
         runtime.ensure_started()
         m = len(q)
         f, g, d = np.zeros(m), np.zeros((m, self.arity, self.dim)), np.zeros((m, self.arity, self.dim))
@@ -43,7 +43,7 @@ class NumericGradient:
         self, points: ti.types.ndarray(ti.f64, 3), f: ti.types.ndarray(ti.f64, 1), g: ti.types.ndarray(ti.f64, 3),
         d: ti.types.ndarray(ti.f64, 3), size: ti.f64,
     ):  # fmt: skip
-        """The function, its gradient as constraints use it, and by differences."""
+        """Compute the function, its gradient as constraints use it, and its differences."""
         for c in range(points.shape[0]):
             q = ti.Matrix.zero(ti.f64, self.arity, self.dim)
             for k, a in ti.static(ti.ndrange(self.arity, self.dim)):
@@ -59,8 +59,8 @@ class NumericGradient:
 
     @ti.func
     def value(self, c, q, j, step):
-        """function at q, moved by `step` along the unknown number (j + 1) / 2, forward for odd j and back for even."""
-        # Vectors, not a matrix: Taichi 1.7.4 ends in control_flow_graph.cpp on some that are assigned whole and by elements.
+        """Return function at q, moved by `step` along the unknown number (j + 1) / 2, forward for odd j and back for even."""
+        # Vectors, not a matrix: Taichi 1.7.4 fails in control_flow_graph.cpp on some that are assigned whole and by elements.
         sign = ti.select(j % 2 == 1, step, -step)
         corners = [
             ti.Vector([q[k, a] + sign * ti.cast((j + 1) // 2 == self.number[k][a], ti.f64) for a in ti.static(range(self.dim))])
@@ -70,18 +70,18 @@ class NumericGradient:
 
     @inline
     def arguments(self, corners, c, counts):
-        """Of a call; Quadrants takes what is unpacked only at their end."""
+        """Return the arguments of a call. Quadrants accepts unpacked arguments only at the end."""
         return [*corners, c] if counts else corners
 
     @ti.func
     def slope(self, c, q):
-        """The gradient that was given."""
+        """Return the given gradient."""
         corners = [q[k, :] for k in ti.static(range(self.arity))]
         return self.rows(self.given(*self.arguments(corners, c, self.gradient_counts)))
 
     @ti.func
     def rows(self, vectors: ti.template()):  # type: ignore[valid-type]
-        """One vector, or a tuple of them, as a matrix."""
+        """Return one vector, or a tuple of vectors, as a matrix."""
         g = ti.Matrix.zero(ti.f64, self.arity, self.dim)
         for k, a in ti.static(ti.ndrange(self.arity, self.dim)):
             if ti.static(self.arity == 1):
@@ -92,9 +92,9 @@ class NumericGradient:
 
     @ti.func
     def differentiate(self, c, q, scale):
-        """function and central differences of it at q. scale: the step where q is 0, in units of STEP.
+        """Return function and its central differences at q. scale: of the step where q is 0, in units of STEP.
 
-        One loop, not unrolled, holds the only copy of the function.
+        One loop, which is not unrolled, holds the only copy of the function.
         """
         size = 0 * q[0, 0]
         for k, a in ti.static(ti.ndrange(self.arity, self.dim)):
@@ -117,7 +117,7 @@ class NumericGradient:
 
     @ti.func
     def both(self, c, q, scale):
-        """The function and its gradient."""
+        """Return the function and its gradient."""
         if ti.static(self.analytic):
             return self.value(c, q, 0, 0 * q[0, 0]), self.slope(c, q)
         else:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def lengths_of(batch: Any, value: Any) -> np.ndarray:
-    """Rest lengths as the user gives them, checked, (m,); in a periodic box they are below half of it."""
+    """Return rest lengths as the user gives them, checked, (m,); in a periodic box they are below half of it."""
     out = checks.per_item(repr(batch), batch.rest_name, value, batch.count, least=0.0)
     if batch.periodic is not None and batch.count:
         batch.periodic.refuse(repr(batch), f"link {int(out.argmax())} holds particles", float(out.max()), "links", True)
@@ -27,7 +27,7 @@ REST_LENGTH = Knob(lengths_of, "Rest length [m].")
 class Length(Quantity):
     """The distance of a pair, f(x) = |x_i - x_j|, and its gradients.
 
-    Two particles in the same place have no direction between them; +x stands in for it.
+    Two particles in the same place have no direction between them; +x replaces it.
     """
 
     arity, apart = 2, True
@@ -35,11 +35,11 @@ class Length(Quantity):
     ends = precise = True
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """Lengths of the links."""
+        """Return the lengths of the links, (m,)."""
         return np.linalg.norm(x[:, 0] - x[:, 1], axis=1)
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
-        """As in measure()."""
+        """Return the gradients, as measure() does."""
         r = x[:, 0] - x[:, 1]
         length = np.linalg.norm(r, axis=1, keepdims=True)
         n = np.divide(r, length, out=np.eye(1, r.shape[1]).repeat(len(r), axis=0), where=length > 0)
@@ -47,19 +47,19 @@ class Length(Quantity):
 
     @ti.func
     def excess(self, c, f):
-        """|r| - rest = (r^2 - rest^2) / (|r| + rest): to all digits of the low words, where there are any."""
+        """Return |r| - rest = (r^2 - rest^2) / (|r| + rest), to all digits of the low words, where there are any."""
         rest = self.rest[c]
         C = f - rest
         if ti.static(self.state.carries):
             if f + rest > 0:
                 r = self.state.between(self.corners.member(c, 0), self.corners.member(c, 1))
-                goal = ti.cast(rest, ti.f64)
+                goal = self.rest_exactly(c)
                 C = ti.cast(r.dot(r) - goal * goal, self.real) / (f + rest)
         return C
 
     @ti.func
     def measure(self, c, q):
-        """|r| and +- r / |r|, with r = x_0 - x_1."""
+        """Return |r| and +- r / |r|, with r = x_0 - x_1."""
         r = q[0, :] - q[1, :]
         length = ti.sqrt(r.dot(r))
         n = 0 * r
@@ -70,11 +70,11 @@ class Length(Quantity):
 
     @ti.func
     def exactly(self, c):
-        """f - rest in f64, which the difference of two lengths in f32 is not."""
+        """Return f - rest in f64; the difference of two lengths in f32 loses digits."""
         r = self.state.between(self.corners.member(c, 0), self.corners.member(c, 1))
-        return ti.sqrt(r.dot(r)) - ti.cast(self.rest[c], ti.f64)
+        return ti.sqrt(r.dot(r)) - self.rest_exactly(c)
 
 
 def is_link(feature: Any) -> "TypeGuard[Scalar]":
-    """Whether what a feature constrains is lengths."""
+    """Whether a feature constrains lengths."""
     return isinstance(getattr(feature, "quantity", None), Length)

@@ -1,6 +1,6 @@
-"""Which particles the constraints of a batch act on: each on as many, or on any number. On the device: corners.py.
+"""The particles that the constraints of a batch act on: a fixed number each, or any number. On the device: corners.py.
 
-What is here does not change: another choice of particles is another object.
+These objects do not change: other particles are another object.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ class FixedSize:
     def __init__(self, kind: str, indices: np.ndarray):
         self.kind = kind
         self.rows = np.asarray(indices, dtype=np.int32)
-        self.indices = handed_out(self.rows, structure(kind, "indices"))  # the same, which says what it is
+        self.indices = handed_out(self.rows, structure(kind, "indices"))  # for users: read-only, with advice in its error
         self.arity = self.rows.shape[1]
 
     @property
@@ -38,15 +38,15 @@ class FixedSize:
 
     @property
     def listing(self) -> np.ndarray:
-        """As the user gives them."""
+        """The particles of each constraint, as the user gives them."""
         return self.indices
 
     def row(self, c: int) -> np.ndarray:
-        """The particles of constraint c."""
+        """Return the particles of constraint c."""
         return self.indices[c]
 
     def check(self, who: str, name: str, count: int) -> None:
-        """Raise ValueError for a particle that is none of `count`; name: the argument of `who` that the indices are."""
+        """Raise ValueError for a particle that is none of `count`; name: the argument of `who` that has the indices."""
         checks.indices(who, name, self.indices, count, arity=self.arity)
 
     def idle(self, inv_mass: np.ndarray) -> np.ndarray:
@@ -54,25 +54,25 @@ class FixedSize:
         return (inv_mass[self.indices] == 0).all(axis=1)
 
     def kept_mask(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Which constraints have none but particles that stay, whose new numbers are not -1."""
+        """Return which constraints have only particles that stay, whose new numbers are not -1."""
         return (np.all(number[self.indices] >= 0, axis=1),)
 
     def remapped(self, some: np.ndarray, number: np.ndarray) -> "FixedSize":
-        """Those in the mask `some`, by the new numbers of their particles."""
+        """Return the constraints in the mask `some`, with the new numbers of their particles."""
         return FixedSize(self.kind, number[self.indices[some]])
 
     def pairs(self) -> np.ndarray:
-        """All pairs of particles of the same constraint, (k, 2)."""
+        """Return all pairs of particles of the same constraint, (k, 2)."""
         pairs = [self.indices[:, [a, b]] for a in range(self.arity) for b in range(a)]
         return np.concatenate([*pairs, np.zeros((0, 2), dtype=np.int32)])
 
     def bind(self, scene: "Scene", batch: Any) -> FixedCorners:
-        """The same on the device, for a batch; with slots, unless it drives its particles."""
+        """Return the corners on the device, for a batch; with slots, unless the batch drives its particles."""
         return FixedCorners(scene, repr(batch), self.indices, None if batch.drives else scene.slots.places(batch))
 
 
 def rows(who: str, name: str, value: Any, least: int) -> list[np.ndarray]:
-    """A sequence of index sequences of any lengths (or a single one), each of at least `least` distinct particles."""
+    """Check a sequence of index sequences of any lengths (or a single one), each of at least `least` distinct particles."""
     value = checks.rows(who, name, value, "a sequence of index sequences")
     if len(value) and np.ndim(value[0]) == 0:
         value = [value]
@@ -89,9 +89,9 @@ def rows(who: str, name: str, value: Any, least: int) -> list[np.ndarray]:
 
 
 class VariableSize:
-    """m constraints of the same kind, each on as many particles as it needs; see FixedSize for the methods.
+    """m constraints of the same kind, each on any number of particles; see FixedSize for the methods.
 
-    The corners of all constraints lie one after the other in `indices` (total,); constraint c owns starts[c] to starts[c + 1].
+    `indices` (total,) has the corners of all constraints one after the other; constraint c owns starts[c] to starts[c + 1].
     kind: the class of the batch, for errors.
     """
 
@@ -114,11 +114,11 @@ class VariableSize:
 
     @property
     def listing(self) -> list[np.ndarray]:
-        """The particles of each."""
+        """The particles of each constraint."""
         return [self.row(k) for k in range(self.count)]
 
     def row(self, c: int) -> np.ndarray:
-        """The particles of constraint c."""
+        """Return the particles of constraint c."""
         return self.indices[self.starts[c] : self.starts[c + 1]]
 
     def check(self, who: str, name: str, count: int) -> None:
@@ -133,21 +133,21 @@ class VariableSize:
         return np.bincount(self.owner, weights=inv_mass[self.indices] > 0, minlength=self.count) == 0
 
     def kept_mask(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Constraints stay as long as all of their particles do, and their corners with them."""
+        """Return masks of the constraints, and of their corners, that have only particles that stay."""
         some = np.bincount(self.owner, weights=number[self.indices] < 0, minlength=self.count) == 0
         return some, some[self.owner]
 
     def remapped(self, some: np.ndarray, number: np.ndarray) -> "VariableSize":
-        """Those in the mask `some`, by the new numbers of their particles."""
+        """Return the constraints in the mask `some`, with the new numbers of their particles."""
         out, sizes = copy(self), np.diff(self.starts)[some]
         out.starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
         out.indices = handed_out(number[self.indices[some[self.owner]]].astype(np.int32), structure(self.kind, "indices"))
         return out
 
     def pairs(self) -> np.ndarray:
-        """No pairs: corners of one constraint may be far from each other."""
+        """Return no pairs: corners of one constraint may be far from each other."""
         return np.zeros((0, 2), dtype=np.int32)
 
     def bind(self, scene: "Scene", batch: Any) -> VariableCorners:
-        """The same on the device, for a batch."""
+        """Return the corners on the device, for a batch."""
         return VariableCorners(scene, repr(batch), self.starts, self.indices, self.owner, scene.slots.places(batch))

@@ -12,12 +12,15 @@ if TYPE_CHECKING:
     from ...features.feature import Scene
     from .curve import Curve
 
-WALK = 64  # steps along the pieces of a path, at most, that a search takes
+WALK = 64  # steps along the pieces of a path that a search takes at most
 
 
 class OnCurve(Place):
-    """Where particles are on a curve: the piece, and how far along it. start: their arc lengths at first, (m,). extent: of the
-    curve [m]. Those that are driven have a pace: speeds where it `moves`, or else arc lengths; None where they slide."""
+    """Places of particles on a curve: the piece, and the distance along it.
+
+    start: initial arc lengths, (m,). extent: of the curve [m]. pace: of driven particles, speeds where it `moves`, else arc
+    lengths; None where particles slide.
+    """
 
     def __init__(
         self, scene: "Scene", passes: AnchorPasses, curve: "Curve", start: np.ndarray, pace: np.ndarray | None, moves: bool,
@@ -48,13 +51,13 @@ class OnCurve(Place):
 
     @ti.func
     def point(self, k, r):
-        """P and dP/dr on piece k."""
+        """Return P and dP/dr on piece k."""
         b, c, d = self.b[k], self.c[k], self.d[k]
         return self.a[k] + r * (b + r * (c + r * d)), b + r * (2 * c + 3 * r * d)
 
     @ti.func
     def drive(self, c, h, frame_fraction):
-        """Put the particle where it is to be."""
+        """Put the particle in its place."""
         s, length = self.source[c], self.begin[self.pieces]
         if ti.static(self.moves):
             s += self.target[c] * h
@@ -72,15 +75,19 @@ class OnCurve(Place):
                 low = middle
             else:
                 high = middle
-        P, T = self.point(low, ti.cast(s - self.begin[low], self.real))
         i = self.corners.member(c, 0)
-        d = P - self.state.place(i)
-        self.state.d[i] = d
-        self.state.advance(i, d)
+        if ti.static(self.state.sums):
+            P, T = self.point(low, s - self.begin[low])
+            self.state.bring(i, P)
+        else:
+            P, T = self.point(low, ti.cast(s - self.begin[low], self.real))
+            d = P - self.state.place(i)
+            self.state.d[i] = d
+            self.state.advance(i, d)
 
     @ti.func
     def search(self, x):
-        """The piece nearest to x, and how far along it, as if it were straight."""
+        """Return the piece nearest to x, and the distance along it, with pieces taken for straight lines."""
         best, piece, rest = ti.cast(ti.math.inf, self.real), 0, 0 * x[0]
         for k in range(self.pieces):
             a, end = self.a[k], self.point(k, self.lengths[k])[0]
@@ -93,9 +100,10 @@ class OnCurve(Place):
 
     @ti.func
     def foot(self, k, r, x, t, across):
-        """Where, from rest r on piece k on, the plane through x across t meets the curve; or else the point nearest to x.
+        """Return where the plane through x normal to t meets the curve, or with `across` False the point nearest to x.
 
-        Also says whether the curve turned away from t by more than 41 degrees, or the way was too long.
+        The search starts at distance r along piece k. Also returns whether the curve turned away from t by more than 41 degrees,
+        or the search was too long.
         """
         going, bent, came = True, False, -1
         for _ in range(WALK):
@@ -126,7 +134,10 @@ class OnCurve(Place):
 
     @ti.func
     def offsets(self, c, frame_fraction, first, fresh):
-        """Across the curve, from where the plane across it meets it; at an end or a bend, from the nearest point."""
+        """Return x - P across the curve, with P where the plane across it meets it.
+
+        At an end or a bend, P is the nearest point.
+        """
         i = self.corners.member(c, 0)
         x, t, C0 = self.state.place(i), self.tangent[c], ti.Vector.zero(self.real, self.state.dim)
         k, r = self.piece[c], self.rest[c]
@@ -152,7 +163,7 @@ class OnCurve(Place):
 
     @ti.func
     def offset_now(self, c, back):
-        """From the nearest point."""
+        """Return the offset from the nearest point."""
         i = self.corners.member(c, 0)
         x = self.state.place(i) - back * self.state.d[i]
         k, r, lost = self.foot(self.piece[c], self.rest[c], x, x, False)
@@ -161,6 +172,6 @@ class OnCurve(Place):
 
     @ti.func
     def offset_change(self, c):
-        """What of the motion is across the curve."""
+        """Return the part of the displacement across the curve."""
         d, t = self.state.d[self.corners.member(c, 0)], self.tangent[c]
         return d - d.dot(t) * t

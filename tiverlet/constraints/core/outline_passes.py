@@ -1,4 +1,4 @@
-"""The passes over constraints that are one number, of any number of corners each: what a line or a surface encloses."""
+"""The passes over constraints on one number, of any number of corners each: areas in lines and volumes in surfaces."""
 
 from typing import Any
 
@@ -16,8 +16,8 @@ PRESSURE = Knob(lambda f, v: checks.per_item(repr(f), "pressure", v, f.count, le
 class OutlinePasses(Passes):
     """The passes of a Scalar on closed outlines of any size, in the loops of VariableCorners; see Equation for the law.
 
-    f is a polynomial of degree dim in the corners and the same after a translation. So dim f = sum_e (x_e - x_0) . grad_e f
-    (Euler), and outlines need no more than their gradients, which are slope(e, back) of their Quantity.
+    f is a polynomial of degree dim in the corners and does not change in a translation. So dim f = sum_e (x_e - x_0) . grad_e f
+    (Euler), and outlines need only their gradients, which are slope(e, back) of their Quantity.
     """
 
     def __init__(self, scene: Scene, batch: Any, start: np.ndarray):
@@ -35,7 +35,10 @@ class OutlinePasses(Passes):
 
     @ti.func
     def reduce_block(self, b, h, h2_effective, first, fresh):
-        """Of a block: f and f0, w |grad|^2; mass-split along both, current, start; its squared size, and of what it moves."""
+        """Sum over a block: f and f0; w |grad|^2; mass-split along both, current, start; squared size; squared move.
+
+        The last is the squared displacement by a multiplier of 1.
+        """
         begin, end, c = self.corners.block[b]
         i0 = self.corners.hub(c)
         sums = ti.Vector.zero(self.real, 8)
@@ -55,7 +58,7 @@ class OutlinePasses(Passes):
 
     @ti.func
     def total(self, c):
-        """f, f0, the sum of w |grad|^2, the mass-split weight, how far it turned, and the last two sums."""
+        """Return f, f0, the sum of w |grad|^2, the mass-split weight, how far it turned, and the last two sums."""
         sums = ti.Vector.zero(self.real, 8)
         for b in range(self.corners.blocks[c], self.corners.blocks[c + 1]):
             sums += self.sums[b]
@@ -67,7 +70,7 @@ class OutlinePasses(Passes):
 
     @ti.func
     def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
-        """Find dlam; scatter_corner() moves the corners."""
+        """Compute dlam; scatter_corner() moves the corners."""
         if ti.static(self.equation.ramp.made):
             if first != 0:
                 self.equation.ramp.follow(c, frame_fraction)
@@ -81,7 +84,7 @@ class OutlinePasses(Passes):
 
     @ti.func
     def scatter_corner(self, e, h, h2_effective, first, fresh):
-        """Move each corner by w_j dlam grad_j C."""
+        """Move corner e by w_j dlam grad_j C."""
         c = self.corners.owner[e]
         n = self.start[e]
         if self.astray[c] != 0:
@@ -90,13 +93,13 @@ class OutlinePasses(Passes):
 
     @ti.func
     def push_spring_force(self, c, h):
-        """As in CornerPasses; scatter_corner() pushes what is found here."""
+        """Compute h^2 F as in CornerPasses; scatter_corner() pushes it."""
         f, f0, w, W, turn, extent, move = self.total(c)
         self.change[c], self.astray[c] = h * h * self.equation.spring_force(c, f, f0, w, h), 1
 
     @ti.func
     def push_reaction(self, c, h, firm, soft):
-        """As in CornerPasses."""
+        """Push h^2 w_j F grad_j C, as in CornerPasses."""
         f, w, W, i0 = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real), self.corners.hub(c)
         if ti.static(self.spring.soft):
             for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
@@ -110,13 +113,21 @@ class OutlinePasses(Passes):
 
     @ti.func
     def break_overloaded(self, c, h2_rigid, h2_effective, tick):
-        """By its multiplier."""
-        reach = self.equation.spring.reach(c, self.weight(c), h2_rigid, h2_effective)
-        self.strength.test(c, ti.abs(self.equation.lam[c]), reach, tick)
+        """Break constraint c if its multiplier, or the sum over many substeps, is too large, see Strength."""
+        if self.strength.holds(c):
+            reach = self.equation.spring.reach(c, self.weight(c), h2_rigid, h2_effective)
+            past, unsure, i0 = self.strength.exceeded(c, c, self.equation.lam[c], reach), 0 * reach, self.corners.hub(c)
+            if past > 0:
+                for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+                    g = self.quantity.slope(e, 0).norm()
+                    if g > 0:
+                        unsure = ti.max(unsure, self.strength.rounding(c, self.corners.members[e], i0) / g)
+                if past > unsure:
+                    self.strength.snap(c, tick)
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
-        """The violation that is left, as in CornerPasses."""
+        """Return the violation that is left, as in CornerPasses."""
         f, f0, w, W, turn, extent, move = self.total(c)
         violation, A, alpha, lam, W = self.equation.terms(c, f, f0, w, W, h, h2_effective, 0, fresh)
         left = self.equation.removed(c, violation, A, alpha, lam, W)
@@ -128,7 +139,7 @@ class OutlinePasses(Passes):
 
     @ti.func
     def energy(self, c, back, h2_effective, residual):
-        """That of its spring, at f by Euler's theorem."""
+        """Return the energy of the constraint's spring, with f by Euler's theorem."""
         out = ti.cast(0, ti.f64)
         if ti.static(self.spring.soft):
             if self.equation.stores(c):
@@ -140,7 +151,7 @@ class OutlinePasses(Passes):
 
     @ti.func
     def weight(self, c):
-        """sum_j w_j |grad_j f|^2 of a spring, as the last pass summed it up."""
+        """Return sum_j w_j |grad_j f|^2 of a spring, as summed up in the last pass."""
         w = ti.cast(0, self.real)
         if ti.static(self.spring.soft):
             for b in range(self.corners.blocks[c], self.corners.blocks[c + 1]):

@@ -1,4 +1,4 @@
-"""What a constraint that is one number holds: the number f, of the corners of each of its constraints."""
+"""The number f that a constraint holds: a function of the corners of each constraint."""
 
 from collections.abc import Callable
 from copy import copy
@@ -11,123 +11,141 @@ from ...device import ti
 if TYPE_CHECKING:
     from ...features.feature import Scene
 
-TOGETHER = 10_000  # rows whose values are found at a time
+TOGETHER = 10_000  # rows whose values are computed at a time
 
 
 class Quantity:
-    """The contract of f in C(x) = f(x) - rest: a length, an angle, an area; and what most of them do.
+    """The contract of f in C(x) = f(x) - rest (a length, an angle, an area), with defaults that suit most quantities.
 
-    A new one says values() and measure(), and how it differs from a plain number: unwrap() and difference() where some values
-    mean the same, `curved` and reach() where its gradient is right only near by. Kernels call what bind() returns. Of outlines
-    (arity 0) f is a polynomial of degree dim in the corners, and they give slope() in place of measure(), see OutlinePasses.
+    A new quantity implements values() and measure(), and overrides what differs from a plain number. unwrap() and difference():
+    where several values are equivalent. `curved` and reach(): where its gradient is valid only near by. Kernels call the object
+    that bind() returns. For outlines (arity 0), f is a polynomial of degree dim in the corners, and slope() replaces measure(),
+    see OutlinePasses.
 
     members: FixedSize or VariableSize, the particles of each constraint.
     """
 
-    arity = 0  # corners of each constraint; 0: as many as each needs
-    apart = False  # whether f is how far two particles are from each other
-    exchangeable: tuple[tuple[int, ...], ...] = ()  # groups of corners that may swap
-    unit: float | None = None  # what residuals are relative to; None: the rest value
-    precise = False  # whether exactly() measures to all the digits that positions have
-    ends = False  # whether gradients end at f = 0
-    curved = False  # whether f is so curved that Newton's step from afar means nothing
+    arity = 0  # corners of each constraint; 0: a variable number
+    apart = False  # whether f is the distance between two particles
+    exchangeable: tuple[tuple[int, ...], ...] = ()  # groups of corners that may be exchanged
+    unit: float | None = None  # scale of residuals; None: the rest value
+    precise = False  # whether exactly() computes f to all digits of the positions
+    ends = False  # whether gradients are discontinuous at f = 0
+    curved = False  # whether f is so curved that a Newton step from afar is meaningless
     collapses = 0  # the power of a length that f is, where gradients vanish with the size of the body; else 0
-    transcends = False  # takes angles, cube roots or exponentials, which SPIR-V has for f32 only
-    centred = False  # whether f is counted from something that moves with the rest value
-    state: Any  # on the device, as what follows
+    transcends = False  # needs angles, cube roots or exponentials, which SPIR-V has for f32 only
+    centred = False  # whether f is measured from a value that moves with the rest value
+    state: Any  # set by bind() for the device, as are the next three
     real: Any
     corners: Any
     rest: Any
+    drive: Any
+    ramp: Any
 
     def __init__(self, members: Any):
         self.members = members
 
     @property
     def listing(self) -> Any:
-        """The particles of each, as the user gives them."""
+        """The particles of each constraint, as the user gives them."""
         return self.members.listing
 
     def pairs(self) -> np.ndarray:
-        """Pairs of particles that may overlap, (k, 2)."""
+        """Return pairs of particles that may overlap, (k, 2)."""
         return self.members.pairs()
 
     def remapped(self, some: np.ndarray, number: np.ndarray) -> "Quantity":
-        """That of the constraints in the mask `some`, by the new numbers of their particles."""
+        """Return the quantity of the constraints in the mask `some`, with the new numbers of their particles."""
         new = copy(self)
         new.members = self.members.remapped(some, number)
         return new
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """f, (m,), of corners x (m, arity, dim) [m]; of outlines, of all positions (n, dim)."""
+        """Return f, (m,), of corners x (m, arity, dim) [m]; for outlines, of all positions (n, dim)."""
         raise NotImplementedError
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
-        """Its gradients by each corner, (m, arity, dim); of outlines (total, dim)."""
+        """Return the gradients of f by each corner, (m, arity, dim); for outlines (total, dim)."""
         return differences(self.values, x)
 
     def difference(self, f: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """How far f is from a goal, (m,)."""
+        """Return the difference of f from a goal, (m,)."""
         return f - goal
 
     def bind(self, scene: "Scene", batch: Any, equation: Any) -> Any:
-        """The same for the kernels of a batch, whose corners and rest values its equation has."""
+        """Return the quantity for the kernels of a batch, with the corners and rest values of its equation."""
         bound = copy(self)
         bound.state, bound.real = scene.state, scene.real
-        bound.corners, bound.rest = equation.corners, equation.rest
+        bound.corners, bound.rest, bound.drive, bound.ramp = equation.corners, equation.rest, equation.drive, equation.ramp
         return bound
 
     def frame(self, corners: Any) -> Any:
-        """What gives measure() its corners: relative to the first of each constraint, unless f says otherwise."""
+        """Return the object that gives measure() its corners: by default relative to the first corner of each constraint."""
         return corners
 
     @ti.func
     def measure(self, c, q):
-        """f of constraint c and its (arity, dim) gradients at corners q (arity, dim), which are relative to corner 0."""
+        """Return f of constraint c and its (arity, dim) gradients at corners q (arity, dim), which are relative to corner 0."""
         return 0.0, q
 
     @ti.func
     def remeasure(self, c, q):
-        """The same where it is not for a pass, which solvers take most of their time for."""
+        """Return what measure() returns, outside of passes; passes call measure() itself, which takes most of a solver's time."""
         return self.measure(c, q)
 
     @ti.func
     def slope(self, e, back):
-        """Of outlines: the gradient by corner e, at x - back d."""
+        """For outlines: return the gradient by corner e, at x - back d."""
         return ti.Vector.zero(self.real, 1)
 
     @ti.func
     def unwrap(self, f, other):
-        """Of the values that mean the same as f, the one nearest to `other`; more than one only for angles."""
+        """Return the value equivalent to f that is nearest to `other`. Only angles have more than one."""
         return f
 
     @ti.func
     def excess(self, c, f):
-        """Where it is `precise`: f - rest of constraint c to all digits."""
+        """Return f - rest of constraint c, to all digits where the quantity is `precise`."""
         return f - self.rest[c]
 
     @ti.func
+    def rest_exactly(self, c):
+        """The rest value of constraint c in f64, where it moves: in f32 it would jerk, with rounding / h^2."""
+        rest = ti.cast(self.rest[c], ti.f64)
+        if ti.static(bool(self.drive)):
+            rest = self.drive.target[c]
+        if ti.static(self.ramp.made):
+            rest += self.ramp.low[c]
+        return rest
+
+    @ti.func
     def exactly(self, c):
-        """f - rest of constraint c in f64."""
+        """Return f - rest of constraint c in f64."""
         return ti.cast(0, ti.f64)
 
     @ti.func
     def reach(self, q):
-        """How far a corner may move before f is no longer what its gradient says, with corners q: about the size of the body."""
+        """Return how far a corner may move before the gradient no longer describes f.
+
+        q: the corners. The result is about the size of the body.
+        """
         return ti.cast(1, self.real)
 
     @ti.func
     def start_substep(self, c, now, start, fresh):
-        """Before the first pass of a substep: keep what measure() needs of its start, from corners now and at the start."""
+        """Before the first pass of a substep: store what measure() needs, from corners now and at the start."""
 
     @ti.func
     def direction_reliable(self, f, f0):
-        """Whether directions at f (now) and f0 (at the start) are clear enough to tell a turn of 41 degrees."""
+        """Whether directions at f (now) and f0 (at the start) are defined well enough to detect a turn of 41 degrees."""
         return True
 
 
 def differences(values: Callable, x: np.ndarray) -> np.ndarray:
-    """Gradients of values(x) by each corner of x (m, arity, dim), central differences. values: takes all of x several times, one
-    behind the other; few rows take as long as one."""
+    """Return gradients of values(x) by each corner of x (m, arity, dim), by central differences.
+
+    values: takes several copies of all of x, one after the other. A few rows take as long as one.
+    """
     step, m = 1e-6 * (float(np.ptp(x, axis=1).max(initial=0.0)) or 1.0), len(x)
     flat = x.reshape(m, x.shape[1] * x.shape[2])
     out, each = np.zeros_like(flat), max(1, TOGETHER // max(1, 2 * m))

@@ -1,23 +1,23 @@
-"""Rotations of clusters, in 2D and 3D: the best fit without reflection, and the turn of a body in a step.
+"""Rotations of clusters, in 2D and 3D: the best fit without reflection, and the rotation of a body in a step.
 
-Kept as (cos, sin) in 2D and as a quaternion (w, x, y, z) in 3D. K = sum mu q s^T holds a shape q against places s.
+Stored as (cos, sin) in 2D and as a quaternion (w, x, y, z) in 3D. K = sum mu q s^T relates a shape q to positions s.
 """
 
 import numpy as np
 
 from ...device import ti
 
-STEPS = 16  # of Newton's iteration at most; from the rotation of the last substep it takes two or three
+STEPS = 16  # Newton iterations at most; from the rotation of the last substep it takes two or three
 
 
 def identity(dim: int) -> np.ndarray:
-    """No rotation, as it is kept."""
+    """Return the identity, as it is stored."""
     return np.eye(1, 2 if dim == 2 else 4)[0]
 
 
 @ti.func
 def matrix(r):
-    """The matrix of a kept rotation."""
+    """Return the matrix of a stored rotation."""
     if ti.static(r.n == 2):
         return ti.Matrix([[r[0], -r[1]], [r[1], r[0]]])
     else:
@@ -31,7 +31,7 @@ def matrix(r):
 
 @ti.func
 def after(a, b):
-    """Rotation b, then a; normalized."""
+    """Return rotation b followed by a, normalized."""
     c = 0 * a
     if ti.static(a.n == 2):
         c = ti.Vector([a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]])
@@ -45,7 +45,7 @@ def after(a, b):
 
 @ti.func
 def axial(B):
-    """sum s x y of B = sum y s^T: one number in 2D, three in 3D."""
+    """Return sum s x y of B = sum y s^T: one number in 2D, three in 3D."""
     if ti.static(B.n == 2):
         return ti.Vector([B[1, 0] - B[0, 1]])
     else:
@@ -54,13 +54,13 @@ def axial(B):
 
 @ti.func
 def quaternion(step):
-    """A rotation by about |step|, about it; not normalized."""
+    """Return the quaternion of a rotation about `step` by about |step|, not normalized."""
     return ti.Vector([1 + 0 * step[0], step[0] / 2, step[1] / 2, step[2] / 2])
 
 
 @ti.func
 def diagonal(value, like):
-    """`value` times the unit matrix."""
+    """Return `value` times the unit matrix."""
     out = 0 * like
     for k in ti.static(range(like.n)):
         out[k, k] = value
@@ -69,7 +69,7 @@ def diagonal(value, like):
 
 @ti.func
 def solved(H, r):
-    """The solution of H x = r by cofactors, and det H."""
+    """Return the solution of H x = r by cofactors, and det H."""
     a, b, c = H[0, :], H[1, :], H[2, :]
     det = a.dot(b.cross(c))
     return (b.cross(c) * r[0] + c.cross(a) * r[1] + a.cross(b) * r[2]) / det, det
@@ -77,14 +77,14 @@ def solved(H, r):
 
 @ti.func
 def spin(S, X):
-    """How a body turns, as a matrix, whose parts move by y: S = sum m r r^T, X = sum m r y^T, about its centre."""
+    """Return the rotation, as a matrix, of a body whose parts move by y: S = sum m r r^T, X = sum m r y^T, about its centre."""
     gap, out, size = axial(X.transpose()), 0 * S, S.trace()
     if size > 0:
         if ti.static(S.n == 2):
             out[1, 0] = gap[0] / size
             out[0, 1] = -out[1, 0]
         else:
-            # About a line of particles anything will do. As a literal, 1 + 2^-46 would be 1 in f32.
+            # The rotation about a line of particles is arbitrary. As a literal, 1 + 2^-46 would be 1 in f32.
             x, _ = solved(diagonal(size + ti.static(2.0**-46) * size, S) - S, gap)
             out = ti.Matrix([[0 * size, -x[2], x[1]], [x[2], 0 * size, -x[0]], [-x[1], x[0], 0 * size]])
     return out
@@ -92,7 +92,10 @@ def spin(S, X):
 
 @ti.func
 def newton(M, gap, least):
-    """A rotation vector that closes the gap of axial(M) for M = R K; along the gap where there is no curvature to go by."""
+    """Return a rotation vector that closes the gap of axial(M) for M = R K, and whether it is longer than `least`.
+
+    It is along the gap where M has no curvature to use.
+    """
     size, step = M.norm(), 0 * gap
     if size > 0:
         step = gap / size
@@ -109,11 +112,11 @@ def newton(M, gap, least):
 
 @ti.func
 def fit(K, kept, least):
-    """The rotation R that comes closest, sum mu |s - R q|^2 least, among rotations without reflection.
+    """Return the rotation R that fits best, sum mu |s - R q|^2 least, among rotations without reflection.
 
-    In 2D it has a closed form. In 3D Newton's iteration from `kept` climbs tr(R K) over the quaternions, by the gradient where it
-    is not concave (Mueller et al. 2016 use the gradient throughout). Where the fit does not determine the rotation (points on a
-    line, in one place, or mirrored with equal axes) it stays as near to `kept` as it can.
+    In 2D it has a closed form. In 3D Newton's iteration from `kept` maximises tr(R K) over the quaternions, along the gradient
+    where it is not concave (Mueller et al. 2016 use the gradient throughout). Where the fit does not determine the rotation
+    (points on a line, in one place, or mirrored with equal axes) R stays as near to `kept` as it can.
     least: the relative size below which a number is rounding.
     """
     r = kept
@@ -134,14 +137,14 @@ def fit(K, kept, least):
 
 @ti.func
 def turn(K, X, U, body, stiff, soft, kept, least, deforms: ti.template()):  # type: ignore[valid-type]
-    """Rotations of a body at the start and at the end of a step, at most 90 degrees apart, and the cosine of that angle.
+    """Return rotations of a body at the start and at the end of a step, at most 90 degrees apart, and the cosine of that angle.
 
     At the start, with K = sum mu q s^T, it is the fit R. At the end it is D R, with
-        axial((stiff + soft D^T) X - (stiff D + soft) R K + U) = 0,   X = sum mu p s^T of the predicted places p.
-    Stiff, this says that what moves places p to D R q has no moment about the places s at the start; then it is one step of a
-    free rigid body (Moser and Veselov 1991), and nothing is lost. Soft, deformations are turned back into the frame at the
-    start first, and U is what else pulls (body: given in the frame of the body). deforms: whether anything is soft.
-    A body whose shape is a point does not turn: all that there is of it would be deformed.
+        axial((stiff + soft D^T) X - (stiff D + soft) R K + U) = 0,   X = sum mu p s^T of the predicted positions p.
+    For a stiff body this means that the moves from positions p to D R q have no moment about the positions s at the start. Then
+    it is one step of a free rigid body (Moser and Veselov 1991), and nothing is lost. For a soft body, deformations are first
+    turned back into the frame at the start, and U is the moment of the other violation terms (body: given in the body frame).
+    deforms: whether anything is soft. A body whose shape is a point does not turn: all of its extent would be deformation.
     """
     start, end, cosine, pull = kept, kept, 1 + 0 * stiff, axial(U)
     if K.norm() == 0:
@@ -161,7 +164,7 @@ def turn(K, X, U, body, stiff, soft, kept, least, deforms: ti.template()):  # ty
             D = ti.Vector([(a * cosine + b * sine) / size, (a * sine - b * cosine) / size])
             end, cosine = after(D, start), D[0]
     else:
-        stage, S = 0, K  # 0: the fit; 1: the turn; 2: done
+        stage, S = 0, K  # 0: the fit; 1: the rotation of the step; 2: done
         for k in range(2 * STEPS):
             if stage < 2:
                 B = matrix(end) @ K
@@ -195,5 +198,5 @@ def turn(K, X, U, body, stiff, soft, kept, least, deforms: ti.template()):  # ty
 
 @ti.func
 def turned_back(r):
-    """The inverse of a quaternion."""
+    """Return the inverse of a quaternion."""
     return ti.Vector([r[0], -r[1], -r[2], -r[3]])

@@ -1,4 +1,4 @@
-"""Constraints that are one number, C = f - rest: their arguments, rest values and loads."""
+"""Constraints on one number, C = f - rest: their arguments, rest values and loads."""
 
 import warnings
 from collections.abc import Callable
@@ -26,16 +26,18 @@ if TYPE_CHECKING:
 
 
 class Scalar(Batch):
-    """Constraints C(x) = f(x) - rest = 0, >= 0 or <= 0, soft or rigid; f is its `quantity`. What is here is the host's: arguments
-    and reports. What a substep does is in Equation, the law, and in CornerPasses or OutlinePasses, the passes over them.
+    """Constraints C(x) = f(x) - rest = 0, >= 0 or <= 0, soft or rigid; f is its `quantity`.
 
-    Rest values that are assigned are reached in the course of the next frame, see Ramp; at once where particles are placed. Where
-    f is curved (angles, areas, volumes), steps of rigid constraints are limited, see StepLimit.
+    This class has the host's part: arguments and reports. Equation has the law of the multiplier. CornerPasses or OutlinePasses
+    have the passes of a substep.
+
+    Assigned rest values are reached during the next frame, see Ramp; at once where particles are placed. Where f is curved
+    (angles, areas, volumes), steps of rigid constraints are limited, see StepLimit.
     """
 
     index_name = "pairs"
     measures: type[Quantity] = Quantity  # f, of a fixed number of corners
-    quantity: Quantity  # the f of its constraints
+    quantity: Quantity  # f of the batch's constraints
     side = 0  # 0: C = 0;  1: C <= 0, pulls when f > rest;  -1: C >= 0, pushes when f < rest
     rest: Any  # a Knob in each constraint: (m,) array
     compliance = Knob(lambda f, v: checks.per_item(repr(f), "compliance", v, f.count, least=0.0), "Of springs.", force=True)
@@ -45,11 +47,11 @@ class Scalar(Batch):
 
     each = ("rest", "compliance", "damping", "break_at")
     uploads_all = True
-    _scene_sized = False  # whether any of its constraints, which has no size of its own, has that of the whole scene
+    _scene_sized = False  # whether any constraint without a size of its own takes the size of the whole scene
     grows = True
 
     def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
-        """Keep the arguments of __init__; what depends on the particles is checked in prepare()."""
+        """Store the arguments of __init__; prepare() checks what depends on the particles."""
         self.hold_all(indices)
         self._warn_duplicates()
         if rest is not None:
@@ -58,23 +60,23 @@ class Scalar(Batch):
         self.break_at, self.compliance, self.damping = break_at, compliance, damping
 
     def quantity_of(self, indices) -> Quantity:
-        """f of these particles, given as the user gives them."""
+        """Return f of these particles, given as the user gives them."""
         return self.measures(self.fixed(indices, self.measures.arity))
 
     def fixed(self, indices, arity: int) -> FixedSize:
-        """The same number of particles for each constraint, checked."""
+        """Check the indices of constraints on `arity` particles each, and return them as members."""
         return FixedSize(type(self).__name__, checks.indices(repr(self), self.index_name, indices, checks.ANY, arity=arity))
 
     def hold(self, quantity: Quantity) -> None:
-        """Take this f, and act on its particles."""
+        """Use this f, and act on its particles."""
         self._keep(quantity=quantity, members=quantity.members, arity=getattr(quantity.members, "arity", 0))
 
     def check_indices(self, particles: "Particles") -> None:
-        """Check the particles of each constraint against those that there are."""
+        """Raise ValueError where a constraint names a particle that does not exist."""
         self.members.check(repr(self), self.index_name, particles.count)
 
     def _warn_duplicates(self) -> None:
-        """Warn of constraints that are given twice, at the line that made them."""
+        """Warn of constraints that are given twice, at the line that created them."""
         if not self.arity:
             return
         ordered = self.indices.copy()
@@ -91,13 +93,15 @@ class Scalar(Batch):
 
     @property
     def transcends(self) -> bool:
-        """Whether it takes angles, cube roots or exponentials."""
+        """Whether f needs angles, cube roots or exponentials."""
         return self.quantity.transcends
 
     @property
     def cusp(self) -> bool:
-        """Whether any rest value is an f at which gradients end (f = 0), or was when kernels were compiled: directions mean
-        nothing there."""
+        """Whether any rest value is an f where the gradient is discontinuous (f = 0), or was when kernels were compiled.
+
+        The constraint direction is not defined there.
+        """
         return self.quantity.ends and bool((self.goal == 0).any()) or "cusp" in self.once
 
     @property
@@ -111,21 +115,21 @@ class Scalar(Batch):
         return self.quantity.listing
 
     def select(self, some: np.ndarray, number: np.ndarray) -> None:
-        """Keep these constraints, by the new numbers of their particles."""
+        """Keep the constraints in the mask `some`, with the new numbers of their particles."""
         self.hold(self.quantity.remapped(some, number))
 
     def excluded_pairs(self, particles: "Particles") -> np.ndarray:
-        """All corners of a constraint may overlap, but of outlines only neighbours."""
+        """Return pairs that may overlap: all corners of a constraint, but only neighbours of an outline."""
         return self.quantity.pairs()
 
     def ties(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rigid links and ropes that nothing drives or breaks, as long as they are at the start."""
+        """Return rigid links and ropes that nothing drives or breaks, and their initial lengths."""
         if not self.quantity.apart or self.side < 0 or self.driven or self.breaks or self.soft or not self.count:
             return super().ties()
         return self.indices, self.rest_of(self.start.position)
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """f of corners x (m, arity, dim), (m,); of outlines, of all positions (n, dim)."""
+        """Return f of corners x (m, arity, dim), (m,); for outlines, of all positions (n, dim)."""
         return self.quantity.values(x)
 
     def hold_all(self, listing: Any) -> None:
@@ -133,25 +137,28 @@ class Scalar(Batch):
         self.hold(self.quantity_of(listing))
 
     def can_regroup(self, change: Regrouping) -> bool:
-        """Whether none of its particles goes or gets another number, and no length of it is that of the whole scene."""
+        """Whether no particle of the batch goes or gets another number, and no constraint takes the size of the whole scene."""
         return not (self.indices >= change.first).any() and not self._scene_sized
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
-        """f at the given positions, (m,): the rest value when none is given."""
+        """Return f at the given positions, (m,): the rest value when none is given."""
         return self.values(self.placed(position) if self.arity else position)
 
     def placed(self, position: np.ndarray) -> np.ndarray:
-        """Where the corners of each constraint are, (m, arity, dim); in a periodic box the images nearest to the first."""
+        """Return the positions of the corners of each constraint, (m, arity, dim).
+
+        In a periodic box these are the images nearest to the first corner.
+        """
         x = position[self.indices]
         return x if self.periodic is None else x[:, :1] + self.periodic.difference(x, x[:, :1])
 
     @property
     def goal(self) -> np.ndarray:
-        """What f is to be, (m,)."""
+        """The value that f is to reach, (m,)."""
         return self.rest
 
     def tracks(self) -> list[tuple[Any, np.ndarray, Callable]]:
-        """What moves when rest values are assigned: fields, what they are to be, and how far values are from others."""
+        """List what an assignment of rest values moves: fields, their goals, and the function for differences of values."""
         return [(self.dev.equation.rest, self.goal, self.quantity.difference)]
 
     @property
@@ -160,23 +167,25 @@ class Scalar(Batch):
         return self.dev.equation.ramp if "equation" in vars(self.dev) else None
 
     def violation(self, position: np.ndarray) -> np.ndarray:
-        """C at the given positions, (m,), with the rest values of the state: where a ramp is under way, those from which it
-        begins."""
+        """Return C at the given positions, (m,), with the rest values of the state: during a ramp, those at which it begins."""
         rest = self.ramp.now()[0] if self.ramp and self.ramp.under_way else self.goal
         return self.quantity.difference(self.rest_of(position), rest)
 
     def gradients(self, position: np.ndarray) -> np.ndarray:
-        """grad_k f of every constraint at the given positions, (m, arity, dim); of outlines (total, dim)."""
+        """Return grad_k f of every constraint at the given positions, (m, arity, dim); for outlines (total, dim)."""
         return self.quantity.gradients(self.placed(position) if self.arity else position)
 
     def weights(self, position: np.ndarray) -> np.ndarray:
-        """The sum of w |grad f|^2 of every constraint at the given positions, (m,)."""
+        """Return the sum of w |grad f|^2 of every constraint at the given positions, (m,)."""
         w, squares = self.scene.inv_mass[self.indices], (self.gradients(position) ** 2).sum(axis=-1)
         return (w * squares).sum(axis=1) if self.arity else np.bincount(self.owner, w * squares, minlength=self.count)
 
     def inverse_size(self, position: np.ndarray) -> np.ndarray:
-        """What makes C a share of the size of its constraint, (m,): 1 / length for links, of which those between particles in one
-        place are as long as the others, or the scene; 0 for what else has no extent."""
+        """Return the factor that makes C relative to the size of its constraint, (m,): 1 / length for links.
+
+        A link between particles in one place counts with the mean length of the others, or else the size of the scene. Other
+        constraints without extent get 0.
+        """
         squares = self.gradients(position) ** 2
         if self.arity:
             x = self.placed(position)
@@ -194,7 +203,7 @@ class Scalar(Batch):
         return np.divide(1, size, out=np.zeros(self.count), where=size > 0)
 
     def prepare(self, particles: "Particles", inv_mass: np.ndarray) -> None:
-        """Check indices against the number of particles and settle the rest values."""
+        """Check indices against the number of particles, and set the rest values."""
         self.check_indices(particles)
         if "rest" not in self.__dict__:
             if self._rest_given is None:
@@ -203,11 +212,11 @@ class Scalar(Batch):
                 self.rest = self._rest_given
 
     def start_from(self, rest: np.ndarray) -> None:
-        """Have these rest values, (m,), which nobody has given: as if they had been, but that nothing changes."""
+        """Set initial rest values (m,) that the user has not given, without marking the batch as changed."""
         self.__dict__["rest"] = handed_out(rest, assign_whole(type(self).__name__, "rest"))
 
     def review(self, particles: "Particles", inv_mass: np.ndarray) -> None:
-        """Warn of constraints that are violated between particles that cannot move."""
+        """Warn of violated constraints between particles that cannot move."""
         stuck = self.idle(inv_mass)
         if stuck.any():
             C = self.violation(particles.position)
@@ -230,50 +239,55 @@ class Scalar(Batch):
 
     @property
     def damped(self) -> bool:
-        """Whether any has a dashpot."""
+        """Whether any constraint has a dashpot, or had when kernels were compiled."""
         return self.soft and bool((self.damping > 0).any()) or "damped" in self.once
 
     @property
     def breaks(self) -> bool:
-        """Whether a load can break constraints of the batch."""
+        """Whether a load can break constraints of the batch, or could when kernels were compiled."""
         return self.break_at is not None or "breaks" in self.once
 
     @property
     def _strictly(self) -> bytes | None:
-        """The compliances in a world of higher order, which is built for these values, though its kernels are not; else None."""
+        """The compliances in a world of order above 2, which is built for their values though its kernels are not; else None."""
         return self.compliance.tobytes() if self.scene and self.scene.order > 2 else None
 
     def acts_as_force(self, scene: Scene) -> np.ndarray:
-        """Which constraints act as forces, (m,): soft ones in substeps of an order above 2. See high_order.py."""
+        """Return which constraints act as forces, (m,): soft ones in substeps of an order above 2. See high_order.py."""
         return (self.compliance > 0) & (scene.order > 2)
 
     def relaxed_alone(self, scene: Scene) -> np.ndarray:
-        """Which constraints no system takes, (m,): those that act as forces, rigid ones at a cusp, and drives with a limited
-        load."""
+        """Return which constraints are never part of a system, (m,).
+
+        These are constraints that act as forces, rigid ones at a cusp, and drives with a limited load.
+        """
         if self.driven:
             return self.acts_as_force(scene) | np.isfinite(self.largest)
         return self.acts_as_force(scene) | (self.cusp & (self.goal == 0) & (self.compliance == 0))
 
     @property
     def outgrown(self) -> bool:
-        """Whether the world has to be built anew: others than before are to be relaxed alone, or compliances differ in a world of
-        higher order. A world is what its knobs say, not how they came there."""
+        """Whether the world has to be rebuilt.
+
+        It has to be where other constraints than before must be relaxed alone, or where compliances differ in a world of order
+        above 2. The result depends on the current values of knobs, not on earlier ones.
+        """
         if not (self.scene and self.acts):
             return super().outgrown
         others = self.solvable_together and bool((self._alone != self.relaxed_alone(self.scene)).any())
         return super().outgrown or others or self._made_for != self._strictly
 
     def drive_of(self, scene: Scene) -> Drive:
-        """What moves the rest values of a driven batch."""
+        """Make the Drive that moves the rest values of a driven batch."""
         raise NotImplementedError
 
     def course(self) -> tuple[Any, Any]:
-        """Of a driven batch: where rest values go to, and how fast, (m,) each."""
+        """Return the goals and the speeds of the rest values of a driven batch, (m,) each."""
         raise NotImplementedError
 
     @property
     def largest(self) -> Any:
-        """Of a driven batch: the largest loads, (m,)."""
+        """The largest loads of a driven batch, (m,)."""
         raise NotImplementedError
 
     @property
@@ -282,12 +296,14 @@ class Scalar(Batch):
         return self.driven and (bool(np.isfinite(self.largest).any()) or "capped" in self.once)
 
     def start_at(self, position: np.ndarray, first: int) -> None:
-        """Of a driven batch: particles from number `first` on were placed at `position`, (n, dim)."""
+        """Adapt a driven batch after particles from number `first` on were placed at `position`, (n, dim)."""
 
     @property
     def limited(self) -> bool:
-        """Whether steps have to be limited, see StepLimit, or had to be when kernels were compiled: f is curved, and any
-        constraint rigid."""
+        """Whether steps have to be limited, see StepLimit, or had to be when kernels were compiled.
+
+        They are limited where f is curved and any constraint is rigid.
+        """
         return self.quantity.curved and bool((self.compliance == 0).any()) or "limited" in self.once
 
     @property
@@ -297,24 +313,26 @@ class Scalar(Batch):
 
     @property
     def learns_loads(self) -> bool:
-        """Whether rigid constraints of the batch can know their loads: few corners, an f that neither is curved nor collapses, no
-        drive."""
+        """Whether rigid constraints of the batch can know their loads.
+
+        They need few corners, no drive, and an f that is not curved and does not collapse.
+        """
         return self.arity > 0 and not (self.driven or self.quantity.curved or self.quantity.collapses)
 
     def passes(self, scene: Scene) -> Any:
-        """Those over a few corners, or over outlines."""
+        """Make the passes over a few corners, or over outlines."""
         start = self.rest_of(self.start.position) if self.count else np.zeros(0)
         return (CornerPasses if self.arity else OutlinePasses)(scene, self, start)
 
     def bind(self, scene: Scene) -> None:
-        """Have it on the device, as long as what it is built for stays."""
+        """Declare the fields, and note for which values the world is built."""
         self._alone, self._made_for = self.relaxed_alone(scene), self._strictly
         super().bind(scene)
         self._scene_sized = self.dev.limit.scene_sized or self.dev.equation.scene_sized
         self.changed = False
 
     def upload(self) -> None:
-        """Write new stiffnesses and strengths; rest values go to new ones in the coming frame."""
+        """Write new stiffnesses and strengths to the device. New rest values are reached during the coming frame."""
         if self.acts:
             if self.driven:
                 self.dev.drive.upload(*self.course(), self.largest)
@@ -327,8 +345,9 @@ class Scalar(Batch):
     def load(self) -> np.ndarray:
         """The force in each constraint during the last substep [N], (m,); positive where it pulls (f above rest).
 
-        More exactly the force along grad f: newtons where f is a length, N m where it is an angle. In f32, rounding of positions
-        is felt as about m ulp(x) / h^2, 1 N for 1 kg some 10 m from the origin at 1200 substeps/s; use f64 where that matters.
+        More exactly it is the force along grad f: newtons where f is a length, N m where f is an angle. In f32, rounding of
+        positions adds about m ulp(x) / h^2, 1 N for 1 kg some 10 m from the origin at 1200 substeps/s; use f64 where that
+        matters. break_at is not affected by it, see Strength.
         """
         if not self.count:
             return np.zeros(0)
@@ -337,22 +356,22 @@ class Scalar(Batch):
         if not self.acts:
             return np.zeros(self.count)
         memory, missing = self.scene.memory, self.sagging
-        known = memory.read(self.dev.equation.lam)[: self.count] - missing  # a force in velocities, as a spring's is
+        known = memory.read(self.dev.equation.lam)[: self.count] - missing  # velocities contain it, as a spring force
         scale = per_newton(self.scene.reach, self.compliance, lambda: self.weights(self.scene.state.get(memory)))
         return -scale * missing - np.divide(known, self.scene.reach[1], out=np.zeros(self.count), where=known != 0)
 
     @property
     def _learns(self) -> bool:
-        """Whether its loads are learnt, in the kernels as they are."""
+        """Whether the compiled kernels learn loads of the batch."""
         return "known" in vars(self.dev) and self.dev.known.learns
 
     @property
     def sagging(self) -> np.ndarray:
-        """The multipliers of the last substep without known loads, (m,): what violations bear."""
+        """The multipliers of the last substep without known loads, (m,): the load that violations bear."""
         lam = self.scene.memory.read(self.dev.equation.lam)[: self.count].astype(np.float64)
         return lam - self.scene.memory.read(self.dev.known.given)[: self.count] if self._learns else lam
 
     def forget_loads(self, some: np.ndarray) -> None:
-        """Forget the known loads of some constraints, a mask (m,): their particles were put elsewhere."""
+        """Forget the known loads of constraints in the mask `some`, (m,), whose particles were placed elsewhere."""
         if self._learns:
             self.dev.known.forget(some)

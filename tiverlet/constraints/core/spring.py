@@ -1,4 +1,4 @@
-"""Springs of constraints: one law from soft to rigid, for every constraint that has a spring. See Equation for the letters."""
+"""Springs of constraints: one law from soft to rigid, for every constraint that has a spring. Equation defines the symbols."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -13,23 +13,23 @@ if TYPE_CHECKING:
 
 @ti.pyfunc
 def stiff_at(ratio):
-    """theta by alpha / (w h^2), see stiff()."""
+    """Return theta for ratio = alpha / (w h^2), see stiff()."""
     return 1 / (1 + ratio * ratio)
 
 
 @ti.func
 def stiff(alpha, h, w):
-    """theta = s^4 / (1 + s^4), s^2 = w h^2 / alpha: 0 where the step resolves the spring, 1 where it is rigid."""
+    """Return theta = s^4 / (1 + s^4), s^2 = w h^2 / alpha: 0 where the step resolves the spring, 1 where it is rigid."""
     return stiff_at(alpha / (h * h * w))  # 1 / s^2; s^4 would overflow in f32
 
 
 @ti.pyfunc
 def made_up(alpha, w, h2_effective, late):
-    """The share of `late`, what a rigid constraint makes up for in a start, that a spring does: 1 where stiff, 0 where resolved.
+    """Return the share of `late` that a spring makes up for in a start: 1 where stiff, 0 where resolved.
 
-    Velocities lack half a kick h_old F / 2 of what is rigid, and theta of it of springs, see Equation.spring_force(). Of what is
-    missing at the end of the start, lam = -C* h^2 / (2 alpha) finds theta s / (1 + theta s), with s = w h^2 / (2 alpha). Here
-    h^2 / 2 = h2_effective, and h h_old / 2 = late.
+    `late` is what a rigid constraint makes up for in a start. Velocities lack half a kick, h_old F / 2, of rigid constraints, and
+    theta of that of springs, see Equation.spring_force(). Of what is missing at the end of the start, lam = -C* h^2 / (2 alpha)
+    finds theta s / (1 + theta s), with s = w h^2 / (2 alpha). Here h^2 / 2 = h2_effective, and h h_old / 2 = late.
     """
     ratio = alpha / (w * h2_effective)
     theta = stiff_at(ratio / 2)
@@ -38,7 +38,7 @@ def made_up(alpha, w, h2_effective, late):
 
 @ti.func
 def law(alpha, damping, h, w, fresh):
-    """The coefficients of C_(n+1), C_n and C_(n-1) in C* + alpha c dC/dt: central where resolved, backward where stiff."""
+    """Return the coefficients of C_(n+1), C_n and C_(n-1) in C* + alpha c dC/dt: central where resolved, backward where stiff."""
     rigid, gamma = stiff(alpha, h, w), damping * alpha / h
     A = (1 + 3 * rigid) / 4 + gamma * (1 + rigid) / 2
     now, last = (1 - rigid) / 2 - gamma * rigid, (1 - rigid) / 4 - gamma * (1 - rigid) / 2
@@ -48,8 +48,11 @@ def law(alpha, damping, h, w, fresh):
 
 
 def per_newton(reach: tuple[float, float], compliance: np.ndarray, weights: Callable[[], np.ndarray]) -> np.ndarray:
-    """What makes multipliers of the last substep forces, (m,); 0 before the first. reach: of the Scene. weights: w of each, see
-    stiff(), asked for where springs differ from what is rigid."""
+    """Return the factors from multipliers of the last substep to forces, (m,); 0 before the first substep.
+
+    reach: of the Scene. weights: returns w of each constraint, see stiff(); called only where springs differ from rigid
+    constraints.
+    """
     h2_rigid, h2_effective = reach
     late, soft, share = h2_rigid - h2_effective, compliance > 0, np.ones(len(compliance))
     if late > 0 and soft.any():
@@ -62,11 +65,11 @@ def per_newton(reach: tuple[float, float], compliance: np.ndarray, weights: Call
 
 
 class Spring:
-    """The springs of a batch on the device: compliance, damping, and what soft constraints remember of the substeps before.
+    """The springs of a batch on the device: compliance, damping, and what soft constraints remember of earlier substeps.
 
-    compliance: (m,), or None where all are rigid, which costs nothing. damping: (m,), or None where there is no dashpot.
-    start: what C (or f) is at the start, one row for each number or vector that is remembered.
-    in_state: what it has in the exact state, by name.
+    compliance: (m,), or None where all constraints are rigid, which costs nothing. damping: (m,), or None without dashpots.
+    start: C (or f) at the start, one row for each number or vector that is remembered.
+    in_state: its fields in the exact state, by name.
     """
 
     def __init__(
@@ -91,7 +94,7 @@ class Spring:
             self._memory.write(self.damping, damping)
 
     def begin(self, compliance: np.ndarray, damping: np.ndarray) -> None:
-        """Springs of these values start where they are fulfilled."""
+        """Set new values, and start with springs that are not stretched."""
         self.upload(compliance, damping)
         self._memory.write(self.last, np.zeros(1))
 
@@ -105,7 +108,7 @@ class Spring:
 
     @ti.func
     def reach(self, c, w, h2_rigid, h2_effective):
-        """What 1 N in constraint c is as a multiplier. w: see stiff()."""
+        """Return the multiplier of 1 N in constraint c. w: see stiff()."""
         late = h2_rigid - h2_effective
         share = ti.cast(1, self.real)
         if ti.static(self.soft):
@@ -117,7 +120,7 @@ class Spring:
 
     @ti.func
     def dashpot(self, c):
-        """Damping of constraint c."""
+        """Return the damping of constraint c."""
         out = ti.cast(0, self.real)
         if ti.static(self.damped):
             out = self.damping[c]
@@ -125,24 +128,24 @@ class Spring:
 
     @ti.func
     def solved(self, borne, h2_effective, left):
-        """F C / 2 over C^2 / (2 alpha): the part of a violation that bears the load; `left` is the rest of it.
+        """Return F C / 2 relative to C^2 / (2 alpha): the share of a violation that bears the load.
 
-        What a solver leaves of a violation bears no load: the spring is as soft as it was solved, F = C / (alpha + what that
-        adds), and 1 / alpha would count energy that nobody supplied. borne: alpha |lam|, for the part alpha |lam| / h2_effective,
-        which is 0 where there was no substep yet.
+        The part that the solver leaves, `left`, bears no load. The spring is then as soft as it was solved: F = C / (alpha + the
+        compliance that this adds). With 1 / alpha the energy would include some that nothing supplied.
+        borne: alpha |lam|. The part alpha |lam| / h2_effective bears the load. h2_effective is 0 before the first substep.
         """
-        out, gone = ti.cast(1, self.real), left * h2_effective  # 0 where both are small
+        out, gone = ti.cast(1, self.real), left * h2_effective  # may underflow to 0
         if h2_effective > 0 and gone > 0:
             out = borne / (borne + gone)
         return out
 
     @ti.func
     def energy(self, c, w, h2_effective, stored, borne):
-        """The energy [J] of constraint c: `stored`, that of its violation in the middle of a substep, where this resolves the
-        spring; `borne`, alpha F^2 / 2 with its load F, where it is stiff.
+        """Return the energy [J] of constraint c: `stored` where the substep resolves it, `borne` where it is stiff.
 
-        What turns by phi in a substep is shorter in its middle, by phi^2 / 8 of its size, and what a stiff spring would store of
-        that is no energy. theta = O(h^4), so it stays second order. w: see stiff().
+        stored: from the violation in the middle of a substep. borne: alpha F^2 / 2 with the load F. w: see stiff().
+        A link that turns by phi in a substep is shorter in the middle of it, by phi^2 / 8 of its length. A stiff spring stores no
+        energy for that. theta = O(h^4), so the energy stays second order.
         """
         theta = ti.cast(0, self.real)
         if h2_effective > 0:
@@ -151,21 +154,21 @@ class Spring:
 
     @ti.func
     def change(self, c, grown, h, w, W):
-        """How much h^2 times the force of constraint c has changed since it acted in a substep of h, which it did at the start
-        of it. grown: by how much its violation has since. w: see stiff(). W: its weight with split masses.
+        """Return how much h^2 times the force of constraint c has changed since the start of the last substep h, where it acted.
 
-        Without it, velocities would get half a kick by the force of a substep ago, which pumps: 1 + (omega h)^2 / 2 times v. A
-        substep has alpha + W h^2 / 4 for alpha, see law(). What is stiff keeps the force that it had.
+        grown: growth of its violation since. w: see stiff(). W: its weight with split masses.
+        Without this, velocities would get half a kick by the force of a substep ago, which pumps: 1 + (omega h)^2 / 2 times v. In
+        a substep alpha + W h^2 / 4 takes the place of alpha, see law(). A stiff spring keeps the force that it had.
         """
         alpha = self.alpha[c]
         return -(1 - stiff(alpha, h, w)) * grown / (alpha / (h * h) + W / 4)
 
     @ti.func
     def before(self, c, present, fresh):
-        """What is remembered of the substep before; at a start, the present, for what was before may be no number."""
+        """Return the remembered value of the last substep; at a start `present`, since the memory may be NaN."""
         return ti.select(fresh != 0, present, self.last[c])
 
     @ti.func
     def law(self, c, h, w, fresh):
-        """See law(), of constraint c."""
+        """Return law() of constraint c."""
         return law(self.alpha[c], self.dashpot(c), h, w, fresh)

@@ -1,4 +1,4 @@
-"""How far a Newton step may go where f is so curved that its gradient means little from afar."""
+"""The limit on Newton steps where f is so curved that its gradient is valid only near by."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -9,29 +9,29 @@ from ...device import ti
 if TYPE_CHECKING:
     from ...features.feature import Scene
 
-APPROACH = 1 / 3  # of its size (1 rad for angles), in a frame: how fast a constraint gives up a violation that no load explains
-BORNE = 0.25  # of its size: an angle that is off by more than this is off by more than a load explains
-TRUST = 0.5  # of its reach, by which a pass moves a corner: beyond, f is not what its gradient says
+APPROACH = 1 / 3  # of its size (1 rad for angles), per frame: how fast a violation that no load explains is removed
+BORNE = 0.25  # of its size: the largest violation of an angle that a load explains
+TRUST = 0.5  # of its reach: beyond this move of a corner in a pass, the gradient does not describe f
 
 
 class StepLimit:
     """The limits on the steps of rigid constraints with a curved f (angles, areas, volumes), on the device.
 
-    A rigid constraint takes out its whole violation in one substep, with the energy C^2 / (2 W h^2), as the spring would that one
-    pass of relaxation is. Under a load that is right: C = W |lam| bears it. But C may come from elsewhere: a rest value that was
-    changed in a jump, or a goal that others keep it from. Where f is curved, W falls as corners go away (from afar an angle
-    between two pins L apart has the gradient L / r^2), and that spring is a pump. So what exceeds the multiplier of the last
-    substep, |C_n| - W |lam|, is given up by at most APPROACH of its size in a frame: the rest is postponed. And where a violation
-    is postponed, or a pass would move a corner by more than TRUST of its reach, the step only takes out motion: with
-    u = sum_j grad_j C . d_j, the motion along the constraint in this substep,
+    A rigid constraint removes its whole violation in one substep. That releases the energy C^2 / (2 W h^2), as a spring with the
+    stiffness of one relaxation pass would. Under a load that is right: C = W |lam| bears it. But C may have another origin: a
+    rest value that jumped, or a goal that other constraints prevent. Where f is curved, W falls as corners move away (an angle
+    between two pins L apart, seen from a distance r, has the gradient L / r^2), and that spring pumps energy. So of the part that
+    the multiplier of the last substep does not explain, |C_n| - W |lam|, at most APPROACH of the size is removed per frame; the
+    rest is postponed. Where a violation is postponed, or a pass would move a corner by more than TRUST of its reach, the step
+    only removes motion. With u = sum_j grad_j C . d_j, the motion along the constraint in this substep,
 
         |u + W dlam| <= max(|u|, pace)
 
     where `pace` is APPROACH of a frame, and 0 where corners are faster than twice that. With mass-split W, in which every
-    constraint has particles of its own, kinetic energy then never grows by more than what the pace is.
+    constraint has particles of its own, kinetic energy then never grows by more than `pace` allows.
 
-    acts: whether the batch has such constraints; where not, it costs nothing. scene_sized: whether any of them is as large as the
-    whole scene, in want of a size of its own.
+    acts: whether the batch has such constraints; otherwise it costs nothing. scene_sized: whether any constraint without a size
+    of its own takes the size of the whole scene.
     """
 
     host_only = ("scene_sized",)
@@ -49,9 +49,10 @@ class StepLimit:
 
     @ti.func
     def postpone(self, c, C, borne, size, share):
-        """What of a violation C, at the start of a substep, is left for later ones.
+        """Return the part of a violation C, at the start of a substep, that is left for later substeps.
 
-        borne: by how much of it constraint c bears its load. size: of c. share: of the frame, that the substep is.
+        borne: the part of C that bears the load of constraint c. size: of c. share: the length of the substep as a share of the
+        frame.
         """
         out = 0 * C
         if ti.static(not self.collapses):
@@ -63,8 +64,12 @@ class StepLimit:
 
     @ti.func
     def limit(self, c, lam, new, u, W, longest, fastest, reach, size, share):
-        """The multiplier `new` of constraint c, or where Newton's step means nothing, one that takes out motion; and whether it
-        is that. u, W, longest, fastest: see CornerPasses.motion. reach: see Quantity. size, share: see postpone()."""
+        """Return the multiplier `new` of constraint c, or one that only removes motion; and whether it is the latter.
+
+        It only removes motion where a Newton step is not valid. u, W, longest, fastest: see CornerPasses.motion. reach: see
+        Quantity.
+        size, share: see postpone().
+        """
         far = False
         if W > 0 and (self.postponed[c] != 0 or ti.abs(new - lam) * longest > TRUST * reach):
             pace = APPROACH * share * ti.min(size, W * ti.min(reach, self.span[c]) / longest)
@@ -76,9 +81,11 @@ class StepLimit:
 
     @ti.func
     def limit_collapse(self, lam, new, rest, extent, move):
-        """A multiplier by which no pass moves corners further than they are, or are to be, apart: next to where f has no
-        direction it is curved. rest: what f is to be. extent: squared size of the body. move: squared size of what a multiplier
-        of 1 moves."""
+        """Return a multiplier by which no pass moves corners further than they are, or are to be, apart.
+
+        f is curved near the shape where it has no direction. rest: the goal of f. extent: squared size of the body. move: squared
+        size of the displacement by a multiplier of 1.
+        """
         size = ti.abs(rest)
         if ti.static(self.collapses == 2):
             size = ti.sqrt(size)

@@ -1,4 +1,4 @@
-"""Questions about what is where: what rays meet first, and which particles are inside of a shape."""
+"""Queries: what rays meet first, and which particles are inside of a shape."""
 
 from .inside import inside
 from .ray import Hits, ray

@@ -1,4 +1,4 @@
-"""Which particles are inside of a shape."""
+"""The query of World.inside(): which particles are inside of a shape."""
 
 from typing import TYPE_CHECKING
 
@@ -10,11 +10,11 @@ from ...features.arguments import knobs_of
 if TYPE_CHECKING:
     from ...world import World
 
-PARTS = {"center": 0.0, "whole": 1.0, "touching": -1.0}  # how many radii deep in the shape a center has to be
+PARTS = {"center": 0.0, "whole": 1.0, "touching": -1.0}  # least depth of the center in the shape, in radii
 
 
 def inside(world: "World", shape: Collider, part: str) -> np.ndarray:
-    """See World.inside()."""
+    """Return the indices of particles inside of a shape. part: a key of PARTS. See World.inside()."""
     who = "World.inside"
     if not isinstance(shape, Collider):
         raise TypeError(
@@ -32,7 +32,7 @@ def inside(world: "World", shape: Collider, part: str) -> np.ndarray:
 
 
 def _check_dimension(who: str, shape: Collider, dim: int) -> None:
-    """Refuse a shape for worlds of another dimension."""
+    """Raise ValueError if the shape is for another dimension."""
     if shape.dim not in (0, dim):
         raise ValueError(f"{who}: shape = {shape!r} is for {shape.dim}D, but the particles are in {dim}D.")
     for name in ("normal", *knobs_of(type(shape))):

@@ -1,4 +1,4 @@
-"""What rays meet first."""
+"""The query of World.ray(): what rays meet first."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -23,12 +23,12 @@ WHO = "World.ray"
 
 @dataclass(frozen=True)
 class Hits:
-    """What each of k rays meets first: a particle, a link or a wall. Of one ray, given as (dim,), all is without the first axis.
+    """What each of k rays meets first: a particle, a link or a wall. For one ray, given as (dim,), the first axis is left out.
 
-    distance: (k,) from the origin [m], inf where nothing is met. point: (k, dim), on the surface [m]. normal: (k, dim), unit, out
-    of what is met, towards the side of the origin. Both are NaN where nothing is met.
-    particle: (k,) its index. link: (k, 2), the number of the feature in world.features and that of the link in it. wall: (k,) the
-    number of the feature. All are -1 where it is something else, or nothing.
+    distance: (k,) from the origin [m], inf for a miss. point: (k, dim), on the surface [m]. normal: (k, dim), a unit vector out
+    of the surface, towards the side of the origin. Both are NaN for a miss.
+    particle: (k,), the index of the particle. link: (k, 2), the number of the feature in world.features, and the number of the
+    link in it. wall: (k,), the number of the feature. Each is -1 if the ray meets something else, or nothing.
     """
 
     distance: np.ndarray
@@ -40,7 +40,7 @@ class Hits:
 
     @property
     def met(self) -> np.ndarray:
-        """Whether there is anything, Boolean (k,)."""
+        """Whether each ray meets anything, Boolean (k,)."""
         return self.distance < np.inf
 
     def __len__(self) -> int:
@@ -51,7 +51,7 @@ def ray(
     world: "World", origin: Any, direction: Any, reach: Any, radius: Any, groups: Any, skip: Any,
     features: Iterable[Feature] | None,
 ) -> Hits:  # fmt: skip
-    """See World.ray()."""
+    """Return the first Hits of rays. See World.ray()."""
     single, origin, direction = _rays(origin, direction, world.particles.dim)
     most = checks.per_item(WHO, "reach", reach, len(origin), least=0.0, infinite=True)
     radius = checks.number(WHO, "radius", radius, least=0.0)
@@ -64,7 +64,7 @@ def ray(
     there = np.zeros(k, dtype=bool)
 
     def meet(rods: Rods) -> tuple[np.ndarray, np.ndarray]:
-        """Rays that meet one of these before anything else, as far as is known, and which."""
+        """Update the nearest hits by these rods. Returns the mask of rays that meet one first so far, and which rod."""
         distance, which = rods.first(origin, direction, best)
         nearer = (which >= 0) & ((distance < best) | ~there)
         best[nearer], there[nearer] = distance[nearer], True
@@ -93,10 +93,9 @@ def ray(
 
 
 class Rods:
-    """Particles and links as rays see them: m rods with round ends from a to b, (m, dim) [m], of a radius (m,) [m]; without b,
-    discs and spheres around a.
+    """The shapes of particles and links for rays: m rods with round ends from a to b, (m, dim) [m], of a radius (m,) [m].
 
-    They are convex, so a ray that starts inside of one has left it for good.
+    Without b they are discs or spheres around a. Rods are convex, so a ray that starts inside of one does not enter it again.
     """
 
     def __init__(self, radius: np.ndarray, a: np.ndarray, b: np.ndarray | None = None):
@@ -107,10 +106,10 @@ class Rods:
         self._tree = BoundingTree(np.minimum(a, b) - reach, np.maximum(a, b) + reach)
 
     def first(self, origin: np.ndarray, direction: np.ndarray, most: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far each ray goes until it enters one, (k,), within most (k,); and which, -1 where there is none."""
+        """Return how far each ray goes until it enters a rod, (k,) [m], within most (k,) [m], and which rod, -1 for none."""
 
         def value(q: np.ndarray, i: np.ndarray) -> np.ndarray:
-            """Where ray q[.] enters rod i[.]."""
+            """Return the distance at which ray q[.] enters rod i[.]."""
             o, d, a, b, radius = origin[q], direction[q], self._a[i], self._b[i], self._radius[i]
             way = ball(o, d, a, radius) if self._discs else capsule(o, d, a, b, radius)
             return entry(way, rounding(o, a, b))
@@ -118,13 +117,13 @@ class Rods:
         return self._tree.first(len(origin), most, ahead(origin, direction, 0.0), value)
 
     def normal(self, point: np.ndarray, direction: np.ndarray, which: np.ndarray) -> np.ndarray:
-        """Unit normals at points (k, dim) on the surface of rods, met by rays in these directions."""
+        """Return unit normals (k, dim) at points (k, dim) on the surface of rods, met by rays in these directions."""
         a, b = self._a[which], self._b[which]
         return away(point, on_segment(point, a, b)[0], direction, b - a, rounding(point, a, b))
 
 
 def _rays(origin: Any, direction: Any, dim: int) -> tuple[bool, np.ndarray, np.ndarray]:
-    """Whether it is one ray; origins and unit directions, (k, dim)."""
+    """Return whether it is one ray, and the checked origins and unit directions, (k, dim)."""
     (one_x, x), (one_d, d) = _places("origin", origin, dim), _places("direction", direction, dim)
     k = len(d) if one_x else len(x)
     if not one_d and len(d) != k:
@@ -134,13 +133,13 @@ def _rays(origin: Any, direction: Any, dim: int) -> tuple[bool, np.ndarray, np.n
     if (size == 0).any():
         where = "" if one_d else f"[{int(np.argmin(size))}]"
         raise ValueError(f"{WHO}: direction{where} = 0 has no direction; give a vector of any length above 0, such as (0, -1).")
-    d = d / size  # whose square neither overflows nor vanishes
+    d = d / size  # so that the square neither overflows nor vanishes
     d = d / np.linalg.norm(d, axis=1, keepdims=True)
     return one_x and one_d, np.broadcast_to(x, (k, dim)), np.broadcast_to(d, (k, dim))
 
 
 def _places(name: str, value: Any, dim: int) -> tuple[bool, np.ndarray]:
-    """Whether it is one vector, and all of them, (k, dim)."""
+    """Return whether `value` is one vector, and its vectors, (k, dim)."""
     array = checks.plain(WHO, name, value)
     if array.ndim == 1:
         return True, checks.vector(WHO, name, array, dim)[None]
@@ -148,7 +147,7 @@ def _places(name: str, value: Any, dim: int) -> tuple[bool, np.ndarray]:
 
 
 def _taken(world: "World", features: Iterable[Feature] | None) -> set[int]:
-    """The numbers of the features that count."""
+    """Return the numbers of the features that rays may meet."""
     if features is None:
         return set(range(len(world.features)))
     numbers = {id(f): k for k, f in enumerate(world.features)}
@@ -160,7 +159,7 @@ def _taken(world: "World", features: Iterable[Feature] | None) -> set[int]:
 
 
 def _seen(world: "World", x: np.ndarray, groups: Any, skip: Any) -> np.ndarray:
-    """Which particles rays can meet, Boolean (n,)."""
+    """Return the mask of particles that rays can meet, Boolean (n,)."""
     seen = np.asarray(np.isfinite(x).all(axis=1))
     if groups is not None:
         wanted = np.atleast_1d(checks.plain(WHO, "groups", groups))
@@ -177,7 +176,7 @@ def _seen(world: "World", x: np.ndarray, groups: Any, skip: Any) -> np.ndarray:
 
 
 def _rods(world: "World", some: set[int], seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Links whose particles both are seen: pairs (m, 2), and the numbers of feature and link (m, 2)."""
+    """Return links of which both particles can be met: pairs (m, 2), and the numbers of feature and link (m, 2)."""
     pairs, numbers = [np.zeros((0, 2), dtype=np.int64)], [np.zeros((0, 2), dtype=np.int64)]
     for f in sorted(some):
         ends, which = world.features[f].rods()

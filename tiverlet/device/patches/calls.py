@@ -1,10 +1,10 @@
-"""Functions that kernels call. Taichi copies a ti.func into each place that calls it, and LLVM takes longer for one long function
-than for two of half its length.
+"""Functions that kernels call. Taichi copies a ti.func into each place that calls it.
 
-Kernels of small worlds compile longer than they run. So there, what is long and stands in several places, or runs once in a
-frame, is compiled once, and called. Large worlds, and many copies of one, have it where it is called, as they have on a GPU.
+LLVM takes longer for one long function than for two of half its length. Kernels of small worlds compile longer than they run. So
+in these worlds, a function that is long and used in several places, or that runs once per frame, is compiled once and called. In
+large worlds, in many copies of one and on a GPU, it is copied into each place.
 
-Everything here knows the inside of Taichi 1.7.4; with another one, all is copied.
+Everything here depends on the internals of Taichi 1.7.4; with another version, all functions are copied.
 """
 
 import ast
@@ -21,31 +21,35 @@ from taichi.lang import impl, kernel_impl
 
 from ..language import active, inline, ti
 
-NEVER = "if {0} < -2147483647: self.{1}({2})"  # what a function begins with: LLVM copies none that calls itself
-MOST = 8  # functions of a kernel
-_numbers = count()  # of functions; they are no part of what kernels are known by
-_kernel: Any = None  # that is compiled,
-_keys: dict[Any, Any] = {}  # those of its functions that have a body,
-_spare: list[tuple[Any, Any]] = []  # and those that have none: keys and functions
+NEVER = "if {0} < -2147483647: self.{1}({2})"  # first statement of a function: LLVM does not inline one that calls itself
+MOST = 8  # most functions of a kernel
+_numbers = count()  # numbers of functions; they are no part of the key of a kernel
+_kernel: Any = None  # the kernel that is being compiled
+_keys: dict[Any, Any] = {}  # keys of its functions that have a body
+_spare: list[tuple[Any, Any]] = []  # its functions without a body: keys and functions
 
 
 def called(function: Any) -> Any:
-    """A ti.func for kernels to call: a method whose other arguments, and what it returns, are integers that its annotations name.
-    What else it finds out, it writes to fields."""
+    """Let kernels call a ti.func instead of copying it.
+
+    It must be a method whose other arguments and result are integers, as its annotations say. All other results go to fields.
+    """
     real = _real(function.func.func)
     return _calling(function, lambda self: real)
 
 
 def called_with(types: Callable[[Any], tuple[tuple[Any, ...], tuple[Any, ...]]]) -> Any:
-    """The same for a method that takes and returns other types, see below; the first is an integer's. types: of arguments and of
-    results, by the object."""
+    """Like called(), for a method with other types of arguments and results. Its first argument must be an integer.
+
+    types: a function of the object that returns the types of arguments and of results.
+    """
 
     def decorated(function: Any) -> Any:
-        """A ti.func whose types depend on the object."""
+        """Wrap a ti.func whose types depend on the object."""
         reals: dict[Any, Any] = {}
 
         def real_for(self: Any) -> Any:
-            """The function for the types of this object."""
+            """Return the function for the types of this object."""
             given, returned = key = types(self)
             if key not in reals:
                 of: Any = function.func.func
@@ -61,17 +65,17 @@ def called_with(types: Callable[[Any], tuple[tuple[Any, ...], tuple[Any, ...]]])
 
 
 def _real(function: Any) -> Any:
-    """A function that is called, of one that would be copied."""
+    """Turn a function that would be copied into one that is called."""
     return kernel_impl.Func(function, _classfunc=True, is_real_function=True)
 
 
 def _calling(function: Any, real_for: Callable[[Any], Any]) -> Any:
-    """A method that kernels call where they may. real_for: what they call of an object."""
+    """Return a method that kernels call where possible. real_for: the function to call, by the object."""
 
     @inline
     @wraps(function)
     def call(self, *args):
-        """Call it, or have it copied."""
+        """Call the function, or copy it."""
         if not (active and active[-1].calls):
             return function(self, *args)
         real = real_for(self)
@@ -82,11 +86,10 @@ def _calling(function: Any, real_for: Callable[[Any], Any]) -> Any:
 
 
 def _key(real: Any, args: tuple[Any, ...]) -> Any:
-    """By what the compiler knows a function of an object, which is compiled when a kernel calls it first; None where it has too
-    many.
+    """Return the key of an object's function, compiled when a kernel first calls it; None if the kernel has too many functions.
 
-    The kernel is kept for other processes by what is in its functions, in the order of their addresses. So all are made at once,
-    and get their bodies in that order.
+    Taichi caches a kernel for other processes under a hash of its functions, in the order of their addresses. So all functions
+    are created at once, and get their bodies in the order of their addresses.
     """
     global _kernel, _keys, _spare
     runtime: Any = impl.get_runtime()
@@ -102,7 +105,7 @@ def _key(real: Any, args: tuple[Any, ...]) -> Any:
 
 
 def _address(made: tuple[Any, Any]) -> int:
-    """Where a function is: of pybind's object, the third word says so."""
+    """Return the address of a function: the third word of pybind's object."""
     return ctypes.c_uint64.from_address(id(made[1]) + 16).value
 
 
@@ -112,12 +115,12 @@ def _compile(real: Any, key: Any, function: Any, args: tuple[Any, ...]) -> None:
     read: Any = kernel_impl._get_tree_and_ctx
     tree, ctx = read(real, is_kernel=False, args=args, is_real_function=True)
     names = [one.name for one in real.arguments[1:]]
-    tree.body[0].returns = real.return_type and ast.Constant(0)  # else Taichi takes it for one that returns nothing
+    tree.body[0].returns = real.return_type and ast.Constant(0)  # without it Taichi assumes that nothing is returned
     tree.body[0].body.insert(0, ast.parse(NEVER.format(names[0], real.func.__name__, ", ".join(names))).body[0])
     real.taichi_functions[key.instance_id] = function
 
     def body() -> None:
-        """Make statements of it."""
+        """Translate the tree into statements of the function."""
         outer, runtime.compiling_callable = runtime.compiling_callable, function
         ctx.ast_builder = function.ast_builder()
         try:

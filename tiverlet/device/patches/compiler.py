@@ -1,13 +1,13 @@
-"""How kernels are compiled: in a third of the time that Taichi takes by itself, to the same bits.
+"""How kernels are compiled: in a third of the time that Taichi takes by itself, bit for bit the same.
 
-Most of that time goes into Taichi's analysis of control flow and, in small worlds, its simplifier; LLVM does both again. They are
-left out while a kernel of ours compiles, and only then: what the user compiles in the same process is compiled as ever. A kernel
-keeps them where a vector is assigned to a variable that is a number, as functions of the user's may do where nobody reads it
-(`_, gap, _ = nearest(x)`): Taichi finds that nobody does, and LLVM would end the process. How functions are read is in
-source_cache.py, and how they become statements in syntax_cache.py.
+Most of Taichi's time goes into its analysis of control flow and, in small worlds, its simplifier. LLVM repeats both. They are
+switched off while a kernel of tiverlet compiles, and only then; kernels that the user compiles in the same process are not
+affected. A kernel keeps both passes if it assigns a vector to a variable that is a number. The user's functions may do so where
+no statement reads the variable (`_, gap, _ = nearest(x)`). Taichi's analysis removes the assignment; LLVM would end the process.
+source_cache.py is about how functions are read, syntax_cache.py about how they become statements.
 
-These are settings, which Quadrants has, too. What goes past the door of a launch knows the inside of Taichi 1.7.4; with another
-one, every launch goes through the door.
+These are settings, which Quadrants has too. CachedLaunch, which skips the checks of a launch, depends on the internals of Taichi
+1.7.4; with another version, every launch makes them.
 """
 
 import contextlib
@@ -22,46 +22,46 @@ import numpy as np
 
 from ..language import active, impl, sources
 from . import lean, patched
-from .unrolling import as_ever, leave_loops
+from .unrolling import disable_unrolling, restore_switches
 
-HOSTS = ("Arch.x64", "Arch.arm64")  # whose kernels LLVM makes as fast without it; measured on x64
-# No variables for what loops read and write at one address: Taichi does not see that another address may be the same place, such
-# as field[k] for field[0].
+HOSTS = ("Arch.x64", "Arch.arm64")  # where LLVM makes kernels as fast without Taichi's passes; measured on x64
+# Loops do not cache a field element in a variable: Taichi misses that another index may be the same element, such as field[k] for
+# field[0].
 SAFE = {"cache_loop_invariant_global_vars": False}
-LEAN = SAFE | {"cfg_optimization": False}  # and no analysis of control flow
-# In small worlds no simplifying either: compiling takes two thirds of the time. Frames with contacts take a tenth more where they
-# take more than the launch, because the address of the fields is looked up again after every store. What Taichi would simplify to
-# other bits (LLVM does not), a power of 1/2 to a root, is to be written so.
+LEAN = SAFE | {"cfg_optimization": False}  # also without analysis of control flow
+# Small worlds also skip the simplifier: compiling takes two thirds of the time. Frames with contacts that take longer than the
+# launch take a tenth more, because the address of the fields is looked up again after every store. Taichi's simplifier turns a
+# power of 1/2 into a root, which has other bits, and LLVM does not: so write a root as a root.
 BRIEF = LEAN | {"advanced_optimization": False}
-# Between the two: simplified, but without a search for equal expressions, which takes most of that time where kernels are long.
+# Between LEAN and BRIEF: the simplifier without its search for equal expressions, which takes most of its time in long kernels.
 UNSEARCHED = LEAN | {"opt_level": 0}
 SETTINGS = {*BRIEF, *UNSEARCHED}
-FEW = 1000  # particles from which it pays
-MADE = 20_000  # objects; what else is done in between makes fewer, and is looked through as ever
+FEW = 1000  # worlds with fewer particles count as small
+MADE = 20_000  # new objects; a context that compiles a kernel makes more, any other one fewer
 _INSIDE = contextlib.nullcontext()
-_lock = threading.RLock()  # the type of literals is one for all threads
+_lock = threading.RLock()  # all threads share the type of literals
 
 
 @dataclass
 class Times:
-    """What was compiled for a world [s], by kernels and by features; nothing for what another world had compiled."""
+    """What was compiled for a world [s], by kernel and by feature. Kernels that another world had compiled do not count."""
 
     kernels: dict[str, float]
     features: dict[str, float]
 
     def add(self, earlier: "Times") -> None:
-        """Count what was compiled before the world was built anew, too."""
+        """Add the times of a world before it was rebuilt."""
         for own, more in ((self.kernels, earlier.kernels), (self.features, earlier.features)):
             for name, seconds in more.items():
                 own[name] = own.get(name, 0.0) + seconds
 
 
 class Compiler:
-    """How the kernels of one world are compiled, while it is called as a context.
+    """The compiler settings of one world, active within the context `with compiler():`.
 
-    real: the type of their literals. Taichi rounds the literal 0.1 to its default type even next to f64 operands; a world of
-    precision "f64" (and the user's own functions in it) must not lose half of the digits that way. few: whether they are
-    for fewer than FEW particles. passes: settings of Taichi's, LEAN, UNSEARCHED or BRIEF. many: whether there are many copies of
+    real: the type of literals in kernels. Taichi rounds the literal 0.1 to its default type even next to f64 operands; a world of
+    precision "f64" (and the user's own functions in it) must not lose half of the digits that way. few: whether the world has
+    fewer than FEW particles. passes: Taichi's settings, one of LEAN, UNSEARCHED and BRIEF. many: whether there are many copies of
     the world. Kernels compile at their first launch.
     """
 
@@ -69,31 +69,33 @@ class Compiler:
 
     def __init__(self, real, few: bool = False, passes: Mapping[str, Any] = LEAN, many: bool = False):
         self.real, self.few, self.passes, self.many = real, few, passes, many
-        self.launches = False  # whether loops at the top of kernels are spread over threads, or those of a GPU
-        self.thorough = not lean  # once and for all, since what Taichi fails to compile may be tried again
-        self.config: Any = None  # of Taichi, while kernels compile
-        self._host: bool | None = None  # whether they are for the host, once that is asked: Taichi takes 6 us to say so
-        self._settings: dict[str, Any] = {}  # that Taichi was started with
+        self.launches = False  # whether Taichi spreads top-level loops over the threads of a CPU or GPU
+        self.thorough = not lean  # never reset: Taichi may retry a kernel that failed to compile
+        self.config: Any = None  # Taichi's settings, while kernels compile
+        self._host: bool | None = None  # whether kernels run on the host; cached, since asking Taichi takes 6 us
+        self._settings: dict[str, Any] = {}  # the settings that Taichi was started with
         self._thread = 0
-        self._hurried = False
-        self.refused: Exception | None = None  # what is wrong with a function that is being compiled, see refuse()
+        self._fast = False
+        self.refused: Exception | None = None  # the error in a function that is being compiled, see refuse()
         self.times = Times({}, {})
-        self.places: list[tuple[Any, int]] = []  # where the world's fields are: layouts and addresses
+        self.places: list[tuple[Any, int]] = []  # layouts and addresses of the world's fields
 
     @property
     def calls(self) -> bool:
-        """Whether kernels call functions that are long, see calls.py. These do not know which copy of a world it is, and have no
-        loops that are spread."""
+        """Whether kernels call long functions, see calls.py.
+
+        Called functions cannot read which copy of a world is current, and their loops are not spread over threads.
+        """
         return bool(self._host) and self.passes is BRIEF and not (self.many or self.launches or self.thorough)
 
     def point(self) -> None:
-        """Have kernels find the fields of this world."""
+        """Let kernels use the fields of this world."""
         for layout, address in self.places:
             if layout.shared:
                 layout.point(address)
 
     def __call__(self) -> contextlib.AbstractContextManager[None]:
-        """The context; inside itself it has nothing to do."""
+        """Return the context; nested in itself it does nothing."""
         if active and active[-1] is self and self._thread == threading.get_ident():
             return _INSIDE
         return self._entered()
@@ -124,9 +126,9 @@ class Compiler:
                 raise error from None
             finally:
                 active.pop()
-                if self._hurried:
-                    as_ever()
-                    self._hurried = False
+                if self._fast:
+                    restore_switches()
+                    self._fast = False
                 if active:
                     active[-1].point()
                 runtime.set_default_fp(literals)
@@ -135,28 +137,28 @@ class Compiler:
                     _pass_over()
                     gc.enable()
 
-    def hurry(self) -> None:
-        """A kernel is about to be compiled, and launched before the context ends: have LLVM take less time for it."""
+    def compile_fast(self) -> None:
+        """Have LLVM spend less time on the kernel that is compiled next. Its first launch must come before the context ends."""
         if self._host and not self.thorough:
-            leave_loops()
-            self._hurried = True
+            disable_unrolling()
+            self._fast = True
 
-    def beware(self) -> None:
-        """Be thorough from here on: there is what LLVM does not take as it is."""
+    def compile_thoroughly(self) -> None:
+        """Compile with all passes from here on: the kernel has an assignment that LLVM cannot handle."""
         runtime: Any = impl.get_runtime()
         self.thorough = True
         _set(runtime.prog.config(), self._settings | SAFE)
 
 
 def refuse(error: Exception) -> None:
-    """Stop compiling because of what a user's function does, with this error and not what Taichi makes of it."""
+    """Stop compiling because of an error in a user's function; this error is raised, not the one that Taichi makes of it."""
     if active:
         active[-1].refused = error
     raise error
 
 
 def readable(function: Any) -> bool:
-    """Whether Taichi will find the source of a Python function."""
+    """Whether Taichi can find the source of a Python function."""
     try:
         sources.getsourcelines(function)
     except (OSError, TypeError):
@@ -165,11 +167,10 @@ def readable(function: Any) -> bool:
 
 
 class CachedLaunch:
-    """A kernel of one object, for many launches: after the first one, past the door at which Taichi looks at the object and at
-    each argument anew, which takes 25 us.
+    """A kernel of one object, for many launches. After the first, they skip Taichi's Python argument checks (25 us a launch).
 
-    Its arguments are arrays, which stay where they are; what they hold may change from launch to launch. It returns nothing. What
-    Taichi freezes at the first compile is frozen, as ever: an object that has changed takes a new CachedLaunch.
+    The arguments are arrays that stay at their addresses; their values may change from launch to launch. The kernel returns
+    nothing. Values that Taichi freezes at the first compile stay frozen: after a change of the object, make a new CachedLaunch.
     """
 
     def __init__(self, owner: Any, name: str, compiler: Compiler, *arrays: np.ndarray):
@@ -177,7 +178,7 @@ class CachedLaunch:
         self._ready: Any = None
 
     def __call__(self) -> None:
-        """Launch it."""
+        """Launch the kernel, and compile it before the first launch."""
         if self._ready is None:
             with self.compiler():
                 getattr(self.owner, self.name)(*self.arrays)
@@ -187,13 +188,13 @@ class CachedLaunch:
             self.launch()
 
     def launch(self) -> None:
-        """Launch it when it is compiled."""
-        with _lock:  # lest another thread's world is told to kernels before
+        """Launch the kernel, which must be compiled."""
+        with _lock:  # so that no other thread points kernels at another world in between
             self.compiler.point()
             self._ready()
 
     def _prepared(self) -> Callable[[], Any]:
-        """A launch; each one on a GPU, which copies arrays to and fro, has a context of its own."""
+        """Return a function that launches. On a GPU, which copies arrays to and fro, each launch has a context of its own."""
         primal: Any = getattr(type(self.owner), self.name)._primal
         kernel = primal.compiled_kernels[primal.ensure_compiled(self.owner, *self.arrays)]
         program: Any = impl.get_runtime().prog
@@ -203,7 +204,7 @@ class CachedLaunch:
         return lambda: program.launch_kernel(compiled, self._context(kernel))
 
     def _context(self, kernel: Any) -> Any:
-        """Where the arrays are."""
+        """Make a launch context with the addresses of the arrays."""
         context = kernel.make_launch_context()
         for k, array in enumerate(self.arrays):
             context.set_arg_external_array_with_shape((k,), array.ctypes.data, array.nbytes, array.shape, 0)
@@ -211,8 +212,8 @@ class CachedLaunch:
 
 
 def _pass_over() -> None:
-    """Have Python take what there is for old where a kernel was compiled, most of which stays: looking through it took 50 ms."""
-    if gc.get_count()[0] > MADE and not gc.get_freeze_count():  # or it would thaw what the user froze
+    """Move all objects to Python's oldest generation after a compilation. Most of them stay, and examining them takes 50 ms."""
+    if gc.get_count()[0] > MADE and not gc.get_freeze_count():  # else unfreeze() would also thaw what the user froze
         gc.freeze()
         gc.unfreeze()
 

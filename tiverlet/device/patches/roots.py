@@ -1,8 +1,8 @@
-"""Where Taichi's kernels look up where the fields of a tree are.
+"""Access to the table in which Taichi's kernels look up the addresses of trees of fields.
 
-Each launch reads the address of the tree from a table of Taichi's runtime. What is written to there makes the same kernel work on
-other memory of the same layout, so that one compiled kernel serves many worlds. Everything here knows the inside of Taichi 1.7.4
-on a CPU; where it is not found, every world has a tree and kernels of its own.
+Each launch reads the address of the tree from a table of Taichi's runtime. After another address is written to the table, the
+same kernel works on other memory of the same layout, so one compiled kernel serves many worlds. Everything here depends on the
+internals of Taichi 1.7.4 on a CPU. Where the table is not found, every world has a tree and kernels of its own.
 """
 
 import ctypes
@@ -12,20 +12,20 @@ import numpy as np
 
 from ..language import impl
 
-NEAR = 64  # words from the begin of the runtime within which the table begins; it is the twelfth
-TREES = 512  # that it has room for
+NEAR = 64  # the table begins within so many words of the runtime's begin; it begins at the twelfth
+TREES = 512  # entries of the table
 
 
 def planned(builder: Any) -> Any:
-    """A tree of fields that kernels can be compiled for, without bytes: they have to be told of some before they run."""
+    """Finalize a tree of fields without memory. Kernels can be compiled for it; it needs an address before they run."""
     return builder._finalize_for_aot()
 
 
 def table_of(finder: Any, kernel: str, addresses: np.ndarray, tree: int, offset: int) -> Any:
-    """The table, as an array of addresses by the numbers of trees; None where it is not found.
+    """Return the table as an array of addresses, indexed by tree; None if it is not found.
 
     finder: an object with a kernel that writes the address of a field to the array `addresses`; the field is `offset` bytes
-    behind the begin of the tree of this number.
+    behind the begin of the tree with number `tree`.
     """
     program: Any = impl.get_runtime().prog
     getattr(finder, kernel)(addresses)
@@ -36,8 +36,8 @@ def table_of(finder: Any, kernel: str, addresses: np.ndarray, tree: int, offset:
     context = made.make_launch_context()
     context.set_arg_external_array_with_shape((0,), addresses.ctypes.data, addresses.nbytes, addresses.shape, 0)
     program.launch_kernel(program.compile_kernel(program.config(), program.get_device_caps(), made), context)
-    builder = _words(_words(id(context), 3)[2], 3)  # of pybind's object, the third word is where the one of C++ is
-    owned, borrowed = builder[1], builder[2]  # one pointer to what kernels get, twice
+    builder = _words(_words(id(context), 3)[2], 3)  # the third word of pybind's object is the address of the C++ object
+    owned, borrowed = builder[1], builder[2]  # two equal pointers to the context that kernels get
     if not owned or owned != borrowed:
         return None
     runtime = _words(owned, 2)[1]

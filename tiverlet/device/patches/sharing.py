@@ -1,14 +1,16 @@
-"""Kernels are compiled for a structure, not for an object: objects of which all that kernels could read is equal share them.
+"""Sharing of kernels: objects share a kernel if everything that it could read of them is equal.
 
-Taichi compiles a kernel anew for every object that it belongs to. What it compiles is a function of what it reads meanwhile:
-attributes of the object and of all that hangs on it, and functions. So all of this is written down in an order that does not
-depend on who asks, numbers by their bits, fields by their places, functions by what they are and what they know from around them.
-Where two objects have the same writing, the second one takes what was compiled for the first. Left out are attributes of our
-objects whose names begin with an underscore, those that a class lists as `host_only` or does not list in `kernels_read` where it
-has that, and what arrays hold: kernels must not read these, which tests/test_sharing.py makes sure of. Whatever else hangs on an
-object counts, read or not: what nobody has thought of has kernels compiled once more, and never makes them wrong.
+Taichi compiles a kernel again for every object that it belongs to. The compiled code is a function of everything that Taichi
+reads meanwhile: attributes of the object and of all objects that it refers to, and functions. This module writes all of that to a
+list, in an order that depends on the objects alone: numbers by their bits, fields by their places, functions by their code and
+the values that they refer to. If two objects give the same list, the second uses the kernel of the first.
 
-Everything here knows the inside of Taichi 1.7.4; with another one, every object has kernels of its own.
+Three things are left out of the list: attributes of tiverlet's objects whose names begin with an underscore; attributes that a
+class lists as `host_only`, or does not list in its `kernels_read` if it has that; and the values of arrays. Kernels must not read
+these; tests/test_sharing.py checks it. Everything else counts, whether kernels read it or not. So an overlooked attribute can
+cause one more compilation, never a wrong kernel.
+
+Everything here depends on the internals of Taichi 1.7.4; with another version, every object has kernels of its own.
 """
 
 import types
@@ -25,13 +27,13 @@ from taichi.lang.kernel_impl import Func, Kernel
 
 from ..language import OURS, TAICHI, active
 
-OF_TAICHI = ("taichi", "numpy", "math")  # modules that stay as they are
-EQUAL = frozenset((int, str, bool, type(None), bytes, complex))  # told apart by what they are equal to, among their own type
+OF_TAICHI = ("taichi", "numpy", "math")  # modules that do not change
+EQUAL = frozenset((int, str, bool, type(None), bytes, complex))  # types compared by value
 ITSELF = frozenset((type, types.ModuleType, types.BuiltinFunctionType, np.ufunc, np.dtype, type(ti.f32)))
 
 
 class Same:
-    """An object that is equal only to itself; it lives as long as somebody asks about it."""
+    """An object that is equal only to itself; it lives as long as this wrapper."""
 
     def __init__(self, value: Any):
         self.value = value
@@ -44,23 +46,23 @@ class Same:
 
 
 class Writing:
-    """All that hangs on an object, in order. known: objects that are not looked into."""
+    """The list of everything that kernels could read of an object, in order. known: objects whose contents are left out."""
 
     def __init__(self, value: Any, known: tuple[Any, ...] = ()):
         self.out: list[Any] = []
         self._numbers: dict[int, int] = {id(one): k for k, one in enumerate(known)}
-        self._alive: list[Any] = []  # whose ids must not go to others
-        self._ours = True  # whether it hangs on an object of ours, and not on one of the user's
+        self._alive: list[Any] = []  # kept alive, so that no other object gets their ids
+        self._ours = True  # whether the value belongs to an object of tiverlet's, not of the user's
         self.write(value)
 
     @property
     def key(self) -> tuple[bytes, tuple[Same, ...]]:
-        """It in short: a digest, and the objects that are meant themselves."""
+        """The list in short: a digest, and the objects that are compared by identity."""
         text = repr([0 if type(word) is Same else word for word in self.out])
         return blake2b(text.encode()).digest(), tuple(word for word in self.out if type(word) is Same)
 
     def write(self, value: Any) -> None:
-        """Add one object."""
+        """Append one object."""
         out, kind = self.out, type(value)
         if kind in EQUAL:
             out += (kind, value)
@@ -79,54 +81,54 @@ class Writing:
         _way(kind)(self, value)
 
     def _write_row(self, value: Any) -> None:
-        """A list or a tuple: of our objects, kernels go through either alike; and a recording gives arguments back as lists."""
+        """Append a list or a tuple. In tiverlet's objects the two count as equal: replay turns arguments into lists."""
         self.out += ("row" if self._ours else type(value), len(value))
         for one in value:
             self.write(one)
 
     def _write_set(self, value: Any) -> None:
-        """A set, in an order of its own."""
+        """Append a set, sorted."""
         self.out.append(type(value))
         self.write(sorted(value, key=repr))
 
     def _write_mapping(self, value: Any) -> None:
-        """A dictionary."""
+        """Append a dictionary."""
         self.out += (type(value), len(value))
         for key, one in value.items():
             self.write(key)
             self.write(one)
 
     def _write_array(self, value: Any) -> None:
-        """An array: of ours, kernels do not read what it holds."""
+        """Append an array. Of tiverlet's own arrays the values are left out, since kernels do not read them."""
         self.out.append(type(value))
         if not self._ours:
             self.out += (value.dtype.str, value.shape, value.tobytes())
 
     def _write_number(self, value: Any) -> None:
-        """A number of NumPy."""
+        """Append a number of NumPy."""
         self.out += (type(value), value.tobytes())
 
     def _write_method(self, value: Any) -> None:
-        """A function of an object."""
+        """Append a bound method."""
         self.out.append(type(value))
         self.write(value.__func__)
         self.write(value.__self__)
 
     def _write_partial(self, value: Any) -> None:
-        """A function with some of its arguments."""
+        """Append a partial function."""
         self.out.append(type(value))
         self.write((value.func, value.args, value.keywords))
 
     def _write_kernel(self, value: Any) -> None:
-        """A function or kernel of Taichi."""
+        """Append a function or kernel of Taichi."""
         self.write(value.func)
 
     def _write_field(self, value: Any) -> None:
-        """A field, by its place."""
+        """Append a field, by its place."""
         self.out.append(vars(value).get("place_name") or Same(value))
 
     def _write_object(self, value: Any) -> None:
-        """An object, by what of it kernels may read."""
+        """Append an object, by the attributes that kernels may read."""
         kind, own = type(value), vars(value)
         before, self._ours = self._ours, _is_ours(kind)
         self.out.append(Same(kind))
@@ -138,11 +140,11 @@ class Writing:
         self._ours = before
 
     def _write_itself(self, value: Any) -> None:
-        """What is equal to nothing else."""
+        """Append an object that is compared by identity."""
         self.out.append(Same(value))
 
     def _write_function(self, function: Any) -> None:
-        """A function, with what it knows from around it."""
+        """Append a function, with its defaults and the values that it refers to from outside."""
         self.out.append(Same(function.__code__))
         if function.__code__.co_filename.startswith((OURS, TAICHI)) and not function.__closure__:
             return
@@ -164,14 +166,14 @@ class Writing:
 
 
 def _names(code: types.CodeType) -> list[str]:
-    """The names that a function asks of what is around it."""
+    """Return the names that a function refers to, including those of functions inside it."""
     inside = [name for const in code.co_consts if isinstance(const, types.CodeType) for name in _names(const)]
     return [*code.co_names, *inside]
 
 
 @lru_cache(None)
 def _way(kind: type) -> Callable[[Writing, Any], None]:
-    """How objects of a class are written."""
+    """Return the method of Writing for objects of a class."""
     if kind in (types.FunctionType, types.MethodType, partial):
         ways = {types.FunctionType: Writing._write_function, types.MethodType: Writing._write_method}
         return ways.get(kind, Writing._write_partial)
@@ -183,13 +185,13 @@ def _way(kind: type) -> Callable[[Writing, Any], None]:
 
 @lru_cache(None)
 def _is_ours(kind: type) -> bool:
-    """Whether a class is ours, and not one of the user's."""
+    """Whether a class is tiverlet's, not the user's."""
     return kind.__module__.startswith("tiverlet.")
 
 
 @lru_cache(1000)
 def _read_of(kind: type, names: tuple[str, ...]) -> list[str]:
-    """The attributes that kernels may read, of an object of a class that has these."""
+    """Return the attributes that kernels may read, out of the `names` of an object's attributes, sorted."""
     return sorted(name for name in names if may_read(kind, name))
 
 
@@ -208,13 +210,13 @@ WAYS: tuple[tuple[Any, Callable[[Writing, Any], None]], ...] = (
     (np.ndarray, Writing._write_array), (np.generic, Writing._write_number), ((Func, Kernel), Writing._write_kernel),
     (Field, Writing._write_field),
 )  # fmt: skip
-_known: dict[tuple, str] = {}  # writings in short, and by which name their kernels are known
-_names_of: weakref.WeakKeyDictionary[Any, dict[tuple, str]] = weakref.WeakKeyDictionary()  # by objects: their kernels
-_keys_of: weakref.WeakKeyDictionary[Any, tuple] = weakref.WeakKeyDictionary()  # by objects: their writings in short
+_known: dict[tuple, str] = {}  # the name of the shared kernel, by the key of a Writing
+_names_of: weakref.WeakKeyDictionary[Any, dict[tuple, str]] = weakref.WeakKeyDictionary()  # names of kernels, by object
+_keys_of: weakref.WeakKeyDictionary[Any, tuple] = weakref.WeakKeyDictionary()  # the key of the Writing, by object
 
 
 def _ensured(self: Any, *args: Any) -> Any:
-    """Compile a kernel, unless one is there."""
+    """Compile a kernel unless an object with an equal list has it already. Return the kernel's key."""
     if not active or not self.classkernel or not getattr(type(args[0]), "__module__", "").startswith("tiverlet"):
         return _ensure(self, *args)
     features, compiler = self.mapper.extract(args), active[-1]
@@ -233,7 +235,7 @@ def _ensured(self: Any, *args: Any) -> Any:
 
 
 def apply(compile_: Callable) -> None:
-    """Put this in the place of what Taichi calls. compile_: what makes kernels that are not there, as timing.compiled does."""
+    """Replace Taichi's Kernel.ensure_compiled. compile_: compiles a missing kernel, as timing.compiled does."""
     global _compile
     _compile = compile_
     Kernel.ensure_compiled = _ensured  # type: ignore[method-assign]

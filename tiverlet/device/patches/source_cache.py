@@ -1,10 +1,10 @@
-"""How Taichi's Python reads our functions: in less time than it takes by itself, into the same statements.
+"""How Taichi's Python reads tiverlet's functions: in less time than by itself, into the same statements.
 
-Taichi expands every call of a ti.func, and each time looks for its source and draws pictures of its lines for errors that do not
-happen. Here this is done once, or not at all, while a kernel of ours compiles, and only then: what the user compiles in the same
-process is compiled as ever.
+Taichi expands every call of a ti.func. Each time it searches for the source and formats source excerpts for errors that do not
+occur. Here this happens once, or not at all, while a kernel of tiverlet compiles, and only then; kernels that the user compiles
+in the same process are not affected.
 
-Everything here knows the inside of Taichi 1.7.4; with another one, functions are read as Taichi does.
+Everything here depends on the internals of Taichi 1.7.4; with another version, Taichi reads functions by itself.
 """
 
 import ast
@@ -22,15 +22,15 @@ from taichi.lang.ast import ASTTransformerContext
 
 from ..language import HOME, OURS, TAICHI, active
 
-CLOSING = (")", "]", "}")  # what the last lines of a function may begin with that are not in its code
-PLAIN = ("ctx", "op", "ops", "id", "attr", "arg", "name", "names", "type_comment")  # what nodes have that is no node of a tree
-NOTHING = 8  # bytes of code of a function that has nothing but a docstring
-_lines: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # of functions, as inspect finds them
-_trees: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # of functions: those that are not in use
+CLOSING = (")", "]", "}")  # last lines of a function that its code object may not count begin with one of these
+PLAIN = ("ctx", "op", "ops", "id", "attr", "arg", "name", "names", "type_comment")  # attributes of nodes without nodes in them
+NOTHING = 8  # bytes of code of a function with only a docstring
+_lines: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # source lines by function, as from inspect
+_trees: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # parsed trees by function that are not in use
 
 
 def _lines_of(function) -> tuple[list[str], int]:
-    """The source of a function that is about to be compiled, found once and not at each call of it."""
+    """Return the source of a function to compile, found once and not at each call."""
     if not active:
         return _find_lines(function)
     if function not in _lines:
@@ -39,39 +39,39 @@ def _lines_of(function) -> tuple[list[str], int]:
 
 
 def _cut_out(code: CodeType) -> tuple[list[str], int] | None:
-    """The lines of a function from where its code begins to where it ends; inspect looks for the end token by token."""
+    """Return the lines of a function from its code's first line to its last; inspect finds the end token by token."""
     first, end, lines = code.co_firstlineno, _end(code), linecache.getlines(code.co_filename)
     while lines[end : end + 1] and lines[end].lstrip().startswith(CLOSING):
         end += 1
-    if len(code.co_code) <= NOTHING:  # its code does not tell where the docstring ends
+    if len(code.co_code) <= NOTHING:  # the code does not contain the last line of the docstring
         end = next((k for k in range(end, len(lines) + 1) if _whole(lines[first - 1 : k])), 0)
     return (lines[first - 1 : end], first) if lines and end else None
 
 
 def _whole(lines: list[str]) -> bool:
-    """Whether they make up a function."""
+    """Whether lines form a complete function."""
     with contextlib.suppress(SyntaxError):
         return bool(ast.parse(textwrap.dedent("".join(lines))))
     return False
 
 
 def _end(code: CodeType) -> int:
-    """The last line of a function and of those inside it."""
+    """Return the last line of a function and of the functions inside it."""
     inside = [_end(const) for const in code.co_consts if isinstance(const, CodeType)]
-    if code.co_filename.startswith(OURS):  # ours end with a line that does something, or with brackets that close
+    if code.co_filename.startswith(OURS):  # tiverlet's functions end with a line of code, or with closing brackets
         return max(code.co_firstlineno, *inside, *(line for _, _, line in code.co_lines() if line))
     return max([code.co_firstlineno, *inside, *(end for _, end, _, _ in code.co_positions() if end)])
 
 
 def _filled(line: str, tabsize: int, width: int) -> str:
-    """A line without tabs and the like, and without space at its end."""
+    """Return a line without tabs and other whitespace characters, and without trailing space, as textwrap.fill does."""
     if line[:-1].isprintable() and len(line) < width:
         return line.rstrip()
     return textwrap.fill(line, tabsize=tabsize, width=width)
 
 
 def _dedented(text: str) -> str:
-    """Lines without the space that all begin with, which is nearly always that of the first one."""
+    """Return text without common leading space, nearly always that of the first line, as textwrap.dedent does."""
     margin = text[: len(text) - len(text.lstrip())]
     if all(line.startswith(margin) for line in text.split("\n") if line):
         return text.removeprefix(margin).replace("\n" + margin, "\n")
@@ -79,7 +79,7 @@ def _dedented(text: str) -> str:
 
 
 def _place_of(self: Any, node: Any) -> str:
-    """Where a node is, without the picture of it that Taichi draws for every node; errors still get it."""
+    """Return file and line of a node, without the excerpt that Taichi formats for every node; errors still show it."""
     if not active or self.raised:
         return _draw(self, node)
     if node.lineno != self.line:
@@ -89,8 +89,10 @@ def _place_of(self: Any, node: Any) -> str:
 
 
 def _read(self: Any, *more: Any, is_kernel: bool = True, is_real_function: bool = False, **options: Any) -> Any:
-    """The tree of a function, and what it is compiled in: a tree that was read before and is not in use, see _transformed(). What
-    calls it may be a function itself, see calls.py; Taichi thinks of kernels alone."""
+    """Return the tree of a function and its context. Reuse a tree that was parsed before and is not in use, see _transformed().
+
+    The caller may itself be a called function, see calls.py; Taichi expects a kernel.
+    """
     if options.get("ast_builder") is not None:
         runtime: Any = impl.get_runtime()
         options["ast_builder"] = runtime.compiling_callable.ast_builder()
@@ -103,7 +105,7 @@ def _read(self: Any, *more: Any, is_kernel: bool = True, is_real_function: bool 
 
 
 def _transformed(tree: Any, ctx: Any) -> Any:
-    """Make statements of a tree. That of a ti.func is kept for the next call of it, without what its nodes came to."""
+    """Translate a tree into statements. The tree of a ti.func is kept for its next call, without the results of its nodes."""
     out = _transform(tree, ctx)
     if active and not ctx.is_kernel and not ctx.is_real_function:
         if not hasattr(tree, "nodes"):
@@ -118,12 +120,12 @@ def _transformed(tree: Any, ctx: Any) -> Any:
 
 @cache
 def _inside(kind: type) -> tuple[str, ...]:
-    """Where nodes of a kind have others, and not a text, a number or the name of an operation."""
+    """Return the attributes of a kind of node that hold nodes, not a text, a number or an operator."""
     return () if kind is ast.Constant else tuple(name for name in kind._fields if name not in PLAIN)  # type: ignore[attr-defined]
 
 
 def _nodes(tree: Any) -> list[Any]:
-    """The nodes of a tree that come to something; ast.walk takes twice the time."""
+    """Return all nodes of a tree that get a result; ast.walk takes twice the time."""
     nodes = [tree]
     for node in nodes:
         known = node.__dict__
@@ -137,8 +139,10 @@ def _nodes(tree: Any) -> list[Any]:
 
 
 def _in_class(level_of_class_stackframe: int) -> bool:
-    """Whether a decorator is at work in the body of a class; Taichi looks for the source of the statement around it, which for
-    all of ours took half of the time that importing them took."""
+    """Whether a decorator runs in the body of a class.
+
+    Taichi searches for the source of the statement around it, which for all of tiverlet's classes takes half of the import time.
+    """
     body = sys._getframe(level_of_class_stackframe - 1)
     if body.f_code.co_filename.startswith(HOME):
         return "__qualname__" in body.f_locals
@@ -146,7 +150,10 @@ def _in_class(level_of_class_stackframe: int) -> bool:
 
 
 def _trace(stacklevel: int = 1) -> str:
-    """Who declares a field, for errors that ours do not make; finding out took longer than declaring it."""
+    """Return which code declares a field, for error messages.
+
+    Fields of tiverlet skip this search, which takes longer than declaring them.
+    """
     frame: Any = sys._getframe(1)
     while frame and frame.f_code.co_filename.startswith(TAICHI):
         frame = frame.f_back
@@ -154,7 +161,7 @@ def _trace(stacklevel: int = 1) -> str:
 
 
 def apply() -> None:
-    """Put these in the place of what Taichi calls."""
+    """Replace Taichi's functions by these."""
     kernel_impl.getsourcelines, kernel_impl._inside_class = _lines_of, _in_class
     kernel_impl.textwrap = SimpleNamespace(fill=_filled, dedent=_dedented)
     kernel_impl._get_tree_and_ctx, kernel_impl.transform_tree = _read, _transformed

@@ -1,6 +1,6 @@
-"""Fewer statements than Taichi makes, to the same bits: its own have branches and functions in them that nobody needs.
+"""Fewer statements than Taichi makes, bit for bit the same result: Taichi's have superfluous branches and functions.
 
-Everything here knows the inside of Taichi 1.7.4; with another one, statements are those that Taichi makes.
+Everything here depends on the internals of Taichi 1.7.4; with another version, Taichi makes its own statements.
 """
 
 import ast
@@ -24,7 +24,10 @@ COMPARISONS = {
 
 
 def _compared(ctx: Any, node: Any) -> Any:
-    """A comparison of two. Taichi makes `True and a < b` of it, which is a branch, and then a truth value of what is one."""
+    """Translate a comparison of two values.
+
+    Taichi translates it as `True and a < b`, which is a branch, and converts the result, a truth value, to a truth value.
+    """
     compare = COMPARISONS.get(type(node.ops[0]))
     if not active or compare is None or len(node.ops) > 1:
         return _compare(ctx, node)
@@ -37,15 +40,17 @@ def _compared(ctx: Any, node: Any) -> Any:
 
 
 def _selected(cond: Any, x1: Any, x2: Any) -> Any:
-    """One of two. Taichi makes a truth value of the condition, by denying it twice, also where it is one."""
+    """Translate a selection of one of two values. Taichi negates the condition twice, even if it is a truth value already."""
     if not active or type(cond) is not Expr or cond.is_tensor() or cond.ptr.get_rvalue_type() != ti.u1:
         return _select(cond, x1, x2)
     return ops._ternary_operation(core.expr_select, None, cond, x1, x2)
 
 
 def _product(x: Any, y: Any) -> Any:
-    """The dot product of two vectors: the same sum in the same order, without the functions inside functions that Taichi makes
-    of it, which copy their arguments."""
+    """Translate a dot product of two vectors: the same sum in the same order.
+
+    Taichi's nested functions, which copy arguments, are left out.
+    """
     vectors = isinstance(x, Expr) and isinstance(y, Expr) and x.is_tensor() and x.get_shape() == y.get_shape()
     if not active or not impl.inside_kernel() or not vectors or len(x.get_shape()) > 1:
         return _dot(x, y)
@@ -54,7 +59,7 @@ def _product(x: Any, y: Any) -> Any:
 
 
 def apply() -> None:
-    """Put these in the place of what Taichi calls."""
+    """Replace Taichi's functions by these."""
     ASTTransformer.build_Compare = staticmethod(_compared)
     ti.select = ops.select = wraps(_select)(_selected)
     matrix_ops.dot = wraps(_dot)(_product)

@@ -1,11 +1,10 @@
-"""How Taichi's Python makes statements of the trees of our functions: in three quarters of the time that it takes by itself, the
-same statements.
+"""How Taichi's Python translates the trees of tiverlet's functions: the same statements in three quarters of the time.
 
-At each node Taichi asks again what it has asked before: where it is, how Taichi was started, which of a dozen kinds of values it
-has. Here this is asked once, or first about the few kinds that our kernels are made of; all others go the way that Taichi made,
-and so does all that the user compiles in the same process.
+At each node Taichi computes again what it has computed before: the node's position, its own settings, which of a dozen kinds of
+values a node has. Here this is computed once, or the few kinds that tiverlet's kernels use are tested first. All others take
+Taichi's own path, and so do kernels that the user compiles in the same process.
 
-Everything here knows the inside of Taichi 1.7.4; with another one, statements are made as Taichi does.
+Everything here depends on the internals of Taichi 1.7.4; with another version, Taichi translates by itself.
 """
 
 import ast
@@ -25,13 +24,13 @@ from taichi.lang.matrix import MatrixField
 
 from ..language import active, ti
 
-PLACES = 1000  # lines of code that are kept as what Taichi tells its compiler about where things are
-INT = range(-(2**31), 2**31)  # what a literal may be without a type of its own
-BUILTINS = {id(f) for f in (print, min, max, int, bool, float, any, all, abs, pow, len, operator.matmul)}  # that Taichi replaces
+PLACES = 1000  # source positions kept as the DebugInfo that Taichi passes to its compiler
+INT = range(-(2**31), 2**31)  # values of an integer literal of the default type
+BUILTINS = {id(f) for f in (print, min, max, int, bool, float, any, all, abs, pow, len, operator.matmul)}  # replaced by Taichi
 
 
 def _decorated(ctx: Any, node: Any) -> str:
-    """Which of Taichi's own a call is; it is asked for every call, and again for every turn of a static loop."""
+    """Return which of Taichi's decorators a call is. Taichi searches for it at every call, and at every turn of a static loop."""
     if not active:
         return _decorator(ctx, node)
     if not hasattr(node, "decorator"):
@@ -45,44 +44,44 @@ def _method(kind: type) -> Any:
 
 
 class _Failed:
-    """In the place of what compiles nodes: it fails with an error that is there already."""
+    """Takes the place of Taichi's translator and raises an error that has occurred already."""
 
     def __init__(self, error: Exception):
         self._error = error
 
     def __getattr__(self, name: str) -> Any:
         def fail(ctx, node):
-            """Raise what went wrong when the tree was read."""
+            """Raise the error of the translation."""
             raise self._error
 
         return fail
 
 
 def _visited(self: Any, ctx: Any, node: Any) -> Any:
-    """Compile a node. Taichi works out anew for each where it is, which takes as long as all else that it does in Python."""
+    """Translate a node. Taichi formats the position of each again, which takes as long as the rest of its Python."""
     kind = type(node)
     method = _method(kind)
     if not active or method is None:
         return _visit(self, ctx, node)
-    if kind is ast.Name:  # as every third is; errors in what it stands for say where they are themselves
+    if kind is ast.Name:  # every third node; looking up a local name cannot fail, so it needs no position
         for names in reversed(ctx.local_scopes):
             if node.id in names:
                 node.ptr = names[node.id]
                 return node.ptr
     if kind is ast.Attribute:
-        node.__dict__.pop("caller", None)  # from the last time
+        node.__dict__.pop("caller", None)  # left from the last translation of the tree
     places = impl.pytaichi.src_info_stack
     places.append(ctx.get_pos_info(node) if hasattr(node, "lineno") else ctx.place)
     try:
         return method(ctx, node)
     except Exception as e:
-        return _visit(_Failed(e), ctx, node)  # which says where, as ever
+        return _visit(_Failed(e), ctx, node)  # Taichi adds the position to the error
     finally:
         places.pop()
 
 
 def _statements(ctx: Any, nodes: Any) -> Any:
-    """Compile nodes one after the other, as far as a `return`, and a `break` or `continue` of a static loop."""
+    """Translate nodes one after the other, up to a `return`, or a `break` or `continue` of a static loop."""
     if not active:
         return _build_all(ctx, nodes)
     ctx.local_scopes.append({})
@@ -97,12 +96,12 @@ def _statements(ctx: Any, nodes: Any) -> Any:
 
 
 def _builtin(ctx: Any, node: Any, args: Any, keywords: Any) -> bool:
-    """Whether a call is of what Python has built in; Taichi makes a dictionary of it for every call."""
+    """Whether a call is of a Python builtin, and translate it; Taichi makes a dictionary of the builtins for every call."""
     return id(node.func.ptr) in BUILTINS and _call_builtin(ctx, node, args, keywords)
 
 
 def _express(self: Any, *args: Any, dbg_info: Any = None, dtype: Any = None) -> None:
-    """An expression from one of the compiler's, from another one or from a number."""
+    """Initialise an expression from one of the compiler's, from another Expr or from a number."""
     if not active or dtype is not None or len(args) != 1:
         return _init(self, *args, dbg_info=dbg_info, dtype=dtype)
     kind, new = type(args[0]), args[0]
@@ -123,7 +122,7 @@ def _express(self: Any, *args: Any, dbg_info: Any = None, dtype: Any = None) -> 
 
 
 def _variable(value: Any) -> Any:
-    """A variable with this value; most are single expressions, which Taichi finds out last."""
+    """Declare a variable with a value. Most values are single expressions, which Taichi tests for last."""
     if not active or type(value) is not Expr:
         return _declare(value)
     runtime: Any = impl.pytaichi
@@ -132,7 +131,7 @@ def _variable(value: Any) -> Any:
 
 
 def _subscript(builder: Any, value: Any, *indices: Any, **options: Any) -> Any:
-    """value[indices]; quickly where these are expressions and numbers."""
+    """Translate value[indices], by a short path if all indices are expressions and numbers."""
     plain = active and indices and all(type(k) is Expr or type(k) is int and k >= 0 for k in indices)
     target = _target(value) if plain else None
     if target is None:
@@ -146,7 +145,7 @@ def _subscript(builder: Any, value: Any, *indices: Any, **options: Any) -> Any:
 
 
 def _target(value: Any) -> Any:
-    """What the compiler takes for a field, an array or a vector; None for all else."""
+    """Return the compiler's object for a field, an array or a vector; None for any other value."""
     kind = type(value)
     if kind is ScalarField:
         return value.vars[0].ptr
@@ -154,7 +153,7 @@ def _target(value: Any) -> Any:
 
 
 def apply() -> None:
-    """Put these in the place of what Taichi calls."""
+    """Replace Taichi's functions by these."""
     core.DebugInfo = lru_cache(PLACES)(core.DebugInfo)
     Expr.__init__, impl.expr_init, impl.subscript = _express, _variable, _subscript
     ASTTransformer.__call__, ASTTransformer.get_decorator = _visited, staticmethod(_decorated)

@@ -1,7 +1,7 @@
-"""How long kernels take to compile, and what of them, by what is `told_apart`; and a word for who waits.
+"""Times of compiling kernels, in all and by parts marked `told_apart`; and a message for the waiting user.
 
-While LLVM works, Taichi holds Python, so nothing can move on a terminal. What is to be seen has to be there before: LLVM takes
-longer than the translation, which is measured.
+While LLVM works, Taichi holds Python's lock, so nothing can change on a terminal. The message has to be printed before. LLVM
+takes longer than the translation, whose measured time decides whether to print it.
 """
 
 import contextlib
@@ -14,11 +14,11 @@ from taichi.lang.kernel_impl import Func
 
 from ..language import active
 
-LONG = 0.3  # [s] of translating a kernel, after which LLVM is expected to take the better part of a second
+LONG = 0.3  # [s] of translating a kernel; LLVM then takes most of a second
 
 
 class Translation:
-    """One that is going on: the time that functions of each feature take, without what they call of others."""
+    """A translation in progress, and the time in functions of each feature, without the functions that they call of others."""
 
     now: "Translation | None" = None
 
@@ -28,12 +28,12 @@ class Translation:
         self._since = perf_counter()
 
     def enter(self, name: str) -> None:
-        """A function of this one begins."""
+        """Begin a function of the named feature."""
         self._count()
         self._open.append(name)
 
     def leave(self) -> None:
-        """It has ended."""
+        """End the function entered last."""
         self._count()
         self._open.pop()
 
@@ -44,10 +44,10 @@ class Translation:
 
 
 def compiled(kernel: Any, key: Any, name: str, translate: Any) -> None:
-    """Translate and compile a kernel, and note how long that took: in all, and by features, in parts as their statements took."""
+    """Translate and compile a kernel, and record the time: in all, and by feature in proportion to the time of translation."""
     if key in kernel.compiled_kernels:
         return
-    active[-1].hurry()
+    active[-1].compile_fast()
     begin, outer, translation = perf_counter(), Translation.now, Translation()
     Translation.now = translation
     try:
@@ -68,8 +68,8 @@ def compiled(kernel: Any, key: Any, name: str, translate: Any) -> None:
 
 @contextlib.contextmanager
 def _told(name: str, features: list[str]) -> Iterator[None]:
-    """On a terminal, a line that says what is compiled, as long as it is."""
-    from rich.console import Console  # noqa: PLC0415  # which takes 50 ms to import
+    """Show what is compiled in a line on the terminal, as long as the context lasts."""
+    from rich.console import Console  # noqa: PLC0415  # importing it takes 50 ms
 
     console = Console(stderr=True)
     if not console.is_terminal:
@@ -80,7 +80,7 @@ def _told(name: str, features: list[str]) -> Iterator[None]:
 
 
 def _called(self: Any, *args: Any, **kwargs: Any) -> Any:
-    """A function inside of a kernel: whose it is."""
+    """Translate a function called in a kernel, and count its time for the object that it belongs to."""
     now = Translation.now
     if now is None or not args or not getattr(args[0], "told_apart", False):
         return _call(self, *args, **kwargs)
@@ -92,7 +92,7 @@ def _called(self: Any, *args: Any, **kwargs: Any) -> Any:
 
 
 def apply() -> None:
-    """Put this in the place of what Taichi calls."""
+    """Replace Taichi's Func.__call__."""
     Func.__call__ = _called  # type: ignore[method-assign]
 
 

@@ -1,4 +1,4 @@
-"""Watches Taichi translate and launch kernels: what `report speed` counts. Nothing is watched otherwise."""
+"""Records which kernels Taichi translates and launches, for `report speed`. Costs nothing while no context here is open."""
 
 import contextlib
 from collections import Counter
@@ -18,7 +18,7 @@ ATOMIC = (ti.atomic_add, ti.atomic_sub, ti.atomic_max, ti.atomic_min)
 
 @contextlib.contextmanager
 def replaced(*places: tuple[Any, str, Any]) -> Iterator[None]:
-    """While this lasts, attributes have other values."""
+    """Within this context, attributes of objects have other values."""
     before = [(owner, name, owner.__dict__[name]) for owner, name, _ in places]
     for owner, name, value in places:
         setattr(owner, name, value)
@@ -30,13 +30,15 @@ def replaced(*places: tuple[Any, str, Any]) -> Iterator[None]:
 
 
 def known_as(kernel: Any, args: tuple) -> str:
-    """The name of a kernel, or what it is compiled for where that is a name."""
+    """Return the name of a kernel, or its first argument that is a text, which names it."""
     return next((a for a in args if isinstance(a, str)), kernel.func.__name__)
 
 
 class Launches(Counter[str]):
-    """How often kernels were launched, by name; seconds: in all, if they were timed. answers: how often the host waited for what
-    they give back, a number or what they write to an array."""
+    """The number of launches by name of the kernel.
+
+    seconds: their total times, if they were timed. answers: how often the host waited for a result, either a number or an array.
+    """
 
     def __init__(self):
         super().__init__()
@@ -46,14 +48,14 @@ class Launches(Counter[str]):
 
 @contextlib.contextmanager
 def launches(timed: bool = False) -> Iterator[Launches]:
-    """The kernels that are launched while this lasts. timed: wait for the end of each."""
+    """Count the kernels launched within this context. timed: wait for the end of each."""
     count = Launches()
 
     def counted(launch, name):
-        """A way to launch kernels, which counts them."""
+        """Wrap a method that launches kernels."""
 
         def run(self, *args, **options):
-            """Launch, and write down how often and for how long."""
+            """Launch, and record count and time."""
             clock = perf_counter()
             out = launch(self, *args, **options)
             known = name(self, args)
@@ -74,14 +76,14 @@ def launches(timed: bool = False) -> Iterator[Launches]:
 
 
 class Sweep:
-    """One outermost loop of a kernel: how often it runs (None: known only when it runs), and what it reads and writes."""
+    """One outermost loop of a kernel: how often it runs (None: known only at run time), and which fields it reads and writes."""
 
     def __init__(self):
         self.trips: int | None = None
         self.sites: list[list] = []  # [field, read, written, whether in a loop inside the loop]
 
     def bytes(self, lengths: dict[int, tuple[int, int]]) -> int:
-        """What it moves, if each element of a field that it names is read once and written once. lengths: see traffic()."""
+        """Return the bytes moved, if the loop reads and writes each element of a field once. lengths: see traffic()."""
         total, fields = 0, {id(site[0]) for site in self.sites}
         for key in fields & lengths.keys():
             sites = [s for s in self.sites if id(s[0]) == key]
@@ -93,38 +95,38 @@ class Sweep:
 
 
 class Tracer:
-    """Watches Taichi translate kernels: .sweeps has the loops of each, by its name."""
+    """Records the translation of kernels: .sweeps has the loops of each kernel, by its name."""
 
     def __init__(self):
         self.sweeps: dict[str, list[Sweep]] = {}
         self._open: list[Sweep] = []
         self._depth = 0
-        self._known: dict[int, tuple[Any, list]] = {}  # expressions that are elements of fields; kept, so that ids stay theirs
+        self._known: dict[int, tuple[Any, list]] = {}  # expressions of field elements; kept alive, so that ids stay unique
 
     @contextlib.contextmanager
     def watching(self) -> Iterator[None]:
-        """While this lasts."""
+        """Record within this context."""
         materialize, subscript = Kernel.materialize, impl.subscript
         loop, call, define = ASTTransformer.build_range_for, ASTTransformer.build_Call, ASTTransformer.build_FunctionDef
         assign, augment = Operations._assign, Operations._augassign
 
         def begun(ctx, node):
-            """A kernel's tree is read: start anew."""
-            if ctx.is_kernel:  # Quadrants does so twice, and the second time it counts
+            """Begin to translate a function; reset the record if it is a kernel."""
+            if ctx.is_kernel:  # Quadrants translates a kernel twice, and the second time counts
                 self._open, self._known = [], {}
             return define(ctx, node)
 
         def translated(kernel, **given):
-            """A kernel is compiled: keep what its loops touch."""
+            """Compile a kernel and keep the accesses of its loops."""
             self._open, self._known = [], {}
             out = materialize(kernel, **given)
             args = given.get("args") or given.get("py_args") or ()
-            if self._known:  # it was not there already
+            if self._known:  # empty if the kernel was compiled already
                 self.sweeps[known_as(kernel, args)] = self._open
             return out
 
         def looped(ctx, node):
-            """A loop: those on the outside are one sweep each."""
+            """Translate a loop; each outermost loop is one sweep."""
             self._depth += 1
             if self._depth == 1:
                 self._open.append(Sweep())
@@ -138,7 +140,7 @@ class Tracer:
             return out
 
         def subscripted(builder, value, *args, **kwargs):
-            """An entry of a field: read, until something is assigned to it."""
+            """Translate a subscript; an element of a field counts as read until it is assigned."""
             out = subscript(builder, value, *args, **kwargs)
             if isinstance(value, ti.Field) and self._open and self._depth:
                 site = [value, True, False, self._depth > 1]
@@ -149,20 +151,20 @@ class Tracer:
             return out
 
         def assigned(to, value):
-            """An entry that is written to."""
+            """Translate an assignment; an element of a field counts as written."""
             if id(to) in self._known:
                 site = self._known[id(to)][1]
                 site[1], site[2] = False, True
             return assign(to, value)
 
         def changed(to, value, op):
-            """An entry that is read and written to."""
+            """Translate an augmented assignment; an element of a field counts as read and written."""
             if id(to) in self._known:
                 self._known[id(to)][1][2] = True
             return augment(to, value, op)
 
         def called(ctx, node):
-            """An atomic operation changes its first argument."""
+            """Translate a call; an atomic operation writes its first argument."""
             out = call(ctx, node)
             if any(node.func.ptr is function for function in ATOMIC) and id(node.args[0].ptr) in self._known:
                 self._known[id(node.args[0].ptr)][1][2] = True

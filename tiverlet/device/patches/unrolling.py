@@ -1,11 +1,12 @@
-"""LLVM is told to leave loops as they are: kernels start in half of the time, to the same bits.
+"""Switches off LLVM's unrolling and peeling of loops: kernels start in half of the time, bit for bit the same.
 
-Of a loop whose length is known only when it runs, LLVM writes up to eight rounds one after the other, and takes first rounds out
-in front of it. All that comes after works on these copies, and frames take as long without, for what loops of ours wait for is
-memory and roots. Taichi has no switch for it. But LLVM is a part of its library, and reads switches of its own, as on a command
-line (LLVMParseCommandLineOptions, of its C API). That function is not among those that the system looks up; it stands in the
-library's table of symbols, as the one that sets all switches back. Where it does not (another system, a stripped library),
-nothing is told.
+For a loop whose length is known only at run time, LLVM writes up to eight rounds one after the other, and peels first rounds off
+in front of it. All later passes work on these copies. Frames take as long without them, since tiverlet's loops wait for memory
+and square roots.
+
+Taichi has no setting for this. But LLVM is part of its library, and reads switches as from a command line
+(LLVMParseCommandLineOptions, of its C API). That function is not exported. It is in the library's symbol table, and so is the
+function that resets all switches. Where they are missing (another system, a stripped library), no switch is set.
 """
 
 import contextlib
@@ -20,42 +21,42 @@ from dataclasses import dataclass
 import numpy as np
 
 SWITCHES = (
-    "-unroll-runtime=false",  # loops whose length is known when they run
-    "-unroll-max-upperbound=0",  # loops of which no more is known than the most rounds that they can take
-    "-unroll-allow-peeling=false",  # first rounds
+    "-unroll-runtime=false",  # loops whose length is known only at run time
+    "-unroll-max-upperbound=0",  # loops with a known upper bound of rounds only
+    "-unroll-allow-peeling=false",  # copies of first rounds
 )
 PARSE, RESET = b"LLVMParseCommandLineOptions", b"_ZN4llvm2cl25ResetAllOptionOccurrencesEv"
-SEEN = b"PyInit_taichi_python"  # one that the system looks up
-SYMBOL = np.dtype([("name", "<u4"), ("kind", "<u4"), ("value", "<u8"), ("size", "<u8")])  # ELF-64; kind: with the section
-TABLE = 2  # the type of a section that is a table of symbols
+SEEN = b"PyInit_taichi_python"  # an exported function, as the reference address
+SYMBOL = np.dtype([("name", "<u4"), ("kind", "<u4"), ("value", "<u8"), ("size", "<u8")])  # ELF-64; kind includes the section
+TABLE = 2  # section type of a symbol table
 
 
 @dataclass
 class CommandLine:
-    """LLVM's: parse takes how many words, these, and None; reset sets all switches back."""
+    """LLVM's command line. parse: takes the number of words, the words, and None. reset: resets all switches."""
 
     parse: Callable
     reset: Callable
-    given: bool = False  # switches that are not set back yet
+    given: bool = False  # whether switches are set
 
-    def give(self, *switches: str) -> None:
-        """Pass switches on. What LLVM does not know, it passes over."""
+    def set_switches(self, *switches: str) -> None:
+        """Set switches. LLVM ignores unknown ones."""
         words = [b"tiverlet", *[s.encode() for s in switches]]
         self.parse(len(words), (ctypes.c_char_p * len(words))(*words), None)
         self.given = True
 
-    def take_back(self) -> None:
-        """Have LLVM work as ever."""
+    def reset_switches(self) -> None:
+        """Reset all switches."""
         self.reset()
         self.given = False
 
 
 @functools.cache
 def command_line() -> CommandLine | None:
-    """That of the LLVM in Taichi's library; None where it is not found."""
+    """Return the command line of the LLVM in Taichi's library; None if it is not found."""
     path, at = getattr(sys.modules.get("taichi._lib.core.taichi_python"), "__file__", None), None
     if path and sys.platform == "linux" and sys.byteorder == "little":
-        with contextlib.suppress(OSError, ValueError, struct.error):  # a file that is none, or not as others are
+        with contextlib.suppress(OSError, ValueError, struct.error):  # no such file, or an unexpected format
             at = _addresses(path, PARSE, RESET, SEEN)
     if at is None:
         return None
@@ -65,22 +66,22 @@ def command_line() -> CommandLine | None:
     return CommandLine(ctypes.CFUNCTYPE(None, *arguments)(parse), ctypes.CFUNCTYPE(None)(reset))
 
 
-def leave_loops() -> None:
-    """Tell LLVM so, for the kernels that are compiled until as_ever()."""
+def disable_unrolling() -> None:
+    """Have LLVM leave loops as they are in kernels compiled until restore_switches()."""
     line = command_line()
     if line and not line.given:
-        line.give(*SWITCHES)
+        line.set_switches(*SWITCHES)
 
 
-def as_ever() -> None:
-    """Tell it nothing any more."""
+def restore_switches() -> None:
+    """Have LLVM unroll loops as by default."""
     line = command_line()
     if line and line.given:
-        line.take_back()
+        line.reset_switches()
 
 
 def _addresses(path: str, *names: bytes) -> list[int] | None:
-    """Where functions are in a library, in bytes from one place; None where its table of symbols does not say that."""
+    """Return the addresses of functions in a library, relative to one place; None if its symbol table does not have them."""
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as image:
         if image[:5] != b"\x7fELF\x02":
             return None
@@ -92,6 +93,6 @@ def _addresses(path: str, *names: bytes) -> list[int] | None:
                 table = np.frombuffer(image, SYMBOL, length // SYMBOL.itemsize, offset)
                 places = [image.find(b"\0" + name + b"\0", begin, end) + 1 - begin for name in names]
                 found = [int(v) for place in places for v in table["value"][table["name"] == place]]
-                del table  # or the file could not be let go
+                del table  # it holds the mapping open
                 return found if min(places) > 0 and len(found) == len(names) else None
     return None

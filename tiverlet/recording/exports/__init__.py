@@ -1,6 +1,6 @@
-"""Recordings for other programs: a file for each format, and here which ending leads to which.
+"""Recordings for other programs: a file for each format. Here the ending of a path selects the format.
 
-A new format is one file with write(recording, path) -> the names of the files that it wrote, and one line here.
+A new format is one file with write(recording, path), which returns the names of the files that it wrote, and one line here.
 """
 
 import os
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ..replay import Replay
 
 NUMBERS = {".npz": arrays.write, ".csv": table.write, ".xyz": xyz.write}
-SHAPED = {  # these take a shape
+SHAPED = {  # formats that accept a shape
     ".glb": gltf.write, ".gltf": gltf.write, ".obj": obj.write, ".pvd": vtk.write,
     ".gif": film.write, ".mp4": film.write, ".webp": film.write,
 }  # fmt: skip
@@ -21,7 +21,7 @@ ENDINGS = sorted([*NUMBERS, *SHAPED])
 
 
 def export(recording: "Replay", path: str, shape: Shape | None = None) -> list[str]:
-    """Write a recording as the ending of `path` says; see Replay.export()."""
+    """Write a recording in the format of the ending of `path`; see Replay.export()."""
     kind = os.path.splitext(path)[1].lower()
     if kind not in ENDINGS:
         raise ValueError(f"replay: {path} ends in {kind!r}, but {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]} can be written.")

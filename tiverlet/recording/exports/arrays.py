@@ -1,4 +1,4 @@
-"""Arrays for numpy."""
+"""Export of arrays for numpy."""
 
 import re
 from typing import TYPE_CHECKING, Any
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 
 
 def write(recording: "Replay", path: str) -> list[str]:
-    """Positions, times, masses, radii, curves and quantities of the user's, in an .npz file."""
+    """Write positions, times, masses, radii, curves and the user's quantities to an .npz file."""
     stretch = only(recording, path, "array", ".csv")
     more: dict[str, Any] = {name: stretch.column(name) for name in ("mass", "radius")}
     for name, (frames, values) in (recording.curves | recording.quantities).items():
-        if not re.fullmatch(r"\w+(/\w+)*", name):  # they become names of files in the archive
+        if not re.fullmatch(r"\w+(/\w+)*", name):  # the name becomes that of a file in the archive
             raise ValueError(f"replay: {recording.path} has a curve with the name {plain(name)!r}; see .verify().")
         more |= {f"{name} frame": frames, f"{name} value": values}
     x = np.array([x for _, _, x in stretch])

@@ -5,7 +5,7 @@ from types import ModuleType
 
 
 def needed(name: str, path: str) -> ModuleType:
-    """The module of this name. Raises ImportError that says how to install it."""
+    """Import a module. Raises ImportError with the command that installs it."""
     try:
         return importlib.import_module(name)
     except ImportError as e:

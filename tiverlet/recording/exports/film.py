@@ -1,4 +1,4 @@
-"""Films: .gif and .webp by Pillow, .mp4 by ffmpeg, which imageio-ffmpeg brings where there is none."""
+"""Export of films: .gif and .webp by Pillow, .mp4 by ffmpeg, which imageio-ffmpeg provides where it is missing."""
 
 import contextlib
 import itertools
@@ -21,11 +21,11 @@ from .stretch import Stretch, stretches
 if TYPE_CHECKING:
     from ..replay import Replay
 
-RATE = 25  # pictures a second: 40 ms each, which GIF, in hundredths of a second, has exactly
+RATE = 25  # pictures a second: 40 ms each, which GIF can store exactly, in hundredths of a second
 
 
 def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
-    """The scene as it went, in its own time, RATE pictures a second: of each moment the frame that is nearest."""
+    """Write a film in the scene's own time, RATE pictures a second; each picture shows the nearest frame."""
     image, draw = needed("PIL.Image", path), needed("PIL.ImageDraw", path)
     kind = os.path.splitext(path)[1].lower()
     video = _ffmpeg(path) if kind == ".mp4" else ""
@@ -40,7 +40,7 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
     words = [video, "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(RATE), "-i", "-"]
     with tempfile.TemporaryFile() as said:
         process = subprocess.Popen([*words, "-pix_fmt", "yuv420p", path], stdin=subprocess.PIPE, stderr=said)
-        with process, contextlib.suppress(BrokenPipeError):  # where it has ended, it has said why
+        with process, contextlib.suppress(BrokenPipeError):  # if ffmpeg has ended, its output says why
             assert process.stdin
             for picture in itertools.chain([first], pictures):
                 process.stdin.write(picture.tobytes())
@@ -51,12 +51,12 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
 
 
 def _ffmpeg(path: str) -> str:
-    """Where the program is."""
+    """Return the path of ffmpeg."""
     return shutil.which("ffmpeg") or needed("imageio_ffmpeg", path).get_ffmpeg_exe()
 
 
 def _pictures(recording: "Replay", shape: Shape | None, image: Any, draw: Any) -> Iterator[Any]:
-    """One picture after the other, all seen from the same place."""
+    """Yield one picture after the other, all from the same point of view."""
     times = recording.times
     moments = np.arange(times[0], times[-1] + 0.5 / RATE, 1 / RATE)
     after = np.clip(np.searchsorted(times, moments), 1, max(1, len(times) - 1))
@@ -77,7 +77,7 @@ def _pictures(recording: "Replay", shape: Shape | None, image: Any, draw: Any) -
 def _stretch(
     stretch: Stretch, shape: Shape | None, wanted: list[int], image: Any, draw: Any, view: View, ends: tuple
 ) -> Iterator[Any]:
-    """Those of one scene, with walls where they are in each frame."""
+    """Yield the pictures of one stretch, with walls at their places in each frame."""
     sketch = Sketch(image, draw, stretch.parts, stretch.geometry(shape), view, ends)
     features = dict(zip(stretch.parts.numbers, stretch.parts.features, strict=True))
     turned = list(stretch.turned)

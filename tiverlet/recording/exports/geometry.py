@@ -1,4 +1,4 @@
-"""What the particles of a recording are to other programs: faces, links, and particles by themselves."""
+"""The geometry of a recording for other programs: faces, links, and single particles."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -13,11 +13,11 @@ from ..surfaces import covered, triangles
 
 @dataclass(frozen=True)
 class Geometry:
-    """The surface of a scene, and what has none.
+    """The surface of a scene, and everything that is not part of a surface.
 
-    faces: particles around each face, with corners in the same sense all over a surface. uv: for each face the texture
-    coordinates of its corners, (corners, 2), or (0, 2) where it has none. links: (m, 2), those that are no part of a surface.
-    loose: particles that nothing joins. bare: particles with a radius that no surface hides. hues: (n, 3). up: (dim,).
+    faces: particles around each face, in the same sense all over a surface. uv: the texture coordinates of each face's corners,
+    (corners, 2), or (0, 2) without any. links: links outside surfaces, (m, 2). loose: particles without any face or link. bare:
+    particles with a radius that no surface hides. hues: colours of particles, (n, 3). up: the direction against gravity, (dim,).
     """
 
     faces: tuple[np.ndarray, ...]
@@ -30,7 +30,7 @@ class Geometry:
 
     @property
     def corners(self) -> np.ndarray:
-        """The triangles of all faces, (t, 3), as numbers of corners: faces one after the other, each as a fan."""
+        """The triangles of all faces, (t, 3), as indices into `around`; each face is a fan."""
         size = np.array([len(face) for face in self.faces], dtype=np.int64)
         if (size == 3).all():
             return np.arange(3 * len(size)).reshape(-1, 3)
@@ -45,9 +45,9 @@ class Geometry:
 
 
 def geometry(parts: Parts, shape: Shape | None = None) -> Geometry:
-    """Those of a scene. shape: what has their faces and texture coordinates, for the same particles.
+    """Return the geometry of a scene. shape: provides faces and texture coordinates for the same particles.
 
-    Raises ValueError for a shape of another number of points.
+    Raises ValueError for a shape with another number of points.
     """
     particles = parts.particles
     if shape is not None and len(shape) != len(particles):
@@ -72,14 +72,15 @@ def geometry(parts: Parts, shape: Shape | None = None) -> Geometry:
 
 
 def distinct(faces: np.ndarray) -> np.ndarray:
-    """Each triangle once, (t, 3): constraints at several of its edges each name it."""
+    """Return each triangle once, (t, 3): constraints at several edges of a triangle each give it."""
     _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     return faces[np.sort(first)]
 
 
 def oriented(faces: np.ndarray, x: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Triangles with corners in the same sense on both sides of each edge that two of them share: counterclockwise from outside
-    of what is closed, in the plane, and for the most part from above otherwise.
+    """Return triangles with a consistent orientation: of two that share an edge, both have the same sense.
+
+    In 2D, and from outside a closed surface, they are counterclockwise. An open surface has most of its normals upwards.
     """
     if x.shape[1] == 2:
         a, b, c = (x[k] for k in faces.T)
@@ -96,8 +97,10 @@ def oriented(faces: np.ndarray, x: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def _pieces(faces: np.ndarray) -> Iterable[tuple[np.ndarray, np.ndarray, bool]]:
-    """What hangs together by edges that two triangles share: its triangles, which of them run the other way than the first, and
-    whether there are no other edges.
+    """Yield the pieces connected by edges that two triangles share.
+
+    For each piece: its triangles, which of them have the other sense than the first, and whether the piece is closed (has no
+    other edges).
     """
     halves = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     _, edge, count = np.unique(np.sort(halves, axis=1), axis=0, return_inverse=True, return_counts=True)
@@ -113,7 +116,7 @@ def _pieces(faces: np.ndarray) -> Iterable[tuple[np.ndarray, np.ndarray, bool]]:
         if turned[seed] >= 0:
             continue
         turned[seed], piece = 0, [seed]
-        for face in piece:  # which grows meanwhile
+        for face in piece:  # the list grows during the loop
             for other, same in near[face]:
                 if turned[other] < 0:
                     turned[other] = turned[face] ^ same

@@ -1,7 +1,7 @@
-"""glTF 2.0: a mesh whose shape is animated, for Blender, three.js and whatever else shows such files.
+"""Export to glTF 2.0: an animated mesh for Blender, three.js and other programs.
 
-Each frame but the first is a morph target, the way from the first frame, and weights blend from one to the next. Positions are as
-they were recorded; a node above turns the scene so that up is y.
+Each frame but the first is a morph target, the displacement from the first frame, and weights interpolate between successive
+frames. Positions are stored as recorded; a node above them rotates the scene so that up is y.
 """
 
 import os
@@ -18,16 +18,17 @@ from .stretch import Stretch, only
 if TYPE_CHECKING:
     from ..replay import Replay
 
-SPHERES = 2000  # particles that are drawn as spheres, each a node that moves; of more, points
-MOST = 2**32 - 1  # bytes that a .glb file can have
-POINTS, LINES, TRIANGLES = 0, 1, 4  # glTF's numbers of kinds of primitives
-FLOAT, UINT, BYTE = 5126, 5125, 5121  # of types of numbers
-VERTICES, INDICES = 34962, 34963  # and of what they are used for
+SPHERES = 2000  # most particles drawn as spheres, each a moving node; with more, loose particles become points
+MOST = 2**32 - 1  # most bytes of a .glb file
+POINTS, LINES, TRIANGLES = 0, 1, 4  # glTF's numbers for kinds of primitives
+FLOAT, UINT, BYTE = 5126, 5125, 5121  # for types of numbers
+VERTICES, INDICES = 34962, 34963  # for uses of buffers
 
 
 def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
-    """Surfaces with normals, colours and texture coordinates; links without a surface as lines; particles that no surface hides
-    as spheres of their radii, or as points.
+    """Write surfaces with normals, colours and texture coordinates, other links as lines, and particles.
+
+    Particles that no surface hides are spheres of their radii, or points.
     """
     lib: Any = needed("pygltflib", path)
     stretch = only(recording, path, "mesh", ".csv, .obj, .pvd or .xyz")
@@ -37,7 +38,7 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
         why = "has positions that are not finite" if x.size else "has no particles"
         raise ValueError(f"replay: {recording.path} {why}, which glTF cannot say; export to .csv, .obj, .pvd or .xyz.")
     times = stretch.times.astype(np.float32)
-    later = np.append(np.diff(times) > 0, True)  # of frames at the same time, the last
+    later = np.append(np.diff(times) > 0, True)  # of several frames at the same time, keep the last
     scene = _Scene(lib, x[later], times[later])
     root = scene.node(name="scene", rotation=_turn(geometry.up))
     single = geometry.bare if len(geometry.bare) <= SPHERES else geometry.bare[:0]
@@ -47,7 +48,7 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
 
 
 def _turn(up: np.ndarray) -> list[float]:
-    """The quaternion that turns the axis nearest to `up` to y."""
+    """Return the quaternion that rotates the axis nearest to `up` to y."""
     axis = int(np.argmax(np.abs(up)))
     sign, half = np.sign(up[axis]), float(np.sqrt(0.5))
     if axis == 1:
@@ -56,8 +57,9 @@ def _turn(up: np.ndarray) -> list[float]:
 
 
 def _meshes(scene: "_Scene", geometry: Geometry, points: np.ndarray) -> list[int]:
-    """A node for all surfaces, one for links and one for points, where there are some: programs that read several kinds of
-    primitives from one animated mesh mix them up (VTK 9.7).
+    """Return one node for all surfaces, one for links and one for points, as far as there are any.
+
+    They are separate, since programs mix up several kinds of primitives in one animated mesh (VTK 9.7).
     """
     at, uv, triangles = _vertices(geometry)
     nodes = []
@@ -73,9 +75,9 @@ def _meshes(scene: "_Scene", geometry: Geometry, points: np.ndarray) -> list[int
 
 
 def _vertices(geometry: Geometry) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The particle of each vertex, its texture coordinates ((0, 2) where there are none), and triangles of vertices.
+    """Return the particle of each vertex, its texture coordinates ((0, 2) without any), and triangles of vertices.
 
-    A particle is as many vertices as it has texture coordinates.
+    A particle with several texture coordinates becomes as many vertices.
     """
     around = geometry.around
     if not any(len(uv) for uv in geometry.uv):
@@ -88,7 +90,10 @@ def _vertices(geometry: Geometry) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _normals(x: np.ndarray, at: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Unit normals at vertices, (v, 3): means over the triangles at a particle, by area. at: the particle of each vertex."""
+    """Return unit normals at vertices, (v, 3): area-weighted means over the triangles at a particle.
+
+    at: the particle of each vertex.
+    """
     a, b, c = (x[at[k]] for k in triangles.T)
     across, corner = np.cross(b - a, c - a), at[triangles].ravel()
     normal = np.stack([np.bincount(corner, np.repeat(across[:, k], 3), len(x)) for k in range(3)], axis=1)[at]
@@ -97,7 +102,7 @@ def _normals(x: np.ndarray, at: np.ndarray, triangles: np.ndarray) -> np.ndarray
 
 
 def _spheres(scene: "_Scene", stretch: Stretch, geometry: Geometry, single: np.ndarray) -> list[int]:
-    """A node for each particle, which moves with it."""
+    """Return a node for each particle, which moves with it."""
     if not len(single):
         return []
     vertices, faces = rounded(np.zeros(3), np.zeros(3), 1.0)
@@ -123,13 +128,13 @@ def _spheres(scene: "_Scene", stretch: Stretch, geometry: Geometry, single: np.n
 
 
 def _linear(hue: np.ndarray) -> np.ndarray:
-    """sRGB in 0 ... 255 as light in 0 ... 1, as glTF has colours."""
+    """Convert sRGB in 0 ... 255 to linear light in 0 ... 1, as glTF stores colours."""
     share = hue / 255
     return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
 
 class _Scene:
-    """A glTF file that is being made. x: (frames, n, 3) [m]. times: (frames,) [s]."""
+    """A glTF file under construction. x: (frames, n, 3) [m]. times: (frames,) [s]."""
 
     def __init__(self, lib: Any, x: np.ndarray, times: np.ndarray):
         self.lib, self.x = lib, x
@@ -139,13 +144,13 @@ class _Scene:
         self._plain = self.material((1.0, 1.0, 1.0))
         self._channels: list[Any] = []
         self._samplers: list[Any] = []
-        self._weights: int | None = None  # the sampler of all that is animated by them
+        self._weights: int | None = None  # the sampler of morph weights, for all meshes
         self._times = self.add(times, "SCALAR", ends=True) if len(x) > 1 else None
 
     def add(self, array: np.ndarray, kind: str, use: int | None = None, *, ends: bool = False) -> int:
-        """The number of an accessor of an array. use: VERTICES or INDICES. ends: with its least and largest values.
+        """Add an array; return the number of its accessor.
 
-        Bytes are shares of 255.
+        use: VERTICES or INDICES. ends: also store the least and largest values. Bytes count as shares of 255.
         """
         lib, data = self.lib, np.ascontiguousarray(array).tobytes()
         number = {"f4": FLOAT, "u4": UINT, "u1": BYTE}[array.dtype.str[1:]]
@@ -156,22 +161,22 @@ class _Scene:
         what = {"componentType": number, "normalized": number == BYTE, "count": len(rows), "type": kind}
         accessors.append(lib.Accessor(bufferView=view, **what, **limits))
         self._blocks.append(data)
-        self._size += len(data)  # always whole words
+        self._size += len(data)  # a multiple of 4 for all arrays here
         return len(accessors) - 1
 
     def material(self, hue: tuple) -> int:
-        """The number of a dull material that is seen from both sides."""
+        """Add a matte two-sided material; return its number."""
         look = self.lib.PbrMetallicRoughness(baseColorFactor=[*hue, 1.0], metallicFactor=0.0, roughnessFactor=0.8)
         self._file.materials.append(self.lib.Material(pbrMetallicRoughness=look, doubleSided=True, alphaCutoff=None))
         return len(self._file.materials) - 1
 
     def primitive(self, mode: int, at: np.ndarray, hues: np.ndarray, indices=None, normals=None, uv=()) -> Any:
-        """Vertices at the particles `at` that move with them. normals: (frames, vertices, 3)."""
+        """Return a primitive whose vertices move with the particles `at`. normals: (frames, vertices, 3)."""
         hue = np.column_stack([np.rint(255 * _linear(hues[at])), np.full(len(at), 255)]).astype(np.uint8)
         first = {"POSITION": self.add(self.x[0, at], "VEC3", VERTICES, ends=True), "COLOR_0": self.add(hue, "VEC4", VERTICES)}
         if normals is not None:
             first["NORMAL"] = self.add(normals[0], "VEC3", VERTICES)
-        if len(uv):  # glTF counts v from above
+        if len(uv):  # glTF's v axis points down
             first["TEXCOORD_0"] = self.add(np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).astype(np.float32), "VEC2", VERTICES)
         targets = []
         for k in range(1, len(self.x)):
@@ -183,22 +188,22 @@ class _Scene:
         return self.lib.Primitive(mode=mode, attributes=attributes, indices=corners, targets=targets, material=self._plain)
 
     def mesh(self, name: str, part: Any) -> int:
-        """The number of a mesh."""
+        """Add a mesh; return its number."""
         self._file.meshes.append(self.lib.Mesh(name=name, primitives=[part], weights=[0.0] * len(part.targets or ())))
         return len(self._file.meshes) - 1
 
     def node(self, **what: Any) -> int:
-        """The number of a node."""
+        """Add a node; return its number."""
         self._file.nodes.append(self.lib.Node(**what))
         return len(self._file.nodes) - 1
 
     def children(self, node: int, others: list[int]) -> None:
-        """Put nodes below another, which is all of the scene."""
+        """Put nodes below another one, which becomes the root of the scene."""
         self._file.nodes[node].children = others
         self._file.scenes.append(self.lib.Scene(nodes=[node]))
 
     def moving(self, name: str, part: Any) -> int:
-        """The number of a node with a mesh that goes from frame to frame."""
+        """Add a node with a mesh that follows the frames; return its number."""
         node = self.node(name=name, mesh=self.mesh(name, part))
         if len(self.x) > 1:
             if self._weights is None:
@@ -207,17 +212,17 @@ class _Scene:
         return node
 
     def sampler(self, values: np.ndarray, kind: str) -> int:
-        """Values at the times of all frames; linear between them."""
+        """Add values at the times of all frames, linear in between; return the number of the sampler."""
         self._samplers.append(self.lib.AnimationSampler(input=self._times, output=self.add(values, kind), interpolation="LINEAR"))
         return len(self._samplers) - 1
 
     def animate(self, node: int, what: str, sampler: int) -> None:
-        """Let something of a node have the values of a sampler."""
+        """Animate a property of a node by a sampler."""
         target = self.lib.AnimationChannelTarget(node=node, path=what)
         self._channels.append(self.lib.AnimationChannel(sampler=sampler, target=target))
 
     def save(self, path: str) -> list[str]:
-        """Write it: one file, or for .gltf two."""
+        """Write the file, or two files for .gltf; return their names."""
         lib, file = self.lib, self._file
         if self._channels:
             file.animations.append(lib.Animation(name="recording", channels=self._channels, samplers=self._samplers))

@@ -1,4 +1,4 @@
-"""Names of files of a sequence."""
+"""File names of a sequence."""
 
 import os
 
@@ -6,7 +6,7 @@ from ..viewer import NUMBER, named
 
 
 def numbered(path: str, frame: int) -> str:
-    """The name of a frame's file: its number where the name has a %d, or else before the ending, in four digits or more."""
+    """Return the name of a frame's file: its number replaces a %d, or precedes the ending with at least four digits."""
     if NUMBER.search(path):
         return named(path, frame)
     base, kind = os.path.splitext(path)

@@ -1,4 +1,4 @@
-"""A sequence of Wavefront .obj files, one for each frame."""
+"""Export to a sequence of Wavefront .obj files, one for each frame."""
 
 from typing import TYPE_CHECKING
 
@@ -12,8 +12,9 @@ if TYPE_CHECKING:
 
 
 def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
-    """Positions, the faces and texture coordinates of `shape` or else triangles, links without a surface as lines, and loose
-    particles as points.
+    """Write positions, faces, other links as lines, and loose particles as points.
+
+    Faces and texture coordinates are those of `shape`; without it, faces are triangles.
     """
     out = []
     for stretch in stretches(recording):

@@ -1,6 +1,6 @@
-"""Pictures of frames, drawn in software: faces in light from above, particles as discs, links and walls as lines.
+"""Pictures of frames drawn in software: faces lit from above, particles as discs, links and walls as lines.
 
-They take no graphics driver and some hundredths of a second each, where the viewer takes two seconds; and show less: no strain,
+They need no graphics driver and some hundredths of a second each, where the viewer takes two seconds. They show less: no strain,
 contacts or breaks.
 """
 
@@ -18,23 +18,23 @@ from ..scene import Parts
 from ..surfaces import Surface
 from .geometry import Geometry
 
-WIDE, MARGIN = 640, 0.04  # pixels, and the share of them that stays free on each side
-FINE = 2  # a picture is drawn in so many times as many pixels, for smooth edges
-STEP = 16  # sizes are multiples of so many pixels, as video wants them
-TALL = (0.3, 1.2)  # least and most height over width
-DOT, LINE = 3, 1.5  # pixels: of a particle without radius, and half the width of a line
+WIDE, MARGIN = 640, 0.04  # width [pixels]; share of it left free on each side
+FINE = 2  # factor of oversampling in each direction, for smooth edges
+STEP = 16  # sizes are multiples of so many pixels, as video requires
+TALL = (0.3, 1.2)  # least and most ratio of height to width
+DOT, LINE = 3, 1.5  # [pixels] diameter of a particle without radius, half the width of a line
 BACK, EDGE = (13, 16, 17), (120, 125, 140)
-ASIDE, ABOVE = np.radians(30), np.radians(20)  # of the eye in 3D
+ASIDE, ABOVE = np.radians(30), np.radians(20)  # angles of the eye in 3D
 
 
 class View:
-    """Where points of a scene between two corners [m] are in a picture, seen from far away."""
+    """Maps points of a scene between two corners [m] to pixels, in parallel projection."""
 
     def __init__(self, low: np.ndarray, high: np.ndarray, up: np.ndarray):
         if len(low) == 2:
             self._axes = np.array([[1.0, 0], [0, 1], [0, 0]])
         else:
-            front = np.array([0.0, -1, 0] if abs(up[2]) > 0.5 else [0.0, 0, 1])  # so that x is to the right
+            front = np.array([0.0, -1, 0] if abs(up[2]) > 0.5 else [0.0, 0, 1])  # so that x points to the right
             front -= front @ up * up
             front /= np.linalg.norm(front)
             eye = np.cos(ASIDE) * front + np.sin(ASIDE) * np.cross(up, front)
@@ -47,11 +47,11 @@ class View:
         share = np.clip(size[1] / size[0], *TALL)
         self.size = tuple(STEP * max(1, round(WIDE * s / STEP)) for s in (1.0, share))
         room = FINE * (1 - 2 * MARGIN) * np.array(self.size)
-        self.scale = float((room / size).min())  # pixels of a meter
+        self.scale = float((room / size).min())  # pixels per meter
         self._begin = FINE * np.array(self.size) / 2 - self.scale * size / 2
 
     def place(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels, (n, 2), and how near to the eye [m], (n,)."""
+        """Return pixels, (n, 2), and the coordinate towards the eye [m], (n,)."""
         right, above, near = self._axes @ x.T
         across = self._begin[0] + self.scale * (right - self._low[0])
         down = FINE * self.size[1] - self._begin[1] - self.scale * (above - self._low[1])
@@ -59,7 +59,7 @@ class View:
 
 
 def extent(parts: Parts, frames: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Two corners [m] around particles in all frames, and around walls of finite size."""
+    """Return two corners [m] around particles in all frames and around walls of finite size."""
     r, x = parts.particles.radius[:, None], np.array(frames)
     low, high = ((x.astype(np.float64) + s * r).reshape(-1, x.shape[-1]) for s in (-1, 1))
     low, high = low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)
@@ -67,7 +67,7 @@ def extent(parts: Parts, frames: Sequence[np.ndarray]) -> tuple[np.ndarray, np.n
 
 
 class Sketch:
-    """Draws frames of a scene. view: of all of them. extent: two corners [m] between which walls are drawn."""
+    """Draws frames of a scene. view: the view of all frames. extent: two corners [m] between which walls are drawn."""
 
     def __init__(
         self, image: Any, draw: Any, parts: Parts, geometry: Geometry, view: View, extent: tuple[np.ndarray, np.ndarray]
@@ -88,7 +88,7 @@ class Sketch:
         self._dots = np.union1d(geometry.bare, geometry.loose)
 
     def frame(self, x: np.ndarray) -> Any:
-        """The picture of a frame, positions [m]."""
+        """Return the picture of a frame. x: positions [m]."""
         view = self._view
         canvas = self._image.new("RGB", tuple(FINE * s for s in view.size), BACK)
         draw = self._draw.Draw(canvas)
@@ -104,7 +104,7 @@ class Sketch:
         return canvas.reduce(FINE)
 
     def _mesh(self, x: np.ndarray, triangles: np.ndarray, depth: Callable, hues: np.ndarray) -> list[tuple]:
-        """Triangles to draw. depth: how near each is, of how near its corners are."""
+        """Return triangles to draw. depth: reduces the depths of three corners to that of the triangle."""
         at, near = self._view.place(x)
         places, nearness = at[triangles].reshape(-1, 6).tolist(), depth(near[triangles], axis=1).tolist()
         shades = map(tuple, hues[triangles].mean(axis=1).astype(int).tolist())
@@ -148,7 +148,7 @@ class Sketch:
                     hues = np.repeat(WALL if closed else WALL // 2, len(vertices), axis=0)
                     light = Surface(faces, hues, np.zeros((0, 2), dtype=np.int64), upwards(self._parts))
                     shades = _bytes(light.colors(vertices, np.zeros(0)))
-                    out += self._mesh(vertices, faces, np.min, shades)  # what lies on them is in front
+                    out += self._mesh(vertices, faces, np.min, shades)  # np.min puts bodies on the wall in front of it
                     continue
             strips, thickness = wall.outline(*self._extent)
             width = max(round(2 * self._view.scale * thickness), round(FINE * LINE))
@@ -159,5 +159,5 @@ class Sketch:
 
 
 def _bytes(rgba: np.ndarray) -> np.ndarray:
-    """Red, green and blue of colours as u32, (n, 3)."""
+    """Return red, green and blue of colours given as u32, (n, 3)."""
     return np.stack([rgba >> 24, rgba >> 16 & 255, rgba >> 8 & 255], axis=1)

@@ -1,4 +1,4 @@
-"""A part of a recording in which no particles come or go."""
+"""Stretches: parts of a recording in which no particles are added or removed."""
 
 import functools
 from collections.abc import Iterator
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 class Stretch:
     """Frames with the same particles and features.
 
-    entry: of the scene. frames: their numbers. times [s]. turned: what the user turned: before which frame, the number of the
-    feature, and its knobs.
+    entry: the entry of the scene. frames: their numbers. times [s]. turned: the knobs that the user set: before which frame, the
+    number of the feature, and the values of its knobs.
     """
 
     recording: "Replay"
@@ -31,32 +31,32 @@ class Stretch:
     turned: list[tuple[int, int, dict[str, Any]]]
 
     def __iter__(self) -> Iterator[tuple[int, float, np.ndarray]]:
-        """Number, time [s] and positions [m] of each frame."""
+        """Yield number, time [s] and positions [m] of each frame."""
         for frame, time in zip(self.frames.tolist(), self.times.tolist(), strict=True):
             yield frame, time, self.recording.position(frame)
 
     def column(self, name: str) -> np.ndarray:
-        """The "mass" [kg] or "radius" [m] of each particle."""
+        """Return the "mass" [kg] or "radius" [m] of each particle."""
         return self.entry.arrays[name]
 
     @functools.cached_property
     def parts(self) -> Parts:
-        """Particles and features."""
+        """Particles and features of the scene."""
         return self.recording.parts(self.entry)
 
     def geometry(self, shape: Shape | None) -> Geometry:
-        """Faces, links and loose particles."""
+        """Return faces, links and loose particles."""
         return geometry(self.parts, shape)
 
     def flat(self, x: np.ndarray) -> np.ndarray:
-        """Positions in 3D: a plane is at z = 0."""
+        """Return positions in 3D; a 2D scene lies at z = 0."""
         out = np.zeros((len(x), 3), dtype=x.dtype)
         out[:, : x.shape[1]] = x
         return out
 
 
 def stretches(recording: "Replay") -> list[Stretch]:
-    """Those of a recording, in order."""
+    """Return the stretches of a recording, in order."""
     times = dict(zip(recording.frames.tolist(), recording.times.tolist(), strict=True))
     out = []
     for entry, frames, turned in recording.scenes:
@@ -66,7 +66,10 @@ def stretches(recording: "Replay") -> list[Stretch]:
 
 
 def only(recording: "Replay", path: str, what: str, others: str) -> Stretch:
-    """The one stretch of a recording. what, others: why there has to be one, and which endings can do with more."""
+    """Return the only stretch of a recording; raise ValueError if there are more or none.
+
+    what, others: for the message, what needs a single stretch, and which formats can hold several.
+    """
     found = stretches(recording)
     if not found:
         raise ValueError(f"replay: {recording.path} has no frame, so there is nothing for {path}.")

@@ -1,4 +1,4 @@
-"""A table with a row for each particle in each frame."""
+"""Export to a table with a row for each particle in each frame."""
 
 from typing import TYPE_CHECKING
 
@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 
 def write(recording: "Replay", path: str) -> list[str]:
-    """Positions, in a .csv file."""
+    """Write positions to a .csv file."""
     with open(path, "w", encoding="ascii") as out:
         for first, stretch in enumerate(stretches(recording)):
             dim = stretch.entry.arrays["position"].shape[1]

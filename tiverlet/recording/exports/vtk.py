@@ -1,6 +1,6 @@
-"""VTK: a .pvd file, which says when, and a .vtu file for each frame. ParaView and VisIt read them.
+"""Export to VTK for ParaView and VisIt: a .pvd file with the times, and a .vtu file for each frame.
 
-They are written here, without a library: what does not change is laid out once for all frames.
+They are written without a library. The parts that do not change are formatted once for all frames.
 """
 
 import base64
@@ -19,13 +19,13 @@ from .stretch import Stretch, stretches
 if TYPE_CHECKING:
     from ..replay import Replay
 
-VERTEX, LINE, TRIANGLE, POLYGON, QUAD = 1, 3, 5, 7, 9  # VTK's numbers of kinds of cells
+VERTEX, LINE, TRIANGLE, POLYGON, QUAD = 1, 3, 5, 7, 9  # VTK's numbers for kinds of cells
 KINDS = {"f4": "Float32", "f8": "Float64", "i4": "Int32", "u1": "UInt8"}
 ORDER = "LittleEndian" if sys.byteorder == "little" else "BigEndian"
 
 
 def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
-    """Points with radius [m] and mass [kg], and cells: faces, links without a surface, loose particles."""
+    """Write points with radius [m] and mass [kg], and cells: faces, other links, loose particles."""
     base, out, sets = os.path.splitext(path)[0], [path], []
     for stretch in stretches(recording):
         before, after = _laid_out(stretch, stretch.geometry(shape))
@@ -43,7 +43,7 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
 
 
 def _laid_out(stretch: Stretch, geometry: Geometry) -> tuple[bytes, bytes]:
-    """What is the same in all files, before and after the positions."""
+    """Return the text that is the same in all files, before and after the positions."""
     rows = [*geometry.faces, *geometry.links, *geometry.loose[:, None]]
     kinds = [{3: TRIANGLE, 4: QUAD}.get(len(face), POLYGON) for face in geometry.faces]
     kinds += [LINE] * len(geometry.links) + [VERTEX] * len(geometry.loose)
@@ -60,7 +60,7 @@ def _laid_out(stretch: Stretch, geometry: Geometry) -> tuple[bytes, bytes]:
 
 
 def _array(name: str, array: np.ndarray) -> bytes:
-    """An array, its size before it, in base 64."""
+    """Return an array in base 64, with its size before it."""
     wide = ' NumberOfComponents="3"' if array.ndim == 2 else ""
     data = base64.b64encode(np.uint64(array.nbytes).tobytes() + array.tobytes())
     head = f'<DataArray type="{KINDS[array.dtype.str[1:]]}" Name="{name}"{wide} format="binary">'

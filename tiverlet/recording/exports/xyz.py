@@ -1,4 +1,4 @@
-"""Extended XYZ, which OVITO and ASE read."""
+"""Export to extended XYZ, which OVITO and ASE read."""
 
 from typing import TYPE_CHECKING
 
@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 
 def write(recording: "Replay", path: str) -> list[str]:
-    """Positions, and radii where particles neither come nor go. A plane is at z = 0."""
+    """Write positions, and radii if no particles are added or removed. A 2D scene lies at z = 0."""
     found = stretches(recording)
     same = len(found) == 1
     columns = "species:S:1:pos:R:3" + (":radius:R:1" if same else "")

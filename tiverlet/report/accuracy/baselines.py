@@ -1,6 +1,6 @@
-"""What errors are compared with: the article's scheme and textbook XPBD, on the same scenes, as fast as they can be written.
+"""The baselines of accuracy: the article's scheme and textbook XPBD, on the same scenes, written for speed.
 
-Each is one kernel for all substeps of a frame, serial, in f64, without any report: nothing here is slower than it has to be.
+Each is one serial kernel for all substeps of a frame, in f64, without a report.
 """
 
 import math
@@ -19,18 +19,18 @@ from ...forces import Drag, Gravity
 from ...particles import Particles
 from ...step.span import integer
 
-KINDS = (Gravity, Drag, Distance)  # what they know
-STIFFNESS = 0.5  # of the article, per pass
-GIVE = Struct("5d").pack_into  # the substep, what drag leaves of velocities, substeps, iterations, whether it starts
+KINDS = (Gravity, Drag, Distance)  # supported features
+STIFFNESS = 0.5  # share of a violation that the article's scheme corrects per pass
+GIVE = Struct("5d").pack_into  # the substep, the factor of drag on velocities, substeps, iterations, whether it is a start
 
 
 @ti.data_oriented
 class Baseline:
-    """A chain or net of links under gravity, with drag. Stands in for a World where errors are measured."""
+    """A chain or net of links under gravity, with drag. Replaces a World where errors are measured."""
 
     name = ""
-    soft = False  # knows compliance
-    advance: Any  # goes through a frame: (h, exp(-rate h), substeps, iterations, fresh)
+    soft = False  # whether it supports compliance
+    advance: Any  # advances by a frame: (h, exp(-rate h), substeps, iterations, fresh)
 
     def __init__(self, particles: Particles, features: Sequence[Feature]):
         runtime.ensure_started()
@@ -60,7 +60,7 @@ class Baseline:
 
     @classmethod
     def refuses(cls, features: Sequence[Feature]) -> str:
-        """Why a scene is beyond it; empty where it is not."""
+        """Return why the baseline cannot run a scene; empty if it can."""
         for f in features:
             if type(f) not in KINDS:
                 return f"knows no {type(f).__name__}"
@@ -72,7 +72,7 @@ class Baseline:
 
     @ti.func
     def relax(self, c, part, give):
-        """Take back `part` of what link c lacks, as far as it does not give way."""
+        """Correct the share `part` of the violation of link c. give: its compliance / h^2."""
         i, j = self.pair[c][0], self.pair[c][1]
         r = self.x[i] - self.x[j]
         length = r.norm()
@@ -84,21 +84,21 @@ class Baseline:
 
     @ti.kernel
     def frame(self, given: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
-        """What step() asks for."""
+        """Advance by a frame with the arguments packed by step()."""
         ti.loop_config(serialize=True)
         for _ in range(1):
             self.advance(given[0], given[1], integer(given, 2), integer(given, 3), integer(given, 4))
 
     def restart(self) -> None:
-        """Go back to the start."""
+        """Restore the start."""
         moves = (self.particles.inv_mass > 0)[:, None]
         self.memory.write(self.x, self.particles.position)
         self.memory.write(self.v, self.particles.velocity * moves)
         self.fresh = True
 
     def step(self, dt: float) -> None:
-        """A frame of dt [s]."""
-        mine = vars(self)  # as in a World: past the doors at which Taichi looks at everything anew
+        """Advance by a frame of dt [s]."""
+        mine = vars(self)  # skips Taichi's attribute checks, as in a World
         h = dt / mine["substeps"]
         GIVE(mine["given"], 0, h, math.exp(-mine["rate"] * h), mine["substeps"], mine["iterations"], mine["fresh"])
         mine["quick"]()
@@ -143,13 +143,13 @@ class Baseline:
 
 @ti.data_oriented
 class Article(Baseline):
-    """Position Verlet, started with x_(-1) = x_0 - v h, and links that are relaxed by half of what they lack, one by one."""
+    """The article's scheme: position Verlet, started with x_(-1) = x_0 - v h. Each link in turn is corrected by half."""
 
     name = "article"
 
     @ti.func
     def advance(self, h, keep, substeps, iterations, fresh):
-        """All substeps. `before` is the position of the step before."""
+        """Compute all substeps. `before` is the position one substep earlier."""
         for s in range(substeps):
             for i in range(self.n):
                 if s == 0 and fresh != 0:
@@ -173,7 +173,7 @@ class Xpbd(Baseline):
 
     @ti.func
     def advance(self, h, keep, substeps, iterations, fresh):
-        """All substeps. Multipliers are those of one pass, so that they start at 0; more passes are for rigid links."""
+        """Compute all substeps. Multipliers start at 0 in every pass, so more than one pass suits rigid links only."""
         for s in range(substeps):
             for i in range(self.n):
                 self.before[i] = self.x[i]

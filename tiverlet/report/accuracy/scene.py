@@ -1,4 +1,4 @@
-"""Error against run time of a scene of the user's: its own reference, the cheapest settings, and what f32 has to do with it."""
+"""Error against run time of the user's own scene: its reference, the cheapest settings, and the share of f32 in the error."""
 
 import json
 from collections.abc import Sequence
@@ -22,17 +22,18 @@ from .cases.case import rms
 
 EFFORTS = (2, 5, 10, 20, 40, 80, 160)
 RUNS = 3
-ITSELF = 0.1  # of the motion: a reference that is off by more than this is none
-MARGIN = 3.0  # an error below so many times that of the reference says no more than that
+ITSELF = 0.1  # largest error of a usable reference, as a share of the motion
+MARGIN = 3.0  # errors below this multiple of the error of the reference are shown as a bound
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to run the scene: what it costs and how wrong it is.
+    """One way to run the scene, with its cost and error.
 
-    error: root mean square distance from the reference at the end [m]. rounding: how far f32 is from f64 with the same settings
-    [m], 0 in f64. share: of the error that is f32's. seconds: per simulated second, median. best: no setting is both faster and
-    more accurate. diverged: not finite. residual, energy_change [J], flags: as in StepReport, the worst of all frames.
+    error: root mean square distance from the reference at the end [m]. rounding: distance between f32 and f64 with the same
+    settings [m], 0 in f64. share: of the error that is due to f32. seconds: per simulated second, median. best: whether no
+    setting is both faster and more accurate. residual, flags: as in StepReport, the worst of all frames. energy_change: the sum
+    of all frames [J].
     """
 
     solver: str
@@ -51,7 +52,7 @@ class Setting:
 
     @property
     def paste(self) -> str:
-        """The arguments of a World with these settings."""
+        """The arguments of a World with these settings, as code."""
         words = [f"substeps={self.substeps}"]
         words += [f"iterations={self.iterations}"] if self.iterations != 1 else []
         words += [f"solver=tv.{self.solver}"]
@@ -63,8 +64,9 @@ class Setting:
 class SceneReport(JupyterMixin):
     """Settings of a scene, with error and cost. print() shows them; see .recommended, .paste, .json(), .markdown().
 
-    settings: all that were tried. reference: what the reference is. reference_error [m]: how far it is itself from the truth, by
-    its own convergence; infinite where it does not converge. tolerance [m]: what was asked for. order: the order of convergence.
+    settings: all that were tried. reference: the settings of the reference. reference_error: its own error [m], estimated from
+    its convergence; infinite if it does not converge. tolerance: the requested error [m]. order: the order of convergence.
+    motion: root mean square displacement of the reference [m].
     """
 
     def __init__(
@@ -75,12 +77,12 @@ class SceneReport(JupyterMixin):
 
     @property
     def converges(self) -> bool:
-        """Whether the reference is one: closer to the truth than a tenth of the motion."""
+        """Whether the reference is usable: its error is less than a tenth of the motion."""
         return bool(self.reference_error < ITSELF * self.motion)
 
     @property
     def recommended(self) -> Setting | None:
-        """The cheapest setting that is within the tolerance even when the reference is as wrong as it may be; None if none is."""
+        """The cheapest setting whose error plus that of the reference is within the tolerance; None if there is none."""
         if not self.converges:
             return None
         good = [s for s in self.settings if s.error + self.reference_error <= self.tolerance and "non-finite" not in s.flags]
@@ -88,7 +90,7 @@ class SceneReport(JupyterMixin):
 
     @property
     def paste(self) -> str:
-        """The recommendation as code, or why there is none."""
+        """The recommendation as code, or a comment that says why there is none."""
         if self.recommended:
             return f"world = tv.World(particles, features, {self.recommended.paste})"
         if not self.converges:
@@ -110,7 +112,7 @@ class SceneReport(JupyterMixin):
         yield self.paste
 
     def cells(self, s: Setting) -> tuple[str, ...]:
-        """A line of the table; an error near that of the reference is a bound."""
+        """Return the table row of a setting; an error near that of the reference is shown as a bound."""
         near = s.error < MARGIN * self.reference_error
         error = f"< {MARGIN * self.reference_error:.1e}" if near else f"{s.error:.1e}"
         error = error if self.converges else f"({s.error:.1e})"
@@ -124,12 +126,12 @@ class SceneReport(JupyterMixin):
         return output.text(self, 150)
 
     def markdown(self) -> str:
-        """The table as Markdown."""
+        """Return the table as Markdown."""
         lines = output.table(HEADS, map(self.cells, self.settings))
         return "\n".join([*lines, "", "```python", self.paste, "```"]) + "\n"
 
     def json(self) -> str:
-        """Everything, for machines."""
+        """Return the report as JSON."""
         names = ("reference", "reference_error", "order", "tolerance", "motion", "converges", "paste")
         about = output.plain({k: getattr(self, k) for k in names})
         return json.dumps({**about, "settings": [output.plain(asdict(s)) for s in self.settings]}, indent=1, allow_nan=False)
@@ -142,7 +144,7 @@ def scene_report(
     world: World, seconds: float, tolerance: float | None = None, *, dt: float = 1 / 60, substeps: Sequence[int] = EFFORTS,
     progress: bool = False,
 ) -> SceneReport:  # fmt: skip
-    """See World.report."""
+    """Return the report of World.report(), which describes the arguments."""
     seconds = checks.number("World.report", "seconds", seconds, above=0.0)
     dt = checks.number("World.report", "dt", dt, above=0.0)
     if tolerance is not None:
@@ -154,7 +156,7 @@ def scene_report(
         raise ValueError("World.report: there are no particles.")
     frames = max(1, round(seconds / dt))
     runner = Runner(world, frames, dt)
-    # The reference goes twice as far, so that the finest of the sweep is measured against something finer.
+    # The reference has twice the substeps of the finest setting, so that it is finer than all of them.
     finer = [*efforts, 2 * efforts[-1]]
     rows: dict[tuple[str, str], list[Result]] = {}
     solvers, precisions = solvers_of(world), ("f64", "f32") if world.order == 2 else ("f64",)
@@ -203,7 +205,7 @@ def scene_report(
 
 @dataclass
 class Result:
-    """What one run left."""
+    """The result of one run."""
 
     substeps: int
     position: np.ndarray
@@ -214,16 +216,16 @@ class Result:
 
 
 class Runner:
-    """Runs clones of a world from its present state."""
+    """Runs clones of a world from its current state."""
 
     def __init__(self, world: World, frames: int, dt: float):
         self.world, self.frames, self.dt = world, frames, dt
         self.start = world.position.copy(), world.velocity.copy()
-        # Where the state is more than positions and velocities, every run needs a clone of its own.
+        # If constraints break or shapes creep, positions and velocities do not restore the start: every run needs its own clone.
         self.fresh = any(isinstance(f, Batch) and f.breaks or isinstance(f, ShapeMatch) and f.creep.any() for f in world.features)
 
     def run(self, solver, precision: str, efforts: Sequence[int], done) -> list[Result]:
-        """All efforts of one solver in one precision."""
+        """Run all substeps `efforts` with one solver in one precision. done: called after each."""
         clone, out = self.world.clone(solver=solver, precision=precision, substeps=1), []
         try:
             self.go(clone, 1)  # compiles
@@ -244,7 +246,7 @@ class Runner:
         return out
 
     def go(self, clone: World, substeps: int) -> tuple[Any, float, float]:
-        """One run: the worst report, the change of energy, and the seconds it takes by its median frame, without compilation."""
+        """Run once: return the worst report, the change of energy [J], and the seconds by the median frame."""
         if not self.fresh:
             clone.position, clone.velocity = self.start
         clone.substeps = substeps
@@ -258,7 +260,7 @@ class Runner:
 
 
 def solvers_of(world: World) -> list[Any]:
-    """The solvers that make sense for a scene: its own, and Direct next to Jacobi where links hang together, at order 2."""
+    """Return the solvers to try: the scene's own and, in order 2 with links that can be solved together, Direct or Jacobi."""
     own = world._solver
     if world.order > 2:
         return [own]
@@ -268,17 +270,17 @@ def solvers_of(world: World) -> list[Any]:
 
 
 def distance(position: np.ndarray, reference: np.ndarray) -> float:
-    """Root mean square distance [m]; infinite where it is none."""
+    """Return the root mean square distance [m]; infinite if it is not finite."""
     with np.errstate(all="ignore"):
         value = rms(position, reference)
     return value if np.isfinite(value) else np.inf
 
 
 def reference(rows: dict[tuple[str, str], list[Result]]) -> tuple[str, np.ndarray, float, float]:
-    """The solver whose finest two runs in f64 agree best, its finest positions, their error [m], and the order it converges with.
+    """Return the solver with the least estimated error in f64, its finest positions, their error [m], and its order.
 
     With an order p, runs at n/2 and n substeps differ by (2^p - 1) times the error at n (Richardson). p is measured on three
-    runs and not taken for more than 2; below 1/2 there is no convergence to speak of, and the error is not known.
+    runs and used up to 2. Below 1/2 the run does not converge, and the error counts as infinite.
     """
     best = ("", np.zeros(0), np.inf, np.nan)
     for (solver, precision), results in rows.items():
@@ -288,7 +290,7 @@ def reference(rows: dict[tuple[str, str], list[Result]]) -> tuple[str, np.ndarra
         wide, close = distance(a.position, b.position), distance(b.position, c.position)
         ratio = c.substeps / b.substeps
         order = np.log(wide / close) / np.log(b.substeps / a.substeps) if close > 0 and wide > 0 and b is not a else 2.0
-        if wide <= 1e-12 * max(1.0, float(np.abs(c.position).max())):  # exact: nothing is left but rounding
+        if wide <= 1e-12 * max(1.0, float(np.abs(c.position).max())):  # the solution is exact but for rounding
             order = 2.0
         error = close / (ratio ** min(order, 2.0) - 1) if np.isfinite(close) and order > 0.5 else np.inf
         if not best[0] or error < best[2]:

@@ -1,9 +1,9 @@
-"""Smaller steps: what shorter substeps make of the error, in every precision, of every order, and with substeps="auto".
+"""Error with shorter substeps, in every precision and order, and with substeps="auto".
 
     python -m tiverlet.report.accuracy.smaller_steps [case ...] [--json] [--plot FILE]
 
-Chains that are solved to rounding. Their error is of order h^2 (h^4 to h^8) until rounding is what is left, which must not grow
-from there on: a frame of 1/60 s has up to 5120 substeps.
+The cases are chains that are solved to rounding. Their error is of order h^2 (h^4 to h^8) until rounding dominates; rounding must
+not grow with more substeps. A frame of 1/60 s has up to 5120.
 """
 
 import argparse
@@ -20,11 +20,11 @@ from .points import observe
 SHOWN = ("D01_double_pendulum", "D02_double_pendulum_low", "D05_chain10", "R06b_pendulum_state:90", "R08_spinning_dumbbell")
 SUBSTEPS = (20, 80, 320, 1280, 5120, "auto")
 CURVES = (("f32", 2), ("f32-compensated", 2), ("f64", 2), ("f64", 4), ("f64", 6), ("f64", 8))
-PASSES = 3  # of Newton's method in a substep, so that its error is not what is seen
+PASSES = 3  # of Newton's method in a substep, so that its error is negligible
 
 
 def curve(case: Case, precision: str, order: int, substeps: Iterable[int | str] = SUBSTEPS) -> dict[str, float]:
-    """Errors of one case, in its unit, by substeps of a frame."""
+    """Return the errors of one case, in its unit, by substeps of a frame."""
     particles, features = case.build()
     out = {}
     with World(particles, features, precision=precision, order=order, iterations=PASSES) as world:
@@ -35,12 +35,12 @@ def curve(case: Case, precision: str, order: int, substeps: Iterable[int | str] 
 
 
 def named(precision: str, order: int) -> str:
-    """A curve, in a few letters."""
+    """Return a short name of a curve."""
     return precision.replace("compensated", "comp.") + (f", order {order}" if order > 2 else "")
 
 
 def table(case: Case, rows: dict[str, dict[str, float]]) -> Table:
-    """One case; 80 columns are enough."""
+    """Return the table of one case, in at most 80 characters."""
     out = Table(title=f"{case.title}: error [{case.unit}] after {case.seconds:g} s", title_justify="left")
     out.add_column("substeps", no_wrap=True)
     for n in SUBSTEPS:
@@ -51,7 +51,7 @@ def table(case: Case, rows: dict[str, dict[str, float]]) -> Table:
 
 
 def plot(path: str, found: dict[str, dict[str, dict[str, float]]]) -> None:
-    """All cases in one picture, log-log; auto is a dashed line across."""
+    """Plot all cases in one picture, log-log; "auto" is a dashed horizontal line."""
     from matplotlib.figure import Figure  # type: ignore[reportMissingImports]
 
     figure = Figure(figsize=(4 * len(found), 4), layout="constrained")
@@ -68,7 +68,7 @@ def plot(path: str, found: dict[str, dict[str, dict[str, float]]]) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measure and print."""
+    """Measure the cases and print the tables."""
     parser = argparse.ArgumentParser(
         prog="python -m tiverlet.report.accuracy.smaller_steps", description=(__doc__ or "").split("\n", 1)[0]
     )

@@ -12,13 +12,13 @@ from .cases import CASES, LEFT_OUT, METHODS, Case, chosen
 from .errors import ErrorReport, Missing
 from .points import Task, curve
 
-FARTHER = (4, 16)  # baselines get the substeps of the case, and its most times these: they need more for as much time
+FARTHER = (4, 16)  # baselines also get these multiples of the most substeps, since theirs are cheaper
 QUICK = 3  # efforts of a quick sweep
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a sweep measures, and what it leaves out."""
+    """The curves that a sweep measures, and those that it leaves out, with reasons."""
 
     tasks: list[Task]
     omissions: list[str]
@@ -28,7 +28,7 @@ def plan(
     cases: Sequence[Case], methods: Iterable[str] | None, precisions: Sequence[str], efforts: Sequence[int] | None,
     baselines: bool, runs: int, quick: bool,
 ) -> Plan:  # fmt: skip
-    """The curves of a sweep: every method of a case in f64, its first one in the other precisions, and the baselines."""
+    """Plan a sweep: every method of a case in the first precision, its first method in the others, and the baselines."""
     tasks, refused = [], {}
     for case in cases:
         steps = tuple(efforts or case.efforts)
@@ -48,7 +48,7 @@ def plan(
 
 
 def few(case: Case, steps: tuple[int, ...]) -> tuple[int, ...]:
-    """Those of a quick sweep: where the order shows, and where the limit is checked."""
+    """Return the substeps of a quick sweep: those that show the order, and that at which the limit is checked."""
     fit = [s for s in case.fit or steps if s in steps]
     middle = fit if case.fit else [s for s in fit if s >= case.at] or fit
     return tuple(sorted({*middle[:QUICK], *(s for s in steps if s == case.at)}))
@@ -63,10 +63,10 @@ def error_vs_time(
 
     cases: names or beginnings of names in tv.report.CASES ("D01", "S"); None for all. methods: names in tv.report.METHODS for
     every case; None for those that each case names. precisions: the first for every method, the others for the first method.
-    efforts: substeps of a frame; None for those of each case. baselines: the article's scheme and textbook XPBD beside them.
-    runs: timed runs of a point, after the one that is looked at; the median counts (fewer where one takes long).
-    executor: with submit(), as in concurrent.futures; curves are measured in its workers, which must not be forked from a process
-    that has started Taichi (use the start method "spawn"). What a worker that dies leaves behind is named in .missing.
+    efforts: substeps of a frame; None for those of each case. baselines: also measure the article's scheme and textbook XPBD.
+    runs: timed runs of a point, after the run whose error is measured; the median counts (fewer runs if one takes long).
+    executor: an object with submit(), as in concurrent.futures. Its workers measure the curves; they must not be forked from a
+    process that has started Taichi (use the start method "spawn"). Curves of a worker that dies are named in .missing.
     quick: fewer substeps and one timed run. progress: show a bar.
 
     Protocol: Rackauckas and Nie, SciMLBenchmarks (work-precision diagrams with omissions).

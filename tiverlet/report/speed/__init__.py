@@ -1,6 +1,6 @@
-"""How fast it is, how near to what the machine can do, and what a start costs: `python -m tiverlet report speed`.
+"""Speed, its share of what the machine can do, and the cost of first steps: `python -m tiverlet report speed`.
 
-Every figure of a scene comes from a process of its own (Taichi's threads are set once in a process, and a start is cold once).
+Every figure of a scene comes from its own process: Taichi's threads are set once in a process, and only its first step is cold.
 """
 
 from .measure import speed

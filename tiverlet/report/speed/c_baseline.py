@@ -1,4 +1,4 @@
-"""The pile written by hand in C, compiled here and now."""
+"""The pile written by hand in C, compiled at run time."""
 
 import os
 import pathlib
@@ -12,7 +12,7 @@ FLAGS = ("-O3", "-march=native", "-ffast-math", "-fopenmp")
 
 
 def build(folder) -> tuple[str | None, str]:
-    """The program, and how it was compiled; or None, and why there is none."""
+    """Return the program and the command that compiled it, or None and the reason."""
     names = [name for name in (os.environ.get("CC"), "gcc", "cc", "clang") if name]
     compiler = next((found for name in names if (found := shutil.which(name))), None)
     if compiler is None:
@@ -26,6 +26,6 @@ def build(folder) -> tuple[str | None, str]:
 
 
 def started(program: str, n: int, substeps: int, threads: int) -> Talker:
-    """The program at work on n discs; see pile.c for what it obeys."""
-    # Each thread on a core of its own, as Taichi's are: Linux wakes them on one, and takes milliseconds to move them.
+    """Start the program on n discs; see pile.c for its commands."""
+    # Each thread has its own core, like Taichi's: Linux wakes threads on one core, and takes milliseconds to move them.
     return Talker([program, str(n), str(substeps)], {"OMP_NUM_THREADS": str(threads), "OMP_PROC_BIND": "true"})

@@ -1,13 +1,13 @@
-"""The process in which a scene is timed: it says what the start cost, then obeys commands, one a line, each answered in JSON.
+"""The process in which a scene is timed. It prints the costs of the first step, then answers commands, one a line, in JSON.
 
-    run K: K frames; the seconds that they took
-    restart: back to the start, and one frame that is not timed
-    look: launches of a frame, counted; path, memory, flags
-    quality: the mean overlap of the pairs that overlap [diameters], and the worst relative violation of a constraint
-    copy: bytes per second that a copy of a large field moves
-    traffic: bytes that each kernel moves in a frame, and seconds that it takes, see counting.py
+    run K: compute K frames; returns their seconds
+    restart: restore the start, and compute one frame that is not timed
+    look: returns launches of a frame, counted; path, memory, flags
+    quality: returns the mean overlap of the overlapping pairs [diameters], and the worst relative violation of a constraint
+    copy: returns the bytes per second that a copy of a large field moves
+    traffic: returns the bytes that each kernel moves in a frame, and its seconds, see counting.py
 
-It runs in copies of the package that lack most of it, see absent.py.
+It also runs in copies of the package that lack most files, see stripped.py.
 """
 
 import json
@@ -15,7 +15,7 @@ import sys
 from time import perf_counter
 from typing import Any
 
-# Run by `python -c`, so that the import can be timed; importing this module imports much else.
+# Run by `python -c`, so that the import can be timed: importing this module would import the package first.
 START = """
 from time import perf_counter
 clock = perf_counter()
@@ -29,7 +29,7 @@ COUNTED = 6  # frames over which launches and bytes are averaged
 
 
 def main(job: dict[str, Any], imported: float) -> None:
-    """job: scene, n, arch, threads. imported: seconds."""
+    """Run the process. job: scene, n, arch, threads. imported: seconds that importing tiverlet took."""
     import tiverlet as tv
 
     from .counting import DT, launches, traffic
@@ -81,7 +81,7 @@ def main(job: dict[str, Any], imported: float) -> None:
 
 
 def copied(size: int = 1 << 28) -> float:
-    """Bytes per second that are read and written in a copy of a field of so many bytes; the best of five."""
+    """Return the bytes per second that are read and written in a copy of a field of `size` bytes, the best of five."""
     from ...device import ti
 
     source, target, best = ti.field(ti.f32, size // 4), ti.field(ti.f32, size // 4), float("inf")
@@ -94,5 +94,5 @@ def copied(size: int = 1 << 28) -> float:
 
 
 def say(what: Any) -> None:
-    """Answer."""
+    """Print one answer, a line of JSON."""
     print(json.dumps(what), flush=True)

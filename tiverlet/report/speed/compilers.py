@@ -1,7 +1,7 @@
-"""The two compilers side by side, Taichi and Quadrants, with the patches of device/patches and without.
+"""Compare the two compilers, Taichi and Quadrants, with the patches of device/patches and without.
 
-Each way has a process of its own, and an empty cache; a second process finds what the first has left there. Processes take turns,
-so that what else the machine does meets all of them.
+Each way has its own process with an empty cache; a second process finds the kernels of the first there. Processes alternate, so
+that other load on the machine affects all of them alike.
 """
 
 import json
@@ -21,9 +21,9 @@ WAYS = {
     "Quadrants, no patches": {"TIVERLET_COMPILER": "quadrants", "TIVERLET_PATCHES": "0"},
 }
 SIZES = (1000, 10_000, 100_000)
-TURNS = 3  # of the processes; the medians count. Those without patches compile for a minute: one has to do, for starts alone
+TURNS = 3  # of the processes; medians count. Without patches a process compiles for a minute, so it runs once, for starts only
 FALLING, SETTLED = (10, 40), (400, 430)  # frames that are timed
-SMALL = 20_000  # discs up to which a pile is waited for until it has settled
+SMALL = 20_000  # discs up to which settled frames are timed, too
 START = """
 from time import perf_counter
 clock = perf_counter()
@@ -36,7 +36,7 @@ main(json.loads(sys.argv[1]), seconds)
 
 
 def compilers(sizes: tuple[int, ...] = SIZES) -> "Table":
-    """A table of seconds, frames and memory, by ways; those of Quadrants where it is installed. sizes: of piles."""
+    """Return a table of starts, frames and memory by compiler; Quadrants only if it is installed. sizes: discs of the piles."""
     from rich.table import Table
 
     ways = [way for way in WAYS if way.startswith("Taichi") or find_spec("quadrants")]
@@ -56,7 +56,7 @@ def compilers(sizes: tuple[int, ...] = SIZES) -> "Table":
 
 
 def measured(way: str, cache: str, sizes: tuple[int, ...]) -> dict[str, float]:
-    """What a process of one way finds."""
+    """Return the figures that a process of one way measures."""
     from .processes import started
 
     with started(START, sizes, cache, **({"TIVERLET_PATCHES": "1"} | WAYS[way])) as talker:
@@ -64,7 +64,7 @@ def measured(way: str, cache: str, sizes: tuple[int, ...]) -> dict[str, float]:
 
 
 def main(sizes: list[int], imported: float) -> None:
-    """The process: seconds, by what they are spent on."""
+    """Run the process: measure import, first step, frames and memory, and print them as JSON."""
     import resource
 
     import numpy as np

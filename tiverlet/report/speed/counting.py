@@ -1,4 +1,4 @@
-"""What a frame does, seen at Taichi's door: kernels launched, the time they take, and bytes that their loops read and write."""
+"""Count what a frame does: kernels launched, the time that they take, and the bytes that their loops read and write."""
 
 from ...device.layout import unshared
 from ...device.patches.tracing import Launches, Tracer, launches
@@ -8,16 +8,16 @@ DT = 1 / 60  # [s] of a frame
 
 
 def traffic(world, frames: int) -> dict[str, tuple[float, float]]:
-    """Bytes that each kernel moves in a frame on the parallel path, and seconds that it takes, on average of so many frames.
+    """Return the bytes and seconds of each kernel in a frame on the parallel path, averaged over `frames` frames.
 
-    Bytes are a model, not measured: every launch of a kernel is counted, and every loop in it reads each element of each field it
-    names once, and writes it once if it assigns it; of the lists of neighbours, the entries that are in use. So it is what would
-    cross the bus if nothing stayed in the caches from one loop to the next, if what particles read of each other (gathers) were
-    fetched once, and if every branch were taken. The fields are those that the kernels name while they are translated.
+    Bytes are a model, not measured. For every launch of a kernel, every loop in it reads each element of each field that it names
+    once, and writes it once if it assigns it. Of neighbour lists, only entries in use count. So this is the traffic if nothing
+    stayed in the caches between loops, if gathered data of other particles were fetched once, and if every branch were taken. The
+    fields are those that the kernels name while they are translated.
     """
     tracer, known, count = Tracer(), -1, Launches()
     with tracer.watching(), launching(), unshared(), world.clone(path="parallel") as clone:
-        while known < len(tracer.sweeps):  # until no kernel was compiled on the way
+        while known < len(tracer.sweeps):  # until no kernel is compiled meanwhile
             known = len(tracer.sweeps)
             with launches(timed=True) as count:
                 for _ in range(frames):

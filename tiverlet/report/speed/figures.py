@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def plot(report: "SpeedReport", folder) -> list[str]:
-    """speed.png: rates by size, with the yardstick dashed; start.png: the first step, cold and warm; memory.png: bytes."""
+    """Write speed.png (rates by size, pile.c dashed), start.png (first step, cold and warm) and memory.png. Returns the paths."""
     Figure = canvas(folder)
     curves = list(report.curves())
     scenes = list(dict.fromkeys(scene for scene, _, _ in curves))

@@ -1,4 +1,4 @@
-"""The measuring: sizes, threads, processes."""
+"""Measure speed: choose sizes and threads, run the processes, and collect their figures."""
 
 import os
 import tempfile
@@ -20,14 +20,14 @@ from . import waits as edits
 from .result import Absent, Peer, Run, SpeedReport, Wait
 from .scenes import SCENES
 
-BLOCK = 1 << 28  # bytes of each of the arrays that are copied: many times the caches
-FRAMES = (12, 60)  # timed in a round, at least and at most
-WORK = 5e7  # particle-substeps of a round, at most, if that is more than the least frames
-TURN = 1e6  # particle-substeps of a turn, if those are more than 6 frames and less than the round
-ROUNDS, SECONDS = 25, 2.0  # rounds at most; seconds of ours after which none is begun
-QUICK = (3, 0.2)  # the same, of a quick report
+BLOCK = 1 << 28  # bytes of each array in the copy: many times the caches
+FRAMES = (12, 60)  # least and largest number of timed frames in a round
+WORK = 5e7  # particle-substeps of a round, within FRAMES
+TURN = 1e6  # particle-substeps of a turn, which has at least 6 frames and at most a round
+ROUNDS, SECONDS = 25, 2.0  # most rounds; seconds of tiverlet's own frames after which no round begins
+QUICK = (3, 0.2)  # ROUNDS and SECONDS of a quick report
 EDITED = 4000  # discs of the pile that is edited
-PAIRS = 5  # of processes with and without the rest of the package: where a process has its memory matters by some percent
+PAIRS = 5  # of processes with and without the rest of the package: the placement of memory changes times by some percent
 
 
 def speed(
@@ -35,16 +35,16 @@ def speed(
     arch: str = "cpu", quick: bool = False, yardstick: bool = True, peers: bool = True, absent: bool = True, waits: bool = True,
     progress: bool = False,
 ) -> SpeedReport:  # fmt: skip
-    """Measure how fast scenes are computed, beside a pile written by hand in C and other engines, and what a start costs.
+    """Measure the speed of scenes, beside a pile written by hand in C and other engines, and the cost of first steps.
 
     scenes: names in SCENES; None for all. sizes: numbers of particles; None for those of each scene. threads: numbers of CPU
-    threads; None for 1, 2, 4, ... up to all cores. arch: of tv.init; on a GPU all cores serve the yardstick. quick: two small
-    sizes, and few rounds. yardstick: run pile.c too, where there is a C compiler. peers: run pymunk and newton too, where they
-    are installed. absent: compare with a package that lacks what the scene does not use. waits: time edits of a pile. progress:
-    show a bar.
+    threads; None for 1, 2, 4, ... up to all cores. arch: as in tv.init; on a GPU, pile.c runs on all cores. quick: two small
+    sizes, and few rounds. yardstick: also run pile.c, if there is a C compiler. peers: also run pymunk and newton, if they are
+    installed. absent: compare with a copy of the package without the files that the scene does not use. waits: time edits of a
+    pile. progress: show a bar.
 
-    A scene is run over its first frames again and again, in turns with the yardstick; medians are reported, and the ratio of
-    medians. ValueError for scenes, sizes or threads that there are not; what fails while it runs is named in .notes.
+    A scene is run over its first frames repeatedly, alternating with pile.c. Medians and the ratio of medians are reported.
+    Raises ValueError for unknown scenes and for invalid sizes or threads. Failures during the run are named in .notes.
     """
     names = chosen(scenes)
     number = os.cpu_count() or 1
@@ -76,7 +76,7 @@ def speed(
 
 
 class Session:
-    """What is measured one after the other, and what has been found so far."""
+    """The measurements of one report, and their results so far."""
 
     def __init__(self, arch: str, cores: Sequence[int], quick: bool):
         self.arch, self.cores, self.folder = arch, cores, ""
@@ -89,45 +89,48 @@ class Session:
         self._caches = 0
 
     def compile(self) -> None:
-        """Compile the yardstick, or say why not."""
+        """Compile pile.c, or add a note with the reason why it was not compiled."""
         self.program, how = c_baseline.build(self.folder)
         self.notes.append(f"pile.c: {how}." if self.program else f"Left out: the yardstick pile.c, since {how}.")
 
     @contextmanager
     def noting(self, what: str) -> Iterator[None]:
-        """Errors inside become notes."""
+        """Turn errors inside the context into notes."""
         try:
             yield
         except (RuntimeError, OSError) as error:
             self.notes.append(f"Missing: {what}: {said(error)}")
 
     def cache(self) -> str:
-        """An empty folder for compiled kernels."""
+        """Return the path of a new, empty folder for compiled kernels."""
         self._caches += 1
         return os.path.join(self.folder, f"cache{self._caches}")
 
     def job(self, name: str, n: int, threads: int) -> dict[str, Any]:
-        """What the process of a scene is told."""
+        """Return the job for the process of a scene, see child.py."""
         return {"scene": name, "n": n, "threads": threads, "arch": self.arch}
 
     def copy(self) -> float:
-        """The bandwidth of a copy on the device."""
+        """Return the bandwidth of a copy on the device [bytes per second]."""
         with processes.world(self.job("rope", 2, 1), self.cache()) as one:
             one.ask()
             return one.ask("copy")
 
     def frames(self, n: int, substeps: int) -> int:
-        """Frames of a round."""
+        """Return the number of frames of a round."""
         return int(np.clip(WORK // (n * substeps), *FRAMES))
 
     def turns(self, talkers: Sequence[processes.Talker], n: int, substeps: int, settles: int = 0) -> list[list[float]]:
-        """Seconds of a frame of each, see side_by_side()."""
+        """Return the seconds per frame of each process in each round, see side_by_side()."""
         frames = self.frames(n, substeps)
         group = int(np.clip(TURN // (n * substeps), 6, frames))
         return processes.side_by_side(talkers, frames, group, self.rounds, self.seconds, settles)
 
     def point(self, name: str, n: int) -> list[Run]:
-        """A scene of one size, on all numbers of threads. Bits, and so work and quality, do not depend on these."""
+        """Measure a scene of one size on all numbers of threads.
+
+        Bits, and so work and quality, do not depend on the number of threads; they are measured once.
+        """
         out: list[Run] = []
         scene, same = SCENES[name], {}
         frames = self.frames(n, scene.substeps)
@@ -158,7 +161,7 @@ class Session:
         return out[::-1]
 
     def beside(self, name: str, n: int) -> None:
-        """The peers that there are for a scene, each with all threads that it can use."""
+        """Measure all installed peers on a scene, each with all threads that it can use."""
         for peer in others.PEERS.values():
             if name in peer.scenes:
                 if why := peer.missing():
@@ -168,7 +171,7 @@ class Session:
                     self.peers.append(self.compare(peer, name, n))
 
     def compare(self, peer: "others.Engine", name: str, n: int) -> Peer:
-        """The cheapest of a peer's settings that is as good as ours, or, if there is none, its best; then both in turns."""
+        """Find a peer's cheapest setting that is as good as tiverlet's, or its best; then time both in alternation."""
         scene, threads = SCENES[name], min(self.cores[-1], peer.threads)
         frames, measure = self.frames(n, scene.substeps), others.MEASURE[name]
         with processes.world(self.job(name, n, threads), self.cache()) as ours:
@@ -193,7 +196,7 @@ class Session:
         )  # fmt: skip
 
     def waits(self, peers: bool) -> list[Wait]:
-        """What edits of a pile take, here and by the peers that there are."""
+        """Measure the time of edits of a pile, by tiverlet and by the installed peers."""
         names = [peer.name for peer in others.PEERS.values() if peers and not peer.missing()]
         with self.noting("waits"):
             few = self.rounds != ROUNDS
@@ -201,7 +204,7 @@ class Session:
         return []
 
     def without(self, name: str, n: int) -> Absent:
-        """A scene by this package, and by one that has only what the scene uses."""
+        """Measure a scene by this package, and by a copy that has only the features of the scene."""
         scene = SCENES[name]
         assert scene.needs is not None
         bare = stripped.copy(os.path.join(self.folder, f"bare_{name}"), scene.needs)
@@ -223,12 +226,12 @@ class Session:
 
 
 def first(start: dict[str, float]) -> float:
-    """Seconds from tv.init to the end of the first step, without building the arrays of the scene."""
+    """Return the seconds from tv.init to the end of the first step, without building the arrays of the scene."""
     return start["start"] + start["first"]
 
 
 def chosen(scenes: Sequence[str] | str | None) -> list[str]:
-    """Names of scenes."""
+    """Return the names of scenes, each once. Raises ValueError for an unknown name."""
     names = list(SCENES) if scenes is None else [scenes] if isinstance(scenes, str) else list(scenes)
     for name in names:
         if name not in SCENES:
@@ -237,17 +240,17 @@ def chosen(scenes: Sequence[str] | str | None) -> list[str]:
 
 
 def numbers(what: str, given: Iterable[int] | None) -> tuple[int, ...]:
-    """Sizes or threads, in order."""
+    """Return sizes or threads in ascending order, each once. Raises ValueError for invalid ones. what: "sizes" or "threads"."""
     return tuple(sorted({checks.integer("speed", what, n, least=2 if what == "sizes" else 1) for n in given or ()}))
 
 
 def powers(cores: int) -> tuple[int, ...]:
-    """1, 2, 4, ... and all cores."""
+    """Return the numbers of threads 1, 2, 4, ... and all cores."""
     return tuple(sorted({*(1 << k for k in range(cores.bit_length())), cores}))
 
 
 def bandwidth(threads: int) -> float:
-    """Bytes per second that are read and written in a copy of a large array, a part of it by each thread; the best of five."""
+    """Return the bytes per second that are read and written in a copy of a large array, split among threads; the best of five."""
     source, target = np.ones(BLOCK // 8), np.zeros(BLOCK // 8)
     parts = list(zip(np.array_split(target, threads), np.array_split(source, threads), strict=True))
     best = np.inf

@@ -1,6 +1,6 @@
-"""Other engines on the same scenes, where they are installed: each in a process that obeys the commands of child.py.
+"""Other engines on the same scenes, if they are installed: each in a process that answers the commands of child.py.
 
-Warp is measured as Newton, which runs on it. They are made to do what the scene says and no more: no friction, no restitution, no
+Warp is measured as Newton, which runs on it. The engines compute what the scene has and no more: no friction, no restitution, no
 damping, no sleeping, no spin.
 """
 
@@ -29,7 +29,7 @@ SIZES = {
     "settled": 1000,
     "spheres": 1000,
     "rope": 41,
-}  # at which they are compared, or as near to it as is measured
+}  # particles at which peers are compared; else the nearest measured size
 MEASURE = {"pile": "overlap", "settled": "overlap", "spheres": "overlap", "rope": "residual"}
 WORDS = {"overlap": "mean overlap", "residual": "worst strain"}
 START = "import json, sys; from tiverlet.report.speed.peers import main; main(json.loads(sys.argv[1]))"
@@ -37,8 +37,8 @@ START = "import json, sys; from tiverlet.report.speed.peers import main; main(js
 
 @dataclass(frozen=True)
 class Engine:
-    """scenes: that it can run. settings: pairs of steps in a frame and iterations of each, the cheapest first. threads: as many
-    as it can use."""
+    """Another engine. scenes: those that it can run. settings: (steps of a frame, iterations of each), the cheapest first.
+    threads: the most that it can use."""
 
     name: str
     scenes: tuple[str, ...]
@@ -46,15 +46,15 @@ class Engine:
     threads: int
 
     def missing(self) -> str:
-        """Why it cannot be run; nothing if it can."""
+        """Return why the engine cannot be run; empty if it can."""
         return "" if importlib.util.find_spec(self.name) else "it is not installed"
 
     def version(self) -> str:
-        """Of what is installed."""
+        """Return the installed version."""
         return importlib.metadata.version(self.name)
 
     def process(self, scene: str, n: int, threads: int, setting: tuple[int, int]) -> Talker:
-        """It, at work on a scene."""
+        """Start a process of the engine on a scene."""
         job = {"peer": self.name, "scene": scene, "n": n, "threads": threads, "setting": setting}
         return Talker([sys.executable, "-P", "-c", START, json.dumps(job)], {"PYTHONPATH": paths()})
 
@@ -62,15 +62,18 @@ class Engine:
 LADDER = (
     (1, 1), (1, 5), (1, 10), (2, 10), (4, 5), (4, 10), (8, 5), (8, 10), (16, 5), (16, 10), (20, 20), (40, 20), (40, 50), (80, 50),
 )  # fmt: skip
-SLOWER = 30.0  # times ours, beyond which no further setting is tried
-# Discs leave their plane in space, so Newton gets spheres. Warp runs on one thread of a CPU, and so does
-# pymunk best: on two a pile of 1000 took 0.93 ms instead of 0.68, one of 10 000 as long.
+SLOWER = 30.0  # times the time of tiverlet, beyond which no further setting is tried
+# Newton gets spheres, because its discs would leave their plane. Warp runs on one thread of a CPU. pymunk is fastest on one:
+# on two, a pile of 1000 took 0.93 ms instead of 0.68, and one of 10 000 as long as on one.
 ENGINES = (Engine("pymunk", ("pile", "settled", "rope"), LADDER, 1), Engine("newton", ("spheres", "rope"), LADDER, 1))
 PEERS = {p.name: p for p in ENGINES}
 
 
 class Pymunk:
-    """Discs are circles that cannot turn, links pin joints, the box four segments. Impulses are iterated and kept (Chipmunk)."""
+    """A scene in pymunk (Chipmunk: iterated impulses with warm start).
+
+    Discs are circles that cannot turn, links are pin joints, the box is four segments.
+    """
 
     def __init__(self, particles, features, threads: int, setting: tuple[int, int]):
         import pymunk  # pyright: ignore[reportMissingImports]
@@ -78,7 +81,7 @@ class Pymunk:
         self.steps, iterations = setting
         self.space = space = pymunk.Space(threaded=threads > 1)
         space.threads, space.iterations, space.gravity = threads, iterations, (0, -9.81)
-        space.collision_slop = 0.0  # else a tenth of a metre of overlap is left on purpose
+        space.collision_slop = 0.0  # the default leaves 0.1 m of overlap on purpose
         self.bodies = []
         for x, mass, free in zip(particles.position.tolist(), particles.mass.tolist(), particles.inv_mass > 0, strict=True):
             body = pymunk.Body(mass, float("inf")) if free else pymunk.Body(body_type=pymunk.Body.STATIC)
@@ -90,13 +93,13 @@ class Pymunk:
             if isinstance(feature, Distance):
                 joints = [pymunk.PinJoint(self.bodies[i], self.bodies[j]) for i, j in feature.indices.tolist()]
                 for joint in joints:
-                    joint.error_bias = 0.0  # take errors back at once
+                    joint.error_bias = 0.0  # correct errors at once
                 space.add(*joints)
             elif isinstance(feature, Box):
                 (a, b), (c, d) = np.asarray(feature.lower).tolist(), np.asarray(feature.upper).tolist()
                 corners = [(a, b), (c, b), (c, d), (a, d)]
                 ends = zip(corners, corners[1:] + corners[:1], strict=True)
-                # Thick, and outside: nothing falls through.
+                # Thick segments outside of the box, so that nothing falls through.
                 out = [(0, -5), (5, 0), (0, 5), (-5, 0)]
                 space.add(*(
                     pymunk.Segment(space.static_body, (p[0] + o[0], p[1] + o[1]), (q[0] + o[0], q[1] + o[1]), 5.0)
@@ -104,17 +107,17 @@ class Pymunk:
                 ))  # fmt: skip
 
     def frame(self) -> None:
-        """Advance."""
+        """Advance by one frame."""
         for _ in range(self.steps):
             self.space.step(DT / self.steps)
 
     def position(self) -> np.ndarray:
-        """Of all particles [m]."""
+        """Return the positions of all particles [m]."""
         return np.array([tuple(b.position) for b in self.bodies])
 
 
 class Newton:
-    """Newton's XPBD on Warp, on the CPU: links are springs of 1e6 N/m, the box is six planes."""
+    """A scene in Newton: XPBD on Warp, on the CPU. Links are springs of 1e6 N/m, the box is six planes."""
 
     STIFF = 1e6
 
@@ -151,7 +154,7 @@ class Newton:
             self.contacts = model.contacts() if self.boxed else None
 
     def frame(self) -> None:
-        """Advance."""
+        """Advance by one frame."""
         for _ in range(self.steps):
             self.now.clear_forces()
             if self.boxed:
@@ -160,7 +163,7 @@ class Newton:
             self.now, self.then = self.then, self.now
 
     def position(self) -> np.ndarray:
-        """Of all particles [m]."""
+        """Return the positions of all particles [m]."""
         return self.now.particle_q.numpy()[:, : self.dim].astype(np.float64)
 
 
@@ -168,7 +171,7 @@ MODELS: dict[str, Any] = {"pymunk": Pymunk, "newton": Newton}
 
 
 def main(job: dict[str, Any]) -> None:
-    """The process of a peer. What it prints itself goes to the errors."""
+    """Run the process of a peer: answer commands. What the engine itself prints goes to stderr."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
 
@@ -179,7 +182,7 @@ def main(job: dict[str, Any]) -> None:
     particles, features = SCENES[job["scene"]].build(job["n"])
 
     def made():
-        """The scene in the peer's engine."""
+        """Return the scene in the peer's engine."""
         return MODELS[job["peer"]](particles, features, job["threads"], job["setting"])
 
     engine = made()
@@ -202,13 +205,13 @@ def main(job: dict[str, Any]) -> None:
 
 
 def overlap(x: np.ndarray, radius: np.ndarray) -> float:
-    """The mean overlap of pairs that overlap, in diameters of the first."""
+    """Return the mean overlap of the overlapping pairs, in diameters of the first particle."""
     deep = overlapping(x, radius)[1]
     return float(deep.mean() / (2 * radius[0])) if len(deep) else 0.0
 
 
 def strain(x: np.ndarray, links, particles) -> float:
-    """The worst relative change of length; infinite where a position is none."""
+    """Return the worst relative change of length of links; 1e300 if a position is not finite."""
     i, j = links.indices.T
     rest = np.linalg.norm(particles.position[i] - particles.position[j], axis=1)
     with np.errstate(all="ignore"):

@@ -1,4 +1,4 @@
-// The pile of discs, written by hand: what the machine can do without a framework.
+// The pile of discs, written by hand in C: the speed of the machine without a framework.
 //
 // Verlet in displacement form, cells by counting sort, a neighbour list with a skin (particles stored in cell order), one Jacobi
 // pass of contacts with relaxation 0.6, a box. The same lattice, box, gravity and steps as the report's own pile; it has neither
@@ -26,7 +26,7 @@ static float width, height;
 static Vec *x, *d, *origin, *move, *x_sorted, *d_sorted;
 static int *begin, *slot, *cell, *number, *near;
 
-// As good as random in [0, 1): the last steps of MurmurHash3. An even sequence would be kinder to branch prediction than life is.
+// Pseudorandom numbers in [0, 1): the last steps of MurmurHash3. An even sequence would make branches too predictable.
 static float scattered(uint32_t k) {
     k = (k ^ k >> 16) * 0x85ebca6bu;
     k = (k ^ k >> 13) * 0xc2b2ae35u;
@@ -44,7 +44,7 @@ static void restart(void) {
 
 static inline float inside(float a, float most) { return fminf(fmaxf(a, R), most - R); }
 
-// Fall, stay in the box; whether something has moved by half the skin since the list was built.
+// Integrate and confine to the box. Returns whether a disc has moved by half the skin since the list was built.
 static int integrate(float fall) {
     const float w = width, h = height;
     Vec *restrict X = x, *restrict D = d, *restrict O = origin;
@@ -61,7 +61,7 @@ static int integrate(float fall) {
     return moved;
 }
 
-// Sort the discs into cells, and list those that are near each.
+// Sort the discs into cells, and list the neighbours of each.
 static void build(void) {
     memset(begin, 0, (cells + 1) * sizeof(int));
 #pragma omp parallel for schedule(static)
@@ -91,7 +91,7 @@ static void build(void) {
     }
 }
 
-// What the contacts of each disc want of it, then all at once.
+// One Jacobi pass: sum the contact corrections of each disc, then apply all of them.
 static void collide(void) {
     const float w = width, h = height;
     Vec *restrict M = move;

@@ -1,4 +1,4 @@
-"""Processes that are timed side by side: each is asked for so many frames, in turn, and answers with seconds."""
+"""Time processes side by side: each computes a number of frames in turn, and answers with seconds."""
 
 import json
 import os
@@ -11,12 +11,12 @@ from time import sleep
 from typing import Any
 
 ROOT = str(pathlib.Path(__file__).parents[3])
-PATIENCE = 600.0  # [s] that ending a process may take
-REST = 0.02  # [s] before a turn: threads of OpenMP look out for work for some milliseconds after the last, on the other's cores
+PATIENCE = 600.0  # [s] to wait for a process to end
+REST = 0.02  # [s] before a turn: OpenMP's threads poll for work for some milliseconds, on the cores of the next process
 
 
 class Talker:
-    """A process that answers lines with lines of JSON. RuntimeError, with the end of what it said, when it dies."""
+    """A process that answers lines with lines of JSON. ask() raises RuntimeError, with the end of its errors, if it died."""
 
     def __init__(self, command: Sequence[str], environment: Mapping[str, str]):
         self._process = subprocess.Popen(
@@ -25,7 +25,7 @@ class Talker:
         )  # fmt: skip
 
     def ask(self, line: str = "") -> Any:
-        """Say something, and wait for the answer; nothing: only wait."""
+        """Send a line, unless it is empty, and wait for the answer."""
         process = self._process
         assert process.stdin and process.stdout and process.stderr
         answer = ""
@@ -56,31 +56,34 @@ class Talker:
 
 
 def started(code: str, job: Any, cache: str, root: str = ROOT, **environment: str) -> Talker:
-    """A process that runs code, with a job for its argument. cache: the folder where Taichi, or Quadrants, keeps what it has
-    compiled. root: the folder of the package."""
+    """Start a process that runs code, with a job as its argument.
+
+    cache: the folder in which Taichi or Quadrants stores compiled kernels. root: the folder of the package.
+    """
     keeps = {f"{of}_OFFLINE_CACHE{what}": value for of in ("TI", "QD") for what, value in (("", "1"), ("_FILE_PATH", cache))}
     return Talker([sys.executable, "-P", "-c", code, json.dumps(job)], {"PYTHONPATH": paths(root), **keeps, **environment})
 
 
 def world(job: Mapping[str, Any], cache: str, root: str = ROOT) -> Talker:
-    """The process of a scene, by the package in `root`. cache: the folder where Taichi keeps what it has compiled."""
+    """Start the process of a scene, with the package in `root`. cache: the folder in which Taichi stores compiled kernels."""
     from .child import START
 
     return started(START, job, cache, root)
 
 
 def paths(root: str = ROOT) -> str:
-    """Where a process imports from: `root` first."""
+    """Return the PYTHONPATH of a process: `root` first."""
     return os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
 
 
 def side_by_side(
     talkers: Sequence[Talker], frames: int, group: int, rounds: int, seconds: float, settles: int = 0
 ) -> list[list[float]]:  # fmt: skip
-    """Seconds of a frame of each, in each round: a restart, then `frames` frames, in groups of `group` that take turns.
+    """Return the seconds per frame of each process in each round.
 
-    At most `rounds`, and none is begun after `seconds` [s] of the first one's, or five times that for the first three. settles:
-    frames after the only restart, where rounds go on from each other.
+    A round is a restart, then `frames` frames of each process, in alternating groups of `group`. There are at most `rounds`. None
+    begins after the first process has taken `seconds` [s], or five times that for the first three rounds. settles: with it, there
+    is one restart, then this many untimed frames, and each round continues from the one before.
     """
     if settles:
         begin(talkers, settles)
@@ -101,7 +104,7 @@ def side_by_side(
 
 
 def begin(talkers: Sequence[Talker], settles: int) -> None:
-    """Back to the start, and so many frames that nobody times."""
+    """Restart each process, and run `settles` untimed frames."""
     for talker in talkers:
         talker.ask("restart")
         if settles:
@@ -109,8 +112,10 @@ def begin(talkers: Sequence[Talker], settles: int) -> None:
 
 
 def quality(talker: Talker, frames: int, settles: int = 0, looks: int = 6) -> dict[str, float]:
-    """The mean overlap [diameters] and the worst relative violation in so many frames from the start, or after so many, looked
-    at now and then."""
+    """Return the mean overlap [diameters] and the worst relative violation, sampled `looks` times in `frames` frames.
+
+    The frames begin at the start, or `settles` frames later.
+    """
     begin([talker], settles)
     seen = []
     for _ in range(looks):

@@ -1,4 +1,4 @@
-"""What was measured, as a report: tables, Markdown, JSON, plots."""
+"""The report of measured speeds, as tables, Markdown, JSON and plots."""
 
 import json
 from collections.abc import Iterator
@@ -14,14 +14,14 @@ from .. import output
 
 @dataclass(frozen=True)
 class Run:
-    """A scene of one size on so many threads.
+    """The figures of a scene of one size on one number of threads.
 
-    seconds: of a frame, the median of `rounds` runs over its first frames, the very first apart. launches: kernels of a frame,
-    counted, on average. traffic: bytes moved for each particle and substep, by kernel, as counting.py counts them; times: seconds
-    of these kernels for each, on the parallel path and the most threads. memory: of all fields [bytes per particle]. imported: of
-    the package; cold, warm: from tv.init to the end of the first step, with nothing compiled and with Taichi's cache of a process
-    before it [s]. overlap: the mean of pairs that overlap [diameters]. residual: the worst relative violation. yardstick,
-    yardstick_overlap: of pile.c; None where it was not run.
+    seconds: of a frame, the median of `rounds` runs over the first frames, without the very first. launches: kernels of a frame,
+    counted, on average. traffic: bytes moved per particle and substep, by kernel, as counted by counting.py. times: seconds of
+    these kernels per particle and substep, on the parallel path and the most threads. memory: of all fields [bytes per particle].
+    imported: seconds of the import. cold, warm: seconds from tv.init to the end of the first step, with an empty cache and with
+    the cache of an earlier process. overlap: the mean of overlapping pairs [diameters]. residual: the worst relative violation.
+    yardstick, yardstick_overlap: seconds of a frame and mean overlap of pile.c; None if it was not run.
     """
 
     scene: str
@@ -51,22 +51,22 @@ class Run:
 
     @property
     def bytes(self) -> float:
-        """Moved for each particle and substep, by all kernels."""
+        """Bytes moved per particle and substep by all kernels."""
         return sum(self.traffic.values())
 
     @property
     def ratio(self) -> float | None:
-        """Its rate over the yardstick's; the medians of runs that took turns."""
+        """The rate over that of pile.c, from medians of alternating runs; None if pile.c was not run."""
         return None if self.yardstick is None else self.yardstick / self.seconds
 
 
 @dataclass(frozen=True)
 class Peer:
-    """Another engine on the same scene: the cheapest of its settings that is no worse than ours.
+    """Another engine on the same scene, with its cheapest setting that is no worse than tiverlet.
 
-    setting: steps of a frame and iterations of each. seconds, ours: of a frame, medians of runs that took turns. quality,
-    our_quality: the mean overlap [diameters] or the worst strain, in the same frames. met: whether a setting was as good as ours;
-    if none, this is its best.
+    setting: steps of a frame and iterations of each. seconds, ours: of a frame, medians of alternating runs, by the engine and by
+    tiverlet. quality, our_quality: the mean overlap [diameters] or the worst strain, in the same frames. met: whether a setting
+    is as good as tiverlet; if not, this is the best one.
     """
 
     peer: str
@@ -84,9 +84,9 @@ class Peer:
 
 @dataclass(frozen=True)
 class Absent:
-    """A scene run by the package, and by one without the files of all features that the scene does not use.
+    """A scene run by the package, and by a copy without the files of all features that the scene does not use.
 
-    fields, bytes, launches of a frame, and the seconds of a frame (medians of runs that took turns): here, and without.
+    fields, bytes, launches of a frame, and seconds of a frame (medians of alternating runs): by the package, and by the copy.
     """
 
     scene: str
@@ -98,14 +98,17 @@ class Absent:
 
     @property
     def ratio(self) -> float:
-        """What the other features cost: 1 for nothing."""
+        """The time with all other features over the time without them: 1 if they cost nothing."""
         return self.seconds[0] / self.seconds[1]
 
 
 @dataclass(frozen=True)
 class Wait:
-    """One act of who edits a pile, with what it puts off for the next frame [s]. cold, warm: by ours, without and with kernels
-    that another process has compiled. aim: what is to be reached; None for none. peers: the same by others, by name."""
+    """The time of one edit of a pile, with the work that it defers to the next frame [s].
+
+    cold, warm: by tiverlet, without and with kernels that another process has compiled. aim: the target time, or None. peers: the
+    times of other engines, by name.
+    """
 
     act: str
     particles: int
@@ -117,10 +120,10 @@ class Wait:
 
 @dataclass(frozen=True)
 class SpeedReport(JupyterMixin):
-    """Speed, memory and starts. print() shows it; see .run(), .growth(), .scaling(), .json(), .markdown(), .plot().
+    """Speed, memory and first steps. print() shows tables; see .run(), .growth(), .scaling(), .json(), .markdown(), .plot().
 
-    arch: of tv.init. copy: bytes per second that a copy of a large array moves (read and written), by threads; on a GPU, there.
-    notes: what was left out, and how the yardstick was compiled.
+    arch: as in tv.init. copy: bytes per second that a copy of a large array moves (read and written), by threads; on a GPU, of
+    its memory. notes: what was left out, and how pile.c was compiled.
     """
 
     machine: str
@@ -134,39 +137,39 @@ class SpeedReport(JupyterMixin):
 
     @property
     def missing(self) -> list[str]:
-        """Notes on what failed."""
+        """The notes on measurements that failed."""
         return [note for note in self.notes if note.startswith("Missing")]
 
     def run(self, scene: str, particles: int, threads: int) -> Run:
-        """One run; KeyError where there is none."""
+        """Return one run. Raises KeyError if there is none."""
         for r in self.runs:
             if (r.scene, r.particles, r.threads) == (scene, particles, threads):
                 return r
         raise KeyError((scene, particles, threads))
 
     def curves(self) -> Iterator[tuple[str, int, list[Run]]]:
-        """Scene, threads, and its runs by size."""
+        """Yield scene, threads, and the runs of both, by size."""
         for scene, threads in dict.fromkeys((r.scene, r.threads) for r in self.runs):
             some = [r for r in self.runs if (r.scene, r.threads) == (scene, threads)]
             yield scene, threads, sorted(some, key=lambda r: r.particles)
 
     def share(self, r: Run) -> float:
-        """Of the bandwidth of a copy, what the counted bytes take up."""
+        """Return the counted bytes per second as a share of the bandwidth of a copy."""
         return r.rate * r.bytes / self.copy[r.threads]
 
     def growth(self, scene: str, threads: int, since: int = 10_000) -> float | None:
-        """The longest time of a particle-substep over the shortest, from `since` particles on; None for less than two sizes."""
+        """Return the longest time of a particle-substep over the shortest, from `since` particles on; None for one size."""
         rates = [r.rate for r in self.runs if (r.scene, r.threads) == (scene, threads) and r.particles >= 0.9 * since]
         return max(rates) / min(rates) if len(rates) > 1 else None
 
     def scaling(self, r: Run) -> float | None:
-        """How many times as fast it is as on the fewest threads; None where those are its own."""
+        """Return the speed of a run over that on the fewest threads; None if the run is the one on the fewest."""
         others = [o for o in self.runs if (o.scene, o.particles) == (r.scene, r.particles)]
         least = min(others, key=lambda o: o.threads)
         return None if least.threads == r.threads else least.seconds / r.seconds
 
     def tables(self) -> Iterator[tuple[str, tuple[str, ...], list[tuple[str, ...]]]]:
-        """Title, heads and rows of each, without columns that are empty."""
+        """Yield title, heads and rows of each table, without empty columns."""
         present = {name for w in self.waits for name in w.peers}
         for title, heads, rows in (
             ("Speed", HEADS, [self._cells(r) for r in self.runs]),
@@ -180,7 +183,7 @@ class SpeedReport(JupyterMixin):
                 yield title, tuple(heads[k] for k in full), [tuple(row[k] for k in full) for row in rows]
 
     def lines(self) -> Iterator[str]:
-        """What else there is to say."""
+        """Yield the lines below the tables: machine, bandwidths, growth, legends and notes."""
         yield f"Machine: {self.machine}; Taichi on {self.arch}."
         for threads, speed in self.copy.items():
             yield f"A copy of a large array moves {speed / 1e9:.1f} GB/s on {threads} thread{'s' * (threads > 1)}."
@@ -213,24 +216,24 @@ class SpeedReport(JupyterMixin):
         return output.text(self, 150)
 
     def markdown(self) -> str:
-        """Everything as Markdown."""
+        """Return tables and notes as Markdown."""
         return output.markdown(self.tables(), self.lines())
 
     def json(self) -> str:
-        """Everything, for machines; see of_json()."""
+        """Return the report as JSON; see of_json()."""
         lists = {k: [output.plain(row) for row in v] for k, v in asdict(self).items() if k in ROWS}
         return json.dumps({**asdict(self), **lists}, indent=1, allow_nan=False)
 
     @classmethod
     def of_json(cls, text: str) -> "SpeedReport":
-        """The report that json() wrote."""
+        """Return the report that json() wrote."""
         data = json.loads(text)
         copy = {int(k): v for k, v in data["copy"].items()}
         lists = {k: tuple(restored(kind, row) for row in data[k]) for k, kind in ROWS.items()}
         return cls(machine=data["machine"], arch=data["arch"], copy=copy, notes=tuple(data["notes"]), **lists)
 
     def plot(self, folder) -> list[str]:
-        """Rates by size, starts, and scaling as PNG in `folder`; returns their paths. Needs matplotlib (the extra "plots")."""
+        """Plot rates, first steps and memory by size as PNG in `folder`; return their paths. Needs matplotlib (extra "plots")."""
         from .figures import plot
 
         return plot(self, folder)
@@ -264,18 +267,18 @@ PEERED = (
 
 
 def restored(kind: type, row: dict[str, Any]) -> Any:
-    """A row of JSON, with tuples where it has lists, and infinity where a number was none."""
+    """Return a row of JSON as an object of `kind`, with tuples for lists, and infinity for numbers that JSON does not have."""
     values = {f.name: np.inf if row[f.name] is None and f.type is float else row[f.name] for f in fields(kind)}
     return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
 
 
 def percent(share: float | None) -> str:
-    """Of a diameter; nothing for nothing."""
+    """Return a share of a diameter in percent; empty for None and 0."""
     return f"{100 * share:.2g}%" if share else ""
 
 
 def started(r: Run) -> tuple[str, ...]:
-    """A line about a start."""
+    """Return the table row of a run's first step, memory and quality."""
     return (
         r.scene, f"{r.particles:,}", str(r.threads), r.path, f"{r.imported:.2f}", f"{r.cold:.2f}", f"{r.warm:.2f}",
         f"{r.memory:.0f}", percent(r.overlap), percent(r.yardstick_overlap), f"{r.residual:.1e}" if r.residual else "",
@@ -284,7 +287,7 @@ def started(r: Run) -> tuple[str, ...]:
 
 
 def beside(p: Peer) -> tuple[str, ...]:
-    """A line about a peer."""
+    """Return the table row of a peer."""
     steps, iterations = p.setting
     return (
         p.peer, p.scene, f"{p.particles:,}", str(p.threads), f"{steps} x {iterations}", f"{1e3 * p.seconds:.3g}",
@@ -294,14 +297,14 @@ def beside(p: Peer) -> tuple[str, ...]:
 
 
 def without(a: Absent) -> tuple[str, ...]:
-    """A line about what is absent."""
+    """Return the table row of a scene with and without the other features."""
     pairs = (f"{x:g} / {y:g}" for x, y in (a.fields, a.bytes, a.launches))
     times = f"{1e3 * a.seconds[0]:.4g} / {1e3 * a.seconds[1]:.4g}"
     return (a.scene, f"{a.particles:,}", *pairs, times, f"{a.ratio:.3f}")
 
 
 def waited(w: Wait, present: set[str]) -> tuple[str, ...]:
-    """A line about a wait. present: the peers that were measured."""
+    """Return the table row of an edit. present: the peers that were measured."""
     times = [w.aim, w.cold, w.warm, *(w.peers.get(name) for name in BESIDE)]
     cells = ["" if t is None else f"{1e3 * t:.3g}" for t in times]
     theirs = [cell if name in present else "not there" for name, cell in zip(BESIDE, cells[3:], strict=True)]

@@ -1,4 +1,4 @@
-"""What is timed. Nothing is imported here that a scene does not need: see stripped.py."""
+"""The scenes that are timed. This module imports nothing that a scene does not need, see stripped.py."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,11 +10,12 @@ import numpy as np
 
 @dataclass(frozen=True)
 class SpeedScene:
-    """A scene of any size: build(n) -> (particles, features); of about n particles, where a scene cannot have just any number.
+    """A scene of any size: build(n) -> (particles, features), of about n particles if a scene cannot have any number.
 
-    sizes: those of a full report; quick: those of a quick one. needs: the files of features that it uses, without which the
-    package must run it all the same (None: not tried). settles: frames that are run before any is timed, each of `settling`
-    substeps (0: as many as later). in_c: substeps of pile.c, which is the same scene but for friction; 0: it is not.
+    sizes, quick: numbers of particles in a full and in a quick report. needs: the files of features that the scene uses; a copy
+    of the package with these alone must run it (None: not tried). settles: untimed frames before the timed ones, each of
+    `settling` substeps (0: as many as the timed ones). in_c: substeps of pile.c, which is the same scene without friction; 0: not
+    run.
     """
 
     title: str
@@ -29,9 +30,9 @@ class SpeedScene:
 
 
 def scattered(k: np.ndarray) -> np.ndarray:
-    """Numbers in [0, 1) that are as good as random, from integers: the last steps of MurmurHash3, as in pile.c.
+    """Return pseudorandom numbers in [0, 1), from integers: the last steps of MurmurHash3, as in pile.c.
 
-    A golden sequence would be kinder to branch prediction than life is: a falling lattice ran twice as fast.
+    An evenly spread (golden) sequence would favour branch prediction: a falling lattice ran twice as fast with it.
     """
     k = np.asarray(k, dtype=np.uint32)
     k = (k ^ k >> np.uint32(16)) * np.uint32(0x85EBCA6B)
@@ -40,7 +41,7 @@ def scattered(k: np.ndarray) -> np.ndarray:
 
 
 def pile(n: int, dim: int = 2):
-    """Discs or spheres that fall from a loose lattice into a box 1.3 times as wide and twice as high, as in pile.c."""
+    """Build discs or spheres that fall from a loose lattice into a wider and higher box, as in pile.c."""
     import tiverlet as tv
 
     side = ceil(round(n ** (1 / dim), 9))
@@ -53,7 +54,7 @@ def pile(n: int, dim: int = 2):
 
 
 def loaded(n: int):
-    """The pile with friction, where contacts know their loads."""
+    """Build the pile with friction and contacts that know their loads."""
     import tiverlet as tv
 
     particles, (gravity, box, _) = pile(n)
@@ -61,7 +62,7 @@ def loaded(n: int):
 
 
 def cloth(n: int):
-    """A square awning, inextensible along its threads and soft across them, held at every 16th particle of every 16th thread."""
+    """Build a square cloth, rigid along its threads, soft diagonally, pinned at every 16th particle of every 16th thread."""
     import tiverlet as tv
 
     side = max(3, round(n**0.5))
@@ -73,20 +74,20 @@ def cloth(n: int):
 
 
 def ropes(n: int):
-    """Ropes of 1 m and 41 particles, a hundred of them at n = 4100, that swing from one end."""
+    """Build ropes of 1 m and 41 particles that swing from one end: a hundred for n = 4100."""
     import tiverlet as tv
 
     count, points = max(1, n // LINE), min(n, LINE)
     one = tv.shapes.rope((0, 0), (1, 0), points=points)
     k = np.arange(count)
-    wide = ceil(count**0.5)  # in rows, so that f32 resolves all of them
+    wide = ceil(count**0.5)  # in rows, so that coordinates stay small enough for f32
     position = (one.position + 2.0 * np.stack([k % wide, k // wide], axis=1)[:, None]).reshape(-1, 2)
     links = (one.links + points * k[:, None, None]).reshape(-1, 2)
     return tv.Particles(position, mass=0.01, pinned=points * k), [tv.Gravity(9.81), tv.Distance(links)]
 
 
 def rope(n: int):
-    """One rope of 1 m that swings from one end."""
+    """Build one rope of 1 m that swings from one end."""
     import tiverlet as tv
 
     one = tv.shapes.rope((0, 0), (1, 0), points=n)
@@ -94,7 +95,7 @@ def rope(n: int):
 
 
 def mixed(n: int):
-    """Discs, ropes of 20 and soft balls of 61 fall on each other in a box, with friction."""
+    """Build discs, ropes of 20 particles and soft balls of 61, which fall on each other in a box, with friction."""
     import tiverlet as tv
 
     ball = tv.shapes.ball((5.5, 5.5), 4.6, rings=4)

@@ -1,4 +1,4 @@
-"""A copy of the package without the files of the features that a scene does not use, without reports, recording and play."""
+"""Copy the package without the files of features that a scene does not use, and without reports, recording and play."""
 
 import ast
 import os
@@ -8,12 +8,12 @@ import shutil
 
 PACKAGE = pathlib.Path(__file__).parents[2]
 FOLDERS = ("colliders", "constraints", "contact", "forces")
-HERE = ("child.py", "counting.py", "scenes.py")  # what the process of a scene runs
+HERE = ("child.py", "counting.py", "scenes.py")  # the files of this folder that the process of a scene runs
 IGNORED = shutil.ignore_patterns("__pycache__", "recording", "live", "report", "commands")
 
 
 def copy(folder: str, needs: frozenset[str]) -> str:
-    """Make one in `folder`; returns the path to import it from. needs: the files of features that stay, by name."""
+    """Make a copy in `folder`; return the path to import it from. needs: names of the feature files that stay."""
     bare = pathlib.Path(folder) / "tiverlet"
     shutil.copytree(PACKAGE, bare, ignore=IGNORED)
     kept = needed(bare, needs)
@@ -39,7 +39,7 @@ def copy(folder: str, needs: frozenset[str]) -> str:
 
 
 def needed(bare: pathlib.Path, needs: frozenset[str]) -> set[str]:
-    """Those, and what they and the rest of the package import of the same folders."""
+    """Return `needs` and all files of the same folders that they and the rest of the package import."""
     kept, before = set(needs), set()
     inits = [bare / folder / "__init__.py" for folder in ("", *FOLDERS)]
     rest = [file for file in bare.rglob("*.py") if file.parent.name not in FOLDERS and file not in inits]
@@ -55,6 +55,6 @@ def needed(bare: pathlib.Path, needs: frozenset[str]) -> set[str]:
 
 
 def exports(init: pathlib.Path) -> list[tuple[str, str]]:
-    """Module and name of everything that the __init__ of a folder imports from it."""
+    """Return module and name of everything that the __init__ of a folder imports from that folder."""
     nodes = [n for n in ast.parse(init.read_text()).body if isinstance(n, ast.ImportFrom) and n.level == 1 and n.module]
     return [(str(n.module), alias.name) for n in nodes for alias in n.names]

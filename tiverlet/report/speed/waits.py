@@ -1,8 +1,8 @@
-"""What one waits for: starts, copies, and edits of a pile, beside the same acts by other engines.
+"""Time first steps, copies, and edits of a pile, beside the same edits by other engines.
 
-Every engine has a process of its own, ours two: one with nothing compiled, one with what the other has left in Taichi's cache. An
-act is timed with the frame that follows it, less an ordinary frame, since an engine may put off what it has to do. Acts take CPU
-time of the host's thread, which other programs disturb less than the time on the clock; starts take that.
+Every engine has its own process, tiverlet has two: one with an empty cache, one with the cache that the first has left. An edit
+is timed with the frame that follows it, less an ordinary frame, because an engine may defer its work. Edits are measured in CPU
+time of the host's thread, which other programs disturb less than wall time. First steps are measured in wall time.
 """
 
 import json
@@ -16,9 +16,9 @@ import numpy as np
 
 from .result import Wait
 
-TIMES, QUICK = 30, 5  # that an act is done, and in a quick report; the median counts
-FEW, SOME = 1, 100  # that come and go
-POINTS, ROPES = 10, 5  # of a rope that does; ropes that are there
+TIMES, QUICK = 30, 5  # repetitions of an edit in a full and in a quick report; the median counts
+FEW, SOME = 1, 100  # particles that are added and removed
+POINTS, ROPES = 10, 5  # particles of the rope that is added and removed; ropes that stay
 START = """
 from time import perf_counter
 clock = perf_counter()
@@ -30,7 +30,7 @@ from tiverlet.report.speed.waits import main
 main(job, seconds)
 """
 FIRST = ("import", "build, first step")
-# What is to be reached [s].
+# Target times [s].
 AIMS = {
     "second world, first step": 0.02, "copy, first step": 0.01, f"add {FEW}": 0.002, f"add {SOME}": 0.002,
     f"remove {FEW}": 0.002, f"remove {SOME}": 0.002, "add as many again": 0.05, "pin another particle": 0.0002,
@@ -39,11 +39,11 @@ AIMS = {
 
 
 def waits(n: int, times: int, cache: str, peers: list[str]) -> list[Wait]:
-    """Of a pile of n discs. times: that an act is done. cache: an empty folder. peers: those that are installed."""
+    """Return the times of edits of a pile of n discs. times: repetitions. cache: an empty folder. peers: installed engines."""
     from .processes import started
 
     def of(engine: str) -> dict[str, float]:
-        """Seconds of each act in one engine, in a process of its own."""
+        """Return the seconds of each edit by one engine, in its own process."""
         with started(START, {"engine": engine, "n": n, "times": times}, cache) as talker:
             return talker.ask()
 
@@ -53,13 +53,13 @@ def waits(n: int, times: int, cache: str, peers: list[str]) -> list[Wait]:
 
 
 def main(job: dict[str, Any], imported: float) -> None:
-    """The process of an engine: seconds, by act."""
+    """Run the process of an engine: print the seconds of each edit."""
     out = {FIRST[0]: imported, **{"tiverlet": ours, "pymunk": pymunks, "newton": newtons}[job["engine"]](job["n"], job["times"])}
     print(json.dumps(out), flush=True)
 
 
 def pile(n: int):
-    """Particles and features of the scene, and discs that come from above."""
+    """Return particles and features of the pile, and a function that makes further discs above it."""
     from ...particles import Particles
     from .scenes import SCENES
 
@@ -67,7 +67,7 @@ def pile(n: int):
     x, radius = particles.position, float(particles.radius[0])
 
     def more(k: int, turn: int) -> Particles:
-        """k more particles on top of the pile, higher with each turn."""
+        """Return k more particles above the pile, higher with each turn."""
         place = np.stack([np.arange(k) % 30, np.arange(k) // 30], axis=1) * 2.2 * radius
         return Particles(place + [x[:, 0].min(), x[:, 1].max() + 3 * radius + turn * 10 * radius], radius=radius)
 
@@ -75,7 +75,7 @@ def pile(n: int):
 
 
 def hung(x: np.ndarray, radius: float, k: int) -> np.ndarray:
-    """The points of a rope that hangs in the air above particles at x, the k-th one."""
+    """Return the points of the k-th rope, which hangs above particles at x."""
     left, top = x[:, 0].min() + 3 * radius * k, x[:, 1].max() + 40 * radius
     return np.stack([np.full(POINTS, left), top - 2.2 * radius * np.arange(POINTS)], axis=1)
 
@@ -84,9 +84,10 @@ Act = Callable[[int], Any]
 
 
 def timed(acts: dict[str, tuple[Act, Act | None]], frame: Callable[[], Any], rounds: int) -> dict[str, float]:
-    """Seconds that acts take, and what they put off for the next frame. By name: the act, and what takes it back, or None.
+    """Return the seconds of edits, each with the work that it defers to the next frame.
 
-    From one act to the next there is an odd number of frames: ours take out sound in every fourth, of 8 substeps.
+    acts: by name, the edit and the function that undoes it, or None. From one edit to the next there is an odd number of frames,
+    because tiverlet takes out sound in every fourth frame of 8 substeps.
     """
     out = {}
     for name, (act, back) in acts.items():
@@ -108,7 +109,7 @@ def timed(acts: dict[str, tuple[Act, Act | None]], frame: Callable[[], Any], rou
 
 
 def ours(n: int, rounds: int) -> dict[str, float]:
-    """By tiverlet, with a pin, a hand and a wall that can be switched in the scene."""
+    """Return the times of edits by tiverlet, with a pin, a hand and a wall with a switch in the scene."""
     import tiverlet as tv
 
     from .counting import DT
@@ -116,7 +117,7 @@ def ours(n: int, rounds: int) -> dict[str, float]:
     particles, features, more = pile(n)
 
     def built(count: int):
-        """The pile of so many particles as a World, and what hands and gates act on it."""
+        """Return a World of the pile with `count` particles, and its wall, hand and pin."""
         some = tv.Particles(particles.position[:count], radius=particles.radius[:count])
         wall, hand = tv.HalfSpace((0, -1), -1e3, active=True), tv.Hand((0.0, 0.0), rate=0.0)
         pin = tv.Pin([0])
@@ -139,27 +140,27 @@ def ours(n: int, rounds: int) -> dict[str, float]:
         copied = perf_counter() - clock
 
     def frame():
-        """One frame."""
+        """Step one frame."""
         world.step(DT)
 
     def hold(k: int):
-        """Hold another particle where it is."""
+        """Let the pin hold another particle where it is."""
         pin.indices, pin.target = [n // 2 + k], world.position[n // 2 + k]
 
     def take(k: int):
-        """Draw another particle by the hand."""
+        """Let the hand pull another particle."""
         hand.particle = k
 
     def switch(k: int):
-        """Open or close the gate."""
+        """Switch the wall on or off."""
         wall.active = bool(k % 2)
 
     def added(k: int):
-        """Add k particles, where others were that are gone."""
+        """Return an edit that adds k particles above the pile."""
         return lambda turn: world.add(more(k, 0))
 
     def removed(k: int):
-        """Take the last k away."""
+        """Return an edit that removes the last k particles."""
         return lambda turn: world.remove(np.arange(len(world.particles) - k, len(world.particles)))
 
     acts = {
@@ -174,7 +175,7 @@ def ours(n: int, rounds: int) -> dict[str, float]:
 
 
 def roped(n: int, rounds: int) -> dict[str, float]:
-    """By tiverlet, in the pile with ropes."""
+    """Return the times of adding and removing a rope by tiverlet, in the pile with ropes."""
     import tiverlet as tv
 
     from .counting import DT
@@ -187,12 +188,12 @@ def roped(n: int, rounds: int) -> dict[str, float]:
     world = tv.World(tv.Particles(np.concatenate([x, ropes]), radius=radius), [*features, links], substeps=8)
 
     def add(turn: int):
-        """One more."""
+        """Add one more rope."""
         more = tv.Particles(hung(x, radius, ROPES), radius=radius)
         world.add(more, extend={links: tv.Distance(pairs + len(world.particles))})
 
     def remove(turn: int):
-        """The last one."""
+        """Remove the last rope."""
         world.remove(np.arange(len(world.particles) - POINTS, len(world.particles)))
 
     acts: dict[str, tuple[Act, Act | None]] = {"add a rope": (add, remove), "remove a rope": (remove, add)}
@@ -202,7 +203,7 @@ def roped(n: int, rounds: int) -> dict[str, float]:
 
 
 def pymunks(n: int, rounds: int) -> dict[str, float]:
-    """By pymunk."""
+    """Return the times of edits by pymunk."""
     import pymunk  # pyright: ignore[reportMissingImports]
     from pymunk.constraints import PinJoint, PivotJoint  # pyright: ignore[reportMissingImports]
 
@@ -211,7 +212,7 @@ def pymunks(n: int, rounds: int) -> dict[str, float]:
     particles, features, more = pile(n)
 
     def built():
-        """The pile in Pymunk."""
+        """Return the pile in pymunk."""
         return Pymunk(particles, features, 1, (8, 10))
 
     clock = perf_counter()
@@ -228,10 +229,10 @@ def pymunks(n: int, rounds: int) -> dict[str, float]:
     space, come, grip, tied = engine.space, [], [], []
 
     def added(k: int):
-        """Add k bodies."""
+        """Return an edit that adds k bodies."""
 
         def act(turn: int):
-            """Put them on top of the pile."""
+            """Add the bodies above the pile."""
             for x in more(k, turn).position.tolist():
                 body = pymunk.Body(1.0, float("inf"))
                 body.position = tuple(x)
@@ -242,10 +243,10 @@ def pymunks(n: int, rounds: int) -> dict[str, float]:
         return act
 
     def removed(k: int):
-        """Take the last k away."""
+        """Return an edit that removes the last k bodies."""
 
         def act(turn: int):
-            """One after the other."""
+            """Remove the bodies one after the other."""
             for _ in range(k):
                 space.remove(*come.pop())
 
@@ -259,7 +260,7 @@ def pymunks(n: int, rounds: int) -> dict[str, float]:
         space.add(*grip)
 
     def tie(turn: int):
-        """Add bodies, and joints between them."""
+        """Add the bodies and joints of a rope."""
         rope = []
         for place in hung(particles.position, float(particles.radius[0]), ROPES).tolist():
             body = pymunk.Body(1.0, float("inf"))
@@ -270,10 +271,10 @@ def pymunks(n: int, rounds: int) -> dict[str, float]:
         space.add(*tied[-1])
 
     def untie(turn: int):
-        """Remove them."""
+        """Remove the bodies and joints of the last rope."""
         space.remove(*tied.pop())
 
-    added(2 * SOME)(0)  # which can be removed
+    added(2 * SOME)(0)  # bodies that the edits can remove
     tie(0)
     acts = {
         f"add {FEW}": (added(FEW), removed(FEW)), f"add {SOME}": (added(SOME), removed(SOME)),
@@ -285,14 +286,17 @@ def pymunks(n: int, rounds: int) -> dict[str, float]:
 
 
 def newtons(n: int, rounds: int) -> dict[str, float]:
-    """By newton, whose models are fixed but for what their arrays hold: particles that come or go, and springs, take another one.
-    What is pinned weighs nothing there. Its discs are balls in a plane."""
+    """Return the times of edits by newton.
+
+    Its models are fixed, except the contents of their arrays: adding or removing particles or springs needs a new model. Pinned
+    particles have mass 0. Discs are balls in a plane.
+    """
     from .peers import Newton
 
     particles, features, _ = pile(n)
 
     def built():
-        """The pile in Newton, and its first frame."""
+        """Return the pile in newton, after its first frame."""
         engine = Newton(particles, features, 1, (8, 2))
         engine.frame()
         return engine
@@ -312,10 +316,10 @@ def newtons(n: int, rounds: int) -> dict[str, float]:
     engine.now = other
     engine.frame()
     copied = perf_counter() - clock
-    inverse, held = engine.model.particle_inv_mass.numpy(), [0, 0.0]  # which is the array itself, on a CPU
+    inverse, held = engine.model.particle_inv_mass.numpy(), [0, 0.0]  # the array is shared, not copied, on a CPU
 
     def hold(k: int):
-        """Have another particle weigh infinitely much."""
+        """Give another particle infinite mass, and the last one its own mass again."""
         inverse[held[0]] = held[1] or inverse[held[0]]
         held[:] = n // 2 + k, float(inverse[n // 2 + k])
         inverse[held[0]] = 0.0

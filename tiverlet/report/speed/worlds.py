@@ -1,7 +1,7 @@
-"""Many worlds in one launch: how many frames of them a second takes, beside one world, one large world, MuJoCo and Newton.
+"""Speed of many worlds in one launch, beside one world, one large world, MuJoCo and Newton.
 
-`python -m tiverlet report speed worlds`. Every part has a process of its own, and in it, what is compared takes turns, so that
-what else the machine does meets all of it. Times of a part are medians; ratios are medians of the ratios of turns.
+`python -m tiverlet report speed worlds`. Every part has its own process, in which the compared runs alternate, so that other load
+on the machine affects all of them alike. Times of a part are medians; ratios are medians of the ratios of turns.
 """
 
 import importlib.metadata
@@ -30,8 +30,8 @@ METHODS = (
     (2, 20, "f32"), (2, 20, "f64"), (4, 1, "f64"), (4, 2, "f64"), (4, 4, "f64"), (4, 20, "f64"),
     (6, 1, "f64"), (6, 2, "f64"), (8, 1, "f64"),
 )  # fmt: skip
-# Of the full report and of a quick one: worlds of a pendulum, a chain, a pile; worlds in comparisons; seconds of a turn, turns;
-# order, substeps and precision of double pendulums.
+# Sizes of the full report and of a quick one: numbers of pendulums, chains and piles; worlds in comparisons; seconds of a turn;
+# turns; order, substeps and precision of double pendulums.
 FULL: dict[str, Any] = {
     "pendulum": (1, 10, 100, 1000, 10_000), "chain": (1, 10, 100, 1000), "pile": (1, 10, 100, 1000), "count": 1000,
     "seconds": 0.15, "turns": 5, "chains": 200, "discs": 100, "frames": 60, "methods": METHODS,
@@ -46,12 +46,12 @@ QUICK = FULL | {
     "chains": 2,
     "discs": 10,
     "frames": 4,
-    "methods": (METHODS[0], METHODS[-1]),  # each other order is compiled anew
+    "methods": (METHODS[0], METHODS[-1]),  # each further order needs its own kernels
 }
-# Seconds after which errors of double pendulums are compared, and times a second at which they are looked at until then.
+# Seconds over which errors of double pendulums are measured, and samples a second.
 LATE, LOOKS = 3.0, 15
 RATES = (30, 45, 60, 90, 120, 240, 480, 960, 1920, 3840)  # steps a second of MuJoCo; multiples of LOOKS
-# As near to points as its bodies can be: 1e-12 kg m2 shifts positions by less than 1e-11 m. All is off that it would not use.
+# Bodies as near to points as MuJoCo allows: 1e-12 kg m2 shifts positions by less than 1e-11 m. Everything unused is off.
 MODEL = """<mujoco><compiler inertiafromgeom="false"/>
 <option integrator="RK4" gravity="0 -9.81 0"><flag contact="disable" constraint="disable" limit="disable" equality="disable"
  frictionloss="disable" spring="disable" damper="disable" actuation="disable" sensor="disable" warmstart="disable"/></option>
@@ -65,7 +65,7 @@ SETTINGS = ((4, 10), (10, 10), (20, 20))  # of Newton: steps of a frame, iterati
 
 @dataclass(frozen=True)
 class WorldsSpeed(JupyterMixin):
-    """Tables by title: heads, and rows of text. notes: what was left out, and why."""
+    """The report: tables by title, each with heads and rows of text. notes: what was left out, and why."""
 
     machine: str
     tables: dict[str, tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]]
@@ -79,11 +79,11 @@ class WorldsSpeed(JupyterMixin):
 
     @property
     def missing(self) -> list[str]:
-        """Notes on what failed."""
+        """The notes on measurements that failed."""
         return [note for note in self.notes if note.startswith("Missing")]
 
     def markdown(self) -> str:
-        """Everything as Markdown."""
+        """Return tables and notes as Markdown."""
         return output.markdown(self._titled, self._lines)
 
     @property
@@ -95,13 +95,16 @@ class WorldsSpeed(JupyterMixin):
         return [f"Machine: {self.machine}.", *self.notes]
 
     def json(self) -> str:
-        """Everything, for machines."""
+        """Return the report as JSON."""
         return json.dumps(asdict(self), indent=1)
 
 
 def worlds(threads: tuple[int, ...] = (), quick: bool = False, peers: bool = True) -> WorldsSpeed:
-    """Measure. threads: numbers of CPU threads; 1 and all cores by default. quick: tiny sizes. peers: with MuJoCo and Newton,
-    where they are installed."""
+    """Measure the speed of many worlds.
+
+    threads: numbers of CPU threads; 1 and all cores by default. quick: tiny sizes. peers: also run MuJoCo and Newton, if they are
+    installed.
+    """
     from .measure import powers
     from .processes import started
 
@@ -128,7 +131,7 @@ def worlds(threads: tuple[int, ...] = (), quick: bool = False, peers: bool = Tru
 
 
 def main(job: dict[str, Any]) -> None:
-    """The process of a part: the rows of its table. What libraries print goes to the errors."""
+    """Run the process of a part: print the rows of its table as JSON. What libraries print goes to stderr."""
     import tiverlet as tv
 
     answers = os.fdopen(os.dup(1), "w")
@@ -140,7 +143,7 @@ def main(job: dict[str, Any]) -> None:
 
 
 def in_turns(acts: dict[Any, Callable[[], Any]], turns: int) -> dict[Any, list[float]]:
-    """Seconds of each act, in each turn."""
+    """Return the seconds of each act in each turn."""
     out: dict[Any, list[float]] = {name: [] for name in acts}
     for _ in range(turns):
         for name, act in acts.items():
@@ -151,12 +154,12 @@ def in_turns(acts: dict[Any, Callable[[], Any]], turns: int) -> dict[Any, list[f
 
 
 def ratio(these: list[float], those: list[float]) -> float:
-    """The median of the ratios of turns."""
+    """Return the median of the ratios of turns."""
     return median(a / b for a, b in zip(these, those, strict=True))
 
 
 def hung(links: int, length: float):
-    """A chain that is let go of horizontally, held at one end: particles, features."""
+    """Build a chain that is released horizontally, held at one end: particles and features."""
     import tiverlet as tv
 
     x = np.stack([length * np.arange(links + 1), np.zeros(links + 1)], axis=1)
@@ -165,7 +168,7 @@ def hung(links: int, length: float):
 
 
 def ladder(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
-    """Worlds x particles, each beside the same world alone."""
+    """Yield the rows of numbers of worlds and particles, each beside the same world alone."""
     import tiverlet as tv
 
     from ...device.patches.tracing import launches
@@ -185,7 +188,7 @@ def ladder(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
                     frames, frames_alone = (_fitting(world, sizes["seconds"]) for world in (many, alone))
                     acts = {"many": partial(many.run, frames * DT, DT), "alone": partial(alone.run, frames_alone * DT, DT)}
                     times: dict[str, list[float]] = {k: [] for k in acts}
-                    for _ in range(sizes["turns"]):  # each from its start, lest a pile comes to rest
+                    for _ in range(sizes["turns"]):  # each turn begins at the start, before the pile comes to rest
                         many.reset()
                         alone.position, alone.velocity = particles.position, particles.velocity
                         for world in (many, alone):
@@ -206,14 +209,14 @@ def ladder(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
 
 
 def _fitting(world: Any, seconds: float) -> int:
-    """How many frames take about so many seconds."""
+    """Return the number of frames that take about `seconds`."""
     clock = perf_counter()
     world.run(2 * DT, DT)
     return int(np.clip(seconds / (perf_counter() - clock) * 2, 1, 600))
 
 
 def pendulums(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
-    """Double pendulums by each order, beside the time that MuJoCo takes for the same error."""
+    """Yield the rows of double pendulums by each order, beside the time that MuJoCo takes for the same error."""
     import tiverlet as tv
 
     count, frames = sizes["count"], 60
@@ -229,7 +232,7 @@ def pendulums(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
     theirs = MuJoCo(job["threads"], count) if job["peers"] and find_spec("mujoco") else None
     if theirs:
         known = [(rate, float(np.abs(theirs.track(rate, times) - exact).max())) for rate in RATES]
-        theirs.run()  # once, for its memory
+        theirs.run()  # an untimed run, which allocates memory
         acts["mujoco"] = theirs.run
     spent = in_turns(acts, sizes["turns"])
     for (order, substeps, precision), error in errors.items():
@@ -257,9 +260,9 @@ def pendulums(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
 
 
 def rate_for(error: float, known: list[tuple[int, float]]) -> float:
-    """Steps a second for an error, between those that are known by powers; beyond them with the power of 4."""
+    """Return the steps a second for an error, by log-log interpolation of `known`; beyond it, by order 4."""
     best = min(range(len(known)), key=lambda k: known[k][1])
-    some = known[: best + 1]  # from there on, rounding
+    some = known[: best + 1]  # beyond the best, rounding dominates
     x, y = np.log([rate for rate, _ in some]), np.log([e for _, e in some])
     wanted = np.log(error)
     if wanted < y[-1]:
@@ -270,7 +273,7 @@ def rate_for(error: float, known: list[tuple[int, float]]) -> float:
 
 
 class MuJoCo:
-    """The pendulums by mujoco.rollout with RK4, all from the same start."""
+    """The double pendulums in MuJoCo: mujoco.rollout with RK4, all from the same start."""
 
     steps = 60  # of a turn
 
@@ -288,27 +291,27 @@ class MuJoCo:
         self.pool = rollout.Rollout(nthread=threads if threads > 1 else 0)
 
     def track(self, rate: int, times: np.ndarray) -> np.ndarray:
-        """Where the two are at these times, with so many steps a second."""
+        """Return the positions of both masses at `times`, (times, 2, 2) [m], with `rate` steps a second."""
         self.model.opt.timestep = 1 / rate
         at = np.rint(times * rate).astype(int)
         states, _ = self.pool.rollout(self.model, self.data, self.start[:1], nstep=int(at[-1]))
         return arms(states[0, at - 1, 1], states[0, at - 1, 1:3].sum(axis=1))
 
     def run(self) -> None:
-        """Some steps of all."""
+        """Compute `steps` steps of all pendulums."""
         self.pool.rollout(self.model, self.data, self.start, nstep=self.steps, state=self.out)
 
 
 def arms(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Where the ends of two links of 1 m are, (times, 2, 2), by their angles from the horizontal."""
+    """Return the ends of two links of 1 m, (times, 2, 2) [m], from their angles to the horizontal."""
     one = np.stack([np.cos(first), np.sin(first)], axis=-1)
     return np.stack([one, one + np.stack([np.cos(second), np.sin(second)], axis=-1)], axis=-2)
 
 
 def double_pendulum(times: np.ndarray, steps: int = 16, stages: int = 8) -> np.ndarray:
-    """Where two masses of 1 kg on links of 1 m are that fall from the horizontal, to 1e-12 m.
+    """Return the positions of two masses of 1 kg on links of 1 m that fall from the horizontal, to 1e-12 m.
 
-    Lagrange's equations by Gauss's collocation of order 16. times: evenly spaced, from the first step on. steps: between two.
+    Solves Lagrange's equations by Gauss collocation of order 16. times: multiples of the first. steps: between two times.
     """
     nodes, weights = np.polynomial.legendre.leggauss(stages)
     nodes, weights = (nodes + 1) / 2, weights / 2
@@ -318,7 +321,7 @@ def double_pendulum(times: np.ndarray, steps: int = 16, stages: int = 8) -> np.n
     h = times[0] / steps
 
     def slope(y):
-        """The time derivatives of angles and their rates, (stages, 4)."""
+        """Return the time derivatives of both angles and their rates, (stages, 4)."""
         a, b, w, v = y.T
         c, s = np.cos(a - b), np.sin(a - b)
         p, q = -2 * 9.81 * np.cos(a) - s * v * v, -9.81 * np.cos(b) + s * w * w
@@ -336,7 +339,7 @@ def double_pendulum(times: np.ndarray, steps: int = 16, stages: int = 8) -> np.n
 
 
 def chains(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
-    """Chains of 20 links, beside Newton's XPBD: all of them in one model."""
+    """Yield the rows of chains of 20 links, beside Newton's XPBD with all chains in one model."""
     import tiverlet as tv
 
     from .peers import Newton
@@ -372,7 +375,7 @@ def chains(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
 
 
 def piles(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
-    """Many piles beside one of all their discs: as they fall, and packed from the start, where both have as many contacts."""
+    """Yield the rows of many piles beside one pile of all their discs, falling and packed, with the contacts of both."""
     import tiverlet as tv
 
     from .scenes import SCENES
@@ -400,7 +403,7 @@ def piles(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
 
 
 def packed(n: int):
-    """Discs that touch each other in rows and columns, in a box that they fill, almost."""
+    """Build discs that touch each other in rows and columns, in a box that is hardly wider."""
     import tiverlet as tv
 
     from .scenes import scattered
@@ -412,7 +415,7 @@ def packed(n: int):
 
 
 def costs(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
-    """Memory, the start, and a reset of half of them."""
+    """Yield the rows of memory, first frame, and a reset of half of the worlds."""
     import tiverlet as tv
 
     from .scenes import SCENES
@@ -448,7 +451,7 @@ def costs(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
 
 
 def resident() -> int:
-    """Memory of the process [bytes]; 0 where the system does not say."""
+    """Return the resident memory of the process [bytes]; 0 if the system does not provide it."""
     try:
         with open("/proc/self/statm") as file:
             return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
@@ -458,8 +461,11 @@ def resident() -> int:
 
 @dataclass(frozen=True)
 class Part:
-    """A table: rows(job, sizes) in a process of its own. peer: what it is beside; alone: whether it has rows without.
-    threads: whether it is run on each number of threads; else on the first."""
+    """One table, whose rows(job, sizes) run in their own process.
+
+    peer: the engine to compare with, or "". alone: whether there are rows without it. threads: whether the part runs on each
+    number of threads, or on the first alone.
+    """
 
     title: str
     heads: tuple[str, ...]

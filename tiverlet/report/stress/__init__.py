@@ -1,1 +1,1 @@
-"""Stability on stiff and extreme cases."""
+"""Stability in stiff and extreme cases: the certificate, perturbed scenes, and the trace of a failure."""

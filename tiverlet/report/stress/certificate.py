@@ -1,4 +1,4 @@
-"""The certificate: every row of the stiff and extreme matrix with what was tried, the figure and the verdict."""
+"""The certificate: every row of the stiff and extreme matrix, with its case, criterion, figure and verdict."""
 
 import json
 import warnings
@@ -24,7 +24,7 @@ PASSED, FAILED, ABSENT = "passed", "FAILED", "not available"
 
 @dataclass(frozen=True)
 class Result:
-    """One row: what was tried, the criterion, the figure, and the verdict; failing: the parts that do not hold."""
+    """The result of one row: case, criterion, figure and verdict. failing: the parts of the criterion that do not hold."""
 
     number: int
     what: str
@@ -36,7 +36,7 @@ class Result:
 
 
 class Certificate(JupyterMixin):
-    """Results of rows. print() shows a table; passed says whether none has failed. See .markdown(), .json()."""
+    """The results of rows. print() shows a table; see .passed, .markdown(), .json()."""
 
     def __init__(self, results: Sequence[Result]):
         self.results = sorted(results, key=lambda r: r.number)
@@ -48,7 +48,7 @@ class Certificate(JupyterMixin):
 
     @property
     def summary(self) -> str:
-        """The count of verdicts."""
+        """The counts of verdicts, as text."""
         count = {v: sum(r.verdict == v for r in self.results) for v in (PASSED, FAILED, ABSENT)}
         return f"{count[PASSED]} of {len(self.results)} passed, {count[FAILED]} failed, {count[ABSENT]} not available."
 
@@ -66,27 +66,27 @@ class Certificate(JupyterMixin):
         return output.text(self, 160)
 
     def markdown(self) -> str:
-        """The table as Markdown."""
+        """Return the table as Markdown."""
         rows = [(str(r.number), r.what, r.criterion, r.figure, verdict(r)) for r in self.results]
         lines = output.table(("#", "case", "criterion", "figure", "verdict"), rows)
         return "\n".join([*lines, "", self.summary]) + "\n"
 
     def json(self) -> str:
-        """Everything, for machines."""
+        """Return the certificate as JSON."""
         return json.dumps({"passed": self.passed, "rows": [asdict(r) for r in self.results]}, indent=1)
 
 
 def verdict(r: Result) -> str:
-    """A verdict, and what does not hold."""
+    """Return a verdict, and the parts of the criterion that do not hold."""
     return "; ".join([r.verdict, *r.failing])
 
 
 def certify(number: int) -> Result:
-    """Try one row; a function of plain data, so that any executor can run it anywhere."""
+    """Run one row. Argument and result are plain data, so that any executor can run this function."""
     row, clock = ROWS[number], perf_counter()
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what is extreme is warned of; rows that ask for a warning catch it themselves
+            warnings.simplefilter("ignore")  # extreme scenes cause warnings; rows about warnings catch them
             found = row.attempt()
         failing = tuple(name for name, holds in found.holds.items() if not holds)
         figure, how = found.figure, FAILED if failing or not found.holds else PASSED
@@ -100,11 +100,12 @@ def certify(number: int) -> Result:
 def stress(
     world: "World | None" = None, *, rows: Iterable[int] | None = None, executor: Any = None, progress: bool = False, **more
 ):  # fmt: skip
-    """Try what is stiff and extreme: the rows of the matrix, or the scene of a world of the user's.
+    """Test stiff and extreme cases: the rows of the matrix, or perturbations of the scene of the user's own world.
 
-    world: None for the matrix; else its scene is perturbed, see tv.report.perturbed, which takes the further arguments.
-    rows: numbers; None for all. executor: with submit(), as in concurrent.futures, in whose workers rows are tried ("spawn").
-    progress: show a bar. Returns a Certificate; a row whose worker died has failed.
+    world: None for the matrix; else its scene is perturbed with the further arguments, see perturbed() in robustness.py.
+    rows: numbers; None for all. executor: an object with submit(), as in concurrent.futures, whose workers run the rows (start
+    method "spawn"). progress: show a bar. Returns a Certificate, in which a row whose worker died has failed; or, for a world, an
+    Endurance.
     """
     if world is not None:
         from .robustness import perturbed

@@ -1,4 +1,4 @@
-"""When a run goes wrong: which particle, what held or touched it, and the last states; as text and as a recording."""
+"""Trace a failure: the particle that shows it, the constraints and contacts at it, and the last states, as text or recording."""
 
 import os
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from ...world import World
 
 @dataclass(frozen=True)
 class Suspect:
-    """What acted on the particle: a constraint or a contact, the particles in it, and how far off it was before."""
+    """A constraint or contact at the particle: its name, its particles, and its violation before the failure."""
 
     name: str
     members: tuple[int, ...]
@@ -29,11 +29,11 @@ class Suspect:
 
 @dataclass(frozen=True)
 class Autopsy:
-    """What went wrong first. print() tells it; record(path) shows it; found says whether anything did.
+    """The first failure of a run. print() describes it, record(path) draws it; see .found.
 
-    report: of the substep in which it showed. frame, substep: from 0. particle: the one that shows it most; others: more that are
-    not finite. suspects: constraints and contacts at it, the most violated first, before that substep. times [s] (k,), positions
-    [m] (k, n, dim): the last states, the wrong one at the end.
+    report: of the substep that failed, or None. frame, substep: counted from 0. particle: the one that shows the failure most.
+    others: further particles that are not finite. suspects: constraints and contacts at the particle before that substep, the
+    most violated first. times [s] (k,), positions [m] (k, n, dim): the last states, the failed one at the end.
     """
 
     report: StepReport | None
@@ -47,7 +47,7 @@ class Autopsy:
 
     @property
     def found(self) -> bool:
-        """Whether anything went wrong."""
+        """Whether there was a failure."""
         return self.report is not None
 
     def __str__(self) -> str:
@@ -64,7 +64,7 @@ class Autopsy:
         return "\n".join(lines)
 
     def record(self, path) -> None:
-        """The last states for the rerun viewer, with the particle, its constraint and its contact in red."""
+        """Write the last states for the rerun viewer, with the particle and its suspects in red."""
         import rerun as rr
 
         if not self.found:
@@ -92,10 +92,11 @@ class Autopsy:
 def autopsy(
     world: World, seconds: float, dt: float = 1 / 60, wrong: Callable[[StepReport], bool] | None = None, last: int = 8
 ) -> Autopsy:
-    """Run a clone of a world until something goes wrong, then go through that frame substep by substep.
+    """Run a clone of a world until it fails, then run that frame again substep by substep.
 
-    seconds [s], dt [s] of a frame: as for world.run(). wrong: what counts, from the report of a frame or of a substep; by default
-    any flag. last: how many states to keep. The world itself is not touched. Targets stand still, so take a world shortly before.
+    seconds, dt [s]: as in world.run(). wrong: report of a frame or substep -> whether it is a failure; by default, whether it has
+    a flag. last: the number of states to keep. The world itself does not change. Targets stand still, so use a world shortly
+    before the failure.
     """
     seconds = checks.number("autopsy", "seconds", seconds, above=0.0)
     dt = checks.number("autopsy", "dt", dt, above=0.0)
@@ -113,7 +114,7 @@ def autopsy(
 
 
 def dissect(w: World, dt: float, seen: StepReport, frame: int, wrong, last: int) -> Autopsy:
-    """The frame again, one substep at a time: bit for bit what happened, until it goes wrong."""
+    """Run the frame again one substep at a time, bit for bit, until it fails. seen: the report of the frame."""
     substeps, w.substeps = seen.substeps, 1
     times, states, report, substep = [w.time], [w.position], seen, 0
     kept = keep(w)
@@ -129,7 +130,7 @@ def dissect(w: World, dt: float, seen: StepReport, frame: int, wrong, last: int)
     put_back(w, kept)
     held = suspects(w, None) if w._clock.h else []
     if len(lost):
-        # What is solved together is lost together; the force that did it shows in the velocity before.
+        # NaN spreads to all particles of a system. The particle that caused it has a NaN velocity one substep earlier.
         spoilt = np.flatnonzero(~np.isfinite(w.velocity).all(axis=1))
         particle: int | None = int(spoilt[0] if len(spoilt) else lost[0])
     else:
@@ -147,7 +148,7 @@ def dissect(w: World, dt: float, seen: StepReport, frame: int, wrong, last: int)
 
 
 def suspects(w: World, particle: int | None) -> list[Suspect]:
-    """Constraints and contacts, of one particle or of all, the most violated first."""
+    """Return constraints and contacts, the most violated first: all of one particle, or the worst of each feature for None."""
     out = []
     for f in w.features:
         if isinstance(f, Batch) and f.count:

@@ -1,4 +1,4 @@
-"""What a scene of the user's can stand: one parameter at a time is made extreme, and what breaks is named."""
+"""Robustness of the user's own scene: make one parameter at a time extreme, and report what breaks."""
 
 import json
 import warnings
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from ...step.step_report import StepReport
 
 STANDS, REFUSED, BREAKS, UNTRIED = "stands it", "refused by name", "BREAKS", "not tried"
-LOOSE = 0.1  # relative violation of a constraint beyond which it no longer holds
-APART = 1e-3  # of the size of the motion, by which the same scene elsewhere may end somewhere else
-PLACES = ("lower", "upper", "center", "a", "b", "target")  # of features: where they are
+LOOSE = 0.1  # relative violation of a constraint beyond which it counts as broken
+APART = 1e-3  # tolerance of a shifted scene's final positions, as a share of the motion
+PLACES = ("lower", "upper", "center", "a", "b", "target")  # attributes of features that are positions
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One perturbation: what was made extreme, the verdict, and how it shows. particle: the first that shows it, or None."""
+    """The result of one perturbation: the extreme parameter, the verdict and the reason. particle: the first affected or None."""
 
     parameter: str
     verdict: str
@@ -43,19 +43,19 @@ class Outcome:
 
 
 class Endurance(JupyterMixin):
-    """What a scene stands and what breaks it. print() shows a table; see .breaks, .json()."""
+    """The perturbations that a scene stands and those that break it. print() shows a table; see .breaks, .json()."""
 
     def __init__(self, outcomes: list[Outcome]):
         self.outcomes = outcomes
 
     @property
     def breaks(self) -> dict[str, str]:
-        """Parameters that break the scene, and how."""
+        """The parameters that break the scene, with reasons."""
         return {o.parameter: o.how for o in self.outcomes if o.verdict == BREAKS}
 
     @property
     def passed(self) -> bool:
-        """Whether nothing breaks it."""
+        """Whether no perturbation breaks the scene."""
         return not self.breaks
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -70,13 +70,13 @@ class Endurance(JupyterMixin):
         return output.text(self, 140)
 
     def json(self) -> str:
-        """Everything, for machines."""
+        """Return the outcomes as JSON."""
         return json.dumps({"passed": self.passed, "outcomes": [asdict(o) for o in self.outcomes]}, indent=1)
 
 
 @dataclass
 class Scene:
-    """What a world is built from, to change one thing in."""
+    """The data that a world is built from, of which one item is changed."""
 
     position: np.ndarray
     velocity: np.ndarray
@@ -85,7 +85,7 @@ class Scene:
     dt: float
 
     def build(self, world: World) -> World:
-        """With the settings and the structure of a world."""
+        """Return a world with this data and the settings and structure of `world`."""
         p = world.particles
         start = Particles(self.position, velocity=self.velocity, mass=self.mass, radius=p.radius, pinned=p.pinned, group=p.group)
         with warnings.catch_warnings():
@@ -94,12 +94,13 @@ class Scene:
 
 
 def perturbed(world: World, *, seconds: float = 1.0, dt: float = 1 / 60, shift: float = 1e6) -> Endurance:
-    """Make one parameter of a scene extreme at a time, run it for `seconds` [s] in frames of dt [s], and say what breaks.
+    """Make one parameter of a scene extreme at a time, run it for `seconds` [s] in frames of dt [s], and report what breaks.
 
-    Tried are: frames of 10 dt; masses times 1e6, all and one; stiffnesses times 1e9; everything moved by `shift` [m]; all
-    particles in one point; NaN in one input, which must be refused by name. A scene breaks when its state is not finite, when the
-    frame reports a flag that it does not have as it is, when constraints no longer hold, when energy comes from nowhere, or when
-    the same scene elsewhere goes elsewhere. The world itself is not touched; knobs keep their values, targets stand still.
+    Perturbations: frames of 10 dt; masses times 1e6, all and one; stiffnesses times 1e9; everything shifted by `shift` [m]; all
+    particles at one point; NaN in one input, which must be refused by name. A scene breaks if its state is not finite, if it has
+    a flag that the unperturbed scene does not have, if constraints no longer hold, if it has more energy than the scene can
+    supply, or if the shifted scene moves differently. The world itself does not change. Knobs keep their values, targets stand
+    still.
     """
     seconds = checks.number("stress", "seconds", seconds, above=0.0)
     dt = checks.number("stress", "dt", dt, above=0.0)
@@ -131,7 +132,7 @@ def perturbed(world: World, *, seconds: float = 1.0, dt: float = 1 / 60, shift: 
 
 @dataclass
 class Seen:
-    """What a run of a scene showed."""
+    """The result of one run: the worst report, final positions, faults, a figure in words, and the first particle affected."""
 
     report: "StepReport"
     position: np.ndarray
@@ -141,7 +142,7 @@ class Seen:
 
 
 def look(world: World, scene: Scene, seconds: float, plain: Seen | None, moves: Any = False) -> Seen:
-    """Run a scene and judge it, against the run of the scene as it is."""
+    """Run a scene and compare it with the run of the unperturbed scene. moves: the shift along x [m], or False."""
     with scene.build(world) as w:
         first = w.step(scene.dt)
         begin = first.energy - first.energy_change
@@ -165,7 +166,7 @@ def look(world: World, scene: Scene, seconds: float, plain: Seen | None, moves: 
         span = float(np.ptp(x[np.isfinite(x).all(axis=1)], axis=0).max(initial=0.0)) + 1e-12
         weight = float(np.where(w.particles.inv_mass > 0, w.particles.mass, 0.0).sum())
         kinetic = 0.5 * float(np.where(w.particles.inv_mass > 0, w.particles.mass, 0.0) @ (scene.velocity**2).sum(axis=1))
-        # A start may hold elastic energy; what falls by as much as the scene is wide gains that much more.
+        # The energy that the scene can supply: at the start, and by a fall over the extent of the scene.
         allowed = abs(begin) + kinetic + weight * gravity_of(w) * span
         if np.isfinite(top) and top > allowed:
             faults.append(f"it moves with {top:.2g} J, more than the scene has to give ({allowed:.2g} J)")
@@ -184,13 +185,13 @@ def look(world: World, scene: Scene, seconds: float, plain: Seen | None, moves: 
 
 
 def gravity_of(w: World) -> float:
-    """The size of gravity [m/s^2]; what other forces may do is taken for as much as that of the earth."""
+    """Return the largest gravity [m/s^2], but at least that of the earth, to allow for other forces."""
     pulls = [float(np.linalg.norm(f.g)) for f in w.features if isinstance(f, Gravity)]
     return max([*pulls, 9.81])
 
 
 def sorted_notes(report: "StepReport") -> list[str]:
-    """The notes of a report, one for each flag in the order of their names where there are as many."""
+    """Return a note for each flag of a report, in the order of the flags' names; the flag itself if it has no note."""
     order = (
         "non-finite", "out-of-range", "tunnelling-risk", "compressed", "turned", "softened", "stiff-force", "unconverged",
         "energy-gain",
@@ -200,7 +201,7 @@ def sorted_notes(report: "StepReport") -> list[str]:
 
 
 def tied(w: World, particle: int) -> str:
-    """The first constraint that a particle belongs to, in words."""
+    """Return the first constraint of a particle, in words; empty if it has none."""
     for f in w.features:
         if isinstance(f, Batch) and f.arity:
             rows = np.flatnonzero((f.indices == particle).any(axis=1))
@@ -210,7 +211,7 @@ def tied(w: World, particle: int) -> str:
 
 
 def loosest(w: World) -> tuple[str, int | None]:
-    """The constraint that is violated most, in words, and its first particle that can move."""
+    """Return the most violated constraint, in words, and its first particle that can move."""
     worst, said_, who = 0.0, "", None
     for f in w.features:
         if isinstance(f, Batch) and f.count:
@@ -224,26 +225,26 @@ def loosest(w: World) -> tuple[str, int | None]:
 
 
 def scene_of(world: World, dt: float) -> Scene:
-    """A world as it is now."""
+    """Return the current scene of a world."""
     features = [f.copy() for f in world.features]
     return Scene(world.position.copy(), world.velocity.copy(), world.particles.mass.copy(), features, dt)
 
 
 def last(world: World) -> int | None:
-    """The last particle that can move."""
+    """Return the last particle that can move; None if there is none."""
     free = np.flatnonzero(world.particles.inv_mass > 0)
     return int(free[-1]) if len(free) else None
 
 
 def heavier(world: World, dt: float, particle: int | None) -> Scene:
-    """Masses times 1e6: of all, or of one."""
+    """Return the scene with masses times 1e6: of all particles (None), or of one."""
     scene = scene_of(world, dt)
     scene.mass[slice(None) if particle is None else particle] *= 1e6
     return scene
 
 
 def stiffer(world: World, dt: float) -> Scene | str:
-    """Compliances divided by 1e9."""
+    """Return the scene with compliances divided by 1e9, or the reason why it cannot be perturbed so."""
     scene, soft = scene_of(world, dt), False
     for f in scene.features:
         alpha = getattr(f, "compliance", None)
@@ -253,7 +254,7 @@ def stiffer(world: World, dt: float) -> Scene | str:
 
 
 def shifted(world: World, dt: float, shift: float) -> Scene | str:
-    """Everything moved along x."""
+    """Return the scene shifted along x by `shift` [m], or the reason why it cannot be shifted."""
     scene = scene_of(world, dt)
     by = shift * np.eye(scene.position.shape[1])[0]
     for f in scene.features:
@@ -273,17 +274,17 @@ def shifted(world: World, dt: float, shift: float) -> Scene | str:
 
 
 def gathered(world: World, dt: float) -> Scene | str:
-    """All particles that can move, in their middle."""
+    """Return the scene with all particles that can move at their mean position, or the reason why there are none."""
     scene, free = scene_of(world, dt), world.particles.inv_mass > 0
     if not free.any():
         return "nothing can move"
-    # Rest values that come from the positions are settled: features that were built keep theirs.
+    # Features that were built before keep their rest values.
     scene.position[free] = scene.position[free].mean(axis=0)
     return scene
 
 
 def spoilt(world: World) -> Outcome:
-    """NaN in one input has to be refused, and the world has to be as before."""
+    """Check that NaN in position and velocity is refused by name, and that the world is unchanged."""
     parameter, before = "NaN in one input", world.hash()
     k = last(world) or 0
     for name in ("position", "velocity"):

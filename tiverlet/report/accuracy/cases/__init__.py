@@ -1,6 +1,6 @@
-"""Scenes with known answers: the entries of cases.json, each built only through the public names.
+"""Scenes with known answers: the entries of cases.json, each built only through public names.
 
-A new case is one row in the list CASES of a file here.
+To add a case, add one entry to the list CASES of a file in this folder.
 """
 
 import difflib
@@ -10,11 +10,11 @@ from .case import FRAME, METHODS, Case, Run, entries, known
 
 CASES: dict[str, Case] = {c.name: c for file in (chains, free, statics, impacts) for c in file.CASES}
 
-# Entries of cases.json that are no case of their own, and why.
+# Entries of cases.json without a case, and why.
 LEFT_OUT = {
     "R04_oscillator_k100_dt0.1": "the same scene as R04_oscillator_k100_dt0.01, at another step",
     "R10_catenary": "a continuum; R10b are the ropes of links that it is the limit of",
-    "R20_rolling": "particles do not spin",
+    "R20_rolling": "spheres that roll: python -m tiverlet.report.accuracy.grains",
     "R22_packing": "statistics of many contacts: python -m tiverlet.report.accuracy.granular",
     "R23_hard_gas_pressure": "statistics of many contacts: python -m tiverlet.report.accuracy.granular",
     "R24_maxwell": "statistics of many contacts: python -m tiverlet.report.accuracy.granular",
@@ -23,7 +23,7 @@ LEFT_OUT = {
 
 
 def chosen(names=None) -> list[Case]:
-    """The cases of these names, or whose names begin so; all for None. ValueError for a name that fits none."""
+    """Return the cases with these names or beginnings of names; all for None. Raises ValueError for a name that fits none."""
     if names is None:
         return list(CASES.values())
     out: dict[str, Case] = {}

@@ -1,4 +1,4 @@
-"""What a case is: a scene with a known answer, and how far from it a run ends."""
+"""A case: a scene with a known answer, and the error of a run."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -39,39 +39,40 @@ def _file() -> dict[str, dict]:
 
 
 def known(name: str) -> dict:
-    """An entry of cases.json: its parameters, values, formula and how far they can be trusted."""
+    """Return an entry of cases.json: parameters, values, formula and their uncertainty."""
     return _file()[name]
 
 
 def entries() -> list[str]:
-    """The names of all entries of cases.json."""
+    """Return the names of all entries of cases.json."""
     return list(_file())
 
 
 @dataclass
 class Run:
-    """What a run leaves for its error measure."""
+    """The data of a run from which its error is computed."""
 
     world: "World"
     times: list[float] = field(default_factory=list)  # of the ends of frames [s]
-    seen: list[np.ndarray] = field(default_factory=list)  # what the case watches, after each frame
+    seen: list[np.ndarray] = field(default_factory=list)  # results of Case.watch, after each frame
     reports: list[StepReport] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class Case:
-    """One scene with a known answer, built only through the public names.
+    """A scene with a known answer, built only through public names.
 
-    name: by which it is asked for; that of its entry in cases.json, or that and what tells several of one entry apart.
+    name: the name of its entry in cases.json, with a suffix if the entry has several cases.
     build: () -> particles and features, new ones at each call.
-    seconds [s]: when the error is taken, a whole number of frames of `frame` [s].
-    error: Run -> its error in `unit`. watch: World -> an array to keep after every frame, for errors of whole runs.
-    size: the error in `unit` of a run that has nothing to do with the answer; beyond it a run counts as diverged.
-    methods: names in METHODS, the best first. efforts: substeps of a frame to try; fit: those of them whose step is short enough
-    for an order of convergence to show. order: the order that the case must show with its first method in f64; None where the
-    error does not come from the step. limit: what its error must not exceed with its first method in f64 at `at` substeps.
-    trusted: how far the answer itself is known, in `unit`. single: what f32 may add to the error (numerics 4.6).
-    momentum: World -> what the motion conserves, as an array, and its natural size; None where nothing is. conserves: the energy.
+    seconds: when the error is measured [s], a whole number of frames of `frame` [s].
+    error: Run -> error in `unit`. watch: World -> an array to store after every frame, for errors of whole runs.
+    size: the error in `unit` beyond which a run counts as diverged: that of a run unrelated to the answer.
+    methods: names in METHODS, the best first. efforts: substeps of a frame to try.
+    fit: the efforts whose substep is short enough for an order of convergence; empty for all.
+    order: the order in f64 of all methods that show one; None if the error does not come from the step.
+    limit: the largest error allowed with the first method in f64 at `at` substeps.
+    trusted: the uncertainty of the answer, in `unit`. single: the error that f32 may always have, in `unit`.
+    momentum: World -> a conserved array and its natural size; None if there is none. conserves: whether energy is conserved.
     """
 
     name: str
@@ -96,41 +97,44 @@ class Case:
 
     @property
     def frames(self) -> int:
-        """Frames of a run."""
+        """The number of frames of a run."""
         return round(self.seconds / self.frame)
 
 
 def rms(position, reference) -> float:
-    """Root mean square distance [m]."""
+    """Return the root mean square distance [m]."""
     return float(np.sqrt(np.mean(np.sum((np.asarray(position) - np.asarray(reference)) ** 2, axis=-1))))
 
 
 def ends_at(index, reference) -> Callable[[Run], float]:
-    """The error measure of positions at the end: of particles `index` from `reference`, as many coordinates as it has."""
+    """Return the error measure of final positions: the rms distance of particles `index` from `reference`.
+
+    Only as many coordinates as `reference` has are compared.
+    """
     want = np.asarray(reference, dtype=np.float64)
     return lambda run: rms(run.world.position[index][..., : want.shape[-1]], want)
 
 
 def spin(world: "World") -> tuple[np.ndarray, float]:
-    """Angular momentum about the origin, and sum m |x| |v|."""
+    """Return the angular momentum about the origin, and sum m |x| |v|."""
     m = np.where(world.particles.inv_mass > 0, world.particles.mass, 0.0)
     size = m @ (np.linalg.norm(world.position, axis=1) * np.linalg.norm(world.velocity, axis=1))
     return angular_momentum(world), float(size)
 
 
 def upright(world: "World") -> tuple[np.ndarray, float]:
-    """Angular momentum about the vertical through the origin, which gravity does not change."""
+    """Return the angular momentum about the vertical through the origin, which gravity conserves, and sum m |x| |v|."""
     p, size = spin(world)
     return p[1:2], size
 
 
 def sideways(world: "World") -> tuple[np.ndarray, float]:
-    """Horizontal momentum, which gravity does not change, and sum m |v|."""
+    """Return the horizontal momentum, which gravity conserves, and sum m |v|."""
     m = world.particles.mass
     return m @ np.delete(world.velocity, 1, axis=1), float(m @ np.linalg.norm(world.velocity, axis=1))
 
 
 def links(n: int, first: int = 0) -> np.ndarray:
-    """Pairs of a chain of n links."""
+    """Return the pairs of a chain of n links, from particle `first` on."""
     k = np.arange(n) + first
     return np.stack([k, k + 1], axis=1)

@@ -1,4 +1,4 @@
-"""Pendulums, chains and spinning rods: what rigid and elastic links do in motion."""
+"""Pendulums, chains and spinning rods: rigid and elastic links in motion."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ CHAIN = ("Direct", "Jacobi")
 
 
 def hung(name: str) -> tuple[Particles, tuple[Gravity, Distance]]:
-    """The planar chain of an entry, with its first particle as the anchor."""
+    """Build the planar chain of an entry, with its first particle as the anchor."""
     p = known(name)["params"]
     if name.startswith("D06"):  # "100 x 0.01", "all 90"
         p = {**p, "theta0_deg": [90.0] * 100, "lengths": [0.01] * 100, "masses": [0.01] * 100}
@@ -27,7 +27,7 @@ def hung(name: str) -> tuple[Particles, tuple[Gravity, Distance]]:
 
 
 def swings(name: str, t: float, limit: float, **more) -> Case:
-    """A case of a planar chain: all of its links, or those that the entry knows, at time t."""
+    """Return the case of a planar chain: the positions of all its particles, or those that the entry lists, at time t."""
     values = known(name)["values"][f"t{t}"]
     if "tip_xy" in values:
         at, want = [11, 21], [values["node11_xy"], values["tip_xy"]]
@@ -36,7 +36,7 @@ def swings(name: str, t: float, limit: float, **more) -> Case:
     else:
         want = np.atleast_2d(values["xy"])
         at = list(values.get("nodes_1based", range(1, len(want) + 1)))
-    if name.startswith("D08"):  # its heavy end; the light links between vibrate
+    if name.startswith("D08"):  # only the heavy end, because the light links vibrate
         at, want = at[-1:], want[-1:]
     size = 0.5 * np.abs(hung(name)[0].position).max()
     error = ends_at(at, want)
@@ -44,45 +44,45 @@ def swings(name: str, t: float, limit: float, **more) -> Case:
 
 
 def sphere() -> tuple[Particles, list[Feature]]:
-    """S01: a pendulum in space."""
+    """Build S01: a pendulum in 3D."""
     p = known("S01_spherical_pendulum")["params"]
     start = Particles([[0, 0, 0], p["x0"]], velocity=[[0, 0, 0], p["v0"]], pinned=[0])
     return start, [Gravity(p["g"]), Distance([[0, 1]])]
 
 
 def skew() -> tuple[Particles, list[Feature]]:
-    """S02: a chain of five in space."""
+    """Build S02: a chain of five links in 3D."""
     p = known("S02_chain5_3d")["params"]
     return Particles(p["x0"], mass=np.r_[1.0, p["masses"]], pinned=[0]), [Gravity(p["g"]), Distance(links(5))]
 
 
 def elastic() -> tuple[Particles, list[Feature]]:
-    """S04: an elastic pendulum."""
+    """Build S04: an elastic pendulum."""
     p = known("S04_spring_pendulum")["params"]
     return Particles([[0, 0], p["x0"]], pinned=[0]), [Gravity(p["g"]), Distance([[0, 1]], p["L"], compliance=p["alpha"])]
 
 
 def lone(angle: float) -> tuple[Particles, list[Feature]]:
-    """A pendulum of 1 m, let go at `angle` [rad] from the vertical."""
+    """Build a pendulum of 1 m, released at `angle` [rad] from the vertical."""
     start = Particles([[0, 0], [np.sin(angle), -np.cos(angle)]], pinned=[0])
     return start, [Gravity(9.81), Distance([[0, 1]])]
 
 
 def late(run: Run) -> float:
-    """How much the period is off, relative: after a quarter of it the pendulum should pass its lowest point."""
+    """Return the relative error of the period: after a quarter of it the pendulum should pass its lowest point."""
     x, v = run.world.position[1], run.world.velocity[1]
     return abs(float(np.arctan2(x[0], -x[1]) / (v[0] * run.times[-1])))
 
 
 def conical() -> tuple[Particles, list[Feature]]:
-    """R07: a pendulum that circles."""
+    """Build R07: a conical pendulum."""
     p, v = known("R07_conical_pendulum")["params"], known("R07_conical_pendulum")["values"]
     start = Particles([[0, 0, 0], [v["radius"], -v["depth"], 0]], velocity=[[0, 0, 0], [0, 0, v["speed"]]], pinned=[0])
     return start, [Gravity(p["g"]), Distance([[0, 1]])]
 
 
 def rod(omega: float, masses: tuple[float, float], dim: int = 2) -> tuple[Particles, list[Feature]]:
-    """R08, S09: two masses on a rod of 1 m that spins about their centre."""
+    """Build R08 or S09: two masses on a rod of 1 m that spins about their centre of mass."""
     a, b = masses[1] / sum(masses), -masses[0] / sum(masses)
     x, v = np.zeros((2, dim)), np.zeros((2, dim))
     x[:, 0], v[:, 1] = (a, b), (omega * a, omega * b)
@@ -90,7 +90,7 @@ def rod(omega: float, masses: tuple[float, float], dim: int = 2) -> tuple[Partic
 
 
 def spun(name: str, omega: float, masses: tuple[float, float], seconds: float, limit: float, **more) -> Case:
-    """A case of a free rod: the ends of the rod after `seconds`, at an angle of omega t."""
+    """Return the case of a free rod: the ends of the rod after `seconds`, at an angle of omega t."""
     a = omega * seconds
     arm = np.array([masses[1], -masses[0]]) / sum(masses)
     want = arm[:, None] * [np.cos(a), np.sin(a)]
@@ -100,7 +100,7 @@ def spun(name: str, omega: float, masses: tuple[float, float], seconds: float, l
 
 
 def period(degrees: int, seconds: float, limit: float) -> Case:
-    """A case of R06: the period of one amplitude, from its quarter."""
+    """Return a case of R06: the period at an amplitude of `degrees`, measured from a quarter of it."""
     angle, frame = np.radians(degrees), seconds / 160
     title = f"Pendulum, period of {degrees} degrees"
     return Case(
@@ -110,7 +110,7 @@ def period(degrees: int, seconds: float, limit: float) -> Case:
 
 
 def state(degrees: int, t: int, limit: float) -> Case:
-    """A case of R06b: where the pendulum is after t seconds."""
+    """Return a case of R06b: the position of the pendulum after t seconds."""
     v, angle = known("R06b_pendulum_state")["values"][f"{degrees}deg_t{t}"], np.radians(degrees)
     title = f"Pendulum of {degrees} degrees after {t} s"
     error = ends_at([1], [[v["x"], v["y"]]])

@@ -1,4 +1,4 @@
-"""Particles that are free, or on springs: falls, orbits, oscillators and the modes of chains."""
+"""Free particles, and particles on springs: falls, orbits, oscillators and modes of chains."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from .case import Case, ends_at, known, links, sideways, spin
 
 
 def fall(name: str) -> Case:
-    """A case of R01: constant acceleration, which position Verlet with half a kick at the start gets right."""
+    """Return a case of R01: constant acceleration, for which position Verlet with half a kick at the start is exact."""
     p = known(name)["params"]
     t = p["steps"] * p["dt"]
     y = p["y0"] + p["v0"] * t - p["g"] * t * t / 2
@@ -25,7 +25,7 @@ def fall(name: str) -> Case:
 
 
 def thrown() -> tuple[Particles, list[Feature]]:
-    """R02: a projectile in space."""
+    """Build R02: a projectile in 3D."""
     p = known("R02_projectile")["params"]
     e, a = np.radians(p["elevation_deg"]), np.radians(p["azimuth_deg"])
     v = p["speed"] * np.array([np.cos(e) * np.cos(a), np.sin(e), np.cos(e) * np.sin(a)])
@@ -33,25 +33,25 @@ def thrown() -> tuple[Particles, list[Feature]]:
 
 
 def dragged() -> tuple[Particles, list[Feature]]:
-    """R03: a projectile with linear drag."""
+    """Build R03: a projectile with linear drag."""
     p = known("R03_linear_drag")["params"]
     return Particles([[0.0, 0.0]], velocity=(p["vx0"], p["vy0"])), [Gravity(p["g"]), Drag(p["k"])]
 
 
 @ti.func
 def _soft_spring(x):
-    """k = 100 N/m."""
+    """Return the force of a spring of 100 N/m."""
     return -100.0 * x
 
 
 @ti.func
 def _hard_spring(x):
-    """k = 10000 N/m."""
+    """Return the force of a spring of 10000 N/m."""
     return -10000.0 * x
 
 
 def rings(name: str, spring, seconds: float, limit: float, **more) -> Case:
-    """A case of R04: the user's own spring; its error is that of Verlet's frequency, 2 asin(omega h / 2) / h."""
+    """Return a case of R04: the user's own spring. Its error is that of Verlet's frequency, 2 asin(omega h / 2) / h."""
     p = known(name)["params"]
     want = p["x0"] * np.cos(np.sqrt(p["k"] / p["m"]) * seconds)
     return Case(
@@ -61,31 +61,31 @@ def rings(name: str, spring, seconds: float, limit: float, **more) -> Case:
 
 
 def sprung(name: str, seconds: float, limit: float) -> Case:
-    """A case of R04b: a compliant link between an anchor and a mass; XPBD loses all of its amplitude."""
+    """Return a case of R04b: a compliant link between an anchor and a mass; with XPBD the amplitude decays to nothing."""
     p = known(name)["params"]
     want = 1.0 + 0.1 * np.cos(np.sqrt(p["k"] / p["m"]) * seconds)
 
     def build() -> tuple[Particles, list[Feature]]:
-        """A mass on a spring."""
+        """Build a mass on a spring."""
         return Particles([[0.0, 0], [1.1, 0]], mass=p["m"], pinned=[0]), [Distance([[0, 1]], 1.0, compliance=p["alpha"])]
 
     return Case(name, f"Oscillator by a compliant link, {p['k']:g} N/m", build, seconds, ends_at([1], [[want, 0]]), limit, 0.2)
 
 
 def dashpot() -> tuple[Particles, list[Feature]]:
-    """R05: a spring with a dashpot."""
+    """Build R05: a spring with a dashpot."""
     p = known("R05_damped_oscillator")["params"]
     link = Distance([[0, 1]], 1.0, compliance=1 / p["k"], damping=p["c"])
     return Particles([[0, 0], [1 + p["x0"], 0]], mass=p["m"], pinned=[0]), [link]
 
 
 def orbit(e: str, limit: float, **more) -> Case:
-    """A case of R09: Kepler's orbit after 10 s."""
+    """Return a case of R09: Kepler's orbit after 10 s. e: the key of its eccentricity, such as "e0.5"."""
     states = known("R09_kepler")["values"]["states"]
     s, want = states[f"{e}_start"], states[f"{e}_t10"]
 
     def build() -> tuple[Particles, list[Feature]]:
-        """A planet."""
+        """Build a planet in the field of an attractor."""
         return Particles([[s["x"], s["y"]]], velocity=(s["vx"], s["vy"])), [Attractor((0, 0), 1.0)]
 
     title = f"Kepler's orbit of eccentricity {e[1:]}"
@@ -94,7 +94,7 @@ def orbit(e: str, limit: float, **more) -> Case:
 
 
 def mode(j: int, limit: float) -> Case:
-    """A case of R12: mode j of a chain of springs between two walls, which keeps its amplitude."""
+    """Return a case of R12: mode j of a chain of springs between two walls, which keeps its amplitude."""
     p, values = known("R12_chain_modes")["params"], known("R12_chain_modes")["values"]["modes"]["dt0.001"]
     n, seconds = p["N"], 2.0
     x = np.stack([np.arange(n + 2.0), np.zeros(n + 2)], axis=1)
@@ -103,7 +103,7 @@ def mode(j: int, limit: float) -> Case:
     want = x + np.cos(values[f"mode{j}"]["omega"] * seconds) * u
 
     def build() -> tuple[Particles, list[Feature]]:
-        """A chain, displaced along its mode."""
+        """Build a chain, displaced along its mode."""
         link = Distance(links(n + 1), p["rest"], compliance=p["alpha"])
         return Particles(x + u, mass=p["m"], pinned=[0, n + 1]), [link]
 
@@ -113,7 +113,7 @@ def mode(j: int, limit: float) -> Case:
 
 
 def sway(n: int, limit: float) -> Case:
-    """A case of R13: the slowest transverse mode of a hanging chain of n links, 0.1 mm wide."""
+    """Return a case of R13: the slowest transverse mode of a hanging chain of n links, with an amplitude of 0.1 mm."""
     omega, seconds = known("R13_hanging_chain_modes")["values"][f"N{n}"]["omega1"], 5.0
     tension = np.arange(n, 0, -1) * 9.81 * n  # over the length of a link, with mass 1
     K = np.diag(tension + np.append(tension[1:], 0)) - np.diag(tension[1:], 1) - np.diag(tension[1:], -1)
@@ -123,7 +123,7 @@ def sway(n: int, limit: float) -> Case:
     want = np.cos(omega * seconds)
 
     def build() -> tuple[Particles, list[Feature]]:
-        """A chain that hangs, displaced along its slowest mode."""
+        """Build a hanging chain, displaced along its slowest mode."""
         return Particles(x, pinned=[0]), [Gravity(9.81), Distance(links(n), 1 / n)]
 
     return Case(
@@ -134,14 +134,14 @@ def sway(n: int, limit: float) -> Case:
 
 
 def racket() -> tuple[Particles, list[Feature]]:
-    """S05: a rigid cluster that tumbles about its middle axis."""
+    """Build S05: a rigid cluster that tumbles about its intermediate axis."""
     p = known("S05_tennis_racket")["params"]
     x = np.repeat(np.diag(p["half_axes"]), 2, axis=0) * np.array([1, -1] * 3)[:, None]
     return Particles(x, velocity=np.cross(p["omega0_body"], x)), [ShapeMatch([np.arange(6)])]
 
 
 def ring() -> tuple[Particles, list[Feature]]:
-    """R25: a soft ring of 12 links around a rigid area, let go out of shape."""
+    """Build R25: a soft ring of 12 links around a rigid area, released out of shape."""
     n = 12
     k = np.arange(n)
     a = 2 * np.pi * k / n
@@ -151,13 +151,13 @@ def ring() -> tuple[Particles, list[Feature]]:
 
 
 def swollen(run) -> float:
-    """How much the area of the ring is off, relative."""
+    """Return the relative error of the area of the ring."""
     area = run.world.features[0]
     return abs(float(area.rest_of(run.world.position)[0] / area.rest[0]) - 1)
 
 
 def cast() -> tuple[Particles, list[Feature]]:
-    """A net of unequal masses, soft in places, that flies and tumbles."""
+    """Build a net of unequal masses, soft in places, that flies and tumbles."""
     rng = np.random.default_rng(4)
     k = np.arange(36).reshape(6, 6)
     pairs = [np.stack([k[:-1].ravel(), k[1:].ravel()], axis=1), np.stack([k[:, :-1].ravel(), k[:, 1:].ravel()], axis=1)]
@@ -169,7 +169,7 @@ def cast() -> tuple[Particles, list[Feature]]:
 
 
 def astray(run) -> float:
-    """How far the centre of mass is from its parabola [m]."""
+    """Return the distance of the centre of mass from its parabola [m]."""
     p, t = run.world.particles, run.times[-1]
     share = p.mass / p.mass.sum()
     return float(np.linalg.norm(share @ (run.world.position - p.position - p.velocity * t) - [0, -9.81 * t * t / 2]))

@@ -1,4 +1,4 @@
-"""Collisions, bounces and friction: by their closed forms, for any step."""
+"""Collisions, bounces and friction, compared with closed forms, which hold for any step."""
 
 import numpy as np
 
@@ -11,13 +11,13 @@ from .case import Case, Run, known, rms, sideways
 
 
 def bumped(masses: tuple[float, float], speeds: tuple[float, float], e: float) -> tuple[Particles, list[Feature]]:
-    """R14: two balls that meet head on."""
+    """Build R14: two balls that collide head on."""
     start = Particles([[-0.3, 0], [0.3, 0]], velocity=[[speeds[0], 0], [speeds[1], 0]], mass=masses, radius=0.1)
     return start, [Contact(restitution=e)]
 
 
 def head_on(m1: float, m2: float, u1: float, u2: float, e: float) -> Case:
-    """A case of R14: the velocities after it."""
+    """Return a case of R14: the velocities after the collision."""
     key = f"m{m1:g}_{m2:g}_u{u1:g}_{u2:g}_e{e:g}"
     v = known("R14_collision_1d")["values"][key]
     title = f"Head-on collision, masses {m1:g} and {m2:g}, e = {e:g}"
@@ -29,35 +29,35 @@ def head_on(m1: float, m2: float, u1: float, u2: float, e: float) -> Case:
 
 
 def glanced() -> tuple[Particles, list[Feature]]:
-    """R15: a disc that hits another off its middle."""
+    """Build R15: a disc that hits another off center."""
     p = known("R15_oblique_discs")["params"]
     start = Particles([[-0.4, p["b"]], [0, 0]], velocity=[[p["u"], 0], [0, 0]], radius=p["r"])
     return start, [Contact(restitution=1.0)]
 
 
 def turned(run: Run) -> float:
-    """The largest error of the directions after it [rad]."""
+    """Return the largest error of the directions after the collision [rad]."""
     want = np.array([known("R15_oblique_discs")["values"]["e1"][k] for k in ("v1", "v2")]) * [1, -1]  # b is counted downwards
     v = run.world.velocity
     return float(np.abs(np.arctan2(v[:, 1], v[:, 0]) - np.arctan2(want[:, 1], want[:, 0])).max())
 
 
 def dropped(e: float) -> tuple[Particles, list[Feature]]:
-    """R16: a ball dropped on a floor."""
+    """Build R16: a ball dropped on a floor."""
     return Particles([[0.0, 1.1]], radius=0.1), [Gravity(9.81), HalfSpace((0, 1), restitution=e)]
 
 
 def bounces(e: float, limit: float) -> Case:
-    """A case of R16: the heights of the first three bounces, from the parabolas between frames, relative."""
+    """Return a case of R16: the relative errors of the first three bounce heights, from the parabolas between impacts."""
     want = np.array(known(f"R16_bounce_e{e}")["values"]["heights"][:3])
     times = known(f"R16_bounce_e{e}")["values"]["impact_times"]
 
     def error(run: Run) -> float:
-        """Of the heights between impacts."""
+        """Return the largest relative error of the heights between impacts."""
         y, v, t = np.array([s[0] for s in run.seen]), np.array([s[1] for s in run.seen]), np.array(run.times)
         found = []
         for a, b in zip(times, times[1:], strict=False):
-            k = int(np.argmin(np.abs(t - (a + b) / 2)))  # in free flight: the top is at y + v^2 / 2g
+            k = int(np.argmin(np.abs(t - (a + b) / 2)))  # in free flight the apex is at y + v^2 / 2g
             found.append(y[k] + v[k] ** 2 / (2 * 9.81))
         return float(np.abs(np.array(found[:3]) / want - 1).max())
 
@@ -69,7 +69,7 @@ def bounces(e: float, limit: float) -> Case:
 
 
 def cradle() -> tuple[Particles, list[Feature]]:
-    """R17: five balls in a row, the first of them moving."""
+    """Build R17: five balls in a row, the first of them moving."""
     p = known("R17_newton_cradle")["params"]
     x = np.zeros((p["n"], 2))
     x[:, 0] = np.arange(p["n"]) * (2 * p["r"] + p["gap"])
@@ -78,14 +78,14 @@ def cradle() -> tuple[Particles, list[Feature]]:
 
 
 def slope(degrees: float, mu: float, speed: float) -> tuple[Particles, list[Feature]]:
-    """R18: a disc on an incline, sliding down at `speed`."""
+    """Build R18: a disc that slides down an incline at `speed` [m/s]."""
     a = np.radians(degrees)
     n, t = np.array([np.sin(a), np.cos(a)]), np.array([np.cos(a), -np.sin(a)])
     return Particles([0.1 * n], velocity=speed * t, radius=0.1), [Gravity(9.81), HalfSpace(n, friction=mu)]
 
 
 def slides(degrees: int, mu: float, speed: int, limit: float) -> Case:
-    """A case of R18: how far it goes until it stops, or in a second."""
+    """Return a case of R18: the distance until the disc stops, or in a second."""
     key = f"{degrees}deg_mu{mu:g}_v{speed}"
     v = known("R18_incline_friction")["values"][key]
     stops, a = v["state"] != "slides", np.radians(degrees)
@@ -93,7 +93,7 @@ def slides(degrees: int, mu: float, speed: int, limit: float) -> Case:
     way = np.array([np.cos(a), -np.sin(a)])
 
     def error(run: Run) -> float:
-        """Of the way that it slid."""
+        """Return the relative error of the sliding distance."""
         return abs(float((run.world.position[0] - run.world.particles.position[0]) @ way) / want - 1)
 
     return Case(
@@ -104,25 +104,31 @@ def slides(degrees: int, mu: float, speed: int, limit: float) -> Case:
 
 
 def round_hill() -> tuple[Particles, list[Feature]]:
-    """R19: a disc that slides off a smooth one, from 0.05 rad."""
+    """Build R19: a disc that slides off a smooth one, from 0.05 rad."""
     start = Particles([[0, 0], [np.sin(0.05), np.cos(0.05)]], radius=[0.9, 0.1], pinned=[0])
     return start, [Gravity(9.81), Contact()]
 
 
 def leaves(run: Run) -> float:
-    """How far from cos = 2/3 cos(0.05) it leaves [degrees]: in flight v_x^3 = g R cos^3 of the departure."""
+    """Return the error of the angle at which the disc leaves [degrees].
+
+    The known angle has cos = 2/3 cos(0.05). In flight v_x^2 = g R cos^3 of the angle of departure, with R = 1 m.
+    """
     angle = np.arccos(np.cbrt(run.world.velocity[1, 0] ** 2 / 9.81))
     return abs(float(np.degrees(angle - np.arccos(2 / 3 * np.cos(0.05)))))
 
 
 def column() -> tuple[Particles, list[Feature]]:
-    """R21: ten discs on top of each other."""
+    """Build R21: ten discs on top of each other."""
     x = np.stack([np.full(10, 0.5), 0.5 + np.arange(10.0)], axis=1)
     return Particles(x, radius=0.5), [Gravity(9.81), Drag(8.0), Contact(), Box((0, 0), (1, np.inf))]
 
 
 def carried(run: Run) -> float:
-    """The largest error of the forces between them: the k-th contact from the top carries k m g, less what the drag takes."""
+    """Return the largest relative error of the contact forces.
+
+    The k-th contact from the top carries k m g, less the share that drag takes in the substep.
+    """
     c, h = run.world.contacts, run.times[0] / run.reports[-1].substeps
     if len(c.pairs) < 9:
         return np.inf

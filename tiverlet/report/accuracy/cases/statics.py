@@ -1,4 +1,4 @@
-"""Ropes, beams and nets that come to rest: what is left is the error of the equilibrium, in positions or in shares."""
+"""Ropes, beams and nets that come to rest: errors of the equilibrium, in positions or relative."""
 
 from typing import Any
 
@@ -11,13 +11,13 @@ from ....forces import Drag, Force, Gravity
 from ....particles import Particles
 from .case import Case, Run, ends_at, known, links
 
-RATE = 4.0  # [1/s] of the drag that brings them to rest; after 10 s exp(-20) of a swing is left
-FINER: dict[str, Any] = {"efforts": (10, 20, 40, 80, 160)}  # where the order of Jacobi shows late
+RATE = 4.0  # [1/s] of the drag that brings scenes to rest; after 10 s exp(-20) of a swing is left
+FINER: dict[str, Any] = {"efforts": (10, 20, 40, 80, 160)}  # for scenes that need more substeps for the order of Jacobi
 SETTLED: dict[str, Any] = {"conserves": False, "trusted": 3e-9, "efforts": (5, 10, 20, 40, 80)}
 
 
 def rope(n: int, length: float, span: float, alpha: float) -> tuple[Particles, list[Feature]]:
-    """n links between two pins of the same height, let go as a V."""
+    """Build a rope of n links between two pins of the same height, released as a V."""
     t, depth = np.linspace(0, 1, n + 1), np.sqrt(length**2 - span**2) / 2
     x = np.stack([span * t, -depth * (1 - np.abs(2 * t - 1))], axis=1)
     link = Distance(links(n), length / n, compliance=alpha)
@@ -25,7 +25,7 @@ def rope(n: int, length: float, span: float, alpha: float) -> tuple[Particles, l
 
 
 def sags(name: str, key: str, n: int, length: float, span: float, alpha: float, limit: float, **more) -> Case:
-    """A hanging rope: its sag, as a share of what it should be."""
+    """Return the case of a hanging rope: the relative error of its sag."""
     values = known(name)["values"]
     sag = (values[key] if key else values)["sag"]
     what = f"Elastic rope of {n} links, {alpha:g} m/N" if alpha else f"Rope of {n} rigid links between two pins"
@@ -36,7 +36,7 @@ def sags(name: str, key: str, n: int, length: float, span: float, alpha: float, 
 
 
 def plumb(name: str) -> tuple[Particles, list[Feature]]:
-    """R11: an elastic chain that hangs straight down."""
+    """Build R11: an elastic chain that hangs straight down."""
     p = known(name)["params"]
     n = p["links"]
     x = np.stack([np.zeros(n + 1), -p["rest"] * np.arange(n + 1)], axis=1)
@@ -45,7 +45,7 @@ def plumb(name: str) -> tuple[Particles, list[Feature]]:
 
 
 def stretches(name: str, limit: float, **more) -> Case:
-    """A hanging elastic chain: its elongation, as a share of alpha m g N (N + 1) / 2."""
+    """Return the case of a hanging elastic chain: the relative error of its elongation alpha m g N (N + 1) / 2."""
     p, v = known(name)["params"], known(name)["values"]
     length = p["links"] * p["rest"]
     return Case(
@@ -57,7 +57,7 @@ def stretches(name: str, limit: float, **more) -> Case:
 
 @ti.func
 def _pull(x, v, t, i):
-    """1 N downward at the tip of the cantilever."""
+    """Return 1 N downward at the tip of the cantilever."""
     out = 0 * x
     if i == 11:
         out[1] = -1.0
@@ -65,7 +65,7 @@ def _pull(x, v, t, i):
 
 
 def cantilever() -> tuple[Particles, list[Feature]]:
-    """S06: a clamped strip of ten rigid links with angular springs, and a force at its tip."""
+    """Build S06: a clamped strip of ten rigid links with angular springs, and a force at its tip."""
     n = 10
     k = np.arange(n)
     x = np.stack([(np.arange(n + 2) - 1) / n, np.zeros(n + 2)], axis=1)
@@ -75,7 +75,7 @@ def cantilever() -> tuple[Particles, list[Feature]]:
 
 
 def net(n: int, alpha: float) -> tuple[Particles, list[Feature]]:
-    """S08: a net of n x n cells in a pinned frame of 1 m."""
+    """Build S08: a net of n x n cells in a pinned frame of 1 m."""
     k = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
     i, j = np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij")
     pairs = [np.stack([k[:-1].ravel(), k[1:].ravel()], axis=1), np.stack([k[:, :-1].ravel(), k[:, 1:].ravel()], axis=1)]
@@ -86,12 +86,12 @@ def net(n: int, alpha: float) -> tuple[Particles, list[Feature]]:
 
 
 def hollows(n: int, alpha: float, limit: float) -> Case:
-    """A net under its weight: how deep its middle is, as a share."""
+    """Return the case of a net under its weight: the relative error of the sag of its middle."""
     key = f"n{n}_alpha{alpha:g}"
     want = known("S08_net_sag")["values"][key]["center_y"]
 
     def error(run: Run) -> float:
-        """Of the sag in the middle."""
+        """Return the relative error of the sag in the middle."""
         return abs(float(run.world.position[(n + 1) ** 2 // 2, 1]) / want - 1)
 
     return Case(

@@ -1,6 +1,6 @@
-"""The stiff and extreme matrix: rows, each a scene that is run, measured, and passes or fails by its own criterion.
+"""The stiff and extreme matrix. Each row runs scenes, measures them, and passes or fails by its own criterion.
 
-A new row is one function with the decorator @row in a file here.
+To add a row, add one function with the decorator @row in a file of this folder.
 """
 
 from . import (  # noqa: F401  (they register their rows)

@@ -1,4 +1,4 @@
-"""Rows about elements and bodies: without extent, inside out, flat, or spinning too fast."""
+"""Rows about elements and bodies that have no extent, are inverted or flat, or spin too fast."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Rows about what is refused at the door: values that make no sense, with the name and the index of the first."""
+"""Rows about invalid arguments, which are refused with the name and the index of the first invalid value."""
 
 from typing import Any
 
@@ -19,12 +19,12 @@ LINE = np.arange(8.0).reshape(4, 2)
 
 
 def given(**settings):
-    """Particles with something wrong."""
+    """Return a function that makes particles with invalid settings."""
     return lambda: Particles(LINE, **settings)
 
 
 def scene(*features: Feature, **settings):
-    """A world with something wrong."""
+    """Return a function that makes a world with invalid features or settings."""
     return lambda: World(Particles(LINE, radius=0.1), features, **settings)
 
 

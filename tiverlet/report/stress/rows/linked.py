@@ -1,4 +1,4 @@
-"""Rows about links: mass ratios, stiffness, what has no direction and what contradicts itself."""
+"""Rows about links: mass ratios, stiffness, links without direction, and links that contradict each other."""
 
 from typing import Any
 
@@ -69,7 +69,7 @@ def _infinite() -> Finding:
 @row(7, "a link between two static particles", "skipped, and warned of where it is violated")
 def _idle() -> Finding:
     def build():
-        """Two pinned particles, off the length of their link."""
+        """Return a world of two pinned particles that violate their link."""
         from ....world import World
 
         return World(Particles([[0.0, 0], [1, 0]], pinned=[0, 1]), [Distance([[0, 1]], 3.0)])
@@ -188,7 +188,7 @@ def _contradiction() -> Finding:
         seen = []
         for _ in range(1000):
             seen.append(w.step(1 / 6).energy)
-        # On a line, a + a against 3: 2 (a - 1)^2 + (2 a - 3)^2 is least at a = 4/3, where each is off by 1/3.
+        # On a line, with lengths a, a and 2 a, 2 (a - 1)^2 + (2 a - 3)^2 is least at a = 4/3, where each link is off by 1/3.
         error = abs(w.last.residual - 1 / 3)
         return Finding(
             f"residual {w.last.residual:.4f}, least squares 0.3333",

@@ -1,4 +1,4 @@
-"""Rows about steps, precision and forces: nothing is lost in f32, and what is not finite is said at once."""
+"""Rows about steps, precision and forces: nothing is lost in f32, and non-finite values are reported in their frame."""
 
 import numpy as np
 
@@ -113,7 +113,7 @@ def _long() -> Finding:
 
 @ti.func
 def _spoilt(x, v, t, i):
-    """NaN for particle 3 after 0.1 s."""
+    """Return NaN for particle 3 after 0.1 s, else no force."""
     f = 0.0 * x
     if t > 0.099 and i == 3:
         f[0] = ti.sqrt(-1.0 - x[0] * x[0])
@@ -121,7 +121,7 @@ def _spoilt(x, v, t, i):
 
 
 def spoilt(*features, **settings) -> dict[str, bool]:
-    """Whether NaN of particle 3 is flagged on its frame, by name."""
+    """Check that NaN of particle 3 is flagged in its frame, with the particle. Returns whether each part holds."""
     with world(Particles(np.arange(12.0).reshape(6, 2), radius=0.1), [Force(_spoilt), *features], substeps=4, **settings) as w:
         seen = [w.step(0.05) for _ in range(4)]
         others = np.isfinite(np.delete(w.position, 3, axis=0)).all()
@@ -174,7 +174,7 @@ def _gravity() -> Finding:
 
 @ti.func
 def _stiff(x):
-    """1e6 N/m."""
+    """Return the force of a spring of 1e6 N/m."""
     return -1e6 * x
 
 
@@ -225,7 +225,7 @@ def _dragged() -> Finding:
 
 
 def _whole(x: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Momentum and angular momentum of particles of 1 kg."""
+    """Return the momentum and angular momentum of particles of 1 kg."""
     spin = [x[:, j] @ v[:, k] - x[:, k] @ v[:, j] for j in range(x.shape[1]) for k in range(j)]
     return np.r_[v.sum(axis=0), spin]
 

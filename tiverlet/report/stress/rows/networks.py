@@ -1,4 +1,4 @@
-"""Rows about many links together: doubled, over-constrained, hubs, long chains, loops and trees."""
+"""Rows about systems of links: doubled links, over-constrained clusters, hubs, long chains, loops and trees."""
 
 import numpy as np
 
@@ -106,7 +106,7 @@ def _trees() -> Finding:
     with world(Particles(x, velocity=v, mass=mass), [Distance(pairs)], substeps=1, solver=Direct()) as w:
         w.step(h)
         found = w.position
-    # One Newton step of all links at once: gradients at the prediction, directions at the start.
+    # The reference is one Newton step of all links, with gradients at the prediction and directions at the start.
     i, j = pairs.T
     now, before = (x + h * v)[i] - (x + h * v)[j], x[i] - x[j]
     length, rest = np.linalg.norm(now, axis=1), np.linalg.norm(before, axis=1)

@@ -1,4 +1,4 @@
-"""Rows about rays: those that go nowhere, along walls, from surfaces, and in very small and very large scenes."""
+"""Rows about rays: without direction, along walls, from surfaces, and in very small and very large scenes."""
 
 import numpy as np
 
@@ -37,7 +37,7 @@ def _along() -> Finding:
             ("from the surface, out", 0.0, (0, 1), INF), ("from the surface, in", 0.0, (0, -1), 0.0), ("down", 1.0, (0, -1), 1.0),
         ):  # fmt: skip
             if isinstance(wall, Capsule) and name == "from the surface, along":
-                continue  # which goes along the seam between its round end and its side
+                continue  # the ray would follow the seam between its round end and its side
             distance, _ = wall.cast(np.array([[0.0, height]]), np.array([way], dtype=float), 0.0)
             holds[f"{wall!r}: {name}"] = bool(np.where(distance < 8, distance, INF)[0] == far)  # other sides are further away
     return Finding(f"{sum(holds.values())} of {len(holds)} as they should", holds)
@@ -50,7 +50,7 @@ def _sizes() -> Finding:
     sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = [face for a, b, c, d in sides for face in ((a, b, c), (a, c, d))]
     start, way = np.array([-3.0, 0.2, 0.1]), np.array([1.0, 0.0, 0.0])
-    round_off = np.sqrt(1 - 0.2**2 - 0.1**2)  # how far a ball of 1 m goes along x, beside its middle
+    round_off = np.sqrt(1 - 0.2**2 - 0.1**2)  # half the chord of a ball of 1 m along the ray
     for precision, digits in (("f64", 1e-12), ("f32", 1e-6)):
         for size in SIZES:
             for away in (0.0, 1e6 * size):

@@ -1,4 +1,4 @@
-"""Rows of the stiff and extreme matrix: how one is written, and what is helpful in many."""
+"""Rows of the stiff and extreme matrix: the decorator that registers them, and helpers."""
 
 import re
 import warnings
@@ -20,7 +20,7 @@ NAN, INF = float("nan"), float("inf")
 
 @dataclass(frozen=True)
 class Row:
-    """A row: its number, what is extreme, the criterion, and the function that tries it: () -> Finding."""
+    """A row: its number, the extreme case, the criterion, and the function that runs it: () -> Finding."""
 
     number: int
     what: str
@@ -30,24 +30,24 @@ class Row:
 
 @dataclass
 class Finding:
-    """What a row has found: a figure in words, and whether each part of its criterion holds."""
+    """The result of a row: a figure in words, and whether each part of its criterion holds."""
 
     figure: str
     holds: dict[str, bool] = field(default_factory=dict)
 
 
 class NotAvailable(Exception):
-    """What a row is about is not part of this tiverlet."""
+    """Raised by a row whose subject this version of tiverlet does not have."""
 
 
 ROWS: dict[int, Row] = {}
 
 
 def row(number: int, what: str, criterion: str) -> Callable:
-    """Register a function as the row of this number."""
+    """Return a decorator that registers a function as the row of this number."""
 
     def register(attempt: Callable[[], Finding]) -> Callable[[], Finding]:
-        """Enter it, once."""
+        """Register the function. Raises ValueError if the number is taken."""
         if number in ROWS:
             raise ValueError(f"row {number} is there twice.")
         ROWS[number] = Row(number, what, criterion, attempt)
@@ -58,7 +58,7 @@ def row(number: int, what: str, criterion: str) -> Callable:
 
 @contextmanager
 def world(particles: Particles, features: Sequence[Feature] = (), **settings) -> Iterator[Any]:
-    """A world in f64 that is closed at the end; warnings about its structure are not shown."""
+    """Provide a world in f64 that is closed at the end; warnings about its structure are suppressed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         made = World(particles, features, **{"precision": "f64", **settings})
@@ -69,7 +69,7 @@ def world(particles: Particles, features: Sequence[Feature] = (), **settings) ->
 
 
 def rerun(w: World, seconds: float, dt: float = 1 / 60, **settings) -> StepReport:
-    """Put a world back to its start and run it with other settings, at no compile cost; the worst of all frames."""
+    """Restore the start of a world and run it with other settings, without compiling. Returns the worst report of all frames."""
     w.position, w.velocity = w.particles.position, w.particles.velocity
     for name, value in settings.items():
         setattr(w, name, value)
@@ -77,7 +77,7 @@ def rerun(w: World, seconds: float, dt: float = 1 / 60, **settings) -> StepRepor
 
 
 def refused(*attempts: tuple[Callable[[], object], str]) -> Finding:
-    """Each attempt has to raise a ValueError or TypeError whose text fits the pattern."""
+    """Check that each attempt raises a ValueError or TypeError whose text matches its pattern."""
     holds = {}
     for attempt, pattern in attempts:
         try:
@@ -93,7 +93,7 @@ def refused(*attempts: tuple[Callable[[], object], str]) -> Finding:
 
 
 def warned(attempt: Callable[[], object], pattern: str) -> bool:
-    """Whether a warning fits the pattern."""
+    """Whether the attempt causes a warning that matches the pattern."""
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always")
         made = attempt()
@@ -103,12 +103,12 @@ def warned(attempt: Callable[[], object], pattern: str) -> bool:
 
 
 def finite(w: World) -> bool:
-    """Whether all positions and velocities are."""
+    """Whether all positions and velocities are finite."""
     return bool(np.isfinite(w.position).all() and np.isfinite(w.velocity).all())
 
 
 def contacts_of(position: np.ndarray, radius, **settings) -> np.ndarray:
-    """All pairs that a world finds to overlap, in the same order."""
+    """Return all pairs that overlap in a world, sorted by their indices."""
     from ....contact import Contact
 
     with world(Particles(position, radius=radius), [Contact(**settings)]) as w:
@@ -118,7 +118,7 @@ def contacts_of(position: np.ndarray, radius, **settings) -> np.ndarray:
 
 
 def same_pairs(position: np.ndarray, radius, **settings) -> Finding:
-    """Contacts of a cloud against brute force."""
+    """Compare the contacts of a cloud of particles with brute force."""
     found, want = contacts_of(position, radius, **settings), overlapping(position, radius)[0]
     missed = len(set(map(tuple, want)) - set(map(tuple, found)))
     return Finding(

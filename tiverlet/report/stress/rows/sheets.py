@@ -1,4 +1,4 @@
-"""Rows about sheets: nets and cloth that are taut, wide, or stiffer than a solver resolves."""
+"""Rows about sheets: nets and cloth that are taut, large, or stiffer than a solver resolves."""
 
 import numpy as np
 
@@ -52,7 +52,7 @@ def _wide() -> Finding:
     n, mass, gale, speed = 60, 0.2, 3.0, 1.0
     sheet = cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (n, n))
     pairs = np.concatenate([sheet.links, sheet.braces])
-    supplied = 0.5 * mass * (gale + speed) ** 2  # by wind and ball: no more than what brings all to their speed
+    supplied = 0.5 * mass * (gale + speed) ** 2  # bound: the energy at the speed of wind plus ball
     holds, worst, most = {}, 0.0, -np.inf
     for name, compliance, solver in (("rigid", 0.0, None), ("1e-6", 1e-6, None), ("1e-6, Jacobi", 1e-6, Jacobi())):
         ball = Ball((0.5, -0.5, 0.5), 0.3)

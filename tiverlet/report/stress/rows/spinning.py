@@ -1,4 +1,4 @@
-"""Rows about particles that spin: what is fast, unequal or without a radius."""
+"""Rows about particles that spin: fast, of unequal mass and size, or without a radius."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Rows about what has more constraints than freedoms, or a load that no constraint bears to first order."""
+"""Rows about scenes with more constraints than degrees of freedom, or with a load that no constraint bears to first order."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -20,11 +20,11 @@ G, MASS = 9.81, 0.01
 STEPS = (2, 20, 200, "auto")
 RULE = "energy never above what it was plus 1e-3 of m g times the size, no speed above free fall, what is not met is flagged"
 SECONDS = 10
-WHIP = 2.0  # a chain that swings beats free fall, by less than this
+WHIP = 2.0  # bound of speed over that of free fall: the end of a swinging chain is faster than free fall
 
 
 class Watch:
-    """Runs passive scenes with every number of substeps, and keeps the worst of all."""
+    """Runs passive scenes with every number of substeps, and keeps the worst figures."""
 
     def __init__(self):
         self.gain, self.speed, self.holds, self.flags = -np.inf, 0.0, {}, set()
@@ -33,8 +33,11 @@ class Watch:
         self, name: str, particles: Particles, features: Sequence[Feature], most: float = 1e-2, room: float = 1e-3, steps=STEPS,
         **settings,
     ) -> None:  # fmt: skip
-        """most: the residual from where on a frame has to have a flag. room: how much more energy there may be, of m g L, where
-        it is flagged "unconverged"; 1e-3 where not. steps: the numbers of substeps."""
+        """Run a scene with each number of substeps in `steps`.
+
+        most: the residual above which a frame under "auto" must have a flag. room: the allowed gain of energy, as a share of m g
+        L, if a frame is flagged "unconverged"; else 1e-3.
+        """
         free = np.flatnonzero(~particles.pinned)
         x = particles.position
         size = float(np.ptp(x, axis=0).max())
@@ -62,13 +65,13 @@ class Watch:
                 self.gain, self.speed = max(self.gain, gain), max(self.speed, fastest)
 
     def finding(self, **more: bool) -> Finding:
-        """The worst of all."""
+        """Return the worst figures of all runs. more: further parts of the criterion."""
         told = ", ".join(sorted(self.flags)) or "no flag"
         return Finding(f"energy {self.gain:+.0e}, {self.speed:.2f} of free fall; {told}", {**self.holds, **more})
 
 
 def ropes(counts: Iterable[int], ends: Iterable[Sequence[float]], rest: float = 1.0) -> tuple[Particles, np.ndarray, np.ndarray]:
-    """Straight ropes between pins, side by side in 3D: particles, pairs and rest lengths."""
+    """Build straight ropes between pins, side by side in 3D: particles, pairs and rest lengths."""
     x = [np.linspace((0, 2, k), (*np.add((0, 2), end), k), n) for k, (n, end) in enumerate(zip(counts, ends, strict=True))]
     first = np.cumsum([0, *map(len, x)])
     pairs = np.vstack([links(len(a) - 1) + k for a, k in zip(x, first, strict=False)])
@@ -78,7 +81,7 @@ def ropes(counts: Iterable[int], ends: Iterable[Sequence[float]], rest: float = 
 
 
 def grid(nx: int, ny: int, length: float = 0.1, braced: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Points of a lattice in 2D, and its links, with both diagonals where braced."""
+    """Return the points of a lattice in 2D and its links, with both diagonals if braced."""
     k = np.arange(nx * ny).reshape(nx, ny)
     x = np.stack(np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij"), axis=2).reshape(-1, 2) * length + [0, 2]
     pairs = [(k[:-1], k[1:]), (k[:, :-1], k[:, 1:])]
@@ -88,7 +91,7 @@ def grid(nx: int, ny: int, length: float = 0.1, braced: bool = True) -> tuple[np
 
 
 def complete(n: int) -> np.ndarray:
-    """Each with each."""
+    """Return all pairs of n particles."""
     return np.array([(i, j) for i in range(n) for j in range(i)])
 
 
@@ -99,7 +102,7 @@ LEVEL = [(1.0, 0.0)]
 def _taut() -> Finding:
     watch = Watch()
     for precision in ("f32", "f64"):
-        for counts, room in (((2, 5, 40), 1e-3), ((400,), 2e-2)):  # the longest hangs through by 0.9 of its length
+        for counts, room in (((2, 5, 40), 1e-3), ((400,), 2e-2)):  # the longest sags by 0.9 of its length
             particles, pairs, _ = ropes(counts, LEVEL * len(counts))
             watch.run("Distance", particles, [Gravity(G), Distance(pairs)], precision=precision, room=room)
     particles, pairs, _ = ropes((5, 40), LEVEL * 2)

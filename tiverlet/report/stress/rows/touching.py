@@ -1,4 +1,4 @@
-"""Rows about contacts, cells and walls: no contact is lost, nothing explodes, nothing passes a wall."""
+"""Rows about contacts, cells and walls: no contact is missed, no energy is gained, and no particle passes a wall."""
 
 import numpy as np
 
@@ -75,7 +75,7 @@ def _crowd() -> Finding:
     made = []
 
     def build() -> None:
-        """A world of them, and how many pairs touch."""
+        """Build a world of the particles, and count the pairs that touch."""
         from ....world import World
 
         with World(Particles(x, radius=0.5), [Contact()], precision="f64") as w:
@@ -132,7 +132,7 @@ ROOMS = {
 
 
 def _kept_in(features, pinned, holds: dict[str, bool], **settings) -> float:
-    """Throw 40 particles about in every room, at v h = 0.1 ... 100 half widths; how far outside one was at worst."""
+    """Throw 40 particles about in every room, at v h = 0.1 ... 100 half widths. Returns the largest distance outside [m]."""
     rng, worst = np.random.default_rng(0), 0.0
     x = np.concatenate([rng.uniform(-0.6, 0.6, (40, 2)), rng.uniform(-3, 3, (len(pinned), 2))])
     aim = rng.normal(size=x.shape)
@@ -274,7 +274,7 @@ def _far() -> Finding:
     x = [(-0.5, 0.2), (0.0, 0.1), (0.5, 0.3), (0.1, 0.4), (2.017036, -0.207938), (2.5, -1.0)]
 
     def places(far: float, *contact: Contact) -> np.ndarray:
-        """Where all others end, with a static particle so far away."""
+        """Return the final positions of all other particles, with a static particle at (far, far)."""
         wire = Path([4, 5], [[2.0, 0.0], [2.5, -1.0], [3.0, -0.5], [4.0, -1.5]])
         start = Particles([*x, (far, far)], radius=0.05, pinned=[len(x)])
         with world(start, [Gravity(9.81), Sdf(_round_room), wire, *contact], precision="f32") as w:
@@ -286,7 +286,7 @@ def _far() -> Finding:
     holds["1e6 m, without contacts"] = np.array_equal(alone, places(1e6))
     try:
         places(1e6, Contact())
-    except ValueError as error:  # cells that f32 cannot tell apart
+    except ValueError as error:  # f32 cannot distinguish neighbouring cells there
         holds["1e6 m, with contacts of 5 cm, is refused"] = "Shift the scene" in str(error)
     gap = float((0.95 - np.linalg.norm(near[:4], axis=1)).min())
     return Finding(f"{abs(gap):.0e} m above the ground", {**holds, "on the ground": abs(gap) < 1e-5})
@@ -294,5 +294,5 @@ def _far() -> Finding:
 
 @ti.func
 def _round_room(p):
-    """Distance from a round wall, from inside."""
+    """Return the distance from a round wall, measured from inside."""
     return 1 - p.norm()
