@@ -1,2 +1,1 @@
-"""Plain geometry in NumPy and f64: rays, segments, triangles, trees of boxes around many of them, rows in order. It knows of no
-world."""
+"""Plain geometry in NumPy and f64, independent of worlds: rays, segments, triangles, bounding volume trees, sorted rows."""

@@ -1,38 +1,37 @@
-"""Which of many boxes to look at first, for many questions at once: a bounding volume hierarchy."""
+"""A bounding volume hierarchy over boxes, for many queries at once."""
 
 from collections.abc import Callable
 
 import numpy as np
 
 WIDE = 4  # children of a node, and boxes in a leaf
-FEW = 1 << 13  # pairs of a question and a box that are all looked at, in less time than a tree is made
-ONCE = 2  # questions for which no tree pays, however many boxes there are
-CHUNK = 1 << 14  # questions that go through the tree together
-TINY = 1e-300  # component of a direction that stands for 0: what is beside a slab stays there
-SLACK = 2.0**-40  # of the largest coordinate: boxes are larger by so much, for what rounds
+FEW = 1 << 13  # pairs of a query and a box up to which comparing all pairs takes less time than building a tree
+ONCE = 2  # queries for which no tree pays, for any number of boxes
+CHUNK = 1 << 14  # queries that descend the tree together
+TINY = 1e-300  # replaces 0 as a component of a direction: a ray beside a slab stays beside it
+SLACK = 2.0**-40  # of the largest coordinate: boxes are enlarged by so much, for rounding
 
 Answer = tuple[np.ndarray, np.ndarray]
 
 
 class BoundingTree:
-    """Boxes from low to high, (m, dim) each, none of them empty.
+    """A tree of boxes from low to high, (m, dim) each, none of them empty.
 
-    Boxes are sorted along a Morton curve through the ranks of their middles: ranks, so that one that is far away harms no other.
-    Four of them make a leaf, and four nodes one of the level above. All questions go down at the same time, each by its own
-    stack, to what is nearest first.
+    Boxes are sorted along a Morton curve through the ranks of their middles. Ranks keep the curve even where one box is far away.
+    Four boxes make a leaf, and four nodes make a node of the level above. All queries descend together, each with its own stack,
+    and visit the nearest child first.
     """
 
     def __init__(self, low: np.ndarray, high: np.ndarray):
         slack = SLACK * max(np.abs(low).max(initial=0.0), np.abs(high).max(initial=0.0))
         self.low, self.high, self.count = low - slack, high + slack, len(low)
-        self._first = -1  # leaf, once the tree is made
+        self._first = -1  # index of the first leaf; -1 until the tree is built
 
     def first(self, questions: int, most: np.ndarray, bound: Callable, value: Callable) -> Answer:
-        """For each question the least value of all boxes, at most most[q], and which box has it; (inf, -1) where none has one.
+        """Return for each query the least value of all boxes up to most[q], and its box; (inf, -1) where there is none.
 
-        bound(q, low, high): for questions q (k,) and boxes around several of them, (k, ..., dim): no more than the values in
-        there, inf where there are none. value(q, b): of question q[i] and box b[i]. Of equal ones the box of the lower number is
-        taken, whichever way it is found.
+        bound(q, low, high): a lower bound of the values in larger boxes (k, ..., dim) for queries q (k,); inf where these hold
+        none. value(q, b): the value of query q[i] and box b[i]. Of equal values, the box with the lower index is returned.
         """
         if not self.count or not questions:
             return np.full(questions, np.inf), np.full(questions, -1)
@@ -47,7 +46,7 @@ class BoundingTree:
         return np.concatenate([a for a, _ in answers]), np.concatenate([b for _, b in answers])
 
     def _compare(self, some: np.ndarray, most: np.ndarray, bound: Callable, value: Callable) -> Answer:
-        """All boxes."""
+        """Answer queries by comparing each with all boxes."""
         with np.errstate(over="ignore"):
             near = bound(some, self.low[None], self.high[None])
         values = np.full(near.shape, np.inf)
@@ -59,7 +58,7 @@ class BoundingTree:
         return np.where(found, best, np.inf), np.where(found, at, -1)
 
     def _grow(self) -> None:
-        """Sort the boxes, and make the nodes from the leaves up; what is missing in the last ones is NaN, which nothing meets."""
+        """Build the tree: sort the boxes and make the nodes from the leaves up. Missing children are NaN, which no query hits."""
         dim = self.low.shape[1]
         depth = 0
         while WIDE ** (depth + 1) < self.count:
@@ -78,7 +77,7 @@ class BoundingTree:
         self._first, self._depth = (WIDE**depth - 1) // (WIDE - 1), depth
 
     def _descend(self, some: np.ndarray, most: np.ndarray, bound: Callable, value: Callable) -> Answer:
-        """Through the tree."""
+        """Answer queries by descending the tree."""
         best, found = most.astype(float), np.full(len(some), -1)
         room = (WIDE - 1) * self._depth + 2
         node, least = np.zeros((len(some), room), dtype=np.int32), np.full((len(some), room), -np.inf)
@@ -109,7 +108,7 @@ class BoundingTree:
         return np.where(found >= 0, best, np.inf), found
 
     def _look(self, rows, here, some, best, found, value) -> None:
-        """At the boxes of one leaf for each row."""
+        """Compare each row's query with the boxes of one leaf, and update `best` and `found`."""
         items = self._items[WIDE * (here - self._first)[:, None] + np.arange(WIDE)]
         there = items >= 0
         values = np.full(items.shape, np.inf)
@@ -123,12 +122,12 @@ class BoundingTree:
 
 
 def ahead(origin: np.ndarray, direction: np.ndarray, extra: float) -> Callable:
-    """A bound for rays: how far it is to a box that is larger by `extra` [m]."""
+    """Return a bound for rays: the distance to a box that is enlarged by `extra` [m]."""
     inverse = 1.0 / np.where(np.abs(direction) < TINY, TINY, direction)
     extra = extra + SLACK * np.abs(origin).max(axis=1)
 
     def bound(q: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Where the slabs of all axes are entered, if that is before any is left."""
+        """Return the distance at which rays have entered the slabs of all axes; inf where a slab is left before."""
         enter, leave = _slabs(origin[q], inverse[q], extra[q], low, high)
         return np.where((enter <= leave) & (leave >= 0), np.maximum(enter, 0.0), np.inf)
 
@@ -136,12 +135,12 @@ def ahead(origin: np.ndarray, direction: np.ndarray, extra: float) -> Callable:
 
 
 def beyond(origin: np.ndarray, direction: np.ndarray, extra: float) -> Callable:
-    """A bound for rays in boxes that are larger by `extra` [m]: the negative of how far it is until one is left."""
+    """Return a bound for rays in boxes that are enlarged by `extra` [m]: minus the distance to the exit from the box."""
     inverse = 1.0 / np.where(np.abs(direction) < TINY, TINY, direction)
     extra = extra + SLACK * np.abs(origin).max(axis=1)
 
     def bound(q: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Where the first slab of a box is left, of those that the ray starts in."""
+        """Return minus the distance at which rays leave the first slab; inf for boxes in which they do not start."""
         enter, leave = _slabs(origin[q], inverse[q], extra[q], low, high)
         return np.where((enter <= 0) & (leave >= 0), -leave, np.inf)
 
@@ -149,10 +148,10 @@ def beyond(origin: np.ndarray, direction: np.ndarray, extra: float) -> Callable:
 
 
 def apart(points: np.ndarray) -> Callable:
-    """A bound for points: how far they are from a box."""
+    """Return a bound for points: their distance from a box."""
 
     def bound(q: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """The length of what is missing along the axes."""
+        """Return the distances from points to boxes [m]."""
         x = points[q][:, None]
         off = np.maximum(np.maximum(low - x, x - high), 0.0)
         distance = np.sqrt((off * off).sum(axis=-1))
@@ -162,14 +161,14 @@ def apart(points: np.ndarray) -> Callable:
 
 
 def _slabs(origin, inverse, extra, low, high) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays enter the last slab of boxes (k, b, dim), and where they leave the first."""
+    """Return where rays enter the last slab of boxes (k, b, dim), and where they leave the first slab."""
     o, i, e = origin[:, None], inverse[:, None], extra[:, None, None]
     one, two = (low - e - o) * i, (high + e - o) * i
     return np.minimum(one, two).max(axis=-1), np.maximum(one, two).min(axis=-1)
 
 
 def _morton(middle: np.ndarray) -> np.ndarray:
-    """Numbers whose order is that of a curve which stays close: the bits of the ranks along the axes, one after the other."""
+    """Return the Morton codes of points (m, dim), whose order follows a space-filling curve: interleaved bits of ranks."""
     out = np.zeros(len(middle), dtype=np.int64)
     ranks = [np.unique(middle[:, k], return_inverse=True)[1].ravel() for k in range(middle.shape[1])]
     bits = min(62 // middle.shape[1], len(middle).bit_length())

@@ -1,31 +1,31 @@
-"""Where a straight line is inside of convex things: from one distance along it to another, (inf, -inf) where it misses.
+"""Intervals of a straight line inside convex shapes: the distances at which it enters and leaves, (inf, -inf) if it misses.
 
-A line is origin + t direction, of unit direction; origins and directions are (m, dim), and so is what they are compared with,
-row by row. What a line only grazes, within rounding, it enters and leaves in the same place.
+A line is origin + t direction, with a unit direction. Origins, directions and shapes have one row per line, (m, dim). A line that
+only grazes a shape, within rounding, enters and leaves it at the same distance.
 """
 
 import numpy as np
 
-ROUNDING = 2.0**-44  # of the largest length that a result is made of: sums of some terms, each within 2^-53 of its own
-PARALLEL = 2.0**-96  # square of the sine of an angle that is nothing but rounding
+ROUNDING = 2.0**-44  # of the largest length in a result: a sum of some terms, each rounded to 2^-53 of its size
+PARALLEL = 2.0**-96  # square of the sine of an angle that is only rounding
 
 Interval = tuple[np.ndarray, np.ndarray]
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of rows."""
+    """Return the dot products of rows."""
     return np.einsum("...i,...i->...", a, b)
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of rows (m, 3), to the bit as np.cross, which takes three times as long, whether they are few or many."""
+    """Return the cross products of rows (m, 3), bit for bit those of np.cross, which takes three times as long."""
     x, y, z = a.T
     u, v, w = b.T
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
 
 
 def rounding(*vectors: np.ndarray) -> np.ndarray:
-    """What it amounts to in results that are made of these rows [m]."""
+    """Return the rounding error of results that are computed from these rows, (m,) [m]."""
     size = np.abs(vectors[0]).max(axis=-1)
     for v in vectors[1:]:
         size = np.maximum(size, np.abs(v).max(axis=-1))
@@ -33,10 +33,10 @@ def rounding(*vectors: np.ndarray) -> np.ndarray:
 
 
 def entry(interval: Interval, close: np.ndarray) -> np.ndarray:
-    """How far a ray goes until it enters, inf where it does not.
+    """Return the distance at which a ray enters; inf where it does not.
 
-    It does not enter what it starts inside of. A start on the surface, within `close`, enters at 0 if the way leads in; not where
-    the thing ends there, as what has no thickness does.
+    A ray does not enter a shape in which it starts. A ray that starts on the surface, within `close`, enters at 0 if it leads
+    into the shape; but not where the interval ends there, as for a shape without thickness.
     """
     enter, leave = interval
     with np.errstate(invalid="ignore"):
@@ -44,14 +44,14 @@ def entry(interval: Interval, close: np.ndarray) -> np.ndarray:
 
 
 def exit_of(interval: Interval, close: np.ndarray) -> np.ndarray:
-    """How far a ray goes until it leaves, into what is all around, inf where it does not; 0 where it leaves at its start."""
+    """Return the distance at which a ray leaves the shape; inf where it does not, 0 where it leaves at its start."""
     enter, leave = interval
     with np.errstate(invalid="ignore"):
         return np.where((leave >= -close) & (enter < leave), np.maximum(leave, 0.0), np.inf)
 
 
 def union(*intervals: Interval) -> Interval:
-    """Of pieces of one convex thing."""
+    """Return the union of intervals of the pieces of one convex shape."""
     enter, leave = intervals[0]
     for a, b in intervals[1:]:
         enter, leave = np.minimum(enter, a), np.maximum(leave, b)
@@ -59,7 +59,7 @@ def union(*intervals: Interval) -> Interval:
 
 
 def common(*intervals: Interval) -> Interval:
-    """What all of them have."""
+    """Return the intersection of intervals."""
     enter, leave = intervals[0]
     for a, b in intervals[1:]:
         enter, leave = np.maximum(enter, a), np.minimum(leave, b)
@@ -67,14 +67,14 @@ def common(*intervals: Interval) -> Interval:
 
 
 def ball(origin: np.ndarray, direction: np.ndarray, center: np.ndarray, radius) -> Interval:
-    """Within `radius` of a center; a radius below 0 leaves nothing."""
+    """Return the intervals within `radius` of a center. A radius below 0 gives none."""
     m = origin - center
     middle = -dot(m, direction)
     return _chord(middle, m + middle[:, None] * direction, np.ones(len(m)), radius, rounding(m, origin))
 
 
 def capsule(origin: np.ndarray, direction: np.ndarray, a: np.ndarray, b: np.ndarray, radius) -> Interval:
-    """Within `radius` of the segment from a to b: a cylinder and two balls."""
+    """Return the intervals within `radius` of the segment from a to b: a cylinder and two balls."""
     axis = b - a
     length = np.sqrt(dot(axis, axis))
     u = axis / np.where(length > 0, length, 1.0)[:, None]
@@ -94,7 +94,10 @@ def capsule(origin: np.ndarray, direction: np.ndarray, a: np.ndarray, b: np.ndar
 
 
 def slab(place: np.ndarray, speed: np.ndarray, low, high, close: np.ndarray | float = 0.0) -> Interval:
-    """Where low <= place + t speed <= high; these may be infinite. What is as near to one of them as `close` begins there."""
+    """Return the intervals of t with low <= place + t speed <= high.
+
+    low, high: may be infinite. close: a place as near as this to a bound counts as on the bound.
+    """
     stands = speed == 0
     inverse = 1.0 / np.where(stands, 1.0, speed)
     below, above = low - place, high - place
@@ -107,14 +110,15 @@ def slab(place: np.ndarray, speed: np.ndarray, low, high, close: np.ndarray | fl
 
 
 def box(origin: np.ndarray, direction: np.ndarray, low: np.ndarray, high: np.ndarray, close: np.ndarray) -> Interval:
-    """Between two corners (dim,)."""
+    """Return the intervals inside a box between two corners (dim,)."""
     return common(*(slab(origin[:, k], direction[:, k], low[k], high[k], close) for k in range(origin.shape[1])))
 
 
 def triangle(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray) -> Interval:
-    """The one place of a facet, corners (m, dim, dim), segments in 2D: found so that lines cannot pass between neighbours.
+    """Return the intervals (of length 0) at which lines hit facets, corners (m, dim, dim): triangles, or segments in 2D.
 
-    On which side of a corner (2D) or an edge (3D) a line passes is worked out alike for all facets that have it, to the bit.
+    Lines cannot pass between adjacent facets: the side on which a line passes a corner (2D) or an edge (3D) is computed bit for
+    bit alike for all facets that share it.
     """
     if origin.shape[1] == 2:
         sides = _turn(direction[:, None], corners - origin[:, None])
@@ -123,7 +127,7 @@ def triangle(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray) -> 
         normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1)
     else:
         r = corners - origin[:, None]
-        sides = dot(direction[:, None], np.cross(r, r[:, [1, 2, 0]]))  # cross(b, a) is -cross(a, b) to the bit
+        sides = dot(direction[:, None], np.cross(r, r[:, [1, 2, 0]]))  # cross(b, a) is -cross(a, b) bit for bit
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     across = dot(normal, direction)
     hit = ((sides >= 0).all(axis=1) | (sides <= 0).all(axis=1)) & (across != 0)
@@ -132,7 +136,7 @@ def triangle(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray) -> 
 
 
 def rounded(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray, radius) -> Interval:
-    """Within `radius` of a facet, corners (m, dim, dim): capsules around its edges, and in 3D the prism between them."""
+    """Return the intervals within `radius` of facets, corners (m, dim, dim): capsules around the edges, and in 3D a prism."""
     if origin.shape[1] == 2:
         return capsule(origin, direction, corners[:, 0], corners[:, 1], radius)
     edges = [capsule(origin, direction, corners[:, k], corners[:, (k + 1) % 3], radius) for k in range(3)]
@@ -147,7 +151,10 @@ def rounded(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray, radi
 
 
 def _chord(middle: np.ndarray, off: np.ndarray, square: np.ndarray, radius, close: np.ndarray) -> Interval:
-    """Where a line of speed sqrt(square) is within `radius` of a center that it passes at `middle`, with `off` in between."""
+    """Return the intervals in which lines of speed sqrt(square) are within `radius` of a center.
+
+    middle: (m,) parameter of the nearest point. off: (m, dim) vector from the center to the nearest point [m].
+    """
     h = np.sqrt(dot(off, off))
     half = np.sqrt(np.maximum((radius - h) * (radius + h), 0.0) / square)
     return _unless((h > radius + close) | (np.asarray(radius) < 0), middle - half, middle + half)

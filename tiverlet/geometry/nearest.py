@@ -1,4 +1,4 @@
-"""The nearest points of segments and triangles."""
+"""Nearest points of segments and triangles, and normals there."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from .intervals import dot
 
 
 def on_segment(x: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The point of the segment from a to b that is nearest to x, (m, dim), and where it is, from 0 at a to 1 at b, (m,)."""
+    """Return the point of the segment from a to b nearest to x, (m, dim) [m], and its parameter, (m,), 0 at a and 1 at b."""
     axis = b - a
     square = dot(axis, axis)
     t = np.clip(dot(x - a, axis) / np.where(square > 0, square, 1.0), 0.0, 1.0)
@@ -14,9 +14,9 @@ def on_segment(x: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray,
 
 
 def on_facet(x: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The point of a facet, corners (m, dim, dim), that is nearest to x, (m, dim), and of which of its parts it is, (m,).
+    """Return the point of a facet, corners (m, dim, dim), nearest to x, (m, dim) [m], and the part of the facet, (m,).
 
-    Parts: its corners 0, 1 (2), its edges 01, 12, 20 (3D) as 3, 4, 5, and -1 for its inside.
+    Parts: corners are 0, 1 (and 2 in 3D); the edges 01, 12, 20 in 3D are 3, 4, 5; the inside is -1.
     """
     dim = x.shape[1]
     if dim == 2:
@@ -38,9 +38,10 @@ def on_facet(x: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def away(point: np.ndarray, nearest: np.ndarray, direction: np.ndarray, along: np.ndarray, close: np.ndarray) -> np.ndarray:
-    """Unit normals (m, dim) at points of surfaces, from the nearest points of what is inside of them.
+    """Return unit normals (m, dim) at points of a rounded surface.
 
-    What has no thickness has its normal against the direction that a ray comes in, at right angles to `along`.
+    point, nearest: the point, and the nearest point of the core inside the surface, (m, dim) [m]. Where both agree within
+    `close`, the normal is opposite to the ray's `direction`, at right angles to `along`.
     """
     r = point - nearest
     size = np.sqrt(dot(r, r))

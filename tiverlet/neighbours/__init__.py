@@ -1,4 +1,4 @@
-"""Which particles are near: periodic boxes, cell list, search, neighbour list, queries."""
+"""Neighbours: periodic boxes, the cell list, the search for near pairs, the neighbour list, queries."""
 
 from .periodic import Periodic
 

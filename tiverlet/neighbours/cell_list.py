@@ -1,15 +1,15 @@
 """A spatial hash over an unbounded domain, for particles of any sizes.
 
-The hash folds space onto a torus of cells, cell (a, b, ...) to bucket (a mod A, b mod B, ...) with A, B powers of two
-of at least 4. The three cells around a particle along each axis thus fall into different buckets, so every bucket is read
-once and every pair is seen once, however many far cells share a bucket; those are told apart by the distance itself. CellList
-of a row stand side by side in memory. Counting sort; no cell has a capacity. On a GPU the counters are atomic, and the order
-within a cell is another one in every run: no result may depend on it.
+The hash folds space onto a torus of cells: cell (a, b, ...) goes to bucket (a mod A, b mod B, ...), with A, B powers of two
+of at least 4. The three cells around a particle along each axis thus fall into different buckets. So every bucket is read
+once and every pair is found once, even where distant cells share a bucket: the distance test excludes particles of those cells.
+Cells of a row are adjacent in memory. Particles are sorted by counting, so no cell has a capacity. On a GPU the counters are
+atomic, and the order within a cell differs from run to run: no result may depend on it.
 
-Particles whose sizes differ by more than a factor of two stand in tables of their own, with cells of their size: level 0 holds
-the largest, each next level sizes down to half of those before. The size of a particle is its radius, and half of how much
-further it has to be found. A particle looks at its own level and at the coarser ones, where
-its neighbours are in the 3^dim cells around it; of the finer ones it hears when they find it.
+Particles whose sizes differ by more than a factor of two are stored in separate tables (levels), with cells of their size. Level
+0 holds the largest particles; each further level holds sizes down to half of those before. The size of a particle is its radius
+plus half of its reach, the extra distance at which it must be found. The search goes through a particle's own level and the
+coarser levels, where its neighbours are in the 3^dim cells around it. Smaller neighbours find the particle by their own search.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -26,25 +26,28 @@ if TYPE_CHECKING:
     from ..device.thread_team import Team
     from ..features.feature import Scene
 
-FARTHEST = 1 << 22  # cells from the origin: beyond it, f32 cannot tell a cell from the next
-LEVELS = 14  # the last one holds all that are smaller, down to points
+FARTHEST = 1 << 22  # cells from the origin: beyond it, f32 cannot distinguish adjacent cells
+LEVELS = 14  # at most; the last level holds all smaller particles, down to points
 
 
 class CellList:
-    """The tables. radius: (n,) [m]. reach: (n,) [m]. Pairs are looked for up to the sum of their radii, the longer of their
-    reaches, and the skin [m]."""
+    """The tables of cells, one for each level of particle sizes.
 
-    n: Any = OnDevice()  # particles
-    buckets: Any = OnDevice()  # of the tables
-    coarsest: Any = OnDevice()  # cells per meter, of level 0
+    radius: (n,) [m]. reach: (n,) [m]. skin [m]. A search finds pairs up to a distance of the sum of their radii, plus the larger
+    of their reaches, plus the skin.
+    """
+
+    n: Any = OnDevice()  # number of particles
+    buckets: Any = OnDevice()  # number of buckets in all tables
+    coarsest: Any = OnDevice()  # cells per meter at level 0
 
     def __init__(self, scene: "Scene", radius: np.ndarray, reach: np.ndarray, skin: float, team: "Team", scratch: Any):
         self.team = team
-        self.place = scratch  # of the particles as they are sorted, while a list is built: read one after the other
+        self.place = scratch  # positions in sorted order, while a list is built: the search then reads memory sequentially
         self.memory = scene.memory
         dim, add = scene.particles.dim, scene.memory.field
         self.n, self.dim, self.state, self.real = scene.count, dim, scene.state, scene.real
-        self.serial = not team.launched  # counting in order, on one thread, beats atomic counters in parallel on a CPU
+        self.serial = not team.launched  # on a CPU, counting on one thread is faster than atomic counters on several
         level = levels_of(radius, reach)
         self.levels = int(level.max(initial=0)) + 1
         self.sizes, self.bits, offsets = self._tables(radius, reach, skin, level)
@@ -71,22 +74,22 @@ class CellList:
     def _tables(
         self, radius: np.ndarray, reach: np.ndarray, skin: float, level: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-        """Of each table the size of its cells [m], the bits of its number of buckets, and where it begins; and where all end."""
+        """Return cell sizes [m] and log2 of bucket numbers, (levels,), and the first bucket of each table, (levels + 1,)."""
         finer, longest = (np.array([v[level >= m].max(initial=0.0) for m in range(self.levels)]) for v in (radius, reach))
         own = finer if self.levels == 1 else np.array([radius[level == m].max(initial=0.0) for m in range(self.levels)])
-        # Rounding of floor(x * scale) must not hide a neighbour.
+        # Slightly larger, so that rounding in floor(x * scale) does not lose a neighbour.
         sizes = (own + finer + longest + skin) * (1 + 2.0**-12)
         counts = np.bincount(level, minlength=self.levels)
         bits = np.maximum(2 * self.dim, np.ceil(np.log2(np.maximum(2 * counts, 1)))).astype(int)
         return sizes, bits, np.concatenate([[0], np.cumsum(1 << bits)])
 
     def can_regroup(self, radius: np.ndarray, reach: np.ndarray) -> bool:
-        """Whether particles of these sizes have as many tables, which have room."""
+        """Whether particles of these sizes need as many tables as there are, and fit into the memory."""
         level = levels_of(radius, reach)
         return int(level.max(initial=0)) + 1 == self.levels and self.memory.holds(4 * (len(radius) + 4**self.dim) + 2)
 
     def drop(self, number: np.ndarray) -> None:
-        """Take out particles that went, where others have new numbers, -1 for these, until cells are filled anew."""
+        """Delete removed particles from the sorted cells and renumber the others. number: (n,) new indices, or -1 if removed."""
         order, edge = self.memory.seen(self.sorted), self.memory.seen(self.edge)
         new = number[order[: len(number)]]
         gone = np.flatnonzero(new < 0)
@@ -94,8 +97,10 @@ class CellList:
         edge -= np.searchsorted(gone, edge).astype(edge.dtype)
 
     def regroup(self, radius: np.ndarray, reach: np.ndarray, skin: float, extent: np.ndarray) -> bool:
-        """There are other particles now, see NeighbourSearch.regroup(). extent: of all of them [m]. Returns whether the cells are
-        those that were filled last."""
+        """Adapt the tables to added and removed particles, see NeighbourSearch.regroup().
+
+        extent: (dim,) size of the bounding box of all particles [m]. Returns whether the tables still have the same cells.
+        """
         level, memory = levels_of(radius, reach), self.memory
         memory.resize(self.sorted, len(radius))
         sizes, bits, offsets = self._tables(radius, reach, skin, level)
@@ -114,7 +119,10 @@ class CellList:
         return False
 
     def shapes(self, extent: np.ndarray) -> np.ndarray:
-        """Bits of each axis of each table, (levels, dim): at least 2, the rest where there are most cells per bucket."""
+        """Return log2 of the buckets along each axis of each table, (levels, dim).
+
+        Each axis has at least 2 bits. Further bits go to the axis with the most cells per bucket.
+        """
         out = []
         extent = np.where(np.isfinite(self._lengths), self._lengths, extent)
         for size, bits in zip(self.sizes, self.bits.tolist(), strict=True):
@@ -126,7 +134,10 @@ class CellList:
         return np.array(out)
 
     def fit(self, extent: np.ndarray) -> bool:
-        """Shape the tables for particles that fill a box of this size [m]; affects speed only. Returns whether they changed."""
+        """Shape the tables for particles in a box of size `extent`, (dim,) [m]; affects speed only.
+
+        Returns whether any changed.
+        """
         shapes = self.shapes(extent)
         changed = not np.array_equal(shapes, self._shapes)
         if changed:
@@ -137,8 +148,11 @@ class CellList:
         return changed
 
     def counts(self, shapes: np.ndarray) -> np.ndarray:
-        """Cells of each table along periodic axes, (levels, dim), 1 along others: no smaller than they have to be. Where there
-        are more than buckets, a multiple of these, so that the three cells around the end of the box have different ones."""
+        """Return the number of cells of each table along periodic axes, (levels, dim); 1 along other axes.
+
+        Cells are not smaller than the search needs. A number above that of the buckets is a multiple of it, so that the three
+        cells around the end of the box fall into different buckets.
+        """
         most = np.where(np.isfinite(self._lengths), self._lengths, 0.0) / self.sizes[:, None]
         fitting, buckets = np.minimum(most, 2.0**30), 2.0**shapes
         each = np.where(fitting < buckets, 1.0, buckets)
@@ -146,7 +160,7 @@ class CellList:
 
     @ti.func
     def level_of(self, i):
-        """The level of particle i."""
+        """Return the level of particle i."""
         m = 0
         if ti.static(self.levels > 1):
             m = self.level[i]
@@ -154,7 +168,7 @@ class CellList:
 
     @ti.func
     def cell_of(self, i, m):
-        """The cell of particle i at level m."""
+        """Return the cell of particle i at level m."""
         cell = ti.floor(self.state.x[i] * self.scale(m), ti.i32)
         for k in ti.static(self.axes):
             cell[k] = self.images.cell(self.state.x[i], k, 0, self.count[m][k])
@@ -162,8 +176,10 @@ class CellList:
 
     @ti.func
     def around(self, point, radius, m, k: ti.template()):  # type: ignore[valid-type]
-        """The first of the cells along periodic axis k in which particles within `radius` of a point in the box may be, and how
-        many there are, with one more on each side; of a sheared box all along FLOW."""
+        """Return the first cell along periodic axis k that may hold particles within `radius` of a point, and their number.
+
+        One cell is added on each side for rounding. In a sheared box these are all cells along FLOW. The point is in the box.
+        """
         count, size = self.count[m][k], self.images.length[None][k]
         low = ti.floor((point[k] - radius) / size * count, ti.i32) - 1
         number = ti.floor((point[k] + radius) / size * count, ti.i32) + 2 - low
@@ -173,7 +189,7 @@ class CellList:
 
     @ti.func
     def scale(self, m):
-        """CellList per meter at level m."""
+        """Return the cells per meter at level m."""
         scale = ti.cast(self.coarsest, self.real)
         if ti.static(self.levels > 1):
             scale = self.per_meter[m]
@@ -181,7 +197,7 @@ class CellList:
 
     @ti.func
     def bucket(self, cell, m):
-        """The bucket of a cell at level m; axis 0 varies fastest."""
+        """Return the bucket of a cell at level m. Axis 0 varies fastest."""
         bits = self.shape[m]
         b = cell[self.dim - 1] & ((1 << bits[self.dim - 1]) - 1)
         for k in ti.static(range(self.dim - 2, -1, -1)):
@@ -192,7 +208,7 @@ class CellList:
 
     @ti.func
     def bucket_of(self, i):
-        """The bucket of particle i."""
+        """Return the bucket of particle i, at its own level."""
         m = self.level_of(i)
         return self.bucket(self.cell_of(i, m), m)
 
@@ -208,8 +224,8 @@ class CellList:
         self.sums.run(self.edge, thread)
         ti.loop_config(serialize=self.serial)
         for back in range(self.team.one(self.n, thread)):
-            # Filling a bucket from its end turns the end of each into its begin, and the next one's begin is its end. From the
-            # last particle on, so that each bucket comes out in order (on one thread) and leaves little to sort.
+            # Filling a bucket from its end moves its counter from the end to the begin; the next bucket's begin is its end. The
+            # loop starts at the last particle, so that on one thread each bucket is in order and little is left to sort.
             i = self.n - 1 - back
             k = add_to(self.edge, self.bucket_of(i) + 1, -1, self.serial) - 1
             self.sorted[k] = i
@@ -220,7 +236,7 @@ class CellList:
 
     @ti.func
     def apart(self, i, k):
-        """From the k-th of the sorted particles to particle i, as State.apart() has it."""
+        """Return the vector from the k-th sorted particle to particle i [m], as State.apart() does for two particle indices."""
         r = self.state.x[i] - self.place[k]
         if ti.static(self.state.compensated and len(self.axes) > 0):
             far = ti.cast(self.state.x[i], ti.f64) - ti.cast(self.place[k], ti.f64)
@@ -233,9 +249,11 @@ class CellList:
 
     @ti.func
     def row(self, i, cell, m, r):
-        """Row r of the 3^(dim - 1) around a cell at level m, of particle i: its first bucket, how far along its three cells
-        begin, into how many parts they fall, and how many cells stand side by side in each: 3, or 1 where the torus wraps
-        between them."""
+        """Return row r of the 3^(dim - 1) rows of three cells around a cell at level m, for particle i.
+
+        Returned are the first bucket of the whole row of the table, the coordinate along axis 0 of the first of the three cells,
+        the number of pieces into which the three fall, and the cells in each piece: 3, or 1 where the torus wraps between cells.
+        """
         at, rest, turn, parts, mask = cell, r, 0, 3, (1 << self.shape[m][0]) - 1
         for k in ti.static(range(1, self.dim)):
             side = rest % 3
@@ -243,7 +261,7 @@ class CellList:
             rest = rest // 3
             if ti.static(k in self.axes):
                 count = self.count[m][k]
-                if side >= count:  # of two cells, or one, all are there
+                if side >= count:  # an axis with one or two cells: all have been read
                     parts = 0
                 if at[k] < 0 or at[k] >= count:
                     way = ti.select(at[k] < 0, -1, 1)
@@ -261,7 +279,7 @@ class CellList:
                 span, parts = 3, 1
             parts = ti.min(parts, count)
             if ti.static(self.sheared):
-                if self.count[m][GRADIENT] < 3 and parts > 0:  # the next row is met on both sides, at two places
+                if self.count[m][GRADIENT] < 3 and parts > 0:  # the next row is a neighbour on both sides, at two offsets
                     span, parts = 1, ti.min(count, mask + 1)
         elif (low & mask) + 2 <= mask:
             span, parts = 3, parts // 3
@@ -269,14 +287,14 @@ class CellList:
 
     @ti.func
     def along(self, cell, m):
-        """Where in its row the bucket of a cell stands, which may be one beyond the end of the box."""
+        """Return the position of a cell's bucket in its row. The cell may lie beyond the end of the box, where it wraps."""
         if ti.static(0 in self.axes):
             cell = ti.select(cell < self.count[m][0], cell, cell - self.count[m][0])
         return cell & ((1 << self.shape[m][0]) - 1)
 
 
 def levels_of(radius: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """The level of each particle, of those that there are, (n,)."""
+    """Return the level of each particle, (n,), numbered without gaps."""
     size = radius + reach / 2
     if not len(size) or (size == size[0]).all():
         return np.zeros(len(size), dtype=int)
@@ -286,14 +304,16 @@ def levels_of(radius: np.ndarray, reach: np.ndarray) -> np.ndarray:
 
 
 def most_levels() -> int:
-    """LEVELS; but one where Taichi writes SPIR-V: there (1.7.4, Vulkan in software) lists that are written to from both sides of
-    their pairs lack entries."""
+    """Return LEVELS, or 1 where Taichi compiles to SPIR-V.
+
+    There (1.7.4, Vulkan in software) lists to which both particles of a pair write lack entries.
+    """
     return LEVELS if runtime.architecture() in runtime.LLVM else 1
 
 
 @ti.func
 def add_to(field: ti.template(), at, by, serial: ti.template()):  # type: ignore[valid-type]
-    """Add to a counter; returns what it was. serial: one thread counts, without atomic operations, which take longer."""
+    """Add to a counter and return its old value. serial: one thread counts, so no atomic operations are needed."""
     old = field[at]
     if ti.static(serial):
         field[at] = old + by

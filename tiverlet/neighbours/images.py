@@ -16,13 +16,13 @@ FLOW, GRADIENT = 0, 1  # the axes of a shear: images along y move along x
 class Images:
     """The nearest images of particles, on the device of one world.
 
-    axes: those that are periodic. sheared: whether images along GRADIENT slide along FLOW. in_state: fields of the state.
+    axes: the periodic axes. sheared: whether images along GRADIENT slide along FLOW. in_state: fields of the state, by name.
     """
 
     def __init__(self, scene: "Scene", box: "Periodic"):
         add, dim = scene.memory.field, scene.particles.dim
         self.axes, self.sheared, self.real = box.axes, box.sheared, scene.real
-        kind = ti.f64 if scene.state.compensated else scene.real  # whose differences are
+        kind = ti.f64 if scene.state.compensated else scene.real  # compensated positions have differences in f64
         self.length = add("Periodic.length", None, width=dim, kind=kind, values=box.away(np.eye(dim, dtype=int)).diagonal())
         self.per_length = add("Periodic.per_length", None, width=dim, kind=kind, values=1 / box.lengths)
         self.near = add("Periodic.near", None, kind=kind, values=(1 - 2.0**-20) * box.shortest**2 / 4)
@@ -32,25 +32,25 @@ class Images:
         if self.sheared:
             self.rate = add("Periodic.rate", None, kind=ti.f64, values=box.shear)
             self.strain = add("Periodic.strain", None, kind=ti.f64, state=True)
-            # How far the next image along GRADIENT is along FLOW, and how far it slid in the last substep [m].
+            # Offset along FLOW of the next image along GRADIENT, and how far it slid in the last substep [m].
             self.shift = add("Periodic.shift", None, width=2, kind=kind, state=True)
             self.in_state = {"strain": self.strain, "shift": self.shift}
 
     @ti.func
     def turns(self, r, axis: ti.template()):  # type: ignore[valid-type]
-        """How many boxes along an axis are nearest to r."""
+        """Return the number of box lengths nearest to r along an axis."""
         return ti.floor(r[axis] * self.per_length[None][axis] + ti.cast(0.5, self.real))
 
     @ti.func
     def nearest(self, r):
-        """The least of the differences x_i - x_j + whole boxes; of most pairs it is r itself, which is told at once."""
+        """Return the shortest of the differences r + whole boxes. Fast path: for most pairs this is r itself."""
         if r.dot(r) > self.near[None]:
             r = self.reduced(r)
         return r
 
     @ti.func
     def reduced(self, r):
-        """The same, in steps."""
+        """Return the shortest of the differences r + whole boxes, axis by axis."""
         if ti.static(self.sheared):
             k = self.turns(r, GRADIENT)
             r[GRADIENT] -= k * self.length[None][GRADIENT]
@@ -62,21 +62,24 @@ class Images:
 
     @ti.func
     def inside(self, x):
-        """The image of a place that is in the box."""
+        """Return the image in the box of a position x [m]."""
         middle = self.middle[None]
         return middle + self.nearest(x - middle)
 
     @ti.func
     def slid(self, moved, r):
-        """How particles r apart, of which one moved by so much more than the other in a substep, moved as images."""
+        """Return the relative displacement of the nearest images of two particles in a substep [m].
+
+        moved: their relative displacement [m]. r: the vector between them [m].
+        """
         moved[FLOW] -= self.turns(r, GRADIENT) * self.shift[None][1]
         return moved
 
     @ti.func
     def cell(self, x, axis: ti.template(), turn, count):  # type: ignore[valid-type]
-        """Of `count` cells along an axis, that of a place: where it is in the box, seen from `turn` boxes further along GRADIENT.
+        """Return which of `count` cells along an axis holds position x, for a viewer `turn` boxes further along GRADIENT.
 
-        In f64: where a particle that is many boxes away is in the box is told as well as its position.
+        The arithmetic is in f64: even for a particle many boxes away, the place in the box is as accurate as its position.
         """
         at = ti.cast(x[axis], ti.f64)
         if ti.static(self.sheared and axis == FLOW):
@@ -88,7 +91,7 @@ class Images:
 
     @ti.func
     def slide(self, h):
-        """The images go on, for a substep."""
+        """Advance the strain and the offset of images by a substep of h [s]."""
         step = self.rate[None] * ti.cast(h, ti.f64)
         self.strain[None] = self.strain[None] + step
         height, length = ti.cast(self.length[None][GRADIENT], ti.f64), ti.cast(self.length[None][FLOW], ti.f64)

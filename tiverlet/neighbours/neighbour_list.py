@@ -1,4 +1,4 @@
-"""The neighbour list: where it is stored, and what pairs remember from one list to the next."""
+"""The neighbour list: its storage, and the data of pairs that is carried from one list to the next."""
 
 import contextlib
 import warnings
@@ -13,19 +13,18 @@ from ..device.thread_team import Team
 if TYPE_CHECKING:
     from ..device.memory import Memory
 
-CROWDED = 300  # near pairs per particle beyond which the user is told
-STALE = 0.49  # of the skin: a list is good until something has moved so far
-MOVED = 2  # what NeighbourList.stale is while it is only because particles moved
-WORD, FULL = 32, 2**32 - 1  # entries that one word of bits is for
+CROWDED = 300  # near pairs per particle beyond which the user is warned
+STALE = 0.49  # of the skin: a list is valid until a particle has moved so far
+MOVED = 2  # value of NeighbourList.stale where the only cause is that particles moved
+WORD, FULL = 32, 2**32 - 1  # entries that one word of bits covers, and a word with all bits set
 
 
 class PairData:
-    """What each pair remembers: a number, or a vector of `width`.
+    """Data of each listed pair: a number, or a vector of `width`.
 
-    lasting: it is part of the state, beyond a substep. told: for reports alone. kept: it is transferred to the next list; what is
-    not is computed anew.
-    marked: only pairs whose bit in NeighbourList.touching is set have other than 0. kind: of the numbers; None for those of the
-    world. field, old: the data of the list, and of the old one while a new one is built.
+    lasting: it belongs to the state, beyond a substep. told: it is for reports only. kept: it is transferred to the next list;
+    other data is recomputed. marked: it is 0 except for pairs whose bit in NeighbourList.touching is set. kind: type of the
+    numbers; None for that of the world. field, old: the data of the present list, and of the old list while a new one is built.
     """
 
     field: Any
@@ -39,8 +38,10 @@ class PairData:
 
 
 class Column:
-    """A number for each row of a table that has room for as many rows as the list for pairs, or a vector of `width`. What is in
-    it stays where it is when the list is built anew, or grows."""
+    """A column of a table with as many rows as the list has room for entries: a number in each row, or a vector of `width`.
+
+    Rows keep their values and places when the list is rebuilt or grows.
+    """
 
     field: Any
 
@@ -49,19 +50,20 @@ class Column:
 
 
 class NeighbourList:
-    """For each particle, the entries of the list that are its own: `number` of them from `first` on, sorted by index.
+    """The neighbour list: pairs of particles closer than contact distance + skin. Each pair is listed for both particles.
 
-    n: how many particles. pair_data: what each pair remembers. short: entries of room after each block.
+    The neighbours of particle i are the `number[i]` entries from `first[i]` on, sorted by index. pair_data: the data of each
+    pair. short: entries of room after each block.
     """
 
-    n: Any = OnDevice()  # particles
+    n: Any = OnDevice()  # number of particles
     blocks: Any = OnDevice()  # parts of the list, each filled by one thread
-    capacity: Any = OnDevice()  # entries of one
-    pitch: Any = OnDevice()  # from one to the next
+    capacity: Any = OnDevice()  # entries of one block
+    pitch: Any = OnDevice()  # entries from the begin of a block to the begin of the next
     capacity_number: Number
     pitch_number: Number
     host_only = ("room",)
-    told_apart = True  # as a Feature
+    told_apart = True  # see Feature
 
     def __init__(self, memory: "Memory", count: Number, rooms: Number, pair_data: list[PairData], team: Team, short: int):
         self.team, self.n, self.memory, self.short = team, count, memory, short
@@ -74,22 +76,24 @@ class NeighbourList:
         self.number = add("grid.number", count, kind=ti.i32)
         self.stale = add("grid.stale", None, kind=ti.i32, values=1)
         self.need = add("grid.need", None, kind=ti.i32)
-        self.touching = add("grid.touching", count, kind=ti.u32)  # bits: which of the first entries touch, when last looked at
+        self.touching = add("grid.touching", count, kind=ti.u32)  # bits: which of the first 32 entries touched at the last test
         self.old_first = add("grid.old_first", count, kind=ti.i32)
         self.old_number = add("grid.old_number", count, kind=ti.i32)
         self.old_saved = add("grid.kept", None, kind=ti.i32)  # 1: the old list is saved for the one that is being built
         self.neighbour: Any = None
-        self.old_neighbour: Any = None  # of the old list, pairs with data other than 0, while a new one is built
+        self.old_neighbour: Any = None  # the pairs of the old list with data other than 0, while a new list is built
         self.store: Memory | None = None
-        self.room = 0  # entries of one list
-        self.columns: list[Column] = []  # of a table with as much room
+        self.room = 0  # entries for which there is memory
+        self.columns: list[Column] = []  # columns of a table with as many rows
 
     def __repr__(self) -> str:
         return "neighbour list"
 
     def allocate(self, capacity: int) -> bool:
-        """Room for `capacity` entries of the list, in a tree of its own, so that it can grow. The old list stays. True if
-        there are new fields."""
+        """Allocate `capacity` entries in a tree of fields of their own, so that the list can grow. The old list is kept.
+
+        Returns whether there are new fields.
+        """
         if 2 * capacity > 2**31 - 1:
             raise MemoryError(f"{capacity} near pairs exceed what a list can index; the particles overlap too much.")
         self.capacity_number.set(max(1, -(-capacity // self.blocks)))
@@ -118,7 +122,10 @@ class NeighbourList:
         return True
 
     def grow(self) -> bool:
-        """Make room for what the last build needed, and a quarter more. True if kernels have to be told."""
+        """Make room for the entries that the last build needed, plus a quarter.
+
+        Returns whether kernels must be compiled again.
+        """
         with self._of_all():
             need = int(self.memory.read(self.need).max())
         each = need * self.blocks / self.n
@@ -133,56 +140,61 @@ class NeighbourList:
         return new
 
     def _fields(self) -> list:
-        """What has to outlive a new list: of a world alone, which has saved all for it, the old one; of one of many copies, also
-        the lists of those that go on with theirs."""
+        """Return the fields that must survive reallocation.
+
+        A single world has saved its data in the old list by then. Of many copies, some continue with their present list.
+        """
         old = [self.old_neighbour, *(piece.old for piece in self.transferred), *(column.field for column in self.columns)]
         return [*old, self.neighbour, *(piece.field for piece in self.pair_data)] if self.memory.copies else old
 
     def _of_all(self) -> contextlib.AbstractContextManager[None]:
-        """Meanwhile read and write what all copies have."""
+        """Return a context in which reads and writes are for all copies of the world."""
         return self.memory.copies.all() if self.memory.copies else contextlib.nullcontext()
 
     def _write_padded(self, field, values: np.ndarray) -> None:
-        """Write a field of the list, with 0 where there are no values."""
-        axis = int(self.memory.copies is not None and self.memory.copies.chosen is None)  # that of the copies comes first
+        """Write a field of the list, padded with 0 behind the values."""
+        axis = int(self.memory.copies is not None and self.memory.copies.chosen is None)  # the axis of copies comes first
         room = np.zeros((*values.shape[:axis], self.room, *values.shape[axis + 1 :]), dtype=values.dtype)
         some = min(self.room, values.shape[axis])
         np.moveaxis(room, axis, 0)[:some] = np.moveaxis(values, axis, 0)[:some]
         self.store.write(field, room)  # type: ignore[union-attr]
 
     def _write_begin(self, field, values: np.ndarray) -> None:
-        """Write a field of the list as far as there are values; what is behind them is not read."""
+        """Write the first entries of a field of the list. Entries behind these values are not read."""
         if self.store.elastic:  # type: ignore[union-attr]
             self.store.write_from(field, 0, values)  # type: ignore[union-attr]
         else:
             self._write_padded(field, values)
 
     def invalidate(self) -> None:
-        """Have a new list built in the next frame."""
-        self.memory.write(self.stale, 1)  # Taichi would compile a kernel for stale[None] = 1
+        """Mark the list as stale, so that the next frame rebuilds it."""
+        self.memory.write(self.stale, 1)  # not stale[None] = 1, for which Taichi would compile a kernel
 
     def entries(self) -> tuple[np.ndarray, np.ndarray]:
-        """The listed pairs (m, 2) either way round, in order, and where they are in the list."""
+        """Return the listed pairs, (m, 2), in both orders and sorted, and their places in the list, (m,)."""
         assert self.store
         i, at = self._entries(self.first, self.number)
         return np.stack([i, self.store.read(self.neighbour)[at]], axis=1).astype(np.int64), at
 
     def read(self, piece: PairData, at: np.ndarray) -> np.ndarray:
-        """The data of some entries of the list."""
+        """Return the data of the entries at places `at`, (m,), of the list."""
         assert self.store
         return self.store.read(piece.field)[at].astype(np.float64)
 
     def _entries(self, first, number) -> tuple[np.ndarray, np.ndarray]:
-        """For every entry of the lists, whose it is and where it is."""
+        """Return the particle of every entry and the place of the entry, (m,) each."""
         first, number = self.memory.read(first)[: self.n], self.memory.read(number)[: self.n]
         i = np.repeat(np.arange(self.n), number)
         return i, np.repeat(first, number) + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)
 
     def lasting_data(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Every listed pair (i, j) with lasting data other than 0, in order, and its data, whatever the list's layout."""
+        """Return the listed pairs (i, j) with lasting data other than 0, sorted, and their data by name.
+
+        The result does not depend on the layout of the list.
+        """
         assert self.store
         seen = self.store.seen if self.store.elastic else self.store.read
-        saved = bool(self.memory.read(self.old_saved)[0])  # given by restore(), and not built into a list yet
+        saved = bool(self.memory.read(self.old_saved)[0])  # restored by restore(), and not yet transferred to a new list
         first, number = (self.old_first, self.old_number) if saved else (self.first, self.number)
         i, at = self._entries(first, number)
         near = seen(self.old_neighbour if saved else self.neighbour).take(at)
@@ -195,7 +207,7 @@ class NeighbourList:
         return np.stack([i[kept], near[kept]], axis=1), {name: value.take(kept, axis=0) for name, value in values.items()}
 
     def restore(self, pairs: np.ndarray, values: dict[str, np.ndarray]) -> None:
-        """Give what lasting_data() returned to the next list that is built."""
+        """Store the result of lasting_data() as the old list, from which the next build takes the data of pairs."""
         if len(pairs) > self.room:
             self.allocate(len(pairs))
         self._write_begin(self.old_neighbour, pairs[:, 1].astype(np.int32))
@@ -210,12 +222,15 @@ class NeighbourList:
 
     @property
     def saved(self) -> bool:
-        """Whether the old list is saved for one that is not built yet."""
+        """Whether the old list is saved for a new one that is not built yet."""
         return bool(self.memory.seen(self.old_saved)[0])
 
     def drop(self, number: np.ndarray) -> None:
-        """Of an elastic list that is not saved, whose particles have new numbers, -1 for those that went, and rows by these: take
-        out the pairs of what went. Other pairs stay where they are, or move up in the list of their particle."""
+        """Delete the pairs of removed particles. number: (n,) new indices, -1 for removed particles.
+
+        For an elastic list that is not saved, whose rows of particles are already in the new order. Other pairs stay where they
+        are, or move up among the entries of their particle.
+        """
         assert self.store
         first, count, touching = (self.memory.seen(field) for field in (self.first, self.number, self.touching))
         i, at = self._entries(self.first, self.number)
@@ -234,14 +249,14 @@ class NeighbourList:
             rows = self.store.seen(field)
             rows[first[i] + place] = rows[at]
         bits = np.zeros(self.n, dtype=np.uint32)
-        bit = np.where(before < WORD, touching[i] >> np.minimum(before, WORD - 1) & 1, 1)  # of those behind it is not known
+        bit = np.where(before < WORD, touching[i] >> np.minimum(before, WORD - 1) & 1, 1)  # 1 behind the first word: unknown
         some = place < WORD
         np.bitwise_or.at(bits, i[some], (bit[some] << place[some]).astype(np.uint32))
         touching[fewer], count[fewer] = bits[fewer], np.bincount(i, minlength=self.n)[fewer]
 
     @ti.func
     def save_old_list(self, thread):
-        """Save the list as the old one, unless one is there already, from a build that did not fit."""
+        """Save the list as the old one, unless a build that did not fit has already saved it."""
         kept = self.old_saved[None]
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             if kept == 0:
@@ -254,7 +269,7 @@ class NeighbourList:
 
     @ti.func
     def save_pairs(self, i):
-        """Save the pairs of particle i with data other than 0."""
+        """Save the pairs of particle i that have data other than 0."""
         first = self.first[i]
         at = first
         for word in range(self.words(i)):
@@ -277,8 +292,10 @@ class NeighbourList:
 
     @ti.func
     def transfer_pair_data(self, i):
-        """Give each pair of particle i its data from the old list; both are sorted. Returns bits for those that got any that is
-        marked, among the first entries."""
+        """Copy the data of each pair of particle i from the old list. Both lists are sorted.
+
+        Returns a word of bits: which of the first entries received data other than 0 of a marked kind.
+        """
         first, number = self.first[i], self.number[i]
         for piece in ti.static(self.pair_data):
             for e in range(first, first + number):
@@ -304,27 +321,27 @@ class NeighbourList:
 
     @ti.func
     def entry(self, i, word, bits):
-        """Where the entry of particle i is that the lowest of some bits is for."""
+        """Return the place in the list of the entry of particle i that belongs to the lowest set bit of a word."""
         return self.first[i] + word * WORD + lowest_bit(bits)
 
     @ti.func
     def words(self, i):
-        """How many words of bits the list of particle i has entries for."""
-        return (self.number[i] + (WORD - 1)) >> 5  # a division by WORD would look at the sign
+        """Return the number of words of bits that cover the entries of particle i."""
+        return (self.number[i] + (WORD - 1)) >> 5  # a division by WORD would test the sign
 
     @ti.func
     def all_bits(self, i, word):
-        """Bits of all entries that the word is for."""
+        """Return a word with a bit set for each entry of particle i that it covers."""
         left = self.number[i] - word * WORD
         return ti.select(left < WORD, (ti.u32(1) << ti.cast(left & (WORD - 1), ti.u32)) - ti.u32(1), ti.u32(FULL))
 
     @ti.func
     def touched(self, i, word):
-        """Bits of those entries that touched when last looked at; beyond the first word, where that is not kept, of all."""
+        """Return the bits of entries that touched at the last test. Words beyond the first are not stored: all bits are set."""
         return ti.select(word == 0, self.touching[i], self.all_bits(i, word))
 
 
 @ti.func
 def lowest_bit(bits):
-    """The number of the lowest bit that is set."""
+    """Return the index of the lowest set bit."""
     return ti.math.popcnt((bits - ti.u32(1)) & ~bits)

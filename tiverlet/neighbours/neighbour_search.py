@@ -1,8 +1,8 @@
-"""Neighbours: how the list of near pairs is built.
+"""The search for neighbours: how the neighbour list is built.
 
-It holds, for each particle, all others closer than the sum of radii plus a skin, sorted by index, and those with which it shares
-pair data other than 0, wherever they are: what touched in the last substep may do so in the next, although a list was built
-in between. It stays valid until something has moved by half the skin, and no sum over it depends on when it was built, on the
+For each particle, the list holds all others closer than the sum of radii plus a skin, sorted by index. It also holds pairs with
+data other than 0 at any distance: a pair that touched in the last substep may touch in the next, although the list was rebuilt in
+between. The list is valid until a particle has moved by half the skin. No sum over the list depends on when it was built, on the
 hash, or on the skin.
 """
 
@@ -25,29 +25,29 @@ from .neighbour_list import MOVED, STALE, NeighbourList, PairData
 if TYPE_CHECKING:
     from ..features.feature import Scene
 
-COUNT, FILL = range(2)  # what a scan of the cells around a particle does with the neighbours that it finds
+COUNT, FILL = range(2)  # whether a scan of the cells around a particle counts neighbours or lists them
 
 
 def _both(linked: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of n particles in both orders, each once, and where those of each particle begin."""
+    """Return pairs of n particles in both orders, each once and sorted, and where the pairs of each particle begin, (n + 1,)."""
     both = distinct(np.concatenate([linked, linked[:, ::-1]]))[0]
     return both, np.searchsorted(both[:, 0], np.arange(n + 1))
 
 
 class NeighbourSearch:
-    """What fills `list`, the list of near pairs, from `cells`, a hash of cells.
+    """The search that fills `list`, the neighbour list, from `cells`, a hash of cells.
 
-    skin: what is listed beyond touching [m]. linked: (m, 2) pairs that are never listed. table: which pairs are near, as Table
-    says it. pair_data: what each pair remembers. scratch: a field of vectors, (n,), to use while the list is built. reach: (n,)
-    how much further than by its radius a particle has to be found [m], see CellList. radius: (n,) [m], where it is not that of
-    the particles.
+    skin: the gap up to which pairs are listed, beyond the contact distance [m]. linked: (m, 2) pairs that are never listed.
+    table: the contact distance of each pair, see Table. pair_data: the data of each pair. scratch: a field of vectors, (n,), for
+    use while the list is built. reach: (n,) extra distance, beyond its radius, at which a particle must be found [m], see
+    CellList. radius: (n,) [m], where it differs from that of the particles.
     """
 
     skin: Any = OnDevice()
-    too_far: Any = OnDevice()  # the square of the way after which the list is stale
-    farthest: Any = OnDevice()  # how far apart pairs are listed [m], at most
-    n: Any = OnDevice()  # particles
-    told_apart = True  # as a Feature
+    too_far: Any = OnDevice()  # the square of the displacement beyond which the list is stale [m^2]
+    farthest: Any = OnDevice()  # the largest distance of listed pairs [m]
+    n: Any = OnDevice()  # number of particles
+    told_apart = True  # see Feature
 
     def __init__(
         self, scene: "Scene", skin: float, linked: np.ndarray, table: Any, pair_data: list[PairData], team: Team, scratch: Any,
@@ -55,8 +55,8 @@ class NeighbourSearch:
     ):  # fmt: skip
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.n, self.memory, self.real, self.team = scene.count, scene.memory, scene.real, team
-        self.sums = Sums(n, team, capped=True)  # with a room of its own where the team is launched
-        # Entries of a list that is sorted without branches; to compile that takes an eighth of all.
+        self.sums = Sums(n, team, capped=True)  # on the launched path it has a room of its own
+        # Entries of a list that is sorted without branches. Compiling that takes an eighth of the compile time.
         short = 1 if scene.memory.compiler.few else 8 if dim == 2 else 16
         rooms = self.sums.room if team.launched else scene.count
         self.list = NeighbourList(scene.memory, scene.count, rooms, pair_data, team, short)
@@ -73,16 +73,16 @@ class NeighbourSearch:
         self._extent: Sequence[float] = [-1.0] * dim
         self.cells = CellList(scene, radius, reach, skin, team, scratch)
         self.several_levels = self.cells.levels > 1
-        # A particle finds all others in the 3^dim cells around it, as far as they have gone since.
+        # Whether a particle finds all neighbours in the 3^dim cells around it, even after it has moved far (see Strays).
         self.lone = not self.several_levels and not self.state.images and not reach.any()
-        self.counts = self.several_levels or team.launched  # before it lists
-        self.serial = not self.counts or (team.size == 1 and not team.launched)  # one thread makes a list, in order
+        self.counts = self.several_levels or team.launched  # neighbours are counted before they are listed
+        self.serial = not self.counts or (team.size == 1 and not team.launched)  # one thread writes each list, in order
         self.list.blocks = number(self._blocks(n))
         self.origin = add("grid.built_at", scene.count, width=dim)
         if self.sheared:
             self.strain = add("grid.built_strain", None, kind=ti.f64)
             self.farthest = number(float(self.cells.sizes.max()), real)
-        self.has_static = bool((scene.inv_mass == 0).any())  # whether there are pairs that cannot move
+        self.has_static = bool((scene.inv_mass == 0).any())  # whether there may be pairs in which neither particle can move
         self.linked = len(linked) > 0
         if self.linked:
             self._both, begin = _both(linked, n)
@@ -93,18 +93,20 @@ class NeighbourSearch:
         return repr(self.list)
 
     def _skin(self, skin: float, radius: np.ndarray, reach: np.ndarray) -> float:
-        """What can be listed beyond touching [m]. In a shear, within half of the height the nearest image along y is the nearest
-        one."""
+        """Return the skin that the box allows [m].
+
+        In a sheared box, the nearest image along y is the nearest image only within half of the box height.
+        """
         if not self.sheared:
             return skin
         return min(skin, float(self._scene.periodic.lengths[GRADIENT]) / 2 - 2 * radius.max(initial=0.0) - reach.max(initial=0.0))
 
     def _blocks(self, n: int) -> int:
-        """Parts of the list of n particles."""
+        """Return the number of blocks of a list of n particles."""
         return max(1, -(-n // self.team.piece)) if self.team.size > 1 and not self.counts else 1
 
     def can_regroup(self, change: Regrouping, radius: np.ndarray, reach: np.ndarray | None = None) -> bool:
-        """Whether particles can come and go where it is. radius, reach: as many as there are now [m]."""
+        """Whether particles can be added and removed in place. radius, reach: of the particles there are now, (n,) [m]."""
         reach = 0 * radius if reach is None else reach
         n, store = change.now.count, self.list.store
         room = store is not None and store.holds(self.list.room + (self.list.short + 1) * (n + 1))
@@ -113,9 +115,11 @@ class NeighbourSearch:
         return room and static and not self.team.launched and lone == self.lone and self.cells.can_regroup(radius, reach)
 
     def regroup(self, change: Regrouping, skin: float, radius: np.ndarray, reach: np.ndarray | None = None) -> None:
-        """They came and went, and the team knows. The list stays, but for pairs of what went, unless it is another one that
-        would be built now; what came is on no list, as a stray is that has gone far. Where the old list is saved, what pairs
-        remember is to be given to the next list by restore()."""
+        """Adapt the list to added and removed particles, after the team was adapted.
+
+        The list is kept without the pairs of removed particles, unless skin or cells change. Added particles are not listed: they
+        count as strays that moved too far. Where the old list is saved, restore() must give the pair data to the next list.
+        """
         n, stale = change.now.count, int(self.memory.seen(self.list.stale)[0])
         reach = 0 * radius if reach is None else reach
         if change.goes and not self.list.saved:
@@ -129,7 +133,7 @@ class NeighbourSearch:
             self.farthest = float(self.cells.sizes.max())
         self.sums.room = n
         if self.list.blocks != self._blocks(n):
-            room = self.list.room  # where the old list stands
+            room = self.list.room  # the old list uses this memory
             self.list.blocks = self._blocks(n)
             self.list.allocate(room)
         if self.linked:
@@ -142,11 +146,11 @@ class NeighbourSearch:
         self.memory.write(self.list.stale, (MOVED if came else stale) if stays else 1)
 
     def can_exclude(self, linked: np.ndarray) -> bool:
-        """Whether it can leave out other pairs than it did."""
+        """Whether exclude() can take these pairs, (m, 2): kernels are compiled either with excluded pairs or without."""
         return self.linked == (len(linked) > 0)
 
     def others(self, linked: np.ndarray, change: Regrouping) -> bool:
-        """Whether these pairs that are left out are others than before, of particles that stay."""
+        """Whether the excluded pairs `linked`, (m, 2), differ from the present ones, among particles that remain."""
         if not self.linked:
             return False
         before, now = change.number[self._both], _both(linked, change.now.count)[0]
@@ -154,7 +158,7 @@ class NeighbourSearch:
         return not np.array_equal(stay, now[(now < change.kept).all(axis=1)])
 
     def exclude(self, linked: np.ndarray) -> None:
-        """Leave out these pairs, which can_exclude() allows; its particles are those that there are now."""
+        """Exclude these pairs, (m, 2), from the list; can_exclude() must allow it. Particles are numbered as they are now."""
         if self.linked:
             self._both, begin = _both(linked, len(self.memory.seen(self.excluded_begin)) - 1)
             self.memory.resize(self.excluded, len(self._both))
@@ -163,11 +167,11 @@ class NeighbourSearch:
 
     @property
     def finest(self) -> float:
-        """The size of the smallest cells [m]."""
+        """Size of the smallest cells [m]."""
         return float(self.cells.sizes.min())
 
     def fit(self, extent: Sequence[float]) -> None:
-        """Shape the hash for the extent of the particles [m], if it is another one by an eighth; affects speed only."""
+        """Shape the hash for the extent of the particles, (dim,) [m], if it has changed by an eighth. Affects speed only."""
         for new, old in zip(extent, self._extent, strict=True):
             if not abs(new - old) <= old / 8:
                 self._extent = extent
@@ -177,10 +181,10 @@ class NeighbourSearch:
 
     @ti.func
     def moved_too_far(self, i):
-        """1 if the list is stale: once a particle has moved by half the skin."""
+        """Return 1 if particle i has moved by half the skin since the list was built, so that the list is stale."""
         r, limit = self.state.x[i] - self.origin[i], self.too_far
         if ti.static(self.sheared):
-            # Beside what all are strained by: that takes pairs apart by no more than the strain of the farthest that are listed.
+            # The mean strain is not counted as motion. It moves listed pairs apart by at most strain * farthest.
             strain = ti.cast(self.state.images.strain[None] - self.strain[None], self.real)
             r[FLOW] -= strain * self.origin[i][GRADIENT]
             left = ti.max(self.skin - ti.abs(strain) * self.farthest, 0)
@@ -189,7 +193,7 @@ class NeighbourSearch:
 
     @ti.func
     def build(self, thread):
-        """Sort the particles into cells, then list the near ones of each. `thread`: see Team."""
+        """Rebuild the list: sort the particles into cells, then list the neighbours of each. `thread`: see Team."""
         self.list.save_old_list(thread)
         self.cells.sort(thread)
         if ti.static(self.counts):
@@ -211,7 +215,10 @@ class NeighbourSearch:
 
     @ti.func
     def fill(self, block):
-        """One level: list the neighbours of a block of particles, one after the other. Beyond the room they are only counted."""
+        """List the neighbours of a block of particles, one after the other, where there is one level of cells.
+
+        Neighbours for which there is no room are only counted.
+        """
         start, room = block * self.list.pitch, self.list.capacity
         size = (self.n + self.list.blocks - 1) // self.list.blocks
         used = 0
@@ -226,17 +233,20 @@ class NeighbourSearch:
 
     @ti.func
     def pair_up(self, thread):
-        """Count, then list: on a GPU, by a thread for each particle; and for several levels, each pair that one of the two finds
-        with both. What does not fit is only counted."""
+        """Count the neighbours of all particles, then list them: on a GPU, and where there are several levels of cells.
+
+        On a GPU each particle has a thread. With several levels, the finer particle of a pair finds it and lists it for both.
+        Pairs that do not fit are only counted.
+        """
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             self.list.number[i] = 0
         self.team.wait()
-        if ti.static(self.team.launched):  # where loops are at the top of a kernel, or serial
+        if ti.static(self.team.launched):  # loops must be at the top of a kernel, or serial
             self.scan_all(COUNT, thread)
             self.make_room(thread)
             self.scan_all(FILL, thread)
         else:
-            for what in range(FILL + 1):  # the code of it is there once
+            for what in range(FILL + 1):  # a loop at run time, so that scan_all() is compiled once
                 self.scan_all(what, thread)
                 if what == COUNT:
                     self.make_room(thread)
@@ -245,7 +255,7 @@ class NeighbourSearch:
 
     @ti.func
     def scan_all(self, what: ti.template(), thread):  # type: ignore[valid-type]
-        """COUNT the neighbours of every particle, or FILL its list."""
+        """Scan the cells around all particles. what: COUNT or FILL."""
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             if what == COUNT or self.list.need[None] <= self.list.capacity:
                 used = self.scan(i, what, self.list.first[i], 0)
@@ -257,7 +267,7 @@ class NeighbourSearch:
 
     @ti.func
     def make_room(self, thread):
-        """Where each list begins, by how many neighbours were counted."""
+        """Compute where the entries of each particle begin, from the counted neighbours."""
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             self.list.first[i] = self.list.number[i]
         self.team.wait()
@@ -273,14 +283,17 @@ class NeighbourSearch:
 
     @ti.func
     def finish(self, i):
-        """Put the list of particle i in order."""
+        """Sort the entries of particle i, and transfer the data of its pairs from the old list."""
         self.order(self.list.first[i], self.list.number[i])
         self.list.touching[i] = self.list.transfer_pair_data(i)
 
     @ti.func
     def scan(self, i, what: ti.template(), start, used):  # type: ignore[valid-type]
-        """Look for neighbours in the cells around particle i, at its own level and the coarser ones. Its list begins at `start`
-        and has `used` entries; returns how many it has then. what: COUNT or FILL, where they are counted first."""
+        """Find the neighbours of particle i in the cells around it, at its own level and the coarser ones.
+
+        The list begins at `start` and has `used` entries; the new number of entries is returned. what: COUNT or FILL, where
+        neighbours are counted first.
+        """
         own = self.cells.level_of(i)
         for m in range(own + 1):
             cell = self.cells.cell_of(i, m)
@@ -292,11 +305,11 @@ class NeighbourSearch:
                         j = self.cells.sorted[e]
                         listed = self.listed(i, j, self.cells.apart(i, e))
                         if ti.static(not self.counts):
-                            # No branch: it would be taken at random. What is not listed is written over by the next.
+                            # No branch, which the CPU could not predict. The next entry overwrites one that is not listed.
                             self.list.neighbour[start + ti.min(used, self.list.capacity)] = j
                         elif (what != COUNT or m < own) and listed != 0:
                             at, theirs = used, 0
-                            if ti.static(self.several_levels):  # others write to this list, too
+                            if ti.static(self.several_levels):  # scans of other particles write to this list, too
                                 if m < own:
                                     theirs = add_to(self.list.number, j, 1, self.serial)
                                 if what != COUNT:
@@ -321,7 +334,7 @@ class NeighbourSearch:
 
     @ti.func
     def listed(self, i, j, r):
-        """1 if a pair, apart by r, belongs on the list: near, not both immovable, not linked."""
+        """Return 1 if a pair with difference r [m] belongs on the list: near, movable, not excluded."""
         far = self.table.reach(self.radius, i, j) + ti.cast(self.skin, self.real)
         yes = ti.cast(r.dot(r) < far * far, ti.i32) & ti.cast(i != j, ti.i32)
         if ti.static(self.has_static):
@@ -339,11 +352,11 @@ class NeighbourSearch:
 
     @ti.func
     def order(self, begin, count):
-        """Sort by index, which makes every sum over the list independent of the table."""
+        """Sort `count` entries from `begin` on by index, which makes every sum over the list independent of the cells."""
         if ti.static(self.several_levels or self.list.short == 1):
             sort(self.list.neighbour, begin, count, self.serial)
         elif count > ti.static(self.list.short):
             sort(self.list.neighbour, begin, count, self.serial)
         else:
-            # Where neighbours in space are neighbours in number too, they are in order as they come.
+            # Where particles close in space have close indices, the entries are already sorted, which exchange() tests first.
             exchange(self.list.neighbour, begin, count, self.network, self.list.short)

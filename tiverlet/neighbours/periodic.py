@@ -1,4 +1,4 @@
-"""Periodic boxes: every particle has images, a box away along each periodic axis, and others meet the nearest of them."""
+"""Periodic boxes: every particle has images, one box length apart along each periodic axis, and acts by the nearest image."""
 
 import contextlib
 from collections.abc import Sequence
@@ -17,31 +17,32 @@ if TYPE_CHECKING:
     from ..particles import Particles
 
 AXES = "xyz"
-SPARE = 2.2  # contact distances, that a sheared box is long at least
-COUNTED = 2.0**62  # boxes
+SPARE = 2.2  # smallest length of a sheared box, in contact distances
+COUNTED = 2.0**62  # largest number of boxes that is counted
 
 
 class Periodic(Feature):
-    """A box that repeats without end along some axes: what leaves on one side is met on the other (periodic boundaries).
+    """A box that repeats without end along some axes (periodic boundaries): particles interact across its ends.
 
-    low, high: corners of the box, (dim,) [m]; what stands there for other axes does not matter. axes: which are periodic, such as
-    (0,) for x alone; None for all. shear: rate of a simple shear [1/s], of boxes without walls along x and y (Lees and Edwards
-    1972): images one box further along y move along x at shear times the height of the box. Live.
+    low, high: corners of the box, (dim,) [m]; values along other axes are ignored. axes: the periodic axes, such as (0,) for x
+    alone; None for all. shear: rate of a simple shear [1/s], for boxes without walls along x and y (Lees and Edwards 1972): the
+    images one box further along y move along x at shear times the height of the box. The shear is live.
 
-    Contacts, links, angles and forces between particles act on the nearest image, r = x_i - x_j less whole boxes; it is unique
-    within half a box, which no two particles in contact, no PairForce and no link may exceed. world.position stays **unwrapped**:
-    a particle that leaves goes on, nothing jumps, and its mean square displacement is one of positions. `wrap(position)` says
-    where particles are in the box; recordings draw them there. What acts on places acts on unwrapped ones (Pin, Path, Attractor,
-    Force); walls and obstacles act on the box: HalfSpace and Box only along other axes; a Ball or a Capsule on the image of a
-    particle that is nearest to its middle; a Polygon, Mesh or Sdf on that in the box, so it may not reach out of it.
+    Contacts, links, angles and forces between particles act on the nearest image: r = x_i - x_j minus whole boxes. It is unique
+    within half a box. No pair in contact, no PairForce and no link may reach further. world.position stays **unwrapped**: a
+    particle that leaves the box goes on without a jump, so mean square displacements follow from positions alone.
+    `wrap(position)` returns positions in the box; recordings draw particles there. Features that read positions read unwrapped
+    ones (Pin, Path, Attractor, Force). Walls and obstacles act on images: HalfSpace and Box only along axes that are not
+    periodic; a Ball or a Capsule on the image nearest to its middle; a Polygon, Mesh or Sdf on the image in the box, so the
+    obstacle must lie within the box.
 
-    In f32 the digits of a coordinate end at 6e-8 of it: particles that wander off by 100 boxes are known to 1e-5 of a box. Where
-    they do, in a flow or a long shear, take "f64" or "f32-compensated".
+    In f32 a coordinate is rounded to 6e-8 of its size: after 100 boxes a position is accurate to 1e-5 of a box. For scenes that
+    drift so far, such as a flow or a long shear, use "f64" or "f32-compensated".
 
-    With shear, velocities are those of the unwrapped motion: of a linear profile v_x = shear y, whatever the box. Walls and
-    obstacles have no place in it. Drag and Wind slow the flow itself. The list of neighbours takes account of the strain.
+    With shear, velocities are those of the unwrapped motion, a linear profile v_x = shear y through all boxes. Walls and
+    obstacles cannot be used with shear. Drag and Wind slow the flow itself. The neighbour list takes account of the strain.
 
-    Raises ValueError for a box that is too small for what is in it. A world has at most one.
+    Raises ValueError for a box that is too small for its contents. A world has at most one.
     """
 
     compiled_for = ("sheared",)
@@ -70,7 +71,7 @@ class Periodic(Feature):
         self.shear = shear
 
     def prepare(self, particles: "Particles", inv_mass: np.ndarray) -> None:
-        """Check the dimension, and that a shear has both of its axes."""
+        """Check the dimension, and that x and y are periodic where there is a shear."""
         if len(self.low) != particles.dim:
             raise ValueError(f"Periodic: low has {len(self.low)} coordinates, but the particles are in {particles.dim}D.")
         if self.sheared and not {FLOW, GRADIENT} <= set(self.axes):
@@ -78,34 +79,36 @@ class Periodic(Feature):
 
     @property
     def does_work(self) -> bool:
-        """Whether images move."""
+        """Whether images move, which does work on the particles."""
         return self.shear != 0
 
     @property
     def sheared(self) -> bool:
-        """Whether there is a shear, or was when kernels were compiled."""
+        """Whether there is a shear, or kernels were compiled for one."""
         return self.shear != 0 or "sheared" in self.once
 
     @property
     def lengths(self) -> np.ndarray:
-        """Of the box along each axis, (dim,) [m]; inf along those that are not periodic."""
+        """Lengths of the box, (dim,) [m]; inf along axes that are not periodic."""
         some = np.isin(np.arange(len(self.low)), self.axes)
         return np.where(some, np.where(some, self.high, 1.0) - np.where(some, self.low, 0.0), np.inf)
 
     @property
     def middle(self) -> np.ndarray:
-        """Of the box, (dim,) [m]; 0 along axes that are not periodic."""
+        """Middle of the box, (dim,) [m]; 0 along axes that are not periodic."""
         some = np.isfinite(self.lengths)
         return (np.where(some, self.low, 0.0) + np.where(some, self.high, 0.0)) / 2
 
     @property
     def shortest(self) -> float:
-        """The shortest side along a periodic axis [m]."""
+        """Length of the shortest periodic side [m]."""
         return float(self.lengths.min())
 
     def refuse(self, who: str, what: str, far: float, smaller: str, half: bool = False) -> None:
-        """Raise ValueError for what reaches further than half a box; or just so far, where `half`. Where images slide, lists need
-        room for their skin."""
+        """Raise ValueError if a reach `far` [m] exceeds half a box, or, with `half`, equals it.
+
+        who, what, smaller: words of the message. A sheared box is longer by a tenth, to leave room for the skin of the list.
+        """
         k, least = int(np.argmin(self.lengths)), (SPARE if self.sheared else 2) * far
         if least > self.shortest or (half and least == self.shortest):
             raise ValueError(
@@ -115,62 +118,64 @@ class Periodic(Feature):
 
     @property
     def strain(self) -> float:
-        """How far the shear has come: the integral of its rate."""
+        """The shear strain: the integral of the rate over time."""
         return self._come[0]
 
     @property
     def _come(self) -> tuple[float, float]:
-        """The strain, and where the image one box further along y is along x [m]."""
+        """The strain, and the offset along x of the image one box further along y [m]."""
         images = vars(self.dev).get("images")
         if images and images.sheared:
-            with contextlib.suppress(RuntimeError):  # there is none before its world is complete, nor after it is closed
+            with contextlib.suppress(RuntimeError):  # fields cannot be read before the world is complete or after it is closed
                 read = self.scene.memory.read
                 self._last = float(read(images.strain)[0]), float(read(images.shift)[0, 0])
         return self._last
 
     def continued(self, other: "Periodic") -> None:
-        """Take over the strain of the same box in another world."""
+        """Take over the strain and offset of the same box in another world."""
         if self.dev.images.sheared:
             strain, offset = other._come
             self.scene.memory.write(self.dev.images.strain, strain)
             self.scene.memory.write(self.dev.images.shift, [offset, 0.0])
 
     def copy(self) -> "Periodic":
-        """Without the strain, which belongs to a world."""
+        """Return a copy without the strain, which belongs to a world."""
         new: Any = super().copy()
         new._last = 0.0, 0.0
         return new
 
     def release(self) -> None:
-        """What is found out while the world is built anew is found out where images are now."""
+        """Store strain and offset before the fields are freed: a world that is rebuilt reads them meanwhile."""
         self._last = self._come
         super().release()
 
     def can_regroup(self, change: Regrouping) -> bool:
-        """Whether the widest particle, which has to fit in, is as wide as before."""
+        """Whether the widest particle, which must fit into the box, has the same radius as before."""
         return change.now.radius.max(initial=0.0) == change.before.radius.max(initial=0.0)
 
     def bind(self, scene: Scene) -> None:
-        """Lengths, and where images are."""
+        """Declare the fields of the box on the device."""
         self.scene, scene.periodic = scene, self
         self.dev.images = scene.state.images = Images(scene, self)
         self.changed = False
 
     def upload(self) -> None:
-        """Write the rate."""
+        """Write the shear rate to the device."""
         if self.dev.images.sheared:
             self.scene.memory.write(self.dev.images.rate, self.shear)
 
-    # Where images are, in NumPy.
+    # Positions of images, in NumPy.
 
     @property
     def offset(self) -> float:
-        """How far along x the image is that is one box further along y [m]."""
+        """Offset along x of the image one box further along y [m]."""
         return self._come[1]
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """For pictures of a scene between two corners: the edges of the box, (m, 2, dim); along axes that are not periodic it
-        ends with the scene."""
+        """Return the edges of the box for drawing, (m, 2, dim) [m].
+
+        low, high: corners of the scene, (dim,) [m], at which the box ends along axes that are not periodic.
+        """
         some = np.isfinite(self.lengths)
         ends = np.stack([np.where(some, self.low, low), np.where(some, self.high, high)])
         corners = np.array(list(product((0, 1), repeat=len(some))))
@@ -178,34 +183,37 @@ class Periodic(Feature):
         return np.array([[ends[a, range(len(a))], ends[b, range(len(b))]] for a, b in pairs])
 
     def boxes(self, position: ArrayLike) -> np.ndarray:
-        """How many boxes along each axis positions (n, dim) are away from the box, (n, dim) integers: the image flags of LAMMPS.
+        """Return how many boxes along each axis positions (n, dim) are from the box, (n, dim) integers: LAMMPS's image flags.
 
         With shear, the velocity of the image in the box is v_x - boxes[:, 1] * shear * height.
         """
         return self._turns(np.asarray(position, dtype=np.float64) - self.middle)
 
     def wrap(self, position: ArrayLike) -> np.ndarray:
-        """Where positions (n, dim) [m] are in the box: low <= x < high, up to rounding, along periodic axes."""
+        """Return the images of positions (n, dim) [m] in the box: low <= x < high along periodic axes, up to rounding."""
         x = np.asarray(position, dtype=np.float64)
         return x - self.away(self.boxes(x))
 
     def difference(self, a: ArrayLike, b: ArrayLike) -> np.ndarray:
-        """a - b between nearest images [m], for arrays (..., dim) of positions."""
+        """Return a - b between nearest images [m], for positions (..., dim)."""
         r = np.asarray(a, dtype=np.float64) - np.asarray(b, dtype=np.float64)
         return r - self.away(self._turns(r))
 
     def away(self, boxes: ArrayLike) -> np.ndarray:
-        """How far so many boxes along each axis are [m], (..., dim)."""
+        """Return the displacement by `boxes`, (..., dim), numbers of boxes along each axis, (..., dim) [m]."""
         boxes = np.asarray(boxes)
         out = np.asarray(boxes * np.where(np.isfinite(self.lengths), self.lengths, 0.0))
         out[..., FLOW] += boxes[..., GRADIENT] * self.offset
         return out
 
     def ghosts(self, position: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-        """Images of particles within `reach` [m] of the box: their numbers, and where they are; first those in it, in order."""
+        """Return all images within `reach` [m] of the box: their particles and positions.
+
+        Images in the box come first, in order.
+        """
         x = self.wrap(position)
         found, places = [np.arange(len(x))], [x]
-        along = 2 if self.offset else 1  # the next box along y begins anywhere along x
+        along = 2 if self.offset else 1  # in a shear, boxes further along y are offset along x
         steps = [range(-along, along + 1) if k == FLOW else range(-1, 2) for k in range(len(self.low))]
         steps = [step if k in self.axes else (0,) for k, step in enumerate(steps)]
         low, high = (np.where(np.isfinite(self.lengths), v, s) for v, s in ((self.low, -np.inf), (self.high, np.inf)))
@@ -218,11 +226,11 @@ class Periodic(Feature):
         return np.concatenate(found), np.concatenate(places)
 
     def _turns(self, r: np.ndarray) -> np.ndarray:
-        """How many boxes along each axis are nearest to r; none where that is no number, or too many to be counted."""
+        """Return the number of boxes along each axis nearest to r, (..., dim); 0 where r is NaN or exceeds COUNTED boxes."""
         out = np.zeros(r.shape, dtype=np.int64)
 
         def count(k: int) -> None:
-            """Along axis k."""
+            """Count boxes along axis k."""
             boxes = np.floor(r[..., k] / self.lengths[k] + 0.5)
             out[..., k] = np.where(np.abs(boxes) < COUNTED, boxes, 0)
 

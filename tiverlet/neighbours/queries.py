@@ -1,4 +1,4 @@
-"""Questions about where particles are: near points, nearest to points, touching each other."""
+"""Queries of positions: particles near points, the nearest particle to a point, particles in contact."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -14,14 +14,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Contacts:
-    """What touches: overlaps now, or was pushed apart in the last substep.
+    """Contacts: pairs that overlap now, or were pushed apart in the last substep.
 
-    pairs: (m, 2), two discs or spheres i < j, or a vertex and the particle where the edge begins that it touches. ends: (m,), the
-    particle where the edge ends; j for discs. place: (m,), where on the edge, 0 at its begin and 1 at its end, beyond them where
-    two corners cross; 0 for discs. overlap: (m,) [m], 0 or less for what has just been pushed apart. normal: (m, dim), from j or
-    the edge to i. point: (m, dim) [m], in the middle of the overlap. impulse: (m,) [N s] along the normal in the last substep;
-    divided by the substep it is the force, but in the first of another length, see Touches. That of World.events() is the sum
-    over the frame. i got impulse * normal, and -(1 - place) and -place of that went to j and the end of the edge.
+    pairs: (m, 2), two discs or spheres i < j, or a vertex i and the particle j at the begin of the edge that it touches. ends:
+    (m,), the particle at the end of the edge; j for discs. place: (m,), the position on the edge, 0 at its begin and 1 at its
+    end, outside that range where two corners cross; 0 for discs. overlap: (m,) [m], 0 or less for pairs that have just been
+    pushed apart. normal: (m, dim), from j or the edge to i. point: (m, dim) [m], the middle of the overlap. impulse: (m,) [N s]
+    along the normal in the last substep. Divided by the substep it is the force, except in the first substep of another length,
+    see Touches. Impulses of World.events() are sums over the frame. Particle i receives impulse * normal, particle j
+    -(1 - place) of that, and the end of the edge -place of that.
     """
 
     pairs: np.ndarray
@@ -38,7 +39,7 @@ class Contacts:
 
 @ti.data_oriented
 class PointSearch:
-    """Particles within a distance of points, by the cells of the contact grid, which has to be sorted."""
+    """The search for particles within a distance of points, by the cells of contacts. The cells must be sorted."""
 
     def __init__(self, search: "NeighbourSearch"):
         self.cells, self.state, self.dim, self.levels = search.cells, search.state, search.dim, search.cells.levels
@@ -46,16 +47,19 @@ class PointSearch:
 
     @ti.func
     def visit(self, point, radius, row, number, at, out: ti.template(), fill: ti.template()):  # type: ignore[valid-type]
-        """Count the particles within `radius` of a point; with `fill` write (row, particle) from `at` on."""
+        """Count the particles within `radius` [m] of a point, and return `number` plus that. fill: write (row, particle), too.
+
+        Pairs are written to `out` from row at + number on.
+        """
         for m in range(self.levels):
             scale = self.cells.scale(m)
-            low = ti.floor((point - radius) * scale, ti.i32) - 1  # one more on each side for what has rounded across
+            low = ti.floor((point - radius) * scale, ti.i32) - 1  # one more cell on each side, for rounding
             count = ti.floor((point + radius) * scale, ti.i32) + 2 - low
             for k in ti.static(self.cells.axes):
                 low[k], count[k] = self.cells.around(point, radius, m, k)
             total = 1
             for k in ti.static(range(self.dim)):
-                count[k] = ti.min(count[k], 1 << self.cells.shape[m][k])  # round the torus once
+                count[k] = ti.min(count[k], 1 << self.cells.shape[m][k])  # each bucket of the torus is read once
                 total *= count[k]
             for c in range(total):
                 cell, rest = low, c
@@ -79,7 +83,7 @@ class PointSearch:
         self, points: ti.types.ndarray(ti.f64, 2), radius: ti.types.ndarray(ti.f64, 1), first: ti.types.ndarray(ti.i32, 1),
         out: ti.types.ndarray(ti.i32, 2), count: ti.i32, fill: ti.i32,
     ):  # type: ignore[valid-type]  # fmt: skip
-        """Without `fill`: the number for each point into `first`. With it: the pairs, from first[p] on."""
+        """Write the number of particles near each point to `first`; or, with `fill`, write pairs to `out` from first[p] on."""
         for p in range(count):
             point = ti.Vector.zero(self.real, self.dim)
             for k in ti.static(range(self.dim)):
@@ -90,7 +94,7 @@ class PointSearch:
                 self.visit(point, ti.cast(radius[p], self.real), p, 0, first[p], out, True)
 
     def near(self, points: np.ndarray, radius: np.ndarray) -> np.ndarray:
-        """(m, 2): rows of points, and particles, in order."""
+        """Return the pairs (row of a point, particle) within `radius`, (m, 2), sorted. points: (k, dim) [m]. radius: (k,) [m]."""
         number, none = np.zeros(len(points), dtype=np.int32), np.zeros((1, 2), dtype=np.int32)
         self.run(points, radius, number, none, len(points), 0)
         first = (np.cumsum(number) - number).astype(np.int32)
@@ -101,12 +105,12 @@ class PointSearch:
 
 
 def between(a: np.ndarray, b: np.ndarray, box: "Periodic | None") -> np.ndarray:
-    """a - b, in a periodic box of nearest images."""
+    """Return a - b [m], between nearest images in a periodic box."""
     return a - b if box is None else box.difference(a, b)
 
 
 def near_by_all(position: np.ndarray, points: np.ndarray, radius: np.ndarray, box: "Periodic | None" = None) -> np.ndarray:
-    """The same by comparing each point with each particle, for worlds without contacts."""
+    """Return what PointSearch.near() does, by comparing each point with each particle, for worlds without contacts."""
     found = ((between(position, p, box) ** 2).sum(axis=1) <= r * r for p, r in zip(points, radius, strict=True))
     rows = [np.flatnonzero(some) for some in found]
     return np.array([(k, i) for k, row in enumerate(rows) for i in row], dtype=np.int64).reshape(-1, 2)
@@ -115,7 +119,11 @@ def near_by_all(position: np.ndarray, points: np.ndarray, radius: np.ndarray, bo
 def nearest(
     find, position: np.ndarray, points: np.ndarray, start: float, box: "Periodic | None" = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Index of and distance to the particle nearest to each point: look within `start`, and twice as far while there is none."""
+    """Return the index of the particle nearest to each point, and its distance [m].
+
+    The search begins with the radius `start` [m] and doubles it until each point has a particle. find(points, radius): pairs as
+    PointSearch.near() returns them.
+    """
     index = np.full(len(points), -1)
     distance = np.full(len(points), np.inf)
     left, reach = np.arange(len(points)), start

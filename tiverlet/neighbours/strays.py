@@ -1,4 +1,4 @@
-"""Strays: particles that went far from where they were when a neighbour list was built, while most others stayed."""
+"""Strays: the few particles that have moved too far since the neighbour list was built, while all others have not."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -12,21 +12,21 @@ if TYPE_CHECKING:
     from ..features.feature import Scene
     from .neighbour_search import NeighbourSearch
 
-MOST = 256  # strays at a time, since all are compared with each other
-SHARE = 64  # particles for each of them: to look around all strays is to cost less than a list
+MOST = 256  # strays at a time at most, since all are compared with each other
+SHARE = 64  # particles per stray at least, so that searching around all strays costs less than a new list
 
 
 class Strays:
-    """A list that is stale because few have moved too far stays, as long as none of them comes near a particle that is not on
-    its list: a disc that flies above a heap has no list built in every other substep.
+    """The test that keeps a stale neighbour list while the strays have no unlisted neighbour.
 
-    All others are within STALE of the skin of where they were as the list was built, so a stray looks around in the cells of that
-    time, and compares itself with the other strays. For one level of cells, without periodic images. As always, when a list is
-    built shows in no result.
+    Without it, a disc that flies above a heap would have the list rebuilt in every other substep. All other particles are within
+    STALE of the skin of where they were when the list was built. So each stray is compared with the particles in the cells of
+    that time around it, and with the other strays. For one level of cells, without periodic images. Results do not depend on when
+    a list is built.
     """
 
-    n: Any = OnDevice()  # particles
-    most: Any = OnDevice()  # strays
+    n: Any = OnDevice()  # number of particles
+    most: Any = OnDevice()  # number of strays for which there is room
 
     def __init__(self, scene: "Scene", search: "NeighbourSearch", team: "Team"):
         self.search, self.list, self.cells, self.team = search, search.list, search.cells, team
@@ -35,11 +35,11 @@ class Strays:
         self.n, self.most = scene.count, scene.memory.number(most)
         self.stray = scene.memory.field("grid.strays", max(1, most), kind=ti.i32)
         self.number = scene.memory.field("grid.stray_number", None, kind=ti.i32)
-        self.met = scene.memory.field("grid.strays_met", None, kind=ti.i32)  # 1: one of them is near what is not on its list
+        self.met = scene.memory.field("grid.strays_met", None, kind=ti.i32)  # 1: a stray is near an unlisted particle
 
     @ti.func
     def keep_list(self, thread):
-        """Where few have moved too far, and none of them is near what is not on its list, that is not stale any more."""
+        """Clear the stale flag if few particles moved too far, and none of them is near an unlisted particle."""
         if self.list.stale[None] == MOVED:
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, thread)):
@@ -61,7 +61,7 @@ class Strays:
 
     @ti.func
     def find(self, begin, end):
-        """List the strays among some particles, in any order; once there are too many, that is enough."""
+        """List the strays among particles from `begin` up to `end`, in any order. The search stops once there are too many."""
         for b in range(blocks(begin, end)):
             low, high = block(b, begin, end)
             far = 0
@@ -76,7 +76,7 @@ class Strays:
 
     @ti.func
     def meets(self, i, number):
-        """1 if stray i is near a particle that is not on its list."""
+        """Return 1 if stray i is near a particle that is not on its list."""
         out, cell = 0, self.cells.cell_of(i, 0)
         for r in range(ti.static(3 ** (self.state.dim - 1))):
             base, low, parts, span = self.cells.row(i, cell, 0, r)
@@ -91,7 +91,7 @@ class Strays:
 
     @ti.func
     def missing(self, i, j):
-        """1 if a pair is as near as it gets while a list is good, and belongs on the list, but is not there."""
+        """Return 1 if a pair belongs on the list, is nearer than any unlisted pair of a valid list can be, and is not listed."""
         near = self.search.table.reach(self.search.radius, i, j) + ti.static(1 - 2 * STALE) * ti.cast(self.search.skin, self.real)
         r, out = self.state.apart(i, j), 0
         if r.dot(r) < near * near:

@@ -1,4 +1,4 @@
-"""Ways to solve constraints."""
+"""Solvers of constraints: Jacobi, Chebyshev, ConjugateGradient, Direct."""
 
 from .chebyshev import Chebyshev
 from .conjugate import ConjugateGradient

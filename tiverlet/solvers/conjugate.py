@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients on the constraints of a scene: cloth and nets that converge."""
+"""Preconditioned conjugate gradients on the constraints of a scene, for cloth and nets that must converge."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -20,40 +20,43 @@ if TYPE_CHECKING:
     from ..constraints.core.scalar import Scalar
 
 POWER = 30  # rounds of power iteration for lambda_max
-GROWTH, HIGHEST = 1.1, 1.0  # of the floor: the factor by which it grows, and its limit, where a link gives way as by itself
+GROWTH, HIGHEST = 1.1, 1.0  # the factor by which the floor grows, and its limit, at which a link is as soft as in Jacobi
 CONVERGED = 1e-2  # of r . z at the start of an iteration: what may be left at its end
-NULL = 8  # roundings, of d . W d: with d . A d below so many, or below REDUNDANT, a direction d is in the null space of A
-BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads
-# Of the sums: r . z; how far to go, and then by how much the direction counts in the next; how far a step is taken back; r . z at
-# the start.
+NULL = 8  # rounding errors of d . W d: if d . A d is below that, or below REDUNDANT, direction d is in the null space of A
+BLOCKS = 64  # partial sums: a fixed number, so that totals are the same bit for bit on any number of threads
+# Indices into `sums`: r . z; the length of the step, later the weight of the old direction in the next one; the length of a step
+# that is taken back; r . z at the start of the iteration.
 LEFT, FACTOR, BACK, FIRST = range(4)
 
 
 class ConjugateGradient(Solver):
-    """All constraints that are one number and act both ways are solved as one linear system in each iteration of a substep:
+    """Solves all two-sided constraints that are scalar functions as one linear system in each iteration of a substep:
 
         A_j sum_k (grad C_j(x) . w . grad C_k(x_n)) dlam_k + alpha'_j dlam_j = -(A_j C_j + B_j + alpha'_j lam_j)
 
-    by `steps` steps of conjugate gradients, preconditioned by the diagonal (Hestenes and Stiefel 1952); the matrix is symmetric
-    but for what the constraints turn in a substep. The error falls as ((sqrt(kappa) - 1) / (sqrt(kappa) + 1))^steps: some forty
-    steps for a cloth of 30 x 30. Sums are over a fixed number of blocks, in f64: the bits are those of any number of threads.
+    It takes `steps` steps of conjugate gradients, preconditioned by the diagonal (Hestenes and Stiefel 1952). The matrix is
+    symmetric except for the rotation of constraints within a substep. The error falls as
+    ((sqrt(kappa) - 1) / (sqrt(kappa) + 1))^steps: some forty steps for a cloth of 30 x 30. Sums are over a fixed number of
+    blocks, in f64, so results are the same bit for bit on any number of threads.
 
-    Steps that end before they have converged do something else in every substep, as a spring would whose stiffness jumps, and
-    that brings in energy; where constraints contradict each other (a row of links drawn straight between two pins) they never
-    converge. So once r . z is not down to a hundredth at the end of an iteration, the diagonal gets a floor,
+    If steps end before they have converged, their result differs in every substep. It acts as a spring whose stiffness jumps,
+    which adds energy. Where constraints contradict each other (a row of links drawn straight between two pins), steps never
+    converge. So once r . z has not fallen to a hundredth at the end of an iteration, the diagonal gets a floor,
 
         alpha'_j + sigma W_j,   sigma = lambda_max / steps^2
 
-    with W_j the diagonal of A = G w G^T and lambda_max the largest eigenvalue of W^-1 A: the condition number is then at most
-    steps^2 + 1, for which so many steps suffice, and a link gives way as one of compliance sigma W h^2 would. The floor stays
-    until particles are placed anew, and grows where it is still too low, or where the tension is near what the substep can stand.
-    Each part, of what hangs together, has its own, which is raised where a row has more than its share, of all rows, of the r . z
-    that is left. Where rigid constraints contradict each other as particles are placed, the right side is partly in the null
-    space of A, to which steps give any multiplier: sigma = 1 from the first substep on bounds it by what a Jacobi pass gives.
-    So is what rounding leaves of violations where links are more than are needed (braced bodies): steps end where no row is left
-    with more than that and the next direction is in the null space, too.
+    with W_j the diagonal of A = G w G^T and lambda_max the largest eigenvalue of W^-1 A. The condition number is then at most
+    steps^2 + 1, for which so many steps suffice, and a link gives way like one of compliance sigma W h^2. The floor stays until
+    particles are put elsewhere. It grows where it is still too low, or where the tension is near the limit of the substep. Each
+    connected part has its own floor, which is raised where a row has more than its share (one over all rows) of the final r . z.
 
-    steps: of conjugate gradients in an iteration. Ropes, spacers and what is not one number are relaxed as by Jacobi beside it.
+    Where rigid constraints contradict each other at the positions given, the right side is partly in the null space of A, where
+    steps give arbitrary multipliers. Then sigma = 1 from the first substep on: it bounds multipliers by those of a Jacobi pass.
+    With more links than needed (braced bodies), rounding of violations is partly in the null space, too. So steps end where all
+    rows are down to rounding and the next direction is in the null space.
+
+    steps: of conjugate gradients in an iteration. Ropes, spacers and constraints that are not scalar functions are relaxed as by
+    Jacobi beside it.
     """
 
     converges = True
@@ -62,17 +65,17 @@ class ConjugateGradient(Solver):
         self.steps = checks.integer("ConjugateGradient", "steps", steps, least=1)
 
     def system(self, scene: Scene, batches: list[Batch], slots: Slots) -> "CGSystem | None":
-        """The system of a scene on the device; None where there is none."""
+        """Return the system of a scene on the device; None where no constraint is solved together with others."""
         scalars = [b for b in solvable(batches) if b.side == 0]
         joined = any((~b.relaxed_alone(scene) & ~b.idle(scene.inv_mass)).any() for b in scalars)
         return CGSystem(scene, batches, slots, scalars, self.steps) if joined else None
 
     def remedy(self, batches: list[Batch], slots: Slots, inv_mass: np.ndarray) -> str:
-        """More steps."""
+        """Return the setting that lowers residuals: twice the steps, where there is a system."""
         return f"solver=tv.ConjugateGradient({2 * self.steps})" if slots.system else Solver.remedy(self, batches, slots, inv_mass)
 
     def explain(self, batches: list[Batch], slots: Slots) -> str:
-        """What is solved how."""
+        """Return how many constraints are solved together, and how many relaxed alone."""
         rows = slots.system.rows if slots.system else 0
         alone = slots.system.left_out(batches) if rows else sum(b.count for b in batches)
         return f"{self!r}: {rows} constraints together" + (f"; {alone} relaxed as by Jacobi" if alone else "")
@@ -82,11 +85,11 @@ class ConjugateGradient(Solver):
 
 
 class CGSystem(System):
-    """The system of one world on the device. Row r is a constraint in its batch's order."""
+    """The system of one world on the device. Rows are constraints in the order of their batches."""
 
-    n: Any = OnDevice()
-    least: Any = OnDevice()
-    groups: Any = OnDevice()  # parts
+    n: Any = OnDevice()  # number of particles
+    least: Any = OnDevice()  # first value of a floor
+    groups: Any = OnDevice()  # number of parts, plus one for particles in none
 
     def __init__(self, scene: Scene, batches: list[Batch], slots: Slots, scalars: "list[Scalar]", steps: int):
         places = [slots.places(b) for b in scalars]
@@ -95,7 +98,7 @@ class CGSystem(System):
         )
         super().__init__(scene, batches, slots, scalars, rows)
         self.steps, self.n, self.begin, self.w = steps, scene.count, slots.begin, scene.state.w
-        self.stride = 1  # launches for each block; Taichi gives each CPU thread at least 512 of them, see Step
+        self.stride = 1  # iterations of a loop for each block; Taichi gives each CPU thread at least 512, see Step
         row = np.concatenate([np.repeat(self.row(b), b.arity) for b in scalars])
         slot, who = (np.concatenate([a.ravel() for a in arrays]) for arrays in (places, [b.indices for b in scalars]))
         free = (slot >= 0) & (row >= 0)
@@ -111,30 +114,32 @@ class CGSystem(System):
         if self.limits_steps:
             self.gain, self.over = self.reals("gain", BLOCKS), self.reals("over", BLOCKS)
         self.sums = scene.memory.field("system.sums", None, width=4, kind=ti.f64)
-        self.noise, self.loud = self.reals("noise"), self.reals("loud", BLOCKS)  # r z of rounding; 1 where a row has more
+        self.noise, self.loud = self.reals("noise"), self.reals("loud", BLOCKS)  # r z of rounding; 1 if a row is above it
         self.null = max(REDUNDANT, NULL * self.epsilon)
-        self.rounding = self.epsilon ** (2 if scene.state.compensated else 1)  # of places
+        self.rounding = self.epsilon ** (2 if scene.state.compensated else 1)  # of positions
         least = 1.2 * largest(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
         self.least = self.memory.number(least, scene.real)
         _, part, _ = distinct(components(len(rows), row[free], who[free]))
-        self._part_of = np.zeros(scene.particles.count, dtype=np.int32)  # the part of each particle, from 1 on; 0 for none
+        self._part_of = np.zeros(scene.particles.count, dtype=np.int32)  # the part of each particle, counted from 1; 0: none
         self._part_of[who[free]] = part[row[free]] + 1
         self.part, self.lead = self.ints("part", part + 1), self.ints("lead", self.leads(scalars, slots))
         self.part_of = scene.memory.field("system.part_of", scene.count, kind=ti.i32, values=self._part_of)
         count = int(part.max(initial=0)) + 2
         self.groups = self.memory.number(count)
         self.strained = self.ints("strained", np.zeros(count, dtype=np.int32))  # parts whose floor is too low
-        self.floor = scene.memory.field("system.floor", scene.count, kind=ti.f64, state=True)  # of its part, for each particle
+        self.floor = scene.memory.field("system.floor", scene.count, kind=ti.f64, state=True)  # floor of its part, by particle
 
     def vector(self, name: str):
-        """A field of real numbers, one for each row."""
+        """Declare a field of real numbers, one for each row."""
         return self.memory.field(f"system.{name}", self.rows)
 
     def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
-        """Take the floors back, for steps may converge from the new places. Where constraints contradict each other there, floors
-        begin at HIGHEST."""
+        """Reset the floors, because steps may converge from the new positions.
+
+        Where constraints contradict each other there, floors begin at HIGHEST.
+        """
         floor, contradicted = np.zeros(self.n), np.zeros(self.groups, dtype=bool)
-        part_of = self._part_of[: self.n]  # particles that came and went since are in none, and stand behind those that are
+        part_of = self._part_of[: self.n]  # particles added or removed since are in no part, and behind all that are in one
         for batch, share in off:
             some = (share > 0) & (self.row(batch) >= 0)
             contradicted[part_of[batch.indices.ravel()[some[batch.owner]]]] = True
@@ -144,7 +149,7 @@ class CGSystem(System):
 
     @ti.func
     def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):
-        """The right side, the preconditioner, and the first direction."""
+        """Set the right side, the preconditioner, and the first direction of row r."""
         System.set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness)
         zero = 0 * violation
         self.step[r] = ti.select(W > 0, ti.cast(0, ti.f64), -ti.cast(lam, ti.f64))
@@ -155,18 +160,18 @@ class CGSystem(System):
 
     @ti.func
     def set_gradient(self, place, i, gradient):
-        """The gradient at one corner, whose slot is `place` and particle i."""
+        """Set the gradient at a corner with slot `place` and particle i."""
         if place >= 0:
             self.gradient[place] = gradient
 
     @ti.func
     def begin_of(self, b):
-        """The first row of block b."""
+        """Return the first row of block b."""
         return b * ((self.rows + BLOCKS - 1) // BLOCKS)
 
     @ti.func
     def summed(self):
-        """The sum of the parts, in order."""
+        """Return the sum of the partial sums, in order."""
         out = ti.cast(0, ti.f64)
         for b in range(BLOCKS):
             out += self.partial[b]
@@ -174,13 +179,13 @@ class CGSystem(System):
 
     @ti.func
     def start(self, thread):
-        """r . z of the first residual, and for each row that of what rounding leaves of its violation, 2 eps |x| |grad C|."""
+        """Compute r . z of the first residual; and for each row, r z of a violation that is only rounding, 2 eps |x| |grad C|."""
         for k in range(self.team.chunk_begin(BLOCKS * self.stride, thread), self.team.chunk_end(BLOCKS * self.stride, thread)):
             if k % self.stride == 0:
                 b, total, loud = k // self.stride, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
                 for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
                     if ti.static(bool(self.state.sleepers)):
-                        if not self.state.awake(self.lead[r]):  # nobody has set it
+                        if not self.state.awake(self.lead[r]):  # rows of sleeping particles were not set in this pass
                             self.residual[r], self.direction[r], self.step[r] = 0, 0, 0
                     far, squares = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
                     for c in range(self.corner_begin[r], self.corner_begin[r + 1]):
@@ -202,7 +207,7 @@ class CGSystem(System):
 
     @ti.func
     def end(self, thread):
-        """Raise the floors of parts where the steps have not converged, or have come to a tension that is hard to stand."""
+        """Raise the floors of parts where steps have not converged, or a tension came near the limit of the substep."""
         for r in range(self.team.chunk_begin(self.rows, thread), self.team.chunk_end(self.rows, thread)):
             share = CONVERGED * self.sums[None][FIRST]
             if self.sums[None][LEFT] > share:
@@ -219,7 +224,7 @@ class CGSystem(System):
 
     @ti.func
     def iterate(self, thread):
-        """One step of conjugate gradients. One that needs a tension too large for the substep is taken back, and is the last."""
+        """Take one step of conjugate gradients. If it needs too large a tension, it is taken back, and no step follows."""
         self.pull(thread)
         self.curve(thread)
         self.advance(thread)
@@ -227,7 +232,7 @@ class CGSystem(System):
 
     @ti.func
     def pull(self, thread):
-        """w G^T d: how the direction moves each particle."""
+        """Compute w G^T d, the move of each particle along the direction."""
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             if self.w.positive(i):
                 total = ti.Vector.zero(self.real, self.dim)
@@ -242,7 +247,7 @@ class CGSystem(System):
 
     @ti.func
     def curve(self, thread):
-        """A d, and how far to go, r . z / d . A d; nowhere, where only rounding is left and d is in the null space."""
+        """Compute A d, and the length of the step, r . z / d . A d; 0 if only rounding is left and d is in the null space."""
         for k in range(self.team.chunk_begin(BLOCKS * self.stride, thread), self.team.chunk_end(BLOCKS * self.stride, thread)):
             if k % self.stride == 0:
                 b, total, size = k // self.stride, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
@@ -270,7 +275,7 @@ class CGSystem(System):
 
     @ti.func
     def advance(self, thread):
-        """Go so far, and work out what is left, and whether that was too far."""
+        """Take the step, and compute the residual and whether the step was too long."""
         for k in range(self.team.chunk_begin(BLOCKS * self.stride, thread), self.team.chunk_end(BLOCKS * self.stride, thread)):
             if k % self.stride == 0:
                 b, total, worst = k // self.stride, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
@@ -311,7 +316,7 @@ class CGSystem(System):
                 for b in range(1, BLOCKS):
                     gain += self.gain[b]
                     over += self.over[b]
-                if gain > 0 and over > 0:  # as in Elimination.limit_steps; such a step is taken back, too
+                if gain > 0 and over > 0:  # as in Elimination.limit_steps(): such a step is taken back, too
                     worst = 2 * TENSEST
             back = ti.select(worst > TENSEST, self.sums[None][FACTOR], 0 * now)
             if worst > TENSEST:
@@ -322,7 +327,7 @@ class CGSystem(System):
 
     @ti.func
     def turn(self, thread):
-        """Take the step back if it was, and the next direction: z + (r . z / r . z before) d."""
+        """Take a step back that was too long, and compute the next direction, z + (r . z / r . z before) d."""
         for r in range(self.team.chunk_begin(self.rows, thread), self.team.chunk_end(self.rows, thread)):
             if self.sums[None][BACK] != 0:
                 self.step[r] = self.step[r] - self.sums[None][BACK] * self.direction[r]

@@ -1,4 +1,4 @@
-"""Corners of constraints: which particles they are, and what hangs together by those that can move."""
+"""Corners of constraints: their particles, and the pieces that movable particles connect."""
 
 from typing import TYPE_CHECKING
 
@@ -11,21 +11,21 @@ if TYPE_CHECKING:
 
 
 def corners_of(batches: "Sequence[Batch]") -> tuple[np.ndarray, np.ndarray]:
-    """The constraint, numbered through all batches, and the particle of every corner, batch by batch."""
+    """Return the constraint, numbered through all batches, and the particle of every corner, batch by batch."""
     first = np.cumsum([0] + [b.count for b in batches])
     owner = np.concatenate([b.owner + k for b, k in zip(batches, first, strict=False)])
     return owner, np.concatenate([b.indices.ravel() for b in batches])
 
 
 def components(n: int, owner: np.ndarray, item: np.ndarray) -> np.ndarray:
-    """Labels of n owners: equal where a chain of shared items leads from one to the other. Owner owner[k] has item item[k]."""
+    """Return labels of n owners, (n,): equal where shared items connect them. Owner owner[k] has item item[k]."""
     label, items = np.arange(n), int(item.max(initial=-1)) + 1
     while True:
         least = np.full(items, n)
         np.minimum.at(least, item, label[owner])
         new = label.copy()
         np.minimum.at(new, owner, least[item])
-        np.minimum.at(new, label, new.copy())  # what is known of one is known of all with its label
+        np.minimum.at(new, label, new.copy())  # owners with one label get the least label that any of them has found
         while not np.array_equal(new, new[new]):
             new = new[new]
         if np.array_equal(new, label):
@@ -34,10 +34,10 @@ def components(n: int, owner: np.ndarray, item: np.ndarray) -> np.ndarray:
 
 
 def bodies_of(m: int, row: np.ndarray, who: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bodies: constraints and particles that hang together by particles that can move. Returns their labels, (m,) and (n,); those
-    of particles that no constraint can move are m.
+    """Return labels of bodies, for constraints (m,) and particles (n,). A body is what movable particles connect.
 
-    Corner k belongs to constraint row[k] of m, and is particle who[k]. w: inverse masses, (n,).
+    Corner k belongs to constraint row[k] of m, and is particle who[k]. w: inverse masses, (n,). Particles that no constraint can
+    move have the label m.
     """
     free = w[who] > 0
     label = components(m, row[free], who[free])

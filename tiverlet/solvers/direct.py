@@ -1,4 +1,4 @@
-"""Chains, trees and loops by elimination: exact for any length, any mass ratio and any compliance."""
+"""Elimination of chains, trees and loops: exact for any length, mass ratio and compliance."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -17,51 +17,53 @@ from .system import REDUNDANT, SLACK, System, solvable
 if TYPE_CHECKING:
     from ..constraints.core.scalar import Scalar
 
-CONTRADICTION = 1e-6  # of its violation: what others leave of such a constraint without contradicting it
-SMALL_PIVOT = 2e-3  # of what the heaviest of its particles adds to it: with a pivot below, a load is hardly borne to first order
-AGREEMENT = 0.25  # of the tension: how far the two ends of a substep may differ about it there
+CONTRADICTION = 1e-6  # of its violation: a redundant constraint with a smaller residual does not contradict the others
+SMALL_PIVOT = 2e-3  # of the contribution of its heaviest particle: below, a load is hardly borne to first order
+AGREEMENT = 0.25  # of the tension: how far solutions with directions at the two ends of the substep may differ there
 STABLE = 2.0  # (omega h)^2 that is allowed there: half the limit of stability
-ROUNDS = 8  # of finding out which ropes pull, and how soft a system has to be
+ROUNDS = 8  # at most, in search of the ropes that pull, and of the softness of a system
 
-# A second step of Newton's method is taken where a particle moved by more than LONG (of a length, squared), unless a tension was
-# above CALM, (omega h)^2: such vibrations are not resolved, and bring in energy, which what the first step leaves takes out.
+# A system takes a second Newton step if a particle moved by more than the square root of LONG, in lengths, unless a tension was
+# above CALM, (omega h)^2. Such vibrations are not resolved and gain energy; the error of the first step removes it.
 LONG, CALM = 1e-5, 0.35
-UNKNOWN, UNMET, ENDED = range(3)  # whether a system takes it: known by the moves of the first; yes; no, whatever these are
+UNKNOWN, UNMET, ENDED = range(3)  # whether a system takes it: decided by the moves of the first step; yes; no
 
-# (omega h)^2 to which a tension gives way with directions at the end of the substep. There the move is a step down the gradient
-# of a convex energy, sum lam |r|; as long as this is at most 1, it brings in no more than lam times what the links shorten.
+# (omega h)^2 to which tensions are softened, with directions at the end of the substep. There the move is a step down the
+# gradient of a convex energy, sum lam |r|. Up to 1, it adds at most lam times the shortening of the links.
 SOFTENED_TO = 1.0
-LEAST_SOFTNESS = 2e-12  # of its diagonal: how much it gives way in any case, so that no pivot vanishes
+LEAST_SOFTNESS = 2e-12  # of the largest diagonal: the least softness, so that no pivot vanishes
 
-# What a system is solved for: with directions at the start of the substep, in f32 first with violations to f32; with those at its
-# end, to compare; then as before if they agree, else at the end as softly as it has to be.
+# Stages of solve(). ROUGH: directions at the start of the substep, violations in f32. FORWARD: the same directions, accurate
+# violations. COMPARE: directions at the end. AGAIN: as FORWARD, once both agree. GIVE_WAY: directions at the end, softened.
 ROUGH, FORWARD, AGAIN, COMPARE, GIVE_WAY, DONE = range(6)
 
 
 class Direct(Solver):
-    """Constraints that hang together like chains, trees or closed loops are solved as one linear system, by elimination.
+    """Solves connected constraints (chains, trees, closed loops) as one linear system, by elimination.
 
-    Each iteration is a step of Newton's method for all multipliers of a system, in the metric of SHAKE, with the gradients at the
-    current positions and the directions at the start of the substep (Barth et al. 1995, Leimkuhler and Skeel 1994 for the same in
-    f64). With iterations=1 a system takes a second one where the first was long:
+    Each iteration is a Newton step for all multipliers of a system, in the metric of SHAKE, with the gradients at the current
+    positions and the directions at the start of the substep (Barth et al. 1995, Leimkuhler and Skeel 1994 for the same in f64):
 
         A_j sum_k (grad C_j(x) . w . grad C_k(x_n)) dlam_k + alpha'_j dlam_j = -(A_j C_j + B_j + alpha'_j lam_j)
 
-    which is tridiagonal for a chain. The systems are found when the world is built: constraints that share a particle that can
-    move are coupled, and are eliminated in order of least degree, the same order on every run; one thread for each system.
+    The matrix is tridiagonal for a chain. With iterations=1 a system takes a second step where the first was long. Systems are
+    found when the world is built. Constraints that share a movable particle are coupled. They are eliminated in order of least
+    degree, the same order on every run, with one thread for each system.
 
-    width: a set of connected constraints becomes a system when no step of its elimination couples more than this many others;
-    a chain has width 1, a closed loop 2, a joint of k rods k - 1. What is wider (cloth), and what is not one number, is relaxed
-    as by Jacobi; a particle in both gives each of them a share of its mass. world.explain() says what went where.
+    width: a set of connected constraints becomes a system when no step of its elimination couples more than this many others.
+    A chain has width 1, a closed loop 2, a joint of k rods k - 1. Wider sets (cloth), and constraints that are not scalar
+    functions, are relaxed as by Jacobi. A particle in both gives each a share of its mass. world.explain() says which
+    constraints are solved in which way.
 
-    Ropes, spacers and limits take part: which of them act is found by switching off those whose multiplier has the wrong sign
-    and on those that are violated, until nothing changes. A constraint that others imply (a double link) is left to them.
-    The elimination is in f64 in every world, for its pivots span the mass ratio.
+    Ropes, spacers and limits take part by an active set: those whose multiplier has the wrong sign are switched off, and those
+    that are violated are switched on, until nothing changes. A constraint that others imply (a double link) gets no multiplier.
+    Elimination is in f64 in every world, because its pivots span the mass ratio.
 
-    A load that cannot be borne to first order (a straight rope between two pins) has no tension to speak of with directions at
-    the start of the step: any number, which brings in energy. Such a system, and one with (omega h)^2 > 4 across a tension, is
-    solved with directions at the end, and made softer until (omega h)^2 <= 1: it gives way and loses energy, and "softened" says
-    so. It is known by a pivot that is a small part of its diagonal while both ends of the substep disagree about the tension.
+    A load that cannot be borne to first order (a straight rope between two pins) leaves the tension undetermined with directions
+    at the start of the substep: an arbitrary number, which adds energy. Such a system is detected by a pivot that is a small part
+    of its diagonal, while solutions with directions at the start and at the end disagree about the tension. It is solved with
+    directions at the end, and softened until (omega h)^2 <= 1; so is a system with a transverse (omega h)^2 > 4. It gives way and
+    loses energy, and the flag "softened" says so.
     """
 
     converges = True
@@ -70,7 +72,7 @@ class Direct(Solver):
         self.width = checks.integer("Direct", "width", width, least=0)
 
     def system(self, scene: Scene, batches: list[Batch], slots: Slots) -> "Elimination | None":
-        """The systems of a scene on the device; None where there are none."""
+        """Return the systems of a scene on the device; None where there are none."""
         scalars = solvable(batches)
         if not scalars:
             return None
@@ -82,7 +84,7 @@ class Direct(Solver):
         return Elimination(scene, batches, slots, scalars, found, slot[free], item[free]) if found.parts else None
 
     def explain(self, batches: list[Batch], slots: Slots) -> str:
-        """What is solved how."""
+        """Return how many constraints are solved by elimination, and how many relaxed alone."""
         system = slots.system
         if not system:
             return f"{self!r}: no system; all are relaxed as by Jacobi (wider than {self.width}, or not one number)"
@@ -96,11 +98,11 @@ class Direct(Solver):
 
 
 class Elimination(System):
-    """The systems of one world on the device. Row r is a constraint, at its place in the elimination."""
+    """The systems of one world on the device. Rows are constraints in the order of elimination."""
 
     host_only = ("plan",)
-    parts: Any = OnDevice()
-    entries: Any = OnDevice()
+    parts: Any = OnDevice()  # number of systems
+    entries: Any = OnDevice()  # number of couplings of two rows
 
     def __init__(
         self, scene: Scene, batches: list[Batch], slots: Slots, scalars: "list[Scalar]", found: Plan, slot: np.ndarray,
@@ -132,13 +134,13 @@ class Elimination(System):
             self.near = scene.memory.field("system.near", scene.count, values=near)
             self.any_unmet = scene.memory.field("system.any_unmet", None, kind=ti.i32)
         self.sleeps = bool(scene.state.sleepers)
-        if self.sleeps:  # all of a system, or nothing
+        if self.sleeps:  # all particles of a system sleep, or none
             self.lead = ints("lead", self.leads(scalars, slots)[found.part_begin[:-1]])
         parts = [scene.inv_mass[b.indices] * (b.gradients(b.start.position) ** 2).sum(axis=2) for b in scalars]
         least = np.concatenate([np.where(p > 0, p, np.inf).min(axis=1, initial=np.inf) for p in parts])[found.rows]
         small = np.where(np.isfinite(least), SMALL_PIVOT * least, 0.0)
         self.small_pivot = scene.memory.field("system.small", self.rows, kind=ti.f64, values=small)
-        llvm = runtime.architecture() in runtime.LLVM  # which has all functions in f64
+        llvm = runtime.architecture() in runtime.LLVM  # LLVM has all functions in f64
         exact = [b.quantity.precise and scene.real == ti.f32 and (llvm or not b.quantity.transcends) for b in scalars]
         self.precise = [(k, b) for k, b in enumerate(scalars) if exact[k]]
         if self.precise:
@@ -150,7 +152,7 @@ class Elimination(System):
 
     @ti.func
     def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):
-        """What constraint r is about in this pass, but for what its corners tell. geometric_stiffness: see CornerPasses."""
+        """Set the data of row r for this pass, see System.set_row(), and whether a one-sided row is active."""
         System.set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness)
         if W > 0:
             self.inverse_size[r] = geometric_stiffness / (2 * W)
@@ -160,7 +162,7 @@ class Elimination(System):
 
     @ti.func
     def set_gradient(self, place, i, gradient):
-        """The gradient at one corner, whose slot is `place` and particle i."""
+        """Set the gradient at a corner with slot `place` and particle i."""
         if place >= 0:
             if ti.static(self.shares):
                 gradient *= self.share[i]
@@ -168,7 +170,7 @@ class Elimination(System):
 
     @ti.func
     def acts(self, r):
-        """Whether row r takes part."""
+        """Whether row r takes part in the system."""
         out = self.scale[r] != 0
         if ti.static(self.one_sided):
             out = self.active[r] != 0
@@ -176,7 +178,10 @@ class Elimination(System):
 
     @ti.func
     def assemble(self, begin, end, softness, at_end):
-        """The matrix, `softness` added to its diagonal, and the right side of the rows that act; others get the multiplier 0."""
+        """Assemble the matrix and right side of rows from `begin` up to `end`. Rows that do not act get the multiplier 0.
+
+        softness: added to the diagonal. at_end: whether directions are those at the end of the substep.
+        """
         rows, entries = self.rows, self.entries
         for r in range(begin, end):
             self.value[r] = 0
@@ -197,7 +202,7 @@ class Elimination(System):
 
     @ti.func
     def coupling(self, at, at_end):
-        """grad C_j . w . grad C_k of one particle. at_end: with the gradient at the end of the substep for both."""
+        """Return grad C_j . w . grad C_k for one particle. at_end: both gradients are at the end of the substep."""
         move = self.move[at[2]]
         if at_end != 0:
             move = self.move_at_end(at[2])
@@ -208,7 +213,7 @@ class Elimination(System):
 
     @ti.func
     def move_at_end(self, s):
-        """What a multiplier of 1 moves the corner of slot s along the gradient at the end of the substep."""
+        """Return the move of the corner with slot s for a multiplier of 1, along the gradient at the end of the substep."""
         i = self.particle_of[s]
         move = self.gradient[s] * self.w.of(i)
         if ti.static(self.shares):
@@ -217,7 +222,7 @@ class Elimination(System):
 
     @ti.func
     def use_end_directions(self, begin, end):
-        """Rows move corners along their gradients at the end of the substep."""
+        """Set the moves of corners to the gradients at the end of the substep."""
         for r in range(begin, end):
             for q in range(self.product_begin[r], self.product_begin[r + 1]):
                 s = self.product[q][1]
@@ -226,9 +231,9 @@ class Elimination(System):
 
     @ti.func
     def eliminate(self, begin, end):
-        """Each row from those that it is coupled to, then back. Returns 1 where a pivot was small, 2 for a contradiction.
+        """Eliminate rows from `begin` up to `end`, then substitute back. Returns 1 if a pivot was small, 2 for a contradiction.
 
-        A constraint that others imply is left to them; it contradicts them where it is off by more than its digits.
+        A constraint that others imply gets no step. It contradicts them if its residual is larger than rounding.
         """
         hard, rows, entries = 0, self.rows, self.entries
         for r in range(begin, end):
@@ -261,7 +266,7 @@ class Elimination(System):
 
     @ti.func
     def update_active_set(self, begin, end, at_end):
-        """Rows off that would push where they can only pull, rows on that are violated; returns whether any changed."""
+        """Switch off one-sided rows with the wrong sign, and switch on violated ones. Returns whether any changed."""
         for r in range(begin, end):
             self.remaining[r] = 0
         changed = 0
@@ -280,14 +285,14 @@ class Elimination(System):
 
     @ti.func
     def solve_active_set(self, begin, end, softness, at_end):
-        """The step of every multiplier, of those that act. Returns what eliminate() does."""
+        """Find the steps of all rows that act, by an active set. Returns the result of eliminate()."""
         hard = 0
         if ti.static(self.one_sided):
             k = 0
             while k < ROUNDS:
                 self.assemble(begin, end, softness, at_end)
                 found = self.eliminate(begin, end)
-                hard = ti.max(found, ti.select(hard == 2, 2, 0))  # one that contradicts gets no multiplier, and is switched off
+                hard = ti.max(found, ti.select(hard == 2, 2, 0))  # a contradiction is kept: its row may be switched off next
                 k = ti.select(self.update_active_set(begin, end, at_end) != 0, k + 1, ROUNDS)
             for r in range(begin, end):
                 if self.side[r] * (self.lam[r] + self.step[r]) > 0:
@@ -299,10 +304,10 @@ class Elimination(System):
 
     @ti.func
     def limit_steps(self, begin, end):
-        """Whether steps go beyond where gradients are trusted and bring in energy, sum step (u + A step / 2) with A step =
-        -violation.
+        """Limit steps that go beyond where gradients are trusted and add energy. Returns whether any was limited.
 
-        Then rows with a curved f take the step that they would take by themselves, and the others have to follow.
+        The energy is sum step (u + A step / 2), with A step = -violation. Rows with a curved f then take the step that they
+        would take alone, and the system is solved again for the other rows.
         """
         gain, spare, too_far, found = ti.cast(0, ti.f64), ti.cast(0, ti.f64), False, 0
         for r in range(begin, end):
@@ -319,7 +324,7 @@ class Elimination(System):
 
     @ti.func
     def stretch(self, r):
-        """The length of constraint r, relative to that at rest: a longer one vibrates less."""
+        """Return the length of constraint r relative to its rest length. A longer one has a lower transverse frequency."""
         out = ti.cast(1, ti.f64)
         if self.scale[r] != 0:
             out += ti.max(self.violation[r], 0 * out) * self.inverse_size[r] / self.scale[r]
@@ -327,8 +332,10 @@ class Elimination(System):
 
     @ti.func
     def tensions(self, begin, end, at_end):
-        """(omega h)^2 of a transverse vibration under the multipliers found: the largest, and the sum; the stiffness behind it,
-        and the largest diagonal."""
+        """Return (omega h)^2 of transverse vibrations under the multipliers found: the largest, and the signed sum.
+
+        Also returned are the ratio of violations to steps, which is the mean stiffness of the system, and the largest diagonal.
+        """
         worst, total = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         size, steps, most = ti.cast(0, ti.f64), ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         for r in range(begin, end):
@@ -344,7 +351,7 @@ class Elimination(System):
 
     @ti.func
     def bears(self, begin, end):
-        """(omega h)^2 under the multipliers of the passes before."""
+        """Return the largest (omega h)^2 of a transverse vibration under the multipliers of the earlier passes."""
         worst = ti.cast(0, ti.f64)
         for r in range(begin, end):
             worst = ti.max(worst, self.geometric_stiffness[r] * ti.abs(self.lam[r]))
@@ -352,13 +359,16 @@ class Elimination(System):
 
     @ti.func
     def stay(self, begin, end):
-        """Make no step."""
+        """Set all steps to 0."""
         for r in range(begin, end):
             self.step[r] = 0
 
     @ti.func
     def refine_violations(self, begin, end):
-        """In f32: violations to all the digits that positions have. Those of a taut rope are of second order in its slopes."""
+        """Recompute rigid violations to the full accuracy of positions, in f32.
+
+        A taut rope needs this: its violations are of second order in its slopes.
+        """
         for r in range(begin, end):
             for k, b in ti.static(self.precise):
                 if self.batch[r] == k and self.alpha[r] == 0 and self.scale[r] != 0:
@@ -368,7 +378,7 @@ class Elimination(System):
 
     @ti.func
     def limit_tensions(self, begin, end):
-        """Limit each multiplier to the largest tension that the substep can stand."""
+        """Limit each multiplier to the tension with (omega h)^2 = SOFTENED_TO."""
         for r in range(begin, end):
             if self.geometric_stiffness[r] > 0:
                 most = SOFTENED_TO * self.stretch(r) / self.geometric_stiffness[r]
@@ -376,7 +386,7 @@ class Elimination(System):
 
     @ti.func
     def takes_step(self, b, newton):
-        """Whether system b takes this step of Newton's method in a pass."""
+        """Whether system b takes Newton step number `newton` of a pass."""
         out = True
         if ti.static(self.refines):
             if newton == 0:
@@ -387,19 +397,21 @@ class Elimination(System):
 
     @ti.func
     def end_newton(self, b):
-        """System b takes no other step of Newton's method in this pass."""
+        """Mark system b as taking no further Newton step in this pass."""
         if ti.static(self.refines):
             self.newton[b] = ENDED
 
     @ti.func
     def is_unmet(self, r):
-        """Whether the system of row r takes another step of Newton's method."""
+        """Whether the system of row r takes another Newton step."""
         return self.newton[self.part_of[r]] == UNMET
 
     @ti.func
     def note_move(self, i, begin, end, move):
-        """Note where particle i moved so far that rigid constraints of its system are left unmet: a length l by |u|^2 / (2 l),
-        where its ends moved across it by u, relative to each other."""
+        """Mark the system of particle i for another Newton step if i moved so far that rigid constraints stay violated.
+
+        A length l whose ends moved across it by u relative to each other is violated by |u|^2 / (2 l).
+        """
         if (self.near[i] * move).norm_sqr() > LONG:
             for s in range(begin, end):
                 r = self.row_of[s]
@@ -410,12 +422,12 @@ class Elimination(System):
 
     @ti.func
     def solve(self, b):
-        """System b: the step of every multiplier in it.
+        """Find the steps of all multipliers in system b.
 
-        A tension makes particles vibrate across. Where the substep is too long for that, or no tension is right, see Direct, the
-        system is solved with directions at the end of the substep, and gives way until its tension is small enough: one over the
-        tension grows linearly with the softness, where one load cannot be borne. Where an earlier pass found more tension than
-        that, to give way now would be to take most of it back, along other directions: the system stays where it is.
+        Particles under tension vibrate transversely. If the substep is too long for that, or the tension is undetermined (see
+        Direct), the system is solved with directions at the end of the substep. It is softened until its tension is small enough:
+        where one load cannot be borne, one over the tension grows linearly with the softness. If an earlier pass found a larger
+        tension, softening would take most of that tension back, along other directions; then the system takes no step.
         """
         begin, end = self.part_begin[b], self.part_begin[b + 1]
         if ti.static(self.sleeps):
@@ -453,7 +465,7 @@ class Elimination(System):
                 if same and tension <= STABLE:
                     stage = AGAIN
                 else:
-                    # What more substeps do not help has the figure of what is just unstable.
+                    # A load that more substeps do not help to bear is reported as just unstable, TENSEST.
                     ti.atomic_max(self.tension[None], ti.select(bound, tension_at_start, ti.min(tension, TENSEST)))
                     softness, stage = LEAST_SOFTNESS * most, GIVE_WAY
                     self.end_newton(b)

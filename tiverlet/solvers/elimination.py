@@ -1,4 +1,4 @@
-"""Which constraints are worth solving together, and in which order: the symbolic half of a sparse elimination."""
+"""The symbolic half of a sparse elimination: which constraints are solved together, and in which order."""
 
 import heapq
 from collections import defaultdict
@@ -10,46 +10,46 @@ import numpy as np
 from ..geometry.ordered import distinct
 from .corners import components, corners_of
 
-SHORT = 4096  # corners of a part up to which its plan is kept
-COUNTED = (("entry", "column"), ("product", "product"), ("update", "update"))  # what X_begin counts, row by row, and its array
+SHORT = 4096  # corners of a part up to which its plan is cached
+COUNTED = (("entry", "column"), ("product", "product"), ("update", "update"))  # X of each X_begin, and the array it indexes
 
 
 @dataclass
 class Plan:
-    """Rows in elimination order, one part after the other, and where every number of the elimination goes.
+    """The plan of an elimination: rows in elimination order, part by part, and the address of every number.
 
-    All values stand in one array: a diagonal for each row, then for each coupling of two rows the entry above the diagonal, then
-    the one below.
+    All values are in one array: the diagonals of all rows, then for each coupling of two rows the entry above the diagonal, then
+    for each coupling the entry below.
     """
 
-    rows: np.ndarray  # (m,) constraints, by the numbers they were given
-    part_begin: np.ndarray  # (parts + 1,) rows of each part
-    entry_begin: np.ndarray  # (m + 1,) couplings of each row to later ones
-    column: np.ndarray  # (e,) the later row
-    product_begin: np.ndarray  # (m + 1,) products of each row
+    rows: np.ndarray  # (m,) the constraint of each row
+    part_begin: np.ndarray  # (parts + 1,) the first row of each part
+    entry_begin: np.ndarray  # (m + 1,) the first coupling of each row to later rows
+    column: np.ndarray  # (e,) the later row of each coupling
+    product_begin: np.ndarray  # (m + 1,) the first product of each row
     product: np.ndarray  # (q, 3) address of a value, corner that gives the gradient, corner that gives the move
-    update_begin: np.ndarray  # (m + 1,)
-    update: np.ndarray  # (u,) addresses of what the elimination of a row changes, all pairs of its couplings in order
-    widths: list[int] = field(default_factory=list)  # of each part: the most rows that one elimination couples
+    update_begin: np.ndarray  # (m + 1,) the first update of each row
+    update: np.ndarray  # (u,) addresses of the values that eliminating a row changes: all pairs of its couplings, in order
+    widths: list[int] = field(default_factory=list)  # (parts,) the most rows that one elimination couples
 
     @property
     def parts(self) -> int:
-        """The number of systems that have nothing to do with each other."""
+        """Number of independent systems."""
         return len(self.part_begin) - 1
 
 
 def plan_of(links: list, inv_mass: np.ndarray, width: int) -> Plan:
-    """The parts of these batches, see plan(); particles that cannot move couple nothing."""
+    """Return the plan of all constraints in these batches, see plan(). Particles that cannot move couple no constraints."""
     owner, item = corners_of(links)
     free = inv_mass[item] > 0
     return plan(sum(b.count for b in links), owner[free], item[free], width)
 
 
 def plan(count: int, owner: np.ndarray, item: np.ndarray, width: int) -> Plan:
-    """The parts of `count` constraints whose elimination never couples more than `width` others, in order of least degree.
+    """Return the plan of those parts of `count` constraints whose elimination never couples more than `width` others.
 
-    (owner[k], item[k]): corner k belongs to constraint `owner` and is the particle `item`, which can move. Constraints that share
-    a particle are coupled. A chain has width 1, a closed loop 2, a joint of k rods k - 1.
+    owner, item: corner k belongs to constraint owner[k] and is the movable particle item[k]. Constraints that share a particle
+    are coupled. Elimination is in order of least degree. A chain has width 1, a closed loop 2, a joint of k rods k - 1.
     """
     label = components(count, owner, item)
     crowd = np.bincount(item, minlength=1)
@@ -70,13 +70,13 @@ def plan(count: int, owner: np.ndarray, item: np.ndarray, width: int) -> Plan:
 
 
 def _numbered(part: np.ndarray, what: np.ndarray, parts: int) -> tuple[np.ndarray, np.ndarray]:
-    """All of `what`, each once, by part, (k, 2); and for every one its number among those of its part, in order."""
+    """Return the distinct pairs (part, what), (k, 2); and for each element of `what` its index among those of its part."""
     each, which, _ = distinct(np.stack([part, what], axis=1))
     return each, (which - np.searchsorted(each[:, 0], np.arange(parts))[part]).astype(np.int32)
 
 
 def _planned(width: int, owner: bytes, item: bytes) -> Plan | None:
-    """One part, whose owners and items are numbered from 0 on, as bytes of i32; None where it is wider than `width`."""
+    """Return the plan of one part; None where it is wider than `width`. owner, item: numbered from 0, as bytes of i32."""
     owners, items = (np.frombuffer(one, dtype=np.int32).tolist() for one in (owner, item))
     corners: dict[int, list[int]] = defaultdict(list)
     sharing: dict[int, list[int]] = defaultdict(list)
@@ -88,30 +88,30 @@ def _planned(width: int, owner: bytes, item: bytes) -> Plan | None:
     return _addresses(found, corners, sharing, owners, items) if found else None
 
 
-# Many parts are alike, as ropes of one length are, and those of an edited world are known from before.
+# Many parts are alike, as ropes of one length are, and an edited world has mostly the parts that it had.
 _known = lru_cache(maxsize=64)(_planned)
 
 
 def _joined(found: list[tuple[Plan, int, int]], owners: np.ndarray, corners: np.ndarray) -> Plan:
-    """The plan of all parts: of each its own, and from which number on the owners and the corners are its."""
+    """Return the plan of all parts. found: for each part its plan, and the first of its owners and of its corners."""
     plans = [one for one, _, _ in found]
 
     def sizes(name: str) -> np.ndarray:
-        """How many each part has of something."""
+        """Return the length of a named array of each part."""
         return np.array([len(getattr(one, name)) for one in plans], dtype=np.int64)
 
     def ends(name: str) -> np.ndarray:
-        """Where those of each part begin, and where all end."""
+        """Return where the elements of each part begin in a joined array, and where all end."""
         return np.concatenate([[0], np.cumsum(sizes(name))])
 
     def joined(name: str, shift: np.ndarray | list[int], skip: int = 0) -> np.ndarray:
-        """What each part has of something, shifted."""
+        """Join a named array of all parts, without its first `skip` elements, with `shift` added to the values of each part."""
         each = [getattr(one, name)[skip:] for one in plans]
         by = np.repeat(np.asarray(shift[: len(plans)], dtype=np.int64), [len(some) for some in each])
         return np.concatenate([*each, np.zeros(0, dtype=np.int64)]) + by
 
     def shifted(address: np.ndarray, name: str) -> np.ndarray:
-        """Addresses in the arrays of the parts, in that of all."""
+        """Return addresses in the arrays of the parts as addresses in the joined array."""
         part = np.repeat(np.arange(len(plans)), sizes(name))
         m, entries = sizes("rows")[part], sizes("column")[part]
         row, entry = address + rows[part], address - m + rows[-1] + columns[part]
@@ -129,7 +129,7 @@ def _joined(found: list[tuple[Plan, int, int]], owners: np.ndarray, corners: np.
 
 
 def _eliminate(near: dict[int, set[int]], width: int) -> list[tuple[int, list[int]]] | None:
-    """Rows in order of least degree, each with those that it is coupled to then; None where there would be more than `width`."""
+    """Return rows in order of least degree, each with the rows it is then coupled to; None if these exceed `width`."""
     queue = [(len(others), c) for c, others in near.items()]
     heapq.heapify(queue)
     out = []
@@ -150,7 +150,7 @@ def _eliminate(near: dict[int, set[int]], width: int) -> list[tuple[int, list[in
 
 
 def _addresses(found: list[tuple[int, list[int]]], corners, sharing, owners, items) -> Plan:
-    """The plan of one part, from what _eliminate() found."""
+    """Return the plan of one part. found: the result of _eliminate()."""
     order, later = [c for c, _ in found], dict(found)
     at = {c: r for r, c in enumerate(order)}
     m = len(order)
@@ -160,7 +160,7 @@ def _addresses(found: list[tuple[int, list[int]]], corners, sharing, owners, ite
     entry = {(r, j): e for r, row in enumerate(columns) for e, j in enumerate(row, int(ends[r]))}
 
     def address(row: int, column: int) -> int:
-        """Where an entry of the matrix lies: diagonals first, then one triangle, then the other."""
+        """Return the address of an entry of the matrix: diagonals first, then the upper triangle, then the lower."""
         if row == column:
             return row
         return m + entry[row, column] if row < column else m + total + entry[column, row]
@@ -175,7 +175,7 @@ def _addresses(found: list[tuple[int, list[int]]], corners, sharing, owners, ite
         update_begin.append(len(updates))
 
     def ints(values) -> np.ndarray:
-        """As an array."""
+        """Return values as an array of integers."""
         return np.asarray(values, dtype=np.int64)
 
     return Plan(

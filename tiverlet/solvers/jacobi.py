@@ -1,4 +1,4 @@
-"""Mass-split Jacobi by slots and gathers: parallel, momentum-conserving, the same bits on any number of threads."""
+"""Mass-split Jacobi by slots and gathers: parallel, momentum-conserving, the same bit for bit on any number of threads."""
 
 import numpy as np
 
@@ -10,18 +10,18 @@ from .system import solvable
 
 
 class Jacobi(Solver):
-    """Every constraint is solved by itself from the same positions, and every particle adds up its share.
+    """Solves every constraint by itself from the same positions; every particle sums its corrections.
 
-    A particle in n constraints gives each an n-th of its mass (mass splitting, Tonge 2012): the corrections then never sum to
-    more than the whole, and unlike averaging they conserve momentum.
+    A particle in n constraints gives each an n-th of its mass (mass splitting, Tonge 2012). Then corrections never sum to
+    more than the whole, and unlike averaged corrections they conserve momentum.
 
     relaxation: factor on each correction. With one iteration per substep, stepping is stable if and only if every eigenvalue p of
-    the residual polynomial has -1/3 < p < 1, p = 1 - relaxation lambda, so relaxation < 4 / (3 lambda_max). Mass splitting has
-    lambda_max <= 1, whatever the geometry. A net has less (a square one 0.66, cloth with shear 0.53) as long as it is not folded
-    up: when the world is built, power iteration finds the value of the scene as it starts. What exceeds the law is refused then,
-    and "auto" takes 1.2 / lambda_max, or 1 where constraints are soft (their stiffness would change) or not one number.
+    the residual polynomial has -1/3 < p < 1, p = 1 - relaxation lambda, so relaxation < 4 / (3 lambda_max). With mass splitting
+    lambda_max <= 1 for any geometry. A net that is not folded up has less (a square one 0.66, cloth with shear 0.53). When the
+    world is built, power iteration finds the value of the scene as it starts. A relaxation beyond the limit is refused. "auto"
+    takes 1.2 / lambda_max, or 1 where constraints are soft (their stiffness would change) or are not scalar functions.
 
-    loads: whether rigid links learn the loads that they bear at rest, and pull them without being stretched. See KnownLoad.
+    loads: whether rigid links learn the loads that they bear at rest, and pull with them without being stretched. See KnownLoad.
     """
 
     def __init__(self, relaxation: float | str = 1.0, *, loads: bool = False):
@@ -31,7 +31,7 @@ class Jacobi(Solver):
         self.relaxation = relaxation
 
     def relaxed_by(self, scene: Scene, batches: list[Batch], split: np.ndarray) -> float:
-        """The factor in this scene; ValueError where stepping would be unstable."""
+        """Return the factor for this scene. Raise ValueError if stepping would be unstable."""
         if self.relaxation != "auto" and self.relaxation < 4 / 3:
             return float(self.relaxation)
         scalars = [b for b in solvable(batches) if not b.soft]
@@ -55,7 +55,7 @@ class Jacobi(Solver):
         return float(self.relaxation)
 
     def explain(self, batches, slots) -> str:
-        """What is solved how."""
+        """Return which constraints are solved in which way, and the relaxation."""
         factor = f", relaxation {slots.relaxation:.3g}" if self.relaxation == "auto" else ""
         return super().explain(batches, slots) + factor
 

@@ -1,4 +1,4 @@
-"""Where constraints leave the moves that they want, and where particles collect them."""
+"""Slots: constraints write their corrections into them, and particles sum them."""
 
 from typing import Any
 
@@ -12,12 +12,15 @@ from ..features.regrouping import Regrouping
 from .corners import bodies_of, corners_of
 from .system import solvable
 
-# Where constraints converge within a substep, SHAKE is an explicit method for what is across them, with a limit:
-TENSEST = 4.0  # (omega h)^2 of a vibration across a tension, beyond which Verlet diverges
+# Where constraints converge within a substep, SHAKE is an explicit method for transverse vibrations, with a limit of stability:
+TENSEST = 4.0  # (omega h)^2 of a transverse vibration under a tension, beyond which Verlet diverges
 
 
 def arranged(batches: list[Batch], inv_mass: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray]:
-    """The slots of the corners of each batch, by its id, -1 for what cannot move; and how many each particle has, (n,)."""
+    """Return the slot of each corner, by the id of its batch, and the number of slots of each particle, (n,).
+
+    Corners that cannot move have the slot -1.
+    """
     n, members = len(inv_mass), corners_of(batches)[1]
     movable = inv_mass[members] > 0
     order = np.argsort(np.where(movable, members, n), kind="stable")
@@ -31,15 +34,14 @@ def arranged(batches: list[Batch], inv_mass: np.ndarray) -> tuple[dict[int, np.n
 
 
 class Slots:
-    """One slot for each corner of a constraint, in the order of the batches and of the constraints in them.
+    """A slot for each corner of a constraint, into which the constraint writes the correction of the particle [m].
 
-    The slots of one particle stand side by side, so that a particle adds them in an order that depends on nothing else. Corners
-    that cannot move have no slot.
+    The slots of a particle are adjacent, in the order of batches and constraints, so a particle always sums them in the same
+    order. Corners that cannot move have no slot.
 
-    loads: whether constraints that are relaxed by themselves know their loads. bears: where they do, the largest load in each
-    body, in weights of a particle, as a window ends. split: the mass-split weight n w of each particle, for the n
-    blocks of constraints that it belongs to: a system that is solved as a whole is one, and each constraint that is relaxed by
-    itself.
+    loads: whether constraints that are relaxed by themselves learn their loads, see KnownLoad. bears: if so, the largest load in
+    each body at the end of a window, in weights of a particle. split: the mass-split weight n w of each particle, for the n
+    blocks of constraints that it belongs to. A block is a system, or a constraint that is relaxed by itself.
     """
 
     bodies: Any = OnDevice()
@@ -63,7 +65,7 @@ class Slots:
         self.system: Any = solver.system(scene, batches, self)
         self.has_system = bool(self.system)
         self.refines = self.has_system and self.system.refines
-        # Whether a substep fulfils constraints to rounding, which is then the error that is left.
+        # Whether a substep satisfies constraints up to rounding.
         scalars = solvable(batches)
         self.exact = bool(scalars) and (not self.system.steps if self.system else bool(degree.max(initial=0) <= 1))
         self._scalars = bool(scalars)
@@ -78,8 +80,11 @@ class Slots:
 
     @staticmethod
     def _tied(batches: list[Batch], inv_mass: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray]:
-        """The body of each constraint, by the batch's id; and the root of the sum of the squares of the masses [kg] of each body.
-        Constraints that share particles that can move, directly or through others, are of one body."""
+        """Return the body of each constraint, by the id of its batch, and the heft of each body, see heft() [kg].
+
+        Constraints that share movable particles, directly or through other constraints, are of one body. The heft is the root of
+        the sum of the squared masses.
+        """
         ends = np.cumsum([b.count for b in batches])
         label, body = bodies_of(int(ends[-1]), *corners_of(batches), inv_mass)
         parts = np.split(label, ends[:-1])
@@ -88,29 +93,31 @@ class Slots:
         return {id(b): part for b, part in zip(batches, parts, strict=True)}, hefts
 
     def body(self, batch: Batch) -> np.ndarray:
-        """The body of each constraint of a batch, where loads become known, or constraints break."""
+        """Return the body of each constraint of a batch, (m,), where constraints learn loads or break."""
         return self._bodies[id(batch)]
 
     def heft(self, batch: Batch) -> np.ndarray:
-        """What rounding of places weighs in the body of each constraint [kg], see Strength."""
+        """Return the heft of the body of each constraint, (m,) [kg]: the mass that rounding of positions moves, see Strength."""
         return self._hefts[self.body(batch)]
 
     def regroup(self, memory: Memory, change: Regrouping) -> None:
-        """Particles that no constraint holds came and went."""
+        """Adapt the slots to added and removed particles, none of which any constraint holds."""
         n, first = change.now.count, change.first
         memory.resize(self.begin, n + 1)
         memory.write_from(self.begin, first, np.full(n + 1 - first, self.total))
 
     def can_grab(self, inv_mass: np.ndarray, batches: list[Batch]) -> bool:
-        """Whether constraints can act on other particles than before, with the same kernels: each is relaxed by itself, and they
-        need as many slots and are as exact as before."""
+        """Whether constraints can be moved to other particles with the same kernels.
+
+        That requires that each is relaxed by itself, and that the number of slots and `exact` stay the same.
+        """
         if self.system or self.semi_iteration or not all(b.arity for b in batches):
             return False
         degree = arranged(batches, inv_mass)[1]
         return int(degree.sum()) == self.total and self.exact == (self._scalars and bool(degree.max(initial=0) <= 1))
 
     def grab(self, memory: Memory, inv_mass: np.ndarray, batches: list[Batch]) -> None:
-        """Have constraints act on other particles than before."""
+        """Move constraints to other particles: assign slots from their present corners."""
         self._places, degree = arranged(batches, inv_mass)
         memory.write(self.begin, np.concatenate([[0], np.cumsum(degree)]))
         memory.write(self.split, degree * inv_mass)
@@ -118,17 +125,19 @@ class Slots:
             memory.write(b.dev.corners.places, self.places(b))
 
     def places(self, batch: Batch) -> np.ndarray:
-        """The slot of each corner of a batch, -1 where it cannot move."""
+        """Return the slot of each corner of a batch, (m, corners), -1 for corners that cannot move."""
         return self._places[id(batch)]
 
     def rows(self, batch: Batch) -> np.ndarray:
-        """The row of each constraint of a batch in a system, -1 where it is relaxed by itself."""
+        """Return the row of each constraint of a batch in the system, (m,), -1 for constraints that are relaxed alone."""
         return self.system.row(batch) if self.system else np.full(batch.count, -1)
 
     @ti.func
     def limited(self, wanted, geometric_stiffness):
-        """The multiplier `wanted`, limited so that (omega h)^2 = geometric_stiffness |multiplier| is at most TENSEST; what is
-        beyond is noted."""
+        """Return the multiplier `wanted`, limited so that (omega h)^2 = geometric_stiffness |multiplier| is at most TENSEST.
+
+        Where the limit acts, the value without the limit is stored for the report.
+        """
         most = TENSEST / geometric_stiffness
         if ti.abs(wanted) >= most:
             ti.atomic_max(self.tension[None], ti.cast(TENSEST * ti.abs(wanted) / most, ti.f64))
@@ -136,7 +145,10 @@ class Slots:
 
     @ti.func
     def turn(self, along, sizes):
-        """How far a direction turned, from the product of what it was and is, and that of their sizes."""
+        """Return how far a direction turned: 0, BENT or FAR.
+
+        along: the dot product of the old and new direction. sizes: the product of their norms.
+        """
         out = 0
         if along < 0.9 * sizes:
             out = BENT
@@ -146,13 +158,13 @@ class Slots:
 
     @ti.func
     def note_turn(self, turn):
-        """Keep the worst turn. Threads that all write to the same place wait for each other, so they look first."""
+        """Store the largest turn. The field is read first, because atomic writes to one place make threads wait."""
         if turn > self.turned[None]:
             ti.atomic_max(self.turned[None], turn)
 
     @ti.func
     def total_of(self, i):
-        """The sum of the moves in the slots of particle i, in order."""
+        """Return the sum of the moves in the slots of particle i, in order [m]."""
         total = 0 * self.state.x[i]
         for s in range(self.begin[i], self.begin[i + 1]):
             total += self.move[s]
@@ -160,7 +172,7 @@ class Slots:
 
     @ti.func
     def wanted(self, i):
-        """What the constraints want of particle i: the sum of the moves, in f64 where large ones of a system cancel."""
+        """Return the correction of particle i: the sum of its moves [m]. With a system it is in f64, as large moves cancel."""
         total = 0 * self.state.x[i]
         if ti.static(self.has_system):
             total = self.system.total_of(i, self.begin[i], self.begin[i + 1])
@@ -170,7 +182,7 @@ class Slots:
 
     @ti.func
     def gather(self, i, newton):
-        """Move particle i by what the constraints want; in later steps of Newton's method, by what its system wants."""
+        """Move particle i by the sum of its slots. In later Newton steps, only particles of systems that take the step move."""
         begin, end = self.begin[i], self.begin[i + 1]
         if ti.static(self.refines):
             if newton > 0 and end > begin:

@@ -11,11 +11,11 @@ if TYPE_CHECKING:
     from ..constraints.core.scalar import Scalar
     from ..features.feature import Scene
 
-ROUNDS = 300  # of power iteration; it converges from below, and the margin of 1.2 to 4/3 covers what is missing
+ROUNDS = 300  # of power iteration, which converges from below; the margin from 1.2 to 4/3 covers its error
 
 
 def largest(scene: "Scene", scalars: "list[Scalar]", split: np.ndarray, rounds: int = ROUNDS) -> float:
-    """lambda_max of D^-1 A for the scene as it starts, A = G w G^T and D its diagonal in mass-split weights."""
+    """Return lambda_max of D^-1 A for the scene as it starts: A = G w G^T, and D is its diagonal with mass-split weights."""
     w, n, dim = scene.inv_mass, len(scene.inv_mass), scene.particles.dim
     row, who = corners_of(scalars)
     G = np.concatenate([b.gradients(b.start.position).reshape(-1, dim) for b in scalars])

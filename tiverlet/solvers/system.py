@@ -1,4 +1,4 @@
-"""Constraints that are solved together: what they tell, and what particles make of the answer."""
+"""Systems: constraints that are solved together. The data of their rows, and the moves of their particles."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -13,29 +13,29 @@ if TYPE_CHECKING:
     from ..features.feature import Batch, Scene
     from .slots import Slots
 
-REDUNDANT = 1e-12  # of its diagonal: what is left of a constraint that others imply
-SLACK = 0.1  # of |step violation|: how much energy steps may bring in by their own curvature
+REDUNDANT = 1e-12  # of its diagonal: a pivot this small belongs to a constraint that others imply
+SLACK = 0.1  # of |step violation|: the energy that steps may add by their own curvature
 
 
 def solvable(batches: "list[Batch]") -> list[Any]:
-    """Batches whose constraints a System may solve: each is a Scalar."""
+    """Return the batches whose constraints a System may solve; each is a Scalar."""
     return [b for b in batches if b.solvable_together]
 
 
 class System:
-    """Rows of constraints, each with its violation, its weights and the step of its multiplier that a solver finds.
+    """A system: rows of constraints, each with a violation, weights, and the step of its multiplier that the solver finds.
 
-    In every pass constraints set their rows and gradients. Then solve() finds the steps part by part, each by one thread; or all
-    threads go through start(), `steps` times iterate(), and end(). Particles move by the sum of step times move over their slots.
+    In every pass, constraints set their rows and gradients. Then solve() finds the steps of each part, with one thread per part.
+    Or all threads call start(), `steps` times iterate(), and end(). Particles move by the sum of step * move over their slots.
 
-    scalars: the batches that take part, their constraints numbered through; rows: those numbers, in the order of the solver.
+    scalars: the batches that take part, with constraints numbered through. rows: these numbers, in the order of the solver.
     """
 
     rows: Any = OnDevice()
-    parts: Any = 1  # systems that have nothing to do with each other
-    steps = 0  # of an iteration, by start(), iterate() and end(); 0 for a solution by solve()
-    refines = False  # whether parts may take a second step of Newton's method in a pass, which takes_step() and is_unmet() tell
-    team: Any  # the threads that share the loops of start(), iterate() and end(), given when the kernels are made
+    parts: Any = 1  # number of independent systems
+    steps = 0  # iterations of a pass, by start(), iterate() and end(); 0 for a solution by solve()
+    refines = False  # whether parts may take a second Newton step in a pass, see takes_step() and is_unmet()
+    team: Any  # the threads that share the loops of start(), iterate() and end(); set when kernels are built
     stride: int  # iterations of such a loop for each block of rows
 
     def __init__(self, scene: "Scene", batches: "list[Batch]", slots: "Slots", scalars: "list[Scalar]", rows: np.ndarray):
@@ -64,21 +64,24 @@ class System:
             self.share = scene.memory.field("system.share", scene.count, kind=ti.i32, values=self.blocks)
 
     def ints(self, name: str, values: np.ndarray, width: int = 0):
-        """A field of integers."""
+        """Declare a field of integers with these values."""
         return self.memory.field(f"system.{name}", len(values), width=width, kind=ti.i32, values=values)
 
     def reals(self, name: str, length: int | None = None):
-        """A field of f64, one for each row."""
+        """Declare a field of f64, with one number for each row, or `length` numbers."""
         return self.memory.field(f"system.{name}", self.rows if length is None else length, kind=ti.f64)
 
     def _blocks(self, batches: "list[Batch]", scene: "Scene") -> tuple[np.ndarray, bool]:
-        """The number of blocks that each particle belongs to, one system at most; and whether any is in a system and others."""
+        """Return the number of blocks of each particle, (n,), and whether any particle is both in a system and in other blocks.
+
+        A block is a system or a constraint that is relaxed alone; a particle is in one system at most.
+        """
         n = len(scene.inv_mass)
         inside, alone = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
         for b in batches:
             row = self.row(b)
             if b.acts_as_force(scene).any():
-                row = np.where(b.acts_as_force(scene), 0, row)  # forces take no share of the mass
+                row = np.where(b.acts_as_force(scene), 0, row)  # constraints that act as forces take no share of the mass
             if (row >= 0).any():
                 inside[b.indices[row >= 0]] = True
                 alone += np.bincount(b.indices[row < 0].ravel(), minlength=n)
@@ -88,11 +91,11 @@ class System:
         return np.where(free, inside + alone, 0), bool((inside & (alone > 0) & free).any())
 
     def row(self, batch: "Batch") -> np.ndarray:
-        """The row of each constraint of a batch, -1 where it is relaxed by itself."""
+        """Return the row of each constraint of a batch, (m,), -1 for constraints that are relaxed alone."""
         return self._rows.get(id(batch), np.full(batch.count, -1))
 
     def leads(self, scalars: "list[Scalar]", slots: "Slots") -> np.ndarray:
-        """One particle of each row that can move."""
+        """Return a movable particle of each row, (rows,)."""
         out = np.zeros(self.rows, dtype=np.int64)
         for b in scalars:
             row = np.broadcast_to(self.row(b)[:, None], b.indices.shape)
@@ -101,63 +104,72 @@ class System:
         return out
 
     def left_out(self, batches: "list[Batch]") -> int:
-        """How many constraints are relaxed by themselves, of those with a particle that can move."""
+        """Return how many constraints with a movable particle are relaxed by themselves."""
         return sum(int((~b.idle(self.inv_mass) & (self.row(b) < 0)).sum()) for b in batches)
 
     def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
-        """Particles were placed anew: forget what was found out on the way to their old places. off: of batches, (m,), by how
-        much rigid constraints cannot be met at the new ones."""
+        """Reset data learnt from earlier positions, after particles were put elsewhere.
+
+        off: for some batches, (m,), the violations of rigid constraints that cannot be removed at the new positions.
+        """
 
     @ti.func
     def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):
-        """What constraint r is about in this pass, but for what its corners tell. geometric_stiffness: see CornerPasses."""
+        """Set the data of row r for this pass, except gradients.
+
+        violation: A C + B + alpha' lam. A, alpha, lam, W: see CornerPasses.linearise(); W is 0 where no corner can move.
+        geometric_stiffness: see CornerPasses.
+        """
         self.violation[r], self.alpha[r], self.lam[r], self.geometric_stiffness[r] = violation, alpha, lam, geometric_stiffness
         self.scale[r] = ti.select(W > 0, A, 0 * A)
 
     @ti.func
     def limit_row(self, r, motion, spare_energy, trusted_step, own_step):
-        """Where steps are limited, see StepLimit: the motion along row r in this substep, the energy that it may bring in, the
-        step up to which its gradient is trusted, and minus the step that it takes where the others' brings in energy."""
+        """Set the limits on the step of row r, see StepLimit.
+
+        motion: along the row in this substep. spare_energy: the energy that the row may add. trusted_step: the step up to which
+        its gradient is trusted. own_step: minus the step that it takes alone, where the steps of the system would add energy.
+        """
         self.motion[r], self.spare_energy[r] = motion, spare_energy
         self.trusted_step[r], self.own_step[r] = trusted_step, own_step
 
     @ti.func
     def set_gradient(self, place, i, gradient):
-        """The gradient at one corner, whose slot is `place` and particle i."""
+        """Set the gradient at a corner with slot `place` and particle i."""
 
     @ti.func
     def takes_step(self, b, newton):
-        """Whether part b takes this step of Newton's method in a pass: all take the first, 0."""
+        """Whether part b takes Newton step number `newton` in a pass. All parts take the first, 0."""
         return True
 
     @ti.func
     def is_unmet(self, r):
-        """Where it refines: whether the part of row r takes another step of Newton's method."""
+        """Whether the part of row r takes another Newton step. Used where `refines`."""
         return False
 
     @ti.func
     def note_move(self, i, begin, end, move):
-        """Where it refines: particle i, with the slots from `begin` up to `end`, moved."""
+        """Record that particle i, with slots from `begin` up to `end`, has moved by `move` [m]. Called where `refines`."""
 
     @ti.func
     def solve(self, b):
-        """Part b: the step of every multiplier in it."""
+        """Find the steps of all multipliers in part b."""
 
     @ti.func
     def start(self, thread):
-        """Before the first of `steps` iterations."""
+        """Prepare for the first of `steps` iterations."""
 
     @ti.func
     def iterate(self, thread):
-        """One of `steps` iterations."""
+        """Do one of `steps` iterations."""
 
     @ti.func
     def end(self, thread):
-        """After the last iteration."""
+        """Finish after the last iteration."""
 
     @ti.func
     def total_of(self, i, begin, end):
-        """The sum of the moves of particle i: those of a large tension at both sides of it cancel, in f64."""
+        """Return the sum of the moves of particle i [m], in f64: moves of large tensions on both sides of it cancel."""
         total = ti.Vector.zero(ti.f64, self.dim)
         for s in range(begin, end):
             r, factor = self.row_of[s], ti.cast(1, ti.f64)

@@ -1,9 +1,9 @@
-"""Constraints that come and go in place: they are bound again, to the fields that they have, which get other lengths.
+"""Adding and removing constraints in place: all constraints are bound again to the fields that they have, with new lengths.
 
-What a constraint has on the device follows from all of them: slots stand by particles, and systems are eliminated in an order of
-their own. So the same code that binds them when a world is built runs once more, and fields that it declares are those that are
-there, see device/again.py. Where it declares others, or kernels could read anything else than before, nothing was changed, and
-the world is built anew.
+The fields of a constraint depend on all constraints: slots are ordered by particle, and systems by elimination. So the code that
+binds constraints when a world is built runs once more. Each field that it declares is one that exists already, see
+device/again.py. If it would declare other fields, or kernels could read anything else than before, nothing is changed, and the
+world is rebuilt.
 """
 
 from collections.abc import Mapping
@@ -23,9 +23,12 @@ from ..particles import Particles
 
 @dataclass(frozen=True)
 class Bound:
-    """Constraints as they are going to be. inv_mass: of all particles, after pins. linked: pairs that contacts leave out.
-    attributes: objects, each with what it has before and then. kept: masks of what stays of each feature's rows. more: what
-    features are extended by."""
+    """The planned constraints of a world.
+
+    inv_mass: (n,) of all particles, 0 for driven ones. linked: (m, 2) pairs that contacts exclude. attributes: objects, each with
+    its attributes before and after. kept: masks of the rows of each feature that remain. more: features by which others are
+    extended.
+    """
 
     again: Again
     inv_mass: np.ndarray
@@ -38,9 +41,12 @@ class Bound:
 def bound_again(
     world: Any, number: np.ndarray, now: Particles, starts: dict[int, Particles], extend: Mapping[Feature, Feature]
 ) -> Bound | None:
-    """Constraints of a world whose particles get other numbers, -1 for those that go, and are `now`, while features take others
-    behind their own; None where it has to be built anew. starts: by the ids of those that there are, the same of those that there
-    will be. Raises ValueError as building it does, and changes nothing."""
+    """Return the constraints of a world after an edit; None if it needs a rebuild.
+
+    number: (n,) new indices of particles, -1 for removed ones. now: all particles after the edit. starts: the new particles at
+    which features started, by the ids of the old ones. extend: features, and for each a feature whose constraints it takes over.
+    Raises the ValueErrors of building a world. Nothing is changed yet.
+    """
     runner, scene, memory = world._runner, world._runner.scene, world._runner.memory
     drivers, batches = runner.step.drivers, runner.batches
     bound = [*drivers, *batches]
@@ -92,15 +98,17 @@ def bound_again(
 
 
 def _check(world: Any, now: Particles, first: int, drivers: list[Batch], batches: list[Batch], inv_mass: np.ndarray) -> None:
-    """Raise Differs where other batches would act than before, and ValueError for what building refuses. first: the number of the
-    first particle that comes."""
+    """Raise Differs if other batches would act than before, and ValueError where building a world would.
+
+    first: the index of the first added particle.
+    """
     there = [f for f in world.features if isinstance(f, Batch) and f.count]
     acting = [f for f in there if not f.drives and (inv_mass[f.indices] > 0).any()]
     if acting != batches or [f for f in there if f.drives] != drivers:
         raise Differs
     refuse_held_twice(now, world.features)
     if box := world._runner.scene.periodic:
-        from .misfits import refuse_misfits  # noqa: PLC0415  (it knows of features that there may not be)
+        from .misfits import refuse_misfits  # noqa: PLC0415  (it imports features that the world may not use)
 
         refuse_misfits(box, now, world.features)
     for f in (*drivers, *batches):
@@ -108,7 +116,7 @@ def _check(world: Any, now: Particles, first: int, drivers: list[Batch], batches
 
 
 def bind(world: Any, change: Regrouping, now: Bound) -> None:
-    """Do it, once particles and contacts are what they are going to be."""
+    """Bind the planned constraints, after particles and contacts were changed."""
     runner = world._runner
     memory, particles = runner.memory, runner.scene.count
     names = {id(e.field): k for k, e in enumerate(memory.entries)}
@@ -142,14 +150,14 @@ def bind(world: Any, change: Regrouping, now: Bound) -> None:
 
 
 def _structure(scene: Any, bound: list[Batch]) -> Any:
-    """All that kernels could read of constraints, in short."""
-    from ..device.patches.sharing import Writing  # noqa: PLC0415  (it knows Taichi's inside, and is not there for others)
+    """Return a key of all that kernels can read of constraints."""
+    from ..device.patches.sharing import Writing  # noqa: PLC0415  (it uses Taichi's internals, and other worlds do not load it)
 
     return Writing((scene.slots, *bound), known=(scene.memory, scene.state)).key
 
 
 def _state(dev: Any, names: dict[int, int]) -> dict[tuple[str, str], int]:
-    """The fields of the state that a feature has, or a part of it that lists them as `in_state`; by their numbers."""
+    """Return the indices of the state fields that a feature's `dev` holds, or a part of it lists as `in_state`."""
     parts = {key: getattr(value, "in_state", {"": value}) for key, value in vars(dev).items()}
     fields = {(key, part): id(field) for key, held in parts.items() for part, field in held.items()}
     return {key: names[field] for key, field in fields.items() if field in names}

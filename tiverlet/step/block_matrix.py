@@ -1,8 +1,8 @@
-"""Sparse symmetric systems of equations about particles: solved directly where they are narrow, by iterations where not.
+"""Sparse symmetric systems of equations between particles: narrow ones are solved directly, wide ones by iteration.
 
-Ordered by levels of the graph they are block tridiagonal. A level is what is one step further from the first particle than the
-level before; neighbours are in the same level or in adjacent ones. A sheet of n x n has levels of about n particles, a chain of
-one.
+Ordered by levels of the graph, the matrix is block tridiagonal. The particles of a level are one step further from the first
+particle than those of the level before, so neighbours are in the same level or in adjacent levels. A sheet of n x n has levels of
+about n particles, a chain has levels of one.
 """
 
 import functools
@@ -10,35 +10,35 @@ from collections.abc import Callable
 
 import numpy as np
 
-WIDEST = 60  # rows of a level: LAPACK takes one thread for them, and with more its bits depend on how many there are
-MOST = 20_000_000  # numbers in all blocks
+WIDEST = 60  # rows of a level: for larger matrices LAPACK's bits depend on the number of threads
+MOST = 20_000_000  # numbers in all blocks for a direct solution
 STEPS = 200  # of conjugate gradients, at most
-ENOUGH = 1e-4  # of r . z at their start: what they leave
+ENOUGH = 1e-4  # of r . z at the start: where conjugate gradients end
 
 
 class WideRows:
-    """The matrix J^T k J of rows on so many particles that no block for each two of them is kept.
+    """The matrix J^T k J of rows with many particles, stored without a block for each pair of particles.
 
-    Corner i belongs to row[i] and is particle who[i] of `count`, with the gradient J[i]. k: of each row.
+    Corner i belongs to row[i] and is particle who[i] of `count`, with the gradient J[i]. k: stiffness of each row.
     """
 
     def __init__(self, count: int, row: np.ndarray, who: np.ndarray, J: np.ndarray, k: np.ndarray):
         self.count, self.row, self.who, self.J, self.k = count, row, who, J, k
 
     def times(self, p: np.ndarray) -> np.ndarray:
-        """Its product with p, (count, dim)."""
+        """Return the product of the matrix with p, (count, dim)."""
         along = self.k * np.bincount(self.row, (self.J * p[self.who]).sum(axis=1), minlength=len(self.k))
         return summed(self.J * along[self.row, None], self.who, self.count)
 
     def own(self) -> np.ndarray:
-        """The blocks of each particle with itself, (count, dim, dim)."""
+        """Return the diagonal blocks, (count, dim, dim)."""
         return summed((self.k[self.row, None] * self.J)[:, :, None] * self.J[:, None, :], self.who, self.count)
 
 
 class BlockMatrix:
-    """A matrix that is the sum of dim x dim blocks, block k between the particles a[k] and b[k] of `count`; positive definite."""
+    """A positive definite matrix: a sum of dim x dim blocks. Block k is between the particles a[k] and b[k] of `count`."""
 
-    products = 0  # of numbers, in iterations so far
+    products = 0  # multiplications in iterations so far
 
     def __init__(self, count: int, dim: int, a: np.ndarray, b: np.ndarray):
         self.count, self.dim, self.a, self.b = count, dim, a, b
@@ -55,7 +55,7 @@ class BlockMatrix:
         place[order] = np.arange(count)
         place -= np.searchsorted(level[order], np.arange(levels))[level]
         self.rows = np.split((dim * order[:, None] + np.arange(dim)).ravel(), np.cumsum(sizes)[:-1])
-        self.some = level[b] >= level[a]  # the other half is the same
+        self.some = level[b] >= level[a]  # half of the blocks: the matrix is symmetric
         a, b = a[self.some], b[self.some]
         same, axis = level[a] == level[b], np.arange(dim)
         begin = np.where(same, self.within[level[a]], self.between[level[a]])
@@ -64,19 +64,21 @@ class BlockMatrix:
         self.address = (begin[:, None, None] + i[:, :, None] * width[:, None, None] + j[:, None, :]).ravel()
 
     def solve(self, blocks: np.ndarray, right: np.ndarray, wide: WideRows | None = None) -> np.ndarray:
-        """x with A x = right, (count, dim), for A the sum of blocks, (pairs, dim, dim), and of wide rows."""
+        """Return x with A x = right, (count, dim). A is the sum of blocks, (pairs, dim, dim), and of wide rows."""
         return self._eliminate(blocks, right) if self.narrow and wide is None else self._iterate(blocks, right, wide)
 
     @functools.cached_property
     def pairs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Of each block the number of its pair; the two particles of each pair, and where those begin that have the same first
-        one: every particle has one with itself."""
+        """The pair of each block; the two particles of each pair; and where the pairs of each first particle begin.
+
+        Every particle has a pair with itself.
+        """
         pairs, pair = np.unique(self.a * self.count + self.b, return_inverse=True)
         first, second = np.divmod(pairs, max(self.count, 1))
         return pair, first, second, np.searchsorted(first, np.arange(self.count))
 
     def _eliminate(self, blocks: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """Level by level."""
+        """Solve by elimination, level by level."""
         A = np.bincount(self.address, blocks[self.some].ravel(), minlength=self.between[-1])
         r, sizes, levels = right.ravel(), self.sizes, len(self.sizes)
         held, out = [], np.zeros(right.size)
@@ -95,13 +97,13 @@ class BlockMatrix:
         return out.reshape(right.shape)
 
     def _iterate(self, blocks: np.ndarray, right: np.ndarray, wide: WideRows | None) -> np.ndarray:
-        """Conjugate gradients, with the blocks of particles for a preconditioner."""
+        """Solve by conjugate gradients, with the diagonal blocks as preconditioner."""
         pair, first, second, begin = self.pairs
         A = summed(blocks, pair, len(first))
         diagonal, A = A[first == second], np.moveaxis(A, 0, 2).copy()
 
         def times(p: np.ndarray) -> np.ndarray:
-            """The product of the matrix with p."""
+            """Return the product of the matrix with p."""
             self.products += A.size
             out = np.add.reduceat(np.einsum("abk,bk->ak", A, p[second].T), begin, axis=1).T
             return out if wide is None else out + wide.times(p)
@@ -111,7 +113,7 @@ class BlockMatrix:
 
 
 def summed(values: np.ndarray, who: np.ndarray, count: int) -> np.ndarray:
-    """The sums of values, numbers, vectors or matrices, over the particles or bodies, of `count`, that they belong to."""
+    """Return the sums of values (numbers, vectors or matrices) by particle or body who[k], (count, ...)."""
     sums = [np.bincount(who, column, minlength=count) for column in values.reshape(len(values), -1).T]
     return np.stack(sums, axis=1).reshape(count, *values.shape[1:])
 
@@ -120,10 +122,10 @@ def conjugate_gradients(
     apply: Callable[[np.ndarray], np.ndarray], precondition: Callable[[np.ndarray], np.ndarray], right: np.ndarray, enough: float,
     steps: int = STEPS,
 ) -> np.ndarray:  # fmt: skip
-    """x with A x = right, preconditioned (Hestenes and Stiefel 1952). enough: of r . z at the start, what may be left. steps: at
-    most.
+    """Return x with A x = right, by preconditioned conjugate gradients (Hestenes and Stiefel 1952).
 
-    Sums are NumPy's: bits of BLAS depend on how many threads it has.
+    enough: the share of the first r . z at which the iteration ends. steps: the largest number of steps. Sums are NumPy's,
+    because bits of BLAS depend on its number of threads.
     """
     x, r = np.zeros_like(right), right
     p = z = precondition(r)
@@ -141,20 +143,20 @@ def conjugate_gradients(
 
 
 def ordered(count: int, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, int]:
-    """The level of each of `count` particles, and their number; those of one piece after those of the other."""
+    """Return the level of each of `count` particles, and the number of levels. Connected pieces have separate levels."""
     order = np.argsort(a, kind="stable")
     b, begin = b[order], np.concatenate([[0], np.cumsum(np.bincount(a, minlength=count))])
     level, last = np.full(count, -1), 0
     for first in range(count):
         if level[first] < 0:
-            far = spread(level, b, begin, first, last)[1]  # from one end of the piece to the other
+            far = spread(level, b, begin, first, last)[1]  # begin at an end of the piece, for narrow levels
             level[level >= last] = -1
             last = spread(level, b, begin, far, last)[0]
     return level, last
 
 
 def spread(level: np.ndarray, b: np.ndarray, begin: np.ndarray, first: int, last: int) -> tuple[int, int]:
-    """Number what hangs together with `first`, from level `last` on; returns the next level, and one of the farthest."""
+    """Number the piece that contains `first`, from level `last` on. Returns the next level, and a particle farthest away."""
     front = np.array([first])
     while len(front):
         level[front] = last

@@ -1,4 +1,4 @@
-"""A world that is built anew around the same features, and what stays of its particles and its state."""
+"""Rebuilding a world around the same features, with the particles and the state that remain."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -17,10 +17,10 @@ from .build import assemble
 
 
 class Rebuild:
-    """Build a world anew, of its particles in the mask `some` and the added ones, under these features, see edit_scene.change().
+    """A rebuild of a world with its particles in the mask `some`, added particles and these features, see edit_scene.change().
 
-    came, went: features, those that begin afresh among both. extending: what features take more of. Where anything is refused,
-    the world is as it was.
+    came, went: added and removed features; features that begin afresh are in both. extending: features by which others are
+    extended. If building fails, the world is left as it was.
     """
 
     def __init__(
@@ -35,16 +35,16 @@ class Rebuild:
         self.particles = world._particles.regrouped(some, added, world.position[some])
         known = {one: start.regrouped(some, added) for one, start in {id(f.start): f.start for f in self.before}.items()}
         self.starts: list[Any] = [None if f in self.came else known[id(f.start)] for f in features]
-        # What there was, for what stays, and to go back to.
+        # The state before, to carry over and to restore after a failure.
         self.checkpoint = checkpoint.keep(world)
         self.attributes = {f: dict(vars(f)) for f in {*self.before, *features}}
         self.noted = {f: world._runner.memory.scratch(f) for f in self.before if isinstance(f, Batch)}
-        self.old: dict[str, np.ndarray] = {}  # state
-        self.masks: dict[Feature, tuple[np.ndarray, ...]] = {}  # of the rows of each feature that stay
-        self.rests: dict[Feature, np.ndarray] = {}  # rest values that were assigned and wait
+        self.old: dict[str, np.ndarray] = {}  # the state before, by name
+        self.masks: dict[Feature, tuple[np.ndarray, ...]] = {}  # of the rows of each feature that remain
+        self.rests: dict[Feature, np.ndarray] = {}  # rest values that still move to the assigned ones
 
     def run(self) -> None:
-        """Do it."""
+        """Rebuild the world. Raises the errors of building it, with the world unchanged."""
         parts, before, memories = None, dict(vars(self.world)), self.world._runner.memories
         try:
             self._settle()
@@ -61,10 +61,10 @@ class Rebuild:
             memory.destroy()
 
     def _settle(self) -> None:
-        """Keep the state; where forces will be others, such as displacements are in between, without a part of them."""
+        """Store the state. If the forces on remaining particles will change, displacements become velocities first."""
         runner = self.world._runner
         runner.note_displacements()
-        pulled = (self.added is not None or not self.some.all()) and runner.step.has_pair_forces  # by others than before
+        pulled = (self.added is not None or not self.some.all()) and runner.step.has_pair_forces  # by other particles than before
         if any(isinstance(f, Collider) for f in self.went):
             self.world._let_go()
         elif pulled or self.world._force_waits or any(map(self._drives, (*self.came, *self.went, *self.extending.values()))):
@@ -76,13 +76,13 @@ class Rebuild:
         self.old = checkpoint.state(self.world)
 
     def _drives(self, feature: Feature) -> bool:
-        """Whether a feature that comes or goes changes the force on particles that stay."""
+        """Whether adding or removing a feature changes the force on particles that remain."""
         if isinstance(feature, Batch):
             return feature.soft and bool(feature.kept_mask(self.number)[0].any()) if feature.scene else feature.soft
         return isinstance(feature, Acceleration)
 
     def _take_apart(self) -> None:
-        """Release features, and give them the new numbers of their particles."""
+        """Release features, and give them the new indices of their particles."""
         self.masks = {f: tuple(mask & (f not in self.came) for mask in f.kept_mask(self.number)) for f in self.before}
         self.rests = {f: np.stack(f.ramp.now())[:, self.masks[f][0]] for f in self.features if f.ramp and f.ramp.waits}
         for f in self.before:
@@ -92,7 +92,7 @@ class Rebuild:
             f.once = frozenset()
 
     def _assembled(self) -> Any:
-        """The parts of the new world, see assemble()."""
+        """Return the parts of the new world, see assemble()."""
         box = next((f for f in self.features if isinstance(f, Periodic)), None)
         for k, f in enumerate(self.features):
             if f in self.extending:
@@ -100,7 +100,7 @@ class Rebuild:
         return assemble(self.particles, self.features, self.starts, int(self.some.sum()), *self.world._build_options)
 
     def _carried(self, memory: Memory) -> dict[str, np.ndarray]:
-        """The state of the new world: the rows of what stays are as they were."""
+        """Return the state of the new world, with the rows of particles and constraints that remain carried over."""
         new = memory.state()
         names = [{id(e.field): e.name for e in one.entries if e.state} for one in (self.world._runner.memory, memory)]
         owned: list[set[str]] = [set(), set()]
@@ -110,7 +110,7 @@ class Rebuild:
             for known, found in zip(owned, pair, strict=True):
                 known.update(found.values())
             for key in pair[0].keys() & pair[1].keys():
-                per_particle = getattr(vars(feature.dev)[key[0]], "per_particle", False)  # and not by how many rows there are
+                per_particle = getattr(vars(feature.dev)[key[0]], "per_particle", False)  # not decided by the number of rows
                 moves.append((pair[0][key], pair[1][key], (self.some,) if per_particle else self.masks[feature]))
         shared = (set(names[0].values()) - owned[0]) & (set(names[1].values()) - owned[1])
         moves += [(name, name, (self.some,)) for name in shared]
@@ -122,7 +122,7 @@ class Rebuild:
         return new
 
     def _undo(self) -> None:
-        """Have the world as it was."""
+        """Restore the world as it was."""
         for f, values in self.attributes.items():
             f.__dict__.clear()
             f.__dict__.update(values)
@@ -131,7 +131,7 @@ class Rebuild:
         self.world._clock.put_back(self.checkpoint.clock)
 
     def _install(self, parts: Any, state: dict[str, np.ndarray]) -> None:
-        """Put the parts into the world, and into these what stays."""
+        """Install the new parts in the world, with the state that was carried over."""
         world, last = self.world, self.world._runner
         contact = next((c for c in last.step.contacts if c in self.features), None)
         reach, left = last.scene.reach, last.left
@@ -156,13 +156,13 @@ class Rebuild:
                 f.changed, f.moving = self.attributes[f].get("changed", True), self.attributes[f].get("moving", False)
                 f.new_force = self.attributes[f].get("new_force", False)
         for f, values in self.rests.items():
-            if f.ramp:  # from where they go to those that were assigned; what came begins at its own
+            if f.ramp:  # rest values continue to the assigned ones; those of added constraints begin at their own
                 f.ramp.put([np.append(rows, now[len(rows) :]) for rows, now in zip(values, f.ramp.now(), strict=True)])
         if any(isinstance(f, PairContact) for f in self.came):
             world._clock.first_moved = 0
 
     def _give_contacts(self, contact: PairContact) -> None:
-        """What pairs in contact remember, and how much smaller particles are than they will be."""
+        """Carry over the data of pairs in contact, and by how much radii are shrunk."""
         if "Contact.shrunk" in self.old:
             contact.enable_shrink()
             less: Any = contact.store
@@ -172,14 +172,14 @@ class Rebuild:
         search, pairs = self.world._runner.search, self.number[self.old["Contact.pairs"]]
         assert search
         both = (pairs >= 0).all(axis=1)
-        # Of what came just now pairs remember nothing.
+        # Data without an old value, of features that were just added, is 0.
         nothing = {p.name: np.zeros((len(pairs), p.width) if p.width else len(pairs)) for p in search.list.lasting}
         search.list.restore(pairs[both], {name: self.old.get(f"Contact.{name}", none)[both] for name, none in nothing.items()})
         self.world._runner.carry_loads()
 
 
 def _fields(attributes: dict[str, Any], names: dict[int, str]) -> dict[tuple[str, str], str]:
-    """The fields of the state that a feature holds, or a part of it that lists them as `in_state`; and their names."""
+    """Return the names of the state fields that a feature's `dev` holds, or a part of it lists as `in_state`."""
     bound = vars(attributes["dev"]) if "dev" in attributes else {}
     parts = {key: getattr(value, "in_state", {"": value}) for key, value in bound.items()}
     fields = {(key, part): field for key, held in parts.items() for part, field in held.items()}

@@ -1,11 +1,10 @@
-"""Particles and constraints come and go in place: rows of fields move up, new ones are written behind them, and nothing is made
-anew.
+"""Adding and removing particles and constraints in place: rows of fields move up, and new rows are written behind them.
 
-Fields have room for many more elements than they have, see device/layout.py, and kernels find in a field how many there are. So
-what has a row for each particle keeps those that stay, and whatever else is known of all particles is worked out again: levels of
-sizes, pieces for threads, where slots begin. Constraints that lose some, take others or whose particles have other numbers are
-bound again to the fields that they have, see bind_again.py. Pairs in contact keep what they remember, in the list or beside it.
-Where more than that would change (features, what kernels are made of), the world is built anew.
+Fields have room for many more elements than they use, see device/layout.py, and kernels read the number of elements from a field.
+So fields with a row for each particle keep the rows of particles that remain. Data derived from all particles is recomputed:
+levels of sizes, pieces for threads, where slots begin. Constraints whose number or particle indices change are bound again to the
+fields that they have, see bind_again.py. Pairs in contact keep their data, in the list or outside it. Where more would
+change (features, the code of kernels), the world is rebuilt.
 """
 
 from collections.abc import Mapping
@@ -27,8 +26,11 @@ NOBODY = np.zeros(0, dtype=np.int32)
 
 @dataclass(frozen=True)
 class Edit:
-    """What is to happen to a world. change: to its particles; starts: those that features began with, by their ids, as they will
-    be. bound: its constraints, where they are to be bound again."""
+    """A planned edit of a world.
+
+    change: of its particles. starts: the new particles at which features started, by the ids of the old ones. bound: the new
+    constraints, if they must be bound again.
+    """
 
     change: Regrouping
     starts: dict[int, Particles]
@@ -36,15 +38,17 @@ class Edit:
 
     @property
     def more(self) -> tuple[Any, ...]:
-        """What features are extended by."""
+        """The features by which others are extended."""
         return (*self.bound.more.values(),) if self.bound else ()
 
 
 def planned(
     world: Any, some: np.ndarray, number: np.ndarray, added: Particles | None, extend: Mapping[Feature, Feature]
 ) -> Edit | None:
-    """What is to happen to a world if particles in the mask `some` stay, others are added, and features take more constraints;
-    None where the world has to be built anew for it. Raises ValueError as building it does, and changes nothing."""
+    """Return the edit that keeps particles in the mask `some`, adds others, and extends features; None if it needs a rebuild.
+
+    number: (n,) new indices, -1 for removed particles. Raises the ValueErrors of building a world. Nothing is changed yet.
+    """
     runner = world._runner
     scene, count = runner.scene, int(np.count_nonzero(some)) + (0 if added is None else len(added))
     batches = [f for f in world.features if isinstance(f, Batch)]
@@ -87,7 +91,7 @@ def planned(
 
 
 def regroup(world: Any, edit: Edit, added: Particles | None) -> None:
-    """Do what was planned."""
+    """Carry out a planned edit."""
     runner, change, bound = world._runner, edit.change, edit.bound
     scene, step, memory, count = runner.scene, runner.step, runner.memory, change.now.count
     search = runner.search
@@ -127,8 +131,11 @@ def regroup(world: Any, edit: Edit, added: Particles | None) -> None:
 
 @dataclass(frozen=True)
 class Grab:
-    """These pins are to hold other particles. soft: whether any of them by a spring. inv_mass: of all, after pins, once they do;
-    some: those of which it may differ."""
+    """A planned change of the particles that pins hold.
+
+    soft: whether any of the pins is a spring. inv_mass: (n,) inverse masses of all particles after the change, 0 for driven ones.
+    some: the particles whose inverse mass may change.
+    """
 
     pins: list[Pin]
     soft: bool
@@ -137,9 +144,11 @@ class Grab:
 
 
 def grabbing(world: Any) -> Grab | None:
-    """What is to happen where knobs ask for nothing but that pins hold other particles: none comes or goes, but masses change, as
-    contacts see them, and slots. None where the world has to be built anew for it, as where constraints act on what is driven now
-    or was before."""
+    """Return the change where knobs only ask pins to hold other particles; None if it needs a rebuild.
+
+    No particle is added or removed, but slots change, and masses for contacts. Constraints on particles whose inverse mass
+    changes, for example, need a rebuild.
+    """
     runner = world._runner
     scene, pins = runner.scene, [f for f in world._features if f.changed and f.outgrown]
     if runner.sleep or runner.launched or scene.order > 2 or not runner.memory.elastic:
@@ -165,14 +174,14 @@ def grabbing(world: Any) -> Grab | None:
 
 
 def grab(world: Any, change: Grab) -> None:
-    """Do what was asked for."""
+    """Carry out a planned change of the particles that pins hold."""
     runner, pins = world._runner, change.pins
     scene, memory, particles = runner.scene, runner.memory, world._particles
     if len(change.some):
         free = min(np.count_nonzero(inv_mass) for inv_mass in (scene.inv_mass, change.inv_mass))
         scene.inv_mass = change.inv_mass
         scene.state.weigh(memory, particles, change.inv_mass, change.some)
-        if free < len(change.inv_mass) - 1:  # lists leave out pairs of which none can move
+        if free < len(change.inv_mass) - 1:  # lists lack pairs in which neither particle can move
             runner.invalidate()
     if change.soft:
         scene.particles = particles.placed(scene.state.get(memory))
@@ -185,12 +194,12 @@ def grab(world: Any, change: Grab) -> None:
 
 
 def _joined(some: list[np.ndarray]) -> np.ndarray:
-    """One array behind the other."""
+    """Return arrays joined one behind the other."""
     return some[0] if len(some) == 1 else np.concatenate(some)
 
 
 def _pairs(near: Any, change: Regrouping) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """What pairs of particles that stay remember, by their new numbers."""
+    """Return the lasting pairs between particles that remain, (m, 2) by their new indices, and their data by name."""
     pairs, values = near.lasting_data()
     pairs = change.number[pairs]
     both = np.flatnonzero((pairs[:, 0] >= 0) & (pairs[:, 1] >= 0))

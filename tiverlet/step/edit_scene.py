@@ -1,5 +1,8 @@
-"""Adding to a world and removing from it. Particles and constraints come and go in place, see edit_in_place.py; for what else
-there is the world is built anew around the same features, and what stays is carried over."""
+"""World.add and World.remove: edits of particles, constraints and features.
+
+Particles and constraints are added and removed in place, see edit_in_place.py. For all other edits the world is rebuilt around
+the same features, and the state of the remaining particles and constraints is carried over.
+"""
 
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
@@ -22,7 +25,7 @@ NONE: Mapping[Feature, Feature] = MappingProxyType({})
 
 
 class Handle:
-    """Some particles of a world, whatever happens to others: NumPy, and whatever takes indices, takes it for an index array.
+    """Some particles of a world, whose indices stay right when other particles are removed. NumPy uses it as an index array.
 
     drops = world.add(tv.Particles(places))
     world.remove([0, 1])
@@ -34,11 +37,11 @@ class Handle:
 
     @property
     def indices(self) -> np.ndarray:
-        """The present numbers of those that were not removed."""
+        """The present indices of its particles, without those that were removed."""
         return self._indices.copy()
 
     def follow(self, number: np.ndarray) -> None:
-        """Take new numbers, -1 for those that go."""
+        """Renumber the particles. number: (n,) new indices, -1 for removed particles."""
         new = number[self._indices]
         self._indices = new[new >= 0]
 
@@ -53,7 +56,7 @@ class Handle:
 
 
 def add(world: Any, particles: Particles | None, features: Iterable[Feature], extend: Mapping[Feature, Feature] | None) -> Handle:
-    """See World.add."""
+    """Add particles, features and constraints to a world, see World.add."""
     world._runner.memory.check()
     late, extend = listed("World.add", features), extend or {}
     check_extended(world, extend)
@@ -79,7 +82,7 @@ def add(world: Any, particles: Particles | None, features: Iterable[Feature], ex
 
 
 def check_extended(world: Any, extend: Mapping[Feature, Feature]) -> None:
-    """Refuse constraints for features that do not act here, or cannot take them."""
+    """Raise TypeError or ValueError for constraints of features that do not act in the world, or cannot take them."""
     if not isinstance(extend, Mapping):
         raise TypeError(f"World.add: extend = {extend!r} is a {type(extend).__name__}; write {{rope: tv.Distance(pairs)}}.")
     for feature, more in extend.items():
@@ -91,7 +94,7 @@ def check_extended(world: Any, extend: Mapping[Feature, Feature]) -> None:
 
 
 def remove(world: Any, particles: Any, features: Iterable[Feature]) -> None:
-    """See World.remove."""
+    """Remove particles and features from a world, see World.remove."""
     world._runner.memory.check()
     gone = listed("World.remove", features)
     for k, feature in enumerate(gone):
@@ -104,14 +107,14 @@ def remove(world: Any, particles: Any, features: Iterable[Feature]) -> None:
 
 
 def handle(world: Any, indices: np.ndarray) -> Handle:
-    """One that the world keeps up to date."""
+    """Return a Handle of these particles, which the world keeps up to date."""
     new = Handle(indices.astype(np.int64))
     world._handles.add(new)
     return new
 
 
 def chosen(world: Any, who: str, particles: Any) -> np.ndarray:
-    """Indices of particles that were given by a handle, indices or a mask."""
+    """Return the indices of particles given as a handle, indices or a mask."""
     array, n = np.asarray(particles), len(world.particles)
     if array.dtype == bool:
         if array.shape != (n,):
@@ -124,8 +127,10 @@ def change(
     world: Any, some: np.ndarray, added: Particles | None, features: tuple[Feature, ...],
     extend: Mapping[Feature, Feature] = NONE,
 ) -> None:  # fmt: skip
-    """Keep particles in the mask `some`, add others, and let these features act; in place where that can be. extend: features,
-    and others whose constraints they take."""
+    """Keep the particles in the mask `some`, add others, and let these features act; in place if possible.
+
+    extend: features, and for each a feature whose constraints it takes over.
+    """
     number = np.where(some, np.cumsum(some) - 1, -1)
     planned = None
     if features == world.features:
@@ -147,7 +152,7 @@ def change(
 
 
 def renew(world: Any) -> None:
-    """Give a world what its knobs ask for: to pins other particles to hold, in place where that can be; or other kernels."""
+    """Change what knobs cannot change in a running kernel: the particles that pins hold, in place if possible; or the kernels."""
     grabbing, runner, clock = edit_in_place.grabbing(world), world._runner, world._clock
     if grabbing is None:
         check_settings(world._precision, world._requested[1], world._order, world.features)
@@ -180,7 +185,7 @@ def renew(world: Any) -> None:
 def build_again(
     world: Any, some: np.ndarray, added: Particles | None, features: tuple[Feature, ...], extend: Mapping[Feature, Feature]
 ) -> None:
-    """Make a change by building the world anew."""
+    """Make the edit of change() by rebuilding the world."""
     world._runner.memory.check()
     again = world._rebuild(some, added, features, extend)
     before, told = world.features, world._all_events()
@@ -193,7 +198,7 @@ def build_again(
 
 
 def _first_off(world: Any, new: list[Feature]) -> int | None:
-    """The first particle of rigid constraints and clusters that came and are not met; None where all are."""
+    """Return the first particle of added rigid constraints and clusters that are violated; None where none is."""
     x, w = world.position, world._runner.scene.inv_mass
     clusters = [f for f in new if isinstance(f, Batch) and f.acts]
     off = [initial_violation.first_off(new, x), initial_shape.first_off(clusters, w, x)]
@@ -203,11 +208,14 @@ def _first_off(world: Any, new: list[Feature]) -> int | None:
 def _seen(
     world: Any, some: np.ndarray, number: np.ndarray, features: tuple[Feature, ...]
 ) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
-    """Velocities before an edit, where what goes has a part in them, else None; the particles that rigid constraints hold which
-    are about to go; and those that nothing drives: masks, (n,)."""
+    """Return velocities before an edit, the particles that it lets go, and the particles that can move: masks, (n,).
+
+    Velocities are None unless removed constraints or contacts contribute to them. The edit lets go of particles that are held by
+    rigid constraints which it removes. Driven particles cannot move.
+    """
     loose, loses = np.zeros(len(some), dtype=bool), world._clock.parted is not None
     for f in world.features:
-        if isinstance(f, Pin) and f in features and f.afresh:  # which takes others
+        if isinstance(f, Pin) and f in features and f.afresh:  # a pin that takes other particles
             if f.drives:
                 loose[f.held] = loses = True
         elif isinstance(f, Batch | PairContact):
@@ -226,15 +234,17 @@ def _edited(
     world: Any, some: np.ndarray, added: Particles | None, told: tuple[ContactEvents, ContactEvents], seen: np.ndarray | None,
     loose: np.ndarray, moved: np.ndarray, walls: np.ndarray, features_too: bool, tied: int | None = None,
 ) -> None:  # fmt: skip
-    """What else there is to an edit once particles and features are there. told: events, of walls that have these numbers now.
-    seen: velocities, see _seen(). loose, moved: likewise. features_too: whether features came or went, too.
-    tied: the first particle of constraints that came and are not met."""
+    """Finish an edit after particles and features have changed: events, handles, the clock, velocities, watchers.
+
+    told: events before the edit. walls: the new index of each feature, for the walls in events. seen, loose, moved: see _seen().
+    features_too: whether features were added or removed, too. tied: the first particle of added constraints that are violated.
+    """
     number, clock = np.where(some, np.cumsum(some) - 1, -1), world._clock
     n, m = int(np.count_nonzero(some)), 0 if added is None else len(added)
     world._events = told[0].renumbered(number, number), told[1].renumbered(number, walls)
     for one in list(world._handles):
         one.follow(number)
-    if m or features_too or n < len(some):  # else knobs only asked for other kernels
+    if m or features_too or n < len(some):  # otherwise only the kernels have changed
         clock.energy = None
     if clock.first_moved is not None:
         clock.first_moved = int(some[: clock.first_moved].sum())
@@ -244,7 +254,7 @@ def _edited(
         clock.first_moved = min(tied, n if clock.first_moved is None else clock.first_moved)
     if m and not clock.d_is_velocity:
         _launch(world, n)
-    if seen is not None:  # what went has left its part in the velocities of what stays
+    if seen is not None:  # removed constraints contributed to the velocities of particles that remain
         seen = seen[some] if added is None else np.concatenate([seen[some], added.velocity])
         _let_go(world, seen, np.concatenate([loose[some], np.zeros(m, dtype=bool)]))
         if not clock.d_is_velocity:
@@ -254,13 +264,13 @@ def _edited(
 
 
 def _held(runner: Any, velocity: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Velocities in which what moved, a mask, and is driven now goes as its displacement says."""
+    """Return velocities, (n, dim), with d / h for particles that moved freely before and are driven now. moved: (n,)."""
     now = moved & (runner.scene.inv_mass == 0)
     return np.where(now[:, None], runner.memory.read(runner.scene.state.d)[: runner.n] / runner.clock.h, velocity)
 
 
 def _let_go(world: Any, seen: np.ndarray, loose: np.ndarray) -> None:
-    """Have the particles in the mask `loose` go on with the velocities that they had, (n, dim)."""
+    """Let the particles in the mask `loose` continue with the velocities `seen`, (n, dim), that they had before the edit."""
     runner, some = world._runner, np.flatnonzero(loose)
     if runner.clock.d_is_velocity or impulse.tells(runner):
         impulse.let_go(runner, some, seen[some], world.iterations)
@@ -269,7 +279,7 @@ def _let_go(world: Any, seen: np.ndarray, loose: np.ndarray) -> None:
 
 
 def _launch(world: Any, first: int) -> None:
-    """Give particles from `first` on the displacements that their velocities need, between two substeps."""
+    """Set the displacements of added particles, from `first` on, to those that their velocities need between two substeps."""
     runner = world._runner
     state, h = runner.scene.state, runner.clock.h
     if state.spins:

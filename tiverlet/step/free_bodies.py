@@ -1,11 +1,11 @@
-"""Bodies that are moved in themselves turn on as before: their velocities get back the angular momentum that the moves took.
+"""Free bodies keep their angular momentum when the host moves their particles.
 
-Moves p along constraints have sum m p = 0, but sum m p x v is lost with what p draws together: a body that turns, stretched by
-its substep, would be braked each time that the substep gets shorter. Each free body gets the spin u that is missing,
+Moves p along constraints have sum m p = 0, but a body that they draw together loses sum m p x v. So a rotating body, stretched by
+its substep, would be braked each time that the substep gets shorter. Each free body gets the missing spin u,
 
-    I u = sum m (x - c) x v - sum m (x' - c') x v',     v' += u x (x' - c'),
+    I u = sum m (x - c) x v - sum m (x' - c') x v',     v' += u x (x' - c').
 
-as a skater does who draws in her arms. The energy of that is what the body gave when it was stretched.
+The energy that this adds is the energy that the body lost when it was stretched.
 """
 
 import numpy as np
@@ -15,52 +15,55 @@ from ..solvers.corners import bodies_of
 from .block_matrix import summed
 from .jacobian import Jacobian
 
-FLAT = 1e-9  # of the largest: a moment of inertia that is none
+FLAT = 1e-9  # of the largest moment of inertia: below, a moment is zero up to rounding
 
 
 class FreeBodies:
-    """What the rows of a Jacobian tie together at places x, (n, dim), and what hangs on nothing.
+    """The bodies whose particles the rows of a Jacobian connect, at positions x (n, dim), and which of them are free.
 
-    stopped: (n,), whether a wall has moved each particle.
+    stopped: (n,) mask of particles that a wall has moved, or that something else holds.
     """
 
     def __init__(self, jacobian: Jacobian, x: np.ndarray, stopped: np.ndarray):
-        real = jacobian.diagonal[jacobian.row] > 0  # contacts that may be and are not tie nothing together
+        real = jacobian.diagonal[jacobian.row] > 0  # open contacts have gradient 0 and connect nothing
         rows, row, who, w = jacobian.m, jacobian.row[real], jacobian.who[real], jacobian.w
         label, body = bodies_of(rows, row, who, w)
         held = np.bincount(label[row[(w[who] == 0) | stopped[who]]], minlength=rows + 1) > 0
         self.free = (~held[body] & (body < rows))[:, None]
-        each, self.body, _ = distinct(np.where(self.free[:, 0], body, rows))  # all that is not free is one
+        each, self.body, _ = distinct(np.where(self.free[:, 0], body, rows))  # all particles that are not free share a label
         self.count = len(each)
         self.mass = np.divide(1, w, out=np.zeros_like(w), where=w > 0)[:, None] * self.free
         self.arm = self._about_center(x)
         axes = 3 if x.shape[1] == 3 else 1
         inertia = summed(self.mass * _inertia(self.arm).reshape(len(x), -1), self.body, self.count).reshape(-1, axes, axes)
-        self._mobility = np.linalg.pinv(inertia, rcond=FLAT, hermitian=True)  # about the axis of a rod there is none
+        self._mobility = np.linalg.pinv(inertia, rcond=FLAT, hermitian=True)  # pinv: a rod has no inertia about its axis
 
     def _about_center(self, x: np.ndarray) -> np.ndarray:
-        """Places, or velocities, relative to those of the centers of mass."""
+        """Return positions or velocities relative to those of the centers of mass, (n, dim)."""
         total = summed(self.mass, self.body, self.count)
         return x - (summed(self.mass * x, self.body, self.count) / np.where(total > 0, total, 1.0))[self.body]
 
     def moment(self, arm: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """sum m r x v of each."""
+        """Return the angular momentum sum m r x v of each body, (bodies, 1 or 3)."""
         return summed(self.mass * _cross(arm, v), self.body, self.count)
 
     def turned(self, moment: np.ndarray) -> np.ndarray:
-        """Velocities of bodies that turn with these moments, 0 of what is not free."""
+        """Return velocities, (n, dim), of bodies that rotate with these angular momenta; 0 for bodies that are not free."""
         spin = np.einsum("kij,kj->ki", self._mobility, moment)
         return self.free * _turning(spin[self.body], self.arm)
 
     def spun(self, v: np.ndarray, x: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, float]:
-        """Velocities v with the moments that velocities `before` had at x, and what that takes [J]."""
+        """Return v with the angular momenta that velocities `before` had at positions x, and the energy that this adds [J]."""
         if not self.free.any():
             return v, 0.0
         out = v + self.turned(self.moment(self._about_center(x), before) - self.moment(self.arm, v))
         return out, float((self.mass * (out**2 - v**2)).sum() / 2)
 
     def calmed(self, v: np.ndarray, due: np.ndarray) -> np.ndarray:
-        """Velocities of which each free body has paid what is due, (n,) of its particles [J], by how it moves in itself."""
+        """Return velocities after each free body has lost the energy `due` from its inner motion.
+
+        Inner motion is without translation and rotation. due: (n,) [J], the energy of its body for each particle.
+        """
         inner = self.free * self.unturned(self._about_center(v))
         kinetic, owed = summed(self.mass * inner**2, self.body, self.count).sum(axis=1) / 2, np.zeros(self.count)
         np.maximum.at(owed, self.body, due)
@@ -68,21 +71,21 @@ class FreeBodies:
         return v - (1 - left)[self.body][:, None] * inner
 
     def unturned(self, moves: np.ndarray) -> np.ndarray:
-        """Moves, or velocities, without those that turn."""
+        """Return moves or velocities without the rotation of free bodies, (n, dim)."""
         return moves - self.turned(self.moment(self.arm, moves)) if self.free.any() else moves
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a x b of vectors (n, dim), (n, 1 or 3)."""
+    """Return the cross products a x b of vectors (n, dim), (n, 1 or 3)."""
     return np.cross(a, b) if a.shape[1] == 3 else (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])[:, None]
 
 
 def _turning(u: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """u x r, u as _cross() gives it."""
+    """Return u x r, (n, dim), with u, (n, 1 or 3), as _cross() returns it."""
     return np.cross(u, r) if r.shape[1] == 3 else u * np.stack([-r[:, 1], r[:, 0]], axis=1)
 
 
 def _inertia(r: np.ndarray) -> np.ndarray:
-    """r^2 1 - r r^T of points (n, dim), for the axes of _cross()."""
+    """Return the inertia r^2 1 - r r^T of points (n, dim) of unit mass, about the axes of _cross()."""
     square = (r**2).sum(axis=1)[:, None, None]
     return square * np.eye(3) - r[:, :, None] * r[:, None, :] if r.shape[1] == 3 else square

@@ -1,13 +1,14 @@
 """Substeps of order 4, 6 and 8: symmetric compositions of the substep of order 2, which is reversible in time.
 
-A substep of H is made of stages of g_k H, some of them backwards, with g_k = g_(s+1-k), sum g_k = 1, sum g_k^3 = 0 and, from
-order 6 on, more conditions, so that the errors of the stages cancel (Suzuki 1990; Kahan and Li 1997; Suzuki and Umeno 1993; all
-in Hairer, Lubich and Wanner, Geometric Numerical Integration, V.3.2). A stage is Verlet, time-corrected from the one before,
+A substep of length H consists of stages of length g_k H, some of them backwards. With g_k = g_(s+1-k), sum g_k = 1, sum g_k^3 = 0
+and, from order 6 on, further conditions, the errors of the stages cancel (Suzuki 1990; Kahan and Li 1997; Suzuki and Umeno 1993;
+all in Hairer, Lubich and Wanner, Geometric Numerical Integration, V.3.2). A stage of h' after a stage of h is time-corrected
+Verlet,
 
     d' = (h'/h) d + h' (h + h') / 2 a(x),   x' = x + d'
 
-where rigid constraints are fulfilled at its end along their directions at its begin. As a map of positions that is RATTLE, which
-is symmetric and symplectic, so their composition is both. A spring counts as a force, -C grad C / alpha, in a.
+Rigid constraints are satisfied at the end of a stage, along their directions at its begin. As a map of positions, a stage is
+RATTLE, which is symmetric and symplectic, so the composition is both. A spring counts as a force, -C grad C / alpha, in a.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -29,7 +30,7 @@ from .step import substep
 if TYPE_CHECKING:
     from .step import Step
 
-# The first half of the stages; the one in the middle is what is missing to 1.
+# The first half of the stages, by order. The stage in the middle makes their sum 1.
 _HALVES = {
     2: (),
     4: (1 / (4 - 4 ** (1 / 3)),) * 2,
@@ -40,18 +41,18 @@ _HALVES = {
     ),
 }  # fmt: skip
 ORDERS = tuple(_HALVES)
-PASSES = {2: 1, 4: 2, 6: 3, 8: 3}  # Newton's method starts with an error of h^2 in x, and each pass squares it
-PROBE = 64  # a velocity is read from two stages of a 64th of the last one, forwards and backwards
+PASSES = {2: 1, 4: 2, 6: 3, 8: 3}  # Newton's method begins with an error of h^2 in x, and each pass squares the error
+PROBE = 64  # velocities are read from two stages, forwards and backwards, of a 64th of the last one
 
 
 def stages(order: int) -> np.ndarray:
-    """The lengths of the stages of a substep of length 1."""
+    """Return the lengths of the stages of a substep of length 1."""
     half = np.array(_HALVES[order])
     return np.concatenate([half, [1 - 2 * half.sum()], half[::-1]])
 
 
 def refuse(order: int, features: tuple[Feature, ...], precision: str, path: str) -> None:
-    """Raise ValueError, with the reason, where a substep of this order could not be of it."""
+    """Raise ValueError, with the reason, if the scene does not allow a substep of this order."""
     who = f"World: order = {order}"
     if precision != "f64":
         raise ValueError(
@@ -83,7 +84,7 @@ def refuse(order: int, features: tuple[Feature, ...], precision: str, path: str)
 
 
 def check_solved(batches: list[Batch], scene: Scene, solver: Solver) -> None:
-    """Raise ValueError where a rigid constraint would be relaxed instead of solved."""
+    """Raise ValueError if the solver would relax a rigid constraint instead of solving it."""
     for b in batches:
         assert isinstance(b, Scalar)
         left = ~b.acts_as_force(scene) & (scene.slots.rows(b) < 0) & ~b.idle(scene.inv_mass)
@@ -115,13 +116,15 @@ class Composition:
         self.fastest = (float(np.abs(g).max()) / self.first) ** 2 * fastest(batches, scene)
 
     def passes(self, iterations: int) -> int:
-        """Passes over the constraints in each stage."""
+        """Return the number of passes over the constraints in each stage."""
         return max(iterations, self.solved) if self.solved else 0
 
     @ti.func
     def times(self, span, s):
-        """Of stage s of a frame, as Verlet.times has them for substeps. The substep that is given is the first stage, which is as
-        long as the last."""
+        """Return length, last length, time and fractions of the frame for stage s, as Verlet.times() does for substeps.
+
+        The length in `span` is that of the first stage, which is as long as the last.
+        """
         whole, g = span.h64 / self.first, self.table[s % self.stages]
         substep, substeps = s // self.stages, span.substeps // self.stages
         fraction = ti.Vector([(substep + g[2]) / substeps, (substep + g[3]) / substeps])
@@ -129,23 +132,26 @@ class Composition:
 
     @ti.func
     def frame_fraction(self, s, substeps):
-        """The fractions of the frame at the start and the end of substep s."""
+        """Return the fractions of the frame at the begin and the end of substep s."""
         return ti.Vector([ti.cast(s, self.real) / substeps, ti.cast(s + 1, self.real) / substeps])
 
     @ti.func
     def h2_effective(self, h, fresh):
-        """What a constant acceleration adds to the displacement in a substep, per m/s^2."""
+        """Return what a constant acceleration adds to the displacement in a substep, per m/s^2 [s^2]."""
         return h * h / 2 if fresh != 0 else h * h
 
     @ti.func
     def advance(self, first, end, now):
-        """Integrate some particles."""
+        """Integrate particles from `first` up to `end`."""
         for i in range(first, end):
             self.integrate(i, now.h, now.last, now.time, now.fresh)
 
     @ti.func
     def integrate(self, i, h, last, t, starts):
-        """Verlet with the force at x, in a stage of h after one of `last`; at a start, d is the velocity."""
+        """Integrate particle i by Verlet with the force at x, in a stage of h after one of `last` [s].
+
+        starts: 1 in a start, the first stage after velocities were set; there d holds the velocity.
+        """
         if self.state.w.of(i) > 0:
             d = self.state.d[i]
             a = self.forces.accelerate(i, self.state.place(i), 0 * d, t, self.forces.pull(t))
@@ -162,20 +168,20 @@ class Composition:
 
     @ti.func
     def velocity_after(self, i, h, t, reaction):
-        """The velocity at a start, where d is one. See velocity() for all other times."""
+        """Return the velocity where d holds it. See velocity() for all other times."""
         return self.state.d[i]
 
 
 @ti.data_oriented
 class Probe:
-    """The kernel that looks where a stage would lead."""
+    """The kernel that computes the displacements of one more stage."""
 
     def __init__(self, step: "Step"):
         self.step = step
 
     @ti.kernel
     def stage(self, h: ti.f64, last: ti.f64, t: ti.f64, end: ti.f64, passes: ti.i32):
-        """One more stage of h after one of `last`. end: in frames."""
+        """Take a stage of h after one of `last` [s]. t: time [s]. end: fraction of the frame at its end."""
         ti.loop_config(serialize=True)
         for _ in range(1):
             span = Span(h, t, t, 0, 0, 0, 0.0, 0, 1, passes, part=passes)
@@ -183,7 +189,7 @@ class Probe:
 
 
 def fastest(batches: list[Any], scene: Scene) -> float:
-    """A bound on omega^2 of the springs [1/s^2]: that of the stiffest, if particles divide their mass among theirs."""
+    """Return a bound on omega^2 of the springs [1/s^2]: the largest, if each particle divides its mass among its springs."""
     members = [b.indices[b.compliance > 0].ravel() for b in batches]
     degree = np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *members]), minlength=len(scene.inv_mass))
     worst = 0.0
@@ -196,8 +202,10 @@ def fastest(batches: list[Any], scene: Scene) -> float:
 
 
 def velocity(probe: Probe, clock: Clock, memory: Memory, iterations: int) -> np.ndarray:
-    """Velocities to the order of the world: the mean over two short stages, one forwards and one backwards, so that their own
-    accelerations cancel, and constraints take out what is along them."""
+    """Return velocities to the order of the world, (n, dim) [m/s]: the mean over a short stage forwards and one backwards.
+
+    The accelerations within the two stages cancel, and constraints remove the components along them.
+    """
     kept, out, h, step = memory.state(), 0.0, clock.h, probe.step
     for e in (h / PROBE, -h / PROBE):
         probe.stage(e, h, clock.time, 1 + e / clock.frame[1], step.integrator.passes(iterations))

@@ -1,13 +1,14 @@
-"""Velocities that are given between two substeps, as impulses: to particles that come, that are let go, or that a user steers.
+"""Velocities that are assigned between two substeps, as impulses: of added particles, released particles, and steered ones.
 
-A velocity is (share d + rest (h^2 a + reaction)) / h, see Integrator.velocity_after(). So what a particle lacks of the velocity
-that it is to have, times h / share, is what its displacement lacks. Nothing else of the state changes: what is to have the
-velocity that it has goes on to the bit, known loads stay known, and sound goes on being damped, as they would not after a start.
+The velocity is v = (share d + rest (h^2 a + reaction)) / h, see Integrator.velocity_after(). So d grows by the missing velocity
+times h / share. Nothing else of the state changes: particles whose velocity is not changed continue bit for bit, known loads stay
+known, and sound continues to be damped. None of that would hold after a start, the first substep after velocities were set.
 
-The half of the reaction that this leaves in d has to go on in the next substep. That of links does, or they would part. What a
-particle leans on by contacts and walls may end, where it is sent off or friction turns round: it gets that half back, so that the
-next substep finds as much to bear as a start would, see Displacements.steer(). What touches it has its own half all the same, and
-falls by g h / 2 too fast where that ends with it. Where a rope that is taut may go slack, all start.
+Half of the reaction of the last substep is left in d, and must act on in the next substep. The reaction of links does, since they
+stay. The reaction of contacts and walls may end, if the particle is sent off or friction reverses. Then the particle gets this
+half back, so that the next substep finds the same load as a start would, see Displacements.steer(). A particle in contact with
+it keeps its own half. If that contact ends too, the other particle falls too fast by g h / 2. If a taut rope may go slack, the
+whole world takes a start.
 """
 
 from collections.abc import Callable
@@ -17,25 +18,27 @@ import numpy as np
 
 from .integrator import FREE
 
-ROUNDS = 100  # of asking for velocities, at most, where forces read them
-NOTHING = 2.0**-20  # of a velocity: less than this of it is in the next displacement
-WEAK = 0.01  # the same: below it, displacements tell velocities by too few digits
-LEANS = 0.25  # of what half of a reaction gives: a change of velocity that ends it, and smaller ones a part of it
-MET = 1e-5  # of the largest velocity: what may be lacking where forces read velocities
-DIGITS = 4  # roundings of it: as near as one comes
+ROUNDS = 100  # evaluations of velocities, at most, where forces read them
+NOTHING = 2.0**-20  # smallest share of a velocity that drag leaves, in factor()
+WEAK = 0.01  # share of a velocity that drag leaves: below, displacements give velocities with too few digits
+LEANS = 0.25  # of the velocity of half of a reaction: a change of v that ends the reaction; a smaller one ends a part of it
+MET = 1e-5  # of the largest velocity: the error that is accepted where forces read velocities
+DIGITS = 4  # rounding errors of the largest velocity, at which the iteration ends
 Write = Callable[[Any, np.ndarray], None]
 
 
 def factor(h: np.ndarray, drag: np.ndarray) -> np.ndarray:
-    """By how much a displacement has to be longer for a velocity of 1 m/s more [s], after a substep h. Where drag leaves nothing
-    of a velocity in a substep, d does not matter. Of many worlds, with drag (worlds, 5)."""
+    """Return the change of displacement per change of velocity [s], after a substep h [s], for worlds with `drag`, (worlds, 5).
+
+    Where drag leaves almost nothing of a velocity in a substep, d does not matter, and the factor is bounded.
+    """
     return h / np.maximum(drag[:, 0], NOTHING)
 
 
 class Displacements:
-    """Those of some particles, (..., dim), and what goes with them: what of them forces did, and their low words.
+    """Displacements of some particles, (..., dim) [m], with their low words and the parts that forces gave them.
 
-    some: the mask of those that change, (...,). read, write: get and set a field's rows.
+    some: the mask of particles that change, (...,). read, write: get and set the rows of a field.
     """
 
     def __init__(self, runner: Any, some: np.ndarray, read: Callable[[Any], np.ndarray], write: Write):
@@ -46,13 +49,13 @@ class Displacements:
         self.was = {field: read(field) for field in (state.d, *([self.low] if self.low else []), *self.others)}
 
     def begin_with(self, d: np.ndarray) -> None:
-        """Of particles that come: what forces alone would have made of them."""
+        """Set the displacements of added particles to d, (..., dim) [m], all of it as given by forces."""
         for field in (self.field, *self.others):
             self.was[field] = d
             self.write(field, d)
 
     def lengthen(self, more: np.ndarray) -> None:
-        """Have them be as they were, and longer by `more`, (..., dim)."""
+        """Restore the displacements and add `more`, (..., dim) [m]."""
         d = self.was[self.field]
         new = d.astype(np.float64) + more
         if self.low:
@@ -67,10 +70,12 @@ class Displacements:
     def give(
         self, want: np.ndarray, velocity: Callable[[], np.ndarray], factor: np.ndarray, seen: np.ndarray | None = None
     ) -> np.ndarray:
-        """Have them stand for velocities `want`, (worlds, ..., dim): at once, but for a round for what the first one rounded, or
-        one time after the other where forces read velocities, until these come no nearer. velocity: asks for those that they
-        stand for. factor: of each world, see factor(). seen: what velocity() would say at first, if that is known. Returns in
-        which worlds that was found, (worlds,)."""
+        """Change displacements until they give velocities `want`, (worlds, ..., dim) [m/s]. Returns where they do, (worlds,).
+
+        One round suffices, and a second removes the rounding of the first. Where forces read velocities, rounds are repeated
+        until the error falls no further. velocity: computes the velocities of the present displacements. factor: of each world,
+        see factor(). seen: the first result of velocity(), if it is known.
+        """
         more = best = np.zeros(want.shape)
         least, factor = np.full(len(want), np.inf), factor.reshape(-1, 1, 1)
         largest = np.abs(want).max(axis=(1, 2), initial=0.0)
@@ -95,26 +100,31 @@ class Displacements:
         self, want: np.ndarray, change: np.ndarray, seen: np.ndarray, had: np.ndarray, bare: np.ndarray, free: np.ndarray,
         pulled: np.ndarray, rubs: bool, velocity: Callable[[], np.ndarray], h: Any, drag: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-        """The same for `want` where velocities or spins get a `change`, with which what particles lean on may end. Returns which
-        share of that is over, (worlds, n, 1), and in which worlds that was found.
+        """Set velocities `want` as give() does, and end the reactions that the `change` of velocities or spins ends.
 
-        seen: velocities so far, for the user; had: what displacements stand for, which is more where something is over; bare:
-        that without reactions; free: without those of contacts and walls. pulled: by links that may go slack. h, drag: of each.
+        Returns the share of each particle's contact reaction that ends, (worlds, n, 1), and in which worlds this succeeded,
+        (worlds,). Velocities are (worlds, n, dim) [m/s]. seen: those that the user read last. had: those of the displacements,
+        which differ from `seen` where a reaction has ended before. bare: without reactions. free: without the reactions of
+        contacts and walls. pulled: mask of particles that links which may go slack hold. rubs: whether there is friction. h,
+        drag: of each world.
         """
         leaning = had - free
         over = _ratio(((had - seen) * leaning).sum(axis=2), leaning) + _ended(change, had - bare, rubs)
         share = np.where(self.some, np.clip(over, 0, 1)[..., None], 0.0)
         more = np.where(self.some, share * leaning, 0.0)
         r = (h * drag[:, 1] / drag[:, 3]).reshape(-1, 1, 1) * more
-        for field in self.others:  # forces that read velocities do without it, too
+        for field in self.others:  # forces that read velocities read them without the ended reaction, too
             self.was[field] = self.was[field] + r
         found = np.isfinite(more).all(axis=(1, 2)) & ~(pulled & (share[..., 0] == 1)).any(axis=1)
         return share, found & self.give(want + more, velocity, factor(h, drag), had)
 
 
 def _ended(change: np.ndarray, leaning: np.ndarray, rubs: bool) -> np.ndarray:
-    """Which share of what particles lean with a change of velocity ends, (worlds, n): all from LEANS of it on, along it or, with
-    friction, in any direction. leaning: what reactions give in half a substep."""
+    """Return the share of each particle's reaction that a change of velocity ends, (worlds, n). It may exceed 1.
+
+    A change of LEANS of the reaction's velocity or more ends all of it: a change along the reaction or, with friction, in any
+    direction. leaning: the velocity that reactions give in half a substep, (worlds, n, dim) [m/s].
+    """
     if rubs:
         part = np.sqrt((change**2).sum(axis=2) * (leaning**2).sum(axis=2))
     else:
@@ -123,18 +133,21 @@ def _ended(change: np.ndarray, leaning: np.ndarray, rubs: bool) -> np.ndarray:
 
 
 def _ratio(part: np.ndarray, leaning: np.ndarray) -> np.ndarray:
-    """By the square of `leaning`; 0 where nothing leans."""
+    """Return `part` divided by the square of `leaning`, (worlds, n); 0 where there is no reaction."""
     square = (leaning**2).sum(axis=2)
     return np.divide(part, square, out=np.zeros_like(square), where=square != 0)
 
 
 def rubs(runner: Any) -> bool:
-    """Whether anything has friction."""
+    """Whether contacts or walls have friction."""
     return any(c.has_friction for c in runner.step.contacts) or any(wall.has_friction for wall in runner.step.walls)
 
 
 def pulled(runner: Any, worlds: int, read: Callable[[Any], np.ndarray]) -> np.ndarray:
-    """The particles that rigid links hold which may go slack, a mask (worlds, n). read: gets a field, of each."""
+    """Return a mask of the particles that taut, rigid, one-sided links hold, (worlds, n): these links may go slack.
+
+    read: returns a field of all worlds.
+    """
     out = np.zeros((worlds, runner.n), dtype=bool)
     for batch in runner.batches:
         if getattr(batch, "side", 0):
@@ -144,16 +157,18 @@ def pulled(runner: Any, worlds: int, read: Callable[[Any], np.ndarray]) -> np.nd
 
 
 def tells(runner: Any) -> bool:
-    """Whether displacements tell velocities: in order 2, by enough digits."""
+    """Whether displacements determine velocities with enough digits, in a world of order 2."""
     return not runner.probe and (runner.clock.drag or FREE)[0] >= WEAK
 
 
 def steer(
     runner: Any, want: np.ndarray, seen: np.ndarray, change: np.ndarray, iterations: int, spun: np.ndarray | None = None
 ) -> bool:  # fmt: skip
-    """Have particles with a `change` of velocity or spin, (n, any) [m/s], that can move go on with velocities `want`, (n, dim)
-    [m/s], instead of `seen`. Returns whether displacements were found that stand for these; else it takes a start. spun: what
-    Runner.spin() says, if that is known."""
+    """Set the velocities of movable particles with a `change` of velocity or spin, (n, any) [m/s], between two substeps.
+
+    want: the new velocities, (n, dim) [m/s]. seen: the present ones. spun: the result of Runner.spin(), if it is known. Returns
+    whether displacements were found that give the new velocities; if not, the caller must take a start.
+    """
     some, clock, drag = (change != 0).any(axis=1), runner.clock, np.array([runner.clock.drag or FREE])
     if clock.d_is_velocity or not tells(runner):
         return False
@@ -178,8 +193,10 @@ def steer(
 
 
 def turn_on(runner: Any, first: int, share: np.ndarray, spun: np.ndarray | None = None) -> None:
-    """Have particles from number `first` on keep of what friction turned them by in half a substep the part that is over.
-    spun: what Runner.spin() says, if that is known."""
+    """Give particles from `first` on back the part of friction's turn in half a substep that has ended. share: (m, 1).
+
+    spun: the result of Runner.spin(), if it is known.
+    """
     state, memory, step = runner.scene.state, runner.memory, runner.step
     turned = [c.dev.forces.turned for c in step.contacts if c.dev.forces.spins]
     turned += [step.particles.wall_turn] if step.particles.turned_by_walls else []
@@ -217,14 +234,17 @@ def let_go(runner: Any, some: np.ndarray, want: np.ndarray, iterations: int) -> 
 
 
 def give_new(runner: Any, first: int, want: np.ndarray, iterations: int) -> None:
-    """Give particles from number `first` on, which touch nothing yet, the displacements that velocities `want` need, (m, dim)."""
+    """Set the displacements of added particles to those that velocities `want`, (m, dim) [m/s], need.
+
+    The particles are those from index `first` on. They touch nothing yet.
+    """
     moves = runner.scene.inv_mass[first:] > 0
     want = np.where(moves[:, None], want, 0.0)[None]
     those = _those(runner, first, moves)
     those.begin_with(runner.clock.h * want)
 
     def velocity() -> np.ndarray:
-        """What they stand for."""
+        """Return the velocities of the present displacements."""
         return runner.velocity(iterations, first, came=True)[None]
 
     with runner.memory.compiler():  # for orders above 2
@@ -235,7 +255,7 @@ def give_new(runner: Any, first: int, want: np.ndarray, iterations: int) -> None
 
 
 def _movable(runner: Any, some: np.ndarray) -> tuple[int, int, np.ndarray]:
-    """Of the particles of a mask that can move, the first, the number behind the last, and which in between they are, a mask."""
+    """Return the range of movable particles in a mask: the first, one behind the last, and the mask within the range."""
     some = some & (runner.scene.inv_mass > 0)
     rows = np.flatnonzero(some)
     first, end = (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, 0)
@@ -243,12 +263,12 @@ def _movable(runner: Any, some: np.ndarray) -> tuple[int, int, np.ndarray]:
 
 
 def _factor(runner: Any) -> float:
-    """That of factor() for a world alone."""
+    """Return factor() for a single world (not one of many copies)."""
     return runner.clock.h / max((runner.clock.drag or FREE)[0], NOTHING)
 
 
 def _those(runner: Any, first: int, some: np.ndarray) -> Displacements:
-    """Of a world alone, those of particles from number `first` on."""
+    """Return the Displacements of particles from index `first` on, for a single world (not one of many copies)."""
     memory, rows = runner.memory, slice(first, first + len(some))
     return Displacements(
         runner,

@@ -1,22 +1,24 @@
-"""Places at which rigid constraints are met, for particles that the user put elsewhere.
+"""Initial violation: moves particles that the user has placed to where their rigid constraints are satisfied.
 
-A pass takes out whatever violation it finds, in one substep: as a spring of stiffness 1 / (W h^2) would, with the energy
-C^2 / (2 W h^2), which no shorter substep bounds. Nobody supplied it. So what is placed anew first goes to where its rigid
-constraints are met, by Newton's method with the least moves in the metric of the masses, and its velocities stay:
+A pass removes any violation that it finds in one substep, like a spring of stiffness 1 / (W h^2) with the energy
+C^2 / (2 W h^2). No shorter substep bounds that energy, and nothing supplied it. So placed particles first move to where their
+rigid constraints are satisfied, by Newton's method with the least moves in the metric of the masses. Velocities stay:
 
     x += s w J^T lam,  (J w J^T + mu W) lam = -C,  W = sum_j n_j w_j |grad_j C|^2
 
-for each body by itself, that is, for constraints that hang together by particles that can move. s is halved until the violation
-falls; no particle moves further in a step than its body is large, and no leg of an angle changes by more than half. From afar
-an angle is flat: Newton's step, pi r^2 / L for one that has to be straight between two pins L apart, would throw its corner away,
-or into one of the pins. Where constraints contradict each other, bodies go to where sum C^2 / W is least, that is, where passes,
-which split masses, find nothing to do, and the report says what is left. Newton's steps know J alone, so across what is pulled in
-a line they do not get there; the last of the way is gone in passes. Systems soften all rows alike, so theirs have the same
-weight. A straight rope that is too long for its two pins has no direction to give way in, so a body whose links are pushed bulges
-first: across all in which it extends, and down where it can. Walls have the last word: what they stop goes on, in turns.
+Each body, of constraints that movable particles connect, is solved by itself. s is halved until the violation falls. In a step no
+particle moves further than the size of its body, and no leg of an angle changes by more than half. That is because the gradient
+of an angle is small far away: the Newton step for an angle that must be straight between two pins L apart is pi r^2 / L, and
+would throw its corner away, or into one of the pins.
 
-In a world that runs, part of a violation bears the load of the last substep, -W lam, or less of it in a shorter one. That part
-stays, of constraints whose particles were put nowhere else.
+Where constraints contradict each other, bodies move to the least sum C^2 / W. There, passes, which split masses, have nothing
+left to do, and the report gives the remaining violation. Newton steps use J alone, so they do not get there across links pulled
+in a line; passes do the rest. Systems soften all rows alike, so their rows have the same weight. A straight rope that is too long
+for its two pins has no direction to give way in. So a body with compressed links bulges first: across all directions in which it
+extends, and downwards if possible. Bodies that walls stop move again, in turns.
+
+In a running world, part of a violation, -W lam, bears the load of the last substep; in a shorter substep a smaller part does.
+That part stays for constraints whose particles were not placed.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,20 +33,20 @@ from ..solvers.corners import bodies_of, corners_of
 from .clock import MET
 from .jacobian import Jacobian
 
-SEEN = 1e-3  # of its size: a violation from where on the report says that it was taken out
-ENOUGH = 0.2  # of its size: a violation after which loads are others
-ROUNDING = {ti.f32: 8 * 2.0**-24, ti.f64: 8 * 2.0**-53}  # of coordinates: what lengths lose, and the Newton steps with them
-NEWTON = 60  # steps at most
-STEPS, LEFT = 1000, 1e-8  # of conjugate gradients in each, at most; what of r . z they may leave
-PASSES, FLAT = 300, 1e-10  # after them, at most; what sum C^2 / W falls by in one, of it, where it is least
-TURNS = 16  # with walls, at most: a link that stands on one halves its violation in each
-LEAST = 1e-2  # part of a step: where even less does not help, nothing does
+SEEN = 1e-3  # of its size: a violation from which on the report says that it was removed
+ENOUGH = 0.2  # of its size: a violation after which known loads are reset
+ROUNDING = {ti.f32: 8 * 2.0**-24, ti.f64: 8 * 2.0**-53}  # of coordinates: the error of lengths, and so of Newton steps
+NEWTON = 60  # steps, at most
+STEPS, LEFT = 1000, 1e-8  # of conjugate gradients in each, at most; the share of r . z at which they end
+PASSES, FLAT = 300, 1e-10  # after them, at most; the relative decrease of sum C^2 / W in a pass at which they end
+TURNS = 16  # with walls, at most: a link that stands on a wall halves its violation in each
+LEAST = 1e-2  # smallest part of a Newton step that is tried
 BETTER = 0.999  # of its square: a violation that falls by less in a step contradicts others
-THIN = 1e-3  # of the longest: an axis along which a body does not extend
+THIN = 1e-3  # of the longest axis: below, a body does not extend along an axis
 
 
 def forget(scene: Scene, batches: list[Batch], x: np.ndarray) -> None:
-    """Before particles are put to x, (n, dim): of constraints that this changes no load is known."""
+    """Reset the known loads of constraints whose violation changes, before particles are put to x, (n, dim) [m]."""
     for b in _rigid(batches):
         lam = scene.memory.read(b.dev.equation.lam)
         if lam.any():
@@ -56,21 +58,26 @@ def forget(scene: Scene, batches: list[Batch], x: np.ndarray) -> None:
 
 
 def left(batches: list[Batch], x: np.ndarray) -> list[tuple[Batch, np.ndarray]]:
-    """By how much rigid constraints that act both ways are off at x, (n, dim), as shares of their sizes, (m,), where above SEEN;
-    else 0. Where remove() leaves that, they contradict each other."""
+    """Return the violations of rigid two-sided constraints at x, (n, dim), by batch: shares of their sizes, (m,), 0 up to SEEN.
+
+    Constraints that remove() leaves violated contradict each other.
+    """
     some = [b for b in _rigid(batches) if b.side == 0]
     off = [(b, np.abs(b.violation(x) * b.inverse_size(x) * (b.compliance == 0) * ~b.broken)) for b in some]
     return [(b, np.where(share > SEEN, share, 0.0)) for b, share in off]
 
 
 def first_off(features: list[Feature], x: np.ndarray) -> int | None:
-    """The first particle of rigid constraints that are off by more than SEEN at x, (n, dim); None where none is."""
+    """Return the first particle of rigid constraints that are violated by more than SEEN at x, (n, dim); None without any."""
     rigid = _rigid([f for f in features if isinstance(f, Batch)])
     return min((i for b in rigid for i in _off_corners(b, x, b.compliance == 0)), default=None)
 
 
 def first_stiffened(features: Sequence[Feature], x: np.ndarray) -> int | None:
-    """The same of those that are springs on the device, and rigid by what was assigned: they would be blows."""
+    """Return the first particle of constraints that become rigid and are violated at x, (n, dim); None without any.
+
+    These are still springs on the device, but a compliance of 0 was assigned. Their violations would act as blows.
+    """
     stiffened = []
     for b in _rigid([f for f in features if isinstance(f, Batch) and f.acts]):
         if b.dev.spring.soft:
@@ -84,7 +91,7 @@ def first_stiffened(features: Sequence[Feature], x: np.ndarray) -> int | None:
 
 
 def _off_corners(batch: Scalar, x: np.ndarray, some: np.ndarray) -> list[int]:
-    """The particles of those of its constraints, of the mask `some`, that are off by more than SEEN at x, (n, dim)."""
+    """Return the particles of constraints in the mask `some`, (m,), that are violated by more than SEEN at x, (n, dim)."""
     if not some.any():
         return []
     C = batch.violation(x) * batch.inverse_size(x) * some
@@ -93,12 +100,12 @@ def _off_corners(batch: Scalar, x: np.ndarray, some: np.ndarray) -> list[int]:
 
 
 def _rigid(batches: list[Batch]) -> list[Scalar]:
-    """Those with rigid constraints."""
+    """Return the batches with rigid constraints."""
     return [b for b in batches if isinstance(b, Scalar) and b.count and (b.compliance == 0).any()]
 
 
 def tied(scene: Scene, batches: list[Batch], placed: int) -> np.ndarray:
-    """Which particles are of bodies of which any was placed anew, a mask (n,). placed: the first of those that were."""
+    """Return a mask of the particles whose body has any placed particle, (n,). placed: the first placed particle."""
     body, bodies = _bodies([b for b in batches if isinstance(b, Scalar) and b.count], scene.inv_mass)
     going = np.bincount(body[placed:], minlength=bodies) > 0
     return (going[body] & (scene.inv_mass > 0)) | (np.arange(len(body)) >= placed)
@@ -107,11 +114,11 @@ def tied(scene: Scene, batches: list[Batch], placed: int) -> np.ndarray:
 def remove(
     scene: Scene, batches: list[Batch], placed: int, ratio: float, stop: Callable[[np.ndarray], None]
 ) -> tuple[np.ndarray, float] | None:
-    """Move bodies to where their rigid constraints are met, or as near to it as they get; those that are there stay.
+    """Move bodies to where their rigid constraints are satisfied, or as near as possible. Bodies that satisfy them stay.
 
-    placed: the first of the particles that were placed anew; bodies without any stay as they are. ratio: of the coming substep to
-    the last. stop: lets walls stop what has moved from some places, (n, dim). Returns how far each particle went [m], (n,), and
-    the violation of the worst constraint that was taken out, as a share of its size; None where nothing moved.
+    placed: the first placed particle; only bodies with a placed particle move. ratio: of the coming substep to the last. stop:
+    lets walls stop particles that have moved from given positions, (n, dim). Returns how far each particle moved, (n,) [m], and
+    the worst violation that was removed, as a share of its size; None where nothing moved.
     """
     w, state, memory = scene.inv_mass, scene.state, scene.memory
     rigid = [b for b in _rigid(batches) if not b.broken.any()]
@@ -146,20 +153,23 @@ def remove(
         lam = memory.read(b.dev.equation.lam)[: b.count]
         others = (going & (far > ENOUGH))[body[b.indices.ravel()]]
         here = np.logical_or.reduceat(others, np.searchsorted(b.owner, np.arange(b.count)))
-        memory.write(b.dev.equation.lam, np.where(here, 0.0, lam))  # they bear nothing there yet
+        memory.write(b.dev.equation.lam, np.where(here, 0.0, lam))  # these constraints bear no load there yet
         b.forget_loads(here)
     return np.linalg.norm(new - x, axis=1), float(far[going].max())
 
 
 def _off(batch: Scalar, x: np.ndarray) -> bool:
-    """Whether any of its constraints is violated by more than rounding: what is asked of every scene, so it is quick."""
+    """Whether any of its constraints is violated by more than rounding. A fast test, because every scene takes it."""
     C = batch.violation(x)
     return bool(((np.abs(C) if batch.side == 0 else C * batch.side) > MET * np.maximum(np.abs(batch.goal), MET)).any())
 
 
 def _borne(scene: Scene, batches: list[Scalar], x: np.ndarray, others: np.ndarray, part: float) -> list[np.ndarray]:
-    """The violations by which passes bear the load of the last substep, -W lam, a part of them in a shorter one; none in systems,
-    which bear it without, nor where the particle is one of the `others`, (n,)."""
+    """Return the violations -part W lam by which passes bear the load of the last substep, (m,) for each batch.
+
+    part: what a shorter substep leaves of them. They are 0 for systems, which bear loads without violations, and for constraints
+    with a particle in the mask `others`, (n,).
+    """
     split, out = scene.memory.read(scene.slots.split)[: len(x)].astype(np.float64), []
     for b in batches:
         g = b.gradients(x).reshape(-1, x.shape[1])
@@ -172,9 +182,9 @@ def _borne(scene: Scene, batches: list[Scalar], x: np.ndarray, others: np.ndarra
 
 
 def met(rows: "Rows", body: np.ndarray, going: np.ndarray) -> np.ndarray:
-    """Places near those of the rows, (n, dim), at which their constraints are met, or as nearly as they can be.
+    """Return positions near those of the rows, (n, dim), at which their constraints are satisfied as far as possible.
 
-    body: that of each particle (n,). going: which bodies move.
+    body: the body of each particle, (n,). going: mask of the bodies that move.
     """
     rows = _relaxed(_newton(rows, body, going), body, going)
     worst, left = _violation(rows, body, len(going))
@@ -187,7 +197,7 @@ def met(rows: "Rows", body: np.ndarray, going: np.ndarray) -> np.ndarray:
 
 
 def _newton(rows: "Rows", body: np.ndarray, going: np.ndarray) -> "Rows":
-    """The rows where Newton's method ends."""
+    """Return the rows at the positions where Newton's method ends."""
     going, bodies = going.copy(), len(going)
     x = rows.x
     far = np.ones(bodies)
@@ -213,8 +223,10 @@ def _newton(rows: "Rows", body: np.ndarray, going: np.ndarray) -> "Rows":
 
 
 def _relaxed(rows: "Rows", body: np.ndarray, going: np.ndarray) -> "Rows":
-    """The rows where passes leave those bodies whose constraints contradict each other. Where an f is curved, passes do not take
-    out what violations there are."""
+    """Return the rows after passes over the bodies whose constraints contradict each other.
+
+    Bodies with a curved f are excluded: there, passes do not remove violations.
+    """
     worst, size = _violation(rows, body, len(going))
     curved = np.concatenate([np.full(some.sum(), b.quantity.curved or b.quantity.collapses > 0) for b, some in rows.active])
     going = going & (worst > SEEN) & (np.bincount(_of(rows, body, len(going)), curved, minlength=len(going)) == 0)
@@ -230,13 +242,13 @@ def _relaxed(rows: "Rows", body: np.ndarray, going: np.ndarray) -> "Rows":
 
 
 def _bodies(batches: list[Scalar], w: np.ndarray) -> tuple[np.ndarray, int]:
-    """The body of each particle, the last one for those that no constraint can move; and how many there are."""
+    """Return the body of each particle, and the number of bodies. The last body has all particles that no constraint can move."""
     m = sum(b.count for b in batches)
     return bodies_of(m, *corners_of(batches), w)[1], m + 1
 
 
 def _violation(rows: "Rows", body: np.ndarray, bodies: int) -> tuple[np.ndarray, np.ndarray]:
-    """The largest violation of each body, relative to the sizes of the constraints, and what it stores, sum C^2 / W."""
+    """Return the largest violation of each body, as a share of the constraint's size, and the energy sum C^2 / W of each body."""
     of = _of(rows, body, bodies)
     worst = np.zeros(bodies)
     np.maximum.at(worst, of, np.abs(rows.C * rows.close))
@@ -244,18 +256,18 @@ def _violation(rows: "Rows", body: np.ndarray, bodies: int) -> tuple[np.ndarray,
 
 
 def _open(rows: "Rows", body: np.ndarray, bodies: int) -> np.ndarray:
-    """Which bodies have a violation beyond rounding."""
+    """Return a mask of the bodies with a violation beyond rounding."""
     return np.bincount(_of(rows, body, bodies), rows.open, minlength=bodies) > 0
 
 
 def _pushed(rows: "Rows", body: np.ndarray, bodies: int) -> np.ndarray:
-    """Which bodies have links that would be longer."""
+    """Return a mask of the bodies with compressed links."""
     short = (rows.C < 0) & np.concatenate([np.full(some.sum(), b.arity == 2) for b, some in rows.active])
     return np.bincount(_of(rows, body, bodies), short, minlength=bodies) > 0
 
 
 def _bulged(rows: "Rows", body: np.ndarray, pushed: np.ndarray, strain: np.ndarray) -> np.ndarray:
-    """Places of bodies that bulge as an arc does that is longer than its chord by the strain: by sqrt(3 / 8 strain) of it."""
+    """Return positions at which bodies bulge like an arc longer than its chord by `strain`: by sqrt(3 / 8 strain) of it."""
     x = rows.x.copy()
     for b in np.flatnonzero(pushed):
         who = np.unique(rows.who[_of(rows, body, len(pushed))[rows.row] == b])
@@ -277,7 +289,7 @@ def _bulged(rows: "Rows", body: np.ndarray, pushed: np.ndarray, strain: np.ndarr
 
 
 def _within(move: np.ndarray, rows: "Rows", body: np.ndarray, bodies: int) -> np.ndarray:
-    """The factor of each move, (n,), with which bodies move no further than they are large, and legs change by half at most."""
+    """Return the factor of each move, (n,), with which no particle moves further than its body's size, nor a leg by half."""
     of, x = _of(rows, body, bodies)[rows.row], rows.x[rows.who]
     low, high, longest = np.full((bodies, rows.dim), np.inf), np.full((bodies, rows.dim), -np.inf), np.zeros(bodies)
     np.minimum.at(low, of, x)
@@ -294,7 +306,7 @@ def _within(move: np.ndarray, rows: "Rows", body: np.ndarray, bodies: int) -> np
 
 
 def _of(rows: "Rows", body: np.ndarray, bodies: int) -> np.ndarray:
-    """The body of each row."""
+    """Return the body of each row."""
     free = rows.w[rows.who] > 0
     of = np.full(len(rows.C), bodies - 1)
     of[rows.row[free]] = body[rows.who[free]]
@@ -304,8 +316,9 @@ def _of(rows: "Rows", body: np.ndarray, bodies: int) -> np.ndarray:
 class Rows:
     """The rigid constraints that act at positions x, and their violations C.
 
-    Corner k belongs to row[k] and is particle who[k]. rounding: of coordinates. borne: of each batch, what violations bear.
-    sizes, weights: of each batch, what makes violations shares of its constraints, and W at the start.
+    Corner k belongs to row[k] and is particle who[k]. rounding: of coordinates, relative. borne: for each batch, the violations
+    that bear loads, which stay. sizes, weights: for each batch, the factors that turn violations into shares of the constraint's
+    size, and W at the start.
     """
 
     def __init__(
@@ -335,7 +348,7 @@ class Rows:
         self.scale = np.divide(1, np.sqrt(W), out=np.zeros(len(W)), where=W > 0)
 
     def _weights(self, gradients: list[np.ndarray]) -> list[np.ndarray]:
-        """W of each batch; rows of systems, which are softened alike, have the same."""
+        """Return W of each batch. Rows of a system have the same W, because it softens all rows alike."""
         split = self.w * sum(np.bincount(b.indices.ravel(), minlength=len(self.w)) for b in self.batches)
         out = []
         for b, g in zip(self.batches, gradients, strict=True):
@@ -345,36 +358,39 @@ class Rows:
         return out
 
     def at(self, x: np.ndarray) -> "Rows":
-        """Those that act at other positions."""
+        """Return the rows that act at positions x."""
         return Rows(self.batches, x, self.w, self.rounding, self.borne, self.sizes, self.weights)
 
     def towards(self, borne: list[np.ndarray]) -> "Rows":
-        """The same, which keep what bears loads."""
+        """Return these rows with the violations `borne`, which bear loads, as their goal."""
         return Rows(self.batches, self.x, self.w, self.rounding, borne, self.sizes, self.weights)
 
     @property
     def open(self) -> np.ndarray:
-        """Which are violated by more than rounding: of coordinates X it changes C by about X |grad C|, (rows,)."""
+        """Mask of the rows that are violated by more than rounding, (rows,).
+
+        Rounding of coordinates of size X changes C by about rounding * X |grad C|.
+        """
         slope = np.sqrt(np.bincount(self.row, (self.J**2).sum(axis=1), minlength=len(self.C)))
         X = np.abs(self.x[self.who[self.first]]).max(axis=1, initial=0.0)
         return np.abs(self.C) * self.close > MET + self.rounding * X * slope * self.close
 
     @property
     def legs(self) -> np.ndarray:
-        """The corners of angles from which a leg leads to the next."""
+        """The corners of angles from which a leg leads to the next corner."""
         angles = [b.quantity.curved and not b.quantity.collapses for b in self.batches]
         angle = np.repeat(angles, [some.sum() for some in self.corners])
         return np.flatnonzero(angle[:-1] & (self.row[:-1] == self.row[1:]))
 
     def newton(self) -> np.ndarray:
-        """The least moves that take C to 0, as far as it is linear."""
+        """Return the least moves that take the linearised C to 0, (n, dim)."""
         return self._scaled.solve(-self.C * self.scale, enough=LEFT, steps=STEPS)
 
     def relaxed(self) -> np.ndarray:
-        """The moves of one pass, -w J^T C / W."""
+        """Return the moves of one pass, -w J^T C / W, (n, dim)."""
         return self._scaled.moves(-self.C * self.scale)
 
     @property
     def _scaled(self) -> Jacobian:
-        """J, of C / sqrt(W)."""
+        """The Jacobian of C / sqrt(W)."""
         return Jacobian(len(self.C), self.row, self.who, self.w, self.J * self.scale[self.row, None])

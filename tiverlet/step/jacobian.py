@@ -1,4 +1,4 @@
-"""Gradients of constraints by their corners: the least moves along them, in the metric of the masses."""
+"""The Jacobian of constraints, stored by corners, and the least moves along it in the metric of the masses."""
 
 from collections.abc import Callable
 
@@ -6,15 +6,15 @@ import numpy as np
 
 from .block_matrix import STEPS, conjugate_gradients, summed
 
-SOFT = 1e-6  # of the diagonal: what has hardly a direction to move in stays
-DONE = 1e-12  # of r . z at the start of conjugate gradients: what is left
+SOFT = 1e-6  # of the diagonal: softness, so that nearly singular directions stay
+DONE = 1e-12  # of r . z at the start: where conjugate gradients end
 
 
 class Jacobian:
-    """J of m constraints between n particles.
+    """The Jacobian J of m constraints between n particles.
 
     Corner k belongs to row[k] and is particle who[k], with the gradient J[k], (corners, dim). w: inverse masses, (n,). whole:
-    makes moves of particles, (n, dim), moves of the bodies that they are in, see Solids; None where each moves alone.
+    projects moves of particles, (n, dim), on rigid moves of their bodies, see Solids; None where each particle moves alone.
     """
 
     def __init__(
@@ -25,26 +25,26 @@ class Jacobian:
         self.diagonal = np.bincount(row, w[who] * (J**2).sum(axis=1), minlength=m)  # of J w J^T
 
     def rates(self, v: np.ndarray) -> np.ndarray:
-        """J v."""
+        """Return J v, (m,)."""
         return np.bincount(self.row, (self.J * v[self.who]).sum(axis=1), minlength=self.m)
 
     def gathered(self, values: np.ndarray) -> np.ndarray:
-        """The sums of values of corners over the particles that they belong to, (n, dim)."""
+        """Return the sums of the values of corners by particle, (n, dim)."""
         return summed(values, self.who, len(self.w))
 
     def moves(self, lam: np.ndarray) -> np.ndarray:
-        """w J^T lam, of whole bodies."""
+        """Return the moves w J^T lam, (n, dim), projected on those of whole bodies."""
         moves = self.w[:, None] * self.gathered(self.J * lam[self.row][:, None])
         return self.whole(moves) if self.whole else moves
 
     def solve(
         self, right: np.ndarray, some: np.ndarray | float = 1.0, enough: float = DONE, steps: int = STEPS, soft: float = SOFT
     ) -> np.ndarray:  # fmt: skip
-        """w J^T lam with (J w J^T + mu) lam = right, for some rows."""
+        """Return w J^T lam with (J w J^T + mu) lam = right, (n, dim). some: the rows that take part."""
         return self.moves(self.multipliers(right, some, enough, steps, soft))
 
     def multipliers(self, right: np.ndarray, some: np.ndarray | float, enough: float, steps: int, soft: float) -> np.ndarray:
-        """lam, by conjugate gradients, preconditioned by the diagonal."""
+        """Return lam, (m,), by conjugate gradients preconditioned by the diagonal. See solve()."""
         mu = soft * self.diagonal
         scale = np.divide(1, self.diagonal + mu, out=np.zeros_like(mu), where=self.diagonal > 0)
         return conjugate_gradients(lambda p: some * self.rates(self.moves(p)) + mu * p, lambda r: scale * r, right, enough, steps)

@@ -1,5 +1,4 @@
-"""What does not fit into a periodic box: what is too large to have one nearest image, and walls across it. And what
-Sleep does not know of."""
+"""Checks of features beside Periodic and Sleep: what exceeds half a periodic box, walls across it, and what cannot sleep."""
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from ..particles import Particles
 
 
 def refuse_misfits(box: Periodic, particles: Particles, features: tuple[Feature, ...]) -> None:
-    """Raise ValueError for what would meet two images of a particle, or none."""
+    """Raise ValueError for features that do not fit into a periodic box, such as those that reach two images of a particle."""
     for feature in features:
         if isinstance(feature, Polygons):
             raise ValueError("Periodic: Polygons do not know of images. Use Contact, for bodies made of discs.")
@@ -37,7 +36,7 @@ def refuse_misfits(box: Periodic, particles: Particles, features: tuple[Feature,
 
 
 def _refuse_wall(box: Periodic, wall: Collider) -> None:
-    """Walls across a periodic axis, and obstacles in a shear."""
+    """Raise ValueError for a wall across a periodic axis, or an obstacle in a sheared box."""
     along: list[int] = []
     if isinstance(wall, Box):
         along = [k for k in box.axes if np.isfinite([wall.lower[k], wall.upper[k]]).any()]
@@ -52,7 +51,7 @@ def _refuse_wall(box: Periodic, wall: Collider) -> None:
 
 
 def _refuse_torn(box: Periodic, batch: Batch) -> None:
-    """Bodies whose particles were put on different sides of the box: these are followed as they are, unwrapped."""
+    """Raise ValueError for a body whose particles are on different sides of the box: bodies use unwrapped positions."""
     x, owner = batch.start.position[batch.indices.ravel()], batch.owner
     first = x[np.searchsorted(owner, np.arange(batch.count))] if batch.count else x
     far = np.abs(x - first[owner]) > box.lengths / 2
@@ -65,7 +64,7 @@ def _refuse_torn(box: Periodic, batch: Batch) -> None:
 
 
 def refuse_restless(features: tuple[Feature, ...], order: int) -> None:
-    """Raise ValueError for what Sleep does not know of."""
+    """Raise ValueError for features and orders that Sleep does not support."""
     for f in features:
         if isinstance(f, Acceleration) and f.pairwise:
             raise ValueError(f"Sleep: {f!r} reaches through space, from one island to the next. Leave one of both out.")

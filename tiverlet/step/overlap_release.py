@@ -1,16 +1,16 @@
-"""What contacts overlap by becomes less where the substep gets shorter: else it would become energy.
+"""Overlap release: reduces the overlap of contacts before the substep gets shorter. Without it overlap would become energy.
 
-A pass holds a load F by an overlap C = D h^2 F, as a spring of stiffness 1 / (D h^2) would. A shorter substep h' makes that
-spring stiffer while it is pressed, and its energy (h / h')^2 times as large. So positions first go to where the same loads need
-the overlap (h' / h)^2 C, by the least moves in the metric of the masses, and velocities stay:
+A pass holds a load F by an overlap C = D h^2 F, like a spring of stiffness 1 / (D h^2). A shorter substep h' makes that spring
+stiffer while it is pressed, and its energy (h / h')^2 times as large. So positions first move to where the same loads need the
+overlap (h' / h)^2 C, by the least moves in the metric of the masses, and velocities stay:
 
     x += w J^T lam,  (J w J^T + mu D) lam = C - (h' / h)^2 C_0,  D the diagonal of J w J^T
 
-for what overlaps, whatever its geometry (Candidates); what the moves push into each other parts again, C_0 = 0. Constraints go
-to where the same loads need them, as in projection.py: that alone would push bodies into each other again. Clusters move as a
-whole, and out of the shape that contacts and walls have left them in (Solids). Nothing moves into walls that stopped it, and
-these only push. mu falls while what is stored does, the sum of C^2 / D, and rises where it does not (Levenberg and Marquardt).
-Motion pays for what is lifted, as in projection.py.
+This is for overlaps of any geometry (Candidates). Pairs that the moves press into each other are parted again, C_0 = 0.
+Constraints move to the violations that the same loads need, as in projection.py; projection alone would press bodies into each
+other again. Clusters move as rigid bodies, and lose the deformation that contacts and walls have left (Solids). Particles do not
+move into walls that stopped them, and walls only push. mu falls while the stored energy, the sum of C^2 / D, falls, and rises
+otherwise (Levenberg and Marquardt). Motion pays for lifted particles, as in projection.py.
 """
 
 from typing import Any
@@ -28,16 +28,17 @@ from .rigid_rows import rigid_rows
 from .solids import Solids
 
 SOFT, SOFTEST = 1e-2, 1e-5  # mu of the first round, and the least
-STEPS, ENOUGH = 32, 1e-6  # of conjugate gradients, at most; what of r . z they leave
-ROUNDS = 16  # of them, each with what particles were pushed into in the one before
-TURNS = 8  # at most, until nothing pulls that cannot
-LEFT = 0.01  # of what overlaps store: what may be left of it in the shorter substep
+STEPS, ENOUGH = 32, 1e-6  # of conjugate gradients, at most; the share of r . z at which they end
+ROUNDS = 16  # of moves, at most, each with the contacts into which the last one led
+TURNS = 8  # at most, until no one-sided row pulls
+LEFT = 0.01  # of the energy that overlaps store: what may be left of it in the shorter substep
 
 
 def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
-    """Take out what overlaps would store; d holds velocities. Nothing happens where they are small, unless `small` asks for it.
+    """Remove the energy that overlaps would store in a shorter substep; d holds velocities.
 
-    h: the coming substep [s]; longest: since this was done last. Returns whether overlaps have been looked after.
+    Nothing happens if overlaps are small, unless `small`. h: the coming substep [s]. longest: the longest substep since the last
+    release [s]. Returns whether overlaps have been treated.
     """
     state, memory, step, ratio = runner.scene.state, runner.memory, runner.step, h / longest
     x, contact = state.get(memory), next(iter(step.contacts), None)
@@ -51,7 +52,7 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
         return False
     pairs: Candidates = DiscCandidates(np.zeros((0, 2), dtype=np.int64), np.zeros(0), None)
     if contact:
-        runner.invalidate()  # so that it does not matter when they were listed last
+        runner.invalidate()  # so that the result does not depend on when pairs were listed last
         runner.look()
         pairs = contact.dev.geometry.candidates(x)
     jacobian = part(runner, pairs, solids, x, ratio)
@@ -70,8 +71,10 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
 
 
 def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: float) -> Jacobian | None:
-    """Move particles from x, (n, dim), until what they store is about ratio^4 of it, or as near to that as they get; returns the
-    rows of the last round."""
+    """Move particles from x, (n, dim), until overlaps store about ratio^4 of their energy, or as near to that as possible.
+
+    Returns the Jacobian of the last round; None if there was none.
+    """
     state, memory, w, jacobian = runner.scene.state, runner.memory, runner.scene.inv_mass, None
     overlap = pairs.at(x)[0]
     known = active = overlap > 0
@@ -79,7 +82,7 @@ def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: f
     soft, tied, walls = SOFT, bound(runner, x, ratio), Walls(x)
 
     def seen_at(x: np.ndarray) -> tuple[float, np.ndarray, Rows | None]:
-        """What is stored there, how much deeper contacts are than they are to be, and the rows of constraints."""
+        """Return the energy stored at x, how much deeper contacts are than their goal, and the rows of constraints."""
         overlap, gradient = pairs.at(x)
         rows = tied.at(x) if tied else None
         stored = stored_by(overlap - goal, gradient, w[pairs.who]) + solids.off(x)
@@ -99,7 +102,7 @@ def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: f
         J, right = [*gradient[some].transpose(1, 0, 2), walls.normal], [more[some], walls.along(best - begin)]
         if rows:
             row, who, J, right = [*row, m + k + rows.row], [*who, rows.who], [*J, rows.J], [*right, -rows.C]
-        if solids.count:  # a row of nothing for each, which tells what hangs together
+        if solids.count:  # an empty row for each cluster, which connects its particles
             row, who = [*row, sum(map(len, right)) + solids.owner], [*who, solids.who]
             J, right = [*J, np.zeros((len(solids.who), x.shape[1]))], [*right, np.zeros(solids.count)]
         wanted = np.concatenate(right)
@@ -118,7 +121,7 @@ def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: f
 
 
 def moved(runner: Any, before: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Put particles to x, where they come from `before`: where they are then, and where walls stop them."""
+    """Put particles, which come from `before`, to x. Returns the positions before and after walls stop them, (n, dim) each."""
     state, memory = runner.scene.state, runner.memory
     state.put(memory, x)
     sent = state.get(memory)
@@ -127,7 +130,7 @@ def moved(runner: Any, before: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, n
 
 
 def one_sided(jacobian: Jacobian, right: np.ndarray, one_way: np.ndarray, soft: float) -> np.ndarray:
-    """The least moves, of which none is made by a row that goes one way and pulls."""
+    """Return the least moves, (n, dim), without rows in the mask `one_way` that would pull."""
     some = np.ones(len(right))
     for _ in range(TURNS):
         lam = jacobian.multipliers(right * some, some, ENOUGH, STEPS, soft)
@@ -139,26 +142,28 @@ def one_sided(jacobian: Jacobian, right: np.ndarray, one_way: np.ndarray, soft: 
 
 
 class Walls:
-    """Which particles were stopped by walls, (k,), and along which normals, (k, dim)."""
+    """The particles that walls have stopped, (k,), and the normals there, (k, dim)."""
 
     def __init__(self, x: np.ndarray):
         self.who, self.normal = np.zeros(0, dtype=np.int64), np.zeros((0, x.shape[1]))
 
     def push(self, way: np.ndarray) -> None:
-        """Note how far walls took particles back, (n, dim)."""
+        """Add particles that walls have moved back by `way`, (n, dim) [m]."""
         length = np.linalg.norm(way, axis=1)
         new = np.setdiff1d(np.flatnonzero(length > 0), self.who)
         self.who = np.concatenate([self.who, new])
         self.normal = np.concatenate([self.normal, way[new] / length[new, None]])
 
     def along(self, way: np.ndarray) -> np.ndarray:
-        """How much of a way, (n, dim), is along the normals, (k,)."""
+        """Return the components of `way`, (n, dim), along the normals, (k,)."""
         return (way[self.who] * self.normal).sum(axis=1)
 
 
 def bound(runner: Any, x: np.ndarray, ratio: float) -> Rows | None:
-    """The constraints of the world, and rigid clusters that share particles with others; C is measured from what it is to be, as
-    in projection.py."""
+    """Return rows of the world's constraints and of rigid clusters that share particles with others; None without any.
+
+    C is measured from its goal, as in projection.py.
+    """
     w = runner.scene.inv_mass
     scalars = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
     some = [b for b in scalars if (~b.idle(w) & ~b.broken).any()]

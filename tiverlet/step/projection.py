@@ -1,21 +1,21 @@
-"""What constraints leave undone becomes less where the substep gets shorter: else it would become energy.
+"""Projection: reduces the violations that passes leave, before the substep gets shorter. Without it they would become energy.
 
-A pass holds a load F by a violation Z = D h^2 F, beside what its compliance takes, as a spring of stiffness 1 / (D h^2) would.
-A shorter substep h' makes that spring stiffer while it is stretched, and its energy (h / h')^2 times as large. So positions
-first go to where the same loads need the violations (h' / h)^2 Z, and velocities to where they do not change:
+A pass holds a load F by a violation Z = D h^2 F, in addition to that of its compliance, like a spring of stiffness 1 / (D h^2). A
+shorter substep h' makes that spring stiffer while it is stretched, and its energy (h / h')^2 times as large. So positions first
+move to where the same loads need the violations (h' / h)^2 Z, and velocities change so that they keep these:
 
     x += w J^T lam,  C(x) = C - (1 - (h' / h)^2) Z;     v += w J^T lam,  (J w J^T + mu) lam = -J v
 
-Z, C + alpha lam / h^2 for what is at rest, is what the last substep left of a constraint; springs that it resolves stay as they
-are. Positions move without velocities, as contacts do that an impact left overlapping.
+Z is the residual violation of the last substep, C + alpha lam / h^2 for particles at rest. Springs that the substep resolves stay
+as they are. Positions move without changing velocities, as for contacts that an impact left overlapping.
 
-Where contacts are in the way, they are rows, too (ContactRows), and what they lead into are others, in a few rounds. Beads stay
-on their wires (Rails), and free bodies keep their angular momentum (FreeBodies).
+Where contacts are in the way, they are rows, too (ContactRows). Moves may lead into further contacts, which become rows in a few
+rounds. Beads stay on their wires (Rails), and free bodies keep their angular momentum (FreeBodies).
 
-Where that lifts what hangs, motion pays for it as far as it can: a taut net has no direction to sag in, so velocities know
-nothing of its fall, and lifting it back at the end of each fall would be a pump. The energy that was gained is taken out of the
-velocities, of the part along the moves first, then of the whole of what is anchored. What hangs at rest is lifted for nothing:
-its fall became heat when it stretched.
+Where moves lift particles, the motion pays for the energy as far as it can. A taut net has no direction to sag in, so its fall
+does not show in velocities; lifting it back at the end of each fall would pump energy in. The energy gained is taken from the
+velocities: first from the part along the moves, then from all motion of anchored bodies. A body that hangs at rest is lifted for
+nothing, since its fall became heat when it stretched.
 """
 
 import copy
@@ -40,31 +40,35 @@ from .rigid_rows import RigidRows, left_out, rigid_rows
 if TYPE_CHECKING:
     from .runner import Runner
 
-ENOUGH = 1e-3  # of its size: a violation that matters, over (r - 1)^2 / r with r = (h / h')^2: what one jump leaves to vibrate
-FRAIL = 0.01  # of what breaks a constraint: a load that a violation may have by itself
-FIRM = 0.9  # theta from where on velocities may not change a constraint
-FAR = 0.75  # of the longest: a substep in which what is small now has had its chance
+ENOUGH = 1e-3  # of its size: a violation that matters, divided by (r - 1)^2 / r, r = (h / h')^2: what one jump leaves to vibrate
+FRAIL = 0.01  # of break_at: the extra load that a violation may cause in a shorter substep
+FIRM = 0.9  # theta from which on velocities must not change a constraint
+FAR = 0.75  # of the longest substep: below, violations that are small now are settled
 NEWTON = 40  # steps, at most
-PRODUCTS = 1e9  # of numbers: some seconds, after which the rest is left as it is
-SHARED = PRODUCTS / 8  # where contacts move, too: they are tried after links alone, some times
-BEGIN, HARDEST, LEAST = 1e-3, 10.0, 1e-9  # mu of the first, and of the last try; the least
-FINE, STALLED = 1e-5, 0.05  # mu from which on a step has to take out as much of what is stored: what cannot be met stays
+PRODUCTS = 1e9  # multiplications, at most: some seconds, after which the remaining violations stay
+SHARED = PRODUCTS / 8  # the limit where contacts move, too: that is tried after links alone, several times
+BEGIN, HARDEST, LEAST = 1e-3, 10.0, 1e-9  # mu of the first and of the last try; the least mu
+FINE, STALLED = 1e-5, 0.05  # mu from which on a step must remove this share of the stored energy, or violations are left
 SLIGHT = 0.01  # of the kinetic energy: what violations may become where contacts are in the way
-SLIGHTEST = 1e-3  # of the kinetic energy inside of bodies: what violations, and moves in the next substep, may make of it
-LOOKS = 8  # steps of conjugate gradients, to see what a solver would move
-LEFT = 0.01  # of what violations store: what may be left of it in the shorter substep
-DONE = 1e-6, 1e-13  # of its size: a violation that is none; and that breaks nothing in the shortest substep
-TURNS = 16  # with walls, at most: a link that stands on one halves its violation in each
-WORSE = 2.0  # times what violations stored before: what is left of it, at most, where it is taken at all
-BETTER = 0.5  # times that, where contacts move, too: what they and links store then
-TOGETHER = 4  # times that links and contacts move together: each may lead into others
-HELD = 1e3  # of its mass: how firmly a wall holds a particle that it has stopped
-GRIP = 1e-3  # of what a wall bears: what it bears along itself, by friction
+SLIGHTEST = 1e-3  # of the kinetic energy inside bodies: what violations, and moves in the next substep, may add to it
+LOOKS = 8  # steps of conjugate gradients, to estimate the moves of a solver
+LEFT = 0.01  # of the energy that violations store: what may be left of it in the shorter substep
+DONE = 1e-6, 1e-13  # of its size: a violation that counts as none; and one that breaks nothing in the shortest substep
+TURNS = 16  # with walls, at most: a link that stands on a wall halves its violation in each
+WORSE = 2.0  # times the energy stored before: a result that stores more is discarded
+BETTER = 0.5  # times that energy, of links and contacts: the limit where contacts move, too
+TOGETHER = 4  # rounds in which links and contacts move together: each may lead into further contacts
+HELD = 1e3  # of its mass: the stiffness with which a wall holds a particle that it has stopped
+GRIP = 1e-3  # of the push of a wall: the tangential part from which on friction holds a particle
 
 
 class Aims(NamedTuple):
-    """Of what violations store, and of the work that a solver of so many `steps` would do: the share that may be left, unless it
-    is less than `slight`. products: how many numbers it may multiply. done: a violation that is none, of its size."""
+    """The aims of _newton().
+
+    share: what may be left of the stored energy, and of the work of a solver with so many `steps`. slight: the amount of both
+    that may be left in any case. products: multiplications, at most. done: a violation that counts as none, as a share of its
+    size.
+    """
 
     share: float
     steps: int
@@ -74,17 +78,17 @@ class Aims(NamedTuple):
 
 
 def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | None = None) -> bool | None:
-    """Take out what violations would store; d holds velocities. Nothing happens where they are small, or would overlap.
+    """Remove the energy that violations would store in a shorter substep; d holds velocities.
 
-    h: the coming substep [s]; longest: since this was done last. contacts: which move together with links. Returns whether
-    positions have been looked after; None where contacts are in the way of what would be more than a hundredth of the kinetic
-    energy.
+    Nothing happens if violations are small, or if the moves would make contacts overlap more. h: the coming substep [s]. longest:
+    the longest substep since the last projection [s]. contacts: contacts that move together with links. Returns whether positions
+    are settled for h; None where contacts are in the way and the energy is more than a hundredth of the kinetic energy.
     """
     ratio = h / longest
     slots = runner.scene.slots
     w, state, memory = runner.scene.inv_mass, runner.scene.state, runner.memory
     x = before = state.get(memory)
-    if not (np.abs(x) < LARGEST).all():  # nor what is no number
+    if not (np.abs(x) < LARGEST).all():  # or NaN
         return True
     batches: list[Any] = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
     stays = left_out(runner.batches, w, x)
@@ -106,7 +110,7 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     kept = memory.read(state.d)
     v = kept.astype(np.float64)
     n = len(x)
-    # Where the solver converges, it moves what is left at once in the next substep, and that flies on.
+    # A solver that converges removes remaining violations at once in the next substep, which leaves velocities.
     steps = LOOKS if slots.converges or slots.exact else 0
     slight = SLIGHTEST * 2 * h * h * start.kinetic(v[:n])
     still = (undone != 0) & (start.theta > FIRM) & ~start.touches
@@ -122,7 +126,7 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     bodies = FreeBodies(start.jacobian, x, stopped | tethered(runner))
     v[:n], spun = bodies.spun(v[:n], before, kept[:n])
     memory.write(state.d, v)
-    runner.invalidate()  # moves may have led into what was far
+    runner.invalidate()  # moves may lead to particles that are not listed
     more, deeper = seen(runner)
     fails = left > BETTER if contacts else deeper > overlap or rows.stored > WORSE * start.stored
     if fails:
@@ -140,8 +144,10 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
 
 
 def _leaning(runner: "Runner", rows: "Rows", share: float) -> "Rows":
-    """The rows where what walls bear stays on them, and where friction holds it: a body that stands does not turn over its feet,
-    nor walk. share: of what links hold by their violations, which rows give up."""
+    """Return the rows with particles that walls bear held on these walls, and held along them by friction.
+
+    So a standing body does not turn over its feet, nor walk. share: the part of the pull of links that the rows give up.
+    """
     if not runner.step.walls:
         return rows
     state, memory = runner.scene.state, runner.memory
@@ -157,8 +163,10 @@ def _leaning(runner: "Runner", rows: "Rows", share: float) -> "Rows":
 
 
 def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: Aims) -> tuple["Rows", np.ndarray]:
-    """Rows where particles are then, and which of them walls have stopped, (n,). aims: for _newton(), a share of what rows stored
-    at the start."""
+    """Move particles by _newton(), in turns with walls. Returns the rows there, and a mask of particles that walls stopped.
+
+    start: the rows whose stored energy aims.share refers to.
+    """
     state, memory, before = runner.scene.state, runner.memory, rows.x
     enough = aims.share * start.stored
     stopped: np.ndarray = rows.wall.any(axis=1)
@@ -168,11 +176,11 @@ def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: Aims) -> tuple["
         runner.stop_at_walls(before)
         x = state.get(memory)
         stopped |= (x != sent).any(axis=1)
-        last, rows = rows, rows.at(x)  # what walls stop is lifted by the others
-        slips = rows.sticks.any() and rows.stored > enough  # friction does not hold feet against each other
+        last, rows = rows, rows.at(x)  # other particles lift those that walls stop
+        slips = rows.sticks.any() and rows.stored > enough  # friction does not hold two feet against each other
         if ((x == sent).all() and not slips) or rows.matrix.products > aims.products:
             break
-        if rows.stored > last.stored or last.wall.any():  # what lies on them would be sent back there again and again
+        if rows.stored > last.stored or last.wall.any():  # particles on walls would be sent into them again and again
             rows = rows.held(last.wall, x - sent)
             if rows.stored <= enough:
                 break
@@ -183,8 +191,11 @@ def _together(
     runner: "Runner", start: "Rows", rows: "Rows", stopped: np.ndarray, pressed: float, links: list[Any],
     aims: Aims,
 ) -> tuple["Rows", np.ndarray, float]:  # fmt: skip
-    """The best rows and stops of some rounds, each among the contacts that the one before led into; and what links and contacts
-    store there, of what they did. pressed: what contacts stored at the start."""
+    """Move links and contacts together, in rounds; each round includes the contacts that the last one led into.
+
+    Returns the best rows, their stopped particles, and the energy that links and contacts store there as a share of that before.
+    pressed: the energy that contacts stored at the start.
+    """
     before, left, products = start.stored_in_links() + pressed, np.inf, 0
     for _ in range(TOGETHER):
         contacts: Any = ContactRows.of(runner)
@@ -203,8 +214,11 @@ def _together(
 
 
 def _newton(rows: "Rows", enough: float, aims: Aims) -> np.ndarray:
-    """Places at which what violations store is `enough` [J s^2], and where a solver of so many steps would move less, by this
-    share of the work, m p^2, that it would do at the begin; both unless they are less than `slight`."""
+    """Return positions at which violations store at most `enough` [J s^2], and a solver would do little work, m p^2.
+
+    That work, of a solver with aims.steps steps, is at most aims.share of that at the begin. Amounts below aims.slight are always
+    accepted.
+    """
     mu, begin = BEGIN, rows.work(aims.steps)
     for _ in range(NEWTON):
         new = rows.at(rows.x + rows.step(mu))
@@ -220,55 +234,57 @@ def _newton(rows: "Rows", enough: float, aims: Aims) -> np.ndarray:
 
 
 def matters(violation: float, ratio: float) -> bool:
-    """Whether what a violation, as a share of its size, leaves to vibrate is worth a look."""
+    """Whether a violation, as a share of its size, would leave so much vibration that it must be removed. ratio: h' / h."""
     return violation * (1 - ratio**2) ** 2 > ENOUGH * ratio**2
 
 
 def _off(batch: Scalar, x: np.ndarray) -> float:
-    """The worst violation of rigid constraints, as a share of their size: what Newton's method left of it, as after an impact."""
+    """Return the worst violation of rigid constraints, as a share of their size, as Newton's method leaves after an impact."""
     C = batch.violation(x) * batch.inverse_size(batch.start.position) * (batch.compliance == 0) * ~batch.broken
     return float((np.abs(C) if batch.side == 0 else C * batch.side).max(initial=0.0))
 
 
 def seen(runner: Any) -> tuple[float, float]:
-    """Energy [J], and the overlap of the worst contact, in radii."""
+    """Return the energy [J], and the overlap of the worst contact, in radii."""
     runner.look()
     report = runner.report()
     return report.energy, report.overlap
 
 
 def seen_before(runner: Any) -> tuple[float, float]:
-    """The same before positions move; energy, where it is known, by the loads of the last substep: what springs of its violations
-    would hold is not there."""
+    """Return energy and overlap as seen() does, before positions move.
+
+    The energy is that at the end of the last frame, if known: it does not contain the energy of violations as springs.
+    """
     energy, overlap = seen(runner)
     return energy if runner.clock.energy is None else runner.clock.energy, overlap
 
 
 def sizes(batch: Scalar | RigidRows | ContactRows) -> np.ndarray:
-    """The number of corners of each constraint, (m,)."""
+    """Return the number of corners of each constraint, (m,)."""
     return np.bincount(batch.owner, minlength=batch.count)
 
 
 def _units(a: np.ndarray) -> np.ndarray:
-    """Vectors (n, dim) of length 1; 0 where there is none."""
+    """Return vectors (n, dim) scaled to length 1; 0 for zero vectors."""
     size = np.linalg.norm(a, axis=1)[:, None]
     return a * _over(np.ones_like(size), size)
 
 
 def _over(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a / b; 0 where b is."""
+    """Return a / b; 0 where b is 0."""
     return np.divide(a, b, out=np.zeros_like(a), where=b > 0)
 
 
 class Rows:
-    """Constraints at positions x: what they are to give up, C, and their gradients J by corners.
+    """Constraints at positions x: the violations C that they are to lose, and their gradients J by corners.
 
     Corner k belongs to row[k] and is particle who[k].
     """
 
-    goal: Any = 0.0  # what C is measured from
-    theta: Any = 1.0  # how rigid they are
-    weight: Any = 1.0  # the same as passes see it, which split masses
+    goal: Any = 0.0  # the violation from which C is measured
+    theta: Any = 1.0  # how rigid rows are, 0 to 1
+    weight: Any = 1.0  # theta with the split masses of passes
 
     rails: Any = None  # see Rails
 
@@ -278,7 +294,7 @@ class Rows:
     ):  # fmt: skip
         self.rails = rails if rails and len(rails.who) else None
         self.batches, self.w, self.n, self.dim = batches, w, *x.shape
-        self.mass = _over(np.ones_like(w), w)  # 0 of what cannot move
+        self.mass = _over(np.ones_like(w), w)  # 0 for particles that cannot move
         self.box = box  # the Periodic of the world
         self.some = [~b.idle(w) & ~b.broken if b.breaks else ~b.idle(w) for b in batches]
         for b, some in zip(batches, self.some, strict=True):
@@ -295,12 +311,12 @@ class Rows:
         self.pairs = self.row[first], self.who[first], self.who[first + 1]
         self.arity = arity
         self.wall = np.zeros_like(x)  # normals of the walls that hold particles; 0 where none does
-        self.sticks = np.zeros(self.n, dtype=bool)  # held along them by friction, too
-        self.rest = np.zeros_like(x)  # moves by what else draws those that walls bear, in a substep
+        self.sticks = np.zeros(self.n, dtype=bool)  # whether friction holds them along walls, too
+        self.rest = np.zeros_like(x)  # moves of particles on walls in a substep, by forces other than links
         self._measure(x)
 
     def _each(self, values: list[np.ndarray]) -> np.ndarray:
-        """Values of every constraint of the batches, for the rows."""
+        """Return the values of the rows, from those of all constraints of the batches."""
         return np.concatenate([value[some] for value, some in zip(values, self.some, strict=True)])
 
     def _measure(self, x: np.ndarray) -> None:
@@ -313,25 +329,25 @@ class Rows:
         self.stored = float(_over(self.weight * self.C * self.C, self.diagonal).sum())
 
     def stored_in_links(self) -> float:
-        """What is stored in all but contacts."""
+        """Return the energy that links store, without contacts."""
         return float((_over(self.weight * self.C * self.C, self.diagonal) * ~self.touches).sum())
 
     def _bounded(self, C: np.ndarray) -> np.ndarray:
-        """C on the side on which constraints act."""
+        """Return C, and 0 for one-sided constraints that do not act."""
         return np.where(self.side == 0, C, np.maximum(self.side * C, 0.0) * self.side)
 
     def _link(self) -> None:
-        """The matrix of step(), for what its rows and their tensions couple."""
+        """Build the matrix of step(), with the blocks that rows and their tensions couple."""
         begin = np.cumsum(self.arity) - self.arity
-        wide = self.arity * self.dim > 2 * WIDEST  # no two levels hold such a row
+        wide = self.arity * self.dim > 2 * WIDEST  # such a row does not fit into two adjacent levels
         rows = [r for r in self._alike() if len(r) > 1 and not wide[r[0]]]
-        self.alike = [begin[r, None] + np.arange(int(self.arity[r[0]])) for r in rows]  # corners of each
+        self.alike = [begin[r, None] + np.arange(int(self.arity[r[0]])) for r in rows]  # corners of each group
         apart = wide.copy()
         apart[np.concatenate([np.zeros(0, dtype=np.int64), *rows])] = True
-        width = np.where(apart[self.row], 0, np.repeat(self.arity, self.arity))  # of the row of each corner
+        width = np.where(apart[self.row], 0, np.repeat(self.arity, self.arity))  # corners in the row of each corner
         a = np.repeat(np.arange(len(self.who)), width)
         b = np.repeat(begin[self.row], width) + np.arange(len(a)) - np.repeat(np.cumsum(width) - width, width)
-        self.corners = a, b  # of each other row, each with each
+        self.corners = a, b  # all pairs of corners within each of the other rows
         each = [self.who[c[0]] for c in self.alike]
         both = [np.repeat(who, len(who)) for who in each], [np.tile(who, len(who)) for who in each]
         self.wide = np.flatnonzero(wide[self.row] & (self.w[self.who] > 0))
@@ -340,7 +356,7 @@ class Rows:
         number = np.full(self.n, -1)
         number[self.inside] = every = np.arange(len(self.inside))
         self.number = number
-        sides = [i, j, i, j], [i, j, j, i]  # of tensions across links
+        sides = [i, j, i, j], [i, j, j, i]  # blocks of tensions across links
         ends = np.stack([
             np.concatenate([*(number[who] for who in (self.who[corner], *some, *side)), every])
             for corner, some, side in zip(self.corners, both, sides, strict=True)
@@ -349,23 +365,28 @@ class Rows:
         self.matrix = BlockMatrix(len(self.inside), self.dim, *ends[:, self.free])
 
     def _alike(self) -> list[np.ndarray]:
-        """Rows that follow one another, by the same particles in the same order, as those of a cluster."""
+        """Return groups of adjacent rows with the same particles in the same order, as those of a cluster."""
         before = np.maximum(np.arange(len(self.who)) - self.arity[self.row], 0)
         other = (self.row[before] != self.row - 1) | (self.who[before] != self.who)
         other |= self.arity[np.maximum(self.row - 1, 0)] != self.arity[self.row]  # the last of more corners are others
         return np.split(np.arange(self.m), np.flatnonzero(np.bincount(self.row, other, minlength=self.m))[1:])
 
     def leaning(self, wall: np.ndarray, push: np.ndarray, share: float, sticks: np.ndarray) -> "Rows":
-        """The same rows where walls, of these normals, bear particles: they moved them by `push` in a substep, (n, dim), against
-        links, of whose pull the rows have this share, and all else."""
+        """Return these rows with walls of normals `wall`, (n, dim), that bear particles.
+
+        push: (n, dim) [m], the moves by walls in the last substep. They balance the pull of links and all other forces. share:
+        the part of the pull of links that the rows have. sticks: (n,), whether friction holds a particle.
+        """
         new = copy.copy(self)
         new.wall, new.sticks = wall, sticks
         new.rest = -(push + self.w[:, None] * self.pull() / share) * wall.any(axis=1)[:, None]
         return new
 
     def held(self, wall: np.ndarray, back: np.ndarray) -> "Rows":
-        """The same rows where walls, of these normals, and of those along which particles were moved `back`, (n, dim), hold what
-        is not drawn off them, and let it slip."""
+        """Return these rows with walls that hold particles which are not drawn off them, without friction.
+
+        wall: (n, dim) the normals so far. back: (n, dim), by how much walls moved particles back, which gives further normals.
+        """
         unit = _units(back)
         wall = np.where(unit.any(axis=1)[:, None], unit, wall)
         new = copy.copy(self)
@@ -374,17 +395,17 @@ class Rows:
         return new
 
     def pull(self) -> np.ndarray:
-        """What is stored draws particles this way, (n, dim)."""
+        """Return the pull of the stored energy on particles, (n, dim)."""
         return -self.jacobian.gathered(self.J * (_over(self.weight, self.diagonal) * self.C)[self.row, None])
 
     def at(self, x: np.ndarray) -> "Rows":
-        """The same rows elsewhere."""
+        """Return these rows at other positions."""
         new = copy.copy(self)
         new._measure(x)
         return new
 
     def towards(self, goal: np.ndarray) -> "Rows":
-        """The same rows, with C from what it is to be."""
+        """Return these rows with C measured from `goal`, (m,)."""
         new = copy.copy(self)
         new.goal = goal
         new._measure(self.x)
@@ -392,13 +413,16 @@ class Rows:
         return new
 
     def among(self, batches: list[Any], runner: Any) -> "Rows":
-        """The same links, towards the same, among other contacts, the last of these batches, which are to store nothing."""
+        """Return rows with the same links and goals, and with other contacts, the last of `batches`, whose goal is 0."""
         new = Rows(batches, self.w, self.x, self.box, self.rails)
-        new.undone(runner)  # for how rigid they are
+        new.undone(runner)  # sets theta and weight
         return new.towards(np.concatenate([self.goal[~self.touches], np.zeros(int(new.touches.sum()))]))
 
     def undone(self, runner: Any) -> np.ndarray:
-        """Z = theta C_(n+1) + (1 - theta) C_n + damping dC/dt + alpha lam / h^2, to second order; and how rigid the rows are."""
+        """Return Z = theta C_(n+1) + (1 - theta) C_n + damping dC/dt + alpha lam / h^2, to second order, (m,).
+
+        Sets theta, and the weight, which is theta with the split masses of passes.
+        """
         read, h = runner.memory.read, runner.clock.h
         alpha, damping = (self._each([getattr(b, name) for b in self.batches]) for name in ("compliance", "damping"))
         split = read(runner.scene.slots.split)[: self.n].astype(np.float64)
@@ -418,7 +442,7 @@ class Rows:
         return self._bounded(gamma * self.C + (1 - gamma) * self._bounded(self._each(before)) + self._each(borne))
 
     def would_break(self, undone: np.ndarray, h: float, longest: float) -> bool:
-        """Whether a violation pulls harder in a substep h than it did, by so much that it counts beside what breaks its row."""
+        """Whether a violation would pull so much harder in a substep h that the change counts beside break_at of its row."""
         if not any(b.breaks for b in self.batches):
             return False
         each: list[Any] = [getattr(b, "break_at", None) for b in self.batches]
@@ -426,28 +450,32 @@ class Rows:
         return bool((np.abs(undone) * (1 / h**2 - 1 / longest**2) > FRAIL * strength * self.diagonal).any())
 
     def _rigid(self, alpha: np.ndarray, reach: np.ndarray) -> np.ndarray:
-        """theta, by what a force of 1 N moves in a substep."""
+        """Return theta. reach: (m,) the move by a force of 1 N in a substep [m]."""
         return _over(reach * reach, reach * reach + alpha * alpha)
 
     def kinetic(self, v: np.ndarray) -> float:
-        """The kinetic energy [J] of particles at velocities v, as they move in their bodies, of what constraints tie together."""
+        """Return the kinetic energy [J] at velocities v relative to the mean velocity of each body.
+
+        Bodies are what constraints connect.
+        """
         _, body = bodies_of(self.m, self.row, self.who, self.w)
         mass = np.bincount(body, self.mass, minlength=self.m + 1)[:, None]
         mean = summed(self.mass[:, None] * v, body, self.m + 1) * _over(np.ones_like(mass), mass)
         return float((self.mass[:, None] * (v - mean[body]) ** 2)[body < self.m].sum()) / 2
 
     def work(self, steps: int) -> float:
-        """m p^2 of the moves p by which a solver of so many steps, 0 for none, meets the rows."""
+        """Return m p^2 of the moves p with which a solver of `steps` steps would satisfy the rows; 0 without steps."""
         move = self.jacobian.solve(-self.theta * self.C, steps=steps) if steps else np.zeros_like(self.x)
         return float((self.mass[:, None] * move**2).sum())
 
     def step(self, mu: float) -> np.ndarray:
-        """Moves p that minimize sum (C + J p)^2 / (2 D) + p^T M (mu + HELD n n^T) p / 2 + p^T K p / 2, with D the diagonal of
-        J w J^T and n the normals of walls that hold particles, 1 for n n^T where friction does: else these are sent into them
-        again, and stopped again.
+        """Return moves p that minimize sum (C + J p)^2 / (2 D) + p^T M (mu + HELD n n^T) p / 2 + p^T K p / 2.
 
-        K is what tensions C / D across links are: without it, those that are in one line have no direction to give way in, and
-        what would draw a taut rope straight throws it into a zigzag.
+        D is the diagonal of J w J^T. n are the normals of walls that hold particles; n n^T is 1 where friction does. Without this
+        term, particles would be sent into walls and stopped again and again.
+
+        K is the transverse stiffness of links under tensions C / D. Without it, links in one line have no direction to give way
+        in, and the step that should straighten a taut rope throws it into a zigzag.
         """
         stiff = _over(self.weight, self.diagonal)
         row, i, j = self.pairs
@@ -475,7 +503,7 @@ class Rows:
 
 
 def given_back(runner: Any, energy: float, spun: float) -> float:
-    """How much of the energy [J] that bodies are spun up by they had before they were stretched: no more than the scene had."""
+    """Return the part of `spun` [J] that bodies had before they were stretched: at most what the scene has lost since."""
     bound = runner.clock.bound
     return spun if bound is None or bound == CHANGED else min(spun, max(bound - energy, 0.0))
 
@@ -483,21 +511,22 @@ def given_back(runner: Any, energy: float, spun: float) -> float:
 def paid(
     jacobian: Jacobian, v: np.ndarray, moves: np.ndarray, energy: float, walls: Any = False, bodies: FreeBodies | None = None
 ) -> np.ndarray:
-    """Velocities without the energy [J] that moves added: of their part along them first, then of what is anchored, or stands on
-    something. walls: whether one holds each particle. bodies: free ones, which pay by how they move in themselves.
+    """Return velocities from which the energy [J] that moves added is taken, (n, dim).
 
-    Each body, of what constraints tie together, pays by the mass that it has lifted, up to all it has.
+    It is taken from the part of velocities along the moves first, then from all motion of bodies that are anchored or stand on
+    something. Each body, of what constraints connect, pays in proportion to mass times distance of its moves, up to all it has.
+    walls: mask of particles that walls hold. bodies: free bodies, which pay by their inner motion.
     """
     rows, row, who, w = jacobian.m, jacobian.row, jacobian.who, jacobian.w
     m = np.divide(1, w, out=np.zeros_like(w), where=w > 0)
     label, body = bodies_of(rows, row, who, w)
 
     def summed(values: np.ndarray) -> np.ndarray:
-        """Sums by bodies."""
+        """Return the sums of values times masses by body."""
         return np.bincount(body, m * values, minlength=rows + 1)
 
     work, size, along = summed(np.linalg.norm(moves, axis=1)), summed((moves**2).sum(axis=1)), summed((moves * v).sum(axis=1))
-    due = energy * _over(work, np.full(len(work), work.sum()))  # none where rounding gained it, and nothing moved
+    due = energy * _over(work, np.full(len(work), work.sum()))  # 0 where no particle moved: such a gain is rounding
     part = _over(along, size)
     due, left = _settled(due, part * along / 2)
     v = v - ((1 - left) * part)[body][:, None] * moves
@@ -509,6 +538,6 @@ def paid(
 
 
 def _settled(due: np.ndarray, kinetic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What is still due after kinetic energies have paid, and the factor of the velocities that they have left."""
+    """Return the energies still due after kinetic energies have paid, and the factor by which velocities shrink."""
     pays = np.minimum(due, kinetic)
     return due - pays, np.sqrt(np.maximum(1 - _over(pays, kinetic), 0.0))

@@ -1,4 +1,4 @@
-"""Beads on rigid wires, where the host moves particles: along these, and not across."""
+"""Beads on rigid wires, when the host moves particles: beads move along the wires only."""
 
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,10 @@ if TYPE_CHECKING:
 
 
 class Rails:
-    """The directions in which beads can move at positions x (n, dim), which no row of a constraint knows. who: (k,) particles."""
+    """The directions along which beads on rigid wires can move at positions x (n, dim). No row of a constraint contains them.
+
+    who: (k,) the beads. along: (k, dim) unit directions.
+    """
 
     def __init__(self, runner: "Runner", x: np.ndarray):
         wires = [b for b in runner.batches if isinstance(b, Anchored) and not b.drives and (b.compliance == 0).any()]
@@ -23,13 +26,13 @@ class Rails:
         self.along = np.concatenate([np.zeros((0, x.shape[1])), *along])
 
     def moves(self, moves: np.ndarray) -> np.ndarray:
-        """Moves (n, dim), of beads along their wires."""
+        """Return moves, (n, dim), with those of beads projected on their wires."""
         out = moves.copy()
         out[self.who] = (moves[self.who] * self.along).sum(axis=1)[:, None] * self.along
         return out
 
     def across(self, n: int) -> np.ndarray:
-        """For each of n particles the projection on what is across its wire, (n, dim, dim)."""
+        """Return for each of n particles the projector across its wire, (n, dim, dim); 0 for particles on no wire."""
         dim = self.along.shape[1]
         out = np.zeros((n, dim, dim))
         out[self.who] = np.eye(dim) - self.along[:, :, None] * self.along[:, None, :]
@@ -37,8 +40,10 @@ class Rails:
 
 
 def tethered(runner: "Runner") -> np.ndarray:
-    """Which particles anything draws to a place of its own, (n,): bodies of theirs are not free; nor is any in a periodic box,
-    for among images there is no moment."""
+    """Return a mask of the particles that are held at a place or path, (n,). Their bodies are not free.
+
+    In a periodic box all particles are in the mask: among images there is no angular momentum.
+    """
     out = np.full(runner.n, runner.scene.periodic is not None)
     for b in runner.batches:
         if isinstance(b, Anchored):

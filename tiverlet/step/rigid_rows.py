@@ -1,4 +1,4 @@
-"""Rigid clusters as constraints that are one number each: what deforms a cluster, in its own frame."""
+"""Rigid clusters as scalar constraints: their deformations, in the frame of the cluster."""
 
 import functools
 from collections.abc import Iterator
@@ -7,16 +7,17 @@ from typing import Any
 
 import numpy as np
 
-HEAVY = 1024  # masses of the cluster: what a particle that cannot move weighs in it
-WIDEST = 60  # numbers of a cluster: LAPACK takes one thread for them, and with more its bits depend on how many there are
-NONE = 1e-9  # of the largest: a way to move that is none
+HEAVY = 1024  # masses of the cluster: the mass of a particle that cannot move
+WIDEST = 60  # coordinates of a cluster: for larger matrices LAPACK's bits depend on the number of threads
+NONE = 1e-9  # of the largest singular value: below, a motion is zero up to rounding
 
 
 class RigidRows:
-    """What every deformation of some rigid clusters is to be, 0; to projection.Rows they are a batch of Scalar.
+    """Rows that hold all deformations of some rigid clusters at 0. projection.Rows uses them like a batch of Scalar.
 
-    With D_i = R^T (x_i - c) - q_i for the best fit c, R of a cluster and B_r a basis, orthonormal in the metric of the masses, of
-    what is no motion of the whole, C_r = sum_i m_i B_ri . D_i; to first order R and c do not matter, grad_i C_r = m_i R B_ri.
+    With D_i = R^T (x_i - c) - q_i for the best fit c, R of a cluster, C_r = sum_i m_i B_ri . D_i. B_r is a basis, orthonormal in
+    the metric of the masses, of all displacements that are not rigid motions. To first order changes of R and c do not matter:
+    grad_i C_r = m_i R B_ri.
     """
 
     side, breaks = 0, False
@@ -32,24 +33,27 @@ class RigidRows:
         self.start, self.dev = batch.start, SimpleNamespace(spring=SimpleNamespace(soft=False))
 
     def idle(self, w: np.ndarray) -> np.ndarray:
-        """No row: what nothing can move is left out already."""
+        """Return a mask of idle rows, (m,): none, because clusters that cannot move are left out already."""
         return np.zeros(self.count, dtype=bool)
 
     def violation(self, x: np.ndarray) -> np.ndarray:
-        """C at positions x, (m,)."""
+        """Return C at positions x, (m,)."""
         return np.concatenate([np.einsum("rka,ka->r", c.basis, c.strain(x)[1]) for c in self.clusters])
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
-        """Of all corners, (total, dim)."""
+        """Return the gradients at all corners, (total, dim)."""
         return np.concatenate([(c.basis @ c.strain(x)[0].T).reshape(-1, x.shape[1]) for c in self.clusters])
 
     def inverse_size(self, x: np.ndarray) -> np.ndarray:
-        """What makes C a share of the size of its cluster, (m,)."""
+        """Return the factors that turn C into a share of the size of its cluster, (m,)."""
         return np.concatenate([np.full(len(c.basis), c.close) for c in self.clusters])
 
 
 class Cluster:
-    """One of them: its particles, masses (k,), shape at rest (k, dim) about its center, its radius [m]; w: inverse masses."""
+    """A cluster: its particles and masses (k,), its rest shape (k, dim) about its center, and its radius [m].
+
+    w: (n,) inverse masses.
+    """
 
     def __init__(self, batch: Any, c: int, w: np.ndarray):
         self.who = batch.members_of(c).astype(np.int64)
@@ -63,7 +67,7 @@ class Cluster:
 
     @functools.cached_property
     def basis(self) -> np.ndarray:
-        """m B, (rows, k, dim)."""
+        """The basis of deformations times the masses, m B, (rows, k, dim)."""
         q, root = self.shape, np.sqrt(self.mass)
         dim = q.shape[1]
         shifts = [np.tile(e, (len(q), 1)) for e in np.eye(dim)]
@@ -76,11 +80,11 @@ class Cluster:
 
     @property
     def close(self) -> float:
-        """What makes a row a share of its size."""
+        """The factor that turns a row's C into a share of the size of the cluster."""
         return 1 / (self.radius * np.sqrt(self.mass[self.free].min())) if self.radius > 0 else 0.0
 
     def strain(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """R, and D (k, dim), at positions x (Kabsch 1976)."""
+        """Return R, and D (k, dim), at positions x (Kabsch 1976)."""
         p = x[self.who] - self.mass @ x[self.who] / self.mass.sum()
         u, _, vt = np.linalg.svd((self.mass[:, None] * p).T @ self.shape)
         u[:, -1] *= np.sign(np.linalg.det(u @ vt)) or 1.0
@@ -89,14 +93,16 @@ class Cluster:
 
 
 def rigid_rows(batches: list, w: np.ndarray, every: bool = False) -> list[RigidRows]:
-    """Rows of the rigid clusters that share particles with anything, which passes leave violated, or of every one; large clusters
-    are left out."""
+    """Return rows of the rigid clusters that share particles with other constraints, or, with `every`, of all rigid clusters.
+
+    Passes leave clusters that share particles violated. Large clusters get no rows, see WIDEST.
+    """
     rows = [RigidRows(b, w, some & ~_wide(b)) for b, some in _coupled(batches, w, every) if (some & ~_wide(b)).any()]
     return [some for some in rows if some.count]
 
 
 def left_out(batches: list, w: np.ndarray, x: np.ndarray) -> float:
-    """How far, in radii, particles are from their places in the clusters that are too large for rows."""
+    """Return the largest deviation of a particle from the rest shape, in radii, for clusters that are too large for rows."""
     worst = 0.0
     for b, some in _coupled(batches, w):
         for c in np.flatnonzero(some & _wide(b)).tolist():
@@ -107,7 +113,7 @@ def left_out(batches: list, w: np.ndarray, x: np.ndarray) -> float:
 
 
 def _coupled(batches: list, w: np.ndarray, every: bool = False) -> Iterator[tuple[Any, np.ndarray]]:
-    """Which rigid clusters share particles with anything, or all of them."""
+    """Yield each batch and the mask of its rigid clusters that share particles with other constraints; with `every`, of all."""
     degree = np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in batches)]), minlength=len(w))
     for b in batches:
         if b.clusters and b.count:
@@ -116,5 +122,5 @@ def _coupled(batches: list, w: np.ndarray, every: bool = False) -> Iterator[tupl
 
 
 def _wide(batch: Any) -> np.ndarray:
-    """Which clusters are too large."""
+    """Return a mask of the clusters that are too large for rows."""
     return np.diff(batch.members.starts) * batch.start.dim > WIDEST

@@ -1,18 +1,18 @@
-"""How large a world is, as far as its kernels are made for it."""
+"""The size of a world for which kernels are compiled."""
 
 from dataclasses import dataclass
 
-STRETCH = 4  # times more or fewer of them, for which a world keeps its kernels
+STRETCH = 4  # factor by which numbers may grow or shrink before a world compiles other kernels
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How many there are of what kernels work on, which decides how they are made. work: particles and constraints."""
+    """The numbers that decide how kernels are compiled. work: particles plus constraints."""
 
     particles: int
     work: int
 
     def holds(self, now: "Scale") -> bool:
-        """Whether what was made for this is still good, so that what comes and goes compiles nothing."""
+        """Whether kernels for this size also serve the size `now`, so that an edit compiles nothing."""
         pairs = (self.particles, now.particles), (self.work, now.work)
         return all(max(some) <= STRETCH * max(1, min(some)) for some in pairs)

@@ -1,4 +1,4 @@
-"""Clusters as bodies that the host moves: what moves their particles moves them as a whole."""
+"""Clusters as rigid bodies, when the host moves particles: moves of their particles become moves of the whole cluster."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,14 +11,14 @@ from .rigid_rows import HEAVY
 
 
 class Solids:
-    """Clusters that share no particle with another one, as they are at rest, or as they hang together under their loads.
+    """Clusters that share no particle with another one, with the shapes that they have at rest or under their loads.
 
-    Particle k belongs to owner[k] and is who[k], of mass m[k]. worst: by how much passes have left their shapes undone, as a
-    share of the radius of a cluster.
+    Corner k belongs to cluster owner[k] and is particle who[k], of mass m[k]. worst: the largest deformation that passes have
+    left in a cluster, as a share of its radius.
     """
 
     def __init__(self, w: np.ndarray, parts: list[tuple[np.ndarray, ...]]):
-        """w: inverse masses, (n,). parts: of each batch, who its particles are, of which of its clusters each is, and shapes."""
+        """Declare bodies. w: (n,) inverse masses. parts: for each batch the particle, cluster and rest shape of each corner."""
         self.count, self.free, self.worst = sum(1 + int(owner.max()) for _, owner, *_ in parts), (w > 0)[:, None], 0.0
         if not self.count:
             return
@@ -33,8 +33,10 @@ class Solids:
 
     @staticmethod
     def loaded(runner: Any, x: np.ndarray, ratio: float) -> "Solids":
-        """Each keeps the shape that it has at x, (n, dim), but for what passes have left undone of it, Z as in projection.py:
-        ratio^2 of that stays."""
+        """Return the clusters with the shapes that they have at x, (n, dim), without a part of their residual deformation.
+
+        The residual Z of passes is that of projection.py; ratio^2 of it stays.
+        """
         w, h, h2_effective = runner.scene.inv_mass, runner.clock.h, h2_effective_of(runner.clock)
         found = [(b, some) for b, some in _apart(runner.batches, w) if some.any()]
         columns = [(b.indices, b.owner, *_state(b, w, h, h2_effective)) for b, _ in found]
@@ -51,7 +53,7 @@ class Solids:
 
     @staticmethod
     def rigid(batches: list[Any], w: np.ndarray, first: int = 0) -> "Solids":
-        """Rigid ones as they are at rest, with any of the particles from number `first` on. worst: what loads leave of that."""
+        """Return the rigid clusters with any particle from `first` on, with their rest shapes. worst: deformation by loads."""
         parts = []
         for b, some in _apart(batches, w):
             some &= (b.compliance == 0) & (np.maximum.reduceat(b.indices, b.members.starts[:-1]) >= first)
@@ -60,24 +62,24 @@ class Solids:
                 columns = b.indices, b.owner, read(b.dev.shape)[:corners], read(b.dev.pull)[:corners].astype(np.float64)
                 parts.append(_of(b, some, columns))
         out = Solids(w, parts)
-        if out.count:  # what passes take back in each substep is what others have moved before
+        if out.count:  # passes undo in each substep the deformation that loads have caused
             out.worst = float(out._shares(np.concatenate([part[3] for part in parts])).max())
         return out
 
     def _shares(self, way: np.ndarray) -> np.ndarray:
-        """Of vectors of particles: lengths as shares of the radius of their cluster."""
+        """Return the lengths of vectors of corners, as shares of the radius of their cluster, (corners,)."""
         return np.divide(np.linalg.norm(way, axis=1), self.radius, out=np.zeros_like(self.radius), where=self.radius > 0)
 
     def far(self, x: np.ndarray) -> np.ndarray:
-        """How far those that can move are from the shape of their cluster where it fits best to x, as shares of its radius."""
+        """Return how far movable particles at x are from the best fit of their cluster's shape, as shares of its radius."""
         return self._shares(np.where(self.free, x - self.fitted(x), 0.0)[self.who]) if self.count else np.zeros(0)
 
     def _means(self, values: np.ndarray) -> np.ndarray:
-        """Means over bodies, by their masses, for each of their particles."""
+        """Return the mass-weighted mean over its body, for each particle."""
         return np.stack([np.bincount(self.owner, self.m * v) / self.total for v in values.T], axis=1)[self.owner]
 
     def _placed(self, x: np.ndarray) -> np.ndarray:
-        """Where shapes are that fit best to positions x (Kabsch 1976)."""
+        """Return the positions of the shapes where they fit best to positions x (Kabsch 1976)."""
         center = self._means(x[self.who])
         moment = self._summed((x[self.who] - center)[:, :, None] * self.shape[:, None, :])
         u, _, vt = np.linalg.svd(moment)
@@ -86,12 +88,12 @@ class Solids:
         return center + np.einsum("kab,kb->ka", self.turn[self.owner], self.shape)
 
     def _summed(self, values: np.ndarray) -> np.ndarray:
-        """Sums over bodies of m times matrices or vectors of particles."""
+        """Return the sums over bodies of m times matrices or vectors of particles."""
         weighted = self.m[:, None] * values.reshape(len(self.m), -1)
         return summed(weighted.reshape(values.shape), self.owner, len(self.total))
 
     def fitted(self, x: np.ndarray) -> np.ndarray:
-        """Positions x, with all bodies in shape."""
+        """Return positions x with all bodies put into their shapes."""
         if not self.count:
             return x
         out = x.copy()
@@ -99,11 +101,14 @@ class Solids:
         return np.where(self.free, out, x)
 
     def off(self, x: np.ndarray) -> float:
-        """How far particles are from these: the sum of m times the square."""
+        """Return the sum of m times the square of the distances from x to fitted(x)."""
         return float((self.m * ((x - self.fitted(x))[self.who] ** 2).sum(axis=1)).sum()) if self.count else 0.0
 
     def whole(self, x: np.ndarray) -> Callable[[np.ndarray], np.ndarray] | None:
-        """What makes moves of particles at x, (n, dim), moves of bodies, with the same momentum and angular momentum."""
+        """Return a function that projects moves, (n, dim), of particles at x on moves of whole bodies; None without clusters.
+
+        Momentum and angular momentum stay the same.
+        """
         if not self.count:
             return None
         r, dim = x[self.who] - self._means(x[self.who]), x.shape[1]
@@ -113,7 +118,7 @@ class Solids:
         inverse = np.linalg.pinv(self._summed(np.einsum("kia,kja->kij", turned, turned)), hermitian=True)
 
         def project(moves: np.ndarray) -> np.ndarray:
-            """The moves of whole bodies, others as they are."""
+            """Return moves projected on those of whole bodies; moves of other particles stay."""
             p, out = moves[self.who], moves.copy()
             omega = np.einsum("cij,cj->ci", inverse, self._summed(np.einsum("kia,ka->ki", turned, p)))
             out[self.who] = self._means(p) + np.einsum("kia,ki->ka", turned, omega[self.owner])
@@ -123,21 +128,24 @@ class Solids:
 
 
 def _apart(batches: list[Any], w: np.ndarray) -> list[tuple[Any, np.ndarray]]:
-    """Of each batch of clusters, those that share no particle with others, are whole, and can move, a mask (m,)."""
+    """Return each batch of clusters, and a mask, (m,), of those that share no particle, are not broken, and can move."""
     clusters = [b for b in batches if b.clusters and b.count]
     degree = np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices for b in clusters)]), minlength=len(w))
     return [(b, (np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) == 1) & ~b.idle(w) & ~b.broken) for b in clusters]
 
 
 def _of(batch: Any, some: np.ndarray, columns: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-    """The rows of some of its clusters, a mask (m,), which are numbered anew: particles, owners, and what else there is."""
+    """Return the columns (particles, owners, others) for the clusters in the mask `some`, (m,), with owners renumbered."""
     who, owner, *others = (column[some[batch.owner]] for column in columns)
     return who, (np.cumsum(some) - 1)[owner], *others
 
 
 def _state(batch: Any, w: np.ndarray, h: float, h2_effective: float) -> tuple[np.ndarray, ...]:
-    """By corners: the shape at rest, the deformation before and what moved each, (corners, dim), the share of the present
-    deformation in what passes see, and what a multiplier gives. See ShapeMatch and Equation for the letters."""
+    """Return for each corner the rest shape, the last deformation and the pull, (corners, dim), and two weights, (corners,).
+
+    The weights are those of the present deformation and of the pull in the residual of passes. See ShapeMatch and Equation for
+    the symbols.
+    """
     read, spring, owner = batch.scene.memory.read, batch.dev.spring, batch.owner
     mass = np.divide(1, w[batch.indices], out=np.zeros(len(owner)), where=w[batch.indices] > 0)
     alpha, total = batch.compliance, np.bincount(owner, mass)
