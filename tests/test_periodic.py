@@ -120,8 +120,7 @@ def test_queries_find_the_nearest_image(world, contact):
 
 
 def crowd(shift, moved, contact, shear=0.0, n=30, **settings):
-    """Return discs, springs and a contact or soft force in a box that begins at `shift`; `moved` adds whole boxes to positions.
-    """
+    """Return discs, springs and a contact or soft force in a box that begins at `shift`; `moved` adds whole boxes."""
     rng, length = np.random.default_rng(2), np.array([4.0, 3.0])
     x, v = rng.uniform(0, 1, (n, 2)) * length, rng.normal(size=(n, 2))
     boxes = rng.integers(-2, 3, (n, 2)) if moved else np.zeros((n, 2))
