@@ -4,7 +4,7 @@ import numpy as np
 
 
 class Prototype:
-    """Gravity and links: half-kick start, mass-split Jacobi, direction at the start of the step, one formula for all stiffness."""
+    """Gravity and links: half-kick start, mass-split Jacobi, direction at the start of the step, soft to rigid in one formula."""
 
     def __init__(self, x, v, w, pairs, rest, alpha, damping, g):
         self.x, self.d, self.w, self.g = x.copy(), v.copy(), w, np.asarray(g)

@@ -1,6 +1,6 @@
 """Damage and forge recordings at random, and kill and interrupt the processes that write them:
 
-python -m tests.recordings_campaign [flips] [truncations] [forgeries] [interrupts] [kills] [seed]
+    python -m tests.recordings_campaign [flips] [truncations] [forgeries] [interrupts] [kills] [seed]
 
 By default 1000, 200, 100, 100 and 100. Nothing may end this process, and no damaged recording may pass as intact.
 """

@@ -23,7 +23,7 @@ def pendulum(angle: float, length: float) -> tv.World:
 
 
 def here(worlds) -> dict[str, Any]:
-    """Return the number of the process that computes a world, and of its threads."""
+    """Return the id of the process that computes each world, and its number of threads."""
     return {"process": [os.getpid()] * len(worlds), "threads": [runtime.threads()] * len(worlds)}
 
 

@@ -100,9 +100,9 @@ def test_a_column_bears_what_is_above(world):
 
 
 def test_a_load_is_learnt_where_it_is_steady_and_lost_where_it_is_let_go(world):
-    # A disc of 1 kg bears one of 99 kg. The part of the pair's load that is not known is learnt if it was the same in the window
-    # of 128 substeps before. The first window has none before it, so nothing is learnt there. Then each window leaves
-    # 1 - 128 / (64 + 0.3 k^2) of that part, k = 99, and the overlap of the pair is proportional to it.
+    # A disc of 1 kg bears one of 99 kg. The part of the pair's load that is not known is learnt if it was the same in the
+    # previous window of 128 substeps. Nothing is learnt in the first window, before which nothing was missing. Then each window
+    # leaves 1 - 128 / (64 + 0.3 k^2) of that part, k = 99, and the overlap of the pair is proportional to it.
     def known(w):
         """Return the known load of the pair [N]."""
         pairs, values = w._runner.search.list.lasting_data()
@@ -139,8 +139,8 @@ def test_what_is_known_holds_at_any_substep(world):
 
 
 def test_three_discs_bear_each_other_as_statics_says(world):
-    # Two discs lie between walls and bear a third: N = m g / (2 cos a) on each, sin a = (half their distance) / 2 R. Masses
-    # differ.
+    # Two discs lie between walls and bear a third, of another mass: N = m g / (2 cos a) on each,
+    # sin a = (half their distance) / 2 R.
     width = 2.5
     half = (width - 2 * R) / 2
     height = np.sqrt(4 * R * R - half * half)

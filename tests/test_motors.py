@@ -135,8 +135,8 @@ def test_hinges_in_space_turn_for_ever(world):
 
 
 def test_a_servo_goes_to_its_angle_and_stays(world):
-    # A servo takes the shorter way, through pi. Under a load it lags by at most the violation that bears it, 2 w m g r h^2 at one
-    # pass.
+    # A servo takes the shorter way, through pi. Under a load, one pass lags by at most the violation that bears it,
+    # 2 w m g r h^2.
     for torque in (np.inf, 20.0):
         w, motor = wheel(world, 3.0, angle=2.5, torque=torque, gravity=G, mass=1.0)
         w.run(0.5)

@@ -19,8 +19,7 @@ def lattice(n, dim, height=1.05):
 
 
 def test_a_column_is_lifted_to_the_overlap_of_the_shorter_substep(world):
-    # The k-th contact from the top overlaps by 2 k g h^2. The top rises by the overlap that all of them lose; nothing moves
-    # after.
+    # The k-th contact from the top overlaps by 2 k g h^2. The top rises by the overlap that they all lose; then nothing moves.
     n = 12
     column = np.stack([np.zeros(n), R + np.arange(n)], axis=1)
     w = world(tv.Particles(column, radius=R), [tv.Gravity(G), tv.Contact(), tv.HalfSpace((0, 1))], substeps=4, precision="f64")
@@ -33,8 +32,8 @@ def test_a_column_is_lifted_to_the_overlap_of_the_shorter_substep(world):
         rise = overlap * (1 - (w.substeps / substeps) ** 2)
         w.substeps = substeps
         w.step(1 / 60)
-        # 1 % of the energy that the overlap would release is left, so a tenth of each overlap: on average a tenth of its work on
-        # the column, and in velocities a tenth of the square root of that.
+        # 1 % of the energy that the overlap would release is left. That is on average a tenth of each overlap, and a tenth of the
+        # velocity that its work on the column would bring.
         left = 0.1 * n**0.5 * np.linalg.norm(rise)
         np.testing.assert_allclose(w.position[:, 1] - before, np.append(0, np.cumsum(rise)), atol=left)
         assert np.abs(w.velocity).max() < 0.2 * np.sqrt(G * rise.sum())
@@ -202,9 +201,9 @@ def test_moves_of_whole_bodies(world, dim):
 @pytest.mark.parametrize("hold", ["links", "shapes"])
 def test_planks_on_a_hinge_go_where_their_load_needs_them(world, hold):
     # Two planks between two pins, hinged at the same height by a link of length 0, with a box on them, at rest at 8 substeps. The
-    # hinge gapes by 15 mm, because contacts and links bear a load by a violation D h^2 F. 256 substeps lift it, which takes 3.9
-    # J, and nothing moves after. Contacts and links have to move together: otherwise what is left of their violations, C^2 / (2 D
-    # h^2), is 1500 J.
+    # hinge gapes by 15 mm, because contacts and links bear a load F by a violation D h^2 F. 256 substeps lift it, which takes
+    # 3.9 J, and then nothing moves. Contacts and links have to move together: otherwise what is left of their violations,
+    # C^2 / (2 D h^2), is 1500 J.
     corners = []
     for a, b in (((0.0, 0.0), (1.8, -0.35)), ((1.8, -0.35), (3.6, 0.0))):
         a, b = np.array(a), np.array(b)
@@ -235,8 +234,9 @@ def test_planks_on_a_hinge_go_where_their_load_needs_them(world, hold):
 
 
 def test_what_is_lifted_does_not_end_inside_of_what_was_far(world):
-    # A bob of 20 kg on a rope rests 0.7 m lower at 2 substeps than at 20, which lift it by m g 0.7 = 144 J. A bead is pinned at
-    # the end of its way, and was on no neighbour list. The bob must not end inside of the bead, which would bring up to 3000 J.
+    # A bob of 20 kg on a rope rests 0.7 m lower at 2 substeps than at 20, which lift it by m g 0.7 = 144 J. A bead, on no
+    # neighbour list of the bob, is pinned where the bob ends up. The bob must not end inside of the bead, which would bring up to
+    # 3000 J.
     n = 8
     rope = np.stack([np.zeros(n), 3 - 0.2 * np.arange(n)], axis=1)
     told = []

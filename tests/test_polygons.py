@@ -273,10 +273,10 @@ def test_overlap_is_pushed_out_and_collapse_stays_finite(world):
 
 def test_nothing_in_a_heap_stays_inside_of_what_it_bears_or_moves_on(world):
     # Boxes of 1 kg and 0.7 to 1 m, dropped at 4 substeps, so that corners are pressed into other boxes as they land. Corners
-    # leave at push_out under any load. At a corner with at most 4 contacts and w = 4 / kg, which bears up to 8 boxes, F h^2 (4 w
-    # + 4 w) is left. With a push that is split as the mass is, corners would stay 0.1 to 0.3 m deep. And the heap comes to rest,
-    # though some corners hardly touch their neighbours. With masses split by the number of contacts, not by their depth, some
-    # would keep 0.03 m/s.
+    # leave at push_out under any load. At a corner with at most 4 contacts and w = 4 / kg, which bears up to 8 boxes,
+    # F h^2 (4 w + 4 w) is left. With a push that is split as the mass is, corners would stay 0.1 to 0.3 m deep. And the heap
+    # comes to rest, though some corners hardly touch their neighbours. With masses split by the number of contacts, not by their
+    # depth, some would keep 0.03 m/s.
     x, loops = dropped(4, 8)
     w = rigid(world, x, loops, low=(0, 0), high=(6.5, np.inf), substeps=4)
     start = w.step(1 / 60).energy

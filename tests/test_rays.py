@@ -145,8 +145,8 @@ def bundle(dim, k, seed, wide=2.0):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_walls_are_met_where_their_distance_falls_to_zero(world, dim, monkeypatch):
-    # Before and after a frame in which the walls move; for rays and balls; and for starts inside of the wall. The host computes
-    # where walls are, so the frame runs without its kernel, which would compile long for all walls.
+    # Before and after a frame in which the walls move; for rays of radius 0 and above; and for starts inside of the wall. The
+    # host computes where walls are, so the frame runs without its kernel, which takes long to compile for all walls.
     monkeypatch.setattr(CachedLaunch, "__call__", lambda launch: None)
     made = [make() for make, _, _ in WALLS[dim]]
     w = world(tv.Particles(np.full((1, dim), 0.05), radius=0.01, pinned=[0]), made, precision="f64", substeps=1)

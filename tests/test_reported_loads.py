@@ -173,7 +173,7 @@ def test_a_pendulum_breaks_at_its_strength_under_auto(world, angle):
 
 def test_walls_give_as_much_as_gravity_takes_away(world):
     # The impulse of a wall is a change of momentum: all that gravity gave to the particle on it, up to the middle of the last
-    # substep, whose displacement is the velocity there. So nothing is lost or counted twice where the substep changes.
+    # substep, where the displacement gives the velocity. So nothing is lost or counted twice where the substep changes.
     floor = tv.HalfSpace((0, 1), -2.0, events=True)
     w = world(tv.Particles([[0.0, -2.0]], mass=MASS), [tv.Gravity(G), floor], substeps=4, precision="f64")
     given = 0.0

@@ -167,8 +167,8 @@ def test_a_free_rod_spins_for_ever(world, dim):
         assert abs(tv.measure.strain(w, [[0, 1]], [1.0])[0]) <= (1e-14 if iterations > 1 else 0.51 * (omega * h) ** 6)
         assert not w.last.flags
     # Velocities that users read have the same angular momentum and are across the rod, from the first substep on and after a
-    # change of h. With the force along the direction at the start of the substep, the momentum would be off by (omega h)^2 / 2 =
-    # 3e-4.
+    # change of h. With the force along the direction at the start of the substep, the momentum would be off by
+    # (omega h)^2 / 2 = 3e-4.
     omega, h, w.iterations = 37.0, 7e-4, 3
     w.velocity, w.position = omega * np.array([[0, 0.25, 0], [0, -0.75, 0]])[:, :dim], x
     for substeps in (1, 1, 1, 2, 2, 1, 3):

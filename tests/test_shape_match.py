@@ -131,8 +131,8 @@ def test_rods_have_the_velocity_of_free_fall(world, precision):
 
 def test_a_point_without_shape_does_not_turn(world):
     # Two clusters of a pinned and a free particle in the same place draw the free one back by dashpots: x' = -x k / c. It returns
-    # more slowly than it left, at any number of passes. If the shape turned with it, the clusters would throw it out: 4e3 to 6e26
-    # J in 0.1 s.
+    # more slowly than it left, at any number of passes. If the shape turned with it, the clusters would throw it out: 4e3 to
+    # 6e26 J in 0.1 s.
     start = tv.Particles(np.zeros((3, 2)), pinned=[0, 2], velocity=[(0, 0), (-41.0, -244.0), (0, 0)])
     match = tv.ShapeMatch([[0, 1], [1, 2]], compliance=1.0, damping=1e4)
     w = world(start, [match], precision="f64", substeps=20)
@@ -173,8 +173,8 @@ def test_clusters_fall_apart(world):
     w.run(0.1)
     assert shape.broken.tolist() == [True, False, True, False]
     assert shape.load[[0, 2]].tolist() == [0, 0] and shape.load[1] == pytest.approx(25, rel=1e-4)
-    # Velocities of a turning pair are across its radius, to second order in h. Without reactions they would be off by h m omega^2
-    # r / 2.
+    # Velocities of a turning pair are across its radius, to second order in h. Without reactions they would be off by
+    # h m omega^2 r / 2.
     assert abs(np.diff(w.velocity, axis=0)[2] @ np.diff(w.position, axis=0)[2]) < 1e-6
     away = w.position
     w.run(0.5)

@@ -76,7 +76,7 @@ def test_what_solvers_are_made_for_is_in_no_kernel(world, solvers):
 
 
 def test_worlds_of_higher_order_compile_nothing_more(world):
-    # At high orders springs are forces, made for their compliances; kernels do not depend on compliances.
+    # At high orders springs are forces; no kernel depends on their compliances.
     def sprung(points, compliance):
         rope = tv.shapes.rope((0, 0), (1, 0.2), points=points)
         features = [tv.Gravity(9.81), tv.Distance(rope.links, compliance=compliance)]

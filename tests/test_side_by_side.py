@@ -11,7 +11,7 @@ pytestmark = pytest.mark.usefixtures("read_here")
 
 
 def scene(k: int) -> tv.World:
-    """Return a world with discs that fall past a moving wall, and a chain; world 2 has a chain that breaks."""
+    """Return a world with discs that fall past a moving wall, and a chain that breaks if k is 2."""
     n = 12
     discs, chain = tv.golden(np.arange(n), dim=2) * (1, 2) + (0, 0.3), tv.shapes.rope((1.2, 1.8), (2.0, 1.8), points=6)
     x, radius = np.concatenate([discs, chain.position]), np.concatenate([np.full(n, 0.08), np.full(6, 0.02)])

@@ -167,9 +167,9 @@ POLYNOMIALS = [
 
 @pytest.mark.parametrize("solver, polynomial", POLYNOMIALS, ids=lambda v: type(v).__name__)
 def test_passes_leave_of_each_mode_what_their_polynomial_says(world, solver, polynomial):
-    # A straight chain of m links between two pins, displaced along itself, where constraints are linear: k passes take C to p_k(A
-    # D^-1) C. Masses split by two give D = 4 w, and 2 w at the pins. So A D^-1 has the eigenvalues (1 - cos(pi j / (m - 1))) / 2
-    # and the vectors cos(pi j i / (m - 1)) for links i, halved at the pins.
+    # A straight chain of m links between two pins, displaced along itself, where constraints are linear: k passes take C to
+    # p_k(A D^-1) C. Masses split by two give D = 4 w, and 2 w at the pins. So A D^-1 has the eigenvalues
+    # (1 - cos(pi j / (m - 1))) / 2 and the vectors cos(pi j i / (m - 1)) for links i, halved at the pins.
     m = 9
     i, rest = np.arange(m), np.full(m, 1.0)
     pairs = np.stack([i, i + 1], axis=1)
@@ -256,8 +256,8 @@ def test_constraints_that_are_not_met_are_flagged_with_what_helps(world, solver,
     ],
 )
 def test_what_is_drawn_straight_between_pins_gains_no_energy(world, solver, precision, pins):
-    # A row of links between two pins has dependent equations: to first order nothing bears a load across it. Gravity may supply m
-    # g L, of which a thousandth is allowed for the error of a substep.
+    # A row of links between two pins has dependent equations: to first order nothing bears a load across it. Gravity may supply
+    # m g L, of which a thousandth is allowed for the error of a substep.
     x, pairs = cloth(12)
     start = tv.Particles(x, mass=1e-3, pinned=pins)
     iterations = 4 if isinstance(solver, tv.Chebyshev) else 1

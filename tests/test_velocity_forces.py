@@ -94,7 +94,8 @@ def test_crossed_fields_drift(world):
 
 
 def test_a_spiral_in_space(world):
-    # omega x v about any axis: gravity along the axis acts as without it, and |v| across it is constant. Also with exact drag.
+    # omega x v about any axis: gravity along the axis acts as without this force, and |v| across it is constant. Also with exact
+    # drag.
     @ti.func
     def spiral(x, v):
         return ti.Vector([1.0, 2.0, 2.0]).cross(v)  # |omega| = 3

@@ -47,9 +47,8 @@ def one_of(world, dim, name, start, before, **settings):
     return w, walls[name], scenes(dim)[name][1]
 
 
-# For bounces in the plane see test_nothing_gets_out_whatever_takes_it_there. Walls in space bring to rest what walls in the plane
-# do, except for the mesh, which is no polygon. The function of the sdf is the same in the plane and in space, and is not in that
-# other test.
+# For bounces in the plane see test_nothing_gets_out_whatever_takes_it_there. Rest is tested in the plane, and in space for the
+# mesh, which is no polygon. The function of the sdf is the same in the plane and in space, and is not in that other test.
 LEFT_OUT = {(name, dim, 0.7 if dim == 2 else 0.0) for name in ("box", "plane", "ball", "bowl", "rod") for dim in (2, 3)}
 LEFT_OUT |= {("sdf", 2, 0.0), ("sdf", 3, 0.7), ("hollow", 2, 0.7)}
 
@@ -110,7 +109,7 @@ TIGHT = {
         lambda x, w: np.linalg.norm(x - w.center, axis=1) - 0.4,
         lambda s: {"center": (0.5 * np.sin(s), 0.5 * np.sin(2 * s))},
     ),
-    "rod": (  # it turns
+    "rod": (  # turning
         lambda **k: [tv.Capsule((-0.8, 0.0), (0.8, 0.0), 0.02, **k)],
         lambda x, w: np.linalg.norm(x - np.clip(x @ w.b / (w.b @ w.b), -1, 1)[:, None] * w.b, axis=1) - 0.02,
         lambda s: {"a": (-0.8 * np.cos(s), -0.8 * np.sin(s)), "b": (0.8 * np.cos(s), 0.8 * np.sin(s))},
@@ -173,9 +172,9 @@ def keeps(world, walls, outside, moves, there):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_points_stay_in_corners_far_from_the_origin(world, dim, briefly):
-    # Points have no radius of tolerance; they fly into the corners of a triangle or a tetrahedron. Far out, the rounding of their
-    # positions is larger than that of the wall. A point on one face, and behind it by rounding, must still be stopped by the next
-    # face. Otherwise 267 of 2000 leave a triangle at 100 m, and 2 a tetrahedron at the origin.
+    # Points, which have no radius, fly into the corners of a triangle or a tetrahedron. Far out, the rounding of their positions
+    # is larger than that of the wall. A point on one face, and behind it by rounding, must still be stopped by the next face.
+    # Otherwise 267 of 2000 leave a triangle at 100 m, and 2 a tetrahedron at the origin.
     if dim == 2:
         corners, faces = np.array([[-3.0, -3], [3, -3], [0, 3]]), np.array([[0, 1], [1, 2], [2, 0]])
     else:
@@ -301,8 +300,8 @@ def test_moving_balls_and_rods_carry_what_they_meet(world):
 
 
 def test_friction_on_every_wall_holds_and_slides(world):
-    # On a plane, on top of a rod, and in a box, of which one is switched on: a horizontal velocity v is lost after v^2 / (2 mu
-    # g).
+    # On a plane, on top of a rod, and in a box, of which one is switched on: a horizontal velocity v is lost after
+    # v^2 / (2 mu g).
     for on in range(3):
         walls = [
             tv.HalfSpace((0, 1), 0.0, friction=0.5, active=on == 0),

@@ -90,7 +90,7 @@ SCENES = {
     "polygons": bricks,
     "Chebyshev": lambda k: cloth(tv.Chebyshev(), k),
     "ConjugateGradient": lambda k: cloth(tv.ConjugateGradient(4), k),
-    # some take two Newton steps
+    # some chains take a second Newton step
     "Direct, compensated": lambda k: cloth(tv.Direct(), k, "f32-compensated", links=30, iterations=1),
     "order 4": lambda k: cloth(None, k, "f64", 4, 2, 30),
 }
