@@ -97,7 +97,8 @@ def test_a_brake_is_dry_friction(world):
 
 
 def test_a_motor_gives_no_momentum(world):
-    # Nor angular momentum: gradients sum to 0, and so do their moments. To rounding, over a second, in 2D and 3D.
+    # Momentum and angular momentum are constant: gradients sum to 0, and so do their moments. To rounding, over a second, in 2D
+    # and 3D.
     rng = np.random.default_rng(0)
     for torque, points, hinges, links in (
         (0.3, [[-1, 0.1], [0, 0], [0.7, 0.4]], [[0, 1, 2]], [[0, 1], [1, 2]]),

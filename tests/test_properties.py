@@ -68,7 +68,7 @@ class Scene:
         unprojected(self.world)
 
     def block(self, name: str, array=None) -> np.ndarray:
-        """The rows of one block."""
+        """Return the rows of one block, of positions if `array` is None."""
         array = self.world.position if array is None else array
         return np.asarray(array)[self.corners[BLOCKS.index(name)]]
 

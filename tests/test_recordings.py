@@ -425,7 +425,7 @@ def _lines(packed):
 
 @pytest.mark.parametrize("frames", [0, 3])
 def test_a_world_without_particles_is_recorded(tmp_path, frames):
-    # Entries of its journal may have no bytes at all.
+    # Entries of an empty world's journal may have no bytes at all.
     world = tv.World(tv.Particles(np.zeros((0, 3))), [tv.Gravity()])
     with tv.Recorder(tmp_path / "a.rrd", world) as recorder:
         for _ in range(frames):

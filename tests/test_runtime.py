@@ -116,7 +116,8 @@ def test_what_spirv_lacks_is_refused(monkeypatch):
 
 
 def test_import_is_quiet_and_starts_nothing():
-    # Nor does the first world. Every attempt to open a socket ends the process, in Python and in the threads that it starts.
+    # The import and the first world print nothing and open no socket. Every attempt to open one ends the process, in Python and
+    # in the threads that it starts.
     done = python(
         """
 import os, socket, sys, time

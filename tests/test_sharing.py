@@ -297,7 +297,7 @@ def test_worlds_of_many_kinds_take_few_trees(world, monkeypatch):
     for k in range(64):
         built(k)
     made = runtime.trees - trees
-    assert made <= 20  # 96 without, as 32 of them have contacts and so two trees
+    assert made <= 20  # 96 without this, as 32 of them have contacts and so two trees
     assert [end(k) for k in some] == alone
     assert runtime.trees - trees == made
 

@@ -15,7 +15,7 @@ from .conftest import unprojected
 
 
 def cloth(n, shear=False):
-    """Positions and links of a square cloth of n x n particles in the plane y = 0, side 1."""
+    """Return positions and links of a square cloth of n x n particles in the plane y = 0, side 1."""
     k = np.arange(n * n).reshape(n, n)
     pairs = [np.stack([k[:, :-1].ravel(), k[:, 1:].ravel()], axis=1), np.stack([k[:-1].ravel(), k[1:].ravel()], axis=1)]
     if shear:

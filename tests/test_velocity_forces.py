@@ -250,7 +250,7 @@ def test_a_hand_that_holds_still_is_not_stiff(world):
     w = world(tv.Particles([[0.0, 0.0], [1.0, 0.0]]), [tv.Gravity(9.81), hand], substeps=1, precision="f64")
     for _ in range(120):
         assert not w.step(1 / 60).flags
-    # Its weight stretches it by g / rate^2, and nothing moves.
+    # The weight stretches the hand's spring by g / rate^2, and nothing moves.
     np.testing.assert_allclose(w.position[0], [0.0, 1 - 9.81 / 400], atol=1e-9)
     hand.rate = 110.0  # rate h = 1.8: the spring is resolved up to 2, and the damping does not interfere
     w.run(1.0)

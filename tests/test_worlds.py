@@ -347,7 +347,7 @@ def test_one_that_is_taken_out_has_the_knobs_that_wait(taichi):
 
 
 def test_knobs_that_wait_for_other_kernels_are_there(taichi):
-    # A rest length of 0 has no direction, so its constraint leaves the system: assigned, and not stepped with yet.
+    # A rest length of 0 is assigned, and no step follows yet: it has no direction, so its constraint leaves the system.
     world, alone = pendulum(solver=tv.Direct()), pendulum(solver=tv.Direct())
     for w in (world, alone):
         w.run(0.1)
