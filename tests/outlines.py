@@ -1,4 +1,4 @@
-"""Polygons and meshes that walls are made of, and how far points are from them, by brute force."""
+"""Polygons and meshes of which walls are made, and distances of points to them by brute force."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ CUBE_FACES = [
 
 
 def outside(points: np.ndarray, loop: np.ndarray, closed: bool = True) -> np.ndarray:
-    """Distance of points from a polygon, negative inside; by brute force."""
+    """Return the distance of points to a polygon, negative inside, by brute force."""
     a, b = loop, np.roll(loop, -1, axis=0)
     if not closed:
         a, b = a[:-1], b[:-1]

@@ -1,10 +1,10 @@
-"""The substep in NumPy, f64, slowly and plainly: what the kernels have to agree with, particle by particle."""
+"""The substep in NumPy and f64, slow and plain: kernels have to agree with it for every particle."""
 
 import numpy as np
 
 
 class Prototype:
-    """Gravity and links, half-kick start, mass-split Jacobi, direction at the start of the step, soft to rigid by one formula."""
+    """Gravity and links: half-kick start, mass-split Jacobi, direction at the start of the step, soft to rigid in one formula."""
 
     def __init__(self, x, v, w, pairs, rest, alpha, damping, g):
         self.x, self.d, self.w, self.g = x.copy(), v.copy(), w, np.asarray(g)

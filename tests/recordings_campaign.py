@@ -1,8 +1,8 @@
-"""Damage and forge recordings at random, and kill and interrupt what writes them:
+"""Damage and forge recordings at random, and kill and interrupt the processes that write them:
 
     python -m tests.recordings_campaign [flips] [truncations] [forgeries] [interrupts] [kills] [seed]
 
-By default 1000, 200, 100, 100 and 100. Nothing of it may end this process, and nothing may pass as intact.
+By default 1000, 200, 100, 100 and 100. Nothing may end this process, and no damaged recording may pass as intact.
 """
 
 import os
@@ -25,7 +25,7 @@ PLACES = {"particles": "world/scene/particles", "positions": "Points2D:positions
 
 
 def scene():
-    """A world with everything that is drawn."""
+    """Return a world with everything that is drawn, and its gravity."""
     rope = tv.shapes.rope((0.0, 1.0), (1.0, 1.0), 6)
     gravity = tv.Gravity(9.81)
     features = [gravity, tv.Distance(rope.links), tv.Contact(), tv.Box((-2.0, 0.0), (2.0, 3.0))]
@@ -33,7 +33,7 @@ def scene():
 
 
 def record(path, frames=8):
-    """A small recording in which a knob is turned; returns its path."""
+    """Make a small recording in which a knob changes; return its path."""
     world, gravity = scene()
     with world, tv.Recorder(path, world) as recorder:
         for frame in range(frames):
@@ -46,10 +46,10 @@ def record(path, frames=8):
 
 
 def judged(path):
-    """What is said of a file: a kind of verdict, or "refused"."""
+    """Return the verdict on a file: its kind, or "refused"."""
     try:
         recording = tv.replay(path)
-        return recording.verify().kind if recording.complete else "incomplete"  # which verify() never calls intact
+        return recording.verify().kind if recording.complete else "incomplete"  # verify() never calls these intact
     except ValueError:
         return "refused"
 
@@ -73,7 +73,7 @@ def truncations(path, count, rng, folder):
 
 
 def forgeries(path, count, rng, folder):
-    """Change rows, and make all checksums right again: those that have a name, and numbers at random."""
+    """Change rows, and renew all checksums: first the named forgeries, then numbers at random."""
     names = sorted(FORGERIES)
     for k in range(count):
         forged = Forgery(path)
@@ -85,7 +85,7 @@ def forgeries(path, count, rng, folder):
 
 
 def changed(forged, rng):
-    """Change one number, text or row of the picture; returns what."""
+    """Change one number, text or row of the picture; return a description."""
     while True:
         k = rng.choice([k for k in forged.chunks() if "tiverlet/journal" not in entity(forged, k)])
         batch = forged.messages[k][2]
@@ -107,12 +107,12 @@ def changed(forged, rng):
 
 
 def entity(forged, k):
-    """Whose rows a message has."""
+    """Return the entity whose rows a message has."""
     return forged.messages[k][2].schema.metadata[b"rerun:entity_path"].decode()
 
 
 def mutate(cell, rng):
-    """Change something in lists of lists; whether there was something."""
+    """Change one value in lists of lists; return whether there was one."""
     if not isinstance(cell, list) or not cell:
         return False
     k = rng.randrange(len(cell))
@@ -134,7 +134,7 @@ def mutate(cell, rng):
 
 
 def interrupted(count, rng, folder):
-    """Ctrl-C at random moments of loops of steps; the verdicts."""
+    """Interrupt loops of steps by Ctrl-C at random moments; yield the verdicts."""
     world, _ = scene()
     with world:
         world.step(1 / 60)
@@ -173,7 +173,7 @@ with tv.Recorder({path!r}, world) as recorder:
 
 
 def killed(count, rng, folder):
-    """SIGKILL at random moments; the verdicts, and how much was lost [s]."""
+    """Kill processes by SIGKILL at random moments; yield the verdicts, and how much was lost [s]."""
     script, path = folder / "killed.py", folder / "k.rrd"
     script.write_text(KILLED.format(root=str(pathlib.Path(__file__).parents[1]), path=str(path)))
     for k in range(count):
@@ -193,7 +193,7 @@ def killed(count, rng, folder):
 
 
 def campaign(counts, seed, folder, say=print):
-    """Do so many of each; returns what went wrong."""
+    """Do `counts` of each; return what went wrong."""
     rng, wrong, path = random.Random(seed), [], record(folder / "original.rrd")
     assert judged(path) == "intact"
     for make, count in zip((flips, truncations, forgeries), counts, strict=False):

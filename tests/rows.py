@@ -1,4 +1,4 @@
-"""Every constraint, by the corners at which it shows what it does: a new one is one row."""
+"""Every constraint, with corners at which it shows what it does: a new constraint is one row."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,15 +10,15 @@ import tiverlet as tv
 
 @dataclass(frozen=True)
 class Row:
-    """A kind of constraint, and corners at which it shows all that it can.
+    """A kind of constraint, and corners at which it shows all that it can do.
 
     make: (corners (m, arity), rest (m,), **options) -> feature, violated by f(points) - rest.
-    points: (arity, dim) [m] in general position. off: how far f is to be from rest, on the violated side.
-    internal: it moves no center of mass and turns nothing; False for constraints to the surroundings.
-    bilateral: holds on both sides, so that it is second order.
-    largest: [m] what f32 holds.
-    like: the row that shows for this one that batches can be divided and worlds be cloned, because the same code does it with
-    the same fields: those of CornerPasses for a fixed number of corners, those of OutlinePasses for loops and surfaces.
+    points: (arity, dim) [m] in general position. off: how far f is from rest, on the violated side.
+    internal: moves no center of mass and turns nothing; False for constraints to the surroundings.
+    bilateral: holds on both sides, so it is second order.
+    largest: [m] the largest size for f32.
+    like: the row that stands for this one in tests of divided batches and cloned worlds, because the same code handles the same
+    fields: CornerPasses for a fixed number of corners, OutlinePasses for loops and surfaces.
     """
 
     make: Callable
@@ -36,27 +36,27 @@ WINGS = np.array([[0.0, -0.1, 0.0], [0.9, 0.1, 0.1], [0.3, 0.8, 0.2], [0.5, -0.6
 
 
 def limit(corners, rest, **options):
-    """Corners that turn at most so far."""
+    """Return a limit on the angle at these corners: at most `rest`."""
     return tv.AngleLimit(corners, np.zeros(len(corners)), rest, **options)
 
 
 def spread(a, b, c):
-    """A length and a product of lengths, of three corners."""
+    """Return a length plus a product of lengths, of three corners."""
     return (a - b).norm() + (b - c).norm() * (c - a).norm()
 
 
 def radius(x):
-    """Distance from the origin."""
+    """Return the distance from the origin."""
     return x.norm()
 
 
 def outward(x):
-    """Its gradient."""
+    """Return the gradient of radius()."""
     return x / x.norm()
 
 
 def made(function, **more):
-    """Rows of the user's own."""
+    """Return the `make` of a row for a constraint of the user."""
     return lambda corners, rest, **options: tv.Constraint(function, corners, rest, **more, **options)
 
 
@@ -79,12 +79,12 @@ TETRA = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
 
 
 def shells(corners):
-    """Closed surfaces of four faces."""
+    """Return closed surfaces of four faces."""
     return tv.Volume(np.concatenate([row[TETRA] for row in np.asarray(corners)]), pressure=1.1)
 
 
-# What is not one number, or the same in other kernels, by its corners and how it is made of them, and the reason why it is no
-# row above; all of these run where batches are divided and cloned.
+# Constraints that are not one number, or that are the same in other kernels: corners, a function that makes them, and the reason
+# why they are no row above. Tests of divided batches and clones run all of them.
 OTHERS = {
     "Pin": (
         LINK[:1],

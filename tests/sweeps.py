@@ -1,4 +1,4 @@
-"""What sweeps in other processes make and measure: each of these imports this file, and what this one imports."""
+"""Functions that sweeps in other processes call; each process imports this file and what it imports."""
 
 import os
 import pathlib
@@ -15,7 +15,7 @@ STARTS = {"angle": np.linspace(0.1, 3.0, 7), "length": np.linspace(0.5, 2.0, 7)}
 
 
 def pendulum(angle: float, length: float) -> tv.World:
-    """Two links, so that it is chaotic: any difference in the bits grows; relaxed, since every process compiles them anew."""
+    """Return two links, which are chaotic: any difference of bits grows; relaxed, as every process compiles them again."""
     bend = np.array([np.sin(angle), -np.cos(angle)]) * length
     x = [[0, 0], bend, [bend[0] + length, bend[1]]]
     features = [tv.Gravity(G), tv.Distance([(0, 1), (1, 2)])]
@@ -23,18 +23,21 @@ def pendulum(angle: float, length: float) -> tv.World:
 
 
 def here(worlds) -> dict[str, Any]:
-    """Which process computes it, and on how many threads."""
+    """Return the id of the process that computes each world, and its number of threads."""
     return {"process": [os.getpid()] * len(worlds), "threads": [runtime.threads()] * len(worlds)}
 
 
 def ends(worlds) -> dict[str, Any]:
-    """Where and how fast they are in the end."""
+    """Return where the particles are at the end, and how fast."""
     worlds.run(SECONDS)
     return {"end": worlds.position, "speed": worlds.velocity} | here(worlds)
 
 
 def ball(speed: float, marker: str = "", always: bool = False) -> tv.World:
-    """Thrown upwards. With a marker, the first process that throws one at 2 m/s is killed; always: every one ends."""
+    """Return a ball thrown upwards.
+
+    With a marker, the first process that throws one at 2 m/s is killed; with `always`, every such process ends.
+    """
     if marker and speed == 2.0 and always:
         os._exit(3)
     if marker and speed == 2.0 and not os.path.exists(marker):
@@ -44,20 +47,20 @@ def ball(speed: float, marker: str = "", always: bool = False) -> tv.World:
 
 
 def height(worlds) -> dict[str, Any]:
-    """After a while."""
+    """Return the height of each ball after 0.5 s."""
     worlds.run(0.5)
     return {"y": worlds.position[:, 0, 1]} | here(worlds)
 
 
 class Unsendable(Exception):
-    """Comes out of no pickle."""
+    """An exception that cannot be unpickled."""
 
     def __init__(self, a, b):
         super().__init__(f"{a} and {b}")
 
 
 def wrong(speed: float, how: str = "") -> Any:
-    """What make() may do wrong."""
+    """Do what make() may do wrong."""
     if how == "raise":
         raise ArithmeticError("no")
     if how == "unsendable":
@@ -66,5 +69,5 @@ def wrong(speed: float, how: str = "") -> Any:
 
 
 def wrong_figures(worlds) -> dict[str, Any]:
-    """What figures() may do wrong."""
+    """Do what figures() may do wrong."""
     raise LookupError("nothing there")

@@ -1,4 +1,4 @@
-"""Links from soft to rigid: against the NumPy prototype, in physical units, and at every extreme of compliance."""
+"""Links from soft to rigid: against the NumPy prototype, in physical units, and at the extremes of compliance."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from .prototype import Prototype
 
 
 def net(dim, seed=0):
-    """A small random net with masses 1 ... 100, static corners, and links from rigid to soft."""
+    """Return a small random net: masses of 1 to 100, static corners, links from rigid to soft."""
     rng = np.random.default_rng(seed)
     n = 12
     x = rng.normal(size=(n, dim))
@@ -49,7 +49,7 @@ def test_kernels_agree_with_the_prototype(world, dim, iterations):
     [("N10_alpha1e-3", ((20, 4), (20, 16), (50, 4))), ("N100_alpha1e-5", ((50, 40),))],
 )
 def test_static_elongation_is_alpha_times_load(world, name, efforts):
-    # Link k from the bottom carries k m g, so it is longer by alpha k m g, for all substeps and iterations that converge.
+    # Link k from the bottom carries k m g, so it stretches by alpha k m g, for any substeps and iterations that converge.
     c = case(f"R11_elastic_rope_{name}")
     p, n = c["params"], c["params"]["links"]
     k = np.arange(n)
@@ -66,8 +66,8 @@ def test_static_elongation_is_alpha_times_load(world, name, efforts):
 
 
 def test_compliance_from_1e_minus_12_to_1e12(world):
-    # Rows 8 and 9: a link under its load of 9.81 N is longer by s = alpha F; let go at its rest length it gets there by
-    # s'' = g - s / alpha - c s', and the softest fall freely. One pendulum each.
+    # Rows 8 and 9: a link under a load of F = 9.81 N stretches by s = alpha F. Released at its rest length it gets there by
+    # s'' = g - s / alpha - c s', and the softest links fall freely. One pendulum per compliance.
     alpha = np.array([0.0, *10.0 ** np.arange(-12, 13)])
     m, g, c, t = len(alpha), 9.81, 20.0, 2.0
     x = np.zeros((2 * m, 2))
@@ -95,7 +95,7 @@ def test_compliance_from_1e_minus_12_to_1e12(world):
         # In f32 a position near 1 m stops following once d < ulp / 2 = 6e-8: speeds below 7e-5 m/s, drag below 1.4e-3 N.
         rtol, atol = (1e-6, 1e-12) if precision == "f64" else (1.5e-3 / g, 4e-7)
         np.testing.assert_allclose(stretch, want, rtol=rtol, atol=atol)
-        if precision == "f64":  # what is in balance stays, whatever the effort, to the last digit of a coordinate of 1 m
+        if precision == "f64":  # equilibrium persists for any effort, to the last digit of a coordinate of 1 m
             hung = x.copy()
             hung[m:, 1] -= g * alpha
             for substeps, iterations in ((20, 4), (20, 1), (7, 1), (50, 2)):
@@ -108,7 +108,7 @@ def test_compliance_from_1e_minus_12_to_1e12(world):
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_every_compliance_is_stable(world, precision):
-    # Kinetic energy never exceeds what gravity has supplied, with one Jacobi pass, from rigid to soft. One chain each.
+    # Kinetic energy never exceeds the work of gravity, with one Jacobi pass, from rigid to soft. One chain per compliance.
     n, alphas = 21, (0.0, 1e-12, 1e-9, 1e-6, 1e-5, 1e-4, 1e-3, 1e-1, 1e12)
     x = np.concatenate([np.stack([np.arange(n) * 0.05, np.full(n, 10.0 * c)], axis=1) for c in range(len(alphas))])
     k = np.concatenate([np.arange(n - 1) + n * c for c in range(len(alphas))])
@@ -138,7 +138,7 @@ def test_dashpot(world):
 
 
 def test_compliance_does_not_damp(world):
-    # R04b: backward Euler (XPBD) keeps 0.7 % of the amplitude in these 1000 steps.
+    # R04b: backward Euler (XPBD) would keep 0.7 % of the amplitude in these 1000 steps.
     link = tv.Distance([[0, 1]], rest=2.0, compliance=0.01)
     w = world(tv.Particles([[0.0, 0], [2.5, 0]], pinned=[0]), [link], substeps=10, iterations=3, precision="f64")
     largest = 0.0
@@ -150,7 +150,7 @@ def test_compliance_does_not_damp(world):
 
 
 def test_ropes_pull_and_spacers_push(world):
-    # A rope lets its end fall freely until it is taut, then stops it; after that it swings as a rigid link does.
+    # The end of a rope falls freely until the rope is taut, then stops. From then on it swings like the end of a rigid link.
     rope = tv.Rope([[0, 1]], length=1.0)
     w = world(
         tv.Particles([[0, 0], [0.0, -0.5]], pinned=[0]),
@@ -178,7 +178,7 @@ def test_ropes_pull_and_spacers_push(world):
     )
     w.run(2.0)
     assert w.position[1, 1] == pytest.approx(1.0, abs=1e-5) and spacer.load[0] == pytest.approx(-9.81, rel=1e-3)
-    # A soft rope is a bungee: from rest at its length it falls to twice its static stretch, and comes back.
+    # A soft rope is a bungee: released at its length, the end falls to twice the static stretch and comes back.
     w = world(
         tv.Particles([[0, 0], [0.0, -1.0]], pinned=[0]), [tv.Gravity(9.81), tv.Rope([[0, 1]], 1.0, compliance=0.01)], substeps=40,
         iterations=4, precision="f64",
@@ -204,15 +204,15 @@ def test_rest_lengths_are_live(world):
 
 
 def test_redundant_links(world):
-    # Row 22: a rope of ten links beside one of which each link is there twice, relaxed: alike all the way, since splitting counts
-    # both, and at rest the catenary R10b, with half of the tension in each of two links.
+    # Row 22: a rope of ten links, and one that has each link twice, both relaxed. They move alike, since mass splitting counts
+    # both copies. At rest both are the catenary R10b, and each copy bears half of the tension.
     n, v = 10, case("R10b_discrete_catenary_N10")["values"]
     t, k = np.linspace(0, 1, n + 1), np.arange(n)
     rope = np.stack([6 * t, -4 * (1 - np.abs(2 * t - 1))], axis=1)
     pairs = np.stack([k, k + 1], axis=1)
     with pytest.warns(UserWarning, match="duplicates") as said:
         links = tv.Distance(np.concatenate([pairs, pairs + n + 1, pairs + n + 1]), 10 / n)
-    assert said[0].filename == __file__  # and at whose line
+    assert said[0].filename == __file__  # the warning names the caller's line
     start = tv.Particles(np.concatenate([rope, rope]), mass=0.1, pinned=[0, n, n + 1, 2 * n + 1])
     w = world(start, [tv.Gravity(9.81), links, tv.Drag(4.0)], iterations=16, precision="f64", solver=tv.Jacobi())
     for seconds in (0.5, 7.5):
@@ -226,7 +226,7 @@ def test_redundant_links(world):
 
 
 def test_contradictory_links(world):
-    # Row 21: a triangle 1, 1, 3 cannot close. Relaxed, it settles on the compromise, and what it swings by on the way goes.
+    # Row 21: a triangle 1, 1, 3 cannot close. Relaxed, it settles on the compromise, and its oscillation decays.
     links = tv.Distance([[0, 1], [1, 2], [0, 2]], [1.0, 1.0, 3.0])
     w = unprojected(world(tv.Particles([[0.0, 0], [1, 0.1], [2.2, 0]]), [links], substeps=50, precision="f64"))
     energies, size = [], 0.0
@@ -236,14 +236,14 @@ def test_contradictory_links(world):
         size = max(size, np.ptp(w.position))
     largest = np.reshape(energies, (10, 200)).max(axis=1)
     assert (np.diff(largest) < 0).all() and largest[-1] < 0.02 * largest[0] and size < 3.0
-    # Least squares with equal weights: all three lie on a line, lengths 4/3, 4/3, 8/3, off by 1/3 each.
+    # Least squares with equal weights: all three lie on a line with lengths 4/3, 4/3, 8/3; each link is off by 1/3.
     assert report.residual == pytest.approx(1 / 3, abs=1e-4)
     assert tv.measure.strain(w, links.indices, [1, 1, 3]) == pytest.approx([1 / 3, 1 / 3, -1 / 9], abs=1e-4)
 
 
 def test_over_constrained_bodies(world):
-    # Row 23: S05 held by all 15 distances of its six masses, and ten particles by all 45. The discrete angular momentum
-    # sum m x_(n-1) x x_n stays to rounding, for any number of passes; the racket tumbles with order 2.
+    # Row 23: the racket S05 held by all 15 distances of its six masses, and ten particles held by all 45. The discrete angular
+    # momentum sum m x_(n-1) x x_n is constant to rounding for any number of passes; the racket tumbles with order 2.
     c = case("S05_tennis_racket")
     racket = np.repeat(np.diag(c["params"]["half_axes"]), 2, axis=0) * np.array([1, -1] * 3)[:, None]
     ten = np.random.default_rng(3).normal(size=(10, 3))
@@ -269,7 +269,7 @@ def test_over_constrained_bodies(world):
 
 
 def test_a_thousand_links_on_one_particle(world):
-    # Row 24: the hub of a star, relaxed.
+    # Row 24: the hub of a star, with relaxed links.
     a = 2 * np.pi * tv.golden(np.arange(1000))
     star = np.concatenate([[[0.0, 0.0]], np.stack([np.cos(a), np.sin(a)], axis=1)])
     spokes = np.stack([np.zeros(1000, dtype=int), np.arange(1, 1001)], axis=1)
@@ -280,8 +280,7 @@ def test_a_thousand_links_on_one_particle(world):
 
 
 def test_the_energy_of_springs_is_a_number_where_what_is_left_underflows(world):
-    # A spring that a rigid link keeps at its length leaves so little of its violation at h = 1e-6 s that f32 cannot tell it,
-    # times h^2, from 0.
+    # A rigid link keeps a spring at its length. At h = 1e-6 s the spring's violation times h^2 is so small that it is 0 in f32.
     x = np.array([[0.0, 0.0, 0.0], [0.3612324426117109, 0.29591168792099837, 0.24240272111714103]])
     v = np.array([[0.1257302210933933, -0.1321048632913019, 0.6404226504432821],
                   [0.10490011715303971, -0.535669373161111, 0.36159505490948474]])  # fmt: skip
@@ -293,7 +292,7 @@ def test_the_energy_of_springs_is_a_number_where_what_is_left_underflows(world):
 
 
 def test_what_is_broken_turns_nothing(world):
-    # All links of a rope are torn, and its beads slide about: no direction of a link matters any more.
+    # All links of a rope are broken and its beads slide about: the directions of broken links must not count as turned.
     n, rng = 12, np.random.default_rng(0)
     links = tv.Distance(np.stack([np.arange(n - 1), np.arange(1, n)], axis=1), break_at=1e-3)
     start = tv.Particles([[0.1 * k, 1.0] for k in range(n)], radius=0.03, velocity=rng.normal(0, 0.3, (n, 2)))
@@ -304,7 +303,7 @@ def test_what_is_broken_turns_nothing(world):
 
 
 def test_ends_that_are_in_one_place_but_for_rounding(world):
-    # 0.1 + 0.2 and 0.3: a link of length 0 is measured beside the scene, not beside 5e-17 m.
+    # 0.1 + 0.2 and 0.3: the violation of a link of length 0 is relative to the size of the scene, not to 5e-17 m.
     told = []
     for at in (0.3, 0.1 + 0.2):
         start = tv.Particles([[0, 0], [0.3, 0], [at, 0], [0.6, 0]], pinned=[0])

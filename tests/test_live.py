@@ -1,4 +1,4 @@
-"""Scenes that are taken by hand: the hand's law, what pages may ask for, and a real mouse in a real browser."""
+"""Scenes under a mouse: the law of the hand, requests of pages, and a real mouse in a real browser."""
 
 import json
 import shutil
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("read_here")
 
 
 def test_a_hand_is_a_critically_damped_spring_on_whom_it_holds(world):
-    # x'' = -k^2 x - 2 k x' from x0 at rest: x0 (1 + k t) exp(-k t). Second order: half the substep, a quarter of the error.
+    # x'' = -k^2 x - 2 k x' from x0 at rest: x0 (1 + k t) exp(-k t). Second order: half the substep gives a quarter of the error.
     hand = tv.Hand((0, 0), 1, rate=5.0)
     w = world(tv.Particles([[3.0, 0], [1.0, 2], [2.0, 2]]), [hand], precision="f64", substeps=8)
     exact, errors = 6 * np.exp(-5.0), []
@@ -36,7 +36,7 @@ def test_a_hand_is_a_critically_damped_spring_on_whom_it_holds(world):
     assert errors[0] < 1e-3 and errors[0] / errors[1] == pytest.approx(4, rel=0.2)
     np.testing.assert_array_equal(w.position[[0, 2]], w.particles.position[[0, 2]])
     fields = w.fields
-    hand.particle, hand.target = 2, (5, 5)  # another one, elsewhere: nothing is built or compiled again
+    hand.particle, hand.target = 2, (5, 5)  # another particle and place: nothing is rebuilt or compiled again
     w.run(3.0, dt=0.1)
     np.testing.assert_allclose(w.position[2], (5, 5), atol=1e-4)  # 3 (1 + 15) exp(-15) = 1e-5
     assert w.fields == fields and w.position[1, 1] < 0.1
@@ -75,7 +75,7 @@ def figures(message: bytes) -> tuple[dict, np.ndarray]:
 
 
 def hear(server, count: int) -> None:
-    """Wait until so many messages have come."""
+    """Wait until `count` messages have arrived."""
     end = time.monotonic() + 10
     while server.said.qsize() < count and time.monotonic() < end:
         time.sleep(0.005)
@@ -108,7 +108,7 @@ def test_what_pages_ask_for_is_done_recorded_and_replayed(rope, server, tmp_path
         assert told["held"] == 5 and told["target"] == [1.5, 2.5]
         for _ in range(20):
             told, x = turn({"do": "move", "target": [0.5, 2.5]})
-        assert x.reshape(6, 2)[5, 1] > 2.2  # it hangs above where it was pinned
+        assert x.reshape(6, 2)[5, 1] > 2.2  # the free end hangs above the pinned one
         told, _ = turn({"do": "drop"}, {"do": "slower"})
         assert "held" not in told and told["slower"] == 2
         before = rope.time
@@ -119,7 +119,7 @@ def test_what_pages_ask_for_is_done_recorded_and_replayed(rope, server, tmp_path
         told, _ = turn({"do": "frame"}, {"do": "name", "particle": 0})
         assert rope.time == pytest.approx(before + 1 / 60) and "particle 0, pinned" in said[-1]["text"]
         assert "Distance" in said[-1]["text"]
-        # Nonsense is answered, and the scene goes on.
+        # Invalid requests are answered, and the scene continues.
         steps = live.steps
         for message in (
             {"do": "grab", "particle": 99, "target": [0, 0]}, {"do": "grab", "particle": 1}, {"do": "name", "particle": "x"},
@@ -136,7 +136,7 @@ def test_what_pages_ask_for_is_done_recorded_and_replayed(rope, server, tmp_path
     live.close()
     recording = tv.replay(tmp_path / "play.rrd")
     assert len(recording.frames) == live.steps + 1 and recording.verify().kind == "intact"
-    # A restart leads back to the start bit for bit, and the file begins there, too.
+    # A restart returns to the start bit for bit, and the file begins there, too.
     live._restart()
     assert rope.time == 0.0 and rope.hash() == start
     live.paused = False
@@ -150,7 +150,7 @@ def test_a_page_that_goes_lets_go_and_one_that_is_slow_is_not_waited_for(rope, s
     with page(server) as there:
         there.send(json.dumps({"do": "grab", "particle": 5, "target": [0, 0]}))
         hear(server, 2)
-        for _ in range(20):  # it never says that it has shown one
+        for _ in range(20):  # the page never confirms a frame
             live.turn()
         assert live.hand.particle == 5 and live.steps == 20
         assert server.viewers[0].waiting == session.AHEAD
@@ -189,7 +189,7 @@ def test_the_world_of_a_script_is_found(tmp_path, world):
 
 
 def test_bodies_and_their_surfaces_are_found(world):
-    # A loop around an area is filled, also where it is not convex: the triangles' areas add up to the loop's.
+    # A loop around an area is filled, also where it is not convex: the areas of its triangles add up to the loop's area.
     star = np.array([[r * np.sin(t), r * np.cos(t)] for t, r in zip(np.arange(10) * np.pi / 5, [1.0, 0.4] * 5, strict=True)])
     x = np.concatenate([star, [[3, 0], [4, 0], [4, 1], [3, 1]], [[6, 0], [7, 0], [8, 0]]])
     features = [tv.Area([np.arange(10)]), tv.ShapeMatch([np.arange(10, 14)]), tv.Distance([(14, 15), (15, 16)])]
@@ -200,7 +200,7 @@ def test_bodies_and_their_surfaces_are_found(world):
     body = surfaces.bodies(w)[corners[:, 0]]
     assert areas[body == 0].sum() == pytest.approx(w.features[0].rest[0]) and areas[body == 10].sum() == pytest.approx(1)
     assert set(body.tolist()) == {0, 10} and len(corners) == 8 + 2
-    # A cube of six tetrahedra has twelve faces; a cloth two triangles in each cell.
+    # A cube of six tetrahedra has twelve faces; a cloth has two triangles per cell.
     cube = np.array([[a, b, c] for a in (0, 1) for b in (0, 1) for c in (0, 1)], dtype=float)
     tets = [[0, a, a + b, 7] for a, b in ((1, 2), (1, 4), (2, 1), (2, 4), (4, 1), (4, 2))]
     assert len(surfaces.skin(np.array(tets))) == 12
@@ -231,7 +231,7 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
 def test_a_mouse_in_a_browser_drags_a_particle(rope, server):
-    # Real events: press on the last particle of a rope, which is paused and still straight, and pull it up.
+    # Real events: press on the last particle of a rope that is paused and still straight, and pull it up.
     sync = pytest.importorskip("playwright.sync_api")
     live, errors = Session(rope, server), []
     live.paused = True
@@ -244,7 +244,8 @@ def test_a_mouse_in_a_browser_drags_a_particle(rope, server):
                     executable_path=CHROMIUM,
                     args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"],
                 )
-                there = browser.new_page(viewport={"width": 600, "height": 500}, bypass_csp=True)  # for what is asked
+                # lets the test evaluate scripts
+                there = browser.new_page(viewport={"width": 600, "height": 500}, bypass_csp=True)
                 there.on("pageerror", lambda e: errors.append(str(e)))
                 there.goto(server.url)
                 there.wait_for_function("x && scene && canvas.width == 600")
@@ -270,5 +271,5 @@ def test_a_mouse_in_a_browser_drags_a_particle(rope, server):
         live.run(1)
     assert not errors
     x, y, point = told[0]
-    # Drawn to where the mouse is, but for the weight of all five, 5 g / k^2 = 0.12 m, at most twice while it still swings.
+    # The end is where the mouse is, but for the weight of all five: 5 g / k^2 = 0.12 m, at most twice that while it swings.
     assert np.hypot(x - point[0], y - point[1]) < 2 * 5 * 9.81 / 20**2 and y > 2.2

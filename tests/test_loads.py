@@ -1,4 +1,4 @@
-"""Contacts that know their loads hold them without overlap, as statics says, and let go of them at once."""
+"""Contacts with known loads hold them without overlap, as statics says, and drop them at once on release."""
 
 from typing import Any
 
@@ -11,14 +11,14 @@ G, R = 10.0, 0.5
 
 
 def heap(n, dim=2):
-    """n^dim discs or spheres, hardly off columns, and how wide they are."""
+    """Return n^dim discs or spheres near the columns of a lattice, and the width of their box [m]."""
     rng = np.random.default_rng(0)
     x = np.stack(np.meshgrid(*[np.arange(n)] * dim, indexing="ij"), axis=-1).reshape(-1, dim)[:, ::-1] * 1.05 + R
     return x + rng.uniform(0, 0.03, x.shape), 1.05 * n + 0.1
 
 
 def pile(world, n=5, dim=2, friction: object = 0.5, spin=None, loads=True, restitution=0.0, **settings):
-    """A heap in a box."""
+    """Return a world with a heap in a box."""
     x, width = heap(n, dim)
     return boxed(world, x, width, friction, spin, loads, restitution, restitution, **settings)
 
@@ -26,14 +26,17 @@ def pile(world, n=5, dim=2, friction: object = 0.5, spin=None, loads=True, resti
 def boxed(
     world, x, width, friction: object = 0.5, spin=None, loads=True, restitution=0.0, walls=0.0, v=0.0, g=G, held=None, **settings
 ):
-    """Discs or spheres in a box, rough ones as they are compiled; and one that is held, out of the way if no place is given."""
+    """Return a world with discs or spheres in a box, and one pinned particle at `held` (out of the way by default).
+
+    Friction and restitution are set after the build, so that the worlds share compiled kernels.
+    """
     above = np.full(x.shape[1], width / 2)
     above[1] = 500.0
     x, v = np.vstack([x, above if held is None else held]), np.vstack([np.broadcast_to(v, x.shape), 0 * above])
     low, high = np.zeros(x.shape[1]), np.full(x.shape[1], width)
     high[1] = np.inf
     rough: Any = friction if spin is not None else 0.5
-    bounces = x.shape[1] == 2 and spin is None and "precision" not in settings  # as they are compiled
+    bounces = x.shape[1] == 2 and spin is None and "precision" not in settings  # the cases that share compiled kernels
     contact = tv.Contact(friction=rough, restitution=0.5 if bounces else restitution, loads=loads)
     box = tv.Box(low, high, friction=rough, restitution=0.5 if bounces else walls, events=bounces)
     start = tv.Particles(x, velocity=v, radius=R, spin=spin, mass=np.append(np.ones(len(x) - 1), 1.5), pinned=[len(x) - 1])
@@ -44,7 +47,7 @@ def boxed(
 
 
 def overlap(w):
-    """The mean of contacts, in diameters."""
+    """Return the mean overlap of the contacts, in diameters."""
     return np.maximum(w.contacts.overlap, 0.0).mean() / (2 * R)
 
 
@@ -54,8 +57,8 @@ def overlap(w):
      ({"spin": 0.0, "friction": (0.5, 0.5, 0.1, 0.0)}, 1e-6)],
 )  # fmt: skip
 def test_a_pile_at_rest_hardly_overlaps(world, settings, most):
-    # Without loads the k-th contact overlaps by 2 k g h^2: on average 1e-4 (8 substeps) and 2e-3 (2) of a diameter here; that it
-    # does is shown by the two that share their kernels.
+    # Without known loads the k-th contact overlaps by 2 k g h^2: 1e-4 of a diameter on average at 8 substeps here, 2e-3 at 2. The
+    # two cases that share kernels with such a world check this.
     w = pile(world, **settings)
     start, highest = w.step(1 / 60).energy, -np.inf
     for _ in range(900):
@@ -66,18 +69,18 @@ def test_a_pile_at_rest_hardly_overlaps(world, settings, most):
         without = pile(world, loads=False, **settings)
         without.run(15.0)
         assert most < 0.05 * overlap(without)
-        # What pushes there is a force in their velocities: else these would be half of what gravity gives in a substep.
+        # Velocities count the pushes of contacts as forces. Otherwise they would be half of what gravity adds in a substep.
         assert np.abs(without.velocity).max() < 1e-9
     speed = np.linalg.norm(w.velocity, axis=1).max()
     assert speed < (1e-3 if w.precision == "f32" or "spin" in settings else 1e-4)
 
 
 def smooth(world, x, mass, pinned=(), high=(99.0, 99.0), **settings):
-    """Discs of these masses without friction in a box, or a column of as many, away from its walls."""
+    """Return a world with smooth discs of these masses in a box: at `x`, or in a column away from the walls."""
     x = np.stack([np.full(len(mass), 5.0), R + np.arange(len(mass))], axis=1) if x is None else x
-    x, pinned = np.vstack([x, [(5.0, 90.0)]]), [*pinned, len(x)]  # one that is held, as in all of these
+    x, pinned = np.vstack([x, [(5.0, 90.0)]]), [*pinned, len(x)]  # a pinned particle, as in all worlds here
     particles = tv.Particles(x, radius=R, mass=np.append(mass, 1.5), pinned=pinned)
-    # As what rubs and bounces is compiled.
+    # Built with friction and restitution, which are then set to 0: the worlds share compiled kernels.
     contact = tv.Contact(friction=0.5, restitution=0.5, loads=True)
     box = tv.Box((0, 0), high, friction=0.5, restitution=0.5, events=True)
     w = world(particles, [tv.Gravity(G), contact, box], precision="f64", **settings)
@@ -86,7 +89,7 @@ def smooth(world, x, mass, pinned=(), high=(99.0, 99.0), **settings):
 
 
 def test_a_column_bears_what_is_above(world):
-    # A contact bears the weight of all that is above it, and the ground all: known to rounding, and nothing overlaps.
+    # A contact bears the weight of all discs above it, and the ground bears all. Loads are exact to rounding; nothing overlaps.
     mass = 2.0 + np.arange(10) % 2
     w = smooth(world, None, mass, substeps=8)
     w.run(20.0)
@@ -97,11 +100,11 @@ def test_a_column_bears_what_is_above(world):
 
 
 def test_a_load_is_learnt_where_it_is_steady_and_lost_where_it_is_let_go(world):
-    # A disc of 1 kg bears one of 99 kg. What is missing of the pair's load is learnt where it was the same in the window before,
-    # of 128 substeps: not in the first of them, before which nothing was missing. Then 1 - 128 / (64 + 0.3 k^2) of it is left by
-    # each window, k = 99, and the overlap of the pair is in proportion to it.
+    # A disc of 1 kg bears one of 99 kg. The part of the pair's load that is not known is learnt if it was the same in the
+    # previous window of 128 substeps. Nothing is learnt in the first window, before which nothing was missing. Then each window
+    # leaves 1 - 128 / (64 + 0.3 k^2) of that part, k = 99, and the overlap of the pair is proportional to it.
     def known(w):
-        """Of the pair [N]."""
+        """Return the known load of the pair [N]."""
         pairs, values = w._runner.search.list.lasting_data()
         return values["load"][(pairs == (0, 1)).all(axis=1)].sum()
 
@@ -111,7 +114,7 @@ def test_a_load_is_learnt_where_it_is_steady_and_lost_where_it_is_let_go(world):
     w.run(12 * 128 / 480, dt=128 / 480)
     left = [w.contacts.overlap[0] for _ in range(3) if w.step(128 / 480)]
     np.testing.assert_allclose(np.array(left[1:]) / left[:-1], 1 - 128 / (64 + 0.3 * 99**2), rtol=1e-3)
-    # What leaves has no load from the substep on in which nothing pushes it, however near it still is.
+    # A pair loses its load in the first substep in which nothing pushes it, however near the discs still are.
     assert known(w) > 0.0
     w.velocity, w.substeps = [[0.0, 0.0], [0.0, 1.0], [0.0, 0.0]], 8
     w.step(8 / 480)
@@ -119,8 +122,8 @@ def test_a_load_is_learnt_where_it_is_steady_and_lost_where_it_is_let_go(world):
 
 
 def test_what_is_known_holds_at_any_substep(world):
-    # A load is a force: what was learnt in a second of 200 substeps a frame bears a column of 50 at 2, where contacts alone would
-    # overlap by 2 k g h^2, 7e-2 of a diameter at the ground. A pile of 25 with friction stands at 1.
+    # A load is a force: loads that were learnt in a second at 200 substeps a frame bear a column of 50 at 2 substeps. Contacts
+    # alone would overlap by 2 k g h^2 there, 7e-2 of a diameter at the ground. A pile of 25 with friction stands at 1 substep.
     n = 50
     w = smooth(world, None, 1.0 + 0.1 * (np.arange(n) % 2), substeps=200)
     w.run(1.0)
@@ -136,7 +139,8 @@ def test_what_is_known_holds_at_any_substep(world):
 
 
 def test_three_discs_bear_each_other_as_statics_says(world):
-    # Two lie between walls, one on them: N = m g / (2 cos a) on each, sin a = (half of their distance) / 2 R. Masses differ.
+    # Two discs lie between walls and bear a third, of another mass: N = m g / (2 cos a) on each,
+    # sin a = (half their distance) / 2 R.
     width = 2.5
     half = (width - 2 * R) / 2
     height = np.sqrt(4 * R * R - half * half)
@@ -148,13 +152,13 @@ def test_three_discs_bear_each_other_as_statics_says(world):
 
 
 def test_each_contact_of_a_pyramid_bears_what_statics_says(world):
-    # 55 discs in rows of 10 to 1, apart in a row, the lowest row held: 90 contacts, and sum f n = m g for 45 discs are as many
-    # equations. The normals are those where it stands.
+    # 55 discs in rows of 10 to 1, with gaps in a row and the lowest row pinned: 90 contacts. The 45 free discs give as many
+    # equations, sum f n = m g. The normals are taken from the pile at rest.
     rows, apart = 10, 1.02
     up = np.sqrt(1 - (apart / 2) ** 2)
     x = np.concatenate([np.stack([apart * (np.arange(rows - r) + r / 2), np.full(rows - r, r * up)], 1) for r in range(rows)])
     mass = np.random.default_rng(0).uniform(1, 2, len(x))
-    w = smooth(world, (1 + 1e-9) * x + 2.0, mass, range(rows), substeps=8)  # so that none overlap at the start
+    w = smooth(world, (1 + 1e-9) * x + 2.0, mass, range(rows), substeps=8)  # scaled so that none overlap at the start
     w.run(15.0)
     found, free = w.contacts, np.arange(len(x)) >= rows
     forces, c = np.zeros((len(x), 2, len(found))), np.arange(len(found))
@@ -167,8 +171,8 @@ def test_each_contact_of_a_pyramid_bears_what_statics_says(world):
 
 
 def test_the_floor_bears_the_weight(world):
-    # Walls without friction bear none of it: sum f = N m g on the floor, and the same on both sides. In f32, the last digit of a
-    # place would be 1e-4 of that.
+    # Walls without friction bear no weight: the floor bears sum f = N m g, and both sides bear the same. In f32 the last digit of
+    # a position would be 1e-4 of that.
     x, width = heap(6)
     w = boxed(world, x, width)
     w.features[2].friction = 0.0  # type: ignore[attr-defined]
@@ -180,8 +184,9 @@ def test_the_floor_bears_the_weight(world):
 
 
 def test_loads_are_gone_with_what_bore_them(world):
-    # Where the ground goes, all fall: what is above is given at most the loads of one more substep, k g h. Rows of five and four
-    # lie in each other's gaps, where they are stable; of heaps from a square lattice, without friction, one in fifty creeps on.
+    # When the ground goes, all discs fall. The discs above get the loads of at most one more substep, k g h. Rows of five and
+    # four lie in each other's gaps, where they are stable. Of heaps from a square lattice without friction, one in fifty keeps
+    # creeping.
     rows = [(R + 1.02 * i + 0.51 * (k % 2), R + k) for k in range(5) for i in range(5 - k % 2)]
     w = boxed(world, np.array(rows), 5.1, 0.0, None, True, 0.0)
     start = w.step(1 / 60).energy
@@ -190,8 +195,8 @@ def test_loads_are_gone_with_what_bore_them(world):
     box.lower = (0.0, -100.0)  # type: ignore[attr-defined]
     v = [w.velocity[:-1] for _ in range(30) if w.step(1 / 60)]
     assert np.abs(v[-1][:, 1] - v[0][:, 1] + G * 29 / 60).max() < 5 * G / 480
-    assert np.ptp(v[-1][:, 1]) < 2 * (1 + 2 + 3 + 4) * G / 480  # of all contacts of a column
-    # What is taken away by hand falls as it would alone: nobody gives it anything.
+    assert np.ptp(v[-1][:, 1]) < 2 * (1 + 2 + 3 + 4) * G / 480  # from all contacts of a column
+    # A disc that is moved away by assignment falls as it would alone: no load acts on it.
     w = pile(world)
     w.run(10.0)
     x = w.position.copy()
@@ -199,7 +204,7 @@ def test_loads_are_gone_with_what_bore_them(world):
     w.position = x
     w.step(1 / 60)
     np.testing.assert_allclose(w.position[12], [2.5, 30.0 - G / 60**2 / 2], atol=1e-4)
-    # And what is removed leaves the others to fall on what is below.
+    # A disc that is removed leaves the others to fall on the discs below.
     w = pile(world)
     w.run(10.0)
     top = w.position[24, 1]
@@ -211,8 +216,9 @@ def test_loads_are_gone_with_what_bore_them(world):
 
 
 def test_pairs_that_bounce_learn_where_they_rest(world):
-    # They ask their overlap whether they rest; one that knows its load has the overlap that would hold it. Nothing overlaps in a
-    # heap, nor at the foot of a column at 2 substeps a frame, by 2 k g h^2 = 0.026 m without.
+    # A pair that bounces decides by its overlap whether it rests. A pair with a known load counts the overlap that would hold it.
+    # Nothing overlaps in a heap, nor at the foot of a column at 2 substeps a frame, where it would be 2 k g h^2 = 0.026 m without
+    # loads.
     w = pile(world, restitution=0.5)
     start = w.step(1 / 60).energy
     assert max(w.step(1 / 60).energy for _ in range(900)) <= start * (1 + 1e-6)
@@ -226,9 +232,9 @@ def test_pairs_that_bounce_learn_where_they_rest(world):
 
 
 def test_what_bounces_knows_no_load(world):
-    # To the bit: what flies about without a force, or falls and bounces on walls in the substep in which pairs are struck, too,
-    # and a ball that falls on one that is held, for the 1.5 s until it rests; it leaves at e times its speed, so it rises to e^2
-    # of its height.
+    # Bit for bit: a gas without forces; a gas that falls and bounces on walls in the substep in which pairs are struck, too; and
+    # a ball that falls on a pinned one, for the 1.5 s until it rests. The ball leaves at e times its speed, so it rises to e^2 of
+    # its height.
     rng = np.random.default_rng(0)
     gas = np.stack(np.meshgrid(1.5 * np.arange(6), 1.5 * np.arange(6)), axis=-1).reshape(-1, 2) + 1.0
     ball, speed = np.array([[5.0, 3.5]]), rng.normal(size=gas.shape)
@@ -248,7 +254,7 @@ def test_what_bounces_knows_no_load(world):
 
 
 def test_loads_are_of_the_state(world):
-    # In clones, and where they are asked for only later, to the same bits; in Worlds, too. For all paths see test_determinism.py.
+    # Clones and Worlds have the same bits, and loads may be switched on later. For all paths see test_determinism.py.
     a = pile(world, precision="f32")
     a.run(4.0)
     with a.clone() as other, tv.Worlds(a, 2) as many:
@@ -267,30 +273,30 @@ def test_loads_are_of_the_state(world):
 
 
 def hung(n=10):
-    """A chain of n links of 0.1 m that hangs down from a pin."""
+    """Return a chain of n links of 0.1 m that hangs from a pin, and the pairs of its links."""
     x = np.stack([np.zeros(n + 1), -0.1 * np.arange(n + 1)], axis=1)
     return tv.Particles(x, mass=0.2, pinned=[0]), np.stack([np.arange(n), np.arange(1, n + 1)], axis=1)
 
 
 def hanging(world, particles, links, g=G, rate=1.0, known=True, precision="f64", **settings):
-    """Links that may break, in a wind that calms: one structure."""
+    """Return a world of links that may break, with drag: one structure for all tests of links."""
     features = [tv.Gravity(g), links, tv.Drag(rate)]
     return world(particles, features, solver=tv.Jacobi(loads=known), precision=precision, **settings)
 
 
 @pytest.mark.parametrize("kind, precision, substeps", [(tv.Distance, "f64", 4), (tv.Rope, "f32", 16)])
 def test_what_hangs_is_not_stretched(world, kind, precision, substeps):
-    # The k-th link from below bears k m g. One pass holds that by a violation W h^2 k m g, 4 k g h^2; what is known, by none.
+    # The k-th link from below bears k m g. One pass bears it by a violation W h^2 k m g = 4 k g h^2; a known load needs none.
     particles, pairs = hung()
     links = kind(pairs, 0.1, break_at=1e3)
     w = hanging(world, particles, links, precision=precision, substeps=substeps)
     highest = max(w.step(1 / 60).energy for _ in range(900))
-    rounding = 0.2 * 2.0**-24 * (60 * substeps) ** 2 if precision == "f32" else 0.0  # of positions of 1 m, m ulp / h^2
+    rounding = 0.2 * 2.0**-24 * (60 * substeps) ** 2 if precision == "f32" else 0.0  # of positions of 1 m: m ulp / h^2
     np.testing.assert_allclose(links.load, 0.2 * G * np.arange(10, 0, -1), rtol=1e-3, atol=rounding)
     sag = 4 * 10 * G / (60 * substeps) ** 2
     stretch = np.linalg.norm(np.diff(w.position, axis=0), axis=1) - 0.1
     assert np.abs(stretch).max() < 1e-3 * sag
-    # It is not above where it began, and what is known breaks links, too.
+    # Energy never rises above the start, and known loads break links, too.
     assert highest <= -0.2 * G * 0.1 * 55 + 1e-5
     for most in (10.5, 9.5):
         links.break_at = most * 0.2 * G
@@ -299,7 +305,7 @@ def test_what_hangs_is_not_stretched(world, kind, precision, substeps):
 
 
 def test_links_that_move_are_as_they_were(world):
-    # What swings through 2 rad in half a second turns by more within a window than its load explains, and nothing is learnt.
+    # A chain that swings through 2 rad in half a second turns by more within a window than its load explains: nothing is learnt.
     particles, pairs = hung(5)
     particles = tv.Particles(particles.position[:, ::-1], mass=0.2, pinned=[0])
     known, plain = (
@@ -311,8 +317,8 @@ def test_links_that_move_are_as_they_were(world):
 
 
 def test_links_without_a_weight_to_compare_with_learn_nothing(world):
-    # Ten links of 0.095 m between pins 1 m apart contradict each other: no load takes their violations C away, 0.05 m in all.
-    # What they pull with, C / (W h^2), is equal, and W = 4 w, for those of a pin 2 w: theirs are half of the others', 0.05 / 9.
+    # Ten links of 0.095 m between pins 1 m apart contradict each other: no load removes their violations C, 0.05 m in all. Their
+    # pulls C / (W h^2) are equal. W = 4 w, but 2 w for links at a pin, whose violation is half of the others', 0.05 / 9.
     x = np.stack([np.linspace(0, 1, 11), np.zeros(11)], axis=1)
     links = tv.Distance(hung()[1], 0.095, break_at=1e3)
     w = hanging(world, tv.Particles(x, mass=0.2, pinned=[0, 10]), links, g=0.0)
@@ -323,8 +329,8 @@ def test_links_without_a_weight_to_compare_with_learn_nothing(world):
 
 
 def test_a_start_finds_the_loads_that_links_know(world):
-    # Velocities that are assigned begin the next substep anew, in which forces act for half a kick, and so do loads; where
-    # particles are put elsewhere all together, links know what they did, and where one is, its own have forgotten.
+    # Assigned velocities make a start: in the next substep forces act for half a kick, and so do loads. If all particles are
+    # moved by the same vector, links keep their known loads. If one particle is moved, its own links drop theirs.
     particles, pairs = hung()
     links = tv.Distance(pairs, 0.1, break_at=1e3)
     w = hanging(world, particles, links, substeps=8)
@@ -345,11 +351,11 @@ def test_a_start_finds_the_loads_that_links_know(world):
 
 
 def test_loads_of_links_are_of_the_state(world):
-    # On all paths, in clones and in Worlds, to the same bits; particles that come leave them as they are.
+    # All paths, clones and Worlds have the same bits; added particles leave known loads as they are.
     particles, pairs = hung()
 
     def made(path):
-        """One of them."""
+        """Return the hanging chain in a world on this path."""
         features = [tv.Gravity(G), tv.Distance(pairs, 0.1), tv.Drag(1.0)]
         return world(particles, features, solver=tv.Jacobi(loads=True), substeps=8, path=path)
 
@@ -359,7 +365,7 @@ def test_loads_of_links_are_of_the_state(world):
     assert a.hash() == b.hash() == c.hash()
     with a.clone() as other, tv.Worlds(a, 2) as many:
         for w in (a, other, many):
-            for _ in range(9):  # over the end of a window
+            for _ in range(9):  # past the end of a window
                 w.step(1 / 60)
         assert other.hash() == a.hash()
         np.testing.assert_array_equal(many.position[1], a.position)

@@ -1,4 +1,4 @@
-"""Motors and winches: speeds that are met, torques and forces that are exact, and what they do to momentum and energy."""
+"""Motors and winches: the speed is met, torque and force are exact, and momentum and energy are accounted for."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ ARM, G = 0.5, 9.81
 
 
 def wheel(world, speed, mass=2.0, pinned=(0, 1), gravity=0.0, **settings):
-    """A mass on an arm of 0.5 m about a hub that does not move: I = m r^2. Returns the world and its motor."""
+    """Return a world with a mass on an arm of 0.5 m about a fixed hub, I = m r^2, and its motor."""
     world_settings = {k: settings.pop(k) for k in ("substeps", "solver", "precision", "iterations") if k in settings}
     motor = tv.Motor([[0, 1, 2]], speed, **settings)
     start = tv.Particles([[-1.0, 0.0], [0.0, 0.0], [ARM, 0.0]], mass=mass, pinned=list(pinned))
@@ -21,14 +21,14 @@ def wheel(world, speed, mass=2.0, pinned=(0, 1), gravity=0.0, **settings):
 
 
 def turned(w, since=0.0):
-    """The angle of the arm, from `since` on [rad], in (-pi, pi]."""
+    """Return the angle of the arm relative to `since` [rad], in [-pi, pi)."""
     x = w.position[2] - w.position[1]
     return (np.arctan2(x[1], x[0]) - since + np.pi) % (2 * np.pi) - np.pi
 
 
 @pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Direct()], ids=str)
 def test_a_limited_torque_accelerates_and_the_speed_is_then_met(world, solver):
-    # I w' = T up to w = speed: angle T t^2 / 2 I, then speed (t - t1 / 2) with t1 = I speed / T. Second order.
+    # I w' = T until w = speed: the angle is T t^2 / 2 I, then speed (t - t1 / 2) with t1 = I speed / T. Second order.
     inertia, torque, speed = 2.0 * ARM**2, 1.0, 3.0
     t1, errors = inertia * speed / torque, []
     for substeps in (5, 10, 20, 40):
@@ -47,7 +47,7 @@ def test_a_limited_torque_accelerates_and_the_speed_is_then_met(world, solver):
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_a_wheel_turns_for_ever_however_slowly(world, precision):
-    # Through +-pi again and again, and at 2^-24 of a turn in a substep, which a rest angle in f32 would lose.
+    # The angle passes +-pi again and again; and 2^-24 of a turn per substep, which would be lost in a rest angle in f32.
     for speed, seconds in ((50.0, 4.0), (1e-3, 4.0)):
         w, _ = wheel(world, speed, precision=precision)
         w.run(1.0)
@@ -58,7 +58,8 @@ def test_a_wheel_turns_for_ever_however_slowly(world, precision):
 
 @pytest.mark.parametrize("substeps", [2, 20, 200])
 def test_a_lever_lifts_what_its_torque_can(world, substeps):
-    # From horizontal, I a = T - m g r cos a: it goes up if and only if T > m g r; with more than enough it holds its speed.
+    # From horizontal, I a = T - m g r cos a: the arm rises if and only if T > m g r. With more than enough torque it holds its
+    # speed.
     most = 2.0 * G * ARM
     for torque, up in ((1.01 * most, True), (0.99 * most, False)):
         w, motor = wheel(world, 1.0, torque=torque, gravity=G, substeps=substeps)
@@ -66,13 +67,13 @@ def test_a_lever_lifts_what_its_torque_can(world, substeps):
         start = torque / (2.0 * ARM**2) - G / ARM
         assert (turned(w) > 0) == up and turned(w) == pytest.approx(start * 0.2**2 / 2, rel=0.02)
     w, motor = wheel(world, 1.0, gravity=G, substeps=substeps)
-    w.run(1.0)  # below the limit: cos 1 of it, and the work is that of the weight and the speed that it got
+    w.run(1.0)  # below the limit: cos 1 of it; the work goes into height and speed
     assert turned(w) == pytest.approx(1.0, abs=20 / (60 * substeps) ** 2 * G / ARM)
     assert motor.load[0] == pytest.approx(-most * np.cos(1.0), rel=20 / (60 * substeps))
 
 
 def test_the_energy_is_torque_times_speed(world):
-    # Sum of -load dt speed over a second of spinning up, at rest first: m (r w)^2 / 2, while torque is at its limit all the time.
+    # The sum of -load dt speed over a second of spinning up from rest is m (r w)^2 / 2. The torque is at its limit all the time.
     w, motor = wheel(world, 100.0, torque=1.0)
     energies, angles = [], []
     for _ in range(60):
@@ -82,7 +83,7 @@ def test_the_energy_is_torque_times_speed(world):
 
 
 def test_a_brake_is_dry_friction(world):
-    # m (r w)' = -T / r until it rests, then it holds, and no frame brings energy in.
+    # m (r w)' = -T / r until the wheel rests; then the brake holds it, and no frame adds energy.
     w, motor = wheel(world, 0.0, torque=0.5)
     w.velocity = [[0, 0], [0, 0], [0, 1.0]]
     energies = np.array([w.step(1 / 60).energy for _ in range(90)])
@@ -90,13 +91,14 @@ def test_a_brake_is_dry_friction(world):
     speed = np.maximum(1.0 - 0.5 * t / ARM / 2.0, 0)
     np.testing.assert_allclose(energies[:55], speed[:55] ** 2, atol=2e-3)
     assert (np.diff(energies) <= 1e-12).all()
-    motor.torque = 0.0  # it runs free
+    motor.torque = 0.0  # the wheel runs free
     w.velocity, w.position = [[0, 0], [0, 0], [0, 1.0]], w.particles.position
-    assert w.run(0.5).energy == pytest.approx(1.0, abs=1e-5)  # (h v / r)^2 = 3e-6: that of the link
+    assert w.run(0.5).energy == pytest.approx(1.0, abs=1e-5)  # (h v / r)^2 = 3e-6: the error of the link
 
 
 def test_a_motor_gives_no_momentum(world):
-    # Nor angular momentum: its gradients sum to 0, and so do their moments. To rounding, over a second; 2D and 3D.
+    # Momentum and angular momentum are constant: gradients sum to 0, and so do their moments. To rounding, over a second, in 2D
+    # and 3D.
     rng = np.random.default_rng(0)
     for torque, points, hinges, links in (
         (0.3, [[-1, 0.1], [0, 0], [0.7, 0.4]], [[0, 1, 2]], [[0, 1], [1, 2]]),
@@ -120,7 +122,7 @@ def test_a_motor_gives_no_momentum(world):
 
 
 def test_hinges_in_space_turn_for_ever(world):
-    # A door of two links about a fixed axis: its angle passes pi as any other.
+    # A door of two links turns about a fixed axis: its angle passes pi like any other.
     x = [[0, 0, 0], [0, 0, 1.0], [1, 0, 0.5], [-1, 0, 0.5]]
     motor = tv.Motor([[0, 1, 2, 3]], 5.0, torque=1.0)
     w = world(tv.Particles(x, pinned=[0, 1, 2]), [motor, tv.Distance([[0, 3], [1, 3]])], precision="f64", substeps=10)
@@ -134,7 +136,8 @@ def test_hinges_in_space_turn_for_ever(world):
 
 
 def test_a_servo_goes_to_its_angle_and_stays(world):
-    # By the shorter way, through pi; under a load it lags by what bears it, 2 w m g r h^2 in one pass, at most.
+    # A servo takes the shorter way, through pi. Under a load, one pass lags by at most the violation that bears it,
+    # 2 w m g r h^2.
     for torque in (np.inf, 20.0):
         w, motor = wheel(world, 3.0, angle=2.5, torque=torque, gravity=G, mass=1.0)
         w.run(0.5)
@@ -146,7 +149,7 @@ def test_a_servo_goes_to_its_angle_and_stays(world):
         assert abs(turned(w)) > 2.4 and motor.load[0] == pytest.approx(-G * ARM * np.cos(2.5), rel=0.05)
         w.run(1.0)
         assert turned(w, -2.5) == pytest.approx(0, abs=1e-4)
-    flat = tv.Motor([[0, 1, 2]], 1.0)  # in space its angle ends at pi, where it waits
+    flat = tv.Motor([[0, 1, 2]], 1.0)  # a servo of triples in space ends at pi, where it waits
     x = [[-1, 0, 0], [0, 0, 0], [1, 0.5, 0]]
     w = world(tv.Particles(x, pinned=[0, 1]), [flat, tv.Distance([[1, 2]])], precision="f64")
     w.run(1.0)
@@ -157,8 +160,8 @@ def test_a_servo_goes_to_its_angle_and_stays(world):
 
 
 def test_a_servo_that_rests_is_a_bend(world):
-    # With a spring that gives way by far more than a rigid hinge may be off; where that bears more than the largest torque, it
-    # slips. Elimination takes springs, and no motor with a largest torque.
+    # The spring of the servo deflects by far more than a rigid hinge may be off. Where the spring would bear more than the
+    # largest torque, the servo slips. Elimination takes springs, but no motor with a largest torque, so Jacobi solves both.
     ends = []
     for hinge in (
         tv.Bend([[0, 1, 2]], 0.0, compliance=0.1, damping=4.0),
@@ -176,7 +179,7 @@ def test_a_servo_that_rests_is_a_bend(world):
 
 
 def test_a_stalled_motor_winds_nothing_up(world):
-    # Held for a second by a stop that gives way then: it goes on at its speed, and catches nothing up.
+    # A stop holds the wheel for a second and then gives way: the wheel goes on at its speed, without catching up the lost angle.
     stop = tv.HalfSpace((0, -1), -ARM / 2)  # at 30 degrees
     w, motor = wheel(world, 2.0, torque=1.0)
     w.add(features=[stop])
@@ -189,13 +192,13 @@ def test_a_stalled_motor_winds_nothing_up(world):
         w.step(1 / 60)
         speeds.append(np.linalg.norm(w.velocity[2]) / ARM)
     assert max(speeds) < 2.0 + 1e-2 and speeds[-1] == pytest.approx(2.0, abs=1e-5)
-    w.velocity, w.position = np.zeros((3, 2)), [[-1, 0], [0, 0], [0, -ARM]]  # it goes on from where it was placed
+    w.velocity, w.position = np.zeros((3, 2)), [[-1, 0], [0, 0], [0, -ARM]]  # the wheel goes on from where it is placed
     report = w.step(1 / 60)
     assert abs(turned(w, -np.pi / 2)) < 2.0 / 60 + 1e-6 and "moved" not in report.flags
 
 
 def hoist(world, speed, substeps=20, solver=None, **options):
-    """A weight of 2 kg that hangs on 2 m of rope."""
+    """Return a world with a weight of 2 kg on 2 m of rope, and its winch."""
     winch = tv.Winch([[0, 1]], speed, **options)
     start = tv.Particles([[0.0, 0.0], [0.0, -2.0]], mass=2.0, pinned=[0])
     return world(start, [tv.Gravity(G), winch], substeps=substeps, solver=solver, precision="f64"), winch
@@ -214,7 +217,7 @@ def test_a_winch_lifts_at_its_speed(world, substeps):
 
 
 def test_a_winch_lifts_what_its_force_can(world):
-    # m a = F - m g up to the speed v, which is reached at t1 = v / a: v (t - t1 / 2) then. Below m g it lets the weight down.
+    # m a = F - m g up to the speed v, which is reached at t1 = v / a, then v (t - t1 / 2). Below m g the weight goes down.
     errors, force, v = [], 40.0, 0.5
     t1 = v / (force / 2.0 - G)
     for substeps in (5, 10, 20, 40):
@@ -226,7 +229,7 @@ def test_a_winch_lifts_what_its_force_can(world):
         w, winch = hoist(world, -v, force=force)
         w.run(1.0)
         assert w.position[1, 1] + 2.0 == pytest.approx(sign * 0.05 / 2, rel=1e-6) and winch.load[0] == pytest.approx(force)
-    winch.force = 100.0  # it holds what fell, where it is, and goes on
+    winch.force = 100.0  # the winch holds the fallen weight where it is, and lifts it
     w.run(1.0)
     begin = w.position[1, 1]
     w.run(0.5)
@@ -234,8 +237,9 @@ def test_a_winch_lifts_what_its_force_can(world):
 
 
 def test_a_winch_does_not_slip_where_the_substep_gets_shorter(world):
-    # The first of the shorter substeps makes up for half of the last kick of a longer one, by h (h + h_old) / 2 times the load,
-    # which is no larger load. Held to twice what a start takes, it let go of what it can hold: by 1e-4 m a second.
+    # In the first of the shorter substeps the multiplier also supplies half of the last kick of a longer one: h (h + h_old) / 2
+    # times the load, which is itself no larger. Limited to twice what a start takes, a winch would give way under loads that it
+    # can hold, by 1e-4 m a second.
     for force, bears in ((2.02 * G, 2 * G), (1.98 * G, 1.98 * G)):
         w, winch = hoist(world, 0.0, force=force)
         for dt in (1 / 60, 1 / 240, 1 / 60, 1 / 60, 1 / 600) * 8:
@@ -252,10 +256,10 @@ def test_a_winch_stops_at_its_ends(world):
     winch.speed = 2.0
     w.run(2.0)
     assert w.position[1, 1] == pytest.approx(-2.25, abs=1e-9) and winch.rest[0] == 2.25
-    short, winch = hoist(world, -1.0, length=1.0, force=9.0)  # it can run out, and nothing is moved
+    short, winch = hoist(world, -1.0, length=1.0, force=9.0)  # a rope that is too short can run out, and nothing is moved
     report = short.step(1 / 60)
     assert "moved" not in report.flags and short.position[1, 1] == pytest.approx(-2.0 - (G - 4.5) / 2 / 60**2, abs=1e-9)
-    slack, winch = hoist(world, -1.0, length=3.0)  # which pulls once the slack is in
+    slack, winch = hoist(world, -1.0, length=3.0)  # a slack rope pulls once the slack is in
     slack.run(0.1)
     assert slack.position[1, 1] == pytest.approx(-2.0 - G * 0.1**2 / 2, abs=1e-9) and winch.load[0] == 0
     slack.run(1.9)
@@ -263,7 +267,7 @@ def test_a_winch_stops_at_its_ends(world):
 
 
 def machine(**settings):
-    """A door that turns, and a weight that it winds up by two ropes, in 3D; and a rope at the door that is slack."""
+    """Return a world in 3D: a door that turns and lifts a weight by two ropes, and a slack rope at the door."""
     x = np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0.5], [-1, 0, 0.5], [0, -1, 0.5]], dtype=float)
     features = [
         tv.Motor([[0, 1, 2, 3]], 5.0, torque=1.0),
@@ -292,7 +296,7 @@ def test_drives_have_the_same_bits_on_every_path_and_survive_edits():
         door, winch = fused.features[:2]
         assert isinstance(door, tv.Motor) and isinstance(winch, tv.Winch)
         rest = door.rest[0]
-        fused.remove(particles=[4])  # and its ropes
+        fused.remove(particles=[4])  # and with it its ropes
         assert door.rest[0] == rest and winch.count == 1 and not fused.step(1 / 60).flags
         assert door.rest[0] != rest and abs(door.violation(fused.position)[0]) < 0.1
 
@@ -308,7 +312,7 @@ def test_many_worlds_have_drives_of_their_own():
     motor = many.features[0]
     assert isinstance(motor, tv.Motor)
     many.run(0.2)
-    motor.torque = 1.0  # for all
+    motor.torque = 1.0  # for all worlds
     many.run(0.2)
     many.set(motor, speed=-speeds[:, None])
     many.run(0.2)

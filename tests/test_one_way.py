@@ -1,4 +1,4 @@
-"""Walls that hold what comes from one side, and let through what comes from the other."""
+"""One-way walls: they hold particles that come from one side, and let through those from the other."""
 
 import numpy as np
 import pytest
@@ -7,12 +7,13 @@ import tiverlet as tv
 
 G, R, THICK = 9.81, 0.05, 0.1
 BOARD = np.array([[-2, -THICK], [2, -THICK], [2, THICK], [-2, THICK]])
-WALLS = {  # platforms along y = 0, and how high their tops are
+WALLS = {  # platforms along y = 0, and the height of their tops
     "Capsule": (lambda **k: tv.Capsule((-2, 0), (2, 0), THICK, **k), THICK),
     "Polygon": (lambda **k: tv.Polygon(BOARD, **k), THICK),
     "line": (lambda **k: tv.Polygon([[-2, 0], [0, 0], [2, 0]], closed=False, **k), 0.0),
 }
-# By the height at which they start and the speed: onto it; up through it, to land; up into it, to fall back; inside of it; fast.
+# Six particles by start height and speed: one falls onto the wall; one rises through it and lands; one rises into it and falls
+# back; one starts inside of it; the last two are fast, downwards and upwards.
 START = np.array([1.0, -0.8, -0.8, 0.02, 3.0, -3.0])
 SPEED = np.array([0.0, 5.0, np.sqrt(2 * G * 0.8), 0.0, -80.0, 80.0])
 STAYS = np.array([True, True, False, False, True, False])
@@ -20,7 +21,7 @@ STAYS = np.array([True, True, False, False, True, False])
 
 @pytest.mark.parametrize(("name", "precision"), [("Capsule", "f32"), ("Polygon", "f64"), ("line", "f32"), ("line", "f64")])
 def test_what_comes_from_below_passes_and_what_comes_from_above_lands(world, name, precision):
-    # What passes is as free as without the wall: y0 + v t - g t^2 / 2, to rounding, in any number of substeps.
+    # Particles that pass move as without the wall: y0 + v t - g t^2 / 2, to rounding, for any number of substeps.
     make, top = WALLS[name]
     x = np.stack([np.linspace(-1.5, 1.5, len(START)), START], axis=1)
     start = tv.Particles(x, velocity=np.stack([0 * SPEED, SPEED], axis=1), radius=R)
@@ -39,7 +40,7 @@ def test_what_comes_from_below_passes_and_what_comes_from_above_lands(world, nam
 
 
 def test_a_platform_that_moves_and_turns(world):
-    # It takes along what stands on it, up and down, and passes by what hangs in its way from below; its direction turns with it.
+    # A platform carries the particle on it up and down, and passes a pinned one from below; its direction turns with it.
     lift = tv.Polygon(BOARD, position=(0.0, 0.0), one_way=(0, 1), friction=0.8)
     x = np.array([[0.0, THICK + R], [1.0, 1.0], [-1.0, -0.4]])
     w = world(tv.Particles(x, radius=R, pinned=[2]), [tv.Gravity(G), lift], precision="f64")
@@ -49,7 +50,7 @@ def test_a_platform_that_moves_and_turns(world):
             w.step(1 / 60)
         assert w.position[0] == pytest.approx([0.0, lift.position[1] + THICK + R], abs=1e-9)
         assert w.position[1] == pytest.approx([1.0, lift.position[1] + THICK + R], abs=1e-9)
-    lift.rotation = np.pi  # upside down it holds nothing
+    lift.rotation = np.pi  # upside down the platform holds nothing
     w.run(1.0)
     assert (w.position[:2, 1] < -3).all() and not w.step(1 / 60).flags
 
@@ -65,9 +66,9 @@ def test_a_sheet_in_space(world):
         [tv.Gravity(G), tv.Distance(np.concatenate([rope.links, rope.links + 6])), sheet],
     )
     w.run(0.3)
-    assert (w.position[6:, 1] > 0.1).all()  # the one that was thrown is through
+    assert (w.position[6:, 1] > 0.1).all()  # the rope that was thrown is through
     w.run(2.0)
-    assert w.position[:, 1] == pytest.approx(0.02, abs=1e-5)  # both lie on it
+    assert w.position[:, 1] == pytest.approx(0.02, abs=1e-5)  # both ropes lie on the sheet
 
 
 def test_bad_directions_are_refused():

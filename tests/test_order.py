@@ -27,8 +27,9 @@ def reference(name, t):
 
 @pytest.mark.parametrize("high", HIGH)
 def test_orders_and_the_error_of_a_good_peer(world, high):
-    # MuJoCo 4.0 with RK4 in joint coordinates, RMS position: D01 at t = 2, 60 and 240 steps/s: 2.2e-6, 2.5e-8 m; D05 at t = 0.5,
-    # 60, 240 and 1200 steps/s: 1.4e-3, 2.9e-6, 6.2e-8. Here with rods as constraints, and at most the same number of substeps.
+    # MuJoCo 4.0 with RK4 in joint coordinates, RMS error of positions: D01 at t = 2 with 60 and 240 steps/s: 2.2e-6, 2.5e-8 m;
+    # D05 at t = 0.5 with 60, 240 and 1200 steps/s: 1.4e-3, 2.9e-6, 6.2e-8 m. Here rods are constraints, with at most as many
+    # substeps.
     for name, t, rates, peer in (
         ("D01_double_pendulum", 2.0, (30, 60, 120, 240), {60: 2.2e-6, 240: 2.5e-8}),
         ("D05_chain10", 0.5, (120, 240, 480, 1200), {240: 2.9e-6, 1200: 6.2e-8}),
@@ -36,15 +37,15 @@ def test_orders_and_the_error_of_a_good_peer(world, high):
         w, (at, want) = chain(world, name, order=high), reference(name, t)
         errors = np.array([rms(rerun(w, t, dt=t, substeps=round(n * t)).position[at], want) for n in rates])
         assert all(errors[rates.index(n)] < limit for n, limit in peer.items()), errors
-        clear = errors[errors > 1e-11][:3]  # of what is not rounding yet
+        clear = errors[errors > 1e-11][:3]  # errors that are above rounding
         assert len(clear) < 2 or order(clear) > high - 0.5, errors
         assert w.last.clean and w.last.residual < 1e-12
         w.close()
 
 
 def test_velocities_have_the_order_too(world):
-    # A Kepler ellipse, e = 0.5, from its pericentre: back there after T = 2 pi with the velocity (0, sqrt(3)). And a conical
-    # pendulum, whose rod has to take out what is along it: v is at right angles to it, and as fast as at the start.
+    # A Kepler ellipse, e = 0.5, from its pericentre: it returns after T = 2 pi with the velocity (0, sqrt(3)). And a conical
+    # pendulum, whose rod has to remove the velocity along it: v stays at right angles to the rod, and as fast as at the start.
     tilt, g = 0.7, 9.81
 
     @ti.func
@@ -69,7 +70,7 @@ def test_velocities_have_the_order_too(world):
 
 
 def test_springs_are_forces(world):
-    # A chain of soft and rigid links converges, with order 6, to what order 2 converges to. A mass below its spring, of length l:
+    # A chain of soft and rigid links converges with order 6 to the limit of order 2. A mass below its spring of length l:
     # l = 1 + g / k + (1 - g / k) cos(omega t), with omega^2 = k = 400.
     k = np.arange(6)
     x = np.concatenate([np.stack([0.3 * np.arange(7), 0.0 * np.arange(7)], axis=1), [(0, 5), (0, 3)]])
@@ -93,7 +94,7 @@ def test_springs_are_forces(world):
 
 
 def test_motion_can_be_turned_round(world):
-    # A composition of reversible stages is reversible: back at the start, to rounding, whatever the error was in between.
+    # A composition of reversible stages is reversible: it returns to the start to rounding, whatever the error was in between.
     w = chain(world, "D05_chain10", order=4)
     start = w.particles.position
     w.substeps = 50
@@ -104,7 +105,7 @@ def test_motion_can_be_turned_round(world):
 
 
 def test_energy_neither_grows_nor_falls(world):
-    # Symplectic: over 200 s the error of the energy stays that of the first second.
+    # Symplectic: over 200 s the energy error stays within four times that of the first ten seconds.
     w = chain(world, "D02_double_pendulum_low", order=4, substeps=5)
     p = case("D02_double_pendulum_low")["params"]
 
@@ -165,15 +166,15 @@ def test_settings_without_such_an_order_are_refused():
     with pytest.raises(ValueError, match="one thread only"):
         tv.World(particles, precision="f64", path="parallel", order=4)
     i, j = np.triu_indices(30, 1)
-    for solver in (None, tv.Jacobi()):  # all linked with all
+    for solver in (None, tv.Jacobi()):  # every particle is linked with every other
         with pytest.raises(ValueError, match="relaxes Distance .435 of them"):
             tv.World(particles, [tv.Distance(np.stack([i, j], 1))], precision="f64", solver=solver, order=4)
 
 
 def test_springs_that_turn_far_in_a_stage_are_told_of(world):
-    # Springs of 1e6 N/m between all of seven particles, stretched to twice their length: they fly through each other at some
-    # 1000 m/s, which no substep of 0.8 ms follows, and gain energy. What swings by 0.01 of a turn is not told of, nor is a spring
-    # without length, whose force is linear, as it goes through its other end.
+    # Springs of 1e6 N/m between all of seven particles, stretched to twice their length: the particles fly through each other at
+    # some 1000 m/s, which no substep of 0.8 ms resolves, and gain energy. A spring that turns by 0.01 of a turn sets no flag, nor
+    # does a spring of length 0, whose force is linear, when it passes through its other end.
     crowd, two = 0.7 * tv.golden(range(7), dim=2), [(0, 0), (1, 0)]
     every = np.stack(np.triu_indices(7, 1), axis=1)
     wild, swing, through = (

@@ -1,4 +1,4 @@
-"""Overlap at the start is known before anything is compiled."""
+"""Overlap at the start is found before anything is compiled."""
 
 from types import SimpleNamespace as Some
 from typing import Any
@@ -29,7 +29,10 @@ def test_overlap_is_what_comparing_all_pairs_finds():
 
 
 def test_what_rounding_makes_overlap_is_known_too(world):
-    """0.1 k in f32: neighbours at 0.1 m are 0.3 - 0.2 > 0.1 or 0.4 - 0.3 < 0.1 apart. So frames are compiled once."""
+    """Find overlap that comes from rounding, too, so that frames are compiled once.
+
+    At 0.1 k in f32, neighbours are more than 0.1 m apart (0.3 - 0.2) or less (0.4 - 0.3).
+    """
     row = np.stack([np.arange(5) * 0.1, np.zeros(5)], axis=1)
     apart = np.diff(row[:, 0].astype(np.float32))
     assert min(apart) < np.float32(0.05) * 2 <= max(apart)
@@ -45,9 +48,9 @@ def test_only_scenes_that_start_with_overlap_have_the_field_for_it(world):
     x = np.array([[0.0, 0.0], [0.19, 0.0], [0.5, 0.0], [0.75, 0.0]])
     for features, start, want in (
         ([tv.Contact()], x, True),
-        ([tv.Contact(), tv.Distance([[1, 0]])], x, False),  # linked
+        ([tv.Contact(), tv.Distance([[1, 0]])], x, False),  # linked, so not in contact
         ([tv.Contact()], x * 1.1, False),
-        ([tv.Contact()], np.zeros((2, 2)), True),  # in one place
+        ([tv.Contact()], np.zeros((2, 2)), True),  # all in one place
         ([tv.Contact(groups=[(0, 1), (0, 2)])], x, True),
         ([tv.Contact(groups=[(0, 2)])], x, False),
         ([tv.Contact(friction={(0, 1): 0.5})], x, True),
@@ -58,7 +61,7 @@ def test_only_scenes_that_start_with_overlap_have_the_field_for_it(world):
         if want and features[0].groups:
             step = w._runner.step
             assert w.step(1e-3).clean and w._runner.step is step  # compiled once
-        if not want and len(features) == 1:  # where it was needed once, and is no more, nothing is left of it
+        if not want and len(features) == 1:  # a checkpoint without the field sets it back
             begin, before = checkpoint.keep(w), w.hash()
             w.position = 0.1 * x
             w.step(1e-3)

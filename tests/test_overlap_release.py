@@ -1,4 +1,4 @@
-"""Overlap that bears a load is no energy in a shorter substep."""
+"""Overlap that bears a load does not become energy in a shorter substep."""
 
 import numpy as np
 import pytest
@@ -12,14 +12,14 @@ G, R = 10.0, 0.5
 
 
 def lattice(n, dim, height=1.05):
-    """n^dim discs or spheres, hardly off a loose lattice."""
+    """Return n^dim discs or spheres, each at most 0.03 m off a loose lattice."""
     rng = np.random.default_rng(0)
     x = np.stack(np.meshgrid(*[np.arange(n)] * dim, indexing="ij"), axis=-1).reshape(-1, dim)[:, ::-1] * height + R
     return x + rng.uniform(0, 0.03, x.shape)
 
 
 def test_a_column_is_lifted_to_the_overlap_of_the_shorter_substep(world):
-    # The k-th contact from the top overlaps by 2 k g h^2; the top rises by what all of them lose, and nothing moves after it.
+    # The k-th contact from the top overlaps by 2 k g h^2. The top rises by the overlap that they all lose; then nothing moves.
     n = 12
     column = np.stack([np.zeros(n), R + np.arange(n)], axis=1)
     w = world(tv.Particles(column, radius=R), [tv.Gravity(G), tv.Contact(), tv.HalfSpace((0, 1))], substeps=4, precision="f64")
@@ -32,8 +32,8 @@ def test_a_column_is_lifted_to_the_overlap_of_the_shorter_substep(world):
         rise = overlap * (1 - (w.substeps / substeps) ** 2)
         w.substeps = substeps
         w.step(1 / 60)
-        # What is left is 1 % of the energy that overlaps would release, so a tenth of each of them in the mean: of its work on
-        # the column, a tenth of its square root in velocities.
+        # 1 % of the energy that the overlap would release is left. That is on average a tenth of each overlap, and a tenth of the
+        # velocity that its work on the column would bring.
         left = 0.1 * n**0.5 * np.linalg.norm(rise)
         np.testing.assert_allclose(w.position[:, 1] - before, np.append(0, np.cumsum(rise)), atol=left)
         assert np.abs(w.velocity).max() < 0.2 * np.sqrt(G * rise.sum())
@@ -41,7 +41,7 @@ def test_a_column_is_lifted_to_the_overlap_of_the_shorter_substep(world):
 
 
 def pile(world, x, friction, restitution, substeps, **settings):
-    """Discs or spheres in a box without a lid: those in the plane have kernels of what rubs and bounces."""
+    """Return a world with discs or spheres in an open box; those in the plane share kernels with friction and restitution."""
     dim = x.shape[1]
     low, high = np.zeros(dim), x.max(axis=0) + R
     high[1] = np.inf
@@ -53,7 +53,7 @@ def pile(world, x, friction, restitution, substeps, **settings):
 
 @pytest.mark.parametrize("dim, friction, restitution", [(2, 0.0, 0.0), (3, 0.5, 0.0), (2, 0.3, 0.5)])
 def test_a_pile_gains_no_energy_however_the_substep_changes(world, dim, friction, restitution):
-    # Gravity and contacts only: kinetic and potential energy never exceed those of the start.
+    # With gravity and contacts only, kinetic plus potential energy never exceeds that of the start.
     x = lattice(5 if dim == 2 else 3, dim)
     w = pile(world, x, friction, restitution, "auto")
     for turns in ("auto", (1, 4), (3, 4, 5, 6, 7)):
@@ -70,7 +70,7 @@ def test_a_pile_gains_no_energy_however_the_substep_changes(world, dim, friction
 
 
 def test_ropes_in_a_heap_gain_none_either(world):
-    # Rigid links keep their lengths while discs part, so they have nothing to take back.
+    # Rigid links keep their lengths while discs are moved apart, so they pull nothing back.
     ropes = S.join(*[S.rope((0, 0.1 + 0.11 * k), (1, 0.12 + 0.11 * k), 12) for k in range(6)])[0]
     features = [tv.Gravity(G), tv.Distance(ropes.links), tv.Contact(friction=0.3), tv.Box((-0.2, 0), (1.2, np.inf), friction=0.3)]
     w = world(tv.Particles(ropes.position, radius=0.045), features, substeps=2)
@@ -82,7 +82,7 @@ def test_ropes_in_a_heap_gain_none_either(world):
 
 
 def test_what_is_taken_out_does_not_depend_on_lists(world):
-    # A clone lists its neighbours anew; for other paths, which have lists of their own, see test_determinism.py.
+    # A clone builds its own neighbour list. For other paths, which have their own lists, see test_determinism.py.
     w = pile(world, lattice(5, 2), 0.3, 0.0, 2)
     w.run(1.5)
     with w.clone() as twin:
@@ -93,13 +93,13 @@ def test_what_is_taken_out_does_not_depend_on_lists(world):
 
 
 def outline(k, radius, center, turn=0.0):
-    """A regular polygon of k corners."""
+    """Return the corners of a regular polygon with k corners."""
     angle = np.arange(k) * 2 * np.pi / k + turn
     return np.asarray(center) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def stack(n=4):
-    """Squares on a square that does not move, each smaller than the one below and aside of it; and their loops."""
+    """Return corners and loops of n squares on a pinned block, each smaller than and beside the one below."""
     sides = 0.7 * 0.9 ** np.arange(n)
     height = np.concatenate([[0], np.cumsum(sides[:-1])]) + 0.5 * sides + 0.01 * np.arange(1, n + 1)
     x = [
@@ -110,15 +110,15 @@ def stack(n=4):
 
 @pytest.mark.parametrize("hold", ["links", "shapes"])
 def test_a_stack_of_bodies_gains_no_energy(world, hold):
-    # Each contact bears what is above it: it overlaps by some h^2 F, which a substep h' makes a spring with (h / h')^2 of its
-    # energy. Left alone, the stack of links was thrown up by 26 times the energy that it had.
+    # Each contact bears the squares above it: it overlaps by some h^2 F. In a substep h' this is a spring with (h / h')^2 of that
+    # energy. Without the release, it would throw up the stack of links with 26 times the energy that the stack had.
     x, loops = stack()
     pairs = np.concatenate([[(a, b) for a in loop for b in loop if a < b] for loop in loops[:-1]])
     holds = {
         "links": lambda: tv.Distance(pairs),
         "shapes": lambda: tv.ShapeMatch(loops[:-1]),
     }
-    x, n = np.concatenate([x, [[-9.0, 0.0]] * 2]), len(x)  # and a point that hangs on another one, as planks below do
+    x, n = np.concatenate([x, [[-9.0, 0.0]] * 2]), len(x)  # and a point that hangs on another, like the planks below
     features = [tv.Gravity(G), holds[hold](), tv.Polygons(loops, friction=0.5), tv.Distance([[n, n + 1]], rest=0.0)]
     start = tv.Particles(x, mass=np.append(np.ones(n + 1), 0.1), pinned=[*loops[-1], n])
     w = world(start, features, substeps=4, precision="f64")
@@ -128,14 +128,15 @@ def test_a_stack_of_bodies_gains_no_energy(world, hold):
         for frame in range(90):
             w.substeps = turns if turns == "auto" else turns[frame // 9 % 2]
             assert w.step(1 / 60).energy <= energy * (1 + 1e-3), (turns, frame)
-        # At rest it is lowered by some h^2 F, and lifted again: at 64 substeps by nothing to speak of.
+        # At rest the stack is lowered by some h^2 F. More substeps lift it again: at 64 hardly anything is left.
         if turns == (4, 64):
             assert w.last.energy == pytest.approx(G * (x[: n - 4, 1] - 0.01 * (1 + np.arange(16) // 4)).sum(), rel=5e-3)
 
 
 @pytest.mark.parametrize("compliance", [0.0, 1e-6])
 def test_a_cluster_on_a_floor_gains_none(world, compliance):
-    # A floor leaves a corner where it is, off the shape of its cluster: 33 times the energy of the start, when that sprang back.
+    # A floor leaves a corner where it is, off the shape of its cluster. If that sprang back, it would bring 33 times the energy
+    # of the start.
     x = outline(5, 0.4, (0.0, 0.6), 0.3)
     features = [tv.Gravity(G), tv.ShapeMatch([range(5)], compliance=compliance), tv.HalfSpace((0, 1), friction=0.3)]
     w = world(tv.Particles(x), features, substeps=1)
@@ -146,8 +147,8 @@ def test_a_cluster_on_a_floor_gains_none(world, compliance):
 
 
 def test_gradients_of_candidates():
-    # By central differences: a square on a hexagon, of which it has pushed two corners, and discs at a corner and beside an edge.
-    # A corner that was pushed over one edge is over that one, although another one is nearer.
+    # By central differences: a square on a hexagon, which has pushed two of its corners, and discs at a corner and beside an
+    # edge. A corner that was pushed over one edge stays with that edge, although another edge is nearer.
     rng = np.random.default_rng(2)
     x = np.vstack([outline(6, 1.0, (0, 0)), outline(4, 0.5, (0.0, 1.2), 0.8), [(-1.05, 0.0), (0.9, 0.55)]])
     x += 1e-3 * rng.standard_normal(x.shape)
@@ -170,13 +171,13 @@ def test_gradients_of_candidates():
     way, eps = rng.standard_normal(x.shape), 1e-6
     slope = (candidates.at(x + eps * way)[0] - candidates.at(x - eps * way)[0]) / (2 * eps)
     np.testing.assert_allclose(-slope, (gradient * way[candidates.who]).sum(axis=(1, 2)), atol=1e-8)
-    assert (candidates.at(x)[0] > 0).sum() <= 4  # none comes in over an edge that it was behind
+    assert (candidates.at(x)[0] > 0).sum() <= 4  # no corner comes in over an edge that it was behind
 
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_moves_of_whole_bodies(world, dim):
-    # The projection on rigid motions in the metric of the masses: itself when done twice, symmetric in that metric, and momentum
-    # and angular momentum as before. A body is in its shape wherever it is.
+    # The projection on rigid motions in the metric of the masses is idempotent and symmetric in that metric. It keeps momentum
+    # and angular momentum. A body that is moved as a whole is in its shape.
     rng = np.random.default_rng(dim)
     x, mass = rng.standard_normal((9, dim)), rng.uniform(0.5, 2, 9)
     w = world(tv.Particles(x, mass=mass), [tv.ShapeMatch([range(5), range(5, 8)])], precision="f64")
@@ -200,8 +201,9 @@ def test_moves_of_whole_bodies(world, dim):
 @pytest.mark.parametrize("hold", ["links", "shapes"])
 def test_planks_on_a_hinge_go_where_their_load_needs_them(world, hold):
     # Two planks between two pins, hinged at the same height by a link of length 0, with a box on them, at rest at 8 substeps. The
-    # hinge gapes by 15 mm, as contacts and links hold a load by what they leave, D h^2 F. With 256 it is lifted, by 3.9 J, and
-    # nothing moves after it: contacts and links have to go there together, and what is left of them, C^2 / (2 D h^2), was 1500 J.
+    # hinge gapes by 15 mm, because contacts and links bear a load F by a violation D h^2 F. 256 substeps lift it, which takes
+    # 3.9 J, and then nothing moves. Contacts and links have to move together: otherwise what is left of their violations,
+    # C^2 / (2 D h^2), is 1500 J.
     corners = []
     for a, b in (((0.0, 0.0), (1.8, -0.35)), ((1.8, -0.35), (3.6, 0.0))):
         a, b = np.array(a), np.array(b)
@@ -232,13 +234,14 @@ def test_planks_on_a_hinge_go_where_their_load_needs_them(world, hold):
 
 
 def test_what_is_lifted_does_not_end_inside_of_what_was_far(world):
-    # A bob of 20 kg on a rope, at rest 0.7 m lower at 2 substeps than at 20, which lift it by m g 0.7 = 144 J; where it comes to
-    # a bead is pinned, which was on no list of neighbours. It ended inside of that, with up to 3000 J.
+    # A bob of 20 kg on a rope rests 0.7 m lower at 2 substeps than at 20, which lift it by m g 0.7 = 144 J. A bead, on no
+    # neighbour list of the bob, is pinned where the bob ends up. The bob must not end inside of the bead, which would bring up to
+    # 3000 J.
     n = 8
     rope = np.stack([np.zeros(n), 3 - 0.2 * np.arange(n)], axis=1)
     told = []
     for bead in ((5.0, 5.0), (0.004, 1.6)):
-        beside = [(9.0, 9.0), (9.0, 9.019)]  # overlap, as the bead and the bob may: the same kernels for both
+        beside = [(9.0, 9.0), (9.0, 9.019)]  # these overlap, as the bead and the bob may: both cases have the same kernels
         mass = [0.5] * (n - 1) + [20.0, 1.0, 1e-6, 1e-6]
         start = tv.Particles([*rope, bead, *beside], radius=0.01, mass=mass, pinned=[0, n, n + 1])
         links = tv.Distance(np.stack([np.arange(n - 1), np.arange(1, n)], axis=1))
@@ -252,8 +255,9 @@ def test_what_is_lifted_does_not_end_inside_of_what_was_far(world):
 
 
 def test_a_bridge_under_a_cart_gains_no_energy(world):
-    # Under "auto": a cart falls onto a truss whose links Jacobi holds. What links are to take back pushes the truss into wheels,
-    # so both have to move together; where they did not, the frame after next had twice the energy of the first, and no flag.
+    # Under "auto" a cart falls onto a truss whose links Jacobi holds. Removing the violation of links pushes the truss into the
+    # wheels, so links and contacts have to move together. Otherwise the frame after next has twice the energy of the first,
+    # without a flag.
     truss = tv.shapes.bridge((0, 0), (4, 0), panels=12, height=0.4)
     n = len(truss.position)
     x = np.concatenate([truss.position, [[0.6, 0.75], [1.0, 0.75], [0.8, 1.0]]])
@@ -273,8 +277,9 @@ def test_a_bridge_under_a_cart_gains_no_energy(world):
 
 
 def test_slow_motion_brings_no_energy_into_soft_bodies(world):
-    # Three balloons on each other, at rest; then frames are a tenth as long. Links and contacts moved together only where there
-    # were more substeps, so 0.4 J came of nothing here, and 4400 J at 1/100 of the frame with ten times the substeps.
+    # Three balloons rest on each other; then frames get ten times shorter. Links and contacts move together here, too, not only
+    # where there are more substeps. Otherwise 0.4 J come from nowhere, and 4400 J at 1/100 of the frame with ten times the
+    # substeps.
     angle = np.arange(24) * 2 * np.pi / 24
     x = np.concatenate(
         [[(0.15 * (k % 2), 0.35 + 0.65 * k)] + 0.3 * np.stack([np.cos(angle), np.sin(angle)], 1) for k in range(3)]
@@ -287,5 +292,5 @@ def test_slow_motion_brings_no_energy_into_soft_bodies(world):
     for dt, substeps in ((1 / 600, 8), (1 / 6000, 80)):
         short = w.clone(substeps=substeps)
         short.step(dt)
-        assert tv.measure.kinetic_energy(short) < 1e-3  # measured: 2e-5; 0.4 and 4400 before
+        assert tv.measure.kinetic_energy(short) < 1e-3  # measured: 2e-5; 0.4 and 4400 if links and contacts do not move together
         short.close()

@@ -1,4 +1,4 @@
-"""What a Recorder draws on request, what of one's own it takes along, and how it frames a run; and what notebooks show."""
+"""What a Recorder draws on request, which quantities of users it stores, how it frames a run; and what notebooks show."""
 
 import re
 import subprocess
@@ -19,14 +19,14 @@ pytestmark = pytest.mark.usefixtures("read_here")
 
 
 def stack(n=4):
-    """Discs of 1 kg and 10 cm one on the other, touching."""
+    """Return a world with a column of touching discs of 1 kg and 10 cm radius."""
     x = np.stack([np.zeros(n), 0.1 + 0.2 * np.arange(n)], axis=1)
     features = [tv.Gravity(9.81), tv.Contact(), tv.Box((-0.1, 0.0), (0.1, 2.0))]
     return tv.World(tv.Particles(x, mass=1.0, radius=0.1), features, substeps=20)
 
 
 def column(path, entity, name):
-    """The values of a component in all rows of an entity, in the order of frames."""
+    """Return the values of a component in all rows of an entity, in the order of frames."""
     found = read(path, f"/{entity}", name)
     return [found[k] for k in sorted(found, key=lambda k: -1 if k is None else k) if found[k] is not None]
 
@@ -99,7 +99,7 @@ def test_wrong_requests_are_refused(tmp_path, call, kind, text):
 
 
 def test_strain_can_be_left_out(tmp_path):
-    # A soft link under a load that draws it to twice its length: red on the scale of strain, or neutral without one.
+    # A load stretches a soft link to twice its length: red on the scale of strain, or neutral without one.
     shades = []
     for strain in (True, False):
         soft = tv.Distance([[0, 1]], 1.0, compliance=1.0)
@@ -116,7 +116,7 @@ def test_strain_can_be_left_out(tmp_path):
 @pytest.mark.parametrize("turn", [0.0, 0.7])
 @pytest.mark.parametrize("shape", ["brick", "hexagon", "triangle"])
 def test_lines_fill_bodies_in_the_plane(shape, turn):
-    # Points within the body are on a line, but for those in sharp corners and at the very middle; and lines end where it does.
+    # Points inside the body are on a line, except in sharp corners and at the very middle; and no line leaves the body.
     x = {
         "brick": np.array([[0.0, 0], [2, 0], [2, 1], [0, 1]]),
         "hexagon": np.stack([np.cos(np.arange(6) * np.pi / 3), np.sin(np.arange(6) * np.pi / 3)], axis=1),
@@ -125,7 +125,7 @@ def test_lines_fill_bodies_in_the_plane(shape, turn):
     world = tv.World(tv.Particles(x), [tv.Polygons([np.arange(len(x))[::-1]])])
     fill = Fill(outlines(world), x, np.zeros((len(x), 3)), np.zeros(0, dtype=np.int64))
     c, s = np.cos(turn), np.sin(turn)
-    there = x @ np.array([[c, s], [-s, c]]) + 5.0  # it has moved since
+    there = x @ np.array([[c, s], [-s, c]]) + 5.0  # the body has moved since
     points, ends = fill.strips(there)
     spread = np.random.default_rng(0).uniform(there.min(axis=0) - 0.3, there.max(axis=0) + 0.3, (4000, 2))
     gap = np.full(len(spread), np.inf)
@@ -140,7 +140,7 @@ def test_lines_fill_bodies_in_the_plane(shape, turn):
 
 
 def distance_to(strip, points):
-    """The distance of points to a line strip."""
+    """Return the distance of each point to a line strip."""
     a, b = strip[:-1], strip[1:]
     t = np.einsum("pij,ij->pi", points[:, None] - a, b - a) / np.maximum(np.einsum("ij,ij->i", b - a, b - a), 1e-30)
     near = a + np.clip(t, 0, 1)[..., None] * (b - a)
@@ -148,7 +148,7 @@ def distance_to(strip, points):
 
 
 def winding(x, points):
-    """Which points are inside of a convex loop."""
+    """Return which points are inside of a convex loop."""
     a, b = x, np.roll(x, -1, axis=0)
     side = (b - a)[:, 0] * (points[:, None] - a)[..., 1] - (b - a)[:, 1] * (points[:, None] - a)[..., 0]
     return (side > 0).all(axis=1)
@@ -156,7 +156,7 @@ def winding(x, points):
 
 @pytest.mark.filterwarnings("ignore:Distance. pairs.3. = .3, 0. is off by 0.16:UserWarning")
 def test_a_body_shows_the_worst_strain_of_its_links(tmp_path):
-    # Of a square of rods one is a tenth too long: the body is red. It is one body, so its diagonal is no line of its own.
+    # One rod of a square is a tenth too long: the body is red. As it is one body, its diagonal is not drawn as a line.
     x = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     rods = tv.Distance([[0, 1], [1, 2], [2, 3], [3, 0], [0, 2]], [1, 1, 1, 1 / 1.2, 2**0.5])
     world = tv.World(tv.Particles(x, pinned=[0, 1, 2, 3]), [rods, tv.Polygons([[0, 1, 2, 3]])])
@@ -169,7 +169,7 @@ def test_a_body_shows_the_worst_strain_of_its_links(tmp_path):
 
 
 def test_a_view_frames_the_whole_run(tmp_path):
-    # A ball is thrown; nothing but its way says what is to be seen.
+    # A ball is thrown: only its path determines the view.
     world = tv.World(tv.Particles([[0.0, 0.0]], velocity=(3.0, 4.0), radius=0.1), [tv.Gravity(9.81)], precision="f64")
     with tv.Recorder(tmp_path / "a.rrd", world) as recorder:
         world.run(1.0, recorder=recorder)
@@ -179,7 +179,7 @@ def test_a_view_frames_the_whole_run(tmp_path):
     (bounds,) = (rows for rows in chunks if rows.schema.metadata[b"rerun:entity_path"] == name)
     ((value,),) = bounds.column("VisualBounds2D:range").to_pylist()
     x, y = value["x_range"], value["y_range"]
-    edge = 0.05 * 3.2  # of the longer side: 3 m and two radii
+    edge = 0.05 * 3.2  # 5 % of the longer side: 3 m and two radii
     np.testing.assert_allclose(x, [-0.1 - edge, 3.1 + edge], rtol=1e-6)
     np.testing.assert_allclose(y, [-(4.0**2 / 2 / 9.81) - 0.1 - edge, 9.81 / 2 - 4.0 + 0.1 + edge], atol=2e-3)
 

@@ -1,4 +1,4 @@
-"""What installing it brings: a version, public names, a command, types, and pages' calls that type checkers accept."""
+"""What an installation brings: a version, public names, a command, types, and calls on pages that type checkers accept."""
 
 import json
 import pathlib
@@ -33,7 +33,7 @@ def test_demos_are_listed_and_found(capsys):
         len(line.split()) > 3 for line in lines[: len(names)]
     )
     assert all(run.find(name) == ROOT / "demos" / f"{name}.py" for name in names)
-    # All of them are in the gallery, and in the wheel.
+    # All demos are in the gallery and in the wheel.
     gallery = (ROOT / "demos/README.md").read_text()
     assert all(f"]({name}.py)" in gallery for name in names)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -46,20 +46,20 @@ def test_completion_shows_what_is_public():
 
 
 def test_every_extra_is_told_of():
-    # The README names each extra as pip takes it, or the page of its folder does.
+    # The README or the page of its folder names each extra as pip takes it.
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     text = "".join((ROOT / page).read_text() for page in PAGES)
     assert not [name for name in extras if f"[{name}]" not in text and f"`{name}`" not in text]
 
 
 def test_type_checkers_accept_what_the_pages_show(tmp_path):
-    # Every call on the pages, and those of documented_calls.py; the demos are checked with the package.
+    # Every call on the pages, and the calls in documented_calls.py; the demos are checked with the package.
     assert (ROOT / "tiverlet/py.typed").is_file()
     (tmp_path / "calls.py").write_text((pathlib.Path(__file__).parent / "documented_calls.py").read_text())
     for k, page in enumerate(page for page in PAGES if blocks(page)):
         (tmp_path / f"page_{k}.py").write_text("\n\n".join(blocks(page)))
     settings = {"include": ["."], "extraPaths": [str(ROOT)], "typeCheckingMode": "basic", "pythonVersion": "3.11"}
-    # What is in kernels is Taichi's language, and its package, which has no types, takes half of the time to go through.
+    # Kernels are in Taichi's language. Its package has no types, and analysing it takes half of the time.
     settings |= {"useLibraryCodeForTypes": False}
     settings |= {"reportIndexIssue": False, "reportOperatorIssue": False, "reportInvalidTypeForm": False}
     (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))

@@ -1,4 +1,4 @@
-"""Forces between particles: closed forms, momentum, brute force, bits, lists that grow."""
+"""Forces between particles: closed forms, momentum, brute force, bits, and lists that grow."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 import tiverlet as tv
 from tiverlet.device import ti
 
-R = 0.3  # [m], where the short force ends
+R = 0.3  # radius at which the short force ends [m]
 
 
 @ti.func
@@ -21,7 +21,7 @@ def newton_energy(r):
 
 @ti.func
 def short(r):
-    """Repels, and ends smoothly at R: F = 40 (1 - |r| / R)^2 r / |r|."""
+    """Return a repulsion that ends smoothly at R: F = 40 (1 - |r| / R)^2 r / |r|."""
     s = r.norm()
     return 40.0 * (1.0 - s / R) ** 2 * r / s
 
@@ -33,12 +33,12 @@ def short_energy(r):
 
 @ti.func
 def lopsided(r, i, j):
-    """Not odd in r, and other for other pairs: what the force on j is must follow from that on i."""
+    """Return a force that is not odd in r and differs between pairs: the force on j must follow from the force on i."""
     return (i + 2 * j + 1) * (0.01 * r + 0.001 * r.dot(r))
 
 
 def pairs_by_hand(x, function):
-    """The forces on all particles by function(r, i, j) with i < j, (n, dim)."""
+    """Return the forces on all particles by function(r, i, j) with i < j, (n, dim)."""
     out = np.zeros_like(x)
     for i in range(len(x)):
         for j in range(i + 1, len(x)):
@@ -49,7 +49,7 @@ def pairs_by_hand(x, function):
 
 
 def crowd(n=60, dim=2, precision="f64", seed=0, features=(), **kwargs):
-    """Particles of different masses at random in a unit square or cube, with the short force."""
+    """Return a world with random particles of different masses in a unit square or cube, with the short force."""
     rng = np.random.default_rng(seed)
     x, v = rng.uniform(0, 1, (n, dim)), rng.normal(0, 0.2, (n, dim))
     force = tv.PairForce(short, R, potential=short_energy)
@@ -57,7 +57,10 @@ def crowd(n=60, dim=2, precision="f64", seed=0, features=(), **kwargs):
 
 
 def orbit(substeps, order=2, radius=None):
-    """Two bodies of mass 1 around each other, 1 m apart: F = 1, so omega^2 / 2 = 1. The error after one turn [m]."""
+    """Return the errors of position [m] and velocity [m/s] after one turn of two bodies of mass 1 around each other.
+
+    They are 1 m apart: F = 1, so omega^2 / 2 = 1.
+    """
     omega = 2**0.5
     start = np.array([[0.5, 0.0], [-0.5, 0.0]])
     particles = tv.Particles(start, velocity=[[0, 0.5 * omega], [0, -0.5 * omega]])
@@ -74,7 +77,7 @@ def orbit(substeps, order=2, radius=None):
 def test_two_bodies_come_round_with_an_error_of_second_order(radius):
     errors = np.array([orbit(substeps, radius=radius) for substeps in (10, 20)])
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.02)
-    assert errors[1].max() < 4e-4  # the phase: (omega h)^2 / 24 of a turn
+    assert errors[1].max() < 4e-4  # phase error: (omega h)^2 / 24 of a turn
 
 
 def test_orders_above_two_hold():
@@ -100,7 +103,7 @@ def test_accelerations_are_those_of_all_pairs(dim, precision):
 
 @pytest.mark.parametrize("radius", [None, 0.4])
 def test_momentum_is_kept_whatever_the_function(radius):
-    """Each pair is worked out once for both, so forces are opposite to the last bit, and sum m v stays to rounding."""
+    """Forces on a pair are computed once for both particles: opposite to the last bit, so sum m v is constant to rounding."""
     rng = np.random.default_rng(1)
     p = tv.Particles(rng.uniform(0, 1, (40, 2)), velocity=rng.normal(0, 1, (40, 2)), mass=rng.uniform(0.5, 2, 40))
     world = tv.World(p, [tv.PairForce(lopsided, radius)], substeps=4, precision="f64")
@@ -111,8 +114,7 @@ def test_momentum_is_kept_whatever_the_function(radius):
 
 
 def test_energy_stays_and_lists_grow():
-    """A crowd that keeps its energy to order h^2, and finds all of its pairs when it is drawn together to many times as many; by
-    a team of threads."""
+    """Energy is constant to order h^2; and all pairs are found after a contraction to many times as many, by a thread team."""
     world = crowd(n=400, substeps=20, path="parallel")
     start = world.step(0.0 + 1e-4).energy
     for _ in range(60):
@@ -131,7 +133,7 @@ def test_energy_stays_and_lists_grow():
 
 
 def test_bits_are_the_same_after_a_replay(world, tmp_path):
-    """With contacts beside it, which have a list of their own; recorded, replayed, cloned. For paths see test_determinism.py."""
+    """Contacts have their own list beside it; recorded, replayed, cloned. For paths see test_determinism.py."""
     rng = np.random.default_rng(2)
     p = tv.Particles(rng.uniform(0, 2.3, (900, 2)), radius=0.02, velocity=rng.normal(0, 1, (900, 2)))
     features = [tv.PairForce(short, 0.1), tv.Contact(), tv.Box((0, 0), (2.3, 2.3)), tv.Gravity()]
@@ -147,8 +149,8 @@ def test_bits_are_the_same_after_a_replay(world, tmp_path):
 
 
 def test_hashes_know_nothing_of_who_is_listed(world, tmp_path):
-    # A pair that is listed and too far apart to act left -0 where one that is not listed leaves 0: worlds that went on from a
-    # frame in the middle of a recording had other hashes, and were refused.
+    # A listed pair that is too far apart to act must leave 0, as an unlisted pair does, not -0. With -0, worlds that continue
+    # from a frame in the middle of a recording have other hashes and are refused.
     rng = np.random.default_rng(0)
     p = tv.Particles(rng.uniform(0, 3, (8, 2)), velocity=rng.normal(0, 1.5, (8, 2)), radius=0.03)
     w = world(p, [tv.Periodic((0, 0), (3, 3)), tv.Contact(restitution=1.0), tv.PairForce(short, 0.3)], substeps=4)
@@ -160,7 +162,7 @@ def test_hashes_know_nothing_of_who_is_listed(world, tmp_path):
 
 
 def test_particles_come_and_go():
-    """Frames that are undone and made again with more substeps; two that come are pulled from where they are."""
+    """Frames are undone and repeated with more substeps; two added particles are pulled from where they are."""
     world = crowd(substeps="auto")
     world.run(0.1)
     velocity = world.velocity
@@ -175,7 +177,7 @@ def test_particles_come_and_go():
 
 
 def test_what_is_too_stiff_for_the_substep_is_named():
-    """Two particles of 1 kg on a spring of k = 4e4 N/m: omega = sqrt(2 k) = 283 / s, and h = 1 / 120 s is too long."""
+    """Two particles of 1 kg on a spring of k = 4e4 N/m: omega = sqrt(2 k) = 283 / s, so h = 1 / 120 s is too long."""
 
     @ti.func
     def spring(r):

@@ -1,4 +1,4 @@
-"""The list of near pairs: all are there, by brute force, and nothing depends on when and where it is built."""
+"""The neighbour list: it holds all pairs that brute force finds, and no result depends on when and where it is built."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from .conftest import CROSSOVER
 
 
 def roomy(w: tv.World, entries: int) -> None:
-    """Give the list of near pairs room before anything compiles; a list that grows makes all compile anew."""
+    """Make room in the neighbour list before compilation; when a list grows, everything compiles again."""
     w._runner.search.list.allocate(entries)
     w._runner.renew()
 
@@ -23,8 +23,10 @@ CELL = (2 * 0.15 + SKIN) * (1 + 2.0**-12)  # of particles of radius 0.15
 
 
 def clouds():
-    """By name: radii, and clouds of as many particles; with how many buckets they fill, and how many are in one at most, where
-    that is the point."""
+    """Yield names, radii, and a list of clouds (positions, filled) of as many particles.
+
+    `filled`, where it matters: the number of buckets that they fill, and the most particles in one.
+    """
     rng = np.random.default_rng(7)
     n = 600
     k = np.stack(np.divmod(np.arange(n), 24), axis=1) - 12
@@ -39,7 +41,7 @@ def clouds():
             (rng.uniform(0, 0.1, (n, 2)), (1, n)),  # rows 32 to 34: all in one cell
             (far + rng.uniform(0.1, 0.9, (n, 2)) * CELL, (1, n)),  # all in one bucket
             ((k + 0.5) * CELL / 2, (13 * 12, 4)),  # row 30: cells are as wide at the origin as elsewhere
-            (k * CELL / 2, None),  # on their borders
+            (k * CELL / 2, None),  # on the borders of cells
         ],
     )  # fmt: skip
     outliers = [[1e5, -1e5, 3e5], [1e5, -1e5, 3e5 + 0.3]]
@@ -49,16 +51,16 @@ def clouds():
         rng.uniform(-900, -895, (n, 3)),
     ]
     yield "space", np.full(n, 0.15), [(x, None) for x in space]
-    # Row 25: radii from 1 to 1000 in one scene, large ones among crowds of small ones and points.
-    # (On the path of a GPU they are in test_grid.py.)
+    # Row 25: radii from 1 to 1000 in one scene: large particles among crowds of small ones and points.
+    # (For the launched path see test_grid.py.)
     wide = np.concatenate([10.0 ** rng.uniform(-3, 0, 750), rng.choice([0.0, 0.02, 0.1, 1.0], 230)])
     yield "radii 1:1000", wide, [(rng.uniform(-3, 3, (980, 2)), None)]
     yield "radii 1:1000 in space", wide, [(rng.uniform(-1.5, 1.5, (980, 3)), None), (rng.uniform(-900, -890, (980, 3)), None)]
     yield "two", np.full(2, 0.3), [([[0.0, 0], [0.5, 0]], None), ([[-7.0, 0], [-7, 0.5]], None)]
 
 
-# Of a team, what others show: one level in the plane, many in space; in the plane see test_many_particles. Phase by phase see
-# test_grid.py.
+# Clouds that a path leaves out, because other tests cover them. A team takes one level in the plane and many in space; for many
+# in the plane see test_many_particles. For the launched path see test_grid.py.
 LEFT_OUT = {
     "fused": (),
     "parallel": ("space", "radii 1:1000"),
@@ -84,12 +86,13 @@ def test_pairs_equal_brute_force(world, path, name, radius, several):
         pairs = pairs[pairs[:, 0] < pairs[:, 1]]
         np.testing.assert_array_equal(pairs, want)
         found = w._runner.memory.read(w._runner.search.list.number)
-        np.testing.assert_array_equal(found, np.bincount(pairs.ravel(), minlength=len(position)))  # each by both
+        # both particles count each pair
+        np.testing.assert_array_equal(found, np.bincount(pairs.ravel(), minlength=len(position)))
         if filled:
             in_bucket = np.diff(w._runner.search.cells.edge.to_numpy()[: w._runner.search.cells.buckets + 2])
             assert ((in_bucket > 0).sum(), in_bucket.max()) == filled
         if path == "parallel" and name != "plane":
-            continue  # frames of a team are compiled for one cloud; what they come to is summed up alike for all
+            continue  # a team's frames are compiled for one cloud; diagnostics sum all clouds in one way
         w._runner.look()
         touching = w._runner.report()
         reach, *extent = w._runner.diagnostics.report.figures[[REACH, *range(EXTENT, EXTENT + w.particles.dim)]]
@@ -119,8 +122,9 @@ def test_many_particles(world, monkeypatch, briefly):
 
 
 def test_neither_room_nor_skin_nor_path_changes_a_bit(world):
-    # Row 35: the hash with room for one entry of the list is that with room for all, and no contact is missing. Nor does it
-    # matter when lists are built: with the least skin in nearly all substeps. Phase by phase, see test_grid.py.
+    # Row 35: the hash with room for one entry of the list equals the hash with room for all, and no contact is missing. Nor does
+    # it matter when lists are built: the smallest skin rebuilds them in nearly all substeps. For the launched path see
+    # test_grid.py.
     position = np.random.default_rng(9).uniform(-1, 1, (200, 2))
     hashes = set()
     for path, ways in (
@@ -141,8 +145,9 @@ def test_neither_room_nor_skin_nor_path_changes_a_bit(world):
 
 
 def test_the_skin_changes_no_bit_of_what_rubs_and_bounces(world):
-    # What comes to overlap at the end of a substep is on the list only if its skin is wide: its slip begins in the next one. Nor
-    # does it of what no longer rubs and bounces: a world that is built anew for another skin keeps kernels with friction of 0.
+    # A pair that begins to overlap at the end of a substep is listed only if the skin is wide: its slip begins in the next
+    # substep. Without friction and restitution the skin changes no bit either: a world rebuilt for another skin keeps kernels
+    # with friction 0.
     rng, k = np.random.default_rng(3), np.arange(200)
     x = np.stack([k % 14 * 0.215, 0.2 + k // 14 * 0.215], axis=1) + rng.uniform(0, 0.005, (200, 2))
     start = tv.Particles(x, velocity=2 * rng.normal(size=(200, 2)), radius=0.08 + 0.02 * tv.golden(k))

@@ -10,19 +10,19 @@ from .conftest import case, order, rerun, rms
 
 
 def cycloid(t, a=0.5):
-    """The curve on which all beads take the same time, lowest at t = 0."""
+    """Return the curve on which all beads take the same time; its lowest point is at t = 0."""
     return np.stack([a * (t + np.sin(t)), -a * (1 + np.cos(t))], axis=-1)
 
 
 def circle(n):
-    """Around the origin from its lowest point, counterclockwise."""
+    """Return n points on the unit circle, counterclockwise from the lowest one."""
     t = 2 * np.pi * np.arange(n) / n
     return np.stack([np.sin(t), -np.cos(t)], axis=1)
 
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_tautochrone(world, precision):
-    # Along a cycloid of radius a the arc length from the bottom is 4 a sin(t / 2), and oscillates with sqrt(g / (4 a)) exactly.
+    # On a cycloid of radius a, the arc length from the bottom is 4 a sin(t / 2) and oscillates with exactly sqrt(g / (4 a)).
     g, a, seconds = 9.81, 0.5, 2.0
     t = np.array([0.2, 0.9, 1.6, 2.3])
     later = 2 * np.arcsin(np.sin(t / 2) * np.cos(np.sqrt(g / (4 * a)) * seconds))
@@ -34,7 +34,7 @@ def test_tautochrone(world, precision):
 
 
 def test_a_bead_on_a_ring_is_a_pendulum(world):
-    # R06b, and ten thousand steps that keep the energy; at the top of the ring, balance.
+    # R06b, and ten thousand substeps that keep the energy; a bead at the top of the ring stays in balance.
     v = case("R06b_pendulum_state")["values"]["90deg_t5"]
     ring = tv.Path([0, 1], circle(96), closed=True)
     w = world(tv.Particles([[1.0, 0], [0, 1]]), [tv.Gravity(9.81), ring], precision="f64")
@@ -47,7 +47,7 @@ def test_a_bead_on_a_ring_is_a_pendulum(world):
 
 
 def test_a_bead_on_a_helix(world):
-    # In 3D: s'' = g sin(slope) along a helix that climbs by that angle; a second bead, flung at the end of the wire, stays there.
+    # In 3D: s'' = g sin(slope) along a helix of that slope. A second bead is flung at the end of the wire and stays there.
     t = np.linspace(0, 8 * np.pi, 400)
     points = np.stack([np.cos(t), -0.25 * t, np.sin(t)], axis=1)
     path = tv.Path([0, 1], points)
@@ -65,7 +65,7 @@ def test_a_bead_on_a_helix(world):
 
 
 def test_driven_along_a_path(world):
-    # At a constant speed around a square with corners, whatever hangs on it; and to given arc lengths, evenly.
+    # At a constant speed around a square with corners, whatever load hangs on the bead; and to given arc lengths, evenly.
     square = [[0, 0], [1, 0], [1, 1], [0, 1]]
     belt = tv.Path([0, 1], square, closed=True, smooth=False, speed=[1.0, -2.0])
     lift = tv.Path([3], [[5, 0], [5, 2]], at=0.5)
@@ -78,7 +78,7 @@ def test_driven_along_a_path(world):
         w.run(0.5)
         s = 0.5 * k
         np.testing.assert_allclose(w.position[:2], belt.place([s % 4, (0.5 - 2 * s) % 4]), atol=1e-10)
-        # Velocities are those of now, not of half a substep ago, when they pointed elsewhere by omega h / 2 = 8e-4.
+        # Velocities belong to the end of the substep. Those of half a substep before point elsewhere by omega h / 2 = 8e-4.
         np.testing.assert_allclose(w.velocity[5], 2.0 * np.array([-np.sin(2 * s), np.cos(2 * s)]), atol=1e-6)
     assert w.position[3] == pytest.approx([5, 0.5])
     lift.at = 1.5
@@ -102,7 +102,7 @@ def test_a_soft_wire_gives_way(world):
 
 
 def test_snapping_to_a_grid(world):
-    # Each axis of each particle is an oscillator about the nearest node; x is left free for the last. Damped, they come to rest.
+    # Each axis of each particle oscillates about the nearest node; the last particle is free along x. Damped, they come to rest.
     x = np.array([[0.1, 0.2], [1.3, -0.7], [2.6, 0.1]])
     k = 50.0
     grid = tv.Snap([0, 1], 1.0, origin=(0.25, 0.0), compliance=1 / k)
@@ -113,7 +113,7 @@ def test_snapping_to_a_grid(world):
     want[2, 0] = 2.6 + 1.5
     errors = [rms(rerun(w, 1.5, substeps=n).position, want) for n in (10, 20, 40)]
     assert 1.9 <= order(errors) <= 2.1 and errors[-1] <= 1e-4
-    # Thrown across many nodes the energy stays where the steps put it; then dampers tidy up.
+    # For particles thrown across many nodes, the energy stays within 2 %. Then dampers bring them to nodes.
     w.velocity = [[20.0, 13.0], [-9.0, 4.0], [0, 8.0]]
     energy = [w.step(1 / 60).energy for _ in range(120)]
     assert np.ptp(energy) <= 0.02 * energy[0]
@@ -123,7 +123,7 @@ def test_snapping_to_a_grid(world):
 
 
 def test_curves():
-    # Splines are of fourth order and arc length is what parametrizes them; polylines pass through their points.
+    # Splines are of fourth order, parametrized by arc length; polylines pass through their points.
     errors = []
     for n in (16, 32, 64):
         c = Curve(circle(n), True, True)
@@ -134,7 +134,7 @@ def test_curves():
     c = Curve(points, False, False)
     np.testing.assert_allclose(c.at([0, 2.5, 5, 5.5, 99]), [[0, 0], [1.5, 2], [3, 4], [3, 4.5], [3, 5]])
     np.testing.assert_allclose(c.nearest(np.array([[1.5 + 0.8, 2 - 0.6]])), 2.5, atol=1e-6)
-    for k in (2, 3, 4):  # few points
+    for k in (2, 3, 4):  # curves of few points
         t = np.arange(k)
         np.testing.assert_allclose(
             Curve(np.stack([t, 2 * t], axis=1), False, True).at([5**0.5 * (k - 1) / 2]), [[(k - 1) / 2, k - 1]]

@@ -14,7 +14,7 @@ DT = 1 / 60
 
 @ti.func
 def soft(r):
-    """Repels, and ends smoothly at 0.5 m: F = 40 (1 - 2 |r|)^2 r / |r|."""
+    """Return a repulsion that ends smoothly at 0.5 m: F = 40 (1 - 2 |r|)^2 r / |r|."""
     s = r.norm()
     return 40.0 * (1.0 - 2.0 * s) ** 2 * r / s
 
@@ -25,12 +25,12 @@ def soft_energy(r):
 
 
 def by_images(a, b, length, axes, offset=0.0):
-    """|a_i - b_j| to the nearest of all images that are near, (len(a), len(b)), one by one."""
+    """Return |a_i - b_j| to the nearest of all images around, computed one by one, (len(a), len(b)) [m]."""
     length = np.asarray(length, dtype=float)
 
     def folded(x):
         x = np.array(x, dtype=float)
-        for k in sorted(axes, reverse=True):  # y before x, which it takes along
+        for k in sorted(axes, reverse=True):  # y before x: a turn along y shifts x
             turns = np.floor(x[:, k] / length[k])
             x[:, k] -= turns * length[k]
             x[:, 0] -= turns * offset * (k == 1)
@@ -47,14 +47,14 @@ def by_images(a, b, length, axes, offset=0.0):
 
 
 def touching(x, radius, length, axes, offset, by=0.0):
-    """Pairs i < j that overlap by more than `by`, by all images."""
+    """Return the pairs i < j that overlap by more than `by` [m], over all images."""
     distance = by_images(x, x, length, axes, offset)
     i, j = np.nonzero(np.triu(radius[:, None] + radius - distance > by, 1))
     return set(zip(i.tolist(), j.tolist(), strict=True))
 
 
 MIXED = (0.3, 0.1, 0.04)
-BOXES = {  # lengths, axes, shear, radii: as many sizes of cells wherever that makes other kernels
+BOXES = {  # lengths, axes, shear, radii; several sizes of cells wherever that makes other kernels
     "2D, two cells and one": ((2.4, 1.3), (0, 1), 0.0, MIXED),
     "2D, more cells than buckets": ((300.0, 160.0), (0, 1), 0.0, MIXED),
     "2D, x alone": ((5.0, 4.0), (0,), 0.0, (0.3,)),
@@ -81,7 +81,7 @@ def test_no_pair_is_missed_whichever_image_is_near(world, name):
     found = 0
     for frame in range(8):
         w.step(DT)
-        listed = set(map(tuple, w._runner.search.list.entries()[0].tolist()))  # that of the frame, as old as it is
+        listed = set(map(tuple, w._runner.search.list.entries()[0].tolist()))  # the frame's list, however old
         there = touching(w.position, radius, length, axes, box.offset, 1e-4)
         assert there <= listed
         found += len(there)
@@ -114,13 +114,13 @@ def test_queries_find_the_nearest_image(world, contact):
     inside = box.wrap(w.position)
     assert (inside >= -1e-12).all() and (inside < length + 1e-12).all()
     np.testing.assert_allclose(w.position - inside, box.away(box.boxes(w.position)), atol=1e-12)
-    # What has exploded is nowhere, and nothing is said of it.
+    # Positions that are not finite have no image, and no warning is issued.
     nowhere = np.array([[np.inf, 1.0], [1.0, -1e300], [np.nan, 0.0]])
     np.testing.assert_array_equal(np.isfinite(box.difference(nowhere, points[:3])).all(axis=1), [False, True, False])
 
 
 def crowd(shift, moved, contact, shear=0.0, n=30, **settings):
-    """Discs, springs and a soft force in a box that is shifted, and particles by whole boxes."""
+    """Return discs, springs and a contact or soft force in a box that begins at `shift`; `moved` adds whole boxes."""
     rng, length = np.random.default_rng(2), np.array([4.0, 3.0])
     x, v = rng.uniform(0, 1, (n, 2)) * length, rng.normal(size=(n, 2))
     boxes = rng.integers(-2, 3, (n, 2)) if moved else np.zeros((n, 2))
@@ -140,7 +140,7 @@ def test_where_the_box_begins_and_which_image_is_followed_changes_nothing(world,
         w.run(0.1)
         return w
 
-    # Until rounding has grown: collisions take it tenfold each.
+    # For a short time only: each collision amplifies rounding tenfold.
     base, shifted, moved = run((0.0, 0.0), False), run((1.7, -2.3), False), run((0.0, 0.0), True)
     d = base.position - base.particles.position
     np.testing.assert_allclose(shifted.position - shifted.particles.position, d, atol=1e-9)
@@ -151,8 +151,8 @@ def test_where_the_box_begins_and_which_image_is_followed_changes_nothing(world,
 
 
 def test_a_collision_across_the_boundary_is_that_with_the_image(world):
-    # Two discs, one at the top and one at the bottom; the other world has the upper one's partner where its image is, a box
-    # higher, faster by shear times the height and further by the strain so far, and no box. They meet after about 0.25 s.
+    # Two discs, one at the top and one at the bottom of the box. The other world has no box, and the second disc is its own image
+    # there, a box higher: faster by shear times that height, and farther by the strain so far. They meet after about 0.25 s.
     length, shear = np.array([5.0, 4.0]), 0.8
     x, v = np.array([[1.0, 3.7], [1.3 - 1.28 * shear, 0.4]]), np.array([[0.2, 0.5], [-0.1, -0.4]])
     contact = {"friction": 0.4, "restitution": 0.6}
@@ -176,8 +176,8 @@ def test_a_collision_across_the_boundary_is_that_with_the_image(world):
 
 
 def test_a_ring_around_the_box_swings_as_a_periodic_chain(world):
-    # m u_j'' = k (u_(j+1) - 2 u_j + u_(j-1)): mode p has omega = 2 sqrt(k / m) sin(pi p / N). Verlet: sin(Omega h / 2) = omega h
-    # / 2, so that with omega h = 0.02 the phase is off by 2e-5 of it. 3 turns.
+    # m u_j'' = k (u_(j+1) - 2 u_j + u_(j-1)): mode p has omega = 2 sqrt(k / m) sin(pi p / N). Verlet:
+    # sin(Omega h / 2) = omega h / 2, so with omega h = 0.02 the relative error of the phase is 2e-5. 3 turns.
     n, p, k, m = 12, 2, 100.0, 0.5
     cells, links = np.arange(n) * 0.25, np.stack([np.arange(n), (np.arange(n) + 1) % n], axis=1)
     u = 1e-3 * np.cos(2 * np.pi * p * np.arange(n) / n)
@@ -194,7 +194,7 @@ def test_a_ring_around_the_box_swings_as_a_periodic_chain(world):
 
 @pytest.mark.parametrize("rigid", [True, False])
 def test_a_closed_chain_with_bends_rests_as_it_was_put(world, rigid):
-    # Straight around the box: all lengths and angles are met, also those across it, so nothing moves but its centre.
+    # A chain straight around the box: all lengths and angles are met, also across the boundary, so only its centre moves.
     n = 16
     links = np.stack([np.arange(n), (np.arange(n) + 1) % n], axis=1)
     bends = np.stack([np.arange(n), (np.arange(n) + 1) % n, (np.arange(n) + 2) % n], axis=1)
@@ -218,7 +218,7 @@ def test_an_elastic_gas_keeps_energy_and_momentum(world):
     w = world(tv.Particles(x, velocity=v, radius=0.28), [tv.Contact(restitution=1.0), box], substeps=10, precision="f64")
     energy, momentum = measure.kinetic_energy(w), measure.momentum(w)
     w.run(1.0)
-    assert (np.abs(w.velocity - v).max(axis=1) > 0.1).mean() > 0.3  # have collided
+    assert (np.abs(w.velocity - v).max(axis=1) > 0.1).mean() > 0.3  # particles have collided
     assert (np.abs(box.boxes(w.position)) > 0).any()
     np.testing.assert_allclose(measure.kinetic_energy(w), energy, rtol=1e-12)
     np.testing.assert_allclose(measure.momentum(w), momentum, atol=1e-11)
@@ -238,7 +238,7 @@ def test_forces_between_images_keep_energy_and_are_those_of_brute_force(world):
     want = (np.where(near, 40 * (1 - 2 * s) ** 2 / np.where(near, s, 1), 0)[..., None] * r).sum(axis=1)
     np.testing.assert_allclose(w._runner.memory.read(force.dev.now)[: len(x)], want, atol=1e-4)  # a substep later
     w.run(1.0)
-    # Order 2: h = 3e-4 s, omega about 15 / s, so (omega h)^2 = 2e-5 of the energy that goes to and fro.
+    # Order 2: h = 3e-4 s and omega is about 15 / s, so the error is (omega h)^2 = 2e-5 of the energy that oscillates.
     np.testing.assert_allclose(w.last.energy, energy, rtol=2e-4)
     np.testing.assert_allclose(measure.momentum(w), momentum, atol=1e-10)
 
@@ -279,7 +279,7 @@ def test_a_shear_is_live_and_survives_whatever_happens_to_the_world(world, tmp_p
 
 
 def strain(w):
-    """How far the first feature of a world, a box, is sheared."""
+    """Return the shear strain of the first feature of a world, a box."""
     return w.features[0].strain
 
 
@@ -289,7 +289,7 @@ def test_many_worlds_have_boxes_of_their_own():
         many.step(DT)
         one.step(DT)
         np.testing.assert_array_equal(many.position[1], one.position)
-        many.set(features[0], shear=[0.5, 1.0, -1.0])  # each its own
+        many.set(features[0], shear=[0.5, 1.0, -1.0])  # one shear for each world
         many.step(DT)
         many.step(DT)
         np.testing.assert_allclose(many.each(strain), np.array([1.5, 2.5, -1.5]) * DT, rtol=1e-12)
@@ -301,19 +301,20 @@ def test_many_worlds_have_boxes_of_their_own():
     lambda at: tv.Polygon(at + np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]), restitution=1.0),
 ])  # fmt: skip
 def test_obstacles_meet_images(world, make):
-    # A disc of radius 0.1 flies around the box, 4 m long, against an obstacle half a metre wide: there and back.
+    # A disc of radius 0.1 flies around the box, 4 m long, until it meets an obstacle that reaches 0.5 m from its centre, and
+    # back.
     w = world(
         tv.Particles([[3.0, 1.0], [11.0, -1.0]], velocity=[(2.0, 0.0), (2.0, 0.0)], radius=0.1),
         [tv.Periodic((0, 0), (4, 2)), make(np.array([1.5, 1.0]))], precision="f64",
     )  # fmt: skip
     w.run(2.0)
-    # To the obstacle at 5.5 - 0.6 = 4.9 are 1.9 m of 4; back by 2.1 m.
+    # From x = 3 m it flies 1.9 m of its 4 m to the image of the obstacle, at 5.5 - 0.6 = 4.9 m, and 2.1 m back.
     np.testing.assert_allclose(w.position, [[2.8, 1.0], [10.8, -1.0]], atol=1e-9)
     np.testing.assert_allclose(w.velocity, [[-2, 0], [-2, 0]], atol=1e-9)
 
 
 def test_a_floor_under_a_periodic_pile(world):
-    # Walls along other axes: what slides out on the right comes in on the left, and rests on the floor.
+    # Walls along other axes: a particle that slides out on the right comes in on the left, and stays on the floor.
     x = np.stack([np.arange(8) * 0.5 + 0.25, 0.2 + 0.01 * np.arange(8)], axis=1)
     box = tv.Periodic((0, -9), (4, 9), (0,))
     w = world(
@@ -366,7 +367,7 @@ def test_what_does_not_fit_is_refused(features, words):
 
 
 def test_lengths_are_refused_while_it_runs(world):
-    # From half a box on there is another image that is nearer, and a link that nothing can meet: 1 m in a box of 1.5 m.
+    # From half a box on, another image is nearer, so that nothing can meet the link: 1 m in a box of 1.5 m.
     links, ropes = tv.Distance([[0, 1]], 0.5), tv.Rope([[0, 1]], 0.7)
     box = tv.Periodic((0, 0), (1.5, 4))
     w = world(tv.Particles([[0.1, 0.1], [0.6, 0.1]]), [box, links, ropes], solver=tv.Jacobi())
@@ -389,7 +390,7 @@ def test_none_and_one(world, count):
 
 
 def test_f32_with_low_words_is_as_good_a_hundred_boxes_away(world):
-    # Particles a hundred boxes from each other: f32 knows their places to 3e-5 m, with low words to 1e-9 m.
+    # Particles a hundred boxes from each other: f32 resolves their positions to 3e-5 m, with low words to 1e-9 m.
     x = np.stack(np.meshgrid(np.arange(5), np.arange(5)), -1).reshape(-1, 2) * 0.8 + 0.4
     rng = np.random.default_rng(4)
     v, away = rng.normal(size=x.shape), 400.0 * rng.integers(-1, 2, x.shape)
@@ -401,12 +402,12 @@ def test_f32_with_low_words_is_as_good_a_hundred_boxes_away(world):
         )  # fmt: skip
         w.run(0.3)
         found.append(w.position - (start - x))
-    assert np.abs(found[0] - x - v * 0.3).max() > 0.1  # have collided
+    assert np.abs(found[0] - x - v * 0.3).max() > 0.1  # particles have collided
     np.testing.assert_allclose(found[1], found[0], atol=2e-6)
 
 
 def test_soft_bodies_pass_the_boundary_as_if_there_were_none(world):
-    # Given whole, members of a body are always nearest to each other as they are. In the larger box they never come to the end.
+    # Members of a body that is given whole are the nearest images of each other. In the larger box they never reach the boundary.
     square = np.array([[0.0, 0], [0.6, 0], [0.6, 0.6], [0, 0.6]])
     found = []
     for size in (2, 200):

@@ -1,4 +1,4 @@
-"""Particles that are held at targets, driven or by springs."""
+"""Particles that are held at targets, rigidly or by springs."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def test_driven_pins_follow_their_targets(world):
         hand.target = [[0.01 * (k + 1), 0.0]]
         w.step(1 / 60)
         np.testing.assert_allclose(w.position[0], [0.01 * (k + 1), 0.0], atol=1e-15)
-    # Row 69: ten metres in one frame. It stays bounded, the link recovers, and the work done is reported.
+    # Row 69: ten metres in one frame. Motion stays bounded, the link recovers, and the work done is reported.
     hand.target = (10.0, 0.0)
     report = w.step(1 / 60)
     assert report.energy_change > 1e3 and np.isfinite(w.position).all()
@@ -31,7 +31,7 @@ def test_driven_pins_follow_their_targets(world):
 
 
 def test_soft_pins_are_springs(world):
-    # m x'' = -k (x - target): like the oscillator, along both axes; and it follows a moving target at the static distance.
+    # m x'' = -k (x - target): an oscillator along both axes; and under gravity the particle rests at the static distance.
     k = 100.0
     w = world(
         tv.Particles([[0.5, 0.25]]),
@@ -46,15 +46,18 @@ def test_soft_pins_are_springs(world):
     w = world(tv.Particles([[0.0, 0.0]]), [tv.Gravity(9.81), hand], iterations=4, precision="f64")
     w.run(3.0)
     np.testing.assert_allclose(w.position[0], [0, -9.81 / k], atol=1e-7)
-    np.testing.assert_allclose(w.velocity[0], 0.0, atol=1e-9)  # else half of what gravity gives in a substep
+    np.testing.assert_allclose(w.velocity[0], 0.0, atol=1e-9)  # otherwise half of what gravity adds in a substep
 
 
-KINDS = [(0.0, "f64")]  # of pins, and of worlds; for springs, and f32, see test_edit_in_place.py
+KINDS = [(0.0, "f64")]  # compliance of the pin and precision of the world; for springs and f32 see test_edit_in_place.py
 
 
 def hung(world, pin, gate, precision):
-    """Six discs in a row, on springs, and above a gate. What a spring gives to a velocity depends on who is held at its ends, and
-    on the way from one pin to another there is a moment at which nobody is: so none is where what drives is compared."""
+    """Return a world with six discs in a row, linked by springs, above a gate.
+
+    What a spring adds to a velocity depends on which of its ends are held. Between two pins there is a moment at which none is.
+    So particles of a driving pin have no springs where positions are compared.
+    """
     x = np.stack([np.arange(6) * 0.3, np.zeros(6)], axis=1)
     links = tv.Distance([[4, 5]] if pin.drives else [[0, 1], [1, 2], [2, 3], [3, 4], [4, 5]], compliance=1e-4)
     features, solver = [tv.Gravity(9.81), links, tv.Contact(), gate, pin], tv.Jacobi(0.5)
@@ -64,7 +67,7 @@ def hung(world, pin, gate, precision):
 @pytest.mark.skipif(not patched or ARCH != "cpu", reason="every world has kernels of its own there")
 @pytest.mark.parametrize(("compliance", "precision"), KINDS)
 def test_a_pin_that_takes_other_particles_is_as_a_new_one(world, compliance, precision):
-    # To the bit, and nothing is compiled. What it held goes on freely.
+    # Bit for bit, and nothing is compiled. Particles that the pin no longer holds move freely.
     def scene():
         pin = tv.Pin([1, 3], [(0.0, 1.0), (1.0, 1.0)], compliance=compliance)
         w = hung(world, pin, tv.HalfSpace((0, 1), -99.0, active=True), precision)

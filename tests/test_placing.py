@@ -1,4 +1,4 @@
-"""What is placed off its rigid constraints goes to where these are met, and brings no energy with it."""
+"""Bodies placed off their rigid constraints are moved to where these are met, without a gain of energy."""
 
 import numpy as np
 import pytest
@@ -11,15 +11,15 @@ N, M, G = 20, 0.05, 9.81
 
 
 def row(n: int = N) -> np.ndarray:
-    """Particles 1 / n apart."""
+    """Return n + 1 particles, 1 / n apart."""
     return np.stack([np.arange(n + 1) / n, np.zeros(n + 1)], axis=1)
 
 
 @pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Direct()], ids=str)
 def test_links_of_other_lengths_bring_no_energy(world, solver):
-    # Lengths 17 % too short, 0.05 % too short and 10 % too long: a pass would make C^2 / (2 W h^2) of it, up to 1 800 J at 200
-    # substeps. From one pin the row whips, with SHAKE's energy, that of the motion but for h^2: 8e-4 J at 20 substeps. Between
-    # two pins, too long by a tenth, it has no direction to give way in, and bulges first.
+    # Rest lengths 17 % too short, 0.05 % too short and 10 % too long. A pass would turn such a violation into C^2 / (2 W h^2), up
+    # to 1 800 J at 200 substeps. From one pin the row whips with the energy error of SHAKE, of order h^2: 8e-4 J at 20 substeps.
+    # Between two pins, a tenth too long, it has no direction to give way in, and bulges first.
     for pins, factors in (([0], (0.83, 0.9995, 1.1)), ([0, N], (1.1,))):
         links = tv.Distance(line(N), 1 / N)
         w = world(tv.Particles(row(), mass=M, pinned=pins), [tv.Gravity(G), links], solver=solver, precision="f64")
@@ -44,7 +44,7 @@ def test_small_violations_go_without_a_word(world):
 
 
 def test_loads_that_passes_bear_stay(world):
-    # Jacobi's one pass holds what hangs by violations of D F h^2: who assigns the same positions again finds it as it hung.
+    # One pass of Jacobi holds a hanging chain by violations D F h^2. Assigning the same positions again must not remove them.
     x = row(8)[:, ::-1] * [1, -1]
     w = world(
         tv.Particles(x, mass=M, pinned=[0]), [tv.Gravity(G), tv.Drag(20.0), tv.Distance(line(8))], solver=tv.Jacobi(),
@@ -59,8 +59,9 @@ def test_loads_that_passes_bear_stay(world):
 
 @pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Direct()], ids=str)
 def test_links_that_come_later_bring_no_energy(world, solver):
-    # A tie that is a fifth too short comes to a rope that hangs: the rope bulges there and is lifted, and nothing flies: in a
-    # frame it falls to 0.16 m/s, where a pass made velocities of 0.05 m / h = 60 m/s at 200 substeps, and 84 J.
+    # A tie that is a fifth too short is added to a hanging rope: the rope bulges there and is lifted, and nothing flies off. In a
+    # frame it falls to 0.16 m/s. A pass would move particles by up to 0.05 m in a substep, 600 m/s at 200 substeps, and leave
+    # 84 J.
     x = row()[:, ::-1] * [1, -1]
     w = world(tv.Particles(x, mass=M, pinned=[0]), [tv.Gravity(G), tv.Distance(line(N))], solver=solver, precision="f64")
     for substeps in (20, 200):
@@ -77,9 +78,9 @@ def test_links_that_come_later_bring_no_energy(world, solver):
 
 
 def test_who_pushes_through_the_middle_gains_nothing(world):
-    # Springs longer than their particles are apart, which pass each other: the push turns by half a turn within a substep. In the
-    # direction at its end it works twice. Verlet's kick, in that at the start, keeps the energy on average: here of 300 pairs
-    # that pass at all distances, in all phases of the substep.
+    # Springs that are longer than the distance of their particles, which pass each other: the push turns by half a turn within a
+    # substep. Along the direction at the end of the substep it would work twice. Along the direction at the start, as in Verlet's
+    # kick, the energy is kept on average: here over 300 pairs that pass at all distances, in all phases of the substep.
     rng, n = np.random.default_rng(0), 300
     x, v = np.zeros((n, 2, 2)), np.zeros((n, 2, 2))
     x[:, 0, 0], x[:, 1, 0] = -0.1, 0.1

@@ -9,7 +9,7 @@ from .outlines import outside
 
 
 def bodies(shapes):
-    """Positions, loops and links of rigid bodies from lists of corners: each corner is linked to all others of its body."""
+    """Return positions, loops and links of rigid bodies from lists of corners: all corners of a body are linked in pairs."""
     loops, links, at = [], [], 0
     for corners in shapes:
         i, j = np.triu_indices(len(corners), 1)
@@ -20,18 +20,18 @@ def bodies(shapes):
 
 
 def regular(sides: int, radius: float, center, turn: float = 0.0):
-    """Corners of a regular polygon; turned so that it stands on an edge."""
+    """Return the corners of a regular polygon that stands on an edge where `turn` is 0."""
     a = np.arange(sides) * 2 * np.pi / sides - np.pi / 2 + np.pi / sides + turn
     return radius * np.stack([np.cos(a), np.sin(a)], axis=1) + center
 
 
 def depths(points: np.ndarray, loop: np.ndarray) -> np.ndarray:
-    """How deep points are inside of a polygon, 0 outside; by brute force."""
+    """Return how deep points are inside of a polygon, 0 outside, by brute force [m]."""
     return np.maximum(-outside(points, loop), 0)
 
 
 def linked(world, start, links, loops, friction=0.0, restitution=0.0, g=0.0, walls=((-99, -99), (999, 99)), floor=0.0, **more):
-    """Bodies of links in a box, with friction and restitution even where they are 0: one structure."""
+    """Return a world of linked bodies in a box; friction and restitution are compiled even where they are 0: one structure."""
     push_out = {"push_out": more.pop("push_out")} if "push_out" in more else {}
     polygons = tv.Polygons(loops, friction=0.5, restitution=0.5, **push_out)
     features = [tv.Distance(links), polygons, tv.Gravity(g), tv.Box(*walls, friction=0.5)]
@@ -41,7 +41,7 @@ def linked(world, start, links, loops, friction=0.0, restitution=0.0, g=0.0, wal
 
 
 def rigid(world, x, loops, g=10.0, restitution=0.0, low=(-99, 0), high=(99, np.inf), mass=0.25, **settings):
-    """Rigid bodies that rub, and bounce or not, on a floor: one structure."""
+    """Return a world of rigid bodies on a floor, with friction and with or without restitution: one structure."""
     features = [tv.Gravity(g), tv.Polygons(loops, friction=0.5, restitution=0.6), tv.ShapeMatch(loops)]
     features.append(tv.Box(low, high, friction=0.5, restitution=0.6))
     w = world(tv.Particles(x, mass=mass), features, precision="f64", **settings)
@@ -50,7 +50,7 @@ def rigid(world, x, loops, g=10.0, restitution=0.0, low=(-99, 0), high=(99, np.i
 
 
 def dropped(columns, rows, size=1.0):
-    """Boxes of 0.7 to 1 times the size, turned at random, in the air."""
+    """Return boxes of 0.7 to 1 times `size`, in the air at random angles: positions and loops."""
     rng, shapes = np.random.default_rng(0), []
     for k, row in np.ndindex(columns, rows):
         half = size * rng.uniform(0.7, 1.0) / np.sqrt(2)
@@ -60,9 +60,9 @@ def dropped(columns, rows, size=1.0):
 
 
 def test_boxes_stand_on_each_other_and_on_slopes(world):
-    # Three boxes of exactly the same width, corners on corners: at rest, and the lower ones, which carry more, give way more (a
-    # Jacobi pass gives links the compliance D h^2; corners on corners are resolved). On slopes of 20 and 30 degrees, pinned
-    # triangles, a box sticks if tan < mu and slides with g (sin - mu cos) if not (R18).
+    # Three boxes of exactly the same width, corners on corners, are at rest. The lower ones carry more and give way more: a
+    # Jacobi pass gives links the compliance D h^2, while contacts of corners are resolved. On slopes of 20 and 30 degrees, pinned
+    # triangles, a box sticks if tan < mu, and slides with g (sin - mu cos) if not (R18).
     mu, side = 0.45, 0.2
     shapes = [regular(4, side / np.sqrt(2), (0.0, (k + 0.5) * side)) for k in range(3)]
     pinned = []
@@ -92,7 +92,7 @@ def test_boxes_stand_on_each_other_and_on_slopes(world):
     way = 9.81 * (np.sin(a) - mu * np.cos(a)) * (1.0**2 - 0.7**2) / 2
     assert np.linalg.norm((got - start)[24:28].mean(axis=0)) == pytest.approx(way, rel=0.02)
     assert w.last.clean and w.last.overlap < 1e-3 and np.abs(start - x)[12:20].max() < 1e-4
-    # The impulses on each slope add up to m g h cos in a substep, and those on the level to m g h.
+    # The impulses on each slope add up to m g h cos per substep, and those on the level block to m g h.
     found, body = w.contacts, np.repeat(np.arange(9), 4)
     for k, degrees in ((4, 20), (6, 30), (8, 0)):
         load = found.impulse[(body[found.pairs] == k).any(axis=1)].sum() * 1200
@@ -100,9 +100,9 @@ def test_boxes_stand_on_each_other_and_on_slopes(world):
 
 
 def test_impulses_are_what_momentum_changes_by(world):
-    # A point of 1 kg meets a free edge at a quarter of it: its gradients are 1, -3/4 and -1/4, so it gets (1 + e) u / (w_v + 9/16
-    # w_a + 1/16 w_b). Another one meets an edge that is pinned, and a small square a large one, corners on edge: in each substep
-    # what a body gets is the sum of impulse times normal, by its shares.
+    # A point of 1 kg meets a free edge at a quarter of its length: the gradients are 1, -3/4 and -1/4, so the impulse is
+    # (1 + e) u / (w_v + 9/16 w_a + 1/16 w_b). Another point meets a pinned edge, and a small square a large one, corners on edge.
+    # In each substep a body receives the sum of impulse times normal, by its shares.
     e, u = 0.5, 3.0
     shapes = [regular(4, np.sqrt(0.5), (4.0 * k, 0.0)) for k in range(2)]
     shapes += [regular(4, np.sqrt(0.5), (8.0, 0.0)), regular(4, np.sqrt(0.125), (9.0, 0.1))]
@@ -138,7 +138,7 @@ def test_impulses_are_what_momentum_changes_by(world):
 def test_collisions_conserve_momentum_and_angular_momentum(world):
     # A spinning hexagon, a triangle and two points meet in free space, with friction and restitution and unequal masses.
     x, loops, links = bodies([regular(6, 0.3, (-0.6, 0.1)), regular(3, 0.4, (0.6, 0.0), 0.3)])
-    # Points: friction at a radius would be a torque, and nothing spins. One of them cannot move, far away.
+    # Points, because friction at a radius would be a torque, and no particle spins. One point is pinned far away.
     x = np.concatenate([x, [[0.0, 0.62], [0.0, -0.62], [99.0, 0.0]]])
     v = np.concatenate([np.tile([2.0, 0.0], (6, 1)), np.tile([-2.0, 0.0], (3, 1)), [[0.0, -2.0], [0.0, 2.0], [0.0, 0.0]]])
     v[:6] += 3.0 * np.stack([-(x[:6, 1] - 0.1), x[:6, 0] + 0.6], axis=1)
@@ -149,7 +149,7 @@ def test_collisions_conserve_momentum_and_angular_momentum(world):
     def moments(x, v):
         return np.r_[(mass[:, None] * v).sum(axis=0), (mass * (x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0])).sum()]
 
-    # What is conserved is the sum of m d, and of x times m d, of the displacements d = h v; the latter but for the slip in a
+    # The sum of m d is conserved, and that of x times m d, for displacements d = h v. The latter is exact but for the slip in a
     # substep, at most 4 m/s h, times the impulses, about 10 kg m/s.
     want = moments(x, v)
     for substeps in (20, 100):
@@ -166,8 +166,8 @@ def test_collisions_conserve_momentum_and_angular_momentum(world):
 
 
 def test_a_pile_settles_without_overlap_and_alike_on_both_paths(world):
-    # Convex and concave bodies, discs, mixed sizes: after settling no vertex is deeper inside of another body than 1 % of an
-    # edge, nor a disc than 2 % of its radius, and kinetic energy is below 1e-2 m g r per particle.
+    # Convex and concave bodies and discs of mixed sizes. After settling no vertex is deeper inside of another body than 1 % of an
+    # edge, and no disc deeper than 2 % of its radius. Kinetic energy is below 1e-2 m g r per particle.
     rng = np.random.default_rng(3)
     shapes = []
     for k in range(16):
@@ -205,9 +205,9 @@ def test_a_pile_settles_without_overlap_and_alike_on_both_paths(world):
 
 
 def test_corners_of_one_width_carry_each_other(world):
-    # Rigid boxes of one width, corners on corners, at so few substeps that one takes corners deeper than edges reach beyond their
-    # ends. Contacts are resolved. A pass gives a cluster of four of mass m back half of what a load F on two of its corners does
-    # in a substep: it is pressed flat by (2 + 4 F / m g) g h^2, its own weight being the 2.
+    # Rigid boxes of one width, corners on corners. At so few substeps, one substep moves corners deeper than edges reach beyond
+    # their ends. Contacts are resolved. A pass gives a cluster of four corners of mass m back half of the displacement by a load
+    # F on two of them: the cluster is pressed flat by (2 + 4 F / m g) g h^2, where the 2 is its own weight.
     x, loops, _ = bodies([regular(4, 0.2 / np.sqrt(2), (0.0, (k + 0.5) * 0.2)) for k in range(3)])
     for substeps in (4, 2):
         w = rigid(world, x, loops, 9.81, mass=1.0, substeps=substeps)
@@ -217,8 +217,8 @@ def test_corners_of_one_width_carry_each_other(world):
 
 
 def test_bodies_of_links_that_lie_edge_to_edge_fall_asleep(world):
-    # A wall of triangles, upright and upside down in turn, whose corners meet: they slide past each other by the sway of their
-    # links, so that their contacts come and go. What bears the load must not change with that, or the wall never rests.
+    # A wall of triangles, upright and upside down in turn, whose corners meet. They slide past each other as their links sway, so
+    # contacts come and go. The contacts that bear the load must not change with that, or the wall never rests.
     side, up = 0.2, 0.2 * 3**0.5 / 2
     shapes = []
     for k, row in np.ndindex(4, 2):
@@ -235,8 +235,8 @@ def test_bodies_of_links_that_lie_edge_to_edge_fall_asleep(world):
 
 
 def test_overlap_is_pushed_out_and_collapse_stays_finite(world):
-    # A corner that starts inside of a box leaves it: each body at less than 1.5 push_out (measured: 1.3). A loop without links is
-    # pressed flat, and stays finite.
+    # A corner that starts inside of a box leaves it: each body is slower than 1.5 push_out (measured: 1.3). A loop without links
+    # is pressed flat, and stays finite.
     x, loops, _ = bodies([regular(4, 0.5, (0.0, 0.0)), regular(4, 0.5, (0.6, 0.02)), regular(3, 0.3, (5.0, 1.0))])
     _, _, links = bodies([x[:4], x[4:8]])
     start = tv.Particles(np.vstack([x, [[50.0, 50.0]]]), mass=np.r_[np.ones(10), 2.0, 2.0], pinned=[11])
@@ -245,8 +245,8 @@ def test_overlap_is_pushed_out_and_collapse_stays_finite(world):
         w.step(1 / 60)
         assert np.abs(w.velocity).max() < 0.3 * 1.5
     assert depths(w.position[4:8], w.position[:4]).max() < 1e-3 and depths(w.position[:4], w.position[4:8]).max() < 1e-3
-    # What overlaps at a start depends on where bodies are, not on how fast they are there; and what is thrown deeper gets no
-    # deeper than it was but for its way in a substep: both are apart after overlap / push_out.
+    # Overlap at a start depends on where bodies are, not on their velocities. A body thrown deeper gets no deeper than it was,
+    # but for its motion in a substep. Both are apart after overlap / push_out.
     found, v = [], np.zeros_like(x)
     for speed in ((0.0, 0.0), (0.0, -6.0), (-3.0, 7.0), (-6.0, 0.0)):
         v[4:8] = speed
@@ -258,9 +258,9 @@ def test_overlap_is_pushed_out_and_collapse_stays_finite(world):
     np.testing.assert_array_equal(found[0].pairs[:, 0], np.flatnonzero(deep))
     np.testing.assert_allclose(
         found[0].overlap, sat(x[:4], x[4:8])[0], rtol=1e-9
-    )  # by how far they have to move, not its corners
+    )  # the distance that the bodies have to move, not how deep their corners are
     begin = x[:4, 0].max() - x[4:8, 0].min()
-    for _ in range(24):  # 0.1 / 0.3 s and a little
+    for _ in range(24):  # 0.1 / 0.3 s and a little more
         w.step(1 / 60)
         left = w.position[:4, 0].max() - w.position[4:8, 0].min()
         assert left < begin + 6 / 1200
@@ -272,11 +272,11 @@ def test_overlap_is_pushed_out_and_collapse_stays_finite(world):
 
 
 def test_nothing_in_a_heap_stays_inside_of_what_it_bears_or_moves_on(world):
-    # Boxes of 1 kg and 0.7 to 1 m, dropped at 4 substeps, so that corners are pressed into others as they land. They go out at
-    # push_out under any load: of a corner with at most 4 contacts and w = 4 / kg, which bears up to 8 boxes, F h^2 (4 w + 4 w) is
-    # left. By a push that is shared out as the mass is, corners stayed 0.1 to 0.3 m deep for good. And the heap comes to rest,
-    # though some corners hardly touch what is beside them: a mass that is split by the number of its contacts, not by how deep
-    # they are, kept some at 0.03 m/s.
+    # Boxes of 1 kg and 0.7 to 1 m, dropped at 4 substeps, so that corners are pressed into other boxes as they land. Corners
+    # leave at push_out under any load. At a corner with at most 4 contacts and w = 4 / kg, which bears up to 8 boxes,
+    # F h^2 (4 w + 4 w) is left. With a push that is split as the mass is, corners would stay 0.1 to 0.3 m deep. And the heap
+    # comes to rest, though some corners hardly touch their neighbours. With masses split by the number of contacts, not by their
+    # depth, some would keep 0.03 m/s.
     x, loops = dropped(4, 8)
     w = rigid(world, x, loops, low=(0, 0), high=(6.5, np.inf), substeps=4)
     start = w.step(1 / 60).energy
@@ -288,17 +288,17 @@ def test_nothing_in_a_heap_stays_inside_of_what_it_bears_or_moves_on(world):
 
 
 def test_stacks_that_bounce_come_to_rest(world):
-    # A contact rests that comes no faster than its load brings it, so bounces are no end in themselves: boxes that fall on each
-    # other, the upper one narrower, bounce off and then lie still. Without, they went on at 0.05 m/s.
+    # A contact rests if its particles approach no faster than its load explains, so bouncing ends. Boxes fall on each other, the
+    # upper one narrower, bounce and then lie still. Otherwise they would keep 0.05 m/s.
     x, loops, _ = bodies([np.array([[-s, 0], [s, 0], [s, 2 * s], [-s, 2 * s]]) + [0, y] for s, y in ((0.5, 0.2), (0.45, 1.9))])
     w = rigid(world, x, loops, restitution=0.6, substeps=8)
     gaps = [w.position[4:, 1].min() - w.position[:4, 1].max() for _ in range(60) if w.step(1 / 60)]
     met = int(np.argmax(np.array(gaps) < 0.01))
-    assert max(gaps[met:]) > 0.03  # m, after they have met
+    assert max(gaps[met:]) > 0.03  # [m], after they have met
     w.run(4.0)
     assert np.abs(w.velocity).max() < 1e-5
-    # In a heap what one corner's bounce takes the next one gives back, unless what two substeps of forces bring rests. Some 20 of
-    # 48 boxes hopped on at 0.1 m/s.
+    # In a heap each corner's bounce feeds the next one's, unless approach speeds that two substeps of forces explain count as
+    # rest. Otherwise some 20 of 48 boxes keep hopping at 0.1 m/s.
     x, loops = dropped(6, 8)
     w = rigid(world, x, loops, restitution=0.6, low=(0, 0), high=(9.5, np.inf), substeps=4)
     w.run(30.0)
@@ -306,8 +306,8 @@ def test_stacks_that_bounce_come_to_rest(world):
 
 
 def test_discs_among_boxes_come_to_rest(world):
-    # What is squeezed from both sides has the eigenvalue 1 of a pass where masses are split by how deep contacts usually are, and
-    # 2 where by how deep they are now: then half of the bodies went to and fro in every other substep, at 0.1 m/s.
+    # A body that is squeezed from both sides has the eigenvalue 1 of a pass where masses are split by the usual depth of
+    # contacts. Split by the depth of this substep it is 2, and half of the bodies oscillate from substep to substep at 0.1 m/s.
     x, loops = dropped(4, 3, 0.55)
     k = np.arange(24)
     discs = np.stack([0.3 + 0.45 * (k % 8), 3.2 + 0.45 * (k // 8)], axis=1)
@@ -325,8 +325,8 @@ def test_discs_among_boxes_come_to_rest(world):
 
 
 def test_edges_that_are_too_long_keep_momentum(world):
-    # Loops that hold nothing together, pulled apart to many times their size: an end of an edge may be too far for the list, and
-    # then a vertex must not push the other end alone.
+    # Loops that hold nothing together, pulled apart to many times their size: one end of an edge may be too far for the list.
+    # Then a vertex must not push the other end alone.
     x = np.stack(np.divmod(np.arange(12), 4)[::-1], axis=1) * 0.3
     v = [(1.3, -1.3), (6.4, 1.0), (-5.4, 3.6), (13.0, 9.5), (-7.0, -12.7), (-6.2, 0.4), (-23.3, -2.2), (-12.5, -7.3),
          (-5.4, -3.2), (4.1, 10.4), (-1.3, 13.7), (-6.7, 3.5)]  # fmt: skip
@@ -357,12 +357,12 @@ def test_bad_loops_are_named():
 
 
 def test_discs_beside_wide_bodies_list_what_they_may_touch(world):
-    # Two discs are near by their own radii, however long the edges of bodies elsewhere are; so are their cells and the skin. A
-    # disc is listed with both ends of an edge that is within its radius and the skin, and few others.
+    # Two discs are neighbours by their own radii, however long the edges of bodies elsewhere are. Cells and the skin follow the
+    # radii, too. A disc is listed with both ends of an edge that is within its radius plus the skin, and few others.
     discs = np.stack(np.divmod(np.arange(100), 10), axis=1) * 0.25 + [0.0, 1.5]
     body = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.46], [0.0, 1.46]])
     start = tv.Particles([*body, *discs], radius=np.r_[np.zeros(4), np.full(100, 0.1)])
-    w = world(start, [tv.Polygons([range(4)])], path="launched")  # whose list has a kernel of its own
+    w = world(start, [tv.Polygons([range(4)])], path="launched")  # with a kernel of its own for the list
     search = w._runner.search
     assert search.skin == pytest.approx(0.75 * 0.1) and search.finest == pytest.approx(2 * 0.1 + 0.075, rel=1e-3)
     w._runner.list_neighbours()
@@ -381,7 +381,7 @@ def test_discs_beside_wide_bodies_list_what_they_may_touch(world):
 
 
 def sat(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
-    """How deep two convex counterclockwise loops overlap (negative where apart), and the direction in which b leaves a."""
+    """Return how deep two convex counterclockwise loops overlap (negative where apart), and the direction in which b leaves a."""
     best = (np.inf, np.zeros(2))
     for p, q, sign in ((a, b, 1.0), (b, a, -1.0)):
         u = np.roll(p, -1, axis=0) - p
@@ -393,9 +393,9 @@ def sat(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def test_corners_that_cross_part_over_the_nearer_edge(world):
-    # Two sharp corners that have passed each other: neither is inside of the other body, so no vertex is, but their edges cross.
-    # Two wedges part soonest over one of their edges (separating axes). That is what contacts have to say, and what they do
-    # conserves momentum, and angular momentum but for an impulse of 0.2 kg m/s times the slip in a substep, 0.2 m/s h.
+    # Two sharp corners have passed each other: no vertex is inside of the other body, but edges cross. Two wedges part soonest
+    # over one of their edges (separating axes), and contacts have to find it. They conserve momentum, and angular momentum but
+    # for an impulse of 0.2 kg m/s times the slip in a substep, 0.2 m/s h.
     rng, shapes = np.random.default_rng(5), []
     while len(shapes) < 30:
         tips = []
@@ -416,7 +416,7 @@ def test_corners_that_cross_part_over_the_nearer_edge(world):
     want = [sat(shapes[k], shapes[k + 1]) for k in range(0, len(shapes), 2)]
     assert (body[found.pairs[:, 0]] // 2 == np.arange(len(want))).all()
     np.testing.assert_allclose(found.overlap, [depth for depth, _ in want], rtol=1e-9)
-    sign = np.where(body[found.pairs[:, 0]] % 2 == 1, 1.0, -1.0)[:, None]  # the second body is the vertex
+    sign = np.where(body[found.pairs[:, 0]] % 2 == 1, 1.0, -1.0)[:, None]  # where the vertex belongs to the second body
     np.testing.assert_allclose(sign * found.normal, [n for _, n in want], atol=1e-9)
     parted = 0.0
     for _ in range(60):

@@ -1,6 +1,6 @@
-"""What every constraint that is one number must do, for all of them at once: a new one is one row of ROWS in rows.py.
+"""What every constraint of one number must do, tested for all at once: a new constraint is one row of ROWS in rows.py.
 
-Each row makes one world of many blocks, the same corners again and again, each with something else to show; they do not touch.
+Each row makes one world of many blocks. Each block has the same corners and tests something else; blocks do not touch.
 """
 
 from functools import cached_property
@@ -18,8 +18,8 @@ from .rows import OTHERS, ROWS, Row
 
 BLOCKS = ("met", "off", "turned", "held", "stuck", "soft", "free", "swing", "loaded", "weak")
 MASS = np.array([1.0, 2.5, 0.7, 4.0])
-OWN = ("Bend 3D", "AngleLimit 3D", "Area of loops 2D")  # that have fields of their own; others have those of Distance, or fewer
-IN_BATCHES = ("Bend 3D", "Volume of surfaces")  # what is tried in two batches of one world, see Row.like
+OWN = ("Bend 3D", "AngleLimit 3D", "Area of loops 2D")  # with fields of their own; the others have those of Distance, or fewer
+IN_BATCHES = ("Bend 3D", "Volume of surfaces")  # tested in two batches of one world, see Row.like
 
 
 class Scene:
@@ -62,23 +62,23 @@ class Scene:
         self.world = unprojected(world(start, [self.gravity, self.feature], substeps=1, precision="f64"))
 
     def again(self, substeps: int = 1, iterations: int = 1) -> None:
-        """Put everything back to where it started."""
+        """Put everything back to the start."""
         self.world.velocity, self.world.position = self.v, self.x
         self.world.substeps, self.world.iterations = substeps, iterations
         unprojected(self.world)
 
     def block(self, name: str, array=None) -> np.ndarray:
-        """The rows of one block."""
+        """Return the rows of one block, of positions if `array` is None."""
         array = self.world.position if array is None else array
         return np.asarray(array)[self.corners[BLOCKS.index(name)]]
 
     def C(self, name: str) -> float:
-        """The violation of a block, by the host."""
+        """Return the violation of a block, computed by the host."""
         return float(self.feature.violation(self.world.position)[BLOCKS.index(name)])
 
     @cached_property
     def gradient(self) -> np.ndarray:
-        """grad C of the block "off" at the start, (arity, dim), by central differences of the host's formula."""
+        """Return grad C of the block "off" at the start, (arity, dim), by central differences of the host's formula."""
         out, step, c = np.zeros((self.arity, self.dim)), 1e-6, BLOCKS.index("off")
         for k in range(self.arity):
             for a in range(self.dim):
@@ -92,9 +92,11 @@ class Scene:
 
 
 def leave_nothing_behind(w: tv.World) -> None:
-    """Frames with NaN for every place, which tests have their worlds make at last: the state is put back to what it was, and goes
-    on to the bit; so a frame that is tried again with more substeps is what it would have been. And places and velocities that
-    are assigned are a new start."""
+    """Check that a frame in which all positions are NaN leaves nothing behind; tests call this last.
+
+    Undone, the state continues bit for bit, so a frame that is repeated with more substeps does not depend on it. Positions and
+    velocities that are assigned instead make a start.
+    """
     x, (memory, state) = w.position, (w._runner.memory, w._runner.scene.state)
     w.step(1e-3)
     kept, waiting = checkpoint.keep(w), checkpoint.flags(w)
@@ -113,7 +115,7 @@ def leave_nothing_behind(w: tv.World) -> None:
 
 
 def moments(m: np.ndarray, x: np.ndarray, d: np.ndarray) -> list[float]:
-    """Sum m d and sum m x x d."""
+    """Return sum m d and sum m x x d."""
     turn = [m @ (x[:, a] * d[:, b] - x[:, b] * d[:, a]) for a in range(x.shape[1]) for b in range(a)]
     return [*(m @ d), *turn]
 
@@ -124,7 +126,7 @@ def test_a_constraint_does_what_all_constraints_do(world, name):
     scene = Scene(world, row)
     w, x0, dt = scene.world, scene.x, 1e-2
 
-    # One pass from rest: nothing where C = 0 or where all are held; elsewhere -w grad C times C / sum w |grad C|^2.
+    # One pass from rest: no displacement where C = 0 or all corners are held; elsewhere -w grad C times C / sum w |grad C|^2.
     w.step(dt)
     move = w.position - x0
     assert np.abs(scene.block("met", move)).max() <= 1e-15 and (scene.block("stuck", move) == 0).all()
@@ -137,7 +139,7 @@ def test_a_constraint_does_what_all_constraints_do(world, name):
     np.testing.assert_allclose(scene.block("held", move), want, atol=1e-7 * np.abs(want).max())
     assert scene.arity == 1 or (scene.block("held", move)[0] == 0).all()
 
-    # More passes leave less of it, and what is left is what residual says.
+    # More passes leave less of the violation, and residual reports what is left.
     left, scale = [abs(row.off)], abs(row.off)
     for iterations in (1, 2, 4, 8):
         scene.again(iterations=iterations)
@@ -163,10 +165,10 @@ def test_a_constraint_does_what_all_constraints_do(world, name):
         np.testing.assert_allclose(scene.block("turned"), scene.block("off") @ scene.turn.T + 0.5 * row.internal, atol=1e-11)
     if row.internal:
         assert np.ptp(history, axis=0).max() <= 1e-14 * 20
-        np.testing.assert_allclose(np.reshape(seen, np.shape(history)), history, atol=1e-14)  # and that of the velocities
+        np.testing.assert_allclose(np.reshape(seen, np.shape(history)), history, atol=1e-14)  # those of velocities, too
     assert np.isfinite(w.position).all() and (scene.block("stuck") == scene.block("stuck", x0)).all()
 
-    # Rigid and soft alike converge with h^2.
+    # Rigid and soft constraints converge with h^2 alike.
     if row.bilateral:
         ends = []
         for substeps in (10, 20, 40, 80):
@@ -177,18 +179,18 @@ def test_a_constraint_does_what_all_constraints_do(world, name):
             steps = [rms(a[k], b[k]) for a, b in zip(ends[1:], ends[:-1], strict=True)]
             assert 1.9 <= order(steps) <= 2.1, (name, k, steps)
 
-    # One of two equal springs is too weak for the load that they bear, and is gone before the first frame ends.
+    # One of two equal springs is too weak for its load, and breaks before the first frame ends.
     f, c = scene.feature, BLOCKS.index("loaded")
     assert np.flatnonzero(f.broken).tolist() == [c + 1] and f.load[c + 1] == 0
 
-    # Under a load F along grad_k f the spring gives way by alpha F / |grad_k f|: there it is in balance, and says so.
+    # Under a load F along grad_k f the spring gives way by alpha F / |grad_k f|: there it is in balance, and reports F.
     last = scene.gradient[-1]
     force = (row.off / 10) / scene.compliance[c] * last  # F = (C / alpha) grad_k f
     scene.again(20, 4)
     scene.gravity.g = force / MASS[scene.arity - 1]
     w.run(0.5, dt=0.1)
     np.testing.assert_allclose(scene.block("loaded"), scene.block("loaded", x0), atol=2e-7)
-    np.testing.assert_allclose(scene.block("loaded", w.velocity), 0.0, atol=1e-8)  # the spring is a force in them, too
+    np.testing.assert_allclose(scene.block("loaded", w.velocity), 0.0, atol=1e-8)  # velocities count the spring as a force, too
     assert f.load[c] == pytest.approx(row.off / 10 / scene.compliance[c], rel=1e-5)
     scene.again()
     leave_nothing_behind(w)
@@ -196,8 +198,8 @@ def test_a_constraint_does_what_all_constraints_do(world, name):
 
 @pytest.mark.parametrize("name", ["Bend 2D", "Bend 3D", "AngleLimit 3D", "Dihedral 3D", "Area 3D", "Volume 3D"])
 def test_gradients_of_many_are_those_of_each(name):
-    # The host takes differences of as many coordinates at once as there is room for: here of all, and of few. Sum grad = 0, and a
-    # move of 1e-4 changes C by grad C dx to second order.
+    # The host differentiates by as many coordinates at once as memory has room for: here by all, and by few. Sum grad = 0, and a
+    # displacement of 1e-4 changes C by grad C dx to second order.
     points, make = ROWS[name].points, ROWS[name].make
     found, move = [], 1e-4 * np.random.default_rng(0).normal(size=points.shape)
     for count in (1, 2000):
@@ -226,9 +228,9 @@ def test_the_tables_hold_every_constraint():
 
 @pytest.mark.parametrize("name", ["Bend 3D", *OTHERS])
 def test_a_batch_is_its_constraints_and_a_clone_is_its_world(world, name):
-    # Two constraints in one batch, the second one of a Row soft; then each alone, among the particles of both: in a batch of its
-    # own where the code of batches differs (see Row.like), else in a world of its own, which takes the kernels of the first; then
-    # a clone of the first world in the middle of its run: the same bits, loads and hashes.
+    # Two constraints in one batch, the second one of a Row soft. Then each alone, among the particles of both: in a batch of its
+    # own where the code of batches differs (see Row.like), else in a world of its own, which reuses the kernels of the first.
+    # Then a clone of the first world in the middle of its run. All have the same bits, loads and hashes.
     assert {row.like for row in ROWS.values()} == {*IN_BATCHES}
     points, make = (ROWS[name].points, ROWS[name].make) if name in ROWS else OTHERS[name][:2]
     corners = np.arange(2 * len(points)).reshape(2, -1)
@@ -254,7 +256,7 @@ def test_a_batch_is_its_constraints_and_a_clone_is_its_world(world, name):
     twin = whole.clone()
     assert twin.hash() == whole.hash()
     if not f.drives:
-        np.testing.assert_array_equal(twin.features[0].load, f.load)  # of the last substep, which the clone has not made itself
+        np.testing.assert_array_equal(twin.features[0].load, f.load)  # loads of a substep that the clone has not made
     for w in (whole, twin):
         w.run(0.1)
     assert twin.hash() == whole.hash()
@@ -263,7 +265,7 @@ def test_a_batch_is_its_constraints_and_a_clone_is_its_world(world, name):
 
 
 def degenerate(row: Row) -> np.ndarray:
-    """Corners in every special position, (blocks, arity, dim)."""
+    """Return corners in every special position, (blocks, arity, dim)."""
     k, dim = row.points.shape
     line = np.arange(k)[:, None] * np.eye(dim)[0]
     pair = row.points.copy()
@@ -280,7 +282,7 @@ def degenerate(row: Row) -> np.ndarray:
 
 @pytest.mark.parametrize("name", ROWS)
 def test_nothing_explodes_where_a_constraint_has_no_direction(world, name):
-    # Rows 15, 17, 54, 56: no NaN, and no particle goes further than its corners are apart, or than the constraint asks.
+    # Rows 15, 17, 54, 56: no NaN, and no particle moves further than its corners are apart, or than the constraint demands.
     row = ROWS[name]
     k, dim = row.points.shape
     x = np.concatenate([degenerate(row)] * 2)
@@ -295,7 +297,7 @@ def test_nothing_explodes_where_a_constraint_has_no_direction(world, name):
     for frame in range(20):
         report = w.step(1 / 60)
         assert "non-finite" not in report.flags and np.isfinite(report.residual) and np.isfinite(feature.load).all()
-        if frame == 0:  # later, what a violent correction has set in motion flies on
+        if frame == 0:  # later, particles that a violent correction has set in motion fly on
             size = (0 if row.internal else np.abs(x).max(axis=(1, 2))) + (0 if feature.quantity.unit else abs(rest))
             size += np.ptp(x, axis=1).max(axis=1) + 1e-6 * np.abs(x).max(axis=(1, 2))
             moved = np.abs(w.position.reshape(x.shape) - x).max(axis=(1, 2))
@@ -308,10 +310,10 @@ def test_nothing_explodes_where_a_constraint_has_no_direction(world, name):
     ids=str,
 )
 def test_no_bad_start_flies(world, dim, solver):
-    # Rigid constraints that nothing in the scene pulled apart have no energy to give, at no number of substeps: what they do not
-    # give up before the first one they give up at a third of their size in a frame: 2 sizes in 6 frames, after the 2 that it
-    # takes to where they are met. Passes as such would move bodies by their size in a substep: 600 sizes at 100. A single pass of
-    # Chebyshev is one of Jacobi.
+    # Rigid constraints that nothing in the scene pulled apart have no energy to give, at any number of substeps. The violation
+    # that is left before the first substep is removed at a third of its size per frame: 2 sizes in 6 frames, after the 2 that it
+    # takes to meet the constraints. Passes alone would move bodies by their size in a substep: 600 sizes at 100 substeps. A
+    # single pass of Chebyshev is one of Jacobi.
     bad = BadStart(dim)
     start = tv.Particles(bad.position, pinned=bad.pinned, mass=0.1)
     w = world(start, bad.features, precision="f64", solver=solver)
@@ -320,5 +322,5 @@ def test_no_bad_start_flies(world, dim, solver):
         for frame in range(6):
             report = w.step(1 / 60)
             assert (bad.far(w.position) < 4).all() and ("moved" in report.flags) == (frame == 0)
-        assert "unconverged" in report.flags  # some contradict each other
+        assert "unconverged" in report.flags  # some constraints contradict each other
     leave_nothing_behind(w)

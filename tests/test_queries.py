@@ -1,4 +1,4 @@
-"""Queries against brute force."""
+"""Queries of points and contacts against brute force."""
 
 import numpy as np
 import pytest
@@ -8,12 +8,12 @@ import tiverlet as tv
 
 @pytest.mark.parametrize("kind, dim", [("one size", 3), ("many sizes", 2), ("no contacts", 2), ("no contacts", 3)])
 def test_near_and_nearest_equal_brute_force(world, dim, kind):
-    # For one size in 2D see the nearest image in test_periodic.py.
+    # For particles of one size in 2D see the nearest image in test_periodic.py.
     rng = np.random.default_rng(5)
     x = 6 * tv.golden(np.arange(400), dim=dim) - 3
     radius = 10.0 ** rng.uniform(-3, -1, 400) if kind == "many sizes" else 0.05
     features = [] if kind == "no contacts" else [tv.Contact()]
-    w = world(tv.Particles(x, radius=radius), features, precision="f64", path="launched")  # whose list has a kernel of its own
+    w = world(tv.Particles(x, radius=radius), features, precision="f64", path="launched")  # its list has its own kernel
     x = w.position = x + 0.01 * np.sin(7 * x)
     points = np.concatenate([rng.uniform(-3.5, 3.5, (50, dim)), x[:5], [[40.0] * dim]])
     for reach in (0.0, 0.3, 2.0, 100.0):
@@ -32,7 +32,7 @@ def test_near_and_nearest_equal_brute_force(world, dim, kind):
 def test_contacts_are_arrays(world):
     rng = np.random.default_rng(6)
     x, radius = rng.uniform(-1, 1, (300, 3)), rng.uniform(0.02, 0.2, 300)
-    w = world(tv.Particles(x, radius=radius), [tv.Contact()], precision="f64", path="launched")  # as above
+    w = world(tv.Particles(x, radius=radius), [tv.Contact()], precision="f64", path="launched")  # see above
     pairs, depth = tv.measure.overlapping(x, radius)
     contacts = w.contacts
     np.testing.assert_array_equal(contacts.pairs, pairs)
@@ -43,7 +43,7 @@ def test_contacts_are_arrays(world):
 
 
 def test_contacts_of_a_pinned_particle_that_another_has_left(world):
-    # A pair that carries something stays on the list of the one that moves, however far it is; the pinned one keeps nothing.
+    # A pair with stored data stays on the list of the moving particle, however far that is; the pinned particle stores nothing.
     start = tv.Particles([(0.0, 0.0), (0.15, 0.0), (0.0, 0.3)], radius=0.1, pinned=[0], velocity=[(0, 0), (400.0, 0), (0, 0)])
     w = world(start, [tv.Contact(friction=0.5, restitution=1.0)], substeps=1)
     for _ in range(3):

@@ -1,4 +1,4 @@
-"""Rest values that are assigned: where they go in the next frame, and what that costs."""
+"""Assigned rest values: how they are reached in the next frame, and what energy that costs."""
 
 import numpy as np
 import pytest
@@ -10,14 +10,15 @@ DT, L, M = 1 / 60, 0.5, 0.2
 
 
 def pendulum(world, *features, **options):
-    """One particle of mass M at a distance L from one that is pinned, without gravity."""
+    """Return a world with one particle of mass M at a distance L from a pinned one, without gravity."""
     return world(tv.Particles([[0.0, 0], [L, 0]], mass=M, pinned=[0]), [tv.Gravity(0.0), *features], **options)
 
 
 @pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Direct()], ids=str)
 def test_a_link_is_drawn_in_at_the_speed_of_the_frame(world, solver):
-    # The rest length goes from L to 0.9 L in a frame, so the particle goes at u = 0.1 L / dt, with m u^2 / 2, in however many
-    # substeps; a jump would be made in one of them, with m (0.1 L / h)^2 / 2. Then it stands still, for a link holds, too.
+    # The rest length goes from L to 0.9 L in a frame, so the particle moves at u = 0.1 L / dt and has m u^2 / 2, for any number
+    # of substeps. A jump would be made in one substep, with m (0.1 L / h)^2 / 2. Then the particle stands still, because a link
+    # also holds.
     link = tv.Distance([[0, 1]])
     w = pendulum(world, link, solver=solver, precision="f64")
     w.step(DT)
@@ -34,7 +35,8 @@ def test_a_link_is_drawn_in_at_the_speed_of_the_frame(world, solver):
 
 
 def test_a_state_before_a_rest_value_was_assigned_knows_of_none(world):
-    # Back at a state in which nothing was on its way, by a knob that was put back meanwhile: the same bits as the first time.
+    # Back at a state in which no rest value was on its way, by a knob that was set back in between: the same bits as the first
+    # time.
     link = tv.Distance([[0, 1]], rest=L)
     w, hashes = pendulum(world, link), []
     w.step(DT)
@@ -51,7 +53,7 @@ def test_a_state_before_a_rest_value_was_assigned_knows_of_none(world):
 
 
 def test_a_rope_that_was_drawn_in_is_slack(world):
-    # As above, but a rope does not stop what comes in: the next frame takes it as far.
+    # As above, but a rope does not stop a particle that comes in: the next frame takes it as far.
     rope = tv.Rope([[0, 1]])
     w = pendulum(world, rope, substeps=50)
     w.step(DT)
@@ -63,8 +65,8 @@ def test_a_rope_that_was_drawn_in_is_slack(world):
 
 
 def test_a_muscle_does_the_work_of_its_load(world):
-    # A mass that hangs is drawn up by a in n frames, by as much in each: m g a of work, but for the kinetic energy m u^2 / 2 of
-    # the last frame, which the next one takes back. The link changes its length at the speed of each frame, never faster.
+    # A hanging mass is drawn up by a in n frames, evenly. The work is m g a, but for the kinetic energy m u^2 / 2 of the last
+    # frame, which the next frame takes back. The link changes its length at the speed of each frame, never faster.
     n, a, g = 20, 0.1, 9.81
     link = tv.Distance([[0, 1]])
     w = world(
@@ -77,14 +79,16 @@ def test_a_muscle_does_the_work_of_its_load(world):
         link.rest = L - a * (k + 1) / n
         w.step(DT)
         speeds.append(abs(w.velocity[1, 1]))
-    # velocities are between that of the last substep, u, and that of the next, 0 in the mean of a half step
+    # Velocities are between that of the last substep, u, and that of the next, whose mean over a half step is 0.
     assert max(speeds) <= a / (n * DT) * (1 + 1e-6) + g * DT / 200
     assert w.step(DT).energy - before == pytest.approx(M * g * a, rel=1e-6)
 
 
 def crowd(first=0):
-    """Of what has rest values some, apart from each other: particles, features of those from this number on, and a function that
-    turns all knobs."""
+    """Return some constraints with rest values, apart from each other.
+
+    These are particles, the features of particles numbered from `first` on, and a function that turns all knobs.
+    """
     x = [
         (-5.0, 0), (0, 0), (0.5, 0), (1, 0), (1.5, 0.2),  # one by itself; links, stop, rope
         (9, 0), (10, 0), (10, 1), (9, 1),  # loop
@@ -100,7 +104,7 @@ def crowd(first=0):
 
 
 def test_what_a_ramp_brings_in_does_not_depend_on_the_substep(world):
-    # m (C / dt)^2 / 2 for each; as jumps, m (C / h)^2 / 2, 64 times as much in 8 times the substeps.
+    # m (C / dt)^2 / 2 for each constraint. As jumps it would be m (C / h)^2 / 2, 64 times as much at 8 times the substeps.
     particles, features, turn = crowd()
     w = world(particles, features, solver=tv.Jacobi())
     energies = []
@@ -114,7 +118,7 @@ def test_what_a_ramp_brings_in_does_not_depend_on_the_substep(world):
 
 
 def test_an_angle_goes_the_shorter_way(world):
-    # From 3 to -3 rad it is 2 pi - 6 = 0.283 rad, at L 0.283 / dt; the other way would be through 0, at 21 times that.
+    # From 3 to -3 rad it is 2 pi - 6 = 0.283 rad, at L 0.283 / dt; the other way, through 0, would be 21 times as fast.
     x = np.array([[0.0, 0], [L, 0], [L * (1 + np.cos(3.0)), L * np.sin(3.0)]])
     bend = tv.Bend([[0, 1, 2]])
     w = world(tv.Particles(x, pinned=[0, 1]), [bend, tv.Distance([[1, 2]])], substeps=50, precision="f64", solver=tv.Jacobi())
@@ -166,7 +170,7 @@ def test_what_comes_while_a_ramp_waits_begins_at_rest_values_of_its_own(world):
 
 
 def test_what_is_placed_anew_has_its_rest_values_at_once(world):
-    # Positions and rest lengths that fit each other, assigned together: nothing moves.
+    # Positions and rest lengths that fit each other are assigned together: nothing moves.
     link = tv.Distance([[0, 1]])
     w = pendulum(world, link, substeps=200)
     w.step(DT)

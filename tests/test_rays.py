@@ -19,19 +19,19 @@ FACES = [face for a, b, c, d in SIDES for face in ((a, b, c), (a, c, d))]
 
 @ti.func
 def ring(p):
-    """Distance to a circle of 0.7 with thickness 0.2 in 2D: an annulus."""
+    """Return the distance to an annulus in 2D: a circle of radius 0.7 with a thickness of 0.2 to both sides."""
     return ti.abs(p.norm() - 0.7) - 0.2
 
 
 @ti.func
 def torus(p):
-    """The same turned about the y axis."""
+    """Return the distance to the circle of ring() turned about the y axis: a torus."""
     a = ti.sqrt(p[0] * p[0] + p[2] * p[2]) - 0.7
     return ti.sqrt(a * a + p[1] * p[1]) - 0.2
 
 
 def turned(x, place, angle):
-    """Points in the frame of what was put at `place` and turned by an angle; about z in 3D."""
+    """Return points in the frame of a shape at `place` that is turned by an angle, about z in 3D."""
     c, s = np.cos(angle), np.sin(angle)
     r = x - place
     out = r.copy()
@@ -40,14 +40,14 @@ def turned(x, place, angle):
 
 
 def to_segment(x, a, b):
-    """Distances of points."""
+    """Return the distances of points to a segment."""
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     t = np.clip((x - a) @ (b - a) / max((b - a) @ (b - a), 1e-300), 0, 1)
     return np.linalg.norm(x - a - t[:, None] * (b - a), axis=1)
 
 
 def to_loop(x, v, closed=True):
-    """Signed distance to a polygon, negative inside (crossings of a ray); unsigned of an open line."""
+    """Return the signed distance to a polygon, negative inside (crossings of a ray); unsigned for an open line."""
     ends = np.roll(v, -1, axis=0)
     pairs = list(zip(v, ends, strict=True))[: None if closed else -1]
     out, odd = np.min([to_segment(x, a, b) for a, b in pairs], axis=0), np.zeros(len(x), dtype=bool)
@@ -59,14 +59,14 @@ def to_loop(x, v, closed=True):
 
 
 def to_cuboid(x, half):
-    """Signed distance to a box about the origin, negative inside."""
+    """Return the signed distance to a box about the origin, negative inside."""
     q = np.abs(x) - half
     return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
 
 
 PLACE, ANGLE = np.array([0.3, -0.2, 0.15]), 0.6
 IN, ON = PLACE[:2], np.zeros(3)
-# Walls that are made somewhere, moved by knobs in a frame, and C(x) where they are then, for points.
+# Walls as they are made; the knobs that move them in a frame; and C(x) of points for the moved wall.
 WALLS = {
     2: [
         (lambda: tv.Box((-1, -1), (1, 1)), {"upper": (1.5, 0.9)}, lambda x: -to_cuboid(x - (0.25, -0.05), (1.25, 0.95))),
@@ -105,12 +105,12 @@ WALLS = {
 
 
 def tube(x):
-    """torus(), in NumPy."""
+    """Return the distance of torus(), in NumPy."""
     return np.hypot(np.hypot(x[:, 0], x[:, 2]) - 0.7, x[:, 1]) - 0.2
 
 
 def prove(hits, origin, direction, gap, radius=0.0, tolerance=1e-9, reach=8.0, samples=400):
-    """Each ray meets the place where gap(x) - radius first falls to 0 from above, and normals are its gradient."""
+    """Check that each ray ends where gap(x) - radius first falls to 0 from above, and that normals are the gradient of gap."""
     d = direction / np.linalg.norm(direction, axis=1)[:, None]
     s = np.linspace(0, reach, samples)
     values = gap((origin[:, None] + s[:, None] * d[:, None]).reshape(-1, d.shape[1])).reshape(len(d), -1) - radius
@@ -121,7 +121,7 @@ def prove(hits, origin, direction, gap, radius=0.0, tolerance=1e-9, reach=8.0, s
     met = t < np.inf
     x = origin[met] + t[met, None] * d[met]
     n = hits.normal[met]
-    # What is met between two samples that do not show it is there, too: out before, in after.
+    # A ray may also meet something between two samples that miss it: gap is positive before the point, and not after it.
     np.testing.assert_allclose(gap(x) - radius, 0, atol=tolerance)
     assert (gap(x - 1e-5 * d[met]) > radius).all() and (gap(x + 1e-5 * d[met]) < radius + tolerance).all()
     np.testing.assert_allclose(hits.point[met], x - radius * n, atol=tolerance)
@@ -137,7 +137,7 @@ def prove(hits, origin, direction, gap, radius=0.0, tolerance=1e-9, reach=8.0, s
 
 
 def bundle(dim, k, seed, wide=2.0):
-    """Rays from all over, to where there is something; their directions are of any length."""
+    """Return rays from all over towards the scene; their directions are of any length."""
     rng = np.random.default_rng(seed)
     origin = rng.uniform(-wide, wide, (k, dim))
     return origin, (rng.uniform(-wide / 2, wide / 2, (k, dim)) - origin) * 10.0 ** rng.uniform(-3, 3, (k, 1))
@@ -145,8 +145,8 @@ def bundle(dim, k, seed, wide=2.0):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_walls_are_met_where_their_distance_falls_to_zero(world, dim, monkeypatch):
-    # Before and after a frame in which they move; balls of a radius, too; and starts that are inside of the wall. The host knows
-    # where walls are, so that the frame goes without its kernel, which for all walls takes long to compile.
+    # Before and after a frame in which the walls move; for rays of radius 0 and above; and for starts inside of the wall. The
+    # host computes where walls are, so the frame runs without its kernel, which takes long to compile for all walls.
     monkeypatch.setattr(CachedLaunch, "__call__", lambda launch: None)
     made = [make() for make, _, _ in WALLS[dim]]
     w = world(tv.Particles(np.full((1, dim), 0.05), radius=0.01, pinned=[0]), made, precision="f64", substeps=1)
@@ -155,7 +155,7 @@ def test_walls_are_met_where_their_distance_falls_to_zero(world, dim, monkeypatc
     for wall, (_, knobs, _) in zip(made, WALLS[dim], strict=True):
         for name, value in knobs.items():
             setattr(wall, name, value)
-    for wall, was in zip(made, before, strict=True):  # knobs that wait move nothing yet
+    for wall, was in zip(made, before, strict=True):  # knobs move nothing before the next step
         np.testing.assert_array_equal(w.ray(o, d, features=[wall], groups=()).distance, was.distance)
     w.step(0.01)
     for k, (wall, (make, knobs, gap)) in enumerate(zip(made, WALLS[dim], strict=True)):
@@ -164,7 +164,7 @@ def test_walls_are_met_where_their_distance_falls_to_zero(world, dim, monkeypatc
             hits = w.ray(o, d, 8.0, radius=radius, features=[wall], groups=())
             met = prove(hits, o, d, gap, radius, fine)
             assert 0.02 < met.mean() and (hits.wall[met] == k).all() and (hits.wall[~met] == NONE).all()
-        # The same shape that acts in no world, at its new place; and what is inside of it.
+        # The same shape outside of any world, at its new place; and starts inside of it.
         alone = make()
         for name, value in knobs.items():
             setattr(alone, name, value)
@@ -174,7 +174,7 @@ def test_walls_are_met_where_their_distance_falls_to_zero(world, dim, monkeypatc
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_particles_and_links_are_met_first_come_first(world, dim):
-    # Discs of many sizes, rods between them, and a wall around: the least of all distances, and who has it.
+    # Discs of many sizes, rods between them and a wall around: the least of all distances, and the thing at that distance.
     rng = np.random.default_rng(2)
     n = 40
     x, r = rng.uniform(-1.5, 1.5, (n, dim)), 10.0 ** rng.uniform(-2.5, -0.8, n)
@@ -183,7 +183,7 @@ def test_particles_and_links_are_met_first_come_first(world, dim):
     rods = r[pairs].min(axis=1)
 
     def gaps(p):
-        """Of all things, (n + m + 1, k): discs, rods, the wall."""
+        """Return the distances to all things, (n + m + 1, k): discs, rods, the wall."""
         discs = [np.linalg.norm(p - x[i], axis=1) - r[i] for i in range(n)]
         lines = [to_segment(p, x[a], x[b]) - rods[c] for c, (a, b) in enumerate(pairs)]
         return np.array([*discs, *lines, 3 - np.abs(p).max(axis=1)])
@@ -207,7 +207,7 @@ def test_particles_and_links_are_met_first_come_first(world, dim):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_the_tree_and_brute_force_find_the_same(dim):
-    # To the bit; with one disc at 1e9 m, some in the same place, some lines along axes, and less reach than there is room.
+    # Bit for bit; with one disc at 1e9 m, some discs in one place, some rays along axes, and a limited reach for some.
     rng = np.random.default_rng(4)
     n, k = 3000, 300
     center, radius = rng.uniform(-1, 1, (n, dim)), 10.0 ** rng.uniform(-4, (-1.3, -0.9)[dim - 2], n)
@@ -216,11 +216,11 @@ def test_the_tree_and_brute_force_find_the_same(dim):
     d[:50] = np.eye(dim)[rng.integers(0, dim, 50)]
     o[:25] = np.round(o[:25], 1)
     d /= np.linalg.norm(d, axis=1)[:, None]
-    o[50:60] = center[40] - 0.0501 * d[50:60]  # just before the disc that is there forty times
+    o[50:60] = center[40] - 0.0501 * d[50:60]  # just before the place of forty discs
     most = np.where(np.arange(k) % 3 == 0, 0.3, np.inf)
 
     def value(q, i):
-        """Where ray q meets disc i."""
+        """Return where ray q meets disc i."""
         return entry(ball(o[q], d[q], center[i], radius[i]), rounding(o[q], center[i]))
 
     tree = BoundingTree(center - radius[:, None], center + radius[:, None])
@@ -233,7 +233,7 @@ def test_the_tree_and_brute_force_find_the_same(dim):
 
 
 def test_nothing_slips_between_facets():
-    # From the inside of a closed mesh, each ray that leaves through an edge or a corner exactly is stopped, in 2D and 3D.
+    # From the inside of a closed mesh, a ray exactly through an edge or a corner is stopped, in 2D and 3D.
     cube = tv.Mesh(CUBE, FACES, inside=True)
     edges = CUBE[np.ravel(FACES)] / 2 + CUBE[np.roll(FACES, -1, axis=1).ravel()] / 2
     target = np.concatenate([CUBE, edges])
@@ -249,7 +249,8 @@ def test_nothing_slips_between_facets():
 
 
 def test_what_a_ray_starts_in_or_on(world):
-    # Out of a particle and a rod without meeting them, to the next; on a surface: in at 0, out and along never.
+    # A ray leaves a particle and a rod without meeting them, and meets the next thing. From a surface: inwards it meets at 0,
+    # outwards and along never.
     w = world(tv.Particles([(0, 0), (3, 0), (5, 0)], radius=(0.5, 0.5, 0.25)), [tv.Distance([(0, 1)])], precision="f64")
     for start, surface, particle in ((0.0, 2.5, 1), (0.2, 2.5, 1), (1.5, 2.5, 1), (2.6, 4.75, 2), (3.0, 4.75, 2), (3.5, 4.75, 2)):
         hit = w.ray((start, 0), (7, 0))
@@ -258,7 +259,7 @@ def test_what_a_ray_starts_in_or_on(world):
     hit = w.ray((0, 0.5), (0, -1))
     assert hit.distance == 0 and hit.particle == 0 and (hit.normal == (0, 1)).all()
     assert w.ray((5, 0.25), (0, 1)).particle == NONE and not w.ray((5, 0.25), (0, 1)).met
-    # A bounce off what it has met does not meet it again, at any angle.
+    # A ray that bounces off a particle does not meet it again, at any angle.
     rng = np.random.default_rng(7)
     d = rng.normal(size=(200, 2))
     hits = w.ray((5, 2) + 0 * d, (0, -1.8) + 0.05 * d, features=())
@@ -273,7 +274,7 @@ FLOORS = [tv.HalfSpace((0, 1), 0.5), tv.Box((-9, 0.5), (9, 30)), tv.Polygon([(-9
 
 @pytest.mark.parametrize("wall", FLOORS, ids=repr)
 def test_floors_met_at_their_surface_or_along_it(wall):
-    # The height of the origin, the slope of the ray, and how far it is to the floor y = 0.5, before other sides of the wall.
+    # The height of the origin, the slope of the ray, and its way to the floor y = 0.5 before other sides of the wall.
     ways = (1.5, -1.0, 1.0), (0.5, -1.0, 0.0), (0.5, 1.0, np.inf), (0.5, 0.0, np.inf), (0.6, 0.0, np.inf), (1.5, -1e-9, np.inf)
     for y, down, far in ways:
         d = np.array([[1.0 if abs(down) < 1 else 0.0, down]])
@@ -286,21 +287,21 @@ def test_floors_met_at_their_surface_or_along_it(wall):
 
 
 def test_a_sheet_has_two_sides():
-    # Without thickness; where a ray starts on it, it is not met, whichever way it goes.
+    # A sheet without thickness; a ray that starts on it does not meet it, in any direction.
     for sheet in (
         tv.Polygon([(-1, 0), (1, 0)], closed=False),
         tv.Mesh([(-1, 0, -1), (1, 0, -1), (0, 0, 2)], [(0, 1, 2)], closed=False),
     ):
         o, d = np.zeros((6, sheet.dim)), np.zeros((6, sheet.dim))
         o[:, 1], d[:, 1] = (2, -2, 0, 0, 2, 3), (-1, 1, 1, -1, 1, -1)
-        o[5, 0] = 1.5  # beside it
+        o[5, 0] = 1.5  # beside the sheet
         distance, normal = sheet.cast(o, d, 0.0)
         assert distance.tolist() == [2, 2, np.inf, np.inf, np.inf, np.inf] and normal[:2, 1].tolist() == [1, -1]
         np.testing.assert_allclose(sheet.cast(o[:5], d[:5], 0.5)[0], [1.5, 1.5, np.inf, np.inf, np.inf], atol=1e-12)
 
 
 def test_points_and_thin_lines(world):
-    # In 2D a link between points is met, also in its joints and along axes; in 3D by a ball only. A point is met head on.
+    # In 2D a ray meets a link between points, also at its joints and along axes; in 3D only a ball does. A point is met head on.
     x = np.array([(0, 0), (1, 0.3), (2, 0.1), (3, 0.7)])
     w = world(tv.Particles(x), [tv.Distance([(0, 1), (1, 2), (2, 3)])], precision="f64")
     above = np.concatenate([x, (x[:-1] + x[1:]) / 2]) + (0, 5)
@@ -309,7 +310,7 @@ def test_points_and_thin_lines(world):
     assert (hits.particle[:4] == range(4)).all() and (hits.link[4:, 1] == range(3)).all()
     u = x[1] - x[0]
     np.testing.assert_allclose(hits.normal[4], np.array([-u[1], u[0]]) / np.linalg.norm(u), atol=1e-14)
-    assert not w.ray(x[1], (0, 1)).met and not w.ray(x[0] + 0.5 * u, (0, 1)).met  # starts on it
+    assert not w.ray(x[1], (0, 1)).met and not w.ray(x[0] + 0.5 * u, (0, 1)).met  # rays that start on a link
     w = world(tv.Particles(np.c_[x, 0 * x[:, :1]]), [tv.Distance([(0, 1)])], precision="f64")
     assert not w.ray((0.5, 5, 0.01), (0, -1, 0)).met
     hit = w.ray((0.5, 5, 0.0), (0, -1, 0), radius=0.1)
@@ -325,7 +326,7 @@ def test_who_counts(world):
     shot = (0, 0), (1, 0)
 
     def first(**options):
-        """Kind and number of what is met."""
+        """Return kind and number of the first thing that is met."""
         h = w.ray(*shot, **options)
         kinds = {"particle": h.particle, "link": h.link[1], "wall": h.wall}
         return next(((kind, int(k)) for kind, k in kinds.items() if k >= 0), None)
@@ -337,7 +338,7 @@ def test_who_counts(world):
     assert first(groups=(), reach=4.99) is None and first(groups=(), reach=5.0) == ("wall", 1)
     assert first(skip=w.handle([0, 1])) == ("link", 0) and first(skip=0) == ("particle", 1)
     assert first(reach=0.89) is None and first(reach=0.9) == ("particle", 0)
-    # Switched off and broken: gone from the next frame on.
+    # A wall that is switched off and a link that breaks: gone from the next frame on.
     wall.active = False
     assert first(groups=()) == ("wall", 1)
     w.velocity = [(0, 0), (0, 0), (0, -300), (0, 300), (0, 0)]
@@ -348,7 +349,7 @@ def test_who_counts(world):
 
 
 def test_of_things_at_the_same_distance_the_first_counts(world):
-    # Two discs in one place, the rod between them and to another one of the same radius, and a floor and a slab at their top.
+    # Two discs in one place, rods from both to another disc of the same radius, and walls at the height of their top.
     slab = tv.Box((-9, -9), (9, 9)), tv.HalfSpace((0, 1), 1.0), tv.Capsule((-5, 0), (5, 0), 1.0)
     x = tv.Particles([(0, 0), (0, 0), (3, 0)], radius=1.0)
     w = world(x, [*slab, tv.Distance([(0, 2), (1, 2)])], precision="f64", solver=tv.Jacobi())

@@ -1,4 +1,4 @@
-"""Recordings: what is read back is what the world was."""
+"""Recordings: the file holds what the world was."""
 
 import warnings
 from itertools import pairwise
@@ -17,10 +17,10 @@ pytestmark = pytest.mark.usefixtures("read_here")
 
 
 def read(path, entity: str, column: str):
-    """All rows of a column of an entity, by frame (None for static data)."""
+    """Return all rows of a column of an entity, by frame (None for static data)."""
     out = {}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # rerun asks for a footer, which takes 90 kB
+        warnings.simplefilter("ignore")  # rerun expects a footer, which would take 90 kB
         reader = rr.chunk.RrdReader(str(path))
     for chunk in reader.stream():
         if chunk.entity_path != entity:
@@ -60,21 +60,21 @@ def test_every_frame_reads_back(world, tmp_path, dim):
     for k, position in enumerate(seen):
         x = position.astype(np.float32)
         drawn = [(a, b, hue) for strip, hue in zip(strips[k], hues[k], strict=True) for a, b in pairwise(strip)]
-        np.testing.assert_array_equal(np.array([d[:2] for d in drawn], np.float32), x[links])  # a rope: in its order
+        np.testing.assert_array_equal(np.array([d[:2] for d in drawn], np.float32), x[links])  # in order, as a rope
         strain = np.linalg.norm(np.diff(position[links], axis=1)[:, 0], axis=1) / w.features[1].rest - 1
         assert [d[2] for d in drawn] == SCALE[levels(strain)].tolist()
     radii = read(path, "/world/scene/particles", f"Points{kind}:radii")
     assert list(radii) == [None] and radii[None][0] < 0 and radii[None][1] == np.float32(0.02)
-    assert len(strips[12]) < 29 or len(set(hues[12])) > 1  # neighbours of one colour are one strip
+    assert len(strips[12]) < 29 or len(set(hues[12])) > 1  # neighbouring links of one colour are one strip
     hues = np.array(read(path, "/world/scene/particles", f"Points{kind}:colors")[None], dtype=np.uint32) >> 8  # RGBA
     red, green, blue = tv.golden_colors(1)[0].tolist()  # a rope is one body
     assert (hues[1:] == red << 16 | green << 8 | blue).all() and hues[0] == 140 << 16 | 140 << 8 | 150
     for end, names in {"energy": ["energy"], "violation": ["residual", "overlap"], "substeps": ["substeps"]}.items():
         curve = read(path, f"/figures/{end}", "Scalars:scalars")
         assert [curve[k + 1] for k in range(12)] == [[getattr(report, name) for name in names] for report in reports]
-    curve = read(path, "/figures/milliseconds", "Scalars:scalars")  # of the first frame: compiling
+    curve = read(path, "/figures/milliseconds", "Scalars:scalars")  # the first frame compiles
     assert [curve[k + 1][0] for k in range(1, 12)] == pytest.approx([report.seconds * 1e3 for report in reports[1:]], rel=5e-3)
-    # y is up: the views of rerun in 2D have it down, and a mirror above the data turns it; in 3D it is said.
+    # y is up. The 2D views of rerun have y down, so a mirror above the data turns it; in 3D the view coordinates name it.
     if dim == 2:
         assert read(path, "/world/scene", "Transform3D:scale")[None] == [[1, -1, 1]]
     else:
@@ -83,7 +83,7 @@ def test_every_frame_reads_back(world, tmp_path, dim):
         assert len(rr.chunk.RrdReader(str(path)).blueprints()) == 1
     about = read(path, "/about", "TextDocument:text")[None][0]
     assert "13 frames, 0.2 s simulated" in about and "constraint violation" in about
-    assert set(read(path, "/world/scene/walls/3", f"LineStrips{kind}:strips")) == {0}  # a wall that stands is written once
+    assert set(read(path, "/world/scene/walls/3", f"LineStrips{kind}:strips")) == {0}  # a wall that does not move is written once
 
 
 def test_every_and_misuse(world, tmp_path):
@@ -119,7 +119,7 @@ def test_a_path_is_recorded_to_and_a_recorder_that_logs_nothing_says_so(world, t
 def test_each_link_is_in_one_strip(count, links):
     rng = np.random.default_rng(count)
     pairs = np.stack([rng.integers(0, count, links), rng.integers(0, count, links)], axis=1)
-    pairs = pairs[pairs[:, 0] != pairs[:, 1]]  # some are there twice
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]  # some pairs occur twice
     particles, link = trails(pairs)
     assert sorted(link[link >= 0].tolist()) == list(range(len(pairs))) and link[-1] == -1
     for k in np.flatnonzero(link >= 0):
@@ -137,13 +137,13 @@ def test_a_rope_is_one_strip_and_a_sheet_is_one_mesh(world):
 
     sheet = tv.shapes.cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (6, 5))
     pairs = np.concatenate([sheet.links, sheet.braces])
-    assert cells(pairs, sheet.position)[0].all()  # threads, diagonals, and what lies on two threads
+    assert cells(pairs, sheet.position)[0].all()  # threads, diagonals, and braces over two threads
     w = world(tv.Particles(sheet.position), [tv.Distance(pairs)])
     faces = triangles(w)
     corners = sheet.position[faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    assert len(area) == 2 * 5 * 4 and area.sum() == pytest.approx(1.0)  # no cell is left out, and none is there twice
-    # Its colour: that of the body, in light by |n . l|, and where links are strained, red or blue by the worst of them.
+    assert len(area) == 2 * 5 * 4 and area.sum() == pytest.approx(1.0)  # no cell is missing or doubled
+    # The colour of the body, in light by |n . l|; where links are strained, red or blue by the worst of them.
     up, body = np.array([0.0, 1.0, 0.0]), np.array([200.0, 100.0, 40.0])
     mesh, level = Surface(faces, np.tile(body, (30, 1)), pairs, up), np.full(len(pairs), LEVELS)
     level[0], level[1] = 2 * LEVELS, 0
@@ -157,7 +157,7 @@ def test_a_rope_is_one_strip_and_a_sheet_is_one_mesh(world):
     for x, n in ((sheet.position, up), (sheet.position[:, [1, 0, 2]], up[[1, 0, 2]])):
         shade = DARKEST + (1 - DARKEST) * abs(n @ light) / np.linalg.norm(light)
         seen = rgb(x)
-        np.testing.assert_allclose(seen[-1], body * shade, atol=0.5 + 200 / 30)  # of 15 shades
+        np.testing.assert_allclose(seen[-1], body * shade, atol=0.5 + 200 / 30)  # one of 15 shades
         np.testing.assert_allclose(seen[pairs[0]], np.tile(LONGER * shade, (2, 1)), atol=0.5 + 255 / 30)
         assert pairs[1][0] in pairs[0] or np.allclose(seen[pairs[1][0]], SHORTER * shade, atol=0.5 + 255 / 30)
 
@@ -187,7 +187,7 @@ def test_bytes_of_positions_take_most_of_the_file(world, tmp_path):
 
 
 def test_a_small_recording_takes_little_beside_its_positions(world, tmp_path):
-    # 40 points in 2D: 320 bytes of f32 in a frame. All else, layout, curves and hashes, takes 1.5 times as much at most.
+    # 40 points in 2D: 320 bytes of f32 in a frame. Everything else (layout, curves, hashes) takes at most 1.5 times as much.
     rope = tv.shapes.rope((0, 2), (1, 2), points=40)
     links = [tv.Gravity(9.81), tv.Distance(rope.links), tv.Box((-2, 0), (2, 3))]
     w = world(tv.Particles(rope.position, mass=0.01, radius=0.01, pinned=[0]), links, substeps=32)
@@ -198,7 +198,7 @@ def test_a_small_recording_takes_little_beside_its_positions(world, tmp_path):
 
 
 def test_what_is_too_far_away_for_a_picture_is_recorded(world, tmp_path, read_here):
-    # 1e40 m is none of the numbers of f32, in which pictures are: NumPy warns of nothing, and frames come out as they were.
+    # 1e40 m exceeds f32, in which pictures are stored: NumPy issues no warning, and frames are replayed as they were.
     w = world(tv.Particles([(0.0, 0.0), (1.0, 0.0)], velocity=[(1e42, 0.0), (0.0, 0.0)]), precision="f64")
     with tv.Recorder(str(tmp_path / "far.rrd"), w) as recorder:
         assert "out-of-range" in w.step(1 / 60).flags

@@ -1,4 +1,4 @@
-"""Files of recordings: what they hold, what becomes of them when they are cut, changed or not finished, and the commands."""
+"""Files of recordings: their content, what remains when they are cut, changed or unfinished, and the commands."""
 
 import json
 import os
@@ -25,14 +25,14 @@ from .forging import Forgery
 
 @pytest.fixture(scope="module")
 def falling(tmp_path_factory):
-    """The file of a small recording, and the energy curve."""
+    """Return the path of a small recording."""
     path = tmp_path_factory.mktemp("falling") / "a.rrd"
     gravity = tv.Gravity(9.81)
     with (
         tv.World(tv.Particles(np.eye(3), velocity=(1, 2, 3)), [gravity], substeps=2) as world,
         pytest.MonkeyPatch.context() as patch,
     ):
-        patch.setattr("tiverlet.recording.recorder.SMALL", 0)  # many messages, as a long recording has
+        patch.setattr("tiverlet.recording.recorder.SMALL", 0)  # many messages, as in a long recording
         with tv.Recorder(path, world, every=2) as recorder:
             for frame in range(20):
                 if frame == 11:
@@ -44,7 +44,7 @@ def falling(tmp_path_factory):
 
 
 def rewrite(path, to, change, seal=True):
-    """Copy a recording with entries changed by change(text) -> text; with new checksums, or not."""
+    """Copy a recording with entries changed by change(text) -> text; `seal` renews the checksums."""
     return Forgery(path).journal(lambda entry: json.loads(change(json.dumps(entry))), seal).save(to)
 
 
@@ -55,7 +55,7 @@ def test_what_was_recorded_reads_back(falling, tmp_path):
     with recording.world(20) as world:
         np.testing.assert_array_equal(recording.position(20), world.position.astype(np.float32))
         assert world.time == recording.times[-1] and world.features[0].g == 5.0
-    # x = t, y = 2 t - g t^2 / 2 without step errors
+    # x = t, y = 2 t - g t^2 / 2 without step errors.
     np.testing.assert_allclose(recording.position(10)[0], [1 + 1 / 6, 2 / 6 - 9.81 / 72, 3 / 6], rtol=1e-6)
     assert list(recording.curves["energy"][0]) == list(range(2, 21, 2))
     np.testing.assert_allclose(recording.curves["momentum/x"][1], 3.0, rtol=1e-6)
@@ -90,7 +90,7 @@ def test_damage_is_named(falling, tmp_path, read_here):
     with pytest.raises(ValueError, match="cut short before anything"):
         tv.replay(path)
 
-    # Cut in the middle of every message: what comes before it is read, and it is said where that ends.
+    # Cut in the middle of every message: everything before it is read, and the text says where that ends.
     ends, at = [], reader.HEADER
     while at < len(whole) and (kind := struct.unpack_from("<QQ", whole, at))[0]:
         at += 16 + kind[1]
@@ -109,7 +109,7 @@ def test_damage_is_named(falling, tmp_path, read_here):
     verdict = part.verify()
     assert not verdict and (verdict.kind, verdict.frames) == ("incomplete", 11) and "the first 11 frames hold" in str(verdict)
 
-    # An entry of the journal that is not there; and a length that is wrong.
+    # A missing entry of the journal; and a wrong length.
     forged = Forgery(falling)
     (k,) = forged.chunks(journal.JOURNAL)[6:7]
     forged.only(k, [])
@@ -157,7 +157,7 @@ def test_tampering_is_found(falling, tmp_path, read_here):
     with pytest.raises(RuntimeError, match=f"frame 12 .* not as it was: taichi 0.{minor} then, 1.{minor} now"):
         tv.replay(rewrite(falling, tmp_path / "d.rrd", elsewhere)).world(12)
 
-    # One coordinate of the picture.
+    # One changed coordinate of the picture.
     forged = Forgery(falling)
     k, row = forged.rows("world/scene/particles", "Points3D:positions")[4]
     x = forged.messages[k][2].column("Points3D:positions").to_pylist()
@@ -189,7 +189,7 @@ other = tv.Recorder({str(tmp_path / "first.rrd")!r}, w)
 os.kill(os.getpid(), signal.SIGKILL)
 """
     assert python(code, check=False).returncode == -9
-    assert list(tv.replay(tmp_path / "first.rrd").frames) == [0]  # something is there at once
+    assert list(tv.replay(tmp_path / "first.rrd").frames) == [0]  # the first frame is written at once
     recording = tv.replay(tmp_path / "k.rrd")
     assert not recording.complete and recording.frames[-1] >= 25 and "it ends with frame" in recording.text
     verdict = recording.verify()
@@ -245,7 +245,7 @@ def test_nothing_is_overwritten_unasked(falling, world, tmp_path, read_here):
     assert path.read_bytes() == falling.read_bytes() and other.read_text() == "years of work"
     with pytest.raises(ValueError, match="Give at least"):
         tv.Recorder(path, w, budget=1000, overwrite=True)
-    assert path.read_bytes() == falling.read_bytes()  # it is replaced once there is something instead
+    assert path.read_bytes() == falling.read_bytes()  # the file is replaced only when there is something to replace it
     assert main(["run", "hello", "--out", str(other)]) == 2 and other.read_text() == "years of work"
     with tv.Recorder(path, w, overwrite=True):
         assert not tv.replay(path).complete
@@ -273,7 +273,7 @@ def test_a_file_that_is_gone_is_noticed(world, tmp_path, monkeypatch, how):
 
 
 def test_what_ends_other_programs_is_an_error(tmp_path):
-    # Without HOME Taichi ends the process; in a forked child it waits for ever at the end; ti.reset destroys the fields.
+    # Without HOME Taichi ends the process; in a forked child it hangs at the end; ti.reset destroys the fields.
     code = f"""
 import os, sys
 assert "HOME" not in os.environ
@@ -323,20 +323,20 @@ def test_a_budget_is_kept_and_said(world, tmp_path, read_here):
                 recording.log()
                 sizes.append((tmp_path / "b.rrd").stat().st_size)
     assert max(sizes) < 500_000 and (tmp_path / "b.rrd").stat().st_size < 500_000
-    recording = tv.replay(tmp_path / "b.rrd")  # the whole run is there
+    recording = tv.replay(tmp_path / "b.rrd")  # the whole run is in the file
     assert {*range(0, 401, 8)} <= {*recording.frames.tolist()} and len(recording.frames) < 110
     assert recording.verify() and recording.complete
     frames, values = recording.curves["energy"]
     assert {*range(8, 401, 8)} <= {*frames.tolist()} and len(frames) < 110 and np.isfinite(values).all()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["b.rrd"]
-    whole = (tmp_path / "b.rrd").read_bytes()  # which was written anew: cut, it is as any other that is cut
+    whole = (tmp_path / "b.rrd").read_bytes()  # the file was rewritten; a part of it reads like a part of any other file
     for share in (0.25, 0.5, 0.8, 0.999):
         (tmp_path / "cut.rrd").write_bytes(whole[: int(share * len(whole))])
         part = tv.replay(tmp_path / "cut.rrd")
         assert not part.complete and "the file is cut short" in part.text and len(part.frames) <= len(recording.frames)
     assert part.verify().kind == "incomplete" and part.verify().frames == len(part.frames)
 
-    # What the user does in each step is in the file, too: where not even that fits, the recording ends, and says so.
+    # The file also holds what the user does in each step. Where not even that fits, the recording ends, with a warning.
     gravity = w.features[0]
     with pytest.warns(UserWarning, match="do not fit in it after frame [0-9]+, where the recording ends"):
         with tv.Recorder(tmp_path / "c.rrd", w, budget=240_000) as recording:
@@ -351,7 +351,7 @@ def test_a_budget_is_kept_and_said(world, tmp_path, read_here):
 
 @pytest.mark.parametrize("stride", [2, 4, 8])
 def test_frames_are_taken_out_so_that_the_rest_shows_the_same(stride):
-    # What is seen in a frame that is kept is the last row up to it: the same before and after.
+    # A viewer shows the last row up to a frame: for frames that are kept, the same row before and after.
     for frames in ([], [0], list(range(41)), [0, 3, 5, 6, 17], [7], [0, 8, 9, 16, 39, 40]):
         gone = messages.droppable(np.array(frames, dtype=np.int64), stride)
         rest = [frame for frame, drop in zip(frames, gone, strict=True) if not drop]
@@ -367,7 +367,7 @@ def test_command_line(falling, tmp_path, monkeypatch, capsys, read_here):
     path.write_bytes(falling.read_bytes())
     assert main(["replay", str(path), "--verify"]) == 0 and "all 11 frames come out" in capsys.readouterr().out
     anew = f"from tiverlet.__main__ import main\nraise SystemExit(main(['replay', {str(path)!r}, '--verify']))"
-    assert "all 11 frames come out" in python(anew).stdout  # where Taichi does not run yet
+    assert "all 11 frames come out" in python(anew).stdout  # in a process in which Taichi does not run yet
     wrong = rewrite(falling, tmp_path / "b.rrd", lambda text: text.replace('"g": 5.0', '"g": 5.5'))
     assert main(["replay", str(wrong), "--verify"]) == 1 and "first particle 0" in capsys.readouterr().out
     assert main(["replay", str(path), "--export", "csv"]) == 0 and (tmp_path / "a.csv").exists()
@@ -398,7 +398,7 @@ if __name__ == "__main__":
 
 
 def test_entries_that_passed_each_other_are_packed_in_order(falling):
-    # Those with and without bytes come in messages of their own: in another order they make the same journal.
+    # Entries with and without bytes are in different messages; messages in another order give the same journal.
     there = messages.split(falling.read_bytes())
     mine = [k for k, (kind, m) in enumerate(there) if kind == messages.CHUNK and _entity(m) == f"/{journal.JOURNAL}"]
     assert len(mine) > 1
@@ -412,7 +412,7 @@ def _entity(message):
 
 
 def _lines(packed):
-    """The entries of a journal in the order of the file, whose checksums have to follow from each other."""
+    """Return the entries of a journal in the order of the file; check that their checksums follow from each other."""
     out, mark = [], ""
     for m in (m for kind, m in packed if kind == messages.CHUNK and _entity(m) == f"/{journal.JOURNAL}"):
         rows = messages.Chunk(m).rows()
@@ -425,7 +425,7 @@ def _lines(packed):
 
 @pytest.mark.parametrize("frames", [0, 3])
 def test_a_world_without_particles_is_recorded(tmp_path, frames):
-    # Entries of its journal may have no bytes at all.
+    # Entries of an empty world's journal may have no bytes at all.
     world = tv.World(tv.Particles(np.zeros((0, 3))), [tv.Gravity()])
     with tv.Recorder(tmp_path / "a.rrd", world) as recorder:
         for _ in range(frames):
@@ -474,12 +474,13 @@ def test_a_picture_without_a_window(falling, tmp_path, monkeypatch):
     assert not list((tmp_path / "temporary").iterdir())
     first, last = (viewer.pixels_of(png).astype(int) for png in (one, other))
     assert first.shape == last.shape and first.shape[0] > 300
-    assert (np.abs(first - last).max(axis=2) > 60).sum() > 50  # particles have moved, on a background that has not
+    assert (np.abs(first - last).max(axis=2) > 60).sum() > 50  # particles have moved on a background that has not
     assert (np.abs(first - last).max(axis=2) < 20).mean() > 0.5
 
 
 def test_what_is_removed_from_a_pile_that_moves_is_recorded(world, tmp_path, read_here):
-    # Contacts that go leave their part in the velocities of what stays, an array of the clock's, until the next step.
+    # Contacts of a removed particle leave their part in the velocities of the others, in an array of the clock, until the next
+    # step.
     start = tv.Particles([(0, 0.1), (0.3, 0.1), (0.25, 0.3)], radius=0.1)
     w = world(start, [tv.Gravity(), tv.Box((-1, 0), (1, 2)), tv.Contact(friction=0.5)])
     with tv.Recorder(tmp_path / "removed.rrd", w) as recorder:
@@ -504,8 +505,8 @@ def test_a_recording_begins_while_a_knob_asks_for_other_kernels(world, tmp_path,
         contact.friction = contact.restitution = box.friction = link.compliance = 0.0
         w.step(1 / 60)
         recorder.log()
-    # Kernels keep what knobs no longer ask for, which shows in bits and in what the state consists of: of a world that goes on
-    # from a recording, of one that begins only then, and of a clone.
+    # Kernels keep what knobs do not ask for. This shows in bits and in the state's fields: of a world that continues from a
+    # recording, of a recording that begins only then, and of a clone.
     clone, again = w.clone(), tv.replay(tmp_path / "knob.rrd")
     assert again.verify() and again.world(2).hash() == w.hash()
     with tv.Recorder(tmp_path / "off.rrd", w) as recorder:
@@ -514,7 +515,7 @@ def test_a_recording_begins_while_a_knob_asks_for_other_kernels(world, tmp_path,
     assert again.verify() and again.world(int(again.frames[-1])).hash() == end
     clone.run(0.1)
     assert clone.hash() == end
-    # The same features in a new world are what their knobs say.
+    # A new world has only what the knobs of the same features ask for.
     w.close()
     fresh = world(start, w.features)
     assert not (contact.has_friction or contact.has_restitution or contact.turns or box.has_friction or link.soft)

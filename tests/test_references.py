@@ -1,6 +1,6 @@
 """Ropes, nets and beams against statics and modes from cases.json.
 
-Where one Jacobi pass cannot hold a long rigid rope, its law is tested: a pass is a spring of compliance W h^2.
+One Jacobi pass cannot hold a long rigid rope. There its law is tested: a pass is a spring of compliance W h^2.
 """
 
 import numpy as np
@@ -15,19 +15,19 @@ DT = 1 / 60
 
 
 def line(n: int) -> np.ndarray:
-    """Pairs of a chain of n links."""
+    """Return the pairs of a chain of n links."""
     return np.stack([np.arange(n), np.arange(n) + 1], axis=1)
 
 
 def discrete(n: int, values: dict) -> np.ndarray:
-    """The steps of a catenary of n links of 10 m in all, (n, 2): link i has the slope (i - (n + 1) / 2) / H."""
+    """Return the steps of a catenary of n links, 10 m in all, (n, 2): link i has the slope (i - (n + 1) / 2) / H."""
     slope = (np.arange(1, n + 1) - (n + 1) / 2) / values["H_over_mg"]
     return 10.0 / n * np.stack([np.ones(n), slope], axis=1) / np.sqrt(1 + slope**2)[:, None]
 
 
 def test_ropes_hang_as_catenaries(world):
-    # R10b, rigid: 1e-4 with 16 passes. S07, elastic: 1e-4 with 4 passes and any effort beyond. All five ropes in one world.
-    # Then the rigid ones and one of a hundred links as they are solved by default, directly: 1e-8 with one pass.
+    # R10b, rigid: 1e-4 with 16 passes. S07, elastic: 1e-4 with 4 passes or more. All five ropes are in one world. Then the rigid
+    # ropes and one of a hundred links with the default solver, which is direct: 1e-8 with one pass.
     rigid = [(n, 10.0, 6.0, 0.0, case(f"R10b_discrete_catenary_N{n}")["values"]) for n in (10, 20)]
     keys = {"N10_alpha1e-3": (10, 1e-3), "N20_alpha1e-4": (20, 1e-4), "N50_alpha1e-3": (50, 1e-3)}
     soft = [(n, 1.0, 0.8, a, case("S07_elastic_catenary")["values"][key]) for key, (n, a) in keys.items()]
@@ -69,8 +69,9 @@ def test_ropes_hang_as_catenaries(world):
 
 
 def test_one_pass_sags_by_the_law(world):
-    # A rigid chain of N links and masses m, one pass: link k carries k m g, and gives way by W h^2 times that, 4 k g h^2 inside.
-    # All but the anchor fall by g h^2 before the pass, so its link gives way by that much less. With drag h^2 is phi h^2.
+    # A rigid chain of N links with masses m, one pass: link k carries k m g, and gives way by W h^2 times that, 4 k g h^2 inside.
+    # All masses but the anchor fall by g h^2 before the pass, so the anchor's link gives way by that much less. With drag h^2 is
+    # phi h^2.
     n, h = 100, DT / 20
     hh = h * -np.expm1(-20 * h) / 20
     weight = np.where(np.arange(n) == 0, 2.0, 4.0)  # W = 2 w + 2 w, but 2 w at the anchor, and 2 w + w at the free end
@@ -88,7 +89,7 @@ def test_one_pass_sags_by_the_law(world):
 
 
 def test_modes_of_a_chain_of_springs(world):
-    # R12: u_i = A sin(j pi i / (N + 1)) cos(omega t), omega = 2 sqrt(k / m) sin(j pi / (2 (N + 1))); all amplitude is kept.
+    # R12: u_i = A sin(j pi i / (N + 1)) cos(omega t), omega = 2 sqrt(k / m) sin(j pi / (2 (N + 1))); the amplitude is kept.
     p, modes = case("R12_chain_modes")["params"], case("R12_chain_modes")["values"]["modes"]["dt0.001"]
     n = p["N"]
     x = np.stack([np.arange(n + 2.0), np.zeros(n + 2)], axis=1)
@@ -130,7 +131,7 @@ def test_modes_of_a_hanging_chain(world):
 
 
 def test_a_whip_of_ten_links(world):
-    # D05: the prototype's error with one pass; that of a direct solver once the passes converge, at second order.
+    # D05: with one pass, the error of the prototype; with passes that converge, that of a direct solver, at second order.
     name = "D05_chain10"
     x, mass, pairs = pendulums(name)
     start = tv.Particles(x, mass=mass, pinned=[0])
@@ -166,7 +167,7 @@ def test_a_net_sags_under_its_weight(world):
 
 
 def test_a_beam_bends_under_its_load(world):
-    # S06: k_b theta_i = F (x_N - x_i), k_b = EI / l; a clamped strip of ten rigid links with a force at its tip.
+    # S06: k_b theta_i = F (x_N - x_i), k_b = EI / l: a clamped strip of ten rigid links with a force at its tip.
     n = 10
     k, values = np.arange(n), case("S06_cantilever_elastica")["values"]
     x = np.stack([(np.arange(n + 2) - 1) / n, np.zeros(n + 2)], axis=1)

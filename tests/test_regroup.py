@@ -1,4 +1,4 @@
-"""Adding to a world and removing from it: what stays goes on to the bit, what comes starts as in a world of its own."""
+"""Adding to a world and removing from it: the rest continues bit for bit, and new particles start as in their own world."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.usefixtures("read_here")
 
 
 def half(x: float):
-    """One of everything around (x, 0): positions, and the features on them as functions of the first number."""
+    """Return the positions of one of everything, around (x, 0)."""
     rope = np.stack([np.linspace(0, 1.5, 6), np.full(6, 2.0)], axis=1)
     ring = 0.4 * np.stack([np.cos(np.arange(7) * 0.9), np.sin(np.arange(7) * 0.9)], axis=1) + [0.5, 0.9]
     block = np.array([[2.0, 1], [2.4, 1], [2.4, 1.4], [2.0, 1.4]])
@@ -23,7 +23,7 @@ def half(x: float):
 
 
 def everything():
-    """Two halves 20 m apart, in every batch."""
+    """Return two halves 20 m apart, with rows of both in every batch: particles and features."""
     x = np.concatenate([half(0.0), half(20.0)])
     n = len(x) // 2
 
@@ -57,7 +57,7 @@ def test_what_stays_goes_on_to_the_bit(world):
     counts = [f.count // 2 for f in batches]
 
     def lead():
-        rope.break_at = rope.break_at * 0.99  # knobs wait to be uploaded, and a target is under way
+        rope.break_at = rope.break_at * 0.99  # knobs wait to be uploaded, and a target is moving
         hand.target = hand.target + [0.0, 0.05]
 
     def look():
@@ -81,7 +81,7 @@ def test_what_stays_goes_on_to_the_bit(world):
     w.run(0.2)
     right = w.handle(np.arange(n, 2 * n))
     x, v = w.position, w.velocity
-    # From the right half, one particle of each constraint, and with them what had them, and a disc; the rest of it flies on.
+    # Remove one particle of each constraint in the right half, with its constraints, and a disc; the rest of that half flies on.
     gone = n + np.array([0, 2, 4, 6, 7, 9, 11, 13, 17, 21, 22, 23])
     w.remove(np.concatenate([gone, new.indices]))
     some = np.setdiff1d(np.arange(2 * n), gone)
@@ -103,14 +103,14 @@ def test_what_stays_goes_on_to_the_bit(world):
 
 @ti.func
 def magnet(x, v):
-    """A force across the velocity, and a spring."""
+    """Return a force across the velocity plus a spring."""
     return 3.0 * ti.Vector([v[1], -v[0]]) - x
 
 
 @pytest.mark.parametrize("last", [tv.Drag(0.4), tv.Force(magnet)], ids=repr)
 def test_what_comes_starts_as_in_a_world_of_its_own(world, last):
-    # Thrown into a world that runs, between two substeps: the same motion as from a start there, to rounding. Drag, and forces
-    # that read velocities, make that more than d = h v - h^2 g / 2.
+    # Thrown into a running world between two substeps: the same motion as from a start there, to rounding. With drag and forces
+    # that read velocities, this takes more than d = h v - h^2 g / 2.
     def features():
         return [tv.Gravity(9.81), last.copy()]
 
@@ -123,7 +123,7 @@ def test_what_comes_starts_as_in_a_world_of_its_own(world, last):
     np.testing.assert_allclose(w.velocity[new], [v[0], [0, 0]], atol=1e-12)
     report = w.step(1 / 60)
     alone.step(1 / 60)
-    # The energy account goes on: of the frame, not of what was added.
+    # The energy account continues: it counts the frame, not the added particles.
     change = 0.5 * (v**2).sum() + 9.81 * x[0, 1]
     assert abs(report.energy_change) < 0.1 * change and report.energy > first + 0.5 * change
     w.run(0.4)
@@ -133,8 +133,9 @@ def test_what_comes_starts_as_in_a_world_of_its_own(world, last):
 
 
 def test_forces_and_constraints_come_and_go(world):
-    # A straight line, then a parabola, then a straight line again: exact, since forces change between a velocity and the next.
-    # Beside it a pair with a rest length from where it is now; and a disc that is put into another parts from it gently.
+    # A straight line, then a parabola, then a straight line again: exact, because forces change between a velocity and the next
+    # substep. Besides, links take their rest lengths from the present positions; and a disc that is put into another parts from
+    # it slowly.
     x, v = np.array([[0.0, 0], [5, 0], [6, 0], [7, 0]]), np.array([1.0, 2.0])
     w = world(tv.Particles(x, velocity=v, radius=[0.0, 0.4, 0.4, 0.4]), [], precision="f64")
     w.run(0.2)
@@ -163,7 +164,8 @@ def test_forces_and_constraints_come_and_go(world):
 
 
 def test_bodies_go_whole_and_numbers_follow():
-    # Without a world: a tetrahedral surface, a body of Polygons, limits, and the arrays of each, when particles 2 and 5 of 12 go.
+    # Without a world: a tetrahedral surface, a body of Polygons, limits, and their arrays, when particles 2 and 5 of 12 are
+    # removed.
     number = np.array([0, 1, -1, 2, 3, -1, 4, 5, 6, 7, 8, 9])
     four = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
     volume = tv.Volume(np.concatenate([four, four + 8]), pressure=[1.0, 2.0])
@@ -182,7 +184,7 @@ def test_bodies_go_whole_and_numbers_follow():
 
 
 def fails(*given):
-    """What goes wrong late."""
+    """Fail after most of the edit is done."""
     raise KeyError("late")
 
 
@@ -208,7 +210,7 @@ def test_after_an_error_the_world_is_as_before(world, monkeypatch):
         w.add(more, [tv.Gravity(1.0), tv.Rope([[3, 4]])])
     with pytest.raises(ValueError, match=r"order = 4, but Contact is one-sided"):
         world(tv.Particles(x, radius=0.1), precision="f64", order=4).add(features=[tv.Contact()])
-    with pytest.raises(ValueError, match="too large for f32"):  # found late, when the force has already asked for a new start
+    with pytest.raises(ValueError, match="too large for f32"):  # found late, when the force has already requested a start
         w.add(more, [tv.Gravity(1.0), tv.Volume([[0, 1, 2, 3]], rest=1e30)])
     with pytest.raises(ValueError, match=r"World.remove: features\[0\] = Gravity does not act in this world"):
         w.remove(features=[used])
@@ -216,7 +218,7 @@ def test_after_an_error_the_world_is_as_before(world, monkeypatch):
         w.remove([0, 3])
     with pytest.raises(ValueError, match=r"mask of shape \(3,\)"):
         w.handle([True])
-    with monkeypatch.context() as patch, pytest.raises(KeyError, match="late"):  # when the world has its new parts already
+    with monkeypatch.context() as patch, pytest.raises(KeyError, match="late"):  # when the world already has its new parts
         patch.setattr(Runner, "pass_on", fails)
         w.add(more, [tv.Gravity(1.0)])
     assert w.hash() == before and w.features[1] is link and (link.rest == rest).all() and len(w.particles) == 3
@@ -225,7 +227,7 @@ def test_after_an_error_the_world_is_as_before(world, monkeypatch):
 
 
 def test_a_recording_begins_after_what_came_and_went(world, tmp_path):
-    # The scene of a world that was built anew is recorded as it is now, with features that came when nothing was where it began.
+    # A rebuilt world is recorded as it is now, with features that were added when particles had left their first positions.
     x = np.array([[0.0, 0], [1, 0], [2, 0], [3, 0], [4, 0], [5, 0]])
     links = tv.Rope([[0, 1], [1, 2], [3, 4], [4, 5]], [1.0, 1.01, 1.02, 1.03])
     w = world(tv.Particles(x, pinned=[0, 3]), [tv.Gravity(), links, tv.Pin([5], compliance=[1e-2])], precision="f64")
@@ -242,7 +244,7 @@ def test_a_recording_begins_after_what_came_and_went(world, tmp_path):
 
 
 def test_a_clone_parts_what_came_into_others_as_the_world_does(world):
-    # Not stepped since: whether they overlap is a matter of where particles are, not of where they were when the world began.
+    # Not stepped since: overlap depends on where particles are, not on where they were when the world began.
     x = np.stack(np.meshgrid(np.arange(4.0), np.arange(4.0)), axis=-1).reshape(-1, 2) * 1.05 + [0.6, 3.0]
     w = world(tv.Particles(x, radius=0.5), [tv.Gravity(9.81), tv.Contact(friction=0.4), tv.Box((0, 0), (4.5, 9))], substeps=4)
     w.run(1.5)

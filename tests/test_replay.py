@@ -1,4 +1,4 @@
-"""Replay: a recording leads to the same bits again, wherever it goes on from."""
+"""Replay: a recording gives the same bits again, from whichever frame it continues."""
 
 from dataclasses import replace
 
@@ -17,18 +17,18 @@ S = tv.shapes
 
 @ti.func
 def swirl(x, v):
-    """A force."""
+    """Return a force."""
     return -0.1 * x - 0.01 * v
 
 
 def spacing(a, b):
-    """A constraint."""
+    """Return the function of a constraint."""
     return (a - b).norm()
 
 
 @ti.func
 def bowl(p):
-    """A distance to a circle."""
+    """Return the distance to a circle."""
     return 3.0 - p.norm()
 
 
@@ -41,7 +41,7 @@ USERS = [swirl, spacing, bowl, crowding]
 
 
 def flat(precision="f32", **settings):
-    """A scene with everything that there is in 2D but Polygons."""
+    """Return a scene with every feature of 2D except Polygons."""
     rope, blob, ball = S.rope((-1, 1), (0, 1), 6), S.cloth((0.3, 0.2), (0.4, 0), (0, 0.4), (3, 3)), S.ball((1.2, 0.6), 0.3, 2)
     body, (a, b, c) = S.join(rope, blob, ball)
     more = np.array([[-1.5, 0.3], [-1.4, 0.3], [-1.2, 0.35], [-1.0, 0.3], [-0.8, 0.3], [-0.6, 0.32], [-0.4, 0.3], [-0.2, 0.31]])
@@ -68,7 +68,7 @@ def flat(precision="f32", **settings):
 
 
 def solid(precision="f64", **settings):
-    """What there is in 3D only, with a solver of its own."""
+    """Return a scene with the features that exist in 3D only, with another solver."""
     tetrahedron = np.array([[0, 0.5, 0], [0.5, 0.5, 0], [0, 1.0, 0], [0, 0.5, 0.5], [0.6, 1.0, 0.6]])
     vertices = np.array([[-2, 0, -2], [2, 0, -2], [2, 0, 2], [-2, 0, 2]], dtype=float)
     features = [
@@ -83,7 +83,7 @@ def solid(precision="f64", **settings):
 
 
 def bodies(precision="f32-compensated", **settings):
-    """Polygons, and a chain that is solved directly."""
+    """Return a scene of Polygons and a chain that is solved directly."""
     angle = np.arange(4) * np.pi / 2
     square = 0.2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     position = np.concatenate([square, square + [0.1, 0.5]])
@@ -95,7 +95,7 @@ def bodies(precision="f32-compensated", **settings):
 
 
 def swing(precision):
-    """Small, with what a state has beyond positions: contacts with friction, a spring, targets on their way."""
+    """Return a small scene whose state is more than positions: contacts with friction, a spring, moving targets."""
     rope = S.rope((0, 0), (1, 0), 5)
     features = [
         tv.Gravity(9.81), tv.Distance(rope.links, compliance=1e-4), tv.Box((-2, -0.2), (2, 2), friction=0.3),
@@ -106,7 +106,7 @@ def swing(precision):
 
 
 def race(precision):
-    """In 3D: drag, a bead that is driven, a link that breaks."""
+    """Return a scene in 3D: drag, a driven bead, a link that breaks."""
     x = np.array([[0, 1, 0], [0, 0, 0], [0, 0, 1], [0, 0, 2]], dtype=float)
     bead = tv.Path([0], [(0, 1, 0), (1, 1, 1), (2, 1, 0)], at=0.0)
     features = [tv.Gravity(9.81), tv.Drag(0.2), tv.Distance([(1, 2), (2, 3)], break_at=[np.inf, 2.0]), bead]
@@ -114,7 +114,7 @@ def race(precision):
 
 
 def drive(world: tv.World, recorder: tv.Recorder, frames: int = 12) -> None:
-    """Step and record, and do everything in between that a user can do."""
+    """Step and record, and change between frames everything that a user can change."""
     of = {type(f): f for f in world.features}
     for frame in range(frames):
         if frame == 3 and tv.Box in of:
@@ -137,7 +137,7 @@ def drive(world: tv.World, recorder: tv.Recorder, frames: int = 12) -> None:
 
 
 def go_on(recording, frame: int) -> str:
-    """The hash at the end, from a frame on."""
+    """Return the hash at the end of a recording that continues from `frame`."""
     entries = recording._entries
     with recording.world(frame) as world:
         for entry in entries[entries.index(recording._frames[frame]) + 1 :]:
@@ -185,7 +185,7 @@ def test_an_empty_world_is_replayed(tmp_path):
             recorder.log()
     recording = tv.replay(tmp_path / "e.rrd")
     assert list(recording.frames) == [0, 1, 2, 3] and recording.position(3).shape == (0, 3) and recording.verify()
-    with pytest.raises(TypeError, match="frame"):  # the call is wrong, and not the file
+    with pytest.raises(TypeError, match="frame"):  # the call is wrong, not the file
         recording.world()  # type: ignore[call-arg]
 
 
@@ -213,7 +213,7 @@ def test_what_comes_and_goes_is_replayed(world, tmp_path):
 
 
 def test_what_auto_tried_in_vain_is_replayed(world, tmp_path):
-    # What the controller keeps of a frame that nothing improves is hashed, and comes back from a file as numbers of Python's.
+    # What the controller stores about a frame that nothing improves is hashed; from a file it returns as Python numbers.
     features = [tv.Gravity(), tv.HalfSpace((0, 1), 0), tv.Contact()]
     w = world(tv.Particles([[0.1, 0.05], [2, 2]], radius=0.1), features, substeps="auto")
     with tv.Recorder(tmp_path / "stuck.rrd", w) as recorder:
@@ -231,7 +231,7 @@ def test_what_auto_tried_in_vain_is_replayed(world, tmp_path):
 
 
 def test_a_knob_that_is_set_to_minus_zero_is_replayed(world, tmp_path):
-    # As -0.002 * k is in the first frame. It equals 0, so it was not written down, but the hash has its sign.
+    # As -0.002 * k is in the first frame. It equals 0, but must be recorded, because the hash contains its sign.
     ball = tv.Ball((0, 0), 0.28)
     w = world(tv.Particles([[0, 0.5], [0.1, 0.9]], radius=0.1), [tv.Gravity(), ball])
     with tv.Recorder(tmp_path / "zero.rrd", w) as recorder:
@@ -267,4 +267,4 @@ def test_moving_targets_move_evenly(world):
         pin.target, path.at = [[0.1 * k, 0.0]], 0.2 * k
         w.step(0.1)
         np.testing.assert_allclose(w.position, [[0.1 * k, 0], [0.2 * k, 1]], atol=1e-12)
-        np.testing.assert_allclose(w.velocity, [[1, 0], [2, 0]], atol=1e-9)  # all along the frame
+        np.testing.assert_allclose(w.velocity, [[1, 0], [2, 0]], atol=1e-9)  # during the whole frame

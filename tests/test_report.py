@@ -1,4 +1,4 @@
-"""The reports: what they measure, what they say of it, and that a defect in the engine does not get past them."""
+"""The reports: what they measure, what they say of it, and that they find a defect in the engine."""
 
 import io
 import json
@@ -43,12 +43,12 @@ def test_cases_are_whole_frames_and_know_their_baselines(name):
     particles, features = case.build()
     assert len(particles) and all(m in tv.report.METHODS for m in case.methods) and case.at in case.efforts
     assert case.frames * case.frame == pytest.approx(case.seconds, rel=1e-9) and set(case.fit) <= set(case.efforts)
-    # A second scene of the same case is another one: features cannot act in two worlds.
+    # A second scene of the same case has its own features: a feature cannot act in two worlds.
     assert not set(map(id, features)) & set(map(id, case.build()[1]))
 
 
 def test_baselines_are_the_textbook_ones():
-    # The prototypes' errors in cases.json, of XPBD with Gauss-Seidel: to the two digits that a different order of sums leaves.
+    # Errors of the prototypes in cases.json, of XPBD with Gauss-Seidel: equal to two digits, since sums have another order.
     for name, t, limit in (("D01_double_pendulum", 2.0, 0.02), ("D05_chain10", 0.5, 0.02)):
         case = CASES[name]
         with baselines.Xpbd(*case.build()) as w:
@@ -60,7 +60,7 @@ def test_baselines_are_the_textbook_ones():
                 errors_.append(case.error(points.Run(w)))
             assert errors_[0] == pytest.approx(figures(name, t, 20)["XPBD-GS"], rel=limit)
             assert errors_[0] / errors_[1] == pytest.approx(2, abs=0.2)  # first order
-    # The article's start is late by a t dt / 2: 49 mm after 1 s at dt = 0.01.
+    # The article's first step is late by a t dt / 2: 49 mm after 1 s at dt = 0.01.
     with baselines.Article(tv.Particles([[0.0, 0.0]]), [tv.Gravity(9.81)]) as w:
         w.substeps = 1
         for _ in range(100):
@@ -72,7 +72,7 @@ def test_baselines_are_the_textbook_ones():
 
 @pytest.fixture(scope="module")
 def report():
-    """A small sweep: two links, and an elastic one."""
+    """Return a small sweep: a double pendulum, and a link that is a spring."""
     return tv.report.error_vs_time(["D01", "S04"], efforts=(10, 20, 40, 80), runs=1)
 
 
@@ -88,7 +88,7 @@ def test_a_sweep_finds_second_order_and_first(report):
     assert all(p.seconds > 0 and p.compile > 0 for p in report.points)
     assert ours[-1].energy < 1e-5 < 1e-2 < theirs[1].energy
     assert any("article on S04" in line for line in report.omissions)
-    # At equal work, whatever the machine: a hundred times less error than textbook XPBD, all along both curves.
+    # At equal work, on any machine: a hundred times less error than textbook XPBD, all along both curves.
     for case in report.cases:
         assert report.advantage(case, CASES[case].methods[0], cost="visits")[1] >= 100
 
@@ -107,7 +107,7 @@ def test_a_report_can_be_read_by_people_and_machines(report, tmp_path):
 
 
 def test_what_is_wrong_is_said(report):
-    # The same points, made worse: the order of 1 instead of 2, an error above the limit, one that has diverged, a loss in f32.
+    # The same points, made worse: order 1 instead of 2, an error above the limit, one that has diverged, a loss in f32.
     case, method = "D01_double_pendulum", "Direct"
 
     def altered(change, precision="f64"):
@@ -131,12 +131,12 @@ def test_what_is_wrong_is_said(report):
 
 
 def die(task):
-    """What a worker that is killed does."""
+    """End the process like a worker that is killed."""
     os._exit(3)
 
 
 class Deadly:
-    """An executor whose worker dies of one task, when it has done what came before."""
+    """An executor whose worker dies in one task, after all earlier tasks are done."""
 
     def __init__(self, pool):
         self.pool, self.sent = pool, []
@@ -150,7 +150,7 @@ class Deadly:
 
 
 def test_sweeps_run_in_processes_and_survive_one_that_dies():
-    # As on any executor; what takes parts on Dask is tried in test_sweep.py.
+    # As on any executor; for the parts that Dask takes see test_sweep.py.
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         found = tv.report.error_vs_time(
             "D01", methods=["Direct"], precisions=("f64",), efforts=(20, 40), runs=1, executor=Deadly(pool)
@@ -226,9 +226,9 @@ PLANTS = {
 
 @pytest.mark.parametrize("defect", PLANTS)
 def test_a_planted_defect_is_caught(defect, tmp_path):
-    # A copy of the package with the defect; without it the same reports pass, see above and `python -m tiverlet stress`.
+    # A copy of the package with the defect. Without it the same reports pass, see above and `python -m tiverlet stress`.
     call, edits = PLANTS[defect]
-    shutil.copytree(ROOT, tmp_path / "tiverlet")  # with the bytecode of what stays, which has the same dates
+    shutil.copytree(ROOT, tmp_path / "tiverlet")  # with the bytecode of unchanged files, which keep their dates
     for file, sound, broken in edits:
         path = tmp_path / "tiverlet" / file
         text = path.read_text()
@@ -247,7 +247,7 @@ raise SystemExit(0 if good else 7)
 
 
 def test_smaller_steps_fit_eighty_columns():
-    # Order 2 until rounding is what is left, some 3e-7: a quarter of the steps, nearly 16 times the error.
+    # Order 2 until rounding, some 3e-7, is left: with a quarter of the steps the error is nearly 16 times as large.
     found = curve(CASES["D01_double_pendulum"], "f32", 2, (10, 40))
     assert 14 < found["10"] / found["40"] < 17 and found["40"] < 3e-6
     rows = {"f32-comp.": found, "f64, order 8": found | dict.fromkeys(("20", "80", "320", "1280", "5120", "auto"), 1e-12)}

@@ -1,4 +1,4 @@
-"""What constraints and walls say that they bear: where the substep changes it is what they bore."""
+"""Loads of constraints and walls: in the substep whose length changes, they equal the loads of the others."""
 
 import numpy as np
 import pytest
@@ -14,14 +14,14 @@ RATIOS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 10.0)
 
 @ti.func
 def length(a, b):
-    """Of a link."""
+    """Return the length of a link."""
     return (a - b).norm()
 
 
 class Bodies:
-    """Bodies side by side at rest, each on a place of its own, and the features that hold them.
+    """Bodies side by side at rest, each at its own place, and the features that hold them.
 
-    loads: of each feature, in newtons or what it counts in.
+    loads: the load of each feature, in newtons or in the unit of its load.
     """
 
     def __init__(self, dim):
@@ -30,7 +30,7 @@ class Bodies:
         self.loads: list[float] = []
 
     def put(self, corners, make, load, held=-1, copies=1):
-        """Hold bodies of these corners, of which the first `held` are pinned, by make(their numbers), which bears `load`."""
+        """Hold bodies of these corners by make(their numbers), which bears `load`; the first `held` corners are pinned."""
         first, (k, dim) = len(self.x), np.shape(corners)
         for copy in range(copies):
             place = np.zeros(self.dim)
@@ -42,7 +42,7 @@ class Bodies:
         return self.features[-1]
 
     def world(self, world, **settings):
-        """All of them."""
+        """Return a world with all bodies."""
         gravity = np.zeros(self.dim)
         gravity[1] = -G
         particles = tv.Particles(self.x, mass=MASS, pinned=self.held)
@@ -54,7 +54,7 @@ FAN, SIMPLEX = [(-0.5, 0), (0.5, 0), (0, -1)], [(0, 0, 0), (1, 0, 0), (0, 0, 1),
 
 
 def all_kinds(dim):
-    """Each kind of rigid constraint bears the weight of a body, by an arm of 1 m where it is a moment."""
+    """Return bodies whose weight is borne by each kind of rigid constraint, at an arm of 1 m where it is a moment."""
     bodies = Bodies(dim)
     for make in (tv.Distance, tv.Rope, lambda p: tv.Winch(p, 0.0), lambda p: tv.Constraint(length, p, rest=2.0)):
         bodies.put(HANGING, make, WEIGHT)
@@ -62,11 +62,11 @@ def all_kinds(dim):
     bodies.put(BENT, tv.Bend, WEIGHT)
     bodies.put(BENT, lambda triples: tv.AngleLimit(triples, np.pi / 2, 3.0), WEIGHT)
     bodies.put([(0, 0), (0, -1), (0, -2)], lambda three: tv.ShapeMatch(three[:, 1:]), WEIGHT, held=1)
-    bodies.features.append(tv.Distance([(len(bodies.x) - 3, len(bodies.x) - 2)]))  # by which that hangs
+    bodies.features.append(tv.Distance([(len(bodies.x) - 3, len(bodies.x) - 2)]))  # the link from which the cluster hangs
     bodies.loads.append(2 * WEIGHT)
     if dim == 2:
         bodies.put(BENT, lambda hinges: tv.Motor(hinges, 0.0), WEIGHT)
-        bodies.put(FAN, tv.Area, 2 * WEIGHT)  # which it changes by 1 / 2 m^2 per m
+        bodies.put(FAN, tv.Area, 2 * WEIGHT)  # the area changes by 1 / 2 m^2 per m
         bodies.put([(0, -2)], lambda one: tv.Path(one[:, 0], [(0, -2), (1e3, -2)], smooth=False), WEIGHT, held=0)
     else:
         bodies.put([(0, 0, -1), (0, 0, 1), (-1, 0, 0), (1, 0, 0)], tv.Dihedral, WEIGHT)
@@ -78,14 +78,14 @@ def all_kinds(dim):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_what_is_at_rest_bears_its_weight_however_the_substep_changes(world, dim):
-    # A constraint moves a body at rest by h^2 g in a substep. Where this is the first of another length than h_old, displacements
-    # become velocities that lack h_old g / 2 along the constraint, and gravity acts for h / 2, so it moves the body by
-    # (h^2 + h h_old) g / 2; where velocities are given, by h^2 g / 2.
+    # A constraint moves a body at rest by h^2 g in a substep. In the first substep after one of another length h_old,
+    # displacements become velocities that lack h_old g / 2 along the constraint, and gravity acts for h / 2. So the constraint
+    # moves the body by (h^2 + h h_old) g / 2; after velocities were given, by h^2 g / 2.
     bodies = all_kinds(dim)
     w = bodies.world(world, iterations=200)
 
     def told():
-        """What each says that it bears, over what it does."""
+        """Return the load that each feature reports, divided by its true load."""
         return [np.linalg.norm(f.load) / load for f, load in zip(bodies.features, bodies.loads, strict=True)]
 
     for ratio in RATIOS:
@@ -96,7 +96,7 @@ def test_what_is_at_rest_bears_its_weight_however_the_substep_changes(world, dim
 
 
 def test_springs_at_rest_bear_their_weight(world):
-    # Velocities lack theta of the half kick of a spring: all of it where it is as good as rigid, and the start finds it again.
+    # Velocities lack theta of the half kick of a spring: all of it where the spring is as good as rigid. The start adds it again.
     compliance = np.concatenate([[0.0], 10.0 ** np.arange(-12, -1)])
     x = np.stack([np.arange(len(compliance)), np.zeros(len(compliance))], axis=1)
     low = x - [0, 2]
@@ -114,7 +114,7 @@ def test_springs_at_rest_bear_their_weight(world):
             np.testing.assert_allclose(pin.load, np.outer(np.ones(len(soft)), [0, WEIGHT]), rtol=1e-6, atol=1e-9)
 
 
-BREAKING = [  # corners, what holds them, its load, how many corners are held
+BREAKING = [  # corners, the feature that holds them, its load, the number of pinned corners
     (HANGING, lambda p: tv.Distance(p, break_at=np.inf), WEIGHT, 1),
     (HANGING, lambda p: tv.Distance(p, 2.0 - 1e-10 * WEIGHT, compliance=1e-10, break_at=np.inf), WEIGHT, 1),
     (FAN, lambda p: tv.Area(p, break_at=np.inf), 2 * WEIGHT, 2),
@@ -124,7 +124,7 @@ BREAKING = [  # corners, what holds them, its load, how many corners are held
 
 @pytest.mark.parametrize("path", ["fused", "parallel", "launched", "many"])
 def test_only_what_is_too_weak_breaks_where_the_substep_changes(world, path):
-    # Two of each kind: one bears a thousandth more than it has to, the other that much less. None: where velocities are given.
+    # Two of each kind: one can bear a thousandth more than it has to, the other a thousandth less. None: velocities are given.
     bodies = Bodies(2)
     kinds = [bodies.put(corners, make, load, held, copies=2) for corners, make, load, held in BREAKING]
     upper = bodies.features[-1].indices.reshape(2, 2)[:, 0]
@@ -143,7 +143,7 @@ def test_only_what_is_too_weak_breaks_where_the_substep_changes(world, path):
 
 
 def broken(w):
-    """Which of each kind have."""
+    """Return which constraints of each kind are broken."""
     return [f.broken.tolist() for f in w.features[1:-1]]
 
 
@@ -177,9 +177,9 @@ def test_rounding_breaks_nothing_and_holds_nothing(world):
 
 @pytest.mark.parametrize("angle", [60, 90, 120])
 def test_a_pendulum_breaks_at_its_strength_under_auto(world, angle):
-    # Let go at rest at an angle a it pulls with T = m g (3 cos b - 2 cos a) at b, and most at its lowest point. The load of a
-    # substep is the mean over a time around it that is no longer than a frame, so within a frame it breaks where T passes its
-    # strength, and one that is stronger than the largest T by more than the motion is wrong holds.
+    # Released at rest at an angle a, the pendulum pulls with T = m g (3 cos b - 2 cos a) at b, and most at its lowest point. The
+    # load of a substep is the mean over a time around it that is at most a frame. So the link breaks within a frame of where T
+    # passes its strength. A link that is stronger than the largest T, by more than the error of the motion, holds.
     a = np.radians(angle)
     top = 3 - 2 * np.cos(a)
     links = [tv.Distance([(0, 1)], break_at=share * top * G) for share in (0.6, 0.8, 0.95, 1.02)]
@@ -200,8 +200,8 @@ def test_a_pendulum_breaks_at_its_strength_under_auto(world, angle):
 
 
 def test_walls_give_as_much_as_gravity_takes_away(world):
-    # What a wall gave is a change of momentum: all that gravity gave to what lies on it, up to the middle of the last substep,
-    # whose displacement has the velocity there. So nothing is lost or counted twice where the substep changes.
+    # The impulse of a wall is a change of momentum: all that gravity gave to the particle on it, up to the middle of the last
+    # substep, where the displacement gives the velocity. So nothing is lost or counted twice where the substep changes.
     floor = tv.HalfSpace((0, 1), -2.0, events=True)
     w = world(tv.Particles([[0.0, -2.0]], mass=MASS), [tv.Gravity(G), floor], substeps=4, precision="f64")
     given = 0.0
@@ -212,8 +212,8 @@ def test_walls_give_as_much_as_gravity_takes_away(world):
 
 
 def test_what_sags_holds_where_the_substep_gets_shorter(world):
-    # A pass holds a moment by a sag that falls with h^2: 1e-4 rad here, which is 4 to 100 times the moment in a substep of a half
-    # to a tenth as long. Where that could break a joint, it is taken out first, however slight.
+    # A pass holds a moment by a sag that falls with h^2: 1e-4 rad here. In a substep of a half to a tenth of the length, this sag
+    # is 4 to 100 times the moment. Where it could break a joint, it is taken out first, however slight.
     particles = tv.Particles([(0, 1), (0, 0), (1, 0), (2, 0)], mass=[1, 1, 2, 1], pinned=[0, 1])
     for ratio in (2, 4, 10):
         angles = tv.Bend([[0, 1, 2], [1, 2, 3]], break_at=np.inf)

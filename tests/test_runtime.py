@@ -1,4 +1,4 @@
-"""What would end the process without an exception ends with a message instead. Each case in a process of its own."""
+"""Causes that would end the process without an exception raise an error instead. Each case has its own process."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def expect(error, words, run):
 
 
 def test_the_host_sees_the_fields_as_kernels_do():
-    # Of every kind and shape, one beside the other: what the host writes a kernel reads, and the other way round, to the bit.
+    # Fields of every kind and shape side by side: a kernel reads what the host writes, and the other way round, bit for bit.
     memory, rng = Memory(ti.f32), np.random.default_rng(0)
     kinds = ((ti.f32, np.float32), (ti.f64, np.float64), (ti.i32, np.int32))
     want = {}
@@ -55,7 +55,8 @@ def test_the_host_sees_the_fields_as_kernels_do():
 
 
 def test_f64_fields_can_stand_apart(monkeypatch):
-    # As on Vulkan: in a tree of their own, which shows in nothing else. Lengths that would put an f64 between two multiples of 8.
+    # As on Vulkan: f64 fields have their own tree, which shows in nothing else. The lengths would put an f64 between multiples of
+    # 8.
     monkeypatch.setattr(fields, "aligned", lambda: False)
     monkeypatch.setattr(layout, "_unshared", True)
     rng = np.random.default_rng(0)
@@ -92,7 +93,7 @@ def test_f64_fields_can_stand_apart(monkeypatch):
             given_up.field(f"f{k}", length, width=width, kind=kind)
         given_up.destroy()
     Memory(ti.f32).destroy()
-    after = Memory(ti.f64)  # nothing was poisoned
+    after = Memory(ti.f64)  # earlier failures poisoned nothing
     last = after.field("last", 2, values=[1.5, 2.5])
     after.place()
     assert after.read(last).tolist() == [1.5, 2.5]
@@ -115,7 +116,8 @@ def test_what_spirv_lacks_is_refused(monkeypatch):
 
 
 def test_import_is_quiet_and_starts_nothing():
-    # Nor does the first world. Every attempt to open a socket ends the process, in Python and in the threads that it starts.
+    # The import and the first world print nothing and open no socket. Every attempt to open one ends the process, in Python and
+    # in the threads that it starts.
     done = python(
         """
 import os, socket, sys, time

@@ -27,7 +27,7 @@ def test_a_world_reports_on_itself(world):
     best = found.recommended
     assert best and best.error + found.reference_error <= 1e-3
     assert found.paste == f"world = tv.World(particles, features, {best.paste})" and "substeps=" in best.paste
-    # What it says of an error is so: against a reference that is a hundred times finer.
+    # Errors in the report are true: against a reference that is a hundred times finer.
     clone = w.clone(precision="f64", solver=tv.Direct(), substeps=1000)
     start = checkpoint.keep(clone)
     clone.run(0.3)
@@ -50,7 +50,7 @@ def test_a_world_reports_on_itself(world):
 
 
 def test_reports_keep_the_order_of_a_world(world):
-    # Order 4 is for f64 and links that are solved: the report finds it, recommends it, and what is perturbed still has it.
+    # Order 4 needs f64 and links that are solved. The report finds the order and recommends it, and perturbed copies keep it.
     links = [(0, 1), (1, 2)]
     w = world(
         tv.Particles([(0, 0), (1, 0), (2, 0)], pinned=[0]),
@@ -74,14 +74,14 @@ def test_a_world_says_what_breaks_it(world):
     assert seen["all masses x 1e6"].verdict == "stands it" and seen["stiffnesses x 1e9"].verdict == "not tried"
     # A pendulum in f32, a thousand kilometres from the origin, where an ulp is 6 cm.
     assert "f32-compensated" in found.breaks["shifted by 1e+06 m"] and seen["shifted by 1e+06 m"].particle is not None
-    # Links of 1 kg that carry 1e6 kg vibrate across too fast for the substep: it says so, and how many would do.
+    # Links of 1 kg that carry 1e6 kg vibrate sideways too fast for the substep: the report says so, and how many would do.
     assert "tension" in found.breaks["mass of one particle x 1e6"] and "substeps" in found.breaks["mass of one particle x 1e6"]
     assert not found.passed and "BREAKS" in str(found) and json.loads(found.json())["passed"] is False
 
 
 @ti.func
 def spoilt(x, v, t, i):
-    """Not a number for particle 3, after 0.14 s."""
+    """Return a force that is NaN for particle 3 after 0.14 s."""
     f = 0.0 * x
     if t > 0.139 and i == 3:
         f[0] = ti.sqrt(-1.0 - x[0] * x[0])

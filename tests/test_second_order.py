@@ -1,4 +1,4 @@
-"""Rigid and compliant links against ODE references: second order, no loss of energy, far below XPBD."""
+"""Rigid and compliant links against ODE references: second order, no loss of energy, errors far below XPBD's."""
 
 from itertools import product
 
@@ -13,7 +13,7 @@ FRAME = 1 / 60
 
 
 def hang(world, name, **settings):
-    """The chain of a D case, hung up at its anchor."""
+    """Return a world with the chain of a D case, hung up at its anchor."""
     x, mass, pairs = pendulums(name)
     start = tv.Particles(x, mass=mass, pinned=[0])
     settings = {"precision": "f64", "solver": tv.Jacobi(), **settings}
@@ -32,7 +32,7 @@ def test_pendulum_state(world):
     errors = np.array([np.linalg.norm(rerun(w, 5.0, substeps=n).position[3:] - want, axis=1) for n in (10, 20, 40)])
     for k in range(3):
         assert 1.9 <= order(errors[:, k]) <= 2.1
-    # XPBD of the same pendulums at 20 substeps, with its one link solved exactly.
+    # XPBD for the same pendulums at 20 substeps, with the single link solved exactly.
     p, speed, h = x[3:], 0 * x[3:], FRAME / 20
     for _ in range(round(5.0 / h)):
         q = p + h * speed + [0, -9.81 * h * h]
@@ -42,7 +42,7 @@ def test_pendulum_state(world):
     rerun(w, 10.0, substeps=10)
     v = values["90deg_t10"]
     assert rms(w.position[4], [v["x"], v["y"]]) <= 1.75e-4  # numerics 4.6: 1.7e-4 at h = 1/600
-    # Energy is never lost; at half steps it swings by m v^2 (omega h)^2 at most, (omega h)^2 = 2 g h^2 (1 - cos) of each.
+    # Energy is never lost. At half steps it swings by at most m v^2 (omega h)^2, with (omega h)^2 = 2 g h^2 (1 - cos) for each.
     energy = -9.81 * np.cos(a).sum()
     assert abs(w.last.energy - energy) <= (2 * 9.81 * 9.81 * (1 - np.cos(a)) / 600**2).sum() and w.last.residual <= 1e-12
     assert w.features[1].load[1] == pytest.approx(9.81 * v["tension_over_mg"], rel=1e-2)  # half a step late
@@ -64,8 +64,8 @@ def test_pendulum_in_f32_stays_near_f64(world, precision):
 
 
 def test_compensated_pendulum_far_from_the_origin(world):
-    # Row 27: at 1e4 m an ulp of f32 is 1 mm, at 1e6 m 6 cm, and (position, previous position) loses the motion altogether. With
-    # the low word the error, that of the method included, is 2e-4 m at most for h = 1/600 to 1e-4.
+    # Row 27: at 1e4 m an ulp of f32 is 1 mm, at 1e6 m 6 cm, and (position, previous position) would lose the motion altogether.
+    # With the low word the error, including that of the method, is at most 2e-4 m for h = 1/600 to 1e-4.
     v = case("R06b_pendulum_state")["values"]["90deg_t10"]
     far = np.array([[1e4, -1e4], [-1e6, 1e6]])
     start = tv.Particles(np.concatenate([far, far + [1, 0]]), pinned=[0, 1])
@@ -95,7 +95,7 @@ def test_triple_pendulum_with_one_jacobi_pass(world):
 
 
 def test_triple_pendulum_keeps_its_energy(world):
-    # The public challenge: XPBD keeps 52 % after 10 s, of what is above the lowest state, all links hanging down.
+    # The public challenge: XPBD keeps 52 % after 10 s of the energy above the lowest state, in which all links hang down.
     w = rerun(hang(world, "D03_mueller_triple"), 10.0, substeps=50)
     p = case("D03_mueller_triple")["params"]
     lowest = -p["g"] * np.array(p["masses"]) @ np.cumsum(p["lengths"])
@@ -115,7 +115,7 @@ def test_spherical_pendulum(world):
 
 
 def test_spherical_pendulum_for_a_million_steps(world):
-    # Row 42: the energy stays where the step puts it; XPBD has lost all of it long before.
+    # Row 42: the energy stays where the step puts it; XPBD would lose all of it much earlier.
     p = case("S01_spherical_pendulum")["params"]
     start = tv.Particles([[0, 0, 0], p["x0"]], velocity=[[0, 0, 0], p["v0"]], pinned=[0])
     w = world(start, [tv.Gravity(p["g"]), tv.Distance([[0, 1]])], substeps=1000, precision="f64")
@@ -144,7 +144,7 @@ def test_elastic_pendulum(world):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_free_rod_spins_for_ever(world, dim):
-    # Row 44 and S09: PBD's direction loses 60 to 76 % of the spin in these times.
+    # Row 44 and S09: with PBD's direction, 60 to 76 % of the spin would be lost in these times.
     x = np.array([[0.25, 0, 0], [-0.75, 0, 0]])[:, :dim]
     start = tv.Particles(x, mass=[3.0, 1.0])
     w = world(start, [tv.Distance([[0, 1]])], substeps=10, precision="f64", solver=tv.Jacobi())
@@ -154,7 +154,7 @@ def test_a_free_rod_spins_for_ever(world, dim):
         w.step(10 * h)
         turn = []
         for _ in range(2):
-            # The angle of one substep, from the last displacement: arg of x_n against x_(n-1).
+            # The angle of one substep from the last displacement: arg of x_n relative to x_(n-1).
             s = w._runner.memory.state()
             r1, d = s["position"][0] - s["position"][1], s["displacement"][0] - s["displacement"][1]
             r0 = r1 - d
@@ -163,11 +163,12 @@ def test_a_free_rod_spins_for_ever(world, dim):
         assert abs(turn[1] / turn[0] - 1) <= 1e-12
         if iterations > 1:
             assert turn[0] == pytest.approx(np.arcsin(omega * h), rel=1e-12)  # the known angle of a tangential start
-        # One pass leaves (omega h)^6 / 2 of the length, for ever.
+        # One pass leaves a constant (omega h)^6 / 2 of the length.
         assert abs(tv.measure.strain(w, [[0, 1]], [1.0])[0]) <= (1e-14 if iterations > 1 else 0.51 * (omega * h) ** 6)
         assert not w.last.flags
-    # The velocities that the user reads: of the same angular momentum, and across the rod, from the first substep on and after a
-    # change of h. With the force along the direction at the start of the substep the momentum was off by (omega h)^2 / 2 = 3e-4.
+    # Velocities that users read have the same angular momentum and are across the rod, from the first substep on and after a
+    # change of h. With the force along the direction at the start of the substep, the momentum would be off by
+    # (omega h)^2 / 2 = 3e-4.
     omega, h, w.iterations = 37.0, 7e-4, 3
     w.velocity, w.position = omega * np.array([[0, 0.25, 0], [0, -0.75, 0]])[:, :dim], x
     for substeps in (1, 1, 1, 2, 2, 1, 3):
@@ -179,7 +180,8 @@ def test_a_free_rod_spins_for_ever(world, dim):
 
 
 def test_a_thousand_radians_per_second(world):
-    # Row 44: omega h = 0.83 turns the rod by more than 41 degrees a step. Length and finiteness hold, and it is said.
+    # Row 44: omega h = 0.83 turns the rod by more than 41 degrees a step. The length is kept, nothing is infinite, and a flag is
+    # set.
     x, v = [[0.5, 0.0], [-0.5, 0.0]], [[0, 500.0], [0, -500.0]]
     w = world(tv.Particles(x, velocity=v), [tv.Distance([[0, 1]])], substeps=20, iterations=20, precision="f64")
     report = w.run(1.0)
@@ -189,7 +191,7 @@ def test_a_thousand_radians_per_second(world):
 
 
 def test_changing_substeps_in_a_swing_costs_no_order(world):
-    # Row 14: the restart after each change of h is second order too.
+    # Row 14: the start after each change of h is second order, too.
     ref = case("D01_double_pendulum")["values"]["t2.0"]["xy"]
     errors = []
     w = hang(world, "D01_double_pendulum", iterations=30)

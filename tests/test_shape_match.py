@@ -1,4 +1,4 @@
-"""Bodies that keep their shape: rigid, soft and plastic ones, without extent, and spinning too fast."""
+"""Bodies that keep their shape: rigid, soft and plastic ones, bodies without extent, and spins too fast for the substep."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from .conftest import case, order, rerun, rms
 
 
 def angular(w, m, steps):
-    """sum m x_(n-1) x d / h, which the discrete motion conserves exactly; three numbers, in 2D too."""
+    """Return sum m x_(n-1) x d / h, which the discrete motion conserves exactly: three numbers, in 2D too."""
     s = w._runner.memory.state()
     d, x = s["displacement"].astype(float), s["position"].astype(float)
     pad = ((0, 0), (0, 3 - d.shape[1]))
@@ -38,19 +38,20 @@ def test_tennis_racket(world, precision):
         assert np.abs(spun - spin).max() <= 1e-5 * np.linalg.norm(spin)
         if k == 599:
             assert abs(np.linalg.norm(spun) / values["L_norm"] - 1) <= 3e-6  # (omega h)^2 / 6 of the discrete start is 3e-6
-            # In f32 it walks by 2^-25 of itself in each of 12 000 substeps, see ShapeMatch: 3.3e-6.
+            # In f32 the angular momentum drifts by 2^-25 of itself in each of 12 000 substeps, see ShapeMatch: 3.3e-6.
             drift = np.linalg.norm(spun - spin) / np.linalg.norm(spin)
             assert drift <= (3e-6 if precision == "f32" else 1e-9)
     tilt = np.array(tilt)
     down, up = (np.flatnonzero((tilt[1:-1] * tilt[2:] < 0) & (np.sign(tilt[2:]) == s)) for s in (-1, 1))
-    # From over (crossing 0 downwards) to back (upwards) is half of the period; the two crossings downwards are a whole one apart.
+    # From turning over (crossing 0 downwards) to turning back (upwards) is half a period; two crossings downwards are a period
+    # apart.
     assert 2 * (up[0] - down[0]) / 60 == pytest.approx(values["omega_period_closed_form"], rel=0.02)
     far = np.linalg.norm(w.position[:, None] - w.position[None], axis=2) - np.linalg.norm(x[:, None] - x[None], axis=2)
     assert np.abs(far).max() <= 1e-6
 
 
 def test_a_rigid_pendulum(world):
-    # Masses on a line, pinned at one end: theta'' = -(S g / I) sin theta, the period of R06 with L = I / S. Only one is pinned.
+    # Masses on a line, of which only one end is pinned: theta'' = -(S g / I) sin theta, the period of R06 with L = I / S.
     length, m, g = np.array([0, 0.3, 0.7, 1.0]), np.array([1.0, 2, 1, 3]), 9.81
     inertia, moment = (m * length**2).sum(), (m * length).sum()
     mean, root = 1.0, np.cos(np.pi / 4)  # the period of 90 degrees by the arithmetic-geometric mean
@@ -65,7 +66,7 @@ def test_a_rigid_pendulum(world):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_soft_shapes(world, dim):
-    # Swelling by 1 % rings with the frequency 1 / sqrt(alpha M); a spinning, badly deformed body keeps energy and both momenta.
+    # Swelling by 1 % rings at 1 / sqrt(alpha M). A spinning, badly deformed body keeps energy, momentum and angular momentum.
     rng = np.random.default_rng(dim)
     n, alpha = 8, 1e-3
     q, m = rng.normal(size=(n, dim)), rng.uniform(0.5, 2, n)
@@ -92,7 +93,8 @@ def test_soft_shapes(world, dim):
 
 @pytest.mark.parametrize("dim, precision, limit", [(2, "f64", 1e-12), (3, "f32", 5e-6)])
 def test_shapes_without_extent(world, dim, precision, limit):
-    # Rows 23, 57: general, flat, on a line, in one place, tiny, mirrored; and one of a single particle. From wild starts.
+    # Rows 23, 57: general, flat, on a line, in one place, tiny, mirrored; and one of a single particle. All start with random
+    # velocities.
     rng = np.random.default_rng(0)
     full, flat = rng.normal(size=(6, dim)), rng.normal(size=(6, dim))
     flat[:, -1] = 0
@@ -116,8 +118,8 @@ def test_shapes_without_extent(world, dim, precision, limit):
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_rods_have_the_velocity_of_free_fall(world, precision):
-    # About a line, moments say nothing of the spin along it: a rod along an axis had NaN for a velocity in f32, where 1 + 2^-46,
-    # as a literal, is 1. Places of 20 m are told apart to 2^-19 m, and so are displacements in a substep.
+    # Moments about a line do not determine the spin along it. In f32 the literal 1 + 2^-46 is 1, which would give a rod along an
+    # axis a velocity of NaN. Positions near 20 m are resolved to 2^-19 m, and so are displacements.
     axes = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.6, 0.0, 0.8)]
     rods = np.concatenate([np.outer(np.arange(4.0), axis) + 5 * k for k, axis in enumerate(axes)])
     match = tv.ShapeMatch(np.arange(16).reshape(4, 4))
@@ -128,8 +130,9 @@ def test_rods_have_the_velocity_of_free_fall(world, precision):
 
 
 def test_a_point_without_shape_does_not_turn(world):
-    # Two clusters of a held particle and a free one in the same place draw it there by dashpots: x' = -x k / c, more slowly than
-    # it came, at any number of passes. Turned with what is deformed, they threw it out: 4e3 to 6e26 J in 0.1 s.
+    # Two clusters of a pinned and a free particle in the same place draw the free one back by dashpots: x' = -x k / c. It returns
+    # more slowly than it left, at any number of passes. If the shape turned with it, the clusters would throw it out: 4e3 to
+    # 6e26 J in 0.1 s.
     start = tv.Particles(np.zeros((3, 2)), pinned=[0, 2], velocity=[(0, 0), (-41.0, -244.0), (0, 0)])
     match = tv.ShapeMatch([[0, 1], [1, 2]], compliance=1.0, damping=1e4)
     w = world(start, [match], precision="f64", substeps=20)
@@ -140,11 +143,11 @@ def test_a_point_without_shape_does_not_turn(world):
 
 
 def test_spins_beyond_the_step(world):
-    # Row 58: 90 degrees in a step are the most that a cluster turns; it is said, the shape is kept and no energy comes of it.
+    # Row 58: a cluster turns by at most 90 degrees in a substep. A flag reports more, the shape is kept and no energy is gained.
     x = np.array([[1.0, 0], [-1, 0], [0, 0.7], [0, -0.7]])
     w = world(tv.Particles(x), [tv.ShapeMatch([np.arange(4)])], precision="f64")
     w.iterations = 2
-    for spin, load in ((10.0, 100.0), (20.0, 400.0)):  # m omega^2 r of the outermost
+    for spin, load in ((10.0, 100.0), (20.0, 400.0)):  # m omega^2 r of the outermost particle
         w.velocity, w.position = spin * np.stack([-x[:, 1], x[:, 0]], axis=1), x
         w.run(0.1)
         assert w.features[0].load == pytest.approx([load], rel=2 * (spin / 1200) ** 2)
@@ -159,8 +162,8 @@ def test_spins_beyond_the_step(world):
 
 
 def test_clusters_fall_apart(world):
-    # Two rigid and two soft pairs spin; a force of m omega^2 r = 2 x 25 x 0.5 N is too much for one of each. The soft ones, which
-    # were not stretched before, swing between none and twice the force.
+    # Two rigid and two soft pairs spin. A force of m omega^2 r = 2 x 25 x 0.5 N is too much for one of each. The soft pairs start
+    # unstretched, so they swing between none and twice the force.
     pair = np.array([[-0.5, 0.0], [0.5, 0.0]])
     x = np.concatenate([pair + [3 * k, 0] for k in range(4)])
     v = np.tile(5 * np.stack([-pair[:, 1], pair[:, 0]], axis=1), (4, 1))
@@ -170,7 +173,8 @@ def test_clusters_fall_apart(world):
     w.run(0.1)
     assert shape.broken.tolist() == [True, False, True, False]
     assert shape.load[[0, 2]].tolist() == [0, 0] and shape.load[1] == pytest.approx(25, rel=1e-4)
-    # What turns has velocities across its radius, second order in h; without reactions they would be off by h m omega^2 r / 2.
+    # Velocities of a turning pair are across its radius, to second order in h. Without reactions they would be off by
+    # h m omega^2 r / 2.
     assert abs(np.diff(w.velocity, axis=0)[2] @ np.diff(w.position, axis=0)[2]) < 1e-6
     away = w.position
     w.run(0.5)
@@ -179,12 +183,12 @@ def test_clusters_fall_apart(world):
 
 
 def test_plastic_shapes_keep_what_they_were_pressed_into(world):
-    # A pair, 2 m apart at rest, is held 3 m apart: its shape goes after it at the rate `creep`, up to the yield strain.
+    # A pair, 2 m apart at rest, is held 3 m apart: its shape follows at the rate `creep`, up to the yield strain.
     creep, seconds = 2.0, 1.0
     x = np.array([[-1.5, 0.0], [1.5, 0]])
     shape = tv.ShapeMatch([[0, 1]], rest=x * 2 / 3, compliance=1e-2, creep=creep, yield_strain=0.1)
     w = world(tv.Particles(x, pinned=[0]), [shape, tv.Pin([1], x[1], compliance=1e-12)], precision="f64")
     w.run(seconds)
     length = np.linalg.norm(np.diff(w._runner.memory.state()["ShapeMatch.shape"], axis=0))
-    # What is pinned stays in place, so all of the deformation e is at the other: e' = -creep (e - 0.1) from 1.
+    # The pinned particle stays in place, so the other one takes all of the deformation e: e' = -creep (e - 0.1) from 1.
     assert 3 - length == pytest.approx(0.1 + 0.9 * np.exp(-creep * seconds), rel=2e-3)

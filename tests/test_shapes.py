@@ -1,4 +1,4 @@
-"""Ready-made bodies: counts, lengths, orientation, closedness; files there and back; and who is refused."""
+"""Ready-made bodies: counts, lengths, orientation, closedness; files written and read; and arguments that are refused."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from .conftest import case
 
 S = tv.shapes
 STAR = [[np.cos(t) * r, np.sin(t) * r] for t, r in zip(np.arange(10) * np.pi / 5, [1.0, 0.5] * 5, strict=True)]
-# A long straight side with a notch next to it on one side and a spike on the other.
+# A long straight side with a notch beside it on one side and a spike on the other.
 MOUTH = [[0, 0], [1.9, 0], [2, 0.9], [2.1, 0], [4, 0], [4, 1], [0.5, 1], [0.5, 2], [1.9, 2], [2, 1.1], [2.1, 2], [4, 2], [4, 3],
          [0, 3]]  # fmt: skip
 BODIES = {
@@ -41,7 +41,7 @@ def test_bodies_in_order_are_the_same_bodies():
         rng = np.random.default_rng(len(body))
         one = body.in_order()
         np.testing.assert_array_equal(np.sort(one.position, axis=0), np.sort(body.position, axis=0), err_msg=name)
-        # Tuples of corners, by where these are, are the same ones; a random number at each place tells places apart.
+        # Tuples of corners are the same by the places of their corners; a random number for each place tells places apart.
         places = np.unique(np.concatenate([body.position, one.position]), axis=0, return_inverse=True)[1].ravel()
         mark = rng.permutation(len(body) * 2)[places]
         for what in INDICES:
@@ -57,7 +57,7 @@ def test_bodies_in_order_are_the_same_bodies():
 
 
 def test_order_is_along_a_curve():
-    # On a grid of 2^k cells a side Morton's curve visits cell (a, b) at the number whose bits are those of b and a in turn.
+    # On a grid of 2^k cells a side, Morton's curve visits cell (a, b) at the number whose bits are alternately those of b and a.
     k = 4
     a, b = (v.ravel() for v in np.meshgrid(np.arange(2**k), np.arange(2**k)))
     at = sum(((a >> i & 1) << 2 * i) + ((b >> i & 1) << 2 * i + 1) for i in range(k))
@@ -68,7 +68,7 @@ def test_order_is_along_a_curve():
 
 
 def volumes(shape):
-    """Areas of the faces in 2D, volumes of the tetrahedra in 3D."""
+    """Return the areas of the faces in 2D, the volumes of the tetrahedra in 3D."""
     cells = shape.faces if shape.position.shape[1] == 2 else shape.tetrahedra
     edges = shape.position[cells[:, 1:]] - shape.position[cells[:, :1]]
     return np.linalg.det(edges) / (2 if cells.shape[1] == 3 else 6)
@@ -94,13 +94,13 @@ def test_every_body_is_sound(name):
         x, y = body.position[loop].T
         assert np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) > 0 and len(np.unique(loop)) == len(loop)
     if dim == 3 and (len(body.tetrahedra) or name == "balloon"):
-        shell = tv.Volume(body.faces)  # refuses what is open
+        shell = tv.Volume(body.faces)  # refuses open surfaces
         shell.prepare(tv.Particles(body.position), np.ones(n))
-        assert shell.count == 1 and np.array_equal(shell.faces, body.faces)  # seen from outside already
+        assert shell.count == 1 and np.array_equal(shell.faces, body.faces)  # already oriented outwards
         if len(body.tetrahedra):
             assert shell.rest[0] == pytest.approx(volumes(body).sum())
     if len(body.tetrahedra) or len(body.loops):
-        # Euler: as many parts as make a ball or a disc.
+        # Euler: vertices, edges, faces and cells count as in a ball or a disc.
         edges, faces, cells = len(np.unique(both, axis=0)), len(body.faces), len(body.tetrahedra)
         if dim == 2 and faces:
             assert n - edges + faces == 1
@@ -132,7 +132,7 @@ def test_counts_and_sizes():
 
 
 def test_a_chain_hangs_on_its_catenary():
-    # R10: its sag; and whatever the ends, its length, and that it is a catenary.
+    # R10: the sag; and for any ends, the length, and that the chain is a catenary.
     p, values = case("R10_catenary")["params"], case("R10_catenary")["values"]
     assert -S.chain((0, 0), (p["span"], 0), p["length"], 1001).position[:, 1].min() == pytest.approx(values["sag"], rel=1e-12)
     for start, end, length in (((0, 0), (1, 0), 1.2), ((0, 0), (1, 0.7), 1.25), ((0, 0, 0), (2, -1, 3), 9), ((0, 0), (0, 1), 2)):
@@ -140,7 +140,7 @@ def test_a_chain_hangs_on_its_catenary():
         steps = np.linalg.norm(np.diff(c.position, axis=0), axis=1)
         assert steps.sum() == pytest.approx(length, rel=1e-5)
         np.testing.assert_allclose(c.position[[0, -1]], [start, end], atol=1e-9)
-        if start[0] != end[0]:  # its slope grows evenly with the length: sinh
+        if start[0] != end[0]:  # the slope grows evenly with the length: sinh
             flat = np.linalg.norm(np.delete(np.diff(c.position, axis=0), 1, axis=1), axis=1)
             slope = np.diff(c.position[:, 1]) / flat
             np.testing.assert_allclose(np.diff(slope, 2), 0, atol=1e-6)
@@ -194,7 +194,7 @@ def test_files_there_and_back(tmp_path, name, ending, binary):
 
 
 def test_files_of_others(tmp_path):
-    # Quads in fans, indices from the end, textures and comments; big-endian PLY with colours, short lists and another name.
+    # Quads as fans, indices from the end, textures and comments; big-endian PLY with colours, short lists and another name.
     path = tmp_path / "a.OBJ"
     path.write_text("# cube side\nvn 0 0 1\nv 0 0 0 1.0\nv 1 0 0\nv 1 1 0\nv 0 1 0\ng side\nf 1/1/1 2//1 3 -1 # quad\ns off\n")
     side = S.load(path)

@@ -1,4 +1,4 @@
-"""Worlds of the same structure share what is compiled, and nothing of each other."""
+"""Worlds of the same structure share compiled kernels, and no state."""
 
 import inspect
 import sys
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.skipif(ARCH != "cpu", reason="every world has kernels o
 
 
 def hung(world, mass, compliance, g, rest, points):
-    """A rope that hangs, with a spring across."""
+    """Return a world with a hanging rope and a spring across it."""
     rope = tv.shapes.rope((0, 0), (1, 0.2), points=points)
     links = [tv.Distance(rope.links), tv.Distance([[2, 7]], rest=rest, compliance=compliance)]
     return world(tv.Particles(rope.position, mass=mass, pinned=[0]), [tv.Gravity(g), *links], substeps=5)
@@ -33,7 +33,7 @@ NUMBERS = [(0.01, 1e-3, 9.81, 0.3, 12), (0.5, 1e-5, 1.6, 0.6, 9), (2.0, 0.1, -3.
 
 
 def test_worlds_with_other_numbers_and_counts_and_clones_compile_nothing(world):
-    # And have the bits that they have alone: when nobody shares, each compiles its own.
+    # Shared worlds have the bits that they have alone, where each world compiles its own kernels.
     first = hung(world, *NUMBERS[0])
     first.run(0.1)
     assert first.velocity.shape == (12, 2)
@@ -65,7 +65,8 @@ def test_worlds_with_other_numbers_and_counts_and_clones_compile_nothing(world):
     "solvers", [(tv.Chebyshev(), tv.Chebyshev(5.0)), (tv.Jacobi(), tv.Jacobi())], ids=["Chebyshev", "Jacobi"]
 )
 def test_what_solvers_are_made_for_is_in_no_kernel(world, solvers):
-    # Nor whether a pass meets all constraints at once, as it does where no two of them have a particle in common.
+    # Neither the parameters of a solver nor whether a pass meets all constraints at once is compiled. A pass does where no two
+    # constraints share a particle.
     with compiled() as names:
         for solver, links in zip(solvers, ([[0, 1], [2, 3]], [[0, 1], [1, 2], [2, 3]]), strict=True):
             x = np.arange(4.0)[:, None] * [1.0, 0.1]
@@ -75,7 +76,7 @@ def test_what_solvers_are_made_for_is_in_no_kernel(world, solvers):
 
 
 def test_worlds_of_higher_order_compile_nothing_more(world):
-    # Whose springs are forces: what they are made for is compliances, and kernels are made for none of these.
+    # At high orders springs are forces; no kernel depends on their compliances.
     def sprung(points, compliance):
         rope = tv.shapes.rope((0, 0), (1, 0.2), points=points)
         features = [tv.Gravity(9.81), tv.Distance(rope.links, compliance=compliance)]
@@ -92,7 +93,7 @@ def test_worlds_of_higher_order_compile_nothing_more(world):
 
 
 def test_a_world_that_grows_compiles_nothing(world):
-    # From 30 discs to 47 and back, with a list that is too short at first; with the bits that it has when all is compiled anew.
+    # From 30 discs to 47 and back, with a list that is too short at first: the same bits as when everything is compiled again.
     def grown(compiles):
         x = np.stack(np.meshgrid(np.arange(10.0), np.arange(3.0)), axis=-1).reshape(-1, 2) + 0.6
         w = world(tv.Particles(x, radius=0.45), [tv.Gravity(9.81), tv.Contact(), tv.Box((0, 0), (10, 99))], substeps=4)
@@ -106,7 +107,7 @@ def test_a_world_that_grows_compiles_nothing(world):
                     w.remove(np.arange(25, len(w.particles)))
                 w.run(0.3)
             hashes.append(w.hash())
-            assert np.isfinite(w.velocity).all()  # an edit asks for velocities, and by then each kernel was needed once
+            assert np.isfinite(w.velocity).all()  # an edit needs velocities, and by then each kernel has been used once
             names += more if k else []
         assert bool(names) == compiles and len(w.particles) == 25
         return hashes
@@ -122,7 +123,7 @@ def spring(x):
 
 
 def compliant(row, corners):
-    """A row with all that it can have."""
+    """Return the feature of a row with every option that it can have."""
     soft = 1e-2 * (np.arange(len(corners)) % 2)
     return row.make(corners, np.full(len(corners), 0.5), compliance=soft, damping=soft, break_at=1e9)
 
@@ -131,12 +132,12 @@ ALL = {name: (row.points, lambda c, row=row: compliant(row, c)) for name, row in
 ALL |= {name: (points, make) for name, (points, make, _) in OTHERS.items()}
 
 
-@pytest.mark.filterwarnings("ignore:Path")  # which points are off
+@pytest.mark.filterwarnings("ignore:Path")  # which warns of points off the curve
 @pytest.mark.parametrize("name", ALL)
 def test_kernels_depend_on_no_number_of_anything(world, name, monkeypatch):
-    # What is written of a world, which decides what is compiled: for two constraints and for four, with more and fewer free
-    # particles, other sizes of the scene, before and after steps of several lengths. Of a step, all but its kernels, which cannot
-    # write to objects of Python, and take long to compile.
+    # The text of a world, which decides what is compiled, is the same for two constraints and for four, with more or fewer free
+    # particles, for other sizes of the scene, and before and after steps of several lengths. Steps run without their kernels,
+    # which cannot write to Python objects and compile long.
     monkeypatch.setattr(CachedLaunch, "__call__", lambda launch: None)
     for kernel in ("to_velocity", "velocities"):
         monkeypatch.setattr(Step, kernel, lambda *arguments: None)
@@ -167,7 +168,7 @@ def test_kernels_depend_on_no_number_of_anything(world, name, monkeypatch):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_kernels_depend_on_no_number_of_particles(world, dim):
-    # The same for what acts on all particles: all forces and walls, contacts of discs and of polygons.
+    # As above for features that act on all particles: all forces and walls, contacts of discs and of polygons.
     shapes = [tv.Polygon(SQUARE)] if dim == 2 else [tv.Mesh(CUBE, CUBE_FACES)]
     far, ahead = np.full(dim, 50.0), np.eye(dim)[0]
     forces = [tv.Gravity(), tv.Drag(0.1), tv.Wind(ahead, 0.1), tv.Attractor(far, 1.0), tv.Hand(far, 1), tv.Force(spring)]
@@ -184,7 +185,7 @@ def test_kernels_depend_on_no_number_of_particles(world, dim):
     def written(w):
         return [sharing.Writing(part).key for part in (w._runner.step, w._runner.diagnostics)]
 
-    for touch in (tv.Contact(friction=0.1), None)[: 4 - dim]:  # None: bodies, one and two
+    for touch in (tv.Contact(friction=0.1), None)[: 4 - dim]:  # None: one and two bodies
         one, more = built(3, touch), built(8, touch)
         first = written(one)
         assert written(more) == first
@@ -193,8 +194,8 @@ def test_kernels_depend_on_no_number_of_particles(world, dim):
 
 
 def test_what_is_left_out_of_the_writing_is_not_read(world, monkeypatch):
-    # What is compiled is a function of what is read. So while kernels are translated, nothing of what sharing.Writing leaves out
-    # may be read: attributes that are for the host, and what arrays hold.
+    # Compiled code is a function of what is read. So while kernels are translated, nothing that sharing.Writing leaves out may be
+    # read: attributes for the host, and the content of arrays.
     class Untold(np.ndarray):
         def refuse(self, *args, **kwargs):
             raise AssertionError("a kernel reads what an array holds")
@@ -257,7 +258,7 @@ def test_what_is_left_out_of_the_writing_is_not_read(world, monkeypatch):
 
 
 def test_what_functions_of_the_user_know_is_part_of_the_structure(world):
-    # Taichi writes numbers and arrays from around a function into the kernel.
+    # Taichi compiles numbers and arrays from around a function into the kernel.
     def force(strength, table):
         @ti.func
         def pull(x):
@@ -275,7 +276,7 @@ def test_what_functions_of_the_user_know_is_part_of_the_structure(world):
 
 
 def test_worlds_of_many_kinds_take_few_trees(world, monkeypatch):
-    # When there are many trees, the next has all fields that any has: most of what comes then finds place there.
+    # When there are many trees, the next tree has all fields that any has: most later worlds fit into it.
     def built(k):
         x = tv.golden(np.arange(12)).reshape(6, 2)
         more = [tv.Contact(), tv.Drag(0.1), tv.Box((-9, -9), (9, 9)), tv.Pin([0]), tv.Distance([[1, 2]], compliance=1e-3)]
@@ -296,13 +297,13 @@ def test_worlds_of_many_kinds_take_few_trees(world, monkeypatch):
     for k in range(64):
         built(k)
     made = runtime.trees - trees
-    assert made <= 20  # 96 without, as 32 of them have contacts and so two trees
+    assert made <= 20  # 96 without this, as 32 of them have contacts and so two trees
     assert [end(k) for k in some] == alone
     assert runtime.trees - trees == made
 
 
 def test_many_worlds_one_after_the_other_take_no_more_than_a_few():
-    # Whether they are closed or forgotten; more than the 511 trees that Taichi has would end the process.
+    # Whether they are closed or garbage-collected; more than the 511 trees that Taichi has would end the process.
     point = tv.Particles([[0.0, 0.0]])
     for _ in range(2):
         tv.World(point, [tv.Gravity()]).step(0.1)

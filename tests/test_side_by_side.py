@@ -11,13 +11,13 @@ pytestmark = pytest.mark.usefixtures("read_here")
 
 
 def scene(k: int) -> tv.World:
-    """Discs that fall past a wall that moves, and a chain that breaks in one of them."""
+    """Return a world with discs that fall past a moving wall, and a chain that breaks if k is 2."""
     n = 12
     discs, chain = tv.golden(np.arange(n), dim=2) * (1, 2) + (0, 0.3), tv.shapes.rope((1.2, 1.8), (2.0, 1.8), points=6)
     x, radius = np.concatenate([discs, chain.position]), np.concatenate([np.full(n, 0.08), np.full(6, 0.02)])
     links = tv.Distance(n + chain.links, break_at=5.0 if k == 2 else 500.0)
     features = [tv.Gravity(9.81 + k), tv.Contact(), tv.HalfSpace((0, 1)), tv.Ball((0.5, 0.2), 0.1), links]
-    return tv.World(tv.Particles(x, radius=radius, pinned=[n]), features, substeps=6, solver=tv.Jacobi())  # compiles soonest
+    return tv.World(tv.Particles(x, radius=radius, pinned=[n]), features, substeps=6, solver=tv.Jacobi())  # compiles fastest
 
 
 @pytest.mark.parametrize("overlays", [{}, {"forces": True, "velocities": True, "strain": False}], ids=str)
@@ -31,7 +31,7 @@ def test_each_view_is_the_picture_of_that_world(taichi, tmp_path, overlays):
                 many.step(1 / 60)
                 recorder.log()
         assert recorder.frames == 21
-    # What is beside a scene is drawn to its size: contacts and particles are not.
+    # Only parts that are not drawn to the size of the scene are compared.
     parts = ["particles", "contacts", "breaks", "velocities", "walls/3"]
     columns = ["Points2D:positions", "Points2D:colors", "LineStrips2D:strips", "LineStrips2D:colors", "Arrows2D:vectors"]
     found = set()

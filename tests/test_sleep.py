@@ -1,4 +1,4 @@
-"""Sleep: what rests is left out, is as it was to the bit, and goes on when something reaches it."""
+"""Sleep: bodies at rest are skipped, keep their state bit for bit, and go on when something reaches them."""
 
 import contextlib
 
@@ -14,20 +14,22 @@ R = 0.5
 
 
 def heap(columns, rows, apart=2.05, x0=0.0):
-    """Discs on top of each other, a little aside, so that columns lean on each other or stand."""
+    """Return discs on top of each other, slightly off columns, so that columns lean on each other or stand, (n, 2) [m]."""
     rng = np.random.default_rng(3)
     x = np.stack(np.meshgrid(np.arange(columns) * apart * R, np.arange(rows) * 2.02 * R), -1).reshape(-1, 2) + R
     return x + rng.uniform(0, 0.02 * R, x.shape) + [x0, 0.0]
 
 
-WIDE = (8 * 2.05 * R + 0.02, 999)  # [m] where the walls around a heap are
-NEVER = 1e9  # [s] to be slow for: asleep never, in the kernels of those that do
+WIDE = (8 * 2.05 * R + 0.02, 999)  # [m] walls around a heap
+NEVER = 1e9  # [s] of slow motion before sleep: never asleep, with the kernels of worlds that sleep
 ROUGH: dict = dict(friction=(0.5, 0.4, 0.05), restitution=0.2, events=True)
 
 
 def rough(world, x, time: float | None = 0.5, wide=WIDE, substeps=10, v=0.0, knobs=ROUGH, g=9.81, path="fused"):
-    """Discs that spin, rub, bounce and tell of it, between walls, the last of them a sensor that is held far away if it has no
-    other place: one structure for all heaps. time: None for a world without Sleep."""
+    """Return a world with discs that spin, rub, bounce and have events, between walls: one structure for all heaps.
+
+    The last disc is a pinned sensor, far away if it has no other place. time: None for a world without Sleep.
+    """
     k = np.arange(len(x))
     start = tv.Particles(x, velocity=v, radius=R, spin=0.0, orientation=0, group=k // (len(x) - 1), pinned=[len(x) - 1])
     features = [tv.Gravity(g), tv.Box((0, 0), wide, **ROUGH), tv.Contact(sensors=[(0, 1)], **ROUGH)]
@@ -41,13 +43,13 @@ AWAY = (4.0, 900.0)
 
 
 def pile(world, height=10.0, time=0.5):
-    """A heap between walls, and a disc that falls on it, where it has a height, when the heap sleeps."""
+    """Return a world with a heap between walls, and a disc at `height` that falls on the sleeping heap; 0 for none."""
     x = heap(8, 4)
     return rough(world, np.vstack([x, *([[4.0, height]] if height else []), AWAY]), time)
 
 
 def until(w, asleep, seconds=12.0):
-    """Step until so many are asleep."""
+    """Step until `asleep` particles are asleep."""
     for _ in range(round(60 * seconds)):
         if w.step(1 / 60).asleep == asleep:
             return
@@ -63,8 +65,10 @@ def falls(w, i=0, frames=20):
 
 
 def test_a_row_that_was_never_disturbed_is_hit_to_the_bit(world):
-    """Without gravity discs at rest have no displacement, so sleep leaves nothing out: the bits are those of a world without.
-    Cradle with e = 1: the speed of the first goes to the last one. Other paths have the bits of this one, see below."""
+    """Without gravity, a world with sleep has the bits of one without: discs at rest have no displacement to skip.
+
+    A cradle with e = 1: the speed of the first disc goes to the last one. Other paths have the same bits, see below.
+    """
     x = np.array([(10 + k * 1.05, 9.0) for k in range(1, 6)] + [(7.0, 9.0), (10.0, 20.0)])
     v = np.zeros((7, 2))
     v[5] = 10.0, 0.0
@@ -80,8 +84,10 @@ def test_a_row_that_was_never_disturbed_is_hit_to_the_bit(world):
 
 
 def test_against_a_world_that_never_rested(world):
-    """Until the disc arrives, a pile that sleeps is off by less than speed * time from one that does not, and as the disc arrives
-    momentum goes into all of it in the same substep: heights of what bounced agree to the bound."""
+    """Until the disc arrives, a sleeping pile is off by less than speed * time from one that is awake.
+
+    When it arrives, momentum enters the whole pile in the same substep: positions after the bounce agree to the bound.
+    """
     a, b = (pile(world, time=time) for time in (0.5, NEVER))
     until(a, 32, seconds=3.0)
     while b.time < a.time - 1e-9:
@@ -92,15 +98,17 @@ def test_against_a_world_that_never_rested(world):
         reached = b.position
         b.step(1 / 60)
     assert np.linalg.norm(before - reached, axis=1).max() < 0.005 and a.last.asleep < 32
-    # What the disc struck stood there, and its island moves: in the frame of the impact they are as near.
+    # The disc that was struck stood still, and its island moves: in the frame of the impact both worlds are as near.
     assert np.linalg.norm(a.position - b.position, axis=1).max() < 0.01
     assert np.abs(a.velocity[:32]).max() > 0.1
 
 
 def test_bits_of_all_paths(world):
-    """Who sleeps, when who wakes, spins and all events are the same on one thread, on a team, and phase by phase. Without spins,
-    friction and events: see bodies of loops."""
-    x = np.vstack([heap(8, 4), [4.0, 7.5], [4.0, 5.5]])  # what falls on the heap passes a sensor
+    """One thread, a team and the launched path agree on sleep, waking, spins and all events.
+
+    For bodies without spins, friction and events see test_bodies_of_loops.
+    """
+    x = np.vstack([heap(8, 4), [4.0, 7.5], [4.0, 5.5]])  # a disc that falls on the heap passes a sensor
     worlds, seen, met = [rough(world, x, 0.25, path=path) for path in ("fused", "parallel", "launched")], [], 0
     for k in range(52):
         seen.append({w.step(1 / 60).asleep for w in worlds})
@@ -108,12 +116,12 @@ def test_bits_of_all_paths(world):
             met += equal(worlds[0].events(), w.events()) + equal(worlds[0].wall_events(), w.wall_events())
         if k % 10 == 0 or seen[-1] != seen[k - 1]:
             assert len({w.hash() for w in worlds}) == 1
-    assert all(len(s) == 1 for s in seen) and {32} in seen and seen[-1] != {32}  # fell asleep, and was hit
+    assert all(len(s) == 1 for s in seen) and {32} in seen and seen[-1] != {32}  # the heap fell asleep, and was hit
     assert met > 500
 
 
 def test_clones_and_replays_sleep_alike(world, tmp_path, read_here):
-    """A clone that is made while some sleep goes on to the bit, and a recording verifies through sleep and waking."""
+    """A clone made while some particles sleep continues bit for bit, and a recording verifies through sleep and waking."""
     w = pile(world)
     with tv.Recorder(tmp_path / "sleep.rrd", w) as recorder:
         until(w, 32)
@@ -131,12 +139,12 @@ def test_clones_and_replays_sleep_alike(world, tmp_path, read_here):
 
 
 def both(w):
-    """The events of particles and of walls."""
+    """Return the events of particles and of walls."""
     return w.events(), w.wall_events()
 
 
 def follow(w, touching):
-    """Step, and have the events continue who touched, (touching | begun) - ended, for particles and walls."""
+    """Step, and check that events continue `touching`, (touching | begun) - ended, for particles and walls."""
     w.step(1 / 60)
     for k, events in enumerate(both(w)):
         begun, ended = rows(events.begun.pairs), rows(events.ended.pairs)
@@ -145,8 +153,10 @@ def follow(w, touching):
 
 
 def test_what_sleeps_goes_on_touching(world):
-    """No pair of a heap ends as it falls asleep, sleeps or wakes: it lasts, without impulses and where it was, in frames that are
-    computed for what still moves and in those that are not; in clones too."""
+    """No contact of a heap ends when its particles fall asleep, sleep or wake; clones agree.
+
+    It lasts, without impulses and in place, in frames that are computed for moving particles and in frames that are not.
+    """
     w, touching = pile(world, height=10.0), [set(), set()]
     while w.last is None or w.last.asleep < 32:
         follow(w, touching)
@@ -170,7 +180,7 @@ def test_what_sleeps_goes_on_touching(world):
 
 
 def test_nothing_begins_where_all_sleep(world):
-    """Frames that are not computed tell what touches, and not again what happened in the last one that was."""
+    """Frames that are not computed report touching pairs, and do not repeat events of the last computed frame."""
     w, touching = pile(world, height=0), [set(), set()]
     while w.last is None or w.last.asleep < 32:
         follow(w, touching)
@@ -182,8 +192,10 @@ def test_nothing_begins_where_all_sleep(world):
 
 
 def test_a_sensor_that_sleeps_and_a_stack_that_wakes(world):
-    """What a sensor overlaps begins and ends as where it is awake. A pair that wakes in the middle of a frame has not met again:
-    the speed at which it came together is 0."""
+    """Overlaps of a sleeping sensor begin and end as if it were awake.
+
+    A pair that wakes in the middle of a frame has not met again: the speed at which it came together is 0.
+    """
     x = [(0.0, R), (9.0, R), (9.0, 3 * R + 1e-3), (-9.0, 0.3 * R), (9.4, 6.0)]
     v = np.zeros((5, 2))
     v[3, 0] = 14.0
@@ -221,16 +233,16 @@ def test_islands(world):
 
 @ti.func
 def later(x, v, t):
-    """Begins to pull after 3 s, at what is to the right of 9 m."""
+    """Return a force that begins to pull after 3 s, right of 9 m."""
     return ti.Vector([ti.select(t > 3.0 and x[0] > 9, 30.0, 0.0), 0.0])
 
 
-DRIVEN = np.array([4, 5, 7])  # two discs on which others lie, and one that another is linked to; the rest lies on a floor
-YARD = slice(9, 9 + 8 + 9 + 16 + 1)  # a ring, a cluster that hangs on one of its corners, a body of discs, and a disc
+DRIVEN = np.array([4, 5, 7])  # two discs that carry others, and one that another is linked to; the rest lies on a floor
+YARD = slice(9, 9 + 8 + 9 + 16 + 1)  # a ring, a cluster that hangs from one of its corners, a body of discs, and a disc
 
 
 def yard(world):
-    """A bit of everything that rests, with what it sleeps on: one world for several tests."""
+    """Return a world with many kinds of sleeping bodies and their supports, for several tests."""
     x = np.vstack([heap(2, 2), [(0.5, -0.5), (1.5, -0.5)], [(10.0, -0.5), (-5.0, -0.5), (-6.2, -0.5)]])
     angle = np.arange(8) * np.pi / 4
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1) * 0.5 + [-20, -0.4]
@@ -257,8 +269,10 @@ def yard(world):
 
 
 def test_what_wakes(world):
-    """Whatever the user changes, and what he drives; a force that depends on time wakes what it begins to pull at, and only that.
-    What is linked to what is driven never sleeps."""
+    """Every change by the user and every driven particle wakes. A force that depends on time wakes only what it begins to pull.
+
+    A particle that is linked to a driven one never sleeps.
+    """
     w = yard(world)
     x, asleep = w.particles.position[:9], w.last.asleep
     assert w.time < 2.5
@@ -282,7 +296,7 @@ def test_what_wakes(world):
     assert again(assigned("position", 1.1 * w.position + [0.0, 1.0]))
     assert again(assigned("velocity", np.full(w.position.shape, 1.0)))
     assert again(turned(0, "g", (5.0, 9.0)))
-    assert again(turned(4, "target", x[DRIVEN] - [0.0, 0.4]))  # what carried them moves away from under them
+    assert again(turned(4, "target", x[DRIVEN] - [0.0, 0.4]))  # their support moves away from under them
     assert again(turned(4, "target", x[DRIVEN] + [0.0, 0.4]))
     assert again(lambda new: new.remove([4, 5]))
     assert not again(turned(2, "active", False))  # a gate far away
@@ -294,13 +308,13 @@ def test_what_wakes(world):
 
 
 def tied(world, start, links, time=0.5, speed=0.05, g=9.81, **settings):
-    """What is linked, above a floor: one structure for each solver."""
+    """Return a world of linked particles above a floor: one structure for each solver."""
     floor, contact = tv.HalfSpace((0, 1), -5.0, friction=0.5), tv.Contact(friction=0.5)
     return world(start, [tv.Gravity(g), floor, contact, tv.Distance(links), tv.Sleep(speed, time)], precision="f64", **settings)
 
 
 def test_what_sleeps_is_as_it_was_and_frames_cost_nothing(world):
-    """Nothing of the state changes but the clock, loads neither."""
+    """Only the clock changes while all sleep; loads stay, too."""
     rope = tv.shapes.rope((0, 0), (3.0, 0), 16)
     x = np.vstack([rope.position, [(6.0, 0.0), (6.0, 0.1001), (9.0, 9.0)]]) + [0, -4.95]
     start = tv.Particles(x, radius=np.r_[np.full(18, 0.05), 0.1], mass=np.r_[np.full(18, 0.1), 1.0], pinned=[18])
@@ -308,7 +322,7 @@ def test_what_sleeps_is_as_it_was_and_frames_cost_nothing(world):
     until(w, 18)
     w.step(1 / 60)
     x, v, loads, state = w.position, w.velocity, w.contacts.impulse, w.last
-    launched, w._runner._fused = w._runner._fused, None  # what would compute a frame
+    launched, w._runner._fused = w._runner._fused, None  # would compute a frame
     for _ in range(120):
         w.step(1 / 60)
     w._runner._fused = launched
@@ -320,8 +334,10 @@ def test_what_sleeps_is_as_it_was_and_frames_cost_nothing(world):
 
 @pytest.mark.parametrize("solver", [None, tv.Jacobi(), tv.ConjugateGradient()], ids=["direct", "jacobi", "conjugate"])
 def test_linked_particles(world, solver):
-    """A rope at rest sleeps whole, with its loads, and wakes whole; Sleep changes nothing of what does not rest. While a ball
-    falls on it, frames are computed, but nobody works out what its links want: what was written there by hand stays."""
+    """A rope at rest sleeps as a whole, with its loads, and wakes as a whole.
+
+    While a ball falls on it, frames are computed, but not the corrections of the rope: values written by hand stay.
+    """
     rope = tv.shapes.rope((0, 0), (3.0, 0), 16)
     x = np.vstack([rope.position, [(rope.position[8, 0] + 0.01, 12.0)], [(9.0, 9.0)]]) + [0, -4.95]
     start = tv.Particles(x, radius=np.r_[np.full(17, 0.05), 0.1], mass=np.r_[np.full(17, 0.1), 1.0], pinned=[17])
@@ -333,17 +349,20 @@ def test_linked_particles(world, solver):
     for field in fields:
         memory.write(field, np.full_like(memory.read(field), 7.0))
     w.step(1 / 60)
-    wants = [7.0, 0.0 if slots.system and slots.system.steps else 7.0]  # conjugate gradients begin with 0 steps of what sleeps
+    wants = [7.0, 0.0 if slots.system and slots.system.steps else 7.0]  # conjugate gradients zero the steps of sleeping rows
     assert all((memory.read(field) == want).all() for field, want in zip(fields, wants, strict=False))
     while w.last.asleep and w.time < 3.0:
         assert (w.position[:-2] == position).all() and np.array_equal(w.features[3].residual, strain)
         w.step(1 / 60)
-    assert w.last.asleep == 0 and 1.5 < w.time < 1.65  # when the ball came down: sqrt(2 * 12 / g) = 1.56 s
+    assert w.last.asleep == 0 and 1.5 < w.time < 1.65  # when the ball arrives: sqrt(2 * 12 / g) = 1.56 s
 
 
 def test_what_is_grazed_wakes_before_its_links_are_solved(world):
-    """A pendulum that would fly past a hanging disc in a substep, but for its link: the disc wakes early enough for its own links
-    to hold it in that substep, too. It hung at rest to rounding, so it goes on as where nothing sleeps."""
+    """A grazed disc wakes before its links are solved, so that these hold it in the same substep.
+
+    A pendulum would fly past the hanging disc in a substep, but for its own link. The disc hung at rest to rounding, so it
+    continues as in a world in which nothing sleeps.
+    """
     angle = np.radians(80)
     x = [(0, 0), (-np.sin(angle), -np.cos(angle)), (0, 1), (0, 0.4), (0, -0.8 - 1e-5)]
     start = tv.Particles(x, radius=[0.01, 0.1, 0.01, 0.01, 0.1], mass=[1, 1, 1, 0.1, 5], pinned=[0, 2])
@@ -359,13 +378,15 @@ def test_what_is_grazed_wakes_before_its_links_are_solved(world):
 
 
 def square(side, center):
-    """The corners of a square."""
+    """Return the corners of a square."""
     return np.asarray(center) + side / 2 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
 
 
 def test_bodies_of_loops(world):
-    """Two squares on each other sleep, and a third beside them, until a fourth falls on the two: after sqrt(2 h / g). Phase by
-    phase; in one kernel they sleep in test_polygons.py."""
+    """Two squares on each other and one beside them sleep, until a fourth falls on the two after sqrt(2 h / g).
+
+    On the launched path; for one kernel see test_polygons.py.
+    """
     x = np.concatenate([square(0.6, (0, 0.31)), square(0.5, (0.03, 0.87)), square(0.6, (0.65, 0.31)), square(0.4, (0.1, 4.0))])
     loops = np.arange(16).reshape(4, 4)
     features = [
@@ -390,14 +411,16 @@ def test_bodies_of_loops(world):
             assert rows(w.wall_events().touches.pairs) == rows(w.wall_events().lasting.pairs) == stand
     assert len({(w.hash(), w.last.asleep) for w in worlds}) == 1 and worlds[0].last.asleep == 4
     assert 0 <= worlds[0].time - (2 * h / 9.81) ** 0.5 < 1 / 60 + 1e-6
-    assert np.abs(worlds[0].velocity[4:8, 1]).min() > 0.1  # what was struck moves in the same frame
+    assert np.abs(worlds[0].velocity[4:8, 1]).min() > 0.1  # the square that is struck moves in the same frame
     assert (worlds[0].position[8:12] == before[0][8:12]).all() and len(stand) > 3
     worlds[-1].close()
 
 
 def test_a_surface_and_a_cluster(world):
-    """Constraints on any number of corners leave what sleeps as it is: a loop with pressure, and a soft cluster that hangs on a
-    corner that cannot move; they report of it what they did, in a clone too. A rigid body of discs sleeps, and a disc alone."""
+    """A loop with pressure and a soft cluster on a pinned corner, of any number of corners, sleep without a change.
+
+    Their reports stay the same, in a clone too. A rigid body of discs sleeps, and a disc alone.
+    """
     w = yard(world)
     w.step(1 / 60)
     state, residual, energy = w.position[YARD], w.last.residual, w.last.energy
@@ -411,7 +434,7 @@ def test_a_surface_and_a_cluster(world):
 
 
 def test_energy_never_grows(world):
-    """Of a pile that falls asleep, and is woken by touching its knobs over and over again: J of creep at most."""
+    """The energy of a pile that falls asleep, and is woken again and again by its knobs, grows by no more than creep."""
     w = pile(world, height=0)
     until(w, 32)
     energy = w.last.energy
@@ -422,7 +445,7 @@ def test_energy_never_grows(world):
 
 
 def test_refusals(world):
-    """What islands do not know of, with what to do."""
+    """Features that islands do not support are refused, with what to do."""
 
     @ti.func
     def apart(r):
@@ -447,8 +470,8 @@ def test_refusals(world):
 
 
 def test_braced_bodies_bear_nothing_in_free_fall_and_are_not_solved_where_they_sleep(world):
-    # Six links of a square hold what five can: what is left of violations is rounding, partly in the null space, to which steps
-    # of conjugate gradients gave any multiplier. In free fall none is needed, and of rows that sleep none is asked for.
+    # Six links of a square do the work of five: the violation that is left is rounding, partly in the null space, where steps of
+    # conjugate gradients could have any multiplier. Free fall needs none, and rows that sleep are not solved.
     square, turn = 0.4 * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]), np.array([[0.8, -0.6], [0.6, 0.8]])
     x = np.concatenate([square @ turn.T + [2.0 * k, 0.6 + 0.1 * k] for k in range(3)])
     links = np.concatenate([np.stack(np.triu_indices(4, 1), 1) + 4 * k for k in range(3)])

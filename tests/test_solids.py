@@ -13,26 +13,26 @@ from .test_walls import keeps
 
 @ti.func
 def box_distance(p):
-    """Of the square or cube with half sides of 1."""
+    """Return the distance to the square or cube with half sides of 1."""
     q = ti.abs(p) - 1
     return ti.max(q, 0).norm() + ti.min(q.max(), 0)
 
 
 def boxes(dim: int, **options) -> dict:
-    """The square or cube with half sides of 1, in all ways to say it."""
+    """Return the square or cube with half sides of 1, by facets and by a function."""
     facets = tv.Polygon(SQUARE, **options) if dim == 2 else tv.Mesh(CUBE, CUBE_FACES, **options)
     return {"facets": facets, "sdf": tv.Sdf(box_distance, **options)}
 
 
 @ti.func
 def round_room(p):
-    """Distance from a round wall, from inside."""
+    """Return the distance to a round wall of radius 1, positive inside."""
     return 1 - p.norm()
 
 
 def test_what_is_far_away_changes_no_bits(world):
-    # Row 85: discs rest in a round room, beads slide down a wire and discs pile up, with another particle at 1e2 m, and with
-    # one near by and one that comes on the way, at 1e5 m.
+    # Row 85: discs rest in a round room, beads slide down a wire and discs pile up. The bits are the same with another particle
+    # at 1e2 m, and with one near by and one that is added later at 1e5 m.
     ends = []
     for far in (1e2, 5.0):
         start = tv.Particles([*FEW, (far, far)], radius=0.05, pinned=[len(FEW)])
@@ -60,8 +60,8 @@ def test_nothing_gets_out_of_a_function(world):
 
 @pytest.mark.parametrize("precision", ["f64", "f32"])
 def test_what_slides_in_a_hollow_keeps_its_energy(world, precision):
-    # A point let go at the rim of a bowl of 1 m, with g = 10 m/s^2, has v^2 / 2 = 10 sin(a) when it has come down by the angle a,
-    # in every frame, at any number of substeps; also of a function that is no distance exactly. It was stopped dead.
+    # A point released at the rim of a bowl of 1 m, with g = 10 m/s^2, has v^2 / 2 = 10 sin(a) when it has come down by the angle
+    # a. This holds in every frame, for any number of substeps, and for a function that is not exactly a distance.
     for function in (round_room, flatter_room):
         off = []
         for substeps in (10, 20, 40, 80, 320):
@@ -79,7 +79,7 @@ def test_what_slides_in_a_hollow_keeps_its_energy(world, precision):
 
 
 def test_friction_in_a_hollow_has_its_closed_form(world):
-    # Sliding down by the angle a in a bowl of 1 m: y = v^2 / 2 has y' = g (cos a - mu sin a) - 2 mu y, so
+    # Sliding down by the angle a in a bowl of 1 m: y = v^2 / 2 has y' = g (cos a - mu sin a) - 2 mu y. So
     # y = g (p cos a + q sin a - p exp(-2 mu a)) with q = (1 - 2 mu^2) / (1 + 4 mu^2), p = mu + 2 mu q.
     g, mu = 10.0, 0.1
     q = (1 - 2 * mu**2) / (1 + 4 * mu**2)
@@ -92,7 +92,7 @@ def test_friction_in_a_hollow_has_its_closed_form(world):
             angle = np.arctan2(-w.position[0, 1], w.position[0, 0])
             y = g * (p * np.cos(angle) + q * np.sin(angle) - p * np.exp(-2 * mu * angle))
             if w.velocity[0, 0] > 0 or angle < 0:
-                break  # it turns back
+                break  # the point turns back
             assert (w.velocity[0] ** 2).sum() / 2 == pytest.approx(y, abs=2e-3 * g)
         assert angle > 2.0
 
@@ -100,7 +100,7 @@ def test_friction_in_a_hollow_has_its_closed_form(world):
 @pytest.mark.parametrize("precision", ["f64", "f32"])
 @pytest.mark.parametrize("restitution", [0.0, 0.8])
 def test_nothing_passes_a_shell(world, precision, restitution, briefly):
-    # 4 cm thick, 1/50 of ways of up to 2 m: three radii in a substep. They slide, bounce and fly on both sides.
+    # The shell is 4 cm thick, 1/50 of the largest displacement in a substep, 2 m. Points slide, bounce and fly on both sides.
     rng = np.random.default_rng(3)
     x = rng.uniform(-1, 1, (3000, 2))
     x = x[np.abs(np.linalg.norm(x, axis=1) - 0.7) > 0.023][:1500]
@@ -115,7 +115,7 @@ def test_nothing_passes_a_shell(world, precision, restitution, briefly):
 
 
 def test_a_thin_sheet_in_a_round_room(world):
-    # It turns by up to 3 rad in a substep, while discs of 1 mm slide and fly on both sides of it, by up to 1 m.
+    # The sheet turns by up to 3 rad in a frame, while discs of 1 mm slide and fly on both sides of it, by up to 1 m in a substep.
     rng = np.random.default_rng(2)
     x = rng.uniform(-0.9, 0.9, (150, 2))
     x[:, 1] = np.where(np.abs(x[:, 1]) < 0.02, 0.1, x[:, 1])
@@ -135,13 +135,13 @@ def test_a_thin_sheet_in_a_round_room(world):
 
 @ti.func
 def flatter_room(p):
-    """No more than 0.92 of that distance."""
+    """Return 0.92 times the distance of round_room()."""
     return 0.92 * (1 - p.norm())
 
 
 @ti.func
 def shell(p):
-    """Distance from a circle of 0.7 m, 4 cm thick."""
+    """Return the distance to a shell: a circle of 0.7 m, 4 cm thick."""
     return ti.abs(p.norm() - 0.7) - 0.02
 
 
@@ -149,7 +149,7 @@ MU, BOUNCE = 0.4, 0.5
 
 
 class Stage:
-    """A box of facets, and one by a function: worlds of their own, that are used together."""
+    """A box of facets, and one by a function, each in its own world; both worlds are used together."""
 
     count = 8
 
@@ -166,17 +166,17 @@ class Stage:
 
     @property
     def single(self) -> bool:
-        """Whether it is in f32."""
+        """Whether the worlds are in f32."""
         return self.precision == "f32"
 
     def place(self, at=0.0, turn=0.0) -> None:
-        """Where the boxes go in the next frame."""
+        """Set where the boxes are at the end of the next frame."""
         for wall in self.walls.values():
             wall.position = np.zeros(self.dim) + at
             wall.rotation = turn if self.dim == 2 else np.array([0.0, 0, turn])
 
     def start(self, x, v=0.0, at=0.0, turn=0.0, substeps=20, gravity=9.81) -> None:
-        """Put particles x (m, dim) with velocities v at each box, the others out of the way, with the boxes at rest."""
+        """Put particles x (m, dim) with velocities v at each box at rest, and the other particles out of the way."""
         x, v = np.asarray(x)[:, : self.dim], np.broadcast_to(v, (len(x), 3))[:, : self.dim]
         self.m = len(x)
         self.place(at, turn)
@@ -189,18 +189,18 @@ class Stage:
             world.velocity, world.position, pull.g = velocity, position, gravity
 
     def step(self, dt: float) -> None:
-        """Both worlds."""
+        """Step both worlds."""
         for world in self.worlds:
             world.step(dt)
 
     @property
     def position(self) -> np.ndarray:
-        """Of the particles: (2, m, dim)."""
+        """Positions of the particles, (2, m, dim)."""
         return np.stack([world.position[: self.m] for world in self.worlds])
 
     @property
     def velocity(self) -> np.ndarray:
-        """Of the particles: (2, m, dim)."""
+        """Velocities of the particles, (2, m, dim)."""
         return np.stack([world.velocity[: self.m] for world in self.worlds])
 
 
@@ -213,8 +213,8 @@ def stage(request, taichi):
 
 
 def test_the_top_of_a_box_is_a_plane(stage, world):
-    # Falling, bouncing, rubbing: on the seam of two triangles, near corners and in the middle, it is the half space y > 1. The
-    # last bounce before it rests may be counted or not: it is (g h)^2 / 2 g high, and friction makes less than that of it.
+    # Falling, bouncing, rubbing: on the seam of two triangles, near corners and in the middle, the top is the half space y > 1.
+    # The last bounce before rest, (g h)^2 / 2 g high, may be there or not; friction changes less than that.
     x = np.array([[0.0, 1.3, 0], [0.3, 1.2, 0.3], [-0.5, 1.1, 0.5], [-0.9, 1.15, -0.4]])
     v = np.array([[0.5, 0, 0.5], [0.4, -1, -0.6], [0.3, 0, -0.3], [1.0, 0, 0.2]])
     stage.start(x, v)
@@ -247,7 +247,7 @@ def test_restitution_on_every_solid(stage):
 
 @pytest.mark.parametrize("degrees", [20.0, 30.0])
 def test_inclines_of_every_solid(stage, degrees):
-    # R18 on the top of a turned box: it sticks if tan < mu, to the bit, and slides with g (sin - mu cos) if not.
+    # R18 on the top of a turned box: a disc sticks if tan < mu, bit for bit, and slides with g (sin - mu cos) if not.
     a = np.radians(degrees)
     n, t = np.array([np.sin(a), np.cos(a), 0]), np.array([np.cos(a), -np.sin(a), 0])
     stage.start([0.1 * n - 0.5 * t], at=-n[: stage.dim], turn=-a, substeps=10)
@@ -267,7 +267,7 @@ def test_inclines_of_every_solid(stage, degrees):
 
 
 def test_a_moving_solid_carries_what_lies_on_it(stage):
-    # Row 70: a table runs at 1 m/s. Friction brings a disc up to its speed after v / (mu g), then holds it without creep.
+    # Row 70: a table runs at 1 m/s. Friction brings a disc to its speed after v / (mu g), then holds it without creep.
     stage.start([[0.2, 1.1, 0.1]])
     for k in range(60):
         stage.place(at=np.eye(stage.dim)[0] * (k + 1) / 60)
@@ -279,8 +279,8 @@ def test_a_moving_solid_carries_what_lies_on_it(stage):
 
 @pytest.mark.parametrize("kind", ["facets", "sdf"])
 def test_a_turning_solid_takes_along_what_sticks_to_it(world, kind):
-    # Turned from level to 10 degrees and back, so slowly that friction holds at the ends of frames, where the speed jumps: what
-    # sticks is carried on a circle about the origin, and does not creep.
+    # Turned from level to 10 degrees and back, so slowly that friction holds at the ends of frames, where the speed jumps: a
+    # sticking disc is carried on a circle about the origin, and does not creep.
     wall = boxes(2, friction=MU)[kind]
     before = np.array([[0.4, 1.1], [-0.6, 1.1]])
     w = world(tv.Particles(before, radius=0.1), [tv.Gravity(9.81), wall], precision="f64")
@@ -294,7 +294,7 @@ def test_a_turning_solid_takes_along_what_sticks_to_it(world, kind):
 
 
 def test_what_starts_inside_is_let_out_gently(stage):
-    # Row 48: at push_out, by the nearest way, from shallow and deep; and it gives no more velocity than that.
+    # Row 48: a particle leaves at push_out by the nearest way, from shallow and deep, and gains no more velocity than that.
     stage.start([[0.7, 0, 0], [0, -0.2, 0]], gravity=0.0)
     fastest = 0.0
     for _ in range(150):
@@ -320,7 +320,7 @@ def test_a_world_with_moving_solids_can_be_cloned(stage):
 
 
 def test_a_paddle_strikes_with_the_speed_of_its_blade(world):
-    # A bar turns about its middle at omega and meets a point at a distance r, at rest: e = 1 sends it off with 2 omega r.
+    # A bar turns about its middle at omega and meets a point at rest at a distance r: with e = 1 the point leaves at 2 omega r.
     paddle = tv.Polygon([[-1.0, -0.01], [1, -0.01], [1, 0.01], [-1, 0.01]], restitution=1.0, position=(0.5, 0.5), rotation=-0.4)
     w = world(tv.Particles([[1.3, 0.5]]), [paddle], precision="f64", substeps=200)
     for k in range(30):

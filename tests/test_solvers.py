@@ -1,4 +1,4 @@
-"""Relaxation up to the law of its stability, and solvers that converge faster than it."""
+"""Relaxation up to its limit of stability, and solvers that converge faster."""
 
 import re
 
@@ -15,7 +15,7 @@ from .conftest import unprojected
 
 
 def cloth(n, shear=False):
-    """Positions and links of a square cloth of n x n particles in the plane y = 0, side 1."""
+    """Return positions and links of a square cloth of n x n particles in the plane y = 0, side 1."""
     k = np.arange(n * n).reshape(n, n)
     pairs = [np.stack([k[:, :-1].ravel(), k[:, 1:].ravel()], axis=1), np.stack([k[:-1].ravel(), k[1:].ravel()], axis=1)]
     if shear:
@@ -27,7 +27,7 @@ def cloth(n, shear=False):
 
 @pytest.mark.parametrize("shear, figure", [(False, 0.66), (True, 0.53)])
 def test_largest_eigenvalue_of_a_net(world, shear, figure):
-    # Numerics 4.3: 0.66 for a square net, 0.53 for cloth with shear; and the dense matrix says the same.
+    # Numerics 4.3: 0.66 for a square net, 0.53 for cloth with shear; the dense matrix has the same eigenvalue.
     x, pairs = cloth(12, shear)
     w = world(tv.Particles(x, pinned=np.arange(12)), [tv.Gravity(9.81), tv.Distance(pairs)], solver=tv.Jacobi("auto"))
     r = x[pairs[:, 0]] - x[pairs[:, 1]]
@@ -63,14 +63,15 @@ def test_auto_is_one_where_springs_would_change(world):
 
 
 def hung(world, solver, n=10, **settings):
-    """A cloth that falls and swings on one of its edges."""
+    """Return a world with a cloth that falls and swings on one of its edges."""
     x, pairs = cloth(n)
     start = tv.Particles(x, mass=1 / n**2, pinned=np.arange(n))
     return world(start, [tv.Gravity(9.81), tv.Distance(pairs)], solver=solver, **{"precision": "f64", **settings})
 
 
 def test_conjugate_gradients_reach_the_direct_solution(world):
-    # Two Newton steps, each of the same linear system: after enough of its own the same, and before them nearer with each.
+    # Two Newton steps, each with the same linear system. Enough steps of conjugate gradients give the direct solution; before
+    # that, each comes nearer.
     direct, many = (hung(world, s, substeps=10, iterations=2) for s in (tv.Direct(width=100), tv.ConjugateGradient(60)))
     few = hung(world, tv.ConjugateGradient(8), substeps=10)
     for w in (direct, many, few):
@@ -82,7 +83,7 @@ def test_conjugate_gradients_reach_the_direct_solution(world):
 
 
 def test_converged_cloth_from_soft_to_rigid(world):
-    # Springs on the same footing: static stretch by alpha F in one iteration, with the rest of the system rigid.
+    # Springs in the same system as rigid links: the static stretch is alpha F after one iteration.
     n = 6
     x, pairs = cloth(n)
     alpha = np.where(np.arange(len(pairs)) % 2, 1e-3, 0.0)
@@ -100,7 +101,7 @@ def test_converged_cloth_from_soft_to_rigid(world):
 
 
 def test_chebyshev_converges_as_the_square_root(world):
-    # k passes of Jacobi leave (1 - 1/kappa)^k of the slowest mode, those of Chebyshev 2 (1 - 2/sqrt(kappa))^k.
+    # k passes of Jacobi leave (1 - 1/kappa)^k of the slowest mode, k passes of Chebyshev 2 (1 - 2/sqrt(kappa))^k.
     left = {}
     for solver in (tv.Jacobi(), tv.Chebyshev()):
         w = hung(world, solver)
@@ -141,7 +142,7 @@ class Ball(SemiIteration):
 
 
 def recursive(solver, eigenvalue, k):
-    """p_(j+1) = (1 + b - a lambda) p_j - b p_(j-1), p_0 = 1, p_1 = 1 - a lambda: what k heavy balls leave."""
+    """Return what k heavy balls leave of a mode: p_(j+1) = (1 + b - a lambda) p_j - b p_(j-1), p_0 = 1, p_1 = 1 - a lambda."""
     before, now = 1.0, 1 - solver.a * eigenvalue
     for _ in range(k - 1):
         before, now = now, (1 + solver.b - solver.a * eigenvalue) * now - solver.b * before
@@ -149,12 +150,12 @@ def recursive(solver, eigenvalue, k):
 
 
 def chebyshev(solver, eigenvalue, k):
-    """T_k((theta - lambda) / delta) / T_k(theta / delta) on 1 / kappa ... 1."""
+    """Return T_k((theta - lambda) / delta) / T_k(theta / delta) on 1 / kappa ... 1."""
     low, T = 1 / solver.condition(k), np.polynomial.chebyshev.Chebyshev.basis(k)
     return T((1 + low - 2 * eigenvalue) / (1 - low)) / T((1 + low) / (1 - low))
 
 
-# Every solver that relaxes, and the polynomial of the eigenvalue and of k by which k passes multiply a mode. A new one is a row.
+# Every solver that relaxes, and the polynomial of eigenvalue and k by which k passes multiply a mode. A new solver is a row.
 POLYNOMIALS = [
     (tv.Jacobi(1.2), lambda solver, eigenvalue, k: (1 - solver.relaxation * eigenvalue) ** k),
     (Damped(), lambda solver, eigenvalue, k: (1 - eigenvalue / 2) ** k),
@@ -166,9 +167,9 @@ POLYNOMIALS = [
 
 @pytest.mark.parametrize("solver, polynomial", POLYNOMIALS, ids=lambda v: type(v).__name__)
 def test_passes_leave_of_each_mode_what_their_polynomial_says(world, solver, polynomial):
-    # A straight chain of m links between two pins, moved along itself, where constraints are linear: k passes take C to
-    # p_k(A D^-1) C. Masses split by two give D = 4 w, 2 w at the pins, so that A D^-1 has the eigenvalues
-    # (1 - cos(pi j / (m - 1))) / 2, and the vectors cos(pi j i / (m - 1)), halved at the pins, for the links i.
+    # A straight chain of m links between two pins, displaced along itself, where constraints are linear: k passes take C to
+    # p_k(A D^-1) C. Masses split by two give D = 4 w, and 2 w at the pins. So A D^-1 has the eigenvalues
+    # (1 - cos(pi j / (m - 1))) / 2 and the vectors cos(pi j i / (m - 1)) for links i, halved at the pins.
     m = 9
     i, rest = np.arange(m), np.full(m, 1.0)
     pairs = np.stack([i, i + 1], axis=1)
@@ -204,7 +205,7 @@ def test_64_chebyshev_refuses_what_is_unstable(world):
 
 @pytest.mark.parametrize("make", [tv.Chebyshev, tv.ConjugateGradient])
 def test_a_solver_has_the_same_bits_in_one_kernel_and_for_a_team(world, make):
-    # Which has those of phase by phase, see test_every_solver_has_the_same_bits_on_1_and_8_threads.
+    # A team has the bits of the launched path, see test_every_solver_has_the_same_bits_on_1_and_8_threads.
     hashes = []
     for path in ("fused", "parallel"):
         x, pairs = cloth(8)
@@ -217,7 +218,7 @@ def test_a_solver_has_the_same_bits_in_one_kernel_and_for_a_team(world, make):
 
 
 def test_elimination_leaves_less_than_a_pass_of_relaxation():
-    # Numerics 4.1, on a chain of ten at 20 substeps: less by orders of magnitude, at 2.5 times the work.
+    # Numerics 4.1, on a chain of ten at 20 substeps: elimination leaves orders of magnitude less, at 2.5 times the work.
     one, all_ = (points.curve(points.Task("D05_chain10", name, efforts=(20,), runs=1))[0] for name in ("Jacobi", "Direct"))
     assert one.visits == 20 * 60 * 10 and all_.visits == 2.5 * one.visits
     assert all_.residual < 1e-3 * one.residual and not all_.flags
@@ -227,7 +228,7 @@ def test_elimination_leaves_less_than_a_pass_of_relaxation():
     "solver, advised", [(tv.Jacobi(), tv.ConjugateGradient()), (tv.ConjugateGradient(3), tv.ConjugateGradient(6))]
 )
 def test_constraints_that_are_not_met_are_flagged_with_what_helps(world, solver, advised):
-    # Of a cloth that falls into its two pins the residual goes down with h or faster: the substeps of the note, and its solver.
+    # The residual of a cloth that falls into its two pins falls with h or faster: both the note's substeps and its solver help.
     x, pairs = cloth(12)
     start = tv.Particles(x, mass=1e-3, pinned=[0, 11])
 
@@ -255,8 +256,8 @@ def test_constraints_that_are_not_met_are_flagged_with_what_helps(world, solver,
     ],
 )
 def test_what_is_drawn_straight_between_pins_gains_no_energy(world, solver, precision, pins):
-    # A row of links between two pins has dependent equations: nothing carries across it to first order. Gravity may supply m g L,
-    # of which a thousandth is allowed for what a substep is off.
+    # A row of links between two pins has dependent equations: to first order nothing bears a load across it. Gravity may supply
+    # m g L, of which a thousandth is allowed for the error of a substep.
     x, pairs = cloth(12)
     start = tv.Particles(x, mass=1e-3, pinned=pins)
     iterations = 4 if isinstance(solver, tv.Chebyshev) else 1
@@ -272,8 +273,8 @@ def test_what_is_drawn_straight_between_pins_gains_no_energy(world, solver, prec
 
 @pytest.mark.parametrize("solver, iterations", [(tv.Direct(), 1), (tv.Chebyshev(), 4)])
 def test_links_of_length_0_bring_in_no_energy(world, solver, iterations):
-    # A straight chain between two pins, held by links of length 0, which have another direction in every pass: what a solver
-    # remembers of the last one is wrong. Chebyshev came to 3.8e4 m g L in 2 s, Direct with auto left 2.8e-2.
+    # A straight chain between two pins, held by links of length 0, whose direction differs in every pass. A solver must not use
+    # the step of the last pass there: Chebyshev would reach 3.8e4 m g L in 2 s, and Direct with auto a residual of 2.8e-2.
     n = 10
     x = np.stack([0.1 * np.clip(np.arange(n + 2) - 1, 0, n - 1), np.full(n + 2, 2.0)], axis=1)
     k = np.arange(n + 1)
@@ -288,8 +289,8 @@ def test_links_of_length_0_bring_in_no_energy(world, solver, iterations):
 
 
 def test_springs_that_are_not_solved_hold_no_energy_that_nobody_supplied(world):
-    # One pass makes a spring of 1 / alpha as soft as 1 / (alpha + D h^2). Its energy is F C / 2: with it, energy never
-    # exceeds that of the start. With C^2 / (2 alpha) a cloth of 2 J had 640 J.
+    # One pass makes a spring of 1 / alpha as soft as 1 / (alpha + D h^2). With F C / 2 as its energy, the total never exceeds
+    # that of the start. With C^2 / (2 alpha) a cloth of 2 J would have 640 J.
     x, pairs = cloth(12, shear=True)
     link = tv.Distance(pairs, compliance=np.geomspace(1e-6, 1e-2, len(pairs)))
     w = world(tv.Particles(x, mass=1e-3, pinned=[0, 11]), [tv.Gravity(9.81), link], path="fused", solver=tv.Jacobi())
@@ -300,10 +301,10 @@ def test_springs_that_are_not_solved_hold_no_energy_that_nobody_supplied(world):
 
 
 def test_pins_and_clusters_hold_the_energy_of_what_they_exert(world):
-    # A spring of 1e-9 m/N draws a rod's end, and another a square, by 0.01 m from where rigid links keep them. At rest, sharing
-    # masses, they hold alpha F^2 / 2, with F what they exert (of a corner with a quarter of a square's mass 4 alpha F^2 / 2).
-    # C^2 / (2 alpha) would be 5e4 J each, m C^2 / h^2 of a pass is 1e3 J, and F C / 2, which is no spring's, 20 J: of that what
-    # is not stiff, (alpha / h^2)^2, is in it.
+    # A spring of 1e-9 m/N pulls a rod's end, and another one a square, 0.01 m away from where rigid links keep them. At rest,
+    # with shared masses, they hold alpha F^2 / 2, with F the force that they exert (4 alpha F^2 / 2 for a corner with a quarter
+    # of the square's mass). C^2 / (2 alpha) would be 5e4 J each, m C^2 / h^2 of a pass 1e3 J, and F C / 2, which is no spring's
+    # energy, 20 J. The share of F C / 2 that is not stiff, (alpha / h^2)^2, is included.
     corner = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     x = np.concatenate([[[-3.0, 0], [-2, 0]], corner])
     ring = np.stack([2 + np.arange(4), 2 + (np.arange(4) + 1) % 4], axis=1)
@@ -321,8 +322,11 @@ def test_pins_and_clusters_hold_the_energy_of_what_they_exert(world):
 
 
 def test_a_contradictory_rope_softens_no_other_links(world):
-    """Conjugate gradients are one system, but a net has nothing to do with a rope beside it that is too short for its pins: its
-    links are off by as little as alone. With one floor for all it was seventy times as much."""
+    """A rope too short for its pins softens no other links, although conjugate gradients solve one system.
+
+    The links of a net beside it are off by as little as alone. With one floor for all rows they would be off by seventy times as
+    much.
+    """
     net, rope = tv.shapes.net((3, 2), (1, 0), (0, -1), points=(8, 8)), tv.shapes.rope((0, 2), (1, 2), points=12)
     x = np.concatenate([net.position, rope.position])
     links = np.concatenate([net.links, rope.links + 64])
@@ -336,12 +340,14 @@ def test_a_contradictory_rope_softens_no_other_links(world):
     assert off[:n].max() < 5e-4 and off[n:] @ rest[n:] > 0.999 * 0.05  # what the rope lacks
     w.remove(range(64))
     w.run(0.1)
-    assert w.features[1].residual @ rest[n:] > 0.999 * 0.05 and np.abs(w.velocity).max() < 0.1  # it is as soft as it was
+    assert w.features[1].residual @ rest[n:] > 0.999 * 0.05 and np.abs(w.velocity).max() < 0.1  # as soft as before
 
 
 def test_contradictory_links_stay_where_they_are(world):
-    """A rope that is 5 % too short for its two pins has no solution, and the least squares of its violations pull at nothing: it
-    hangs at rest, its residual and the first frame say so. One that fits is as it was."""
+    """A rope that is 5 % too short for its two pins has no solution; at the least squares of its violations it pulls at nothing.
+
+    It hangs at rest, and its residual and the first frame report it. A rope that fits is not affected.
+    """
     rope = tv.shapes.rope((0, 2), (1, 2), points=12)
     for rest in (0.95 / 11, 1 / 11, None):
         for substeps in (20, 200):
@@ -353,29 +359,32 @@ def test_contradictory_links_stay_where_they_are(world):
             )
             first = w.step(1 / 60)
             w.run(0.1)
-            assert np.abs(w.velocity).max() < 9.81 * 0.12  # no faster than it falls in that time: it was 61 m/s
+            assert np.abs(w.velocity).max() < 9.81 * 0.12  # no faster than free fall in that time
             assert ("unconverged" in first.flags) == (rest == 0.95 / 11)
-            if rest == 0.95 / 11:  # shared alike by all, it is the least that can be missing of the worst
+            if rest == 0.95 / 11:  # shared alike by all links: the least possible largest violation
                 assert 0.999 * 0.05 / 0.95 < w.last.residual < 0.07
 
 
 @pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Chebyshev(), tv.ConjugateGradient(5)], ids=repr)
 def test_contradictory_links_start_where_they_pull_at_nothing(world, solver):
-    """A triangle of 1, 1 and 3 m lies on a line, each link off by 1/3 m. Newton's steps know no direction across it, and half a
-    centimetre off the line passes gave it 243 J, since they hold a violation C with C^2 / (2 W h^2)."""
+    """A triangle of 1, 1 and 3 m starts on a line, each link off by 1/3 m, where its links pull at nothing.
+
+    Newton's steps have no direction across the line. Half a centimetre off it, passes would give it 243 J, as they hold a
+    violation C with C^2 / (2 W h^2).
+    """
     links = tv.Distance([[0, 1], [1, 2], [2, 0]], [3.0, 1.0, 1.0])
     x = np.array([[0, 0.1], [1, 0.1], [0.5, 0.5]])
     w = world(tv.Particles(x, mass=1.0), [tv.Gravity(10.0), links], substeps=60, solver=solver)
     energies = [w.step(1 / 60).energy for _ in range(20)]
-    # It falls as it was placed; f32 leaves a violation of C = 1/3 m with rounding of 1e-7 m of it, T dx = C dx / (W h^2).
+    # It falls as placed. f32 leaves the violation C = 1/3 m with a rounding error of 1e-7 m, of energy T dx = C dx / (W h^2).
     np.testing.assert_allclose(energies, 10 * x[:, 1].sum(), atol=0.2)
     np.testing.assert_allclose(np.abs(links.violation(w.position)), 1 / 3, rtol=1e-2)
     np.testing.assert_allclose(np.ptp(w.position[:, 1]), 0.0, atol=1e-3)
 
 
 def test_light_constraints_are_solved_beside_heavy_ones(world):
-    # r . z of a row is C^2 / w: 1e7 times as much for the chain as for the cloth. The cloth alone stretches by 6e-4, by 2.6e-2
-    # where steps of conjugate gradients ended once the sum over rows was that of rounding.
+    # r . z of a row is C^2 / w: 1e7 times as much for the chain as for the cloth. Alone the cloth stretches by 6e-4. If conjugate
+    # gradients ended when the sum over all rows is rounding, it would stretch by 2.6e-2.
     x = np.array([(2 + 0.1 * i, 3.0, 0.1 * j) for i in range(8) for j in range(8)])
     at = np.arange(64).reshape(8, 8)
     links = np.concatenate([np.c_[at[1:].ravel(), at[:-1].ravel()], np.c_[at[:, 1:].ravel(), at[:, :-1].ravel()]])

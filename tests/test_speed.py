@@ -1,4 +1,4 @@
-"""The report on speed: its figures belong together. Nothing here is about how fast anything is."""
+"""The report on speed: its figures are consistent. No test here checks how fast anything is."""
 
 import contextlib
 import io
@@ -34,20 +34,23 @@ from .conftest import python
 
 @pytest.fixture(scope="module")
 def kept(taichi):
-    """A folder for what children compile, beside what is kept of the tests themselves: no second run compiles it again."""
+    """Return a folder for what child processes compile, beside the cache of the tests: a second run compiles nothing again."""
     return pathlib.Path(ti.cfg.offline_cache_file_path, "speed")
 
 
 class Forked:
-    """What is asked once and answers once, by a process that has imported tiverlet before. Asked the same a second time, as where
-    nothing has to be compiled any more, it gives the first answer again: only seconds would be others."""
+    """A process that gets one question and gives one answer, forked from one that has imported tiverlet.
+
+    The same question returns the first answer again, as where nothing is left to compile: only seconds would differ.
+    """
 
     answers: dict[str, str] = {}
 
     def __init__(self, code, job, cache):
         keeps = {"TI_OFFLINE_CACHE": "1", "TI_OFFLINE_CACHE_FILE_PATH": cache}
         before = f"import os, sys, warnings\nwarnings.simplefilter('default')\nos.environ.update({keeps})"
-        after = "from tiverlet.device import ti\nti.reset()"  # which keeps what was compiled; what was forked does not at its end
+        # ti.reset() stores compiled kernels; a forked process does not at its end
+        after = "from tiverlet.device import ti\nti.reset()"
         self.code = f"{before}\nsys.argv[1:] = [{json.dumps(job)!r}]\n{code}\n{after}\n"
 
     def said(self):
@@ -67,7 +70,7 @@ class Forked:
 
 @pytest.fixture(scope="module")
 def forked(process):
-    """Only the scene, which is asked again and again, has interpreters of its own: each imports for a second of CPU time."""
+    """Start a new interpreter only for the scene, which gets many questions: each import takes a second of CPU time."""
     with pytest.MonkeyPatch.context() as patch:
         made = processes.started
         patch.setattr(processes, "started", lambda code, *job: (made if code == child.START else Forked)(code, *job))
@@ -76,8 +79,10 @@ def forked(process):
 
 @pytest.fixture(scope="module")
 def report(kept, forked):
-    """A scene of one size, quickly, and another by a copy of the package that lacks what it does not use. What is cold is so only
-    where nobody has compiled the same before."""
+    """Return a quick report on one scene of one size, and on another scene by a stripped copy of the package.
+
+    A cold start is one only where nobody compiled the same before.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(measure, "BLOCK", 1 << 22)
         patch.setattr(waits, "QUICK", 2)
@@ -103,7 +108,7 @@ def test_figures_are_positive_and_belong_together(report):
 
 
 def test_a_scene_of_links_has_a_residual(monkeypatch, capsys):
-    # What the process of a scene answers, line by line, in this one.
+    # The answers of a scene's process, line by line, computed in this process.
     monkeypatch.setattr(tv, "init", lambda arch, threads: None)
     monkeypatch.setattr("sys.stdin", io.StringIO("restart\nrun 12\nquality\nlook\n"))
     child.main({"scene": "rope", "n": 41, "arch": "cpu", "threads": 1}, 0.5)
@@ -128,7 +133,7 @@ def test_edits_of_other_engines_are_timed(engine):
 
 
 def test_pile_in_c_does_the_same(report):
-    # Two schemes for one scene: the mean overlap is a matter of the scheme, but not of another size.
+    # Two schemes for one scene: the mean overlap depends on the scheme, but is of the same order.
     pile = report.run("pile", 41, 1)
     if pile.yardstick is None:
         assert any(note.startswith("Left out: the yardstick") for note in report.notes)
@@ -138,7 +143,7 @@ def test_pile_in_c_does_the_same(report):
 
 
 def test_yardstick_starts_where_the_scene_does(tmp_path):
-    # pile.c has the lattice, the jitter and the box of the scene: nothing overlaps at first, and the text has the same numbers.
+    # pile.c has the scene's lattice, jitter and box: nothing overlaps at first, and its source has the same numbers.
     x = scenes.pile(1000)[0].position
     assert x.min() >= 0.5 and np.ptp(x, axis=0).max() < 1.1 * 31 + 0.05
     jitter = x - 0.5 - 1.1 * np.stack([np.arange(1000) % 32, np.arange(1000) // 32], axis=1)
@@ -180,8 +185,8 @@ def test_plots(report, tmp_path):
 
 
 def test_bytes_are_those_of_the_fields(world):
-    # Free fall in f32 and 2D, in each substep: x and d (8 bytes each) are read and written, the inverse mass (4), if not all have
-    # the same, and, once for all, g (8) and how many there are of what (4 each).
+    # Free fall in f32 and 2D, per substep: x and d (8 bytes each) are read and written, the inverse mass (4) is read if masses
+    # differ; and once for all particles g (8) and the counts of each kind (4 each).
     for mass, more in ((1.0, 0), (np.arange(1.0, 301.0), 4)):
         w = world(tv.Particles(np.zeros((300, 2)), mass=mass), [tv.Gravity(9.81)], substeps=5)
         w.step(counting.DT)
@@ -195,7 +200,7 @@ def test_launches_are_counted(world):
         w.step(0.01)
     assert count == {"integrate solve_constraints apply_corrections": 5, "measure": 1}
     w.step(0.01)
-    assert count.total() == 6  # no more than in the block
+    assert count.total() == 6  # launches after the block are not counted
 
 
 def test_scenes_are_sound():
@@ -204,7 +209,7 @@ def test_scenes_are_sound():
             particles, features = scene.build(n)
             assert 0.5 * n <= len(particles) <= 2 * n + 60, name
             assert sum(isinstance(f, tv.Contact) for f in features) == (particles.radius.any() > 0)
-            if particles.radius.any():  # nothing overlaps, links apart
+            if particles.radius.any():  # nothing overlaps, not counting links
                 x, r = particles.position, particles.radius[0]
                 far = np.linalg.norm(x[:, None] - x[None], axis=2) + 10 * np.eye(len(x))
                 assert far.min() > 2 * r
@@ -213,7 +218,7 @@ def test_scenes_are_sound():
 
 
 def test_what_is_stripped_runs_and_has_the_same_fields(report):
-    # The copy has two features and what the package itself needs.
+    # The copy has two features and the parts that the package itself needs.
     (absent,) = report.absent
     assert absent.fields[0] == absent.fields[1] and absent.bytes[0] == absent.bytes[1] and absent.launches == (1, 1)
     assert absent.ratio > 0 and SpeedReport.of_json(report.json()) == report
@@ -260,11 +265,11 @@ def test_command(capsys):
     assert "a million" not in (out := capsys.readouterr().out) and all(name in out for name in SCENES)
     assert main(["report", "speed", "pule"]) == 2
     assert "no scene 'pule'" in capsys.readouterr().err
-    assert main(["report", "--list"]) == 0  # with no word more, the report on errors
+    assert main(["report", "--list"]) == 0  # without a further word: the report on errors
     assert "D01_double_pendulum" in capsys.readouterr().out
 
 
-# All jobs one after the other, each of which takes what it prints to for its own.
+# All jobs one after the other; each redirects the output that it prints to.
 TOGETHER = """
 import json, os, sys
 import tiverlet as tv
@@ -281,15 +286,17 @@ for job in json.loads(sys.argv[1]):
 
 @pytest.fixture(scope="module")
 def batch(kept):
-    """Many worlds, few of them; piles only where they are beside one of all their discs, for they take longest to compile. All
-    parts in one process, where they share kernels; first the one that counts those that it compiles."""
+    """Return a report on few of many worlds. All parts run in one process, where they share kernels.
+
+    Piles run only beside one of all their discs, because they compile longest. The part that counts compiled kernels runs first.
+    """
     jobs, rows = {}, {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(worlds, "tempfile", types.SimpleNamespace(TemporaryDirectory=lambda: contextlib.nullcontext(str(kept))))
         patch.setattr(processes, "started", lambda code, job, cache: contextlib.nullcontext(types.SimpleNamespace(
             ask=lambda: rows.get(job["part"]) or jobs.update({job["part"]: job}) or []
         )))  # fmt: skip
-        worlds.worlds(threads=(1,), quick=True, peers=False)  # which asks for all of them
+        worlds.worlds(threads=(1,), quick=True, peers=False)  # asks for all parts
         names = sorted(jobs, key="costs".__ne__)
         said = Forked(TOGETHER, [jobs[name] for name in names], str(kept / "worlds")).said()
         rows = dict(zip(names, map(json.loads, said.splitlines()), strict=True))
@@ -321,7 +328,7 @@ def test_worlds_are_measured_or_left_out(batch):
 
 
 def test_reference_of_double_pendulums():
-    # It has the energy of its start, and halving the step changes nothing.
+    # The reference has the energy of its start, and half the step changes nothing.
     times = np.arange(1, 46) / 15
     x, finer = worlds.double_pendulum(times), worlds.double_pendulum(times, steps=32)
     np.testing.assert_allclose(x, finer, atol=1e-12)
@@ -330,7 +337,7 @@ def test_reference_of_double_pendulums():
 
 
 def test_rate_for_an_error():
-    known = [(30, 16e-4), (60, 1e-4), (120, 1e-8), (240, 2e-8)]  # the last one rounds
+    known = [(30, 16e-4), (60, 1e-4), (120, 1e-8), (240, 2e-8)]  # the last one is rounding
     assert worlds.rate_for(1e-4, known) == pytest.approx(60)
     assert worlds.rate_for(4e-4, known) == pytest.approx(30 * 2**0.5)
     assert worlds.rate_for(256e-4, known) == pytest.approx(15)

@@ -1,4 +1,4 @@
-"""Particles that spin: rolling, sliding into rolling, impacts, and what is kept."""
+"""Particles that spin: rolling, sliding into rolling, impacts, and conserved quantities."""
 
 import numpy as np
 import pytest
@@ -12,31 +12,31 @@ BODIES = [(2, "disc", 2.0), (2, "ring", 1.0), (3, "sphere", 2.5), (3, "shell", 1
 
 
 def turning(omega: float, dim: int):
-    """An angular velocity about the axis out of the plane."""
+    """Return an angular velocity about the axis out of the plane."""
     return omega if dim == 2 else (0.0, 0.0, omega)
 
 
 def rate(world, i: int = 0) -> float:
-    """The same of a particle."""
+    """Return the angular velocity of particle i about the axis out of the plane."""
     return float(world.spin[i] if world.particles.dim == 2 else world.spin[i, 2])
 
 
 def slope(angle: float, dim: int) -> tuple[np.ndarray, np.ndarray]:
-    """The normal of an incline that falls to the right, and the way down."""
+    """Return the normal of an incline that falls to the right, and the direction down it."""
     normal, down = np.zeros((2, dim))
     normal[:2], down[:2] = (np.sin(angle), np.cos(angle)), (np.cos(angle), -np.sin(angle))
     return normal, down
 
 
 def incline(world, start, normal, friction, precision="f64", **settings):
-    """A half space with all kinds of friction, of which some may be 0: one structure for all that lies on one."""
+    """Return a world with a half space that has all kinds of friction, of which some may be 0: one structure for all inclines."""
     w = world(start, [tv.Gravity(G), tv.HalfSpace(normal, friction=(1.0, 1.0, 1.0, 1.0))], precision=precision, **settings)
     w.features[1].friction = friction
     return w
 
 
 def free(world, start, friction=(0.5, 0.5), restitution=(0.0, 0.0), g=0.0, **settings):
-    """The same for what touches: friction and restitution in all directions, of which some may be 0."""
+    """Return a world with contacts; all kinds of friction and restitution are compiled even where they are 0: one structure."""
     features = [tv.Gravity(g), tv.Contact(friction=(1.0, 1.0), restitution=(0.5, 0.5))]
     w = world(start, features, precision="f64", **settings)
     features[1].friction, features[1].restitution = friction, restitution
@@ -46,7 +46,7 @@ def free(world, start, friction=(0.5, 0.5), restitution=(0.0, 0.0), g=0.0, **set
 @pytest.mark.parametrize(("dim", "body", "k"), BODIES)
 def test_what_rolls_down_an_incline_does_so_to_rounding(world, dim, body, k):
     # a = k / (1 + k) g sin a and omega = a t / r while tan a <= (1 + k) mu; beyond, a = g (sin a - mu cos a) and
-    # omega = k mu g cos a t / r. d + s / k is what friction cannot change, so each substep is exact, as a free fall is.
+    # omega = k mu g cos a t / r. Friction cannot change d + s / k, so each substep is exact, as in free fall.
     r = 0.1
     for mu, angle in ((0.3, np.arctan(0.3 * (1 + k)) - 0.01), (0.3, np.arctan(0.3 * (1 + k)) + 0.01)):
         normal, down = slope(angle, dim)
@@ -59,7 +59,7 @@ def test_what_rolls_down_an_incline_does_so_to_rounding(world, dim, body, k):
         assert w.position[0] @ down == pytest.approx(a * t**2 / 2, rel=1e-12)
         assert w.velocity[0] @ down == pytest.approx(a * t, rel=1e-12)
         assert rate(w) == pytest.approx(-alpha * t, rel=1e-12)
-        # The moment of friction about the middle, I alpha; and the energy, that of rolling included.
+        # The moment of friction about the middle is I alpha; and the energy includes that of rolling.
         inertia = 3.0 * r**2 / k
         assert abs(np.ravel(tv.measure.torque(w))[-1]) == pytest.approx(inertia * alpha, rel=1e-9)
         assert tv.measure.kinetic_energy(w) == pytest.approx(1.5 * (a * t) ** 2 + inertia / 2 * (alpha * t) ** 2, rel=1e-12)
@@ -69,8 +69,8 @@ def test_what_rolls_down_an_incline_does_so_to_rounding(world, dim, body, k):
 
 @pytest.mark.parametrize(("dim", "body", "k"), [BODIES[0], BODIES[2]])
 def test_what_slides_comes_to_roll(world, dim, body, k):
-    # v = k / (1 + k) v0 from t = v0 / ((1 + k) mu g) on, by d + s / k again; the position is off by how that falls in a substep,
-    # of order h^2.
+    # v = k / (1 + k) v0 from t = v0 / ((1 + k) mu g) on, because d + s / k is constant. The position is off by what friction
+    # changes within a substep, of order h^2.
     mu, v0, r = 0.2, 3.0, 0.11
     start = tv.Particles(np.eye(dim)[1:2] * r, velocity=v0 * np.eye(dim)[0], radius=r, spin=0, inertia=body)
     w = incline(world, start, np.eye(dim)[1], mu)
@@ -85,15 +85,15 @@ def test_what_slides_comes_to_roll(world, dim, body, k):
         x = v0 * t1 - mu * G * t1**2 / 2 + k / (1 + k) * v0 * (t - t1)
         errors.append(abs(w.position[0, 0] - x))
         assert errors[-1] <= mu * G * (1 / 60 / substeps) ** 2
-    # Rolling resistance stops it: v' = -rolling g / (1 + 1 / k), so it comes to a stand, and stays there to the bit. It sets in
-    # half a substep before the frame does.
+    # Rolling resistance stops the body: v' = -rolling g / (1 + 1 / k), so it comes to a stand, and stays there bit for bit.
+    # Resistance sets in half a substep before the frame begins.
     w.features[1].friction = (mu, mu, 0.05)
     w.step(1 / 60)
     v, x = w.velocity[0, 0], w.position[0, 0]
     w.run(0.5)
     a = 0.05 * G / (1 + 1 / k)
     assert w.velocity[0, 0] == pytest.approx(v - a * 0.5, rel=1e-12)
-    # v has of the wall no more than its weight, so it lacks up to h / 2 a rolling^2 / 2.
+    # The velocity counts no more of the wall than the weight, so it lacks up to h / 2 a rolling^2 / 2.
     assert w.position[0, 0] - x == pytest.approx(v * 0.5 - a * 0.5**2 / 2, abs=a * 0.05**2 / 4 * 0.5 / 2400)
     w.run(v / a)
     place = w.position
@@ -102,7 +102,7 @@ def test_what_slides_comes_to_roll(world, dim, body, k):
 
 
 def law(x, v, omega, m, r, k, e, mu, beta):
-    """Two spheres that collide (Walton 1993; Foerster et al. 1994): the time, and velocities and spins after it."""
+    """Return time, velocities and spins after two spheres collide (Walton 1993; Foerster et al. 1994), and whether they stick."""
     dim, axes = x.shape[1], omega.shape[1]
     X, V, W = np.zeros((3, 2, 3))
     X[:, :dim], V[:, :dim], W[:, 3 - axes :] = x, v, omega
@@ -123,7 +123,7 @@ def law(x, v, omega, m, r, k, e, mu, beta):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_two_that_collide_obey_the_law_of_impacts_to_rounding(world, dim):
-    # Momentum, angular momentum about any point and, for a super ball, energy are kept to rounding.
+    # Momentum, angular momentum about any point and, for a super ball, energy are constant to rounding.
     m, r, k = np.array([1.0, 2.5]), np.array([0.1, 0.15]), 1 / 0.4 if dim == 3 else 2.0
     x = np.array([[0.0, 0, 0], [0.5, 0.12, 0.05]])[:, :dim]
     v = np.array([[2.0, 0.3, -0.2], [-1.0, 0.5, 0.1]])[:, :dim]
@@ -153,7 +153,7 @@ def test_two_that_collide_obey_the_law_of_impacts_to_rounding(world, dim):
 
 
 def test_a_super_ball_comes_back(world):
-    # Thrown at a floor with a wall's grip (e = 1, beta = 1): d - s x n changes its sign with each bounce, so with k = 5/2
+    # Between a floor and a ceiling that grip (e = 1, beta = 1), d - s x n changes its sign with each bounce. So with k = 5/2,
     # v' = (v (1 - k) + 2 u) / (1 + k), u' = (2 k v - (1 - k) u) / (1 + k) for u = r omega (Garwin 1969); twice is no change.
     k, r = 2.5, 0.02
     v, u = 2.0, 0.0
@@ -164,12 +164,13 @@ def test_a_super_ball_comes_back(world):
     for _ in range(4):
         before, speed = w.position[0, 0], w.velocity[0, 0]
         w.run(0.98, dt=0.98 / 40)
-        # In a box of height 0.96 for its middle, at 1 m/s, it meets the first plate after 0.48 s, and others 0.96 s later each.
+        # The middle moves in a box of height 0.96 at 1 m/s: it meets the first plate after 0.48 s, and each further one 0.96 s
+        # later.
         since = w.time - 0.48 - 0.96 * len(seen)
         x = before + speed * (0.98 - since) + w.velocity[0, 0] * since
         assert w.position[0, 0] == pytest.approx(x, abs=1e-12)
         seen.append([w.velocity[0, 0], r * w.spin[0, 2]])
-    want, side = [], -1  # the floor is below: the point that touches moves by v + u
+    want, side = [], -1  # the floor is below: the point of contact moves at v + u
     for _ in range(4):
         slip = v - side * u
         v, u = v - 2 * slip / (1 + k), u + side * 2 * k * slip / (1 + k)
@@ -180,7 +181,7 @@ def test_a_super_ball_comes_back(world):
 
 
 def test_what_rolls_off_another_does_so_to_second_order(world):
-    # (1 + 1 / k) (R + r) theta'' = g sin theta for a body that rolls on one that is pinned; the reference is Runge and Kutta's.
+    # (1 + 1 / k) (R + r) theta'' = g sin theta for a body that rolls on a pinned one; the reference is by Runge and Kutta.
     k, R, r, theta, T = 2.5, 1.0, 0.2, 0.3, 0.5
     place = np.zeros((2, 3))
     place[1, :2] = (R + r) * np.sin(theta), (R + r) * np.cos(theta)
@@ -207,9 +208,9 @@ def test_what_rolls_off_another_does_so_to_second_order(world):
 
 
 def test_a_swarm_keeps_angular_momentum_and_loses_energy(world):
-    # Pairs that bounce keep momentum and angular momentum to rounding. Where a particle is struck by two in the same substep,
-    # angular momentum is off by the cross product of what both do in a part of it, O(h); the more substeps, the fewer. Energy
-    # only falls.
+    # Pairs that bounce keep momentum and angular momentum to rounding. Where two strike a particle in the same substep, angular
+    # momentum is off by the cross product of what both do in a part of it, O(h); this is rarer with more substeps. Energy only
+    # falls.
     rng = np.random.default_rng(3)
     x, size = tv.golden(np.arange(60), dim=3) * 0.7, np.linspace(0.045, 0.055, 60)
     start = tv.Particles(x, velocity=-2 * (x - x.mean(axis=0)), radius=size, mass=size, spin=rng.normal(size=x.shape) * 30)
@@ -239,14 +240,15 @@ def test_rolling_resistance_holds_and_lets_go(world):
         w.features[1].friction = (1.0, 1.0, 0.1)
         begin = (
             w.time - 1 / 60 / w.last.substeps / 2
-        )  # what friction bore in the last substep, it bore up to the middle of the next
+        )  # friction of the last substep counts as acting up to the middle of the next substep
         w.run(0.5)
         a, t = G * (np.sin(angle) - 0.1 * np.cos(angle)) / (1 + 1 / k), w.time - begin
         assert w.velocity[0] @ down == pytest.approx(a * t, rel=1e-9 if precision == "f64" else 1e-4)
 
 
 def test_twisting_resistance_stops_a_top(world):
-    # I omega' = -twisting r m g: omega = omega0 - twisting g k t / r. Without it a sphere spins about the normal for ever.
+    # I omega' = -twisting r m g: omega = omega0 - twisting g k t / r. Without twisting resistance a sphere spins about the normal
+    # forever.
     r, k, omega = 0.1, 2.5, 40.0
     start = tv.Particles([(0, r, 0)], radius=r, spin=(0, omega, 0))
     w = incline(world, start, (0, 1, 0), (0.5, 0.5, 0.0, 0.1))
@@ -261,8 +263,8 @@ def test_twisting_resistance_stops_a_top(world):
 
 
 def test_a_turning_wall_takes_a_ball_along(world):
-    # In a drum that turns, a disc that resists rolling turns as the drum does, 0.6 rad/s, as if it were glued to it; a disc that
-    # lies between two pinned ones that spin takes the speed of their surfaces, -5 rad/s times R / r.
+    # In a turning drum, a disc that resists rolling turns as the drum does, at 0.6 rad/s, as if glued to it. A disc between two
+    # pinned, spinning ones takes the speed of their surfaces, -5 rad/s times R / r.
     drum = tv.Polygon([(1, 0), (0, 1), (-1, 0), (0, -1)], inside=True, friction=(1.0, 1.0, 10.0))
     w = world(tv.Particles([(0.0, -0.85)], radius=0.1, spin=0), [tv.Gravity(G), drum], precision="f64", substeps=40)
     for k in range(30):
@@ -278,7 +280,7 @@ def test_a_turning_wall_takes_a_ball_along(world):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_orientations_follow_spins(world, dim):
-    # theta = omega t; in 3D the quaternion of the rotation vector omega t. At 1e4 rad/s, too: 8 rad a substep.
+    # theta = omega t; in 3D the quaternion of the rotation vector omega t. Also at 1e4 rad/s, 8 rad per substep.
     omega = np.array([[3.0], [-1e4]]) * np.array([[1.0]] if dim == 2 else [[0.6, 0.0, 0.8]])
     x = np.zeros((2, dim))
     x[1, 0] = 1
@@ -295,7 +297,7 @@ def test_orientations_follow_spins(world, dim):
 
 
 def scene(dim: int):
-    """Discs or spheres that spin, in a box and among themselves, with all that acts on spins."""
+    """Return spinning discs or spheres in a box, and all features that act on spins."""
     rng = np.random.default_rng(0)
     x = tv.golden(np.arange(30), dim=dim) + 0.05
     spin = rng.normal(size=30 if dim == 2 else (30, 3)) * 10
@@ -308,8 +310,8 @@ def scene(dim: int):
 
 
 def test_spins_are_the_same_on_all_ways(world, tmp_path, read_here):
-    # Clones, copies, recordings, and particles that come and go. In space, where there is all that there is in the
-    # plane; on all paths see test_sleep.py, for the plane and many worlds the recordings below.
+    # Clones, copies, recordings, and particles that are added and removed. In space, which has everything that the plane has. For
+    # all paths see test_sleep.py, for the plane and many worlds the recordings below.
     dim, (start, features) = 3, scene(3)
     w = world(start, features, path="fused", substeps=6)
     with tv.Recorder(tmp_path / "spin.rrd", w) as recorder:
@@ -373,7 +375,7 @@ def test_what_cannot_spin_is_refused(what):
 
 
 def test_none_and_some_that_spin(world):
-    # A world of none has spins, too; and one that had none gets them with the particles that come.
+    # A world without particles has spins, too; and a world without spins gets them with added particles.
     none = world(tv.Particles(np.zeros((0, 2)), spin=0, orientation=0), [tv.Gravity(), tv.Contact(friction=0.5)])
     none.step(1 / 60)
     assert none.spin.shape == (0,) and none.orientation.shape == (0,) and tv.measure.kinetic_energy(none) == 0
@@ -388,7 +390,7 @@ def test_none_and_some_that_spin(world):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_recordings_show_angular_momentum(world, dim, tmp_path, read_here):
-    # Two that collide and spin: the curve is that of measure, but for half a substep, and constant to rounding in f64.
+    # Two spinning particles collide: the curve is that of measure, but for half a substep, and constant to rounding in f64.
     x = np.zeros((2, dim))
     x[1, :2] = 0.5, 0.07
     v, spin = [np.eye(dim)[0], -np.eye(dim)[0]], turning(3.0, dim)
@@ -401,7 +403,7 @@ def test_recordings_show_angular_momentum(world, dim, tmp_path, read_here):
             recorder.log()
     recording = tv.replay(tmp_path / "spin.rrd")
     assert recording.verify()
-    if dim == 2:  # which is compiled in half of the time
+    if dim == 2:  # compiles in half of the time
         with tv.Worlds(w, 2) as many:
             w.position, many.position = start.position, start.position
             w.velocity, many.velocity = start.velocity, start.velocity

@@ -1,4 +1,4 @@
-"""A report, as it is kept, sent, compared and shown."""
+"""A report: stored, pickled, compared and shown."""
 
 import dataclasses
 import pickle

@@ -1,4 +1,4 @@
-"""tv.sweep: the same bits wherever and however its parts are done, and workers that die."""
+"""tv.sweep: the same bits wherever and however its parts are computed, and workers that die."""
 
 import contextlib
 import functools
@@ -59,15 +59,15 @@ def test_parts_of_any_size_have_the_same_bits(here, at_once):
 
 
 def test_processes_have_the_same_bits_and_share_the_cores(here, monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "3")  # for workers of executors; its own know how many there are
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")  # for workers of executors; workers of the sweep set their own
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    found = tv.sweep(pendulum, STARTS, ends, executor=2)  # in 4 + 3, so that both have something to do
+    found = tv.sweep(pendulum, STARTS, ends, executor=2)  # in 4 + 3, so that both have work
     assert same(here, found) and len(set(found["process"]) - {os.getpid()}) == 2
     assert set(found["threads"]) == {max(1, cores // 2)}
 
 
 class Backwards:
-    """An executor that does the last part first, and whose futures know only result()."""
+    """An executor that computes the last part first, and whose futures have result() only."""
 
     def __init__(self):
         self.calls = []
@@ -98,7 +98,7 @@ def test_the_order_of_parts_does_not_matter(here):
 
 
 def test_dask_has_the_same_bits_and_survives_a_worker_that_dies(here, tmp_path):
-    dask, distributed = map(importlib.import_module, ("dask.config", "distributed"))  # here, or every worker imports them
+    dask, distributed = map(importlib.import_module, ("dask.config", "distributed"))  # here, otherwise every worker imports them
     with (
         dask.set({"distributed.scheduler.allowed-failures": 0}),
         # Threads of one worker would start Taichi in any of them.
@@ -127,18 +127,18 @@ def test_what_a_process_did_when_it_died_is_named_and_done_again(tmp_path):
 
 
 def test_what_a_pool_loses_is_done_by_other_processes(tmp_path, monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "3")  # of which the pool knows
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")  # which the pool uses
     make = functools.partial(ball, marker=str(tmp_path / "died"))
     with pool(1) as executor, pytest.warns(RuntimeWarning, match="BrokenProcessPool"):
         found = tv.sweep(make, {"speed": SPEEDS}, height, executor, at_once=1)
     np.testing.assert_allclose(found["y"], HEIGHTS, atol=1e-6)
     assert found["threads"][:2].tolist() == [3, 3] and os.getpid() not in found["process"]
-    # What the pool was at when it broke: the part that ended it, and at most one more.
+    # The parts that the pool computed when it broke: the one that ended it, and at most one more.
     assert range(2, 3) in [r.numbers for r in found.repeated] and len(found.repeated) <= 2
     assert {r.by for r in found.repeated} == {"another process"}
     with pool(1) as executor:
         executor.shutdown()
-        with pytest.raises(RuntimeError, match="after shutdown"):  # one that never worked is not replaced
+        with pytest.raises(RuntimeError, match="after shutdown"):  # a pool that never worked is not replaced
             tv.sweep(ball, {"speed": SPEEDS}, height, executor)
 
 
@@ -150,7 +150,7 @@ def test_parameters_that_end_every_worker_are_named():
 
 
 def raised(kind, *args) -> tuple[str, str]:
-    """What an exception of a sweep says, and its notes."""
+    """Return the message of an exception of a sweep, and its notes."""
     with pytest.raises(kind) as caught:
         tv.sweep(*args)
     return str(caught.value), "".join(caught.value.__notes__)
@@ -172,7 +172,7 @@ def test_what_functions_raise_comes_out_of_processes():
     rows = [{"speed": 1.0}, {"speed": 2.5, "how": "unsendable"}]
     text, note = raised(RuntimeError, wrong, rows, height, 1)
     assert text == "Unsendable: one and other" and "parameters 1, make(speed=2.5, how='unsendable')" in note
-    assert 'raise Unsendable("one", "other")' in note  # the line of the worker's traceback
+    assert 'raise Unsendable("one", "other")' in note  # the line in the worker's traceback
 
 
 @pytest.mark.parametrize(
@@ -278,7 +278,7 @@ def test_mpi_has_the_same_bits(here, tmp_path):
 
 
 def test_the_page_runs_as_a_script():
-    # Its processes import it, here one of them. test_docs.py runs what is above `if __name__`.
+    # Its processes import it, here one of them. test_docs.py runs the code above `if __name__`.
     _, section = (ROOT / "tiverlet/worlds/README.md").read_text().split("## A sweep over machines")
     code = re.findall(r"^```python\n(.*?)^```$", section.partition("\n## ")[0], re.S | re.M)
     done = python("\n\n".join(code).replace("executor=2", "executor=1"))
@@ -286,7 +286,7 @@ def test_the_page_runs_as_a_script():
 
 
 def test_a_prompt_is_told_where_to_write_its_functions():
-    # Processes import __main__ by its file; at a prompt there is none.
+    # Processes import __main__ by its file; a prompt has none.
     code = (
         "import sys\nimport tiverlet as tv\ndel sys.modules['__main__'].__file__\n"
         "def make(k):\n    pass\ndef figures(worlds):\n    pass\n"
@@ -296,7 +296,7 @@ def test_a_prompt_is_told_where_to_write_its_functions():
 
 
 def test_futures_that_are_cancelled_are_done_by_others():
-    # As when a cluster goes away: its futures are cancelled, and then it takes no more.
+    # As when a cluster goes away: its futures are cancelled, and then it accepts no more.
     class Gone:
         def __init__(self):
             self.calls = 0
@@ -310,7 +310,7 @@ def test_futures_that_are_cancelled_are_done_by_others():
             future.set_running_or_notify_cancel()
             return future
 
-    def make(speed):  # cannot be sent to processes, so that this one does it
+    def make(speed):  # cannot be sent to processes, so this one computes it
         return ball(speed)
 
     with pytest.warns(RuntimeWarning, match="is done again: CancelledError"):

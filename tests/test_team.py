@@ -1,4 +1,4 @@
-"""What falls to each thread of a team."""
+"""How work is dealt to the threads of a team."""
 
 import numpy as np
 
@@ -6,12 +6,12 @@ from tiverlet.device import ti
 from tiverlet.device.memory import Memory
 from tiverlet.device.thread_team import Team
 
-DEALS = ((1, 1), (7, 1), (16, 4), (23, 4), (64, 8))  # so many things, so many at a time
+DEALS = ((1, 1), (7, 1), (16, 4), (23, 4), (64, 8))  # number of things, number per unit
 
 
 @ti.data_oriented
 class Dealt:
-    """Who got what: a row for each of DEALS."""
+    """Which thread got each thing: a row for each of DEALS."""
 
     def __init__(self, size: int):
         memory = Memory(ti.f32)
@@ -23,7 +23,7 @@ class Dealt:
 
     @ti.kernel
     def deal(self, active: ti.i32):
-        """One thread after the other."""
+        """Run the threads one after the other."""
         self.team.active_threads[None] = active
         for k in range(ti.static(len(DEALS) * 64)):
             self.times[k] = 0

@@ -1,4 +1,4 @@
-"""The velocity that a user reads, and writes back: for all constraints that may be soft."""
+"""Velocities that users read and write back: for all constraints that may be soft."""
 
 import numpy as np
 import pytest
@@ -21,11 +21,11 @@ PLACES = {
     "Volume of surfaces": lambda c, x, **soft: tv.Volume(np.concatenate([row[TETRA] for row in c]), **soft),
 }
 POINTS = {"ShapeMatch 3D": WINGS, "Volume of surfaces": WINGS, "ShapeMatch 2D": FLAT, "Motor": FLAT[:3], "Winch": FLAT[:2]}
-STIFF = np.array([0.02, 0.05, 0.1, 0.2, 0.32, 0.5, 0.8, 1.3, 2.0, 5.0, 20.0])  # omega h, about, in 20 substeps
+STIFF = np.array([0.02, 0.05, 0.1, 0.2, 0.32, 0.5, 0.8, 1.3, 2.0, 5.0, 20.0])  # omega h, about, at 20 substeps
 
 
 def scene(name, damped):
-    """Blocks of one constraint each, as stiff as STIFF says, in motion; what of them there is to make a world of."""
+    """Return particles and a feature: moving blocks of one constraint each, as stiff as STIFF."""
     points = ROWS[name].points if name in ROWS else POINTS.get(name, FLAT[:1])
     (k, dim), m = points.shape, len(STIFF)
     corners, x = np.arange(m * k).reshape(m, k), np.tile(points, (m, 1, 1))
@@ -35,7 +35,7 @@ def scene(name, damped):
         probe.prepare(tv.Particles(x.reshape(-1, dim)), np.ones(m * k))
         slopes, rest = probe.gradients(x.reshape(-1, dim)), probe.violation(x.reshape(-1, dim))
         size = (slopes**2).reshape(m, -1).sum(axis=1)
-        if name not in ("Rope 2D", "AngleLimit 3D", "Spacer 2D"):  # what is one-sided only just touches
+        if name not in ("Rope 2D", "AngleLimit 3D", "Spacer 2D"):  # one-sided constraints just touch
             rest = rest - 0.1 * ROWS[name].off
         made = ROWS[name].make(corners, rest, compliance=alpha * size, damping=damped * 2.4 / size)
     else:
@@ -46,9 +46,9 @@ def scene(name, damped):
 
 @pytest.mark.parametrize("name", [*ROWS, *PLACES])
 def test_velocities_written_back_change_nothing(world, name):
-    # Without gravity a block has the energy of its start. Read and written back after each frame, velocities may neither pump a
-    # spring nor brake it by more than 1 - (1 - (omega h)^4 / 16) a start; with the force of a substep ago in them they grew by
-    # 1 + (omega h)^2 / 4 a frame, e^(15 omega^2 h^2) a second.
+    # Without gravity a block has the energy of its start. Velocities that are read and written back after each frame may neither
+    # pump a spring nor brake it by more than 1 - (1 - (omega h)^4 / 16) per start. With the force of the substep before in them,
+    # they would grow by 1 + (omega h)^2 / 4 per frame, e^(15 omega^2 h^2) per second.
     start, made = scene(name, damped=0)
     w = world(start, [made], precision="f64")
     blocks = len(STIFF)
@@ -74,7 +74,7 @@ def test_velocities_written_back_change_nothing(world, name):
 
 
 def swing(world, substeps):
-    """A pendulum in mid-swing, and what holds it."""
+    """Return a world with a pendulum in mid-swing, its pin and its link."""
     pin, link = tv.Pin([0]), tv.Distance([[0, 1]])
     start = tv.Particles([(0, 0), (np.sin(1), -np.cos(1))])
     w = world(start, [tv.Gravity(9.81), pin, link], substeps=substeps, precision="f64")
@@ -84,8 +84,8 @@ def swing(world, substeps):
 
 @pytest.mark.parametrize("what", ["link", "pin", "particle", "pin that takes another"])
 def test_what_is_let_go_flies_on_to_second_order(world, what):
-    # It has the velocity of that moment, and from then on x + v t + g t^2 / 2, or is a pendulum about another particle. Without
-    # half of what held it in the last substep it was off by h / 2 times that: of first order, 5e-3 at 5 substeps.
+    # The particle has the velocity of that moment, and from then on x + v t + g t^2 / 2, or is a pendulum about another particle.
+    # Without half of the last substep's reaction it would be off by h / 2 times that: first order, 5e-3 at 5 substeps.
     ends = []
     for substeps in (5, 10, 20, 320):
         w, pin, link = swing(world, substeps)
@@ -110,8 +110,8 @@ def test_what_is_let_go_flies_on_to_second_order(world, what):
 
 @pytest.mark.parametrize("precision", ["f64", "f32", "f32-compensated"])
 def test_what_keeps_its_velocity_goes_on_to_the_bit(world, precision):
-    # A swinging chain, spinning discs that roll and touch, and one far away that is steered, by v and spin: an impulse is for it
-    # alone. To write back what was read is nothing at all.
+    # A swinging chain, spinning discs that roll and touch, and one disc far away that is steered by velocity and spin: an impulse
+    # acts on that disc alone. Writing back what was read changes nothing.
     rope = tv.shapes.rope((0, 3), (1, 3.2), points=6)
     x = np.concatenate([rope.position, [(3, 0.1), (3.21, 0.1), (3.1, 0.28), (9, 0.5)]])
     features = [
@@ -138,8 +138,8 @@ def test_what_keeps_its_velocity_goes_on_to_the_bit(world, precision):
 
 
 def test_piles_come_to_rest_and_sleep_while_one_steers(world):
-    # Loads stay known and sound is damped, though velocities are clipped after each frame, and another particle is led about. A
-    # start in every frame had the pile shake by 2e-4 J for ever.
+    # Loads stay known and sound is damped, though velocities are clipped after each frame and another particle is steered. With a
+    # start in every frame the pile would keep shaking by 2e-4 J.
     x = np.stack(np.meshgrid(np.arange(6) * 0.21 + 0.15, np.arange(6) * 0.21 + 0.15, indexing="ij"), axis=-1).reshape(-1, 2)
     start = tv.Particles([*x, (5.0, 0.1)], radius=0.1)
     w = world(start, [tv.Gravity(9.81), tv.Contact(), tv.HalfSpace((0, 1)), tv.Sleep()], substeps=8)
@@ -156,13 +156,14 @@ def test_piles_come_to_rest_and_sleep_while_one_steers(world):
     v[5] = 0.0, 2.0
     w.velocity = v
     w.step(1 / 60)
-    assert w.last.asleep == 30 and w.velocity[5, 1] == pytest.approx(2 - 9.81 / 60)  # what leaves another wakes no others
+    assert w.last.asleep == 30 and w.velocity[5, 1] == pytest.approx(2 - 9.81 / 60)  # a disc that leaves another wakes no others
 
 
 @pytest.mark.parametrize("how", ["velocity", "spin", "both", "many", "sleep"])
 @pytest.mark.parametrize("precision", ["f64", "f32", "f32-compensated"])
 def test_a_pile_goes_on_to_the_bit_beside_what_is_driven_on_a_rough_floor(world, precision, how):
-    # Friction turns round in every frame. Where all started for it, 24 discs shook by 2.4e-4 J, and nobody slept.
+    # Friction reverses in every frame. If all particles made a start for it, 24 discs would shake by 2.4e-4 J, and none would
+    # sleep.
     x = [(0.06 + 0.102 * i + 0.05 * (j % 2), 0.05 + 0.09 * j) for j in range(3) for i in range(5)]
     fence = [(0.62, 0.05 + 0.1 * j) for j in range(4)]
     features = [tv.Gravity(9.81), tv.Contact(friction=0.5), tv.HalfSpace((0, 1), friction=0.5), tv.HalfSpace((1, 0))]
@@ -191,7 +192,7 @@ def test_a_pile_goes_on_to_the_bit_beside_what_is_driven_on_a_rough_floor(world,
 
 
 def ways(world, substeps, friction=0.0):
-    """A disc at rest on a floor, one on a pinned disc, and one that hangs on a taut rope: what leans, and is sent off."""
+    """Return a world with a disc on a floor, one on a pinned disc, and one on a taut rope: all three rest on something."""
     x = [(0, 0.1), (2, 0.1), (2, 0.3), (4, 3), (4, 2)]
     features = [tv.Gravity(9.81), tv.Contact(), tv.HalfSpace((0, 1), friction=friction), tv.Rope([[3, 4]], 1.0)]
     w = world(tv.Particles(x, radius=0.1, pinned=[1, 3], spin=0), features, substeps=substeps, precision="f64")
@@ -202,8 +203,8 @@ def ways(world, substeps, friction=0.0):
 @pytest.mark.parametrize("parts", [1, 1000])
 @pytest.mark.parametrize("substeps", [1, 5, 20])
 def test_what_leans_and_is_sent_off_flies(world, substeps, parts):
-    # x + v t - g t^2 / 2, to rounding: half of what it leaned on is over. An impulse alone had it fly slower by g h / 2, as 1000
-    # had that were too small each to end anything.
+    # x + v t - g t^2 / 2, to rounding: half of the last reaction ends. A bare impulse would make the disc slower by g h / 2, and
+    # so would 1000 impulses that are each too small to end the reaction.
     w = ways(world, substeps)
     begin, some = w.position, [0, 2, 4] if parts == 1 else [0, 2]
     for k in range(parts):
@@ -217,7 +218,7 @@ def test_what_leans_and_is_sent_off_flies(world, substeps, parts):
 
 
 def test_what_is_borne_by_loads_that_are_known_flies(world):
-    # Where they are known to the last digit, contacts and ropes give nothing beside them, and nothing seems to lean.
+    # Where loads are known to the last digit, contacts and ropes add nothing, and particles seem to rest on nothing.
     x = [(0, 0.1), (0, 0.3), (0, 0.5), (2, 3), (2, 2), (2, 1)]
     features = [
         tv.Gravity(9.81),
@@ -239,7 +240,7 @@ def test_what_is_borne_by_loads_that_are_known_flies(world):
 
 
 def test_braking_a_chain_feeds_nothing(world):
-    # Half of a reaction given back to some of what a chain holds would be a blow to it: 0.3 J in a frame, of 70.
+    # Half of a reaction given back to some particles of a chain would strike it: 0.3 J per frame, of 70.
     x = [(0.2 * k, 0.0) for k in range(9)]
     w = world(tv.Particles(x, pinned=[0]), [tv.Gravity(9.81), tv.Distance([[k, k + 1] for k in range(8)])], substeps=12)
 
@@ -255,7 +256,7 @@ def test_braking_a_chain_feeds_nothing(world):
 
 @pytest.mark.parametrize("substeps", [5, 20])
 def test_what_rubs_and_is_pushed_slides(world, substeps):
-    # x + v t - mu g t^2 / 2 from where it rested, and what is spun up on the spot goes off at mu g t: friction was none before.
+    # x + v t - mu g t^2 / 2 from rest; and a disc that is spun up in place moves off at mu g t. There was no friction before.
     mu, g, v = 0.5, 9.81, 3.0
     for spun in (False, True):
         w = ways(world, substeps, friction=mu)
@@ -274,7 +275,7 @@ def test_what_rubs_and_is_pushed_slides(world, substeps):
 
 
 def test_spins_and_throws_survive_what_comes_next(world):
-    # A velocity that is assigned before the substep changes, places are assigned, or a pin takes another particle.
+    # A velocity is assigned before the substep changes, positions are assigned, or a pin takes another particle.
     pin = tv.Pin([0])
     w = world(tv.Particles([(0, 0), (3, 0), (6, 0)], spin=5.0, radius=0.1), [tv.Gravity(9.81), pin], precision="f64")
     w.run(0.1)
@@ -295,7 +296,7 @@ def test_spins_and_throws_survive_what_comes_next(world):
 
 @pytest.mark.parametrize("precision", ["f64", "f32"])
 def test_what_is_stopped_stands_still(world, precision):
-    # However fast it was, and however strong the drag is; and what is pushed then goes v / rate.
+    # However fast it was, and however strong the drag is; a particle that is pushed then moves by v / rate.
     for rate, fast in ((0.0, 146.0), (0.0, 1e9), (8.0 * 1200, 1.0), (20.0 * 1200, 1.0)):
         start = tv.Particles([(0, 0), (9, 0)], velocity=[(fast, 0.3 * fast), (0, 0)])
         w = world(start, [tv.Gravity(0.0), tv.Drag(rate)], substeps=20, precision=precision)

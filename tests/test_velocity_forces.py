@@ -1,4 +1,4 @@
-"""Forces that read velocities: what turns motion keeps its energy, what brakes it never overshoots, and both to second order."""
+"""Forces that read velocities: forces across v keep the energy, drag never overshoots, and both are second order."""
 
 import numpy as np
 import pytest
@@ -8,30 +8,30 @@ from tiverlet.device import ti
 
 from .conftest import order, rerun
 
-OMEGA = 4.0  # [rad/s] of the magnet; tests take longer steps instead of a stronger one, which would be compiled anew
+OMEGA = 4.0  # [rad/s] of the magnet; tests take longer steps instead of a stronger magnet, which would compile again
 
 
 @ti.func
 def magnet(x, v):
-    """m v' = -omega J v: a circle of radius |v| / omega."""
+    """Return the force of m v' = -omega J v: a circle of radius |v| / omega."""
     return OMEGA * ti.Vector([v[1], -v[0]])
 
 
 @ti.func
 def brake(x, v):
-    """-c v, with c = 1 / s: dt says how stiff it is."""
+    """Return -c v with c = 1 / s: dt determines how stiff it is."""
     return -v
 
 
 @ti.func
 def air(x, v):
-    """-k |v| v, with k = 1 / m."""
+    """Return -k |v| v with k = 1 / m."""
     return -v.norm() * v
 
 
 @ti.func
 def dry(x, v):
-    """Friction of 1 N against the velocity, whatever that is, but within 1e-6 m/s of rest."""
+    """Return friction of 1 N against the velocity at any speed, but within 1e-6 m/s of rest."""
     return -v / ti.max(v.norm(), 1e-6)
 
 
@@ -43,13 +43,13 @@ def again(w, **settings):
 
 
 def turned(z, omega_h, n):
-    """z after n substeps, each of which turns by 2 arctan(omega h / 2)."""
+    """Return z after n substeps, each of which turns by 2 arctan(omega h / 2)."""
     return z * np.exp(-2j * np.arctan(omega_h / 2) * n)
 
 
 @pytest.mark.parametrize("precision, limit", [("f64", 1e-12), ("f32", 2e-5), ("f32-compensated", 2e-5)])
 def test_a_magnet_keeps_the_speed_whatever_the_substep(world, precision, limit):
-    # v_n = d_n / h + h a(v_n) / 2 says (1 + i omega h / 2) v_n = d_n / h, and d_(n+1) / h = (1 - i omega h / 2) v_n: v is turned
+    # v_n = d_n / h + h a(v_n) / 2 means (1 + i omega h / 2) v_n = d_n / h and d_(n+1) / h = (1 - i omega h / 2) v_n. So v turns
     # by 2 arctan(omega h / 2), and x is on a circle of radius |v| / omega (1 + (omega h)^2 / 4).
     w = world(tv.Particles([[0.0, 0.0]], velocity=(3.0, 0.0)), [tv.Force(magnet)], substeps=20, precision=precision)
     for omega_h in (0.05, 0.33, 0.83, 1.67, 1.99):
@@ -63,7 +63,7 @@ def test_a_magnet_keeps_the_speed_whatever_the_substep(world, precision, limit):
 
 
 def test_substeps_that_change_keep_the_speed(world):
-    # A start from v_n, and the return to it, are the two halves of the same substep.
+    # A start from v_n, and the return to v_n, are the two halves of one substep.
     rng = np.random.default_rng(0)
     w = world(tv.Particles([[0.0, 0.0]], velocity=(3.0, 0.0)), [tv.Force(magnet)], precision="f64")
     angle = 0.0
@@ -76,8 +76,8 @@ def test_substeps_that_change_keep_the_speed(world):
 
 
 def test_crossed_fields_drift(world):
-    # v' = -i omega v + E has v = u + (v0 - u) exp(-i omega t) with u = -i E / omega, across E: |v - u| is kept to the last
-    # digits, and x - u t is second order.
+    # v' = -i omega v + E has the solution v = u + (v0 - u) exp(-i omega t) with u = -i E / omega, across E. |v - u| is constant
+    # to the last digits, and x - u t is second order.
     @ti.func
     def crossed(x, v):
         return OMEGA * ti.Vector([v[1], -v[0]]) + ti.Vector([2.0, 0.0])
@@ -94,7 +94,8 @@ def test_crossed_fields_drift(world):
 
 
 def test_a_spiral_in_space(world):
-    # omega x v of any axis: gravity along it does what it does, |v| across it stays. And with drag that is exact.
+    # omega x v about any axis: gravity along the axis acts as without this force, and |v| across it is constant. Also with exact
+    # drag.
     @ti.func
     def spiral(x, v):
         return ti.Vector([1.0, 2.0, 2.0]).cross(v)  # |omega| = 3
@@ -117,7 +118,8 @@ def test_a_spiral_in_space(world):
 
 
 def test_drag_is_second_order_and_settles_however_stiff(world):
-    # v' = -c v: exp(-c t). A substep makes 1 - z / (1 + q (1 + theta)) of d, z = c h, q = z / 2, which is in (0, 1) for any z.
+    # v' = -c v: exp(-c t). A substep multiplies d by 1 - z / (1 + q (1 + theta)), z = c h, q = z / 2, which is in (0, 1) for any
+    # z.
     w = world(tv.Particles([[0.0, 0.0]], velocity=(0.6, -0.8)), [tv.Force(brake)], precision="f64")
     errors = []
     for substeps in (4, 8, 16, 32):
@@ -128,14 +130,14 @@ def test_drag_is_second_order_and_settles_however_stiff(world):
         q = z / 2
         rerun(w, 3 * z, dt=z, substeps=1)
         first, late = 1 - q / (1 + q * q**2 / (1 + q**2)), 1 - z / (1 + q * (1 + q**2 / (1 + q**2)))
-        want = first * late**2 * (1 - q / (1 + q * (1 + q**2 / (1 + q**2))))  # d_3 / h, and the half of a kick to v_3
+        want = first * late**2 * (1 - q / (1 + q * (1 + q**2 / (1 + q**2))))  # d_3 / h, and half of a kick to v_3
         assert w.velocity[0] == pytest.approx(want * np.array([0.6, -0.8]), rel=1e-9, abs=1e-15) and not w.last.flags
 
 
 @pytest.mark.parametrize("force", [air, dry], ids=lambda f: f.__name__)
 def test_what_brakes_takes_energy_and_is_no_stiff_force(world, force):
-    # Drag of the air v = v0 / (1 + k v0 t), and friction, which changes at once where v does: v goes down to 1 % of what friction
-    # takes in a substep, without a flag.
+    # Drag of the air, v = v0 / (1 + k v0 t), and friction, which reverses at once with v: v falls to 1 % of what friction takes
+    # in a substep, without a flag.
     start = tv.Particles(np.zeros((2, 3)), velocity=[[3.0, 4.0, 12.0], [0.0, 0.0, -1.0]])
     w = world(start, [tv.Force(force)], substeps=1, precision="f64")
     for dt in (1e-3, 0.1, 1.0, 10.0):
@@ -152,12 +154,12 @@ def test_what_brakes_takes_energy_and_is_no_stiff_force(world, force):
 
 
 def test_links_stay_second_order_beside_what_turns_and_brakes(world):
-    # A pendulum under a force that depends on all of v, also along the rod, where only its reaction makes v what it is.
+    # A pendulum under a force that depends on all of v, also along the rod, where v is right only with the rod's reaction.
     @ti.func
     def slanted(x, v):
         return ti.Vector([-0.8 * v[0] - 0.5 * v[1], 0.9 * v[0] - 0.1 * v[1]])
 
-    def rate(y):  # theta'' by the force along the tangent
+    def rate(y):  # theta'' from the force along the tangent
         out, along = np.array([np.cos(y[0]), np.sin(y[0])]), np.array([-np.sin(y[0]), np.cos(y[0])])
         v = y[1] * along
         return np.array([y[1], along @ (np.array([0, -9.81]) - [[0.8, 0.5], [-0.9, 0.1]] @ v) + 0 * out[0]])
@@ -170,7 +172,7 @@ def test_links_stay_second_order_beside_what_turns_and_brakes(world):
         y = y + h / 6 * (a + 2 * b + 2 * c + rate(y + h * c))
     start = tv.Particles([[0, 0], [1.0, 0]], velocity=[[0, 0], [0, 0.5]], pinned=[0])
     w = world(start, [tv.Gravity(9.81), tv.Force(slanted), tv.Distance([(0, 1)])], precision="f64")
-    for turns in (1, 3):  # always as many substeps, or other ones in each frame
+    for turns in (1, 3):  # always as many substeps, or another number in each frame
         errors = []
         for substeps in (4, 8, 16, 32):
             again(w)
@@ -182,8 +184,8 @@ def test_links_stay_second_order_beside_what_turns_and_brakes(world):
 
 
 def test_blows_do_not_count_as_forces(world):
-    # 64 balls in a box that gives all back, in a magnet, for tens of bounces each: none is taken for a force that goes on, which
-    # would more than double their energy. What is left is the substep in which they happen.
+    # 64 balls bounce tens of times elastically in a box in a magnet. No blow counts as a force that goes on, which would more
+    # than double their energy. What is left is the error of the substep of each blow.
     angle = np.arange(64) * np.pi / 32
     start = tv.Particles(
         0.4 * tv.golden(np.arange(64), dim=2) - 0.2, velocity=np.stack([np.cos(angle), np.sin(angle)], axis=1), radius=0.01
@@ -195,18 +197,18 @@ def test_blows_do_not_count_as_forces(world):
 
 
 def test_slight_blows_between_particles_do_not_either(world):
-    # 20 balls that graze each other in a magnet: taken for forces that go on, their blows made 41 J of 0.95 at 8 substeps.
+    # 20 balls graze each other in a magnet. If their blows counted as forces that go on, 0.95 J would become 41 J at 8 substeps.
     x = np.stack([np.linspace(0, 1, 20), np.zeros(20)], axis=1)
     v = np.zeros((20, 2))
     v[1:, 1] = 2 * np.sin(0.5 * np.arange(1, 20))
     start = tv.Particles(x, velocity=v, mass=0.05, radius=0.02)
     w = world(start, [tv.Force(magnet), tv.Contact(restitution=1.0)], substeps=8, precision="f64")
     energy = [w.step(1 / 60).energy for _ in range(600)]
-    assert max(energy) < 2 * energy[0]  # 1.6: each takes a substep
+    assert max(energy) < 2 * energy[0]  # 1.6: the error of the substep of each blow
 
 
 def test_the_flag_comes_where_a_turn_is_not_resolved(world):
-    # omega h > 2: a substep turns by no more than half a turn, and far more slowly than the force. "auto" takes shorter ones.
+    # omega h > 2: a substep turns by at most half a turn, much more slowly than the force. "auto" takes shorter substeps.
     w = world(tv.Particles([[0.0, 0.0]], velocity=(3.0, 0.0)), [tv.Force(magnet)], substeps=1, precision="f64")
     for omega_h, flags in ((1.9, set()), (2.1, {"stiff-force"}), (9.0, {"stiff-force"})):
         rerun(w, 3 * omega_h / OMEGA, dt=omega_h / OMEGA)
@@ -219,7 +221,7 @@ def test_the_flag_comes_where_a_turn_is_not_resolved(world):
 
 
 def test_what_feeds_motion_is_flagged_and_stays_finite(world):
-    # v' = v: v grows by e^h; where h is too long for that, it says so.
+    # v' = v: v grows by e^h; a flag reports an h that is too long for that.
     @ti.func
     def feeds(x, v):
         return v
@@ -232,8 +234,8 @@ def test_what_feeds_motion_is_flagged_and_stays_finite(world):
 
 
 def test_a_force_that_is_not_defined_at_rest_goes_back_and_forth_at_most(world):
-    # -v / |v| is NaN at rest, where it brings v = 1 in one substep of 1 s. What is not known there is left out: that can end in
-    # going back and forth, see the page of forces, but within the 0.5 m in which it stops, and in numbers.
+    # -v / |v| is NaN at rest, where it brings v = 1 in one substep of 1 s. The undefined force is left out. The particle may then
+    # go back and forth, see the page of forces, but within the 0.5 m in which it stops, and without NaN.
     @ti.func
     def bare(x, v):
         return -v / v.norm()
@@ -248,21 +250,21 @@ def test_a_hand_that_holds_still_is_not_stiff(world):
     w = world(tv.Particles([[0.0, 0.0], [1.0, 0.0]]), [tv.Gravity(9.81), hand], substeps=1, precision="f64")
     for _ in range(120):
         assert not w.step(1 / 60).flags
-    # Its weight stretches it by g / rate^2, and nothing moves.
+    # The weight stretches the hand's spring by g / rate^2, and nothing moves.
     np.testing.assert_allclose(w.position[0], [0.0, 1 - 9.81 / 400], atol=1e-9)
-    hand.rate = 110.0  # rate h = 1.8: the spring is resolved up to 2, and the damping does not get into its way
+    hand.rate = 110.0  # rate h = 1.8: the spring is resolved up to 2, and the damping does not interfere
     w.run(1.0)
     np.testing.assert_allclose(w.position[0], [0.0, 1 - 9.81 / 110**2], atol=1e-6)
 
 
 @ti.func
 def wild(x, v, t):
-    """Turns, brakes, and changes with time."""
+    """Return a force that turns, brakes and changes with time."""
     return 3.0 * ti.Vector([v[1], -v[0]]) - (0.2 + 0.1 * ti.sin(t)) * v.norm() * v
 
 
 def scene():
-    """Discs that fall on each other in a wind that turns, some of them linked, one in a hand."""
+    """Return discs that fall on each other in a turning wind, some of them linked, one held by a hand."""
     x = np.stack(np.meshgrid(np.arange(18), np.arange(18)), axis=2).reshape(-1, 2) * 0.105
     links, box = tv.Distance([(0, 1), (1, 2)]), tv.Box((-0.2, -0.2), (2.2, 4))
     features = [tv.Gravity(9.81), tv.Force(wild), tv.Hand((1, 1), 7), links, tv.Contact(), box]

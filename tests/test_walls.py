@@ -1,4 +1,4 @@
-"""Surroundings of every shape: nothing is inside, nothing passes, and what they do is one law."""
+"""Walls of every shape: no particle is inside, none passes, and all walls obey one law."""
 
 import numpy as np
 import pytest
@@ -12,12 +12,12 @@ from .outlines import CUBE, CUBE_FACES, SQUARE
 
 @ti.func
 def round_rod(p):
-    """Distance from a disc, or from a rod along z."""
+    """Return the distance to a disc, or to a rod along z."""
     return ti.Vector([p[0] - 0.2, p[1]]).norm() - 0.5
 
 
 def scenes(dim):
-    """Walls, with a function that says how far a point is outside of each."""
+    """Return walls by name, each with a function for how far a point is outside of it."""
     e = np.eye(dim)
     a, b = -0.6 * e[0], 0.6 * e[0] + 0.2 * e[1]
 
@@ -41,14 +41,14 @@ def scenes(dim):
 
 
 def one_of(world, dim, name, start, before, **settings):
-    """Walls of all shapes, of which only this one is switched on: one structure for all."""
+    """Return a world with walls of all shapes, of which only this one is switched on: one structure for all."""
     walls = {key: make(active=key == name) for key, (make, _) in scenes(dim).items()}
     w = world(start, [*before, *walls.values()], **settings)
     return w, walls[name], scenes(dim)[name][1]
 
 
-# Bounces in the plane: test_nothing_gets_out_whatever_takes_it_there. In space what comes to rest is what does so in the plane,
-# but for the mesh, which is no polygon. The function of the sdf is the same in both, and is not in that other test.
+# For bounces in the plane see test_nothing_gets_out_whatever_takes_it_there. Rest is tested in the plane, and in space for the
+# mesh, which is no polygon. The function of the sdf is the same in the plane and in space, and is not in that other test.
 LEFT_OUT = {(name, dim, 0.7 if dim == 2 else 0.0) for name in ("box", "plane", "ball", "bowl", "rod") for dim in (2, 3)}
 LEFT_OUT |= {("sdf", 2, 0.0), ("sdf", 3, 0.7), ("hollow", 2, 0.7)}
 
@@ -56,8 +56,8 @@ LEFT_OUT |= {("sdf", 2, 0.0), ("sdf", 3, 0.7), ("hollow", 2, 0.7)}
 @pytest.mark.parametrize("name", scenes(2))
 @pytest.mark.parametrize("dim", [2, 3])
 def test_no_particle_is_ever_inside(world, name, dim):
-    # Rows 45 and 46, of walls alone, which take no turns: thrown at speeds up to v h / r = 100, with and without restitution, and
-    # never inside after a step.
+    # Rows 45 and 46, for walls alone, which take no turns. Particles are thrown at up to v h / r = 100, with and without
+    # restitution, and never inside after a step.
     make, outside = scenes(dim)[name]
     rng = np.random.default_rng(1)
     x = rng.uniform(-0.9, 0.9, (400, dim))
@@ -81,8 +81,8 @@ def test_no_particle_is_ever_inside(world, name, dim):
 SLOPE = np.array([[1.0, 0.3], [-1.0, 0.3]]) / np.hypot(1.0, 0.3)
 
 
-# Walls that take turns, or a particle back into themselves, as functions of friction and restitution; how far outside of them a
-# point is; and how they move with a time s.
+# Walls that take turns, or that throw a particle back into themselves, as functions of friction and restitution; how far outside
+# of them a point is; and how they move with a time s.
 TIGHT = {
     "box": (
         lambda **k: [tv.Box((-1.0, -1.0), (1.0, 1.0), **k)],
@@ -109,7 +109,7 @@ TIGHT = {
         lambda x, w: np.linalg.norm(x - w.center, axis=1) - 0.4,
         lambda s: {"center": (0.5 * np.sin(s), 0.5 * np.sin(2 * s))},
     ),
-    "rod": (  # which turns
+    "rod": (  # turning
         lambda **k: [tv.Capsule((-0.8, 0.0), (0.8, 0.0), 0.02, **k)],
         lambda x, w: np.linalg.norm(x - np.clip(x @ w.b / (w.b @ w.b), -1, 1)[:, None] * w.b, axis=1) - 0.02,
         lambda s: {"a": (-0.8 * np.cos(s), -0.8 * np.sin(s)), "b": (0.8 * np.cos(s), 0.8 * np.sin(s))},
@@ -129,15 +129,18 @@ TURNS = ("box", "corner", "wedge", "bowl")
 def test_nothing_gets_out_whatever_takes_it_there(world, name):
     make, outside, moves = TIGHT[name]
     bounce = 1.0 if name in ("box", "bowl") else 0.8
-    # Those that take turns anyway are in worlds of one structure, in which the others are switched off.
+    # Walls that take turns anyway are in worlds of one structure, in which the others are switched off.
     walls = {key: TIGHT[key][0](friction=0.3, restitution=bounce, active=key == name) for key in TURNS}
     mine = walls[name] if name in TURNS else make(friction=0.3, restitution=bounce)
     keeps(world, mine, outside, moves, [wall for some in walls.values() for wall in some] if name in TURNS else mine)
 
 
 def keeps(world, walls, outside, moves, there):
-    """Rows 80 and 81: v h = 0.02 ... 100 half widths, friction, bounces, rods, links that draw particles to anchors on either
-    side, 1 ... 8 iterations, standing and moving walls. Nobody is outside after a substep, and what is free gains no energy."""
+    """Check rows 80 and 81: no particle is outside after a substep, and free ones gain no energy.
+
+    v h = 0.02 ... 100 half widths, friction, bounces, rods, links that draw particles to anchors on either side, 1 ... 8
+    iterations, standing and moving walls.
+    """
     rng, r, m, h = np.random.default_rng(4), 0.05, 30, 1 / 60
     x = rng.uniform(-0.9, 0.9, (2000, 2))
     x = x[outside(x, walls[0]) > r + 0.01][: 3 * m]
@@ -169,9 +172,9 @@ def keeps(world, walls, outside, moves, there):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_points_stay_in_corners_far_from_the_origin(world, dim, briefly):
-    # Points, which have no radius to be inside by, fly into the corners of a triangle or a tetrahedron. Far out the last digits
-    # of their places are larger than those of the wall's: what lay on one face, and by rounding behind it, was not stopped by
-    # the next one (267 of 2000 in a triangle, at 100 m; 2 in a tetrahedron at the origin).
+    # Points, which have no radius, fly into the corners of a triangle or a tetrahedron. Far out, the rounding of their positions
+    # is larger than that of the wall. A point on one face, and behind it by rounding, must still be stopped by the next face.
+    # Otherwise 267 of 2000 leave a triangle at 100 m, and 2 a tetrahedron at the origin.
     if dim == 2:
         corners, faces = np.array([[-3.0, -3], [3, -3], [0, 3]]), np.array([[0, 1], [1, 2], [2, 0]])
     else:
@@ -211,7 +214,7 @@ def test_nothing_passes_a_thin_rod(world):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_ball_stops_what_would_fly_through_it(world, dim):
-    # v h = 20 diameters of the ball: caught on the side where it came from; with restitution 1 it goes back where it came from.
+    # v h = 20 diameters of the ball: a point is caught on the side that it came from; with restitution 1 it goes back.
     x = np.zeros((2, dim))
     x[:, 0], x[1, 1] = -2.0, 0.3
     v = np.zeros((2, dim))
@@ -221,7 +224,7 @@ def test_a_ball_stops_what_would_fly_through_it(world, dim):
         w = world(tv.Particles(x, velocity=v, radius=0.0), [ball], precision="f64", substeps=1)
         w.step(1 / 60)
         assert (np.linalg.norm(w.position, axis=1) >= 0.5 - 1e-9).all() and w.position[0, 0] <= -0.5 + 1e-9
-        if not restitution:  # what is left of the way to the ball is left of the displacement: caught again, and at rest
+        if not restitution:  # the rest of the way to the ball stays in the displacement: caught again, and at rest
             w.step(1 / 60)
             assert w.position[0, 0] <= -0.5 + 1e-9 and abs(w.velocity[0, 0]) < 1e-9
         if restitution:
@@ -233,7 +236,7 @@ def test_a_ball_stops_what_would_fly_through_it(world, dim):
 
 
 def test_pendulum_in_a_bowl(world):
-    # A point that slides in a smooth bowl is a pendulum: second order is not asked of a contact, but energy to 1 % is.
+    # A point that slides in a smooth bowl is a pendulum. A contact need not be second order, but keeps the energy to 1 %.
     w = world(tv.Particles([[0.8, 0.0]]), [tv.Gravity(9.81), tv.Ball((0, 0), 0.8, inside=True)], precision="f64", substeps=100)
     lowest, energies = 0.0, []
     for _ in range(60):
@@ -244,8 +247,8 @@ def test_pendulum_in_a_bowl(world):
 
 @pytest.mark.parametrize("name", scenes(2))
 def test_walls_that_are_switched_off_are_not_there(world, name):
-    # Through one that is off everything goes straight, x = x0 + v t; one that is on lets nothing in. Switching compiles nothing,
-    # where the wall was made with a switch.
+    # Through a wall that is off a particle goes straight, x = x0 + v t; a wall that is on lets nothing in. Switching compiles
+    # nothing where the wall was made with a switch.
     inside = scenes(2)[name][1](np.zeros((1, 2)))[0] < 0.2
     x, v = np.array([[0.9, 0.88] if inside else [0.0, 0.0]]), np.array([[-3.0, -3.1]])
     start = tv.Particles(x, velocity=v, radius=0.05)
@@ -267,7 +270,7 @@ def test_walls_that_are_switched_off_are_not_there(world, name):
 
 
 def test_a_wall_without_a_switch_can_be_switched_off_too(world):
-    # Which builds the world anew, once: it falls from rest at 0.2 m for t = 0.5 s, g t^2 / 2.
+    # The world is rebuilt for it, once: the particle falls from rest at 0.2 m for t = 0.5 s, by g t^2 / 2.
     floor = tv.HalfSpace((0, 1))
     w = world(tv.Particles([[0.0, 0.2]], radius=0.2), [tv.Gravity(9.81), floor], precision="f64")
     w.run(0.1)
@@ -297,7 +300,7 @@ def test_moving_balls_and_rods_carry_what_they_meet(world):
 
 
 def test_friction_on_every_wall_holds_and_slides(world):
-    # On a plane, on top of a rod, and in a box, of which one is switched on: a horizontal velocity v is used up after
+    # On a plane, on top of a rod, and in a box, of which one is switched on: a horizontal velocity v is lost after
     # v^2 / (2 mu g).
     for on in range(3):
         walls = [
@@ -324,22 +327,22 @@ def test_bad_walls_are_named():
 
 
 def test_a_conveyor_takes_along_what_lies_on_it(world):
-    # Row 70: a long rod runs along its own axis at 1 m/s. Friction brings a disc up to its speed after v / (mu g), then holds.
+    # Row 70: a long rod runs along its own axis at 1 m/s. Friction brings a disc to its speed after v / (mu g), then holds it.
     belt = tv.Capsule((-50.0, -1.0), (50.0, -1.0), 1.0, friction=0.4)
     w = world(tv.Particles([[0.0, 0.1]], radius=0.1), [tv.Gravity(9.81), belt], precision="f64")
     for k in range(90):
         shift = (k + 1) / 60
         belt.a, belt.b = (-50.0 + shift, -1.0), (50.0 + shift, -1.0)
         w.step(1 / 60)
-    slip = 1.0 / (0.4 * 9.81)  # until then it has gone v t / 2 instead of v t
+    slip = 1.0 / (0.4 * 9.81)  # until then the disc has moved v t / 2 instead of v t
     assert w.position[0, 0] == pytest.approx(1.5 - slip / 2, abs=2e-3) and w.velocity[0, 0] == pytest.approx(1.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", scenes(2))
 @pytest.mark.parametrize("dim", [2, 3])
 def test_what_is_moved_between_substeps_stays_outside_too(world, name, dim):
-    # Links made 1.5 times too long, all ways, are met before the first substep; one that is taut, before a shorter substep. Both
-    # move particles without a substep, and would put some behind a wall. What pays for it is no speed: v <= C / 1 s.
+    # Links made 1.5 times too long, in all directions, are met before the first substep; a taut link, before a shorter substep.
+    # Both move particles without a substep, and must not put any behind a wall. This brings no speed: v <= C / 1 s.
     outside = scenes(dim)[name][1]
     rng = np.random.default_rng(3)
     x = rng.uniform(-0.9, 0.9, (600, dim))
@@ -371,9 +374,9 @@ def test_what_comes_near_a_rod_does_not_touch_it(world):
 @pytest.mark.parametrize("path", ["auto", "parallel", "launched"])
 @pytest.mark.parametrize("substeps", [1, 2, 8])
 def test_a_bounce_is_no_load(world, path, substeps):
-    # From rest at a height H, v = -g (t - T) where T is the time of the last apex, and apexes are 2 sqrt(2 H / g) apart. What
-    # bounced in the last substep of a frame was read g h / 2 too fast, and an elastic ball that was told so gained 0.4 J a
-    # second. Side by side, balls bounce everywhere in a substep.
+    # From rest at a height H, v = -g (t - T), where T is the time of the last apex, and apexes are 2 sqrt(2 H / g) apart. A
+    # bounce in the last substep of a frame must not count as a load: velocities would be g h / 2 too fast, and an elastic ball
+    # whose velocity is written back would gain 0.4 J a second. Many balls side by side bounce everywhere in a substep.
     heights = np.linspace(0.3, 1.2, 32)
     start = tv.Particles(np.stack([np.arange(32), 0.1 + heights], axis=1), radius=0.1)
     w = world(start, [tv.Gravity(), tv.HalfSpace((0, 1), 0, restitution=1.0)], substeps=substeps, precision="f64", path=path)
@@ -390,7 +393,7 @@ def test_a_bounce_is_no_load(world, path, substeps):
 
 
 def test_what_lies_on_a_floor_is_carried_while_it_bounces_off_a_side(world):
-    # x = the triangle wave between the sides, y = the radius: with the load of the floor in it, v_y is 0 in every frame.
+    # x is the triangle wave between the sides, y the radius. With the load of the floor in it, v_y is 0 in every frame.
     w = world(
         tv.Particles([[0.5, 0.1], [0.3, 0.1]], velocity=[[2.9, 0], [0, 0]], radius=0.1),
         [tv.Gravity(), tv.Box((0, 0), (1.0, 2.0), restitution=1.0)], substeps=2, precision="f64",
@@ -405,7 +408,7 @@ def test_what_lies_on_a_floor_is_carried_while_it_bounces_off_a_side(world):
 
 
 def test_what_slides_and_bounces_at_once_is_read_to_second_order(world):
-    # With friction below that which grips, sliding v = v0 - mu g t on a floor that also bounces what falls on it.
+    # Friction below the limit of grip: sliding, v = v0 - mu g t, on a floor that also has restitution.
     w = world(
         tv.Particles([[0, 0.1]], velocity=(3.0, 0), radius=0.1),
         [tv.Gravity(), tv.HalfSpace((0, 1), 0, friction=0.2, restitution=0.5)], substeps=2, precision="f64",

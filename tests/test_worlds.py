@@ -1,4 +1,4 @@
-"""Many worlds in one launch: each has the bits that it has alone, whatever is in it, and knows nothing of the others."""
+"""Many worlds in one launch: each has the bits that it has alone, whatever is in it, independent of the others."""
 
 import contextlib
 import copy
@@ -22,8 +22,10 @@ def spring(x):
 
 
 def every_constraint(dim, k, part):
-    """Constraints of this dimension with fields of their own, far from each other, each at corners that meet it, more or less.
-    part: which of `dim - 1` parts of them, since the time that they take to compile grows faster than their number."""
+    """Return a world with constraints of this dimension that have their own fields, far apart, at corners that nearly meet them.
+
+    part: which of `dim - 1` parts of them, since compile time grows faster than their number.
+    """
     made = {name: (ROWS[name].points, ROWS[name].make) for name in OWN} | {name: row[:2] for name, row in OTHERS.items()}
     x, features = [], []
     fitting = [(name, *made[name]) for name in made if made[name][0].shape[1] == dim and name != "Path"]
@@ -38,7 +40,10 @@ def every_constraint(dim, k, part):
 
 
 def every_force(dim, k):
-    """All forces and walls, between particles that touch; for friction and restitution see test_events.py and test_spin.py."""
+    """Return a world with all forces and walls, between touching particles.
+
+    For friction and restitution see test_events.py and test_spin.py.
+    """
     along, far = np.eye(dim)[0], np.full(dim, 9.0)
     forces = [tv.Gravity(9.81), tv.Drag(0.1), tv.Wind(along, 0.1 + k), tv.Attractor(far, 1.0), tv.Hand(far, 1), tv.Force(spring)]
     pairs = [tv.PairForce(spring, 2.5)]
@@ -51,7 +56,7 @@ def every_force(dim, k):
 
 
 def cloth(solver, k, precision="f32", order=2, substeps=5, links=None, iterations=2):
-    """A net, pinned at two corners, that falls; or a part of it."""
+    """Return a world with a falling net that is pinned at two corners; or with its first `links` links."""
     n = np.arange(36).reshape(6, 6)
     pairs = np.vstack([np.stack([n[:, :-1].ravel(), n[:, 1:].ravel()], 1), np.stack([n[:-1].ravel(), n[1:].ravel()], 1)])
     pairs = pairs if links is None else pairs[:links]
@@ -62,7 +67,7 @@ def cloth(solver, k, precision="f32", order=2, substeps=5, links=None, iteration
 
 
 def bricks(k):
-    """Polygons that fall on each other."""
+    """Return a world with polygons that fall on each other."""
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
     x = np.concatenate([square + [0.3 * j * (1 + 0.1 * k), 1.05 * j + 0.05] for j in range(4)])
     bodies = np.arange(16).reshape(4, 4)
@@ -85,19 +90,20 @@ SCENES = {
     "polygons": bricks,
     "Chebyshev": lambda k: cloth(tv.Chebyshev(), k),
     "ConjugateGradient": lambda k: cloth(tv.ConjugateGradient(4), k),
-    "Direct, compensated": lambda k: cloth(tv.Direct(), k, "f32-compensated", links=30, iterations=1),  # some step twice
+    # some chains take a second Newton step
+    "Direct, compensated": lambda k: cloth(tv.Direct(), k, "f32-compensated", links=30, iterations=1),
     "order 4": lambda k: cloth(None, k, "f64", 4, 2, 30),
 }
 
 
-NO_OTHERS = ("Chebyshev", "ConjugateGradient")  # whose velocities are made as those of "Direct"
+NO_OTHERS = ("Chebyshev", "ConjugateGradient")  # their velocities are computed like those of "Direct"
 
 
-@pytest.mark.filterwarnings("ignore")  # of corners that are off
+@pytest.mark.filterwarnings("ignore")  # warnings of corners that are off
 @pytest.mark.parametrize("name", SCENES)
 def test_each_has_the_bits_that_it_has_alone(taichi, name):
-    # Three worlds with other masses, places and knobs: frames one by one and in one launch, with fewer substeps, from velocities
-    # that are assigned, and once more from the start. Their velocities and reports are those of the worlds alone, too.
+    # Three worlds with other masses, positions and knobs: frames one by one and in one launch, with fewer substeps, from assigned
+    # velocities, and once more from the start. Velocities and reports are those of the worlds alone, too.
     alone = [SCENES[name](k) for k in range(3)]
     with tv.Worlds([SCENES[name](k) for k in range(3)]) as many:
         assert [many.hash(k) for k in range(3)] == [w.hash() for w in alone]
@@ -123,7 +129,7 @@ def test_each_has_the_bits_that_it_has_alone(taichi, name):
             w.substeps = 3 if name[:5] != "order" else 1
             w.velocity = np.sin(np.arange(alone[0].position.size).reshape(alone[0].position.shape))
         both()
-        for w in (many, *alone):  # between substeps of one length: impulses, to some of them
+        for w in (many, *alone):  # between substeps of one length: impulses on some particles
             v = w.velocity.copy()
             v[..., ::2, :] *= 0.5
             w.velocity = v
@@ -143,7 +149,7 @@ def test_each_has_the_bits_that_it_has_alone(taichi, name):
 
 
 def heap(k=0, count=60, radius=0.5, **settings):
-    """Discs that fall on a slope and are drawn to a point, so that some have many neighbours."""
+    """Return a world with discs that fall on a slope and are drawn to a point, so that some have many neighbours."""
     n = np.arange(count)
     x = np.stack([n % 10, n // 10], axis=1) * 1.5 + 0.2 * tv.golden(n + 7 * k, dim=2)
     features = [tv.Gravity(9.81), tv.Contact(), tv.Attractor((7, 3), 200.0), tv.HalfSpace((0.1, 1), 0.0)]
@@ -151,7 +157,7 @@ def heap(k=0, count=60, radius=0.5, **settings):
 
 
 def give_room(many, pairs):
-    """A list with room for so many near pairs, of which kernels know where there are many worlds."""
+    """Return the neighbour list with room for this many pairs, which is compiled into kernels of many worlds."""
     near = many._runner.search.list
     near.store.destroy()
     near.store = None
@@ -161,7 +167,7 @@ def give_room(many, pairs):
 
 
 def test_a_list_that_is_too_short_in_one_grows_in_all(taichi):
-    # Room for fewer near pairs than come: some frames stop in the middle while others go on, in one launch.
+    # There is room for fewer pairs than there will be: some frames stop in the middle while others continue, in one launch.
     alone = [heap(k, 20) for k in range(3)]
     many = tv.Worlds([heap(k, 20) for k in range(3)])
     with many:
@@ -176,11 +182,11 @@ def test_a_list_that_is_too_short_in_one_grows_in_all(taichi):
 
 
 def test_what_is_wrong_in_one_is_flagged_for_it_alone(taichi):
-    # NaN and an explosion in two of eight; the others have the bits of worlds that have such a neighbour in none.
+    # NaN and an explosion in two of eight worlds; the others have the bits of worlds without such a neighbour.
     worlds = [heap(k, 20) for k in range(8)]
     with tv.Worlds(worlds) as many, tv.Worlds(worlds) as clean:
         for some in (many, clean):
-            give_room(some, 20 * 20)  # for what is no number, which is near everything, or kernels would be compiled twice
+            give_room(some, 20 * 20)  # room for NaN, which is near everything; otherwise kernels would compile twice
             some.run(0.1)
         v = many.velocity.copy()
         for some in (many, clean):
@@ -205,14 +211,15 @@ def test_what_is_wrong_in_one_is_flagged_for_it_alone(taichi):
 
 
 def pendulum(length=1.0, mass=1.0, g=9.81, **settings):
-    """Two rods, horizontal; relaxed, if nothing else is said, which compiles sooner than a system."""
+    """Return a world with two horizontal rods; by default relaxed, which compiles faster than a system."""
     start = tv.Particles([[0, 0], [length, 0], [2 * length, 0]], mass=[1, 1, mass], pinned=[0])
     features = [tv.Gravity(g), tv.Distance([[0, 1], [1, 2]]), tv.Pin([2], (2.0, 0.0), compliance=10.0)]
     return tv.World(start, features, precision="f64", **({"solver": tv.Jacobi()} | settings))
 
 
 def test_knobs_are_for_one_some_or_all(taichi):
-    # A force and a target, set on the way, against worlds alone with the same assignments; the last is for all again.
+    # A force and a target are set between frames, and compared with single worlds that have the same assignments. The last is for
+    # all.
     rng = np.random.default_rng(0)
     g, places = rng.uniform(1, 20, 5), rng.uniform(-1, 1, (5, 1, 2))
     world = pendulum()
@@ -254,7 +261,7 @@ def test_knobs_are_for_one_some_or_all(taichi):
 
 
 def test_drag_that_is_set_on_the_way_acts_from_then_on(taichi):
-    # v falls by exp(-rate t): the same rates set before and after a reset, with velocities assigned, and of one of them.
+    # v falls by exp(-rate t): the same rates set before and after a reset, with assigned velocities, and for one world.
     rate = np.array([0.5, 1.0, 2.0])
     with tv.Worlds(tv.World(tv.Particles([[0.0, 0]], velocity=(1.0, 0)), [tv.Drag(0.1)], precision="f64"), 3) as many:
         drag = many.features[0]
@@ -280,14 +287,15 @@ def test_drag_that_is_set_on_the_way_acts_from_then_on(taichi):
 
 
 def sliding(friction=0.4, restitution=0.3, offset=0.0, between=0.5, apart=0.2, active=True):
-    """Two discs that slide on a floor, one into the other."""
+    """Return a world with two discs that slide on a floor, one into the other."""
     start = tv.Particles([[0.0, 0.55], [1.3, 0.5]], radius=0.5, velocity=[[5.0, 0.0], [0.0, 0.0]])
     floor = tv.HalfSpace((0, 1), offset, friction=friction, restitution=restitution, active=active)
     return tv.World(start, [tv.Gravity(9.81), floor, tv.Contact(friction=between, restitution=apart)], precision="f64")
 
 
 def test_walls_and_contacts_take_each_knob_per_world(taichi):
-    # One after the other or in one call, before and after steps, with numbers for all in between: as worlds made with them.
+    # Knobs set one after the other or in one call, before and after steps, with values for all in between: as in worlds built
+    # with them.
     first = dict(friction=[0.1, (0.3, 0.2), 0.5], restitution=[0.2, 0.3, 0.4]), dict(offset=[0.0, -0.1, -0.2])
     second = dict(offset=[0.0, -0.2, -0.1], restitution=[0.5, 0.4, 0.3]), dict(friction=[(0.2, 0.1), (0.3, 0.2), (0.5, 0.1)])
     between, apart = [0.1, (0.4, 0.3), 0.2], [0.3, 0.2, 0.1]
@@ -313,7 +321,7 @@ def test_walls_and_contacts_take_each_knob_per_world(taichi):
 
 
 def test_a_wall_that_is_off_in_some_lets_go_in_these_alone(taichi):
-    # Moved, then off in all: each goes on as in worlds that all had it, or had it not.
+    # Moved, then off in all: each world continues like worlds that all have the wall, or all lack it.
     off, on = sliding(active=False), sliding()
     with tv.Worlds([on, off]) as mixed, tv.Worlds(off, 2) as without, tv.Worlds(on, 2) as there:
         for knobs in dict(restitution=[0.0, 0.0]), dict(offset=[-0.01, -0.01]), dict(active=[False, False]):
@@ -324,7 +332,8 @@ def test_a_wall_that_is_off_in_some_lets_go_in_these_alone(taichi):
 
 
 def test_one_that_is_taken_out_has_the_knobs_that_wait(taichi):
-    # A force that changed: velocities are taken by what it was, as a clone of the world alone does. The others go on alike.
+    # A changed force: velocities are computed with the force before, as a clone of a single world does. The others continue
+    # alike.
     world, alone = pendulum(), pendulum()
     with tv.Worlds(world, 3) as many:
         for w in (many, alone):
@@ -338,7 +347,7 @@ def test_one_that_is_taken_out_has_the_knobs_that_wait(taichi):
 
 
 def test_knobs_that_wait_for_other_kernels_are_there(taichi):
-    # A rest length of 0 has no direction, so its constraint leaves the system: assigned, and not stepped with yet.
+    # A rest length of 0 is assigned, and no step follows yet: it has no direction, so its constraint leaves the system.
     world, alone = pendulum(solver=tv.Direct()), pendulum(solver=tv.Direct())
     for w in (world, alone):
         w.run(0.1)
@@ -350,7 +359,7 @@ def test_knobs_that_wait_for_other_kernels_are_there(taichi):
 
 
 def test_a_target_is_reached_in_the_first_of_many_frames(taichi):
-    # As in a world alone: a wall that moves in a frame stands in the next; so does a driven pin.
+    # As in a single world: a wall that moves in a frame stands still in the next; so does a driven pin.
     def built():
         start = tv.Particles([[0.0, 2], [3, 0]], radius=0.5)
         return tv.World(start, [tv.Gravity(9.81), tv.HalfSpace((0, 1), 0.0), tv.Pin([1])], substeps=4)
@@ -378,7 +387,7 @@ def test_tracks_of_some_frames_go_on_from_launch_to_launch(taichi, monkeypatch):
 
 
 def test_a_reset_starts_from_places_that_are_given(taichi):
-    # Of some; they go on as a world that was built there, with its constraints met first, and its energy from there.
+    # Reset worlds continue as a world that was built there: its constraints are met first, and its energy counts from there.
     world = pendulum()
     with tv.Worlds(world, 4) as many:
         many.run(0.3)
@@ -406,7 +415,7 @@ def test_worlds_of_the_same_structure_compile_nothing_more(taichi):
 
 
 def test_fields_of_many_take_what_those_of_each_alone_do(taichi):
-    # Bytes on the device: for each world at most those that it has alone, and the sheets that tell it what to do.
+    # Bytes on the device: for each world at most those that it has alone, and the sheets with its instructions.
     for world in (pendulum(), heap(), cloth(None, 0)):
         with tv.Worlds(world, 100) as many:
             told = sum(size for name, size in many.fields.items() if name.startswith("frames."))
@@ -415,7 +424,7 @@ def test_fields_of_many_take_what_those_of_each_alone_do(taichi):
 
 
 class Tensor:
-    """What other libraries give: an array that speaks DLPack only."""
+    """An array of another library, with DLPack only."""
 
     def __init__(self, array):
         self.array = array
@@ -448,7 +457,7 @@ def test_arrays_come_and_go_without_copies(taichi):
 
 @pytest.mark.skipif(COMPILER != "taichi", reason="what kernels are compiled from is known of Taichi alone")
 def test_kernels_of_other_constants_are_refused_wherever_fields_are(taichi):
-    # The relaxation that Jacobi("auto") finds is compiled; other masses and places are not. Also where trees are not shared.
+    # The relaxation that Jacobi("auto") finds is compiled; masses and positions are not. Also where trees are not shared.
     for around in (contextlib.nullcontext, layout.unshared):
         with around():
             relaxed = [cloth(tv.Jacobi("auto"), k) for k in range(2)]
