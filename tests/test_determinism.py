@@ -252,8 +252,8 @@ def test_the_host_asks_once_in_a_frame(world):
     with counting.launches() as count:
         for _ in range(frames):
             w.step(counting.DT)
-    assert count["measure"] == frames + len(lists) and count["listed"] == len(lists) > 0
-    assert count.answers == count["measure"] + count["listed"]
+    assert count["measure"] == frames + len(lists) and count["build_list"] == len(lists) > 0
+    assert count.answers == count["measure"] + count["build_list"]
 
 
 def test_unused_files_change_no_bit(tmp_path):
