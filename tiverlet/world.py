@@ -204,7 +204,7 @@ class World:
         The old force is lost when it is overwritten, or left out of a copy. steps: see _adapt().
         """
         changed = [f for f in self._features if f.changed]
-        if any(f.lets_go for f in changed):
+        if any(f.has_released_load for f in changed):
             if not steps:
                 self._runner.note_displacements()
             self._let_go()

@@ -136,5 +136,5 @@ def _pull(world: "World") -> np.ndarray:
 
 def _walls(world: "World") -> list[Collider]:
     """Those that stand, and that can be asked; one of the user's need not."""
-    walls = [f for f in world.features if isinstance(f, Collider) and f.stands]
+    walls = [f for f in world.features if isinstance(f, Collider) and f.was_active]
     return [wall for wall in walls if type(wall).clearance is not Collider.clearance]

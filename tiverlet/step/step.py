@@ -227,7 +227,7 @@ class Step:
         out = True
         if ti.static(self.has_impacts):
             if not self.regular(now, half):
-                out = self.impacts.wanted(self.turn(now, half))
+                out = self.impacts.needs_pass(self.turn(now, half))
         return out
 
     @ti.func
@@ -317,7 +317,7 @@ class Step:
         if ti.static(self.has_impacts):
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, now.thread)):
-                self.impacts.close()
+                self.impacts.clear_requests()
         self.particles.integrate(now)
         self.team.wait()
         self.team.watch(now.thread)
