@@ -60,7 +60,7 @@ class WorldsRecorder:
         self.frames = self._calls = self._flushed = 0
         self._before = self._last = 0.0  # [s] the total time before the last reset; the time of the last frame
         self._looked = perf_counter()
-        with interrupts.whole:
+        with interrupts.deferred_signals:
             self._open(overlays, overwrite)
 
     def _open(self, overlays: Overlays, overwrite: bool) -> None:

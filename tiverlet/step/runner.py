@@ -8,7 +8,7 @@ import numpy as np
 
 from ..constraints.path import Path
 from ..contact.initial_overlap import overlapping
-from ..device.interrupts import whole
+from ..device.interrupts import deferred_signals
 from ..device.patches.compiler import CachedLaunch
 from ..particles.spin import moments
 from . import high_order, initial_violation
@@ -478,7 +478,7 @@ class Runner:
     def raise_signals(self) -> None:
         """In a long frame: call the handlers of signals that came. What they raise undoes the frame, see World.step."""
         if self.interruptible:
-            whole.raise_pending()
+            deferred_signals.raise_pending()
 
     def look(self, bare: bool = False) -> None:
         """Diagnose the state where no frame did. bare: nothing but its energy is asked for, which takes a third of the time."""

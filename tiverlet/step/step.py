@@ -131,7 +131,7 @@ class Step:
     def fused(self, sheet: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """All substeps of a frame, in one launch, and what it came to; without substeps that alone."""
         ti.loop_config(serialize=self.team.size == 1)
-        for thread in range(self.team.spread):
+        for thread in range(self.team.loop_length):
             if thread % LEAST == 0:
                 self.run(integer(sheet, FIRST) + thread // LEAST, sheet)
 
@@ -180,7 +180,7 @@ class Step:
     @ti.func
     def works(self, now):
         """Whether the thread takes part in this substep; all must ask."""
-        return self.team.works(now.thread) and self.halted() == 0
+        return self.team.takes_part(now.thread) and self.halted() == 0
 
     @ti.func
     def again(self, now):
@@ -320,7 +320,7 @@ class Step:
                 self.impacts.clear_requests()
         self.particles.integrate(now)
         self.team.wait()
-        self.team.watch(now.thread)
+        self.team.check_waits(now.thread)
 
     @ti.func
     def drive(self, now):
@@ -574,7 +574,7 @@ class Step:
             if ti.static(self.team.size == 1):
                 self.constraints.spring_forces(0, h)
             else:
-                for thread in range(self.team.spread):
+                for thread in range(self.team.loop_length):
                     if thread % LEAST == 0:
                         self.constraints.spring_forces(thread // LEAST, h)
         for i in range(self.n):
