@@ -257,7 +257,7 @@ def test_nothing_is_overwritten_unasked(falling, world, tmp_path, read_here):
 @pytest.mark.parametrize("how", ["removed", "replaced"])
 def test_a_file_that_is_gone_is_noticed(world, tmp_path, monkeypatch, how):
     w = world(tv.Particles(np.eye(2)), [tv.Gravity(1.0)])
-    monkeypatch.setattr(recorder, "LOOK", 0.0)
+    monkeypatch.setattr(recorder, "CHECK_INTERVAL", 0.0)
     recording = tv.Recorder(tmp_path / "a.rrd", w)
     recording.log()
     if how == "removed":
