@@ -77,9 +77,9 @@ def figures(message: bytes) -> tuple[dict, np.ndarray]:
 def hear(server, count: int) -> None:
     """Wait until `count` messages have arrived."""
     end = time.monotonic() + 10
-    while server.said.qsize() < count and time.monotonic() < end:
+    while server.received.qsize() < count and time.monotonic() < end:
         time.sleep(0.005)
-    assert server.said.qsize() >= count
+    assert server.received.qsize() >= count
 
 
 def test_what_pages_ask_for_is_done_recorded_and_replayed(rope, server, tmp_path):
@@ -92,7 +92,7 @@ def test_what_pages_ask_for_is_done_recorded_and_replayed(rope, server, tmp_path
                 there.send(json.dumps(message))
             hear(server, len(messages) + (not came))
             came.append(True)
-            live.turn()
+            live.advance()
             there.send('{"do": "shown"}')
             while isinstance(text := there.recv(timeout=10), str):
                 said.append(json.loads(text))
@@ -140,7 +140,7 @@ def test_what_pages_ask_for_is_done_recorded_and_replayed(rope, server, tmp_path
     live._restart()
     assert rope.time == 0.0 and rope.hash() == start
     live.paused = False
-    live.turn()
+    live.advance()
     live.close()
     assert len(tv.replay(tmp_path / "play.rrd").frames) == 2
 
@@ -151,11 +151,11 @@ def test_a_page_that_goes_lets_go_and_one_that_is_slow_is_not_waited_for(rope, s
         there.send(json.dumps({"do": "grab", "particle": 5, "target": [0, 0]}))
         hear(server, 2)
         for _ in range(20):  # the page never confirms a frame
-            live.turn()
+            live.advance()
         assert live.hand.particle == 5 and live.steps == 20
         assert server.viewers[0].waiting == session.AHEAD
     hear(server, 1)
-    live.turn()
+    live.advance()
     assert live.hand.particle == -1 and not server.viewers
 
 

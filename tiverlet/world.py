@@ -16,7 +16,7 @@ from .contact.pair_contact import PairContact
 from .contact.rays import Hits, inside, ray
 from .contact.touches import ContactEvents, joined, no_events
 from .device.copies import Copies
-from .device.interrupts import whole
+from .device.interrupts import deferred_signals
 from .features.arguments import meant
 from .features.feature import Acceleration, Batch, Feature
 from .features.read_only import assign_whole, read_only, structure
@@ -146,7 +146,7 @@ class World:
         """
         self._runner.memory.check()
         dt = checks.number("World.step", "dt", dt, above=0.0)
-        with whole:
+        with deferred_signals:
             for watcher in self._watchers:
                 watcher.before()
             clock = perf_counter()
@@ -213,7 +213,7 @@ class World:
         The old force is lost when it is overwritten, or left out of a copy. steps: see _adapt().
         """
         changed = [f for f in self._features if f.changed]
-        if any(f.lets_go for f in changed):
+        if any(f.has_released_load for f in changed):
             if not steps:
                 self._runner.note_displacements()
             self._let_go()
@@ -279,7 +279,7 @@ class World:
             frames = track(frames, description=f"{len(self._particles)} particles")
         worst = None
         for _ in frames:
-            with whole:  # signals wait until the frame is in the file, too
+            with deferred_signals:  # signals wait until the frame is in the file, too
                 report = self.step(dt, tolerance, budget)
                 worst = report if worst is None else worst.worse(report)
                 if recorder is not None:
@@ -312,7 +312,7 @@ class World:
         if self._runner.step.contacts:
             self._runner.step.contacts[0].check_range(value)
         self._runner.memory.check()
-        with whole:
+        with deferred_signals:
             for watcher in self._watchers:
                 watcher.assigned("position", value)
             self._runner.place(value, self._iterations)
@@ -330,7 +330,7 @@ class World:
         out = self._clock.parted
         if out is None:
             self._runner.memory.check()
-            with whole, self._runner.memory.compiler():
+            with deferred_signals, self._runner.memory.compiler():
                 out = self._runner.velocity(self._iterations)
         return read_only(out.copy(), assign_whole("World", "velocity"))
 
@@ -339,7 +339,7 @@ class World:
         """Set the velocities with which particles continue, (n, dim) [m/s]."""
         value = checks.points("World", "velocity", value, dim=self._particles.dim, count=len(self._particles))
         self._runner.memory.check()
-        with whole:
+        with deferred_signals:
             for watcher in self._watchers:
                 watcher.assigned("velocity", value)
             seen = self.velocity
@@ -354,7 +354,7 @@ class World:
         if not state.spins:
             return read_only(at_rest("spin", self._particles), assign_whole("World", "spin"))
         self._runner.memory.check()
-        with whole, self._runner.memory.compiler():
+        with deferred_signals, self._runner.memory.compiler():
             return read_only(state.spin.to_rates(self._runner.spin()), assign_whole("World", "spin"))
 
     @spin.setter
@@ -364,7 +364,7 @@ class World:
             raise ValueError("World.spin: these particles do not spin. Make them with tv.Particles(..., spin=0).")
         value = spin_of("World", value, self._particles)
         self._runner.memory.check()
-        with whole:
+        with deferred_signals:
             for watcher in self._watchers:
                 watcher.assigned("spin", value)
             runner, clock, spin = self._runner, self._clock, self._runner.scene.state.spin
@@ -407,7 +407,7 @@ class World:
         points = points if box is None else box.wrap(points)
         if not self._runner.search:
             return near_by_all(self.position, points, radius, box)
-        with whole:
+        with deferred_signals:
             self._runner.list_neighbours()
             with self._runner.memory.compiler():
                 self._search = self._search or PointSearch(self._runner.search)
@@ -475,7 +475,7 @@ class World:
             vectors = np.zeros((0, self._particles.dim))
             return Contacts(index, index[:, 0], none, none, vectors, vectors, none)
         contact = self._runner.step.contacts[0]
-        with whole:
+        with deferred_signals:
             self._runner.list_neighbours()
             if contact.detects and self._runner.step.launched:
                 self._runner.look()  # measures contacts; on other paths list_neighbours() has called it
@@ -631,7 +631,7 @@ class World:
 
         Raises the errors of World(); the world is then unchanged.
         """
-        with whole:
+        with deferred_signals:
             return edit_scene.add(self, particles, features, extend)
 
     def remove(self, particles: Any = (), features: Iterable[Feature] = ()) -> None:
@@ -648,7 +648,7 @@ class World:
 
         Raises ValueError or TypeError for particles or features that do not exist; the world is then unchanged.
         """
-        with whole:
+        with deferred_signals:
             edit_scene.remove(self, particles, features)
 
     def handle(self, particles: Any) -> Handle:

@@ -13,7 +13,7 @@ FEW, MANY = 8, 32
 MET = 2.0**-9  # of the first push: a smaller error of the normal displacement counts as met
 LIGHTEST = 2.0**-7  # the least share that a particle may have in the mass that its impact stops
 FELT = 2.0**-20  # of a squared displacement: a smaller change is no impact
-WAITS, HELD = 1, 2  # a particle is struck: in the pass in which it meets the wall, and in later passes
+STRUCK_NOW, STRUCK_BEFORE = 1, 2  # a particle is struck: in the pass in which it meets the wall, and in later passes
 
 
 def can_have_impacts(scene: "Scene", batches: "list[Batch]") -> bool:
@@ -58,7 +58,7 @@ class BodyImpacts:
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.state = scene.state
         self.rigid = add("impacts.rigid", n, kind=ti.i32)  # whether a rigid constraint holds it
-        self.struck = add("impacts.struck", n, kind=ti.i32)  # WAITS, HELD, or 0
+        self.struck = add("impacts.struck", n, kind=ti.i32)  # STRUCK_NOW, STRUCK_BEFORE, or 0
         self.normal, self.moved = add("impacts.normal", n, width=dim), add("impacts.wall_moved", n, width=dim)
         self.coefficients = add("impacts.friction", n, width=2)
         self.target, self.pushed, self.first_push = (add(f"impacts.{k}", n) for k in ("target", "pushed", "first_push"))
@@ -66,10 +66,10 @@ class BodyImpacts:
         self.held = add("impacts.held", n, width=dim)  # by friction
         self.logs: list[Any] = []  # of walls that report events
         self.log = add("impacts.log", n, kind=ti.i32)  # of the wall, by its number, or -1
-        self.stirred = add("impacts.stirred", n, kind=ti.i32, state=True)  # whether an impact of the last substep has reached it
+        self.reached = add("impacts.stirred", n, kind=ti.i32, state=True)  # whether an impact of the last substep has reached it
         self.open = add("impacts.open", self.passes + 1, kind=ti.i32)
 
-    def enter(self, log: Any) -> int:
+    def add_log(self, log: Any) -> int:
         """Return the number of a log; -1 for None."""
         if log is None:
             return -1
@@ -77,12 +77,12 @@ class BodyImpacts:
         return len(self.logs) - 1
 
     @ti.func
-    def linked(self, i):
+    def is_linked(self, i):
         """Whether rigid constraints hold particle i."""
         return self.rigid[i] != 0
 
     @ti.func
-    def link(self, batch: ti.template(), c):  # type: ignore[valid-type]
+    def mark_linked(self, batch: ti.template(), c):  # type: ignore[valid-type]
         """In the first pass: mark the particles that constraint c holds, if it is rigid.
 
         An impact is too short for springs to act.
@@ -95,61 +95,61 @@ class BodyImpacts:
                 self.rigid[batch.dev.corners.member(c, k)] = 1
 
     @ti.func
-    def waits(self, i):
+    def is_struck_now(self, i):
         """Whether particle i was struck in this pass."""
-        return self.struck[i] == WAITS
+        return self.struck[i] == STRUCK_NOW
 
     @ti.func
     def clear(self, i):
         """At the start of a substep: clear the marks of particle i."""
-        self.struck[i] = self.stirred[i] = self.rigid[i] = 0
+        self.struck[i] = self.reached[i] = self.rigid[i] = 0
 
     @ti.func
-    def close(self):
+    def clear_requests(self):
         """At the start of a substep: request no passes beside the regular ones."""
         for k in range(ti.static(self.passes + 1)):
             self.open[k] = 0
 
     @ti.func
-    def ask(self, now):
+    def request_pass(self, now):
         """Request another pass, once the regular ones are done."""
         if now.it + 1 >= now.span.iterations:
             self.open[now.it + 1 - now.span.iterations] = 1
 
     @ti.func
-    def wanted(self, now):
+    def needs_pass(self, now):
         """Whether this pass, beyond the regular ones, is needed."""
         return self.open[now.it - now.span.iterations] != 0
 
     @ti.func
-    def notes(self):
+    def is_first_extra_pass(self):
         """Whether this is the first extra pass, which only records the violations that constraints leave."""
         return self.open[0] != 0 and self.open[1] == 0
 
     @ti.func
-    def goes_on(self):
+    def is_later_extra_pass(self):
         """Whether this is a later extra pass."""
         return self.open[1] != 0
 
     @ti.func
-    def stir(self, i, change):
+    def mark_reached(self, i, change):
         """Mark particle i if an extra pass changed its displacement by more than rounding."""
         if change.norm_sqr() > ti.static(FELT) * self.state.d[i].norm_sqr():
-            self.stirred[i] = 1
+            self.reached[i] = 1
 
     @ti.func
-    def reaches(self, batch: ti.template(), c):  # type: ignore[valid-type]
+    def is_reached(self, batch: ti.template(), c):  # type: ignore[valid-type]
         """Whether constraint c is rigid, and an impact has reached it."""
         out = batch.dev.spring.is_rigid(c)
         if ti.static(self.spreads):
             near = False
             for k in ti.static(range(batch.arity)):
-                near = near or self.stirred[batch.dev.corners.member(c, k)] != 0
+                near = near or self.reached[batch.dev.corners.member(c, k)] != 0
             out = out and near
         return out
 
     @ti.func
-    def strike(self, i, n, moved, target, static, dynamic, log):
+    def record_impact(self, i, n, moved, target, static, dynamic, log):
         """Record that a wall is to give particle i the normal displacement `target`, relative to the wall.
 
         n: normal of the wall. moved: motion of the wall. log: number of the log for the impulse. Returns whether a later pass
@@ -157,7 +157,7 @@ class BodyImpacts:
         """
         out = self.struck[i] == 0 and self.open[ti.static(self.passes - 1)] == 0
         if out:
-            self.struck[i] = WAITS
+            self.struck[i] = STRUCK_NOW
             self.normal[i], self.moved[i], self.target[i] = n, moved, target
             self.pushed[i] = self.last_push[i] = 0 * target
             self.coefficients[i] = [static, dynamic]
@@ -166,24 +166,24 @@ class BodyImpacts:
         return out
 
     @ti.func
-    def calm_between(self, i, n):
+    def cancel_bounce(self, i, n):
         """Cancel the bounce of particle i off the wall that it struck, if a wall with normal n presses it from the other side.
 
         Otherwise each of the two walls would amplify the push of the other.
         """
-        if self.struck[i] == HELD and n.dot(self.normal[i]) < 0:
+        if self.struck[i] == STRUCK_BEFORE and n.dot(self.normal[i]) < 0:
             self.target[i] = ti.min(self.target[i], 0)
 
     @ti.func
-    def hold(self, i):
+    def correct_push(self, i):
         """Push particle i towards its target, or correct the push. Returns whether its displacement was off."""
         off = False
         if self.struck[i] != 0:
             n, d = self.normal[i], self.state.d[i] - self.moved[i]
             miss = self.target[i] - d.dot(n)
-            if self.struck[i] == WAITS:
+            if self.struck[i] == STRUCK_NOW:
                 self.first_push[i] = miss
-            self.struck[i] = HELD
+            self.struck[i] = STRUCK_BEFORE
             off = ti.abs(miss) > ti.static(MET) * self.first_push[i]
             part = 1 + 0 * miss
             if ti.static(self.exact):
@@ -202,7 +202,7 @@ class BodyImpacts:
             change -= held - self.held[i]
             self.held[i] = held
             self.state.shift(i, change)
-            self.stirred[i] = 1
+            self.reached[i] = 1
             if ti.static(self.state.keeps_wall_push):
                 self.state.wall_push[i] = self.state.wall_push[i] + change
         return off

@@ -16,10 +16,10 @@ from .wall_log import WallLog
 class Collider(Feature):
     """Keeps each particle on one side of a wall, as the last correction in every iteration.
 
-    Subclasses implement confine(), which finds how deep a particle is and calls dev.surface.press() of the Surface that each
-    holds; and for host queries, clearance() and cast(). One-sided: depth that was gained in this substep is removed completely,
-    at any speed, whether it came from motion, constraints, contacts, friction or a bounce off another wall. Earlier depth (a bad
-    start) is removed at `push_out` [m/s], and gives no more velocity than that.
+    Subclasses implement confine(), which finds how deep a particle is and calls dev.surface.push_without_slide() of the Surface
+    that each holds; and for host queries, clearance() and cast(). One-sided: depth that was gained in this substep is removed
+    completely, at any speed, whether it came from motion, constraints, contacts, friction or a bounce off another wall. Earlier
+    depth (a bad start) is removed at `push_out` [m/s], and gives no more velocity than that.
 
     Where one correction may push a particle into a wall again (several walls, a box in whose corners particles bounce),
     corrections are repeated until none changes anything. The first rounds include friction and bounces. Later rounds leave both
@@ -61,13 +61,13 @@ class Collider(Feature):
     host_only = ("widest",)
     one_way: Any = None  # unit vector along which particles pass
     _switch = False  # whether `active` was given
-    sweeps = False  # needs the exact position at the start of the substep
-    repeats = False  # after confine(), a particle with friction or a bounce may have to be confined again
+    needs_start_position = False  # needs the exact position at the start of the substep
+    needs_repeat = False  # after confine(), a particle with friction or a bounce may have to be confined again
     dim = 0  # 2 or 3; 0 while it is not known
     inside = False  # particles are kept inside of it
     poses = False  # has a pose(frame_fraction) to be computed once for each substep, before any confine()
 
-    def surface(
+    def set_surface(
         self, friction: Any, restitution: Any, push_out: float, active: bool | None, events: bool = False, one_way: Any = None,
         dim: int = 0,
     ) -> None:  # fmt: skip
@@ -106,14 +106,14 @@ class Collider(Feature):
         return restitution_of(repr(self), "restitution", self.restitution)
 
     @property
-    def lets_go(self) -> bool:
+    def has_released_load(self) -> bool:
         """Whether the wall was present in the last frame and is switched off now, so that it ends its support."""
-        return not self.active and self.stands
+        return not self.active and self.was_active
 
     @property
-    def stands(self) -> bool:
+    def was_active(self) -> bool:
         """Whether the wall was present in the last frame."""
-        return self.active if self.scene is None else self.dev.surface.stands
+        return self.active if self.scene is None else self.dev.surface.was_active
 
     @property
     def has_switch(self) -> bool:
@@ -176,8 +176,11 @@ class Collider(Feature):
         return 1
 
     @ti.func
-    def confine(self, i, radius, h, frame_fraction, turn):
-        """Move particle i out of the wall, with self.dev.surface.press(). turn: FIRST, AGAIN, GENTLY or AHEAD."""
+    def confine(self, i, radius, h, frame_fraction, mode):
+        """Move particle i out of the wall, with self.dev.surface.push_without_slide().
+
+        mode: ANY_DEPTH, BEYOND_ROUNDING, FRICTIONLESS or BEFORE_CONTACTS.
+        """
 
 
 def _friction(wall: Collider, value: Any) -> Any:

@@ -155,7 +155,7 @@ class Contact(PairContact):
         dev.spins, dev.axes = scene.state.spins and dev.has_friction, scene.particles.axes
         dev.turn = PairData("turn", dev.axes, lasting=True) if dev.turns else None
         dev.slack = PairData("slack", 0, lasting=True, marked=True)  # the part of the overlap that is not pushed out [m]
-        dev.impulse = PairData("given", 0, lasting=True, told=True)  # pushes and impacts in the last substep [kg m]
+        dev.impulse = PairData("given", 0, lasting=True, for_reports=True)  # pushes and impacts in the last substep [kg m]
         dev.has_loads = self.has_loads
         dev.known = KnownLoads(scene) if dev.has_loads else None
         loads = dev.known.pair_data if dev.known else []

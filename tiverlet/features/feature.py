@@ -81,9 +81,9 @@ class Feature:
     """The base class of all features.
 
     arguments: the arguments of its __init__. changed: a knob waits to be uploaded. new_force: the waiting knob changes a force.
-    lets_go: the feature no longer bears the load that it had in the last frame. afresh: its state begins anew when the world is
-    rebuilt. moving: a target is being approached. once: names of compiled_for that its kernels have used in this world; they stay
-    in the kernels when the world is rebuilt.
+    has_released_load: the feature no longer bears the load that it had in the last frame. afresh: its state begins anew when the
+    world is rebuilt. moving: a target is being approached. once: names of compiled_for that its kernels have used in this world;
+    they stay in the kernels when the world is rebuilt.
     """
 
     arguments: Mapping[str, Any] = MappingProxyType({})
@@ -98,7 +98,7 @@ class Feature:
     for_all = False  # no data of it, on device or host, depends on which particles exist; see can_regroup()
     bulk = 0.3  # size of its kernel code relative to that of a Distance; see build.LONG
     changed = True
-    moving = new_force = lets_go = afresh = False
+    moving = new_force = has_released_load = afresh = False
     once: frozenset[str] = frozenset()
     scene: Any = None  # Scene, from bind() on
     periodic: Any = None  # the Periodic of its world, set before prepare()

@@ -109,7 +109,7 @@ class NeighbourSearch:
         """Whether particles can be added and removed in place. radius, reach: of the particles there are now, (n,) [m]."""
         reach = 0 * radius if reach is None else reach
         n, store = change.now.count, self.list.store
-        room = store is not None and store.holds(self.list.room + (self.list.short + 1) * (n + 1))
+        room = store is not None and store.has_room(self.list.room + (self.list.short + 1) * (n + 1))
         static = bool((change.inv_mass == 0).any()) == self.has_static
         lone = not self.several_levels and not self.state.images and not reach.any()
         return room and static and not self.team.launched and lone == self.lone and self.cells.can_regroup(radius, reach)
@@ -120,7 +120,7 @@ class NeighbourSearch:
         The list is kept without the pairs of removed particles, unless skin or cells change. Added particles are not listed: they
         count as strays that moved too far. Where the old list is saved, restore() must give the pair data to the next list.
         """
-        n, stale = change.now.count, int(self.memory.seen(self.list.stale)[0])
+        n, stale = change.now.count, int(self.memory.view(self.list.stale)[0])
         reach = 0 * radius if reach is None else reach
         if change.goes and not self.list.saved:
             self.list.drop(change.number)
@@ -137,7 +137,7 @@ class NeighbourSearch:
             self.list.blocks = self._blocks(n)
             self.list.allocate(room)
         if self.linked:
-            begin = self.memory.seen(self.excluded_begin)[change.first]
+            begin = self.memory.view(self.excluded_begin)[change.first]
             self.memory.resize(self.excluded_begin, n + 1)
             self.memory.write_from(self.excluded_begin, change.first, np.full(n + 1 - change.first, begin))
         came = n - change.kept
@@ -160,7 +160,7 @@ class NeighbourSearch:
     def exclude(self, linked: np.ndarray) -> None:
         """Exclude these pairs, (m, 2), from the list; can_exclude() must allow it. Particles are numbered as they are now."""
         if self.linked:
-            self._both, begin = _both(linked, len(self.memory.seen(self.excluded_begin)) - 1)
+            self._both, begin = _both(linked, len(self.memory.view(self.excluded_begin)) - 1)
             self.memory.resize(self.excluded, len(self._both))
             self.memory.write(self.excluded, self._both[:, 1])
             self.memory.write(self.excluded_begin, begin)

@@ -46,7 +46,7 @@ def curves_of(world: "World") -> dict[str, tuple[str, dict[str, Any]]]:
     return CURVES | {title: (end, {name: curves[name] for name in list(curves)[: world.particles.axes]})}
 
 
-def shown(world: "World") -> dict[str, tuple[str, list[bool]]]:
+def informative_views(world: "World") -> dict[str, tuple[str, list[bool]]]:
     """Return the views of curves that are informative for this scene, by title: last part of the path, and which curves to show.
 
     Left out are overlap without contacts, momentum where walls or pins change it, and substeps if their number is fixed.
@@ -83,7 +83,7 @@ class Curves:
         self.own: list[str] = []  # names of the user's quantities
         for title, (end, curves) in self._curves.items():
             titles, colors = zip(*(curves[name] for name in _names(curves, world)), strict=True)
-            _, those = shown(world).get(title, (end, [False] * len(titles)))
+            _, those = informative_views(world).get(title, (end, [False] * len(titles)))
             lines = rr.SeriesLines(names=titles, colors=colors, visible_series=those)
             stream.log(f"figures/{end}", lines, static=True, strict=True)
 

@@ -163,7 +163,10 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         if scene.order > 2:
             high_order.check_solved(batches, scene, solver)
     state.remember(
-        memory, has_friction or any(w.sweeps for w in walls) or (bounces and bool(walls)), bounces, bool(contact and walls)
+        memory,
+        has_friction or any(w.needs_start_position for w in walls) or (bounces and bool(walls)),
+        bounces,
+        bool(contact and walls),
     )
     size = size_of(path, scale.work)
     team = Team(memory, size, len(particles), path == "parallel" and size == 1, pieces=PIECES if contact else size)

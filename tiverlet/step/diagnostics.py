@@ -318,7 +318,7 @@ class Residuals:
         if ti.static(self.step.team.size == 1):
             self.diagnostics.reduce_blocks(0, h64, fresh)
         elif ti.static(len(self.step.constraints.ragged) > 0):
-            for thread in range(self.step.team.spread):
+            for thread in range(self.step.team.loop_length):
                 if thread % LEAST == 0:
                     self.diagnostics.reduce_blocks(thread // LEAST, h64, fresh)
         for c in range(self.batch.count):

@@ -54,7 +54,7 @@ def planned(
     batches = [f for f in world.features if isinstance(f, Batch)]
     if not (count and len(some) and scene.order == 2):
         return None
-    if runner.launched or not all(memory.elastic and memory.holds(count + 1) for memory in runner.memories):
+    if runner.launched or not all(memory.elastic and memory.has_room(count + 1) for memory in runner.memories):
         return None
     if any(f.changed and f.outgrown for f in world.features):
         return None

@@ -166,7 +166,7 @@ def renew(world: Any) -> None:
     if seen is not None:
         had = seen[loose]
     elif not clock.d_is_velocity:
-        had = runner.memory.seen(runner.scene.state.d)[loose] / clock.h
+        had = runner.memory.view(runner.scene.state.d)[loose] / clock.h
     if grabbing.soft or not impulse.tells(runner):
         with runner.memory.compiler():
             runner.restart_between(world.iterations)

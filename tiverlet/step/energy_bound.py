@@ -142,5 +142,5 @@ def _pull(world: "World") -> np.ndarray:
 
 def _walls(world: "World") -> list[Collider]:
     """Return the walls that are present and implement clearance(), which walls of the user need not do."""
-    walls = [f for f in world.features if isinstance(f, Collider) and f.stands]
+    walls = [f for f in world.features if isinstance(f, Collider) and f.was_active]
     return [wall for wall in walls if type(wall).clearance is not Collider.clearance]

@@ -37,7 +37,7 @@ def explain(world: "World") -> str:
         *(f"    {line}" for line in _absent(world)),
     ]
     total = sum(world.fields.values())
-    spare = sum(memory.spare for memory in world._runner.memories)
+    spare = sum(memory.spare_bytes for memory in world._runner.memories)
     room = f"; {spare} bytes more stay for what went" if spare else ""
     lines.append(f"Memory: {len(world.fields)} fields, {total} bytes, {total / max(1, len(p)):.0f} per particle{room}")
     for owner, own in groupby(sorted(world.fields, key=_owner), key=_owner):

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..constraints.path import Path
 from ..contact.initial_overlap import overlapping
-from ..device.interrupts import whole
+from ..device.interrupts import deferred_signals
 from ..device.patches.compiler import CachedLaunch
 from ..particles.spin import moments
 from . import high_order, initial_shape, initial_violation
@@ -492,7 +492,7 @@ class Runner:
     def raise_signals(self) -> None:
         """In a long frame: call the handlers of pending signals. If one raises, the frame is undone, see World.step."""
         if self.interruptible:
-            whole.raise_pending()
+            deferred_signals.raise_pending()
 
     def look(self, bare: bool = False) -> None:
         """Diagnose a state that no frame has diagnosed. bare: compute only its energy, in a third of the time."""

@@ -135,7 +135,7 @@ class Step:
     def fused(self, sheet: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """Run all substeps of a frame and its diagnostics in one launch; with 0 substeps, only the diagnostics."""
         ti.loop_config(serialize=self.team.size == 1)
-        for thread in range(self.team.spread):
+        for thread in range(self.team.loop_length):
             if thread % LEAST == 0:
                 self.run(integer(sheet, FIRST) + thread // LEAST, sheet)
 
@@ -186,7 +186,7 @@ class Step:
     @ti.func
     def takes_part(self, now):
         """Whether this thread takes part in the substep. All threads must call it."""
-        return self.team.works(now.thread) and self.halted() == 0
+        return self.team.takes_part(now.thread) and self.halted() == 0
 
     @ti.func
     def resumes(self, now):
@@ -233,7 +233,7 @@ class Step:
         out = True
         if ti.static(self.has_impacts):
             if not self.is_regular(now, half):
-                out = self.impacts.wanted(self.pass_of(now, half))
+                out = self.impacts.needs_pass(self.pass_of(now, half))
         return out
 
     @ti.func
@@ -322,10 +322,10 @@ class Step:
         if ti.static(self.has_impacts):
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, now.thread)):
-                self.impacts.close()
+                self.impacts.clear_requests()
         self.particles.integrate(now)
         self.team.wait()
-        self.team.watch(now.thread)
+        self.team.check_waits(now.thread)
 
     @ti.func
     def drive(self, now):
@@ -580,7 +580,7 @@ class Step:
             if ti.static(self.team.size == 1):
                 self.constraints.spring_forces(0, h)
             else:
-                for thread in range(self.team.spread):
+                for thread in range(self.team.loop_length):
                     if thread % LEAST == 0:
                         self.constraints.spring_forces(thread // LEAST, h)
         for i in range(self.n):

@@ -76,14 +76,14 @@ def _structure(world: "World") -> dict[str, Any]:
 
 def _written(world: "World") -> Any:
     """Return the source of a world's kernels, with numbers in place of its fields."""
-    from ..device.patches.sharing import Writing  # noqa: PLC0415
+    from ..device.patches.sharing import KernelInputs  # noqa: PLC0415
 
     fields = [vars(e.field) for memory in world._runner.memories for e in memory.entries]
     before = [known.get("place_name") for known in fields]
     for k, known in enumerate(fields):
         known["place_name"] = "field", k
     try:
-        return Writing(world._runner.step).key
+        return KernelInputs(world._runner.step).key
     finally:
         for known, name in zip(fields, before, strict=True):
             known["place_name"] = name

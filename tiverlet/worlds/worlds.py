@@ -11,7 +11,7 @@ from .. import checks
 from ..constraints.core.scalar import Scalar
 from ..device import runtime
 from ..device.copies import Copies
-from ..device.interrupts import whole
+from ..device.interrupts import deferred_signals
 from ..device.patches.compiler import CachedLaunch
 from ..features.arguments import knobs_of, meant
 from ..features.feature import Feature
@@ -65,7 +65,7 @@ class Worlds:
             count = checks.integer("Worlds", "count", 1 if count is None else count, least=1)
         else:
             count = len(sources)
-        with whole:
+        with deferred_signals:
             self._originals = first.features  # the user may name features by these
             sources = alike(sources)
             self._copies = Copies(count)
@@ -83,7 +83,7 @@ class Worlds:
             if len(sources) < count:
                 for memory in self._runner.memories:
                     memory.choose(0)
-                    memory.spread()
+                    memory.copy_to_all()
                 self._clocks = Clocks([self._clocks.of(0)] * count)
             self._knobs = Knobs(self._world.features, sources, count)
             self._rest()
@@ -97,7 +97,7 @@ class Worlds:
         runner = self._runner
         runner.memory.choose(k)
         numbers = [(search.list.capacity, search.list.pitch) for search in runner.step.searches]
-        runner.memory.take(world._runner.memory)
+        runner.memory.copy_from(world._runner.memory)
         for search, (capacity, pitch) in zip(runner.step.searches, numbers, strict=True):
             search.list.capacity_number.set(capacity)
             search.list.pitch_number.set(pitch)
@@ -108,7 +108,7 @@ class Worlds:
     @contextlib.contextmanager
     def _open(self) -> Iterator[None]:
         """Make fields those of all worlds, and delay signals, while the context lasts."""
-        with whole, self._copies.all():
+        with deferred_signals, self._copies.all():
             self._runner.memory.check()
             self._knobs.forget_assigned()
             yield
@@ -507,7 +507,7 @@ class Worlds:
         if name not in known:
             raise ValueError(f"Worlds.view: name = {name!r}, but it must be one of {', '.join(map(repr, known))}.")
         with self._open():
-            return read_only(self._runner.memory.seen(known[name])[:, : self._runner.n], assign_whole("Worlds", "position"))
+            return read_only(self._runner.memory.view(known[name])[:, : self._runner.n], assign_whole("Worlds", "position"))
 
     @position.setter
     def position(self, value) -> None:
