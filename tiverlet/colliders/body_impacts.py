@@ -1,4 +1,4 @@
-"""Impacts of bodies on walls: where what a wall strikes is linked to other particles."""
+"""Impacts of bodies on walls and on each other: where what is struck is linked to other particles."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 FEW, MANY = 8, 32
 MET = 2.0**-9  # of the first push: a velocity that is missed by less is met
 LIGHTEST = 2.0**-7  # a particle is taken for this part, at least, of the mass that it has to stop
+CAREFUL = 0.55  # the same where impacts of pairs may change each other's: projections converge by steps of less than 1 / 0.5
 FELT = 2.0**-20  # of the square of a displacement: a change that is less is no blow
 WAITS, HELD = 1, 2  # what is struck is so in the pass in which it meets the wall, and in those after that
 
@@ -43,12 +44,17 @@ class BodyImpacts:
     at once it would be speed. Contacts wait for the next substep. What comes nearer by no more than SLOW substeps of forces and
     links add does not bounce, see Surface.
 
-    open: for each pass beyond those of every substep, whether it is needed.
+    Two particles that strike each other, of which one is linked at least, are the same with the displacement of one relative to
+    the other, in the direction of their impact, of which each takes its share by mass. Both sides work out the same, before
+    either moves. A particle has one impact of this kind in a substep, on a wall or another; in others it bounces alone.
+
+    open: for each pass beyond those of every substep, whether it is needed. pairs: whether particles strike each other.
     """
 
-    def __init__(self, scene: "Scene", batches: "list[Batch]"):
+    def __init__(self, scene: "Scene", batches: "list[Batch]", pairs: bool):
         system = scene.slots.system
-        self.passes = FEW if system else MANY
+        self.passes = FEW if system and not pairs else MANY
+        self.lightest = CAREFUL if pairs else LIGHTEST
         self.spreads = not system  # from link to link; a system takes all at once
         self.exact = bool(scene.slots.exact and (not system or system.left_out(batches) == 0))
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
@@ -64,6 +70,11 @@ class BodyImpacts:
         self.log = add("impacts.log", n, kind=ti.i32)  # of the wall, by its number, or -1
         self.stirred = add("impacts.stirred", n, kind=ti.i32, state=True)  # whether a blow of the last substep has reached it
         self.open = add("impacts.open", self.passes + 1, kind=ti.i32)
+        self.pairs = pairs
+        if pairs:
+            self.partner = add("impacts.partner", n, kind=ti.i32)  # or -1, for a wall
+            self.ready = add("impacts.ready", n, kind=ti.i32)  # whether it has struck nothing, as a round of bounces begins
+            self.change = add("impacts.change", n, width=dim)
 
     def enter(self, log: Any) -> int:
         """The number of a log; -1 for None."""
@@ -149,6 +160,8 @@ class BodyImpacts:
         out = self.struck[i] == 0 and self.open[ti.static(self.passes - 1)] == 0
         if out:
             self.struck[i] = WAITS
+            if ti.static(self.pairs):
+                self.partner[i] = -1
             self.normal[i], self.moved[i], self.target[i] = n, moved, target
             self.pushed[i] = self.last_push[i] = 0 * target
             self.coefficients[i] = [static, dynamic]
@@ -160,30 +173,20 @@ class BodyImpacts:
     def calm_between(self, i, n):
         """A wall with the normal n presses particle i, too: if it faces the one that i has struck, i does not bounce off that,
         for what one of them gives, the other would make more."""
-        if self.struck[i] == HELD and n.dot(self.normal[i]) < 0:
+        if self.struck[i] == HELD and self.by_wall(i) and n.dot(self.normal[i]) < 0:
             self.target[i] = ti.min(self.target[i], 0)
 
     @ti.func
     def hold(self, i):
-        """Push particle i, or push it on. Returns whether it was off."""
+        """Push particle i, which struck a wall, or push it on. Returns whether it was off."""
         off = False
-        if self.struck[i] != 0:
+        if self.struck[i] != 0 and self.by_wall(i):
             n, d = self.normal[i], self.state.d[i] - self.moved[i]
-            miss = self.target[i] - d.dot(n)
-            if self.struck[i] == WAITS:
-                self.first_push[i] = miss
-            self.struck[i] = HELD
-            off = ti.abs(miss) > ti.static(MET) * self.first_push[i]
-            part = 1 + 0 * miss
-            if ti.static(self.exact):
-                if self.last_push[i] != 0:
-                    part = ti.max(ti.static(LIGHTEST), ti.min((self.last_miss[i] - miss) / self.last_push[i], 1))
-            pushed = ti.max(self.pushed[i] + miss / part, 0)
-            change = (pushed - self.pushed[i]) * n
+            off, push = self.missing(i, d.dot(n))
+            change, pushed = push * n, self.pushed[i]
             for k in ti.static(range(len(self.logs))):
                 if self.log[i] == k:
                     self.logs[k].add(i, change)
-            self.last_push[i], self.last_miss[i], self.pushed[i] = pushed - self.pushed[i], miss, pushed
             held = self.held[i] + d - d.dot(n) * n
             size = held.norm()
             if size > self.coefficients[i][0] * pushed:
@@ -195,3 +198,67 @@ class BodyImpacts:
             if ti.static(self.state.keeps_wall_push):
                 self.state.wall_push[i] = self.state.wall_push[i] + change
         return off
+
+    @ti.func
+    def missing(self, i, has):
+        """Whether the normal displacement that particle i has is off, and what it is to be pushed by now, of what it noted."""
+        miss = self.target[i] - has
+        if self.struck[i] == WAITS:
+            self.first_push[i] = miss
+        self.struck[i] = HELD
+        part = 1 + 0 * miss
+        if ti.static(self.exact):
+            if self.last_push[i] != 0:
+                part = ti.max(ti.static(self.lightest), ti.min((self.last_miss[i] - miss) / self.last_push[i], 1))
+        pushed = ti.max(self.pushed[i] + miss / part, 0)
+        push = pushed - self.pushed[i]
+        self.last_push[i], self.last_miss[i], self.pushed[i] = push, miss, pushed
+        return ti.abs(miss) > ti.static(MET) * self.first_push[i], push
+
+    @ti.func
+    def by_wall(self, i):
+        """Whether what particle i struck is a wall."""
+        out = True
+        if ti.static(self.pairs):
+            out = self.partner[i] < 0
+        return out
+
+    @ti.func
+    def prepare(self, i):
+        """As a round of bounces of pairs begins, in which nobody is struck before the next loop."""
+        self.ready[i] = ti.cast(self.struck[i] == 0, ti.i32)
+
+    @ti.func
+    def meets(self, i, j):
+        """Whether particle i has struck particle j in this substep, and is left to passes to come."""
+        return self.struck[i] != 0 and self.partner[i] == j
+
+    @ti.func
+    def strike_other(self, i, j, n, target):
+        """Particles i and j strike each other, as both find in the same round, and are to leave at `target` along n, from j to i.
+        Returns whether that can wait for another pass, as strike() does."""
+        out = (self.linked(i) or self.linked(j)) and self.ready[i] != 0 and self.ready[j] != 0
+        if out and self.state.w.positive(i):
+            self.struck[i] = WAITS
+            self.partner[i] = j
+            self.normal[i], self.target[i] = n, target
+            self.pushed[i] = self.last_push[i] = 0 * target
+        return out
+
+    @ti.func
+    def work_out(self, i):
+        """What particle i, which struck another, is pushed by; nobody moves before the next loop. Returns whether it was off, and
+        the push, relative to the other one."""
+        off, push = False, 0 * self.target[i]
+        if self.struck[i] != 0 and not self.by_wall(i):
+            j, n, w = self.partner[i], self.normal[i], self.state.w.of(i)
+            off, push = self.missing(i, self.state.slid(self.state.d[i] - self.state.d[j], i, j).dot(n))
+            self.change[i] = w / (w + self.state.w.of(j)) * push * n
+        return off, push
+
+    @ti.func
+    def push(self, i):
+        """Then it is."""
+        if self.struck[i] != 0 and not self.by_wall(i):
+            self.state.shift(i, self.change[i])
+            self.stirred[i] = 1

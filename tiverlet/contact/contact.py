@@ -187,6 +187,11 @@ class Contact(PairContact):
         dev.projection = VelocityProjection(scene, dev.list, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
         return dev.search
 
+    @property
+    def takes_along(self) -> bool:
+        """With restitution; not where friction turns particles, too."""
+        return self.dev.has_restitution and not self.dev.spins
+
     @ti.func
     def presses(self, i, e):
         """Whether particle i presses on the one at entry e of its list, which does on it."""

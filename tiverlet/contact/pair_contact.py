@@ -130,6 +130,11 @@ class PairContact(Feature):
         return self._pairs.has_restitution or "has_restitution" in self.once
 
     @property
+    def takes_along(self) -> bool:
+        """Whether particles that bounce off each other take along what they are linked to, see BodyImpacts."""
+        return False
+
+    @property
     def turns(self) -> bool:
         """Whether any pair resists rolling, or bounces across the normal, or did when kernels were compiled."""
         return self._pairs.turns or "turns" in self.once

@@ -29,6 +29,8 @@ class Restitution:
         self.geometry, self.list, self.table, self.state = geometry, geometry.list, table, scene.state
         self.struck, self.slack, self.impulse, self.events = struck, slack, impulse, events
         self.has_events = events is not None
+        self.takes_along = False  # whether linked particles take their bodies along
+        self.impacts: Any = None  # then the BodyImpacts
         self.weight = add("Contact.struck", n)  # the split mass of the first pass, 0 where nothing touched
         self.d_change = add("Contact.d_change", n, width=dim)
         self.lift = add("Contact.lift", n, width=dim)  # moves the position alone
@@ -36,6 +38,12 @@ class Restitution:
         self.partner = add("Contact.partner", n, kind=ti.i32)
         self.first = add("Contact.first", n, kind=ti.i32)
         self.hit = add("Contact.hit", None, kind=ti.i32)
+
+    def bind(self, scene: Scene, impacts: Any) -> None:
+        """Leave impacts of linked particles to the passes of a BodyImpacts."""
+        n, dim, add = scene.count, scene.particles.dim, scene.memory.field
+        self.takes_along, self.impacts = True, impacts
+        self.normal, self.target_of = add("Contact.normal", n, width=dim), add("Contact.target", n)
 
     @ti.func
     def clear(self, i, weight):
@@ -90,9 +98,11 @@ class Restitution:
     def choose(self, i):
         """The first of the pairs of particle i that were struck and still come together, and what it does to i."""
         first, partner, most, w = -1, -1, 0 * self.weight[i], self.state.w.of(i)
+        if ti.static(self.takes_along):
+            self.impacts.prepare(i)
         if self.weight[i] > 0:
             for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
-                if self.struck.field[e] > 0:
+                if self.struck.field[e] > 0 and not self.left_to_passes(i, self.list.neighbour[e]):
                     j = self.list.neighbour[e]
                     contact_distance = self.geometry.contact_distance(i, j)
                     overlap, _each, n, _reach = self.geometry.impact(i, j, contact_distance, self.weight[i], False)
@@ -101,6 +111,8 @@ class Restitution:
                         if left > most or (left == most and earlier(i, j, partner)):
                             first, partner, most = e, j, left
                             self.d_change[i] = w / (w + self.state.w.of(j)) * given * n
+                            if ti.static(self.takes_along):
+                                self.wanted(i, j, n, given)
                             if self.hit[None] == 0:
                                 self.hit[None] = 1
         self.first[i] = first
@@ -112,7 +124,11 @@ class Restitution:
         """Let particle i bounce off its partner, if it is the partner's partner."""
         j = self.partner[i]
         if j >= 0:
-            if self.partner[j] == i or self.state.w.of(j) == 0:
+            meets = self.partner[j] == i or self.state.w.of(j) == 0
+            if ti.static(self.takes_along):
+                if meets:
+                    meets = not self.impacts.strike_other(i, j, self.normal[i], self.target_of[i])
+            if meets:
                 e, d_change = self.first[i], self.d_change[i]
                 impulse = d_change.norm() / self.state.w.of(i)
                 self.impulse.field[e] = self.impulse.field[e] + impulse
@@ -122,6 +138,34 @@ class Restitution:
                 self.state.d[i] = self.state.d[i] + d_change
                 self.state.before[i] = self.state.before[i] + d_change
                 self.state.advance(i, self.left[i] * d_change)
+
+    @ti.func
+    def left_to_passes(self, i, j):
+        """Whether the impact of particles i and j is left to passes to come, see BodyImpacts."""
+        out = False
+        if ti.static(self.takes_along):
+            out = self.impacts.meets(i, j)
+        return out
+
+    @ti.func
+    def wanted(self, i, j, n, given):
+        """Note the displacement along n with which particle i is to leave particle j."""
+        self.normal[i] = n
+        self.target_of[i] = given + self.state.slid(self.state.d[i] - self.state.d[j], i, j).dot(n)
+
+    @ti.func
+    def push_on(self, i):
+        """In one of these passes: work out what particle i is pushed by, and note the impulse. Returns whether it was off."""
+        off, push = self.impacts.work_out(i)
+        if push != 0:
+            j = self.impacts.partner[i]
+            for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
+                if self.list.neighbour[e] == j:
+                    impulse = push / (self.state.w.of(i) + self.state.w.of(j))
+                    self.impulse.field[e] = self.impulse.field[e] + impulse
+                    if ti.static(self.has_events):
+                        self.events.note_impact(e, impulse, self.impacts.first_push[i] / (1 + self.table.of(i, j)[2]))
+        return off
 
 
 @ti.func

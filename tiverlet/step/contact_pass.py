@@ -93,6 +93,21 @@ class ContactPass:
                 self.team.wait()
 
     @ti.func
+    def push_bodies(self, now):
+        """In passes beyond those of every substep: what struck each other is pushed on, see BodyImpacts."""
+        for c in ti.static(self.contacts):
+            if ti.static(c.has_restitution and c.takes_along):
+                for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+                    if c.dev.state.awake(i):
+                        if c.dev.restitution.push_on(i):
+                            c.dev.restitution.impacts.ask(now)
+                self.team.wait()
+                for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+                    if c.dev.state.awake(i):
+                        c.dev.restitution.impacts.push(i)
+                self.team.wait()
+
+    @ti.func
     def start_events(self, now):
         """Note which substep it is; as a frame begins, what touched before."""
         for c in ti.static(self.contacts):

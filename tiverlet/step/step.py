@@ -64,6 +64,9 @@ def substep(do, now):
                     for _ in range(REBOUNDS):
                         if turn.first != 0 and do.struck() != 0:
                             do.rebound(turn)
+                if ti.static(do.has_pair_impacts):
+                    if not do.regular(now, half):
+                        do.push_bodies(turn)
                 do.apply_corrections(turn)
     if ti.static(do.finishes):
         if do.leaves(now):
@@ -107,6 +110,7 @@ class Step:
         self.halves = 2 if batches and contact else 1  # of a pass, each with a list that is good
         self.impacts: Any = scene.impacts
         self.has_impacts = bool(scene.impacts)
+        self.has_pair_impacts = self.has_impacts and self.impacts.pairs
         self.newton_steps = 2 if scene.slots and scene.slots.refines else 1  # in a pass, at most
         self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
         self.orients = self.state.spins and self.state.spin.orients
@@ -449,6 +453,11 @@ class Step:
     def rebound(self, now):
         """One round of restitution."""
         self.contact_pass.rebound(now.thread)
+
+    @ti.func
+    def push_bodies(self, now):
+        """Bodies that struck each other are pushed on."""
+        self.contact_pass.push_bodies(now)
 
     @ti.func
     def apply_corrections(self, now):
