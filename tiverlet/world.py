@@ -129,9 +129,10 @@ class World:
         """Advance by dt [s], and say how it went.
 
         Without tolerance and budget the frame has `substeps` substeps; with substeps="auto", as many as it needs to be stable.
-        tolerance: of the residual and the overlap, both relative, of phi^2 / 24 for the angle phi by which rigid constraints turn
-        in a substep, and of (omega h)^2 / 24 in forces that differ from place to place; the frame is made again with more
-        substeps until they are met.
+        tolerance: of the residual and the overlap, both relative, of phi^2 / 24 for the angle phi by which rigid constraints, and
+        beads on smooth curves, turn in a substep, of (omega h)^2 / 24 in forces that differ from place to place, and of about
+        (omega h)^2 A / 12 where springs vibrate by a part A of their size; the frame is made again with more substeps until they
+        are met. It knows nothing of the errors of impacts, of what slides along curved walls or others, and of soft clusters.
         budget: seconds of computing that the frame may take; alone, it is spent for as many substeps as fit. The report says how
         many substeps there were, and has a flag when the aim was missed. Results of a budget depend on the speed of the machine.
 

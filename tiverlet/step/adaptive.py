@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import checks
+from ..constraints.core.scalar import Scalar
+from ..constraints.path import Path
 from ..solvers.slots import TENSEST
 from . import checkpoint, energy_bound
 from .clock import room
@@ -21,6 +23,7 @@ MOST = 4096  # substeps of a frame
 PASSES = 64  # iterations of a substep
 RESIDUAL, OVERLAP = 1e-2, 0.1  # what is good where the user asks for nothing else
 TENSION = 2.0  # (omega h)^2: half the limit of stability
+STIFF = 2.0  # omega h from where on a spring is as good as rigid
 FORCE = 0.06  # (omega h)^2: 25 substeps to a vibration, as molecular dynamics takes them
 RISKS = {"tunnelling-risk", "stiff-force", "non-finite"}
 GAIN = 1.4  # by which twice the effort has to lower the figures; of second order they fall by 4, of first order by 2
@@ -30,7 +33,7 @@ ROOM = 6.0  # by which the figures have to be better than asked before less is t
 PLENTY = 24.0  # four times that: what is left after a try has room again, and failures are forgotten
 PATIENCE = 64  # frames, at most, until it is tried again
 
-Figures = tuple[float, ...]  # residual, overlap, tension, turn, stiffness and energy, relative to what is asked
+Figures = tuple[float, ...]  # residual, overlap, tension, motion, stiffness and energy, relative to what is asked
 TENSE, ENERGY = 2, 5  # the places of the tension and, as the last one, the energy among them
 NOTHING: Figures = (1.0,) * 6
 WORST: Figures = (float("inf"),) * 6
@@ -47,7 +50,8 @@ class StepController:
     Where they bring in energy, more with each try, what is left violated could not be put right first, and the frame is the best
     of the tries.
     A body that turns by phi in a substep does so by phi^2 / 24 of that too fast or too slowly, a relative error as a residual is:
-    the 26 degrees above are one of 1e-2, and a tolerance that is asked for is asked of the turns of rigid constraints, too.
+    the 26 degrees above are one of 1e-2, and a tolerance that is asked for is asked of the turns of rigid constraints and of beads
+    on curves, too, and of the vibrations of springs, see vibrates().
     What vibrates or orbits in forces that differ from place to place is too fast by (omega h)^2 / 24 in the same way, of which
     0.06 is allowed. Where a frame got more than a fiftieth of the energy wrong, see energy_bound.missed(), it is made again while
     that helps. What does not help is no fault of the frame, for the energy before it was that of longer substeps.
@@ -95,8 +99,8 @@ class StepController:
             report = world._runner.advance(dt, n, k)
             took = perf_counter() - begun
             self.learn(took / (n * k))
-            angle, missed = turned(world) if tolerance else 0.0, energy_bound.missed(world, report, energy)
-            figures, risks = judge(report, tolerance, angle, stiffness(world), missed)
+            motion, missed = motion_error(world) if tolerance else 0.0, energy_bound.missed(world, report, energy)
+            figures, risks = judge(report, tolerance, motion, stiffness(world), missed)
             if tries.note(figures, risks, report.energy, world._runner.sheet.item(KINETIC)):
                 break
             if not tries.verdict and perf_counter() + 2 * took > end:
@@ -194,12 +198,54 @@ class Tries:
         return False
 
 
-def turned(world: "World") -> float:
-    """The largest angle [rad] by which a corner of a rigid constraint turned about its first one in the last substep."""
+def motion_error(world: "World") -> float:
+    """By how much constraints are too fast or too slow, at most, relative: by phi^2 / 24 where they turn by phi in a substep, and
+    where springs vibrate, see vibrates()."""
     state, memory = world._runner.scene.state, world._runner.memory
     x = state.get(memory)
-    d, worst = memory.read(state.d)[: len(x)].astype(np.float64), 0.0
+    d = memory.read(state.d)[: len(x)].astype(np.float64)
+    return max(turned(world, x, d) ** 2 / 24, vibrates(world, x, d))
+
+
+def vibrates(world: "World", x: np.ndarray, d: np.ndarray) -> float:
+    """The worst error of a spring that vibrates, after a last move d to x [m]: of an amplitude A, relative to its size, and
+
+        omega_h / omega - 1 = (omega h)^2 (1 / 24 - W / (8 w)),    omega^2 = w / alpha
+
+    with W = w of split masses: it is solved as a spring of compliance alpha + W h^2 / 4, see Equation. A is what its speed, how
+    much its length f changed in the substep, would carry it to, |f - f_0| / (omega h). What is stiffer than the substep, from
+    omega h = 2 on, does not vibrate, and is right to |f - f_0|.
+    """
+    runner, h, worst = world._runner, world._clock.h, 0.0
+    split = runner.memory.read(runner.scene.slots.split)[: len(x)] if runner.batches else None
+    for b in runner.batches:
+        if not (isinstance(b, Scalar) and b.arity and h):
+            continue
+        some = (b.compliance > 0) & ~b.broken
+        if some.any():
+            squares = (b.gradients(x) ** 2).sum(axis=2)
+            w, shared = ((each[b.indices] * squares).sum(axis=1) for each in (runner.scene.inv_mass, split))
+            some &= w > 0
+            now, before = (b.violation(each) for each in (x, x - d))
+            if b.side:
+                now, before = (np.maximum(b.side * each, 0) for each in (now, before))
+            changed = np.abs(now - before) * b.inverse_size(x)
+            omega = np.minimum(h * np.sqrt(w[some] / b.compliance[some]), STIFF)
+            worst = max(worst, float((changed[some] * omega * (shared[some] / w[some] / 8 - 1 / 24)).max(initial=0.0)))
+    return worst
+
+
+def turned(world: "World", x: np.ndarray, d: np.ndarray) -> float:
+    """The largest angle [rad] by which a corner of a rigid constraint turned about its first one in the last substep, or a bead
+    with its curve, after a move d to x [m]."""
+    memory, worst = world._runner.memory, 0.0
     for b in world._runner.batches:
+        if isinstance(b, Path) and b.curve.smooth:
+            place, who = b.dev.place, b.indices[:, 0]
+            s = b.curve.starts[memory.read(place.piece)[: b.count]] + memory.read(place.rest)[: b.count]
+            way = b.curve.tangent(s)
+            back = b.curve.tangent(s - (way * d[who]).sum(axis=1))
+            worst = max(worst, float(((way - back) ** 2).sum(axis=1).max()))
         rigid = np.broadcast_to(getattr(b, "compliance", 0.0) == 0, b.count)
         if b.count and b.indices.size > b.count and rigid.any() and not getattr(b, "side", 0):
             starts = np.arange(b.count + 1) * b.arity if b.arity else b.members.starts
@@ -234,9 +280,9 @@ def pumps(energies: list[float], kinetic: float) -> bool:
 
 
 def judge(
-    report: StepReport, tolerance: float | None, angle: float, stiffness: float, missed: float
+    report: StepReport, tolerance: float | None, motion: float, stiffness: float, missed: float
 ) -> tuple[Figures, set[str]]:  # fmt: skip
-    """How residual, overlap, tension, turn, stiffness and energy compare with what is asked (1: just met), and what shorter
+    """How residual, overlap, tension, motion, stiffness and energy compare with what is asked (1: just met), and what shorter
     substeps have to remove."""
     risks = set(report.flags & RISKS)
     if report.turn:
@@ -247,7 +293,7 @@ def judge(
         report.residual / (tolerance or RESIDUAL),
         report.overlap / (tolerance or OVERLAP),
         report.tension / TENSION,
-        angle**2 / (24 * (tolerance or RESIDUAL)),
+        motion / (tolerance or RESIDUAL),
         stiffness / (24 * tolerance if tolerance else FORCE),
         missed,
     )
