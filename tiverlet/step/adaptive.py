@@ -50,8 +50,8 @@ class StepController:
     Where they bring in energy, more with each try, what is left violated could not be put right first, and the frame is the best
     of the tries.
     A body that turns by phi in a substep does so by phi^2 / 24 of that too fast or too slowly, a relative error as a residual is:
-    the 26 degrees above are one of 1e-2, and a tolerance that is asked for is asked of the turns of rigid constraints and of beads
-    on curves, too, and of the vibrations of springs, see vibrates().
+    the 26 degrees above are one of 1e-2, and a tolerance that is asked for is asked of the turns of rigid constraints and of
+    beads on curves, too, and of the vibrations of springs, see vibrates().
     What vibrates or orbits in forces that differ from place to place is too fast by (omega h)^2 / 24 in the same way, of which
     0.06 is allowed. Where a frame got more than a fiftieth of the energy wrong, see energy_bound.missed(), it is made again while
     that helps. What does not help is no fault of the frame, for the energy before it was that of longer substeps.
@@ -217,13 +217,12 @@ def vibrates(world: "World", x: np.ndarray, d: np.ndarray) -> float:
     omega h = 2 on, does not vibrate, and is right to |f - f_0|.
     """
     runner, h, worst = world._runner, world._clock.h, 0.0
-    split = runner.memory.read(runner.scene.slots.split)[: len(x)] if runner.batches else None
     for b in runner.batches:
         if not (isinstance(b, Scalar) and b.arity and h):
             continue
         some = (b.compliance > 0) & ~b.broken
         if some.any():
-            squares = (b.gradients(x) ** 2).sum(axis=2)
+            squares, split = (b.gradients(x) ** 2).sum(axis=2), runner.memory.read(runner.scene.slots.split)[: len(x)]
             w, shared = ((each[b.indices] * squares).sum(axis=1) for each in (runner.scene.inv_mass, split))
             some &= w > 0
             now, before = (b.violation(each) for each in (x, x - d))
