@@ -391,7 +391,7 @@ class Reporter:
             return ()
         need = np.ceil(substeps * np.sqrt(residual / LOST)) + 1  # of order h^2 at least
         return (
-            f"Constraints are off by {100 * residual:.3g} % of their size; beyond {100 * LOST:g} % they are damped, and what turns "
+            f"Constraints are off by {100 * residual:.3g} % of their size; beyond {100 * LOST:g} % they are damped: what turns "
             f"loses energy and angular momentum. Use about {need:.7g} substeps, or more steps of the solver.",
         )
 
