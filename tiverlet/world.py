@@ -132,8 +132,10 @@ class World:
 
         Without tolerance and budget the frame has `substeps` substeps; with substeps="auto", as many as it needs to be stable.
         tolerance: upper bound of the residual and the overlap, both relative; of phi^2 / 24, for the angle phi by which rigid
-        constraints turn in a substep; and of (omega h)^2 / 24 for forces that vary in space. The frame is repeated with more
-        substeps until all of these are met.
+        constraints, and beads on smooth curves, turn in a substep; of (omega h)^2 / 24 for forces that vary in space; and of
+        about (omega h)^2 A / 12 for springs that vibrate by a share A of their size. The frame is repeated with more substeps
+        until all of these are met. It does not cover errors of impacts, of sliding along curved walls or particles, and of soft
+        clusters.
         budget: seconds of computing that the frame may take. Without tolerance, it is spent on as many substeps as fit. The
         report gives the number of substeps, and has a flag if the aim was missed. Results of a budget depend on the speed of the
         machine.

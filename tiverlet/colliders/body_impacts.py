@@ -1,4 +1,4 @@
-"""Impacts of bodies on walls: where a struck particle is linked to other particles."""
+"""Impacts of bodies on walls and on each other: where a struck particle is linked to other particles."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +12,9 @@ if TYPE_CHECKING:
 FEW, MANY = 8, 32
 MET = 2.0**-9  # of the first push: a smaller error of the normal displacement counts as met
 LIGHTEST = 2.0**-7  # the least share that a particle may have in the mass that its impact stops
+CAREFUL = 0.55  # the same if impacts of pairs may change each other: projections converge with steps of less than 1 / 0.5
 FELT = 2.0**-20  # of a squared displacement: a smaller change is no impact
-STRUCK_NOW, STRUCK_BEFORE = 1, 2  # a particle is struck: in the pass in which it meets the wall, and in later passes
+STRUCK_NOW, STRUCK_BEFORE = 1, 2  # a particle is struck: in the pass in which it meets the wall or particle, and in later passes
 
 
 def can_have_impacts(scene: "Scene", batches: "list[Batch]") -> bool:
@@ -47,12 +48,18 @@ class BodyImpacts:
     removed all at once, they would become speed. Contacts wait for the next substep. A particle that approaches by no more than
     SLOW substeps of forces and links add does not bounce, see Surface.
 
-    open: for each pass beyond the regular ones of every substep, whether it is needed.
+    Two particles that strike each other, at least one of them linked, obey the same law with the displacement of one relative to
+    the other, along their normal; each takes its share of the push by mass. Both sides compute the same push before either
+    moves. A particle has one impact of this kind in a substep, on a wall or on a particle; in others it bounces alone.
+
+    open: for each pass beyond the regular ones of every substep, whether it is needed. pairs: whether particles strike each
+    other.
     """
 
-    def __init__(self, scene: "Scene", batches: "list[Batch]"):
+    def __init__(self, scene: "Scene", batches: "list[Batch]", pairs: bool):
         system = scene.slots.system
-        self.passes = FEW if system else MANY
+        self.passes = FEW if system and not pairs else MANY
+        self.lightest = CAREFUL if pairs else LIGHTEST
         self.spreads = not system  # from link to link; a system solves all links at once
         self.exact = bool(scene.slots.exact and (not system or system.left_out(batches) == 0))
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
@@ -68,6 +75,11 @@ class BodyImpacts:
         self.log = add("impacts.log", n, kind=ti.i32)  # of the wall, by its number, or -1
         self.reached = add("impacts.stirred", n, kind=ti.i32, state=True)  # whether an impact of the last substep has reached it
         self.open = add("impacts.open", self.passes + 1, kind=ti.i32)
+        self.pairs = pairs
+        if pairs:
+            self.partner = add("impacts.partner", n, kind=ti.i32)  # the particle that was struck; -1 for a wall
+            self.ready = add("impacts.ready", n, kind=ti.i32)  # whether it had struck nothing when the round of bounces began
+            self.change = add("impacts.change", n, width=dim)
 
     def add_log(self, log: Any) -> int:
         """Return the number of a log; -1 for None."""
@@ -158,6 +170,8 @@ class BodyImpacts:
         out = self.struck[i] == 0 and self.open[ti.static(self.passes - 1)] == 0
         if out:
             self.struck[i] = STRUCK_NOW
+            if ti.static(self.pairs):
+                self.partner[i] = -1
             self.normal[i], self.moved[i], self.target[i] = n, moved, target
             self.pushed[i] = self.last_push[i] = 0 * target
             self.coefficients[i] = [static, dynamic]
@@ -171,30 +185,21 @@ class BodyImpacts:
 
         Otherwise each of the two walls would amplify the push of the other.
         """
-        if self.struck[i] == STRUCK_BEFORE and n.dot(self.normal[i]) < 0:
+        if self.struck[i] == STRUCK_BEFORE and self.by_wall(i) and n.dot(self.normal[i]) < 0:
             self.target[i] = ti.min(self.target[i], 0)
 
     @ti.func
     def correct_push(self, i):
-        """Push particle i towards its target, or correct the push. Returns whether its displacement was off."""
+        """Push particle i, which struck a wall, towards its target, or correct the push. Returns whether its displacement was
+        off."""
         off = False
-        if self.struck[i] != 0:
+        if self.struck[i] != 0 and self.by_wall(i):
             n, d = self.normal[i], self.state.d[i] - self.moved[i]
-            miss = self.target[i] - d.dot(n)
-            if self.struck[i] == STRUCK_NOW:
-                self.first_push[i] = miss
-            self.struck[i] = STRUCK_BEFORE
-            off = ti.abs(miss) > ti.static(MET) * self.first_push[i]
-            part = 1 + 0 * miss
-            if ti.static(self.exact):
-                if self.last_push[i] != 0:
-                    part = ti.max(ti.static(LIGHTEST), ti.min((self.last_miss[i] - miss) / self.last_push[i], 1))
-            pushed = ti.max(self.pushed[i] + miss / part, 0)
-            change = (pushed - self.pushed[i]) * n
+            off, push = self.missing_push(i, d.dot(n))
+            change, pushed = push * n, self.pushed[i]
             for k in ti.static(range(len(self.logs))):
                 if self.log[i] == k:
                     self.logs[k].add(i, change)
-            self.last_push[i], self.last_miss[i], self.pushed[i] = pushed - self.pushed[i], miss, pushed
             held = self.held[i] + d - d.dot(n) * n
             size = held.norm()
             if size > self.coefficients[i][0] * pushed:
@@ -206,3 +211,71 @@ class BodyImpacts:
             if ti.static(self.state.keeps_wall_push):
                 self.state.wall_push[i] = self.state.wall_push[i] + change
         return off
+
+    @ti.func
+    def missing_push(self, i, has):
+        """Return whether the normal displacement `has` of particle i is off, and the push that it needs in this pass."""
+        miss = self.target[i] - has
+        if self.struck[i] == STRUCK_NOW:
+            self.first_push[i] = miss
+        self.struck[i] = STRUCK_BEFORE
+        part = 1 + 0 * miss
+        if ti.static(self.exact):
+            if self.last_push[i] != 0:
+                part = ti.max(ti.static(self.lightest), ti.min((self.last_miss[i] - miss) / self.last_push[i], 1))
+        pushed = ti.max(self.pushed[i] + miss / part, 0)
+        push = pushed - self.pushed[i]
+        self.last_push[i], self.last_miss[i], self.pushed[i] = push, miss, pushed
+        return ti.abs(miss) > ti.static(MET) * self.first_push[i], push
+
+    @ti.func
+    def by_wall(self, i):
+        """Whether particle i struck a wall, not another particle."""
+        out = True
+        if ti.static(self.pairs):
+            out = self.partner[i] < 0
+        return out
+
+    @ti.func
+    def begin_round(self, i):
+        """At the start of a round of bounces of pairs: note whether particle i has struck nothing before."""
+        self.ready[i] = ti.cast(self.struck[i] == 0, ti.i32)
+
+    @ti.func
+    def has_struck(self, i, j):
+        """Whether particle i has struck particle j in this substep, so that extra passes push them."""
+        return self.struck[i] != 0 and self.partner[i] == j
+
+    @ti.func
+    def record_pair_impact(self, i, j, n, target):
+        """Record that particle i is to leave particle j with the relative displacement `target` along n, from j to i.
+
+        It is called for both particles in the same round. Returns whether a later pass does that, as record_impact() does.
+        """
+        out = (self.is_linked(i) or self.is_linked(j)) and self.ready[i] != 0 and self.ready[j] != 0
+        if out and self.state.w.positive(i):
+            self.struck[i] = STRUCK_NOW
+            self.partner[i] = j
+            self.normal[i], self.target[i] = n, target
+            self.pushed[i] = self.last_push[i] = 0 * target
+        return out
+
+    @ti.func
+    def compute_pair_push(self, i):
+        """Compute the push of particle i, if it struck another. No particle moves before push_pair().
+
+        Returns whether its relative displacement was off, and the relative push.
+        """
+        off, push = False, 0 * self.target[i]
+        if self.struck[i] != 0 and not self.by_wall(i):
+            j, n, w = self.partner[i], self.normal[i], self.state.w.of(i)
+            off, push = self.missing_push(i, self.state.slid(self.state.d[i] - self.state.d[j], i, j).dot(n))
+            self.change[i] = w / (w + self.state.w.of(j)) * push * n
+        return off, push
+
+    @ti.func
+    def push_pair(self, i):
+        """Push particle i by what compute_pair_push() found."""
+        if self.struck[i] != 0 and not self.by_wall(i):
+            self.state.shift(i, self.change[i])
+            self.reached[i] = 1

@@ -194,6 +194,11 @@ class Contact(PairContact):
         dev.projection = VelocityProjection(scene, dev.list, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
         return dev.search
 
+    @property
+    def strikes_bodies(self) -> bool:
+        """Whether bodies of linked particles bounce as wholes: with restitution, unless friction turns particles."""
+        return self.dev.has_restitution and not self.dev.spins
+
     @ti.func
     def presses(self, i, e):
         """Whether particle i and the particle at entry e of its list press on each other."""

@@ -140,6 +140,11 @@ class PairContact(Feature):
         return self._pairs.has_restitution or "has_restitution" in self.once
 
     @property
+    def strikes_bodies(self) -> bool:
+        """Whether bodies of linked particles bounce off each other as wholes, see BodyImpacts."""
+        return False
+
+    @property
     def turns(self) -> bool:
         """Whether any pair has rolling, twisting or tangential restitution, now or when kernels were compiled."""
         return self._pairs.turns or "turns" in self.once

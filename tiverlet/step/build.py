@@ -171,8 +171,12 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     size = size_of(path, scale.work)
     team = Team(memory, size, len(particles), path == "parallel" and size == 1, pieces=PIECES if contact else size)
     search = contact.join(scene, batches, team) if contact else None
-    if can_have_impacts(scene, batches) and any(w.has_restitution for w in walls):
-        scene.impacts = BodyImpacts(scene, batches)
+    if can_have_impacts(scene, batches):
+        pairs = bool(contact and contact.strikes_bodies)
+        if pairs or any(w.has_restitution for w in walls):
+            scene.impacts = BodyImpacts(scene, batches, pairs)
+        if contact and pairs:
+            contact.dev.restitution.bind(scene, scene.impacts)
     for feature in of(Batch):
         feature.scene = scene  # also for those that do nothing, because all of their particles are held
     for feature in [*accelerations, *drivers, *batches, *walls]:

@@ -68,6 +68,9 @@ def substep(do, now):
                     for _ in range(REBOUNDS):
                         if this_pass.first != 0 and do.any_struck() != 0:
                             do.rebound(this_pass)
+                if ti.static(do.has_pair_impacts):
+                    if not do.is_regular(now, half):
+                        do.push_bodies(this_pass)
                 do.apply_corrections(this_pass)
     if ti.static(do.finishes):
         if do.ends_substep(now):
@@ -111,6 +114,7 @@ class Step:
         self.halves = 2 if batches and contact else 1  # of a pass; each begins with a valid list
         self.impacts: Any = scene.impacts
         self.has_impacts = bool(scene.impacts)
+        self.has_pair_impacts = self.has_impacts and self.impacts.pairs
         self.newton_steps = 2 if scene.slots and scene.slots.refines else 1  # most of them in a pass
         self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
         self.orients = self.state.spins and self.state.spin.orients
@@ -454,6 +458,11 @@ class Step:
     def rebound(self, now):
         """One round of restitution."""
         self.contact_pass.rebound(now.thread)
+
+    @ti.func
+    def push_bodies(self, now):
+        """In extra passes: push bodies that struck each other."""
+        self.contact_pass.push_bodies(now)
 
     @ti.func
     def apply_corrections(self, now):
