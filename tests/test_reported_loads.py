@@ -196,3 +196,28 @@ def test_what_sags_holds_where_the_substep_gets_shorter(world):
         w.run(0.5, dt=1 / 60 / ratio)
         np.testing.assert_allclose(np.abs(angles.load), [4 * G, G], rtol=1e-4)
         assert not angles.broken.any()
+
+
+def test_what_is_moved_steadily_bears_its_weight_in_f32(world):
+    # What is lifted without acceleration bears m g, whatever lifts it: a winch, rest lengths, pins or paths. Coordinates of 3 m
+    # end at e = 2^-22 m in f32: where a rest value or a place is rounded to that it jerks, by m e / h^2 = 17 N here. Angles
+    # likewise, by I e / (r h^2): a motor that turns a spoke of 1 m steadily gives m g cos(angle), and a bend holds m g 1 m.
+    h, speed = 1 / 6000, 0.5
+    bodies = Bodies(2)
+    bodies.put(HANGING, lambda p: tv.Winch(p, -speed), WEIGHT, held=1)
+    lifted = bodies.put(HANGING, tv.Distance, WEIGHT, held=1)
+    bodies.put(HANGING, tv.Distance, WEIGHT, held=0)
+    bodies.put(HANGING, tv.Distance, WEIGHT, held=0)
+    bodies.put(BENT, lambda p: tv.Motor(p, speed), WEIGHT, held=2)
+    bodies.put(BENT, tv.Bend, -WEIGHT, held=2)
+    spokes = tv.Distance([[9, 10], [12, 13]])
+    pin = tv.Pin([4], bodies.x[4])
+    path = tv.Path([6], [bodies.x[6], bodies.x[6] + np.array([0.0, 9.0])], speed=speed)
+    bodies.features += [pin, path, spokes]
+    w = bodies.world(world, substeps=100, precision="f32", solver=tv.Direct())
+    for frame in range(40):
+        lifted.rest, pin.target = 2 - speed * (frame + 1) / 60, bodies.x[4] + np.array([0.0, speed * (frame + 1) / 60])
+        w.step(100 * h)
+        turned = speed * (w.time - h)
+        expected = [*bodies.loads[:4], -WEIGHT * np.cos(turned), bodies.loads[5]]
+        np.testing.assert_allclose([f.load[0] for f in bodies.features[:6]], expected, rtol=1e-3)

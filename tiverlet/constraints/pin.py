@@ -57,9 +57,13 @@ class Target(Place):
     def drive(self, c, h, frame_fraction):
         """Put the particle on the target."""
         i = self.corners.member(c, 0)
-        d = self.aim(c, frame_fraction) - self.state.place(i)
-        self.state.d[i] = d
-        self.state.advance(i, d)
+        if ti.static(self.state.sums):  # else what hangs on it would be jerked, with rounding / h^2
+            source, target = ti.cast(self.source[c], ti.f64), ti.cast(self.target[c], ti.f64)
+            self.state.bring(i, source + (target - source) * frame_fraction)
+        else:
+            d = self.aim(c, frame_fraction) - self.state.place(i)
+            self.state.d[i] = d
+            self.state.advance(i, d)
 
     @ti.func
     def offsets(self, c, frame_fraction, first, fresh):

@@ -220,6 +220,13 @@ class State:
             self.x[i] = self.x[i] + d
 
     @ti.func
+    def bring(self, i, place):
+        """Particle i goes to a place in f64, where positions are sums."""
+        self.d[i] = ti.cast(place - ti.cast(self.x[i], ti.f64) - ti.cast(self.low[i], ti.f64), self.real)
+        self.x[i] = ti.cast(place, self.real)
+        self.low[i] = ti.cast(place - ti.cast(self.x[i], ti.f64), self.real)
+
+    @ti.func
     def shift(self, i, move):
         """A correction: the same move to x_i and to d_i, so that x - d stays the start of the substep."""
         if ti.static(self.carries):

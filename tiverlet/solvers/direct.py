@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import checks
-from ..device import ti
+from ..device import runtime, ti
 from ..device.number import OnDevice
 from ..features.feature import Batch, Scene
 from .corners import corners_of
@@ -138,7 +138,9 @@ class Elimination(System):
         least = np.concatenate([np.where(p > 0, p, np.inf).min(axis=1, initial=np.inf) for p in parts])[found.rows]
         small = np.where(np.isfinite(least), SMALL_PIVOT * least, 0.0)
         self.small_pivot = scene.memory.field("system.small", self.rows, kind=ti.f64, values=small)
-        self.precise = [(k, b) for k, b in enumerate(scalars) if b.quantity.precise and scene.real == ti.f32]
+        llvm = runtime.architecture() in runtime.LLVM  # which has all functions in f64
+        exact = [b.quantity.precise and scene.real == ti.f32 and (llvm or not b.quantity.transcends) for b in scalars]
+        self.precise = [(k, b) for k, b in enumerate(scalars) if exact[k]]
         if self.precise:
             batch = np.repeat(np.arange(len(scalars)), [b.count for b in scalars])[found.rows]
             number = np.concatenate([np.arange(b.count) for b in scalars])[found.rows]
@@ -361,6 +363,8 @@ class Elimination(System):
             for k, b in ti.static(self.precise):
                 if self.batch[r] == k and self.alpha[r] == 0 and self.scale[r] != 0:
                     self.violation[r] = b.dev.quantity.exactly(self.number[r])
+                    if ti.static(b.dev.limit.acts):
+                        self.violation[r] -= b.dev.limit.postponed[self.number[r]]
 
     @ti.func
     def limit_tensions(self, begin, end):

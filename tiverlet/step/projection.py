@@ -161,7 +161,7 @@ def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: Aims) -> tuple["
     at the start."""
     state, memory, before = runner.scene.state, runner.memory, rows.x
     enough = aims.share * start.stored
-    stopped: np.ndarray = rows.wall.any(axis=1)
+    stopped = np.linalg.norm(rows.wall, axis=1) > 0
     for _ in range(TURNS):
         state.put(memory, _newton(rows, enough, aims))
         sent = state.get(memory)

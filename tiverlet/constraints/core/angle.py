@@ -9,7 +9,7 @@ from ... import checks
 from ...device import called_with, inline, ti
 from ...features.feature import Knob
 from ...geometry.intervals import cross
-from .quantity import Quantity
+from .quantity import Quantity, rest_exactly
 
 TURN = 2 * np.pi
 SHORT = 1e-24  # [m^2] squared length below which a link has no direction, in f32 and far below any in use
@@ -31,7 +31,7 @@ def corners_of(angle: Any) -> Any:
 class Angle(Quantity):
     """Angles: those that are whole turns apart mean the same, and residuals are in radians."""
 
-    unit, transcends, curved = 1.0, True, True
+    unit, transcends, curved, precise = 1.0, True, True, True
 
     def difference(self, f: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """How far angles are from others, in (-pi, pi]."""
@@ -41,6 +41,16 @@ class Angle(Quantity):
     def unwrap(self, f, other):
         """f plus whole turns, within half a turn of `other`."""
         return wrapped(f, other)
+
+    @ti.func
+    def excess(self, c, f):
+        """f - rest, to all digits of the low words, where there are any."""
+        return excess_of(self, c, f)
+
+    @ti.func
+    def exactly(self, c):
+        """f - rest in f64, within half a turn of 0."""
+        return exactly_off(self, c)
 
     @called_with(lambda self: ((ti.i32, corners_of(self)), (self.real, corners_of(self))))
     @ti.func
@@ -89,6 +99,27 @@ class DihedralAngle(Angle):
     def measure(self, c, q):
         """See dihedral_angle()."""
         return dihedral_angle(q)
+
+
+@ti.func
+def excess_of(angle: ti.template(), c, f):  # type: ignore[valid-type]
+    """See Angle.excess()."""
+    C = f - angle.rest[c]
+    if ti.static(angle.state.carries):
+        C = ti.cast(wrapped(exactly_off(angle, c), ti.cast(C, ti.f64)), angle.real)
+    return C
+
+
+@ti.func
+def exactly_off(angle: ti.template(), c):  # type: ignore[valid-type]
+    """See Angle.exactly()."""
+    q = ti.Matrix.zero(ti.f64, angle.arity, angle.state.dim)
+    for k in ti.static(range(1, angle.arity)):
+        r = angle.state.between(angle.corners.member(c, k), angle.corners.member(c, 0))
+        for a in ti.static(range(angle.state.dim)):
+            q[k, a] = r[a]
+    f, _gradients = angle.measure(c, q)
+    return wrapped(f - rest_exactly(angle, c), ti.cast(0, ti.f64))
 
 
 def turned(C: np.ndarray) -> np.ndarray:

@@ -72,11 +72,15 @@ class OnCurve(Place):
                 low = middle
             else:
                 high = middle
-        P, T = self.point(low, ti.cast(s - self.begin[low], self.real))
         i = self.corners.member(c, 0)
-        d = P - self.state.place(i)
-        self.state.d[i] = d
-        self.state.advance(i, d)
+        if ti.static(self.state.sums):
+            P, T = self.point(low, s - self.begin[low])
+            self.state.bring(i, P)
+        else:
+            P, T = self.point(low, ti.cast(s - self.begin[low], self.real))
+            d = P - self.state.place(i)
+            self.state.d[i] = d
+            self.state.advance(i, d)
 
     @ti.func
     def search(self, x):

@@ -38,6 +38,8 @@ class Quantity:
     real: Any
     corners: Any
     rest: Any
+    drive: Any
+    ramp: Any
 
     def __init__(self, members: Any):
         self.members = members
@@ -73,7 +75,7 @@ class Quantity:
         """The same for the kernels of a batch, whose corners and rest values its equation has."""
         bound = copy(self)
         bound.state, bound.real = scene.state, scene.real
-        bound.corners, bound.rest = equation.corners, equation.rest
+        bound.corners, bound.rest, bound.drive, bound.ramp = equation.corners, equation.rest, equation.drive, equation.ramp
         return bound
 
     def frame(self, corners: Any) -> Any:
@@ -123,6 +125,17 @@ class Quantity:
     def direction_reliable(self, f, f0):
         """Whether directions at f (now) and f0 (at the start) are clear enough to tell a turn of 41 degrees."""
         return True
+
+
+@ti.func
+def rest_exactly(quantity: ti.template(), c):  # type: ignore[valid-type]
+    """The rest value of constraint c in f64. In f32, one that moves would jerk, with rounding / h^2."""
+    rest = ti.cast(quantity.rest[c], ti.f64)
+    if ti.static(bool(quantity.drive)):
+        rest = quantity.drive.target[c]
+    if ti.static(quantity.ramp.made):
+        rest += quantity.ramp.low[c]
+    return rest
 
 
 def differences(values: Callable, x: np.ndarray) -> np.ndarray:

@@ -21,14 +21,14 @@ class Ramp:
 
     batch: the Scalar, whose tracks() say what moves. What a ramp needs on the device is `made` when rest values are assigned for
     the first time, in a `memory` of its own: until then it costs nothing. under_way: whether rest values go to others in the
-    coming frame. step: how far the first of the tracks goes in this substep.
+    coming frame. step: how far the first of the tracks goes in this substep; low: what rounding takes from where it is then.
     """
 
     host_only = ("memory", "under_way")
 
     def __init__(self, memory: "Memory", batch: Any):
         self._memory, self._batch, self.memory = memory, batch, memory
-        self.made = self.under_way = False
+        self.made, self.under_way, self.real = False, False, memory.real
 
     @property
     def waits(self) -> bool:
@@ -83,6 +83,7 @@ class Ramp:
         self.put(goals)
         if self.made:
             self._aim(goals, goals)
+            self.memory.write(self.low, np.zeros(self.shape[1]))
         self.under_way = False
 
     def _make(self) -> None:
@@ -92,17 +93,18 @@ class Ramp:
         self.begin = [self.memory.field(f"{name}.rest_at_begin", m) for _ in self.fields]
         self.goal = [self.memory.field(f"{name}.rest_at_end", m) for _ in self.fields]
         self.step = self.memory.field(f"{name}.step_of_rest", m)
+        self.low = self.memory.field(f"{name}.rest_low", m)
         self.memory.place()
         self.made = True
 
     def adopt(self, before: "Ramp") -> None:
         """Take what was made for the same batch when it had other constraints."""
         self.fields, self.memory, self.made = before.fields, before.memory, True
-        self.begin, self.goal, self.step = before.begin, before.goal, before.step
+        self.begin, self.goal, self.step, self.low = before.begin, before.goal, before.step, before.low
 
     def fit(self) -> None:
         """Have a row for each constraint that there is now. Nothing is on its way."""
-        for field in (*self.begin, *self.goal, self.step):
+        for field in (*self.begin, *self.goal, self.step, self.low):
             self.memory.resize(field, self._batch.count)
         self.arrive()
 
@@ -119,3 +121,5 @@ class Ramp:
             self.fields[k][c] = self.goal[k][c] - way * (1 - frame_fraction[1])
             if ti.static(k == 0):
                 self.step[c] = way * (frame_fraction[1] - frame_fraction[0])
+                now = ti.cast(self.goal[k][c], ti.f64) - ti.cast(way, ti.f64) * (1 - frame_fraction[1])
+                self.low[c] = ti.cast(now - self.fields[k][c], self.real)
