@@ -4,10 +4,11 @@ A pass holds a load F by a violation Z = D h^2 F, beside what its compliance tak
 A shorter substep h' makes that spring stiffer while it is stretched, and its energy (h / h')^2 times as large. So positions
 first go to where the same loads need the violations (h' / h)^2 Z, and velocities to where they do not change:
 
-    x += w J^T lam,  C(x) = C - (1 - (h' / h)^2) Z;     v += w J^T lam,  (J w J^T + mu) lam = -J v
+    x += w J^T lam,  C(x) = C - (1 - (h' / h)^2) Z;     v += w J^T lam,  (J w J^T + mu) lam = u - J v
 
-Z, C + alpha lam / h^2 for what is at rest, is what the last substep left of a constraint; springs that it resolves stay as they
-are. Positions move without velocities, as contacts do that an impact left overlapping.
+with u how fast rest values go, as those of motors do. Z, C + alpha lam / h^2 for what is at rest, is what the last substep left
+of a constraint; springs that it resolves stay as they are. Positions move without velocities, as contacts do that an impact left
+overlapping.
 
 Where contacts are in the way, they are rows, too (ContactRows), and what they lead into are others, in a few rounds. Beads stay
 on their wires (Rails), and free bodies keep their angular momentum (FreeBodies).
@@ -24,6 +25,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ..constraints.core.drive import STALL
 from ..constraints.core.scalar import Scalar
 from ..neighbours.queries import between
 from ..particles import LARGEST
@@ -73,12 +75,14 @@ class Aims(NamedTuple):
     done: float
 
 
-def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | None = None) -> bool | None:
+def project(
+    runner: "Runner", h: float, dt: float, longest: float, contacts: ContactRows | None = None
+) -> bool | None:  # fmt: skip
     """Take out what violations would store; d holds velocities. Nothing happens where they are small, or would overlap.
 
-    h: the coming substep [s]; longest: since this was done last. contacts: which move together with links. Returns whether
-    positions have been looked after; None where contacts are in the way of what would be more than a hundredth of the kinetic
-    energy.
+    h: the coming substep [s], of a frame dt; longest: since this was done last. contacts: which move together with links. Returns
+    whether positions have been looked after; None where contacts are in the way of what would be more than a hundredth of the
+    kinetic energy.
     """
     ratio = h / longest
     slots = runner.scene.slots
@@ -110,7 +114,7 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     steps = LOOKS if slots.converges or slots.exact else 0
     slight = SLIGHTEST * 2 * h * h * start.kinetic(v[:n])
     still = (undone != 0) & (start.theta > FIRM) & ~start.touches
-    v[:n] += rows.jacobian.solve(-rows.jacobian.rates(v[:n]) * still, still)
+    v[:n] += rows.jacobian.solve((rows.pace(runner, h, dt) - rows.jacobian.rates(v[:n])) * still, still)
     energy, overlap = seen_before(runner)
     finest = ratio**4 if frail else ratio**2  # by loads, or by energies
     aims = Aims(LEFT * finest, steps, 0.0 if frail else slight, SHARED if contacts else PRODUCTS, DONE[frail])
@@ -228,6 +232,17 @@ def _off(batch: Scalar, x: np.ndarray) -> float:
     """The worst violation of rigid constraints, as a share of their size: what Newton's method left of it, as after an impact."""
     C = batch.violation(x) * batch.inverse_size(batch.start.position) * (batch.compliance == 0) * ~batch.broken
     return float((np.abs(C) if batch.side == 0 else C * batch.side).max(initial=0.0))
+
+
+def _pace(runner: Any, batch: Any, x: np.ndarray, h: float, dt: float) -> np.ndarray:
+    """How fast the rest value of each constraint goes in the coming substep h, of a frame dt, (m,); 0 where it waits at x."""
+    if getattr(batch, "driven", False):
+        off = np.abs(batch.violation(x)) * batch.inverse_size(batch.start.position)
+        return batch.dev.equation.drive.rates(h)[: batch.count] * (off < STALL)
+    if any(batch is b for b in runner.ramping):
+        _field, goal, difference = batch.tracks()[0]
+        return -difference(batch.ramp.now()[0], goal) / dt
+    return np.zeros(batch.count)
 
 
 def seen(runner: Any) -> tuple[float, float]:
@@ -416,6 +431,10 @@ class Rows:
             for b in self.batches
         ]
         return self._bounded(gamma * self.C + (1 - gamma) * self._bounded(self._each(before)) + self._each(borne))
+
+    def pace(self, runner: Any, h: float, dt: float) -> np.ndarray:
+        """How fast rest values go in the coming substep h, of a frame dt."""
+        return self._each([_pace(runner, b, self.x, h, dt) for b in self.batches])
 
     def would_break(self, undone: np.ndarray, h: float, longest: float) -> bool:
         """Whether a violation pulls harder in a substep h than it did, by so much that it counts beside what breaks its row."""

@@ -140,10 +140,10 @@ class Runner:
                 self.restart(iterations)
                 if h < clock.longest and not self.probe:
                     released = release(self, h, clock.longest)
-                    projected = project(self, h, clock.longest)
+                    projected = project(self, h, dt, clock.longest)
                     # Links and contacts have to move together. Where frames are of slightly uneven length, stacks would walk off.
                     if projected is None and (dt == clock.frame[1] or 2 * h <= clock.longest):
-                        projected = project(self, h, clock.longest, ContactRows.of(self))
+                        projected = project(self, h, dt, clock.longest, ContactRows.of(self))
                     if projected is None and not released:
                         released = release(self, h, clock.longest, small=True)
                     if projected or projected is None or released:
