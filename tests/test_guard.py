@@ -562,6 +562,28 @@ def test_what_an_impact_left_of_a_link_is_no_spring_where_a_wall_holds_it(world)
     assert report.residual < 1e-3 and report.energy < before.energy + m * g * L * before.residual
 
 
+def test_motors_and_muscles_go_on_where_the_substep_gets_shorter(world):
+    # A crank that a motor turns at 6 rad/s pushes a slider, and a muscle between two braced squares gets shorter by 0.5 m/s. They
+    # do so at any substep: links lag by some (6 h)^2 and muscles by what the mass that they draw needs, and that goes. With
+    # J v = 0 for motors and muscles, too, they were stopped, and had to get up speed in the next substep: 6.9 rad/s and 0.61 m/s.
+    crank, rod, diagonal = 0.3, 1.0, 2**0.5
+    x = [[-1, 5], [0, 5], [crank, 5], [crank + rod, 5], [0, 0], [1, 0], [2, 0], [1, -1], [2, -1]]
+    links = [[1, 2], [2, 3], [4, 5], [5, 6], [7, 8], [5, 7], [6, 8], [5, 8], [6, 7]]
+    start = tv.Particles(x, mass=[1.0] * 4 + [2.0] * 5, pinned=[0, 1, 4])
+    for turns, most in (((2, 8), 0.03), ((4, 30), 0.01)):
+        muscle, motor, wire = tv.Distance([[4, 7]]), tv.Motor([[0, 1, 2]], speed=6.0), tv.Path([3], [(0.0, 5.0), (3.0, 5.0)])
+        features = [motor, wire, tv.Distance(links), muscle]
+        w = world(start, features, substeps=turns[0], precision="f64", solver=tv.Jacobi())
+        for frame in range(36):
+            w.substeps = turns[frame >= 30]
+            muscle.rest = diagonal - 0.5 * (frame + 1) / 60
+            w.step(1 / 60)
+            if frame >= 30:
+                along = w.position[7] - w.position[4]
+                assert np.linalg.norm(w.velocity[2]) == pytest.approx(6 * crank, rel=most), frame
+                assert w.velocity[7] @ along / np.linalg.norm(along) == pytest.approx(-0.5, rel=most), frame
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_what_stands_stays_on_its_feet_where_the_substep_gets_shorter(world, dim):
     # A block of links, twice as high as wide, on a slope of 15 degrees with friction 0.6 > tan 15: its weight acts through

@@ -64,16 +64,21 @@ class Rebuild:
         """Store the state. If the forces on remaining particles will change, displacements become velocities first."""
         runner = self.world._runner
         runner.note_displacements()
-        pulled = (self.added is not None or not self.some.all()) and runner.step.has_pair_forces  # by other particles than before
         if any(isinstance(f, Collider) for f in self.went):
             self.world._let_go()
-        elif pulled or self.world._force_waits or any(map(self._drives, (*self.came, *self.went, *self.extending.values()))):
+        elif self.restarts:
             with runner.memory.compiler():
                 runner.restart(self.world.iterations)
         else:
             self.old = self.checkpoint.values
             return
         self.old = checkpoint.state(self.world)
+
+    @property
+    def restarts(self) -> bool:
+        """Whether forces will be others."""
+        pulled = (self.added is not None or not self.some.all()) and self.world._runner.step.has_pair_forces  # by others
+        return pulled or self.world._force_waits or any(map(self._drives, (*self.came, *self.went, *self.extending.values())))
 
     def _drives(self, feature: Feature) -> bool:
         """Whether adding or removing a feature changes the force on particles that remain."""

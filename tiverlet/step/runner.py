@@ -144,10 +144,10 @@ class Runner:
                 self.restart(iterations)
                 if h < clock.longest and not self.probe:
                     released = release(self, h, clock.longest)
-                    projected = project(self, h, clock.longest)
+                    projected = project(self, h, dt, clock.longest)
                     # Links and contacts must move together. With frames of slightly uneven length, stacks would creep sideways.
                     if projected is None and (dt == clock.frame[1] or 2 * h <= clock.longest):
-                        projected = project(self, h, clock.longest, ContactRows.of(self))
+                        projected = project(self, h, dt, clock.longest, ContactRows.of(self))
                     if projected is None and not released:
                         released = release(self, h, clock.longest, small=True)
                     if projected or projected is None or released:

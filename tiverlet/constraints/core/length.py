@@ -7,7 +7,7 @@ import numpy as np
 from ... import checks
 from ...device import ti
 from ...features.feature import Knob
-from .quantity import Quantity
+from .quantity import Quantity, rest_exactly
 
 if TYPE_CHECKING:
     from .scalar import Scalar
@@ -53,7 +53,7 @@ class Length(Quantity):
         if ti.static(self.state.carries):
             if f + rest > 0:
                 r = self.state.between(self.corners.member(c, 0), self.corners.member(c, 1))
-                goal = self.rest_exactly(c)
+                goal = rest_exactly(self, c)
                 C = ti.cast(r.dot(r) - goal * goal, self.real) / (f + rest)
         return C
 
@@ -72,7 +72,7 @@ class Length(Quantity):
     def exactly(self, c):
         """Return f - rest in f64; the difference of two lengths in f32 loses digits."""
         r = self.state.between(self.corners.member(c, 0), self.corners.member(c, 1))
-        return ti.sqrt(r.dot(r)) - self.rest_exactly(c)
+        return ti.sqrt(r.dot(r)) - rest_exactly(self, c)
 
 
 def is_link(feature: Any) -> "TypeGuard[Scalar]":
