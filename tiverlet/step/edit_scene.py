@@ -113,6 +113,8 @@ def handle(world: Any, indices: np.ndarray) -> Handle:
 
 def chosen(world: Any, who: str, particles: Any) -> np.ndarray:
     """Indices of particles that were given by a handle, indices or a mask."""
+    if any(isinstance(f, Feature) for f in (particles if isinstance(particles, (list, tuple)) else [particles])):
+        raise TypeError(f"{who}: particles = {particles!r} are features; write features=[...].")
     array, n = np.asarray(particles), len(world.particles)
     if array.dtype == bool:
         if array.shape != (n,):

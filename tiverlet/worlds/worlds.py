@@ -454,6 +454,8 @@ class Worlds:
 
     def __getitem__(self, k: int) -> World:
         """The k-th as a World of its own, in its present state: what is done to it shows in no other."""
+        if not -len(self) <= k < len(self):
+            raise IndexError(f"Worlds: world {k}, but there are {len(self)} (0 ... {len(self) - 1}).")
         k = range(len(self))[k]
         with self._open(), self._at(k) as world, self._knobs.flagged(k):
             self._knobs.check_kernels()
