@@ -32,7 +32,9 @@ class Collider(Feature):
     restitution: 0 ... 1. The moment of the impact within the substep is solved for, with the acceleration in it; the particle
     leaves at restitution times its velocity then, and is placed where it would be at the end of the substep. What rigid
     links hold takes its body along, see BodyImpacts, and rests where 8 substeps of forces and links gave it its speed; on
-    springs, beside ShapeMatch, Area of loops, Path or Snap, and where it spins and rubs, it bounces alone.
+    springs, beside ShapeMatch, Area of loops, Path or Snap, and where it spins and rubs, it bounces alone. At 0 nothing looks
+    after impacts of bodies: links find in later substeps that an end was stopped, and an upright rod leaves a floor at 0.2 of its
+    speed, a chain of ten links at 0.6, at any number of substeps; 1e-9 has the body stop.
     Of particles that spin, the displacement of the point that touches is taken back. friction = (static, dynamic, rolling,
     twisting) then also resists rolling, by a moment of up to rolling * radius times the normal force, and spinning about the
     normal, by up to twisting * radius times it; what these hold does not roll. restitution = (normal, tangential): in a bounce
