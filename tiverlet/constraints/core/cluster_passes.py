@@ -235,8 +235,8 @@ class ClusterPasses(Passes):
 
     @ti.func
     def reaction(self, e, c, middle, center, R, h, firm, soft):
-        """What moves corner e: as in the last substep, and as far as the force of its spring has changed since. middle, center,
-        R: see best_fit()."""
+        """What moves corner e: as in the last substep, and as far as the force of its spring has changed since; 0 once its
+        cluster has broken. middle, center, R: see best_fit()."""
         move = firm * ti.cast(self.pull[e], ti.f64)
         if ti.static(self.spring.soft):
             w, mass = self.w.of(self.corners.members[e]), self.mass[c]
@@ -247,6 +247,9 @@ class ClusterPasses(Passes):
                     grown = ti.cast(C - R @ ti.cast(self.spring.last[e], ti.f64), self.real)
                     n = self.slots.split[self.corners.members[e]] / w
                     move += ti.cast(self.spring.change(c, grown / mass, h, 1 / mass, n / mass), ti.f64)
+        if ti.static(self.strength.breaks):
+            if not self.strength.holds(c):
+                move = 0 * move
         return move
 
     @ti.func

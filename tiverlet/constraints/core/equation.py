@@ -179,7 +179,8 @@ class Equation:
 
     @ti.func
     def reaction(self, c, f, w, W, h, firm, soft):
-        """h^2 F of the last substep; of a spring, with how much it has changed since. f: now. w, W: as in Spring.change()."""
+        """h^2 F of the last substep; of a spring, with how much it has changed since; 0 once it has broken, for nothing of it
+        is in what comes. f: now. w, W: as in Spring.change()."""
         pull = firm * self.lam[c]
         if ti.static(self.spring.soft):
             if not self.spring.is_rigid(c):
@@ -192,6 +193,9 @@ class Equation:
                         pull = -self.bounded(-pull)
                     if ti.static(self.driven):
                         pull = h * h * self.drive.clamp_force(c, pull / (h * h))
+        if ti.static(self.strength.breaks):
+            if not self.strength.holds(c):
+                pull = 0 * pull
         return pull
 
     @ti.func
