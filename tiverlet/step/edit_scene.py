@@ -14,7 +14,7 @@ from ..contact.touches import ContactEvents
 from ..features.feature import Batch, Feature
 from ..neighbours.periodic import Periodic
 from ..particles import Particles
-from . import edit_in_place, impulse, initial_shape, initial_violation
+from . import edit_in_place, impulse, initial_violation, solids
 from .build import check_settings, checked_features, listed
 from .integrator import FREE
 from .sleep import Sleep
@@ -196,7 +196,7 @@ def _first_off(world: Any, new: list[Feature]) -> int | None:
     """The first particle of rigid constraints and clusters that came and are not met; None where all are."""
     x, w = world.position, world._runner.scene.inv_mass
     clusters = [f for f in new if isinstance(f, Batch) and f.acts]
-    off = [initial_violation.first_off(new, x), initial_shape.first_off(clusters, w, x)]
+    off = [initial_violation.first_off(new, x), solids.first_off(clusters, w, x)]
     return min((i for i in off if i is not None), default=None)
 
 

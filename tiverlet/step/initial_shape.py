@@ -19,17 +19,10 @@ from .jacobian import Jacobian
 from .overlap_release import Walls, moved, one_sided
 from .solids import Solids
 
-SEEN, BORNE = 1e-3, 4.0  # of the radius of a cluster: out of shape by more, and by so many times what its loads do to it
 ROUNDS = 64  # of Newton's method, at most, each with what walls stopped in the one before
 BETTER = 0.9  # of what is left: rounds that leave no less, this many of them, end it
 PATIENCE = 8
 SOFT = 1e-6  # mu, see Jacobian
-
-
-def first_off(batches: list[Any], w: np.ndarray, x: np.ndarray) -> int | None:
-    """The first particle of rigid clusters that are out of shape at x, (n, dim); None where none is."""
-    solids = Solids.rigid(batches, w)
-    return min(solids.who[solids.far(x) > _most(solids)].tolist(), default=None) if solids.count else None
 
 
 def restore(runner: Any, placed: int) -> tuple[np.ndarray, float] | None:
@@ -44,7 +37,7 @@ def restore(runner: Any, placed: int) -> tuple[np.ndarray, float] | None:
     rigid = [b for b in runner.batches if isinstance(b, Scalar) and b.count and (b.compliance == 0).any() and not b.broken.any()]
     rows = Rows(rigid, x, w, ROUNDING[scene.real]) if rigid else None
     far = _left(solids, rows, x, w)
-    if far <= _most(solids):
+    if far <= solids.borne:
         return None
     best, least, walls, waited = x, np.inf, Walls(x), 0
     for _ in range(ROUNDS):
@@ -72,11 +65,6 @@ def restore(runner: Any, placed: int) -> tuple[np.ndarray, float] | None:
             break
     scene.state.put(runner.memory, best)
     return np.linalg.norm(best - x, axis=1), far
-
-
-def _most(solids: Solids) -> float:
-    """What loads may leave."""
-    return max(SEEN, BORNE * solids.worst)
 
 
 def _left(solids: Solids, rows: Rows | None, x: np.ndarray, w: np.ndarray) -> float:
