@@ -16,7 +16,7 @@ from ..solvers.corners import bodies_of
 from .clock import MET
 from .initial_violation import ROUNDING, Rows
 from .jacobian import Jacobian
-from .overlap_release import Walls, moved, one_sided
+from .one_sided import Walls, moved, one_sided
 from .solids import Solids
 
 ROUNDS = 64  # of Newton's method, at most, each with what walls stopped in the one before

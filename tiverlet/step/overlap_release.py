@@ -22,15 +22,14 @@ from ..contact.candidates import Candidates, DiscCandidates
 from .contact_rows import stored_by
 from .free_bodies import FreeBodies
 from .jacobian import Jacobian
+from .one_sided import Walls, moved, one_sided
 from .projection import Rows, given_back, matters, paid, seen, seen_before
 from .rails import tethered
 from .rigid_rows import rigid_rows
 from .solids import Solids
 
 SOFT, SOFTEST = 1e-2, 1e-5  # mu of the first round, and the least
-STEPS, ENOUGH = 32, 1e-6  # of conjugate gradients, at most; what of r . z they leave
 ROUNDS = 16  # of them, each with what particles were pushed into in the one before
-TURNS = 8  # at most, until nothing pulls that cannot
 LEFT = 0.01  # of what overlaps store: what may be left of it in the shorter substep
 
 
@@ -115,45 +114,6 @@ def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: f
             soft, active = 10 * soft, active | (more > 0)
     state.put(memory, best)
     return jacobian
-
-
-def moved(runner: Any, before: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Put particles to x, where they come from `before`: where they are then, and where walls stop them."""
-    state, memory = runner.scene.state, runner.memory
-    state.put(memory, x)
-    sent = state.get(memory)
-    runner.stop_at_walls(before)
-    return sent, state.get(memory)
-
-
-def one_sided(jacobian: Jacobian, right: np.ndarray, one_way: np.ndarray, soft: float) -> np.ndarray:
-    """The least moves, of which none is made by a row that goes one way and pulls."""
-    some = np.ones(len(right))
-    for _ in range(TURNS):
-        lam = jacobian.multipliers(right * some, some, ENOUGH, STEPS, soft)
-        pulls = one_way & (lam < 0)
-        if not pulls.any():
-            break
-        some[pulls] = 0.0
-    return jacobian.moves(lam)
-
-
-class Walls:
-    """Which particles were stopped by walls, (k,), and along which normals, (k, dim)."""
-
-    def __init__(self, x: np.ndarray):
-        self.who, self.normal = np.zeros(0, dtype=np.int64), np.zeros((0, x.shape[1]))
-
-    def push(self, way: np.ndarray) -> None:
-        """Note how far walls took particles back, (n, dim)."""
-        length = np.linalg.norm(way, axis=1)
-        new = np.setdiff1d(np.flatnonzero(length > 0), self.who)
-        self.who = np.concatenate([self.who, new])
-        self.normal = np.concatenate([self.normal, way[new] / length[new, None]])
-
-    def along(self, way: np.ndarray) -> np.ndarray:
-        """How much of a way, (n, dim), is along the normals, (k,)."""
-        return (way[self.who] * self.normal).sum(axis=1)
 
 
 def bound(runner: Any, x: np.ndarray, ratio: float) -> Rows | None:
