@@ -65,7 +65,7 @@ def meeting(x, y, v, reach: float) -> tuple[int, int, np.ndarray]:
     return int(i), int(j), (r[i, j] + time[i, j] * v) / reach
 
 
-@pytest.mark.parametrize("e", [0.4, 1.0])
+@pytest.mark.parametrize("e", [1e-9, 0.4, 1.0])
 @pytest.mark.parametrize("shape", [BAR, TRIANGLE, TETRAHEDRON], ids=["bar", "triangle", "tetrahedron"])
 def test_rigid_bodies_leave_by_newtons_law(world, shape, e):
     # Without forces, velocities before and after the impact are constant. The only error is the turn during a substep, omega h.

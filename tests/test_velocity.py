@@ -324,6 +324,23 @@ def test_spins_and_throws_survive_what_comes_next(world):
     assert w.velocity[0] == pytest.approx([3, 4 - fallen]) and w.velocity[1] == pytest.approx([0, 0])
 
 
+def test_what_breaks_flies_on_with_the_velocity_that_is_read(world):
+    # x + v t - g t^2 / 2, to rounding, also from the substep in which it breaks: half a kick of what broke is not to come.
+    # A rigid link, a spring, an area and a cluster, each held by pinned particles.
+    x = np.array([(0, 0), (1, 0), (3, 0), (4, 0), (6, 0), (7, 0), (6.5, -1), (9, 0), (10, 0)])
+    broke = tv.Distance([[0, 1], [2, 3]], compliance=[0, 0.02], break_at=np.inf)
+    others = tv.Area([[4, 6, 5]], compliance=0.01, break_at=np.inf), tv.ShapeMatch([[7, 8]], compliance=0.02, break_at=np.inf)
+    w = world(tv.Particles(x, pinned=[0, 2, 4, 5, 7]), [tv.Gravity(9.81), broke, *others], substeps=1, precision="f64")
+    w.run(0.4)
+    for f in (broke, *others):
+        f.break_at = 1e-30
+    w.step(1 / 60)
+    begin, v, free = w.position, w.velocity, [1, 3, 6, 8]
+    assert broke.broken.all() and all(f.broken.all() for f in others) and np.abs(v[free]).max(axis=1).min() > 0.1
+    w.run(0.2)
+    np.testing.assert_allclose(w.position[free], (begin + 0.2 * v - (0, 9.81 * 0.2**2 / 2))[free], rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("precision", ["f64", "f32"])
 def test_what_is_stopped_stands_still(world, precision):
     # However fast it was, and however strong the drag is; a particle that is pushed then moves by v / rate.

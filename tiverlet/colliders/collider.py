@@ -34,7 +34,9 @@ class Collider(Feature):
     particle leaves at restitution times its velocity at that time, and is placed where it would be at the end of the substep. A
     particle that rigid links hold takes its body along, see BodyImpacts; it does not bounce if 8 substeps of forces and links
     account for its speed. On springs, beside ShapeMatch, Area of loops, Path or Snap, and where it spins and has friction, a
-    particle bounces alone.
+    particle bounces alone. With 0, the default, impacts of bodies are left to the links, which find in later substeps that an end
+    was stopped: an upright rod leaves a floor at 0.2 of its speed, a chain of ten links at 0.6, at any number of substeps. 1e-9
+    stops the whole body.
     For particles that spin, the displacement of the contact point is removed. Then friction = (static, dynamic, rolling,
     twisting) also resists rolling, by a moment of up to rolling * radius times the normal force, and spinning about the normal,
     by up to twisting * radius times it; a particle that these moments hold does not roll. With restitution = (normal, tangential)

@@ -18,7 +18,7 @@ from ..contact.touches import ContactEvents
 from ..features.feature import Batch, Feature
 from ..neighbours.periodic import Periodic
 from ..particles import Particles
-from . import edit_in_place, impulse, initial_shape, initial_violation
+from . import edit_in_place, impulse, initial_violation, solids
 from .build import check_settings, checked_features, listed
 from .sleep import Sleep
 
@@ -116,6 +116,8 @@ def handle(world: Any, indices: np.ndarray) -> Handle:
 
 def chosen(world: Any, who: str, particles: Any) -> np.ndarray:
     """Return the indices of particles given as a handle, indices or a mask."""
+    if any(isinstance(f, Feature) for f in (particles if isinstance(particles, (list, tuple)) else [particles])):
+        raise TypeError(f"{who}: particles = {particles!r} are features; write features=[...].")
     array, n = np.asarray(particles), len(world.particles)
     if array.dtype == bool:
         if array.shape != (n,):
@@ -203,7 +205,7 @@ def _first_off(world: Any, new: list[Feature]) -> int | None:
     """Return the first particle of added rigid constraints and clusters that are violated; None where none is."""
     x, w = world.position, world._runner.scene.inv_mass
     clusters = [f for f in new if isinstance(f, Batch) and f.acts]
-    off = [initial_violation.first_off(new, x), initial_shape.first_off(clusters, w, x)]
+    off = [initial_violation.first_off(new, x), solids.first_off(clusters, w, x)]
     return min((i for i in off if i is not None), default=None)
 
 

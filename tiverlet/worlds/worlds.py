@@ -461,6 +461,8 @@ class Worlds:
 
     def __getitem__(self, k: int) -> World:
         """Return world k as a World of its own, in its present state. Changing it does not change these worlds."""
+        if not -len(self) <= k < len(self):
+            raise IndexError(f"Worlds: world {k}, but there are {len(self)} (0 ... {len(self) - 1}).")
         k = range(len(self))[k]
         with self._open(), self._at(k) as world, self._knobs.flagged(k):
             self._knobs.check_kernels()
