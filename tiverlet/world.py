@@ -213,7 +213,7 @@ class World:
         The old force is lost when it is overwritten, or left out of a copy. steps: see _adapt().
         """
         changed = [f for f in self._features if f.changed]
-        if any(f.lets_go for f in changed):
+        if any(f.has_dropped_load for f in changed):
             if not steps:
                 self._runner.note_displacements()
             self._let_go()
@@ -237,7 +237,7 @@ class World:
         steps: whether a frame follows at once, so that residuals of the last frame are not read before it.
         """
         self._settle_forces(steps)
-        if any(f.outgrown for f in self._features if f.changed):
+        if any(f.needs_other_kernels for f in self._features if f.changed):
             edit_scene.renew(self)
 
     def _upload(self) -> None:
@@ -673,7 +673,7 @@ class World:
         self._runner.memory.check()
         self._find_stiffened()
         self._adapt()
-        copies = tuple(f.twin() for f in self._features)
+        copies = tuple(f.copy_with_kernels() for f in self._features)
         new = World._of(self._particles, copies, [f.start for f in self._features], **{**settings, **changes})
         checkpoint.transfer(self, new)
         new._runner.pass_on(self._runner.left, np.ones(len(self._particles), dtype=bool))
@@ -696,7 +696,7 @@ class World:
         for memory in self._runner.memories:
             memory.destroy()
         for feature in self._features:
-            feature.scene, feature.once = None, frozenset()
+            feature.scene, feature.compiled_so_far = None, frozenset()
 
     def __enter__(self) -> "World":
         return self

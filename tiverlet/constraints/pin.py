@@ -132,12 +132,12 @@ class Pin(Anchored):
         return not self.soft
 
     @property
-    def outgrown(self) -> bool:
+    def needs_other_kernels(self) -> bool:
         """Whether the world has to be rebuilt: also when other particles are held, since their masses and slots differ."""
-        return self._grabs or super().outgrown
+        return self._grabs or super().needs_other_kernels
 
     @property
-    def afresh(self) -> bool:
+    def needs_new_state(self) -> bool:
         """Whether the Pin starts anew when the world is rebuilt: when other particles were assigned."""
         return self._grabs
 

@@ -93,17 +93,17 @@ class ShapeMatch(Batch):
     @property
     def soft(self) -> bool:
         """Whether any cluster has compliance, or had when kernels were compiled."""
-        return bool((self.compliance > 0).any()) or "soft" in self.once
+        return bool((self.compliance > 0).any()) or "soft" in self.compiled_so_far
 
     @property
     def breaks(self) -> bool:
         """Whether a load can break clusters, or could when kernels were compiled."""
-        return self.break_at is not None or "breaks" in self.once
+        return self.break_at is not None or "breaks" in self.compiled_so_far
 
     @property
     def transcends(self) -> bool:
         """Whether any cluster flows, at an exponential rate, or did when kernels were compiled."""
-        return bool((self.creep > 0).any()) or "transcends" in self.once
+        return bool((self.creep > 0).any()) or "transcends" in self.compiled_so_far
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Compute the rest shapes, each about its center of mass."""
@@ -124,7 +124,7 @@ class ShapeMatch(Batch):
         """Whether more clusters can be appended: not where `rest` was given, which has a row for every particle."""
         return self._rest is None
 
-    def hold_all(self, listing: Any) -> None:
+    def set_listing(self, listing: Any) -> None:
         """Replace the clusters by these."""
         self._keep(members=VariableSize("ShapeMatch", listing))
 

@@ -89,7 +89,7 @@ class PairContact(Feature):
     table: Table  # bound to one world
     bodies: Sequence[np.ndarray] = ()
     matters = True
-    bulk = 3.0
+    code_size = 3.0
     room = 0  # initial list entries per particle, if more than discs need
     detects = False  # whether each pass calls detect() for all particles, before contacts are counted
     projects = False  # whether it has a velocity projection of loaded pairs, see velocity_projection.py
@@ -132,17 +132,17 @@ class PairContact(Feature):
     @property
     def has_friction(self) -> bool:
         """Whether any pair has friction, or had friction when kernels were compiled."""
-        return self._pairs.has_friction or "has_friction" in self.once
+        return self._pairs.has_friction or "has_friction" in self.compiled_so_far
 
     @property
     def has_restitution(self) -> bool:
         """Whether any pair has restitution, or had restitution when kernels were compiled."""
-        return self._pairs.has_restitution or "has_restitution" in self.once
+        return self._pairs.has_restitution or "has_restitution" in self.compiled_so_far
 
     @property
     def turns(self) -> bool:
         """Whether any pair has rolling, twisting or tangential restitution, now or when kernels were compiled."""
-        return self._pairs.turns or "turns" in self.once
+        return self._pairs.turns or "turns" in self.compiled_so_far
 
     @property
     def has_events(self) -> bool:
@@ -187,14 +187,14 @@ class PairContact(Feature):
         # `reports`: whether pairs that push each other are recorded, not only sensors. `events`: an EventLog, or None.
         dev.has_events, dev.reports, dev.events = self.has_events, bool(vars(self).get("events")), None
 
-    def built_for(self) -> dict[str, Any]:
+    def build_values(self) -> dict[str, Any]:
         """Return the settings for which the world was built, and the groups of the table.
 
         Groups that the settings do not name any more stay in the table, so dropping a name does not rebuild the world.
         """
         named = self._pairs.named
         told = self.table.named if self.scene and self.matters else frozenset()
-        return super().built_for() | {"named": told if named <= told else named}
+        return super().build_values() | {"named": told if named <= told else named}
 
     def upload(self) -> None:
         """Write changed friction and restitution to the device."""

@@ -115,7 +115,7 @@ class Polygons(PairContact):
             new, whole = number[corner].astype(np.int32), np.bincount(owner, number[corner] < 0) == 0
             self._hold([new[begin[k] : begin[k + 1]] for k in np.flatnonzero(whole).tolist()])
 
-    def check_more(self, more: Feature) -> None:
+    def check_extension(self, more: Feature) -> None:
         """Raise unless `more` is a Polygons with the same settings."""
         if not isinstance(more, Polygons):
             raise TypeError(f"World.add: extend: {self!r} cannot take {more!r}, which is of another kind. Add it to features.")

@@ -23,7 +23,7 @@ class Gravity(Acceleration):
     g: a number [m/s^2] along -y, or a vector (dim,). Live: assign to .g between frames.
     """
 
-    for_all = True
+    has_no_particle_data = True
     conservative = True
     uniform = common = True
     dim = 0

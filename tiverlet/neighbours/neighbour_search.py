@@ -47,7 +47,7 @@ class NeighbourSearch:
     too_far: Any = OnDevice()  # the square of the way after which the list is stale
     farthest: Any = OnDevice()  # how far apart pairs are listed [m], at most
     n: Any = OnDevice()  # particles
-    told_apart = True  # as a Feature
+    has_own_compile_time = True  # as a Feature
 
     def __init__(
         self, scene: "Scene", skin: float, linked: np.ndarray, table: Any, pair_data: list[PairData], team: Team, scratch: Any,

@@ -44,7 +44,7 @@ def bound_again(
     runner, scene, memory = world._runner, world._runner.scene, world._runner.memory
     drivers, batches = runner.step.drivers, runner.batches
     bound = [*drivers, *batches]
-    if not (set(extend) <= set(bound)) or any(f.afresh for f in bound):
+    if not (set(extend) <= set(bound)) or any(f.needs_new_state for f in bound):
         return None
     if not batches or any(f.changed and f not in drivers for f in bound):
         return None
@@ -75,7 +75,7 @@ def bound_again(
                     f.bind(scene)
                 if f in ramps:
                     f.ramp.adopt(ramps[f])
-                f.built()
+                f.note_built()
         if not (memory.holds(again.longest) and scene.slots.exact == exact and _structure(scene, bound) == structure):
             return None
         linked = excluded_pairs(batches, now.radius)

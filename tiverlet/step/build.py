@@ -127,12 +127,12 @@ def _passes(particles: Particles, features: tuple[Feature, ...], scale: Scale, c
 
     Each wall has code of its own; other features share code by kind.
     """
-    code = {f if isinstance(f, Collider) else type(f): f.bulk for f in features}
-    bulk = sum(code.values()) * (1.5 if particles.dim == 3 else 1.0)
-    often = copies is not None and copies.count >= COPIES and bulk < MIDDLING
-    if bulk > ENDLESS or (scale.particles < FEW and not often):
+    code = {f if isinstance(f, Collider) else type(f): f.code_size for f in features}
+    code_size = sum(code.values()) * (1.5 if particles.dim == 3 else 1.0)
+    often = copies is not None and copies.count >= COPIES and code_size < MIDDLING
+    if code_size > ENDLESS or (scale.particles < FEW and not often):
         return BRIEF
-    return UNSEARCHED if bulk > LONG and scale.particles < MANY else LEAN
+    return UNSEARCHED if code_size > LONG and scale.particles < MANY else LEAN
 
 
 def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, path: str, scale: Scale) -> Assembly:
@@ -179,7 +179,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     for feature in features:
         feature.new_force = False  # the force has been on the device from the start
         feature.changed = feature in drivers  # they move to their targets in the first frame; other knobs are in fields already
-        feature.built()
+        feature.note_built()
     known = contact.known if contact else None
     forces = Forces(scene, [*accelerations, known.carried] if known else accelerations)
     integrator = Verlet(scene, forces, bool(contact)) if scene.order == 2 else high_order.Composition(scene, forces, batches)

@@ -28,8 +28,8 @@ class Rebuild:
         extend: Mapping[Feature, Feature],
     ):  # fmt: skip
         self.world, self.some, self.added, self.features, self.before = world, some, added, features, world.features
-        self.came = [f for f in features if f not in self.before or f.afresh]
-        self.went = [f for f in self.before if f not in features or f.afresh]
+        self.came = [f for f in features if f not in self.before or f.needs_new_state]
+        self.went = [f for f in self.before if f not in features or f.needs_new_state]
         self.extending = {f: other.copy() for f, other in extend.items()}
         self.number = np.where(some, np.cumsum(some) - 1, -1)
         self.particles = world._particles.regrouped(some, added, world.position[some])
@@ -89,7 +89,7 @@ class Rebuild:
             f.release()
             f.remap_indices(self.number, len(self.particles))
         for f in self.went:
-            f.once = frozenset()
+            f.compiled_so_far = frozenset()
 
     def _assembled(self) -> Any:
         """The parts of the new world, see assemble()."""

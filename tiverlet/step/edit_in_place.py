@@ -52,7 +52,7 @@ def planned(
         return None
     if runner.launched or not all(memory.elastic and memory.holds(count + 1) for memory in runner.memories):
         return None
-    if any(f.changed and f.outgrown for f in world.features):
+    if any(f.changed and f.needs_other_kernels for f in world.features):
         return None
     stay = np.flatnonzero(some)
     now = world._particles.regrouped(some, added, scene.state.get(runner.memory).take(stay, axis=0))
@@ -141,11 +141,11 @@ def grabbing(world: Any) -> Grab | None:
     contacts see them, and slots. None where the world has to be built anew for it, as where constraints act on what is driven now
     or was before."""
     runner = world._runner
-    scene, pins = runner.scene, [f for f in world._features if f.changed and f.outgrown]
+    scene, pins = runner.scene, [f for f in world._features if f.changed and f.needs_other_kernels]
     if runner.sleep or runner.launched or scene.order > 2 or not runner.memory.elastic:
         return None
     for f in pins:
-        if not (f.afresh and f.acts):
+        if not (f.needs_new_state and f.acts):
             return None
     driving, inv_mass, some = [f for f in pins if f.drives], scene.inv_mass, NOBODY
     if driving:

@@ -87,7 +87,7 @@ def check_extended(world: Any, extend: Mapping[Feature, Feature]) -> None:
             raise ValueError(f"World.add: extend: {feature!r} does not act in this world. Add it to features.")
         if not isinstance(more, Feature):
             raise TypeError(f"World.add: extend[{feature!r}] = {more!r} is a {type(more).__name__}; write {feature!r} of others.")
-        feature.check_more(more)
+        feature.check_extension(more)
 
 
 def remove(world: Any, particles: Any, features: Iterable[Feature]) -> None:
@@ -207,7 +207,7 @@ def _seen(
     are about to go; and those that nothing drives: masks, (n,)."""
     loose, loses = np.zeros(len(some), dtype=bool), world._clock.parted is not None
     for f in world.features:
-        if isinstance(f, Pin) and f in features and f.afresh:  # which takes others
+        if isinstance(f, Pin) and f in features and f.needs_new_state:  # which takes others
             if f.drives:
                 loose[f.held] = loses = True
         elif isinstance(f, Batch | PairContact):

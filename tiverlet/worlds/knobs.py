@@ -88,8 +88,8 @@ class Knobs:
     def check_kernels(self) -> None:
         """Raise ValueError if a knob that was assigned for all worlds needs other kernels; for the world that is shown."""
         for f in self.features:
-            if f.changed and f.outgrown:
-                _refuse_outgrown(f)
+            if f.changed and f.needs_other_kernels:
+                _refuse_other_kernels(f)
 
     def idle(self) -> bool:
         """Whether no knob waits to be uploaded."""
@@ -161,13 +161,13 @@ def _check_fits(feature: Feature, name: str, value: Any) -> None:
     """Raise ValueError if a value of a knob needs other kernels."""
     before, vars(feature)[name] = vars(feature)[name], value
     try:
-        if feature.outgrown:
-            _refuse_outgrown(feature)
+        if feature.needs_other_kernels:
+            _refuse_other_kernels(feature)
     finally:
         vars(feature)[name] = before
 
 
-def _refuse_outgrown(feature: Feature) -> None:
+def _refuse_other_kernels(feature: Feature) -> None:
     raise ValueError(
         f"Worlds: a knob of {feature!r} asks for what these kernels do not have, such as friction where there was none. Give the "
         "World that Worlds is made of a value other than 0 first."

@@ -70,7 +70,7 @@ class Worlds:
             sources = alike(sources)
             self._copies = Copies(count)
             self._world = World._of(
-                first.particles, tuple(f.twin() for f in first.features), [f.start for f in first.features],
+                first.particles, tuple(f.copy_with_kernels() for f in first.features), [f.start for f in first.features],
                 copies=self._copies, **(first.settings | {"path": "fused"}),
             )  # fmt: skip
             self._runner = self._world._runner

@@ -18,7 +18,7 @@ class Place:
     name: distinguishes it from other features. in_state: its fields in the exact state, by name.
     """
 
-    told_apart = True
+    has_own_compile_time = True
     name: str
     in_state: dict[str, Any]
 

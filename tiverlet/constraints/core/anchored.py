@@ -53,7 +53,7 @@ class Anchored(Batch):
         """The particle of each constraint, (m,)."""
         return self.indices[:, 0]
 
-    def hold_all(self, listing: Any) -> None:
+    def set_listing(self, listing: Any) -> None:
         """Act on these particles."""
         self._keep(members=one_each(repr(self), listing))
 
@@ -63,7 +63,7 @@ class Anchored(Batch):
         rows = self.compliance
         if rows is not self._asked[0]:  # cached: a pin that takes other particles reads it ten times
             self._asked = rows, bool((rows > 0).any())
-        return self._asked[1] or "soft" in self.once
+        return self._asked[1] or "soft" in self.compiled_so_far
 
     def upload(self) -> None:
         """Write new stiffnesses to the device."""
