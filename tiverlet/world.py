@@ -19,7 +19,7 @@ from .device.copies import Copies
 from .device.interrupts import whole
 from .features.arguments import meant
 from .features.feature import Acceleration, Batch, Feature
-from .features.read_only import assign_whole, read_only, structure
+from .features.read_only import assign_whole_advice, read_only, structure_advice
 from .neighbours.queries import Contacts, PointSearch, near_by_all, nearest
 from .particles import Particles, at_rest, in_range, spin_of
 from .solvers.jacobi import Jacobi
@@ -197,7 +197,7 @@ class World:
         waiting = [f for f in self._features if f.changed or f.moving]
         if waiting:
             self._clock.bound = CHANGED
-            if self._runner.sleep and not all(isinstance(f, Batch) and f.drives for f in waiting):
+            if self._runner.sleep and not all(isinstance(f, Batch) and f.is_kinematic for f in waiting):
                 self._runner.wake()
             self._adapt(steps=True)
             self._upload()
@@ -302,7 +302,7 @@ class World:
     @property
     def position(self) -> np.ndarray:
         """Positions [m], (n, dim), a read-only copy in f64. Assign an array to move particles; velocities are kept."""
-        return read_only(self._runner.scene.state.get(self._runner.memory), assign_whole("World", "position"))
+        return read_only(self._runner.scene.state.get(self._runner.memory), assign_whole_advice("World", "position"))
 
     @position.setter
     def position(self, value) -> None:
@@ -332,7 +332,7 @@ class World:
             self._runner.memory.check()
             with whole, self._runner.memory.compiler():
                 out = self._runner.velocity(self._iterations)
-        return read_only(out.copy(), assign_whole("World", "velocity"))
+        return read_only(out.copy(), assign_whole_advice("World", "velocity"))
 
     @velocity.setter
     def velocity(self, value) -> None:
@@ -352,10 +352,10 @@ class World:
         """Angular velocities [rad/s], (n,) in 2D, (n, 3) in 3D, a read-only copy in f64; second order. Assign to set them."""
         state = self._runner.scene.state
         if not state.spins:
-            return read_only(at_rest("spin", self._particles), assign_whole("World", "spin"))
+            return read_only(at_rest("spin", self._particles), assign_whole_advice("World", "spin"))
         self._runner.memory.check()
         with whole, self._runner.memory.compiler():
-            return read_only(state.spin.to_rates(self._runner.spin()), assign_whole("World", "spin"))
+            return read_only(state.spin.to_rates(self._runner.spin()), assign_whole_advice("World", "spin"))
 
     @spin.setter
     def spin(self, value) -> None:
@@ -389,7 +389,7 @@ class World:
         if self._particles.orientation is None:
             raise ValueError("World.orientation: nobody keeps track of it. Make particles with tv.Particles(..., orientation=0).")
         turned = self._runner.memory.read(self._runner.scene.state.spin.orientation)[: len(self._particles)]
-        return read_only(turned[:, 0] if self._particles.dim == 2 else turned, structure("World", "orientation"))
+        return read_only(turned[:, 0] if self._particles.dim == 2 else turned, structure_advice("World", "orientation"))
 
     def near(self, points, radius) -> np.ndarray:
         """Return which particles have their center within `radius` [m] of which points.

@@ -170,7 +170,7 @@ class ShapeMatch(Batch):
         w = self.scene.inv_mass[self.indices]
         mass = self.scene.memory.read(self.dev.mass)
         weights = np.divide(1.0, mass, out=np.zeros(self.count), where=mass > 0)
-        firm = per_newton(self.scene.reach, self.compliance, lambda: weights)
+        firm = per_newton(self.scene.multipliers_per_newton, self.compliance, lambda: weights)
         scale = np.divide(firm[self.owner], w, out=np.zeros_like(w), where=w > 0)
         pull = self.scene.memory.read(self.dev.pull).astype(np.float64)
         return np.maximum.reduceat(scale * np.linalg.norm(pull, axis=1), self.members.starts[:-1])

@@ -65,8 +65,8 @@ class PairContact(Feature):
 
     bodies: arrays of particles that sleep and wake together.
 
-    A subclass defines prepare() and join(), which makes `dev.geometry` and `dev.forces`. In a pass of a substep its methods are
-    called in this order:
+    A subclass defines prepare() and make_search(), which makes `dev.geometry` and `dev.forces`. In a pass of a substep its
+    methods are called in this order:
 
     - detect(i, first), if it `detects`
     - count(begin, end, now) and busy(begin), by blocks of particles
@@ -90,7 +90,7 @@ class PairContact(Feature):
     bodies: Sequence[np.ndarray] = ()
     matters = True
     code_size = 3.0
-    room = 0  # initial list entries per particle, if more than discs need
+    neighbours_per_particle = 0  # initial list entries per particle, if more than discs need
     detects = False  # whether each pass calls detect() for all particles, before contacts are counted
     projects = False  # whether it has a velocity projection of loaded pairs, see velocity_projection.py
 
@@ -174,7 +174,7 @@ class PairContact(Feature):
         """The names of state fields that enable_shrink() declares. Their values are 0 before."""
         return self.dev.geometry.late
 
-    def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
+    def make_search(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields and the neighbour search, and return the search."""
         raise NotImplementedError
 

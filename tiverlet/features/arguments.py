@@ -15,7 +15,7 @@ import numpy as np
 
 from ..device import at
 from ..device.language import inside_kernel
-from .read_only import assign_whole, handed_out, structure
+from .read_only import as_read_only, assign_whole_advice, structure_advice
 
 TAKEN_BY = {"one_way": "Capsule, Polygon and Mesh"}  # arguments that only some features of a kind take
 
@@ -51,7 +51,7 @@ class Knob:
 
     def __set__(self, feature, value) -> None:
         value, own = self.check(feature, value), feature.__dict__
-        own[self.name] = handed_out(value, assign_whole(type(feature).__name__, self.name))
+        own[self.name] = as_read_only(value, assign_whole_advice(type(feature).__name__, self.name))
         own["changed"] = True
         if self.force:
             own["new_force"] = True
@@ -78,7 +78,7 @@ def set_attribute(thing: Any, name: str, value: Any) -> None:
 def keep(thing: Any, **values: Any) -> None:
     """Set attributes that cannot be set from outside."""
     for name, value in values.items():
-        object.__setattr__(thing, name, handed_out(value, structure(type(thing).__name__, name)))
+        object.__setattr__(thing, name, as_read_only(value, structure_advice(type(thing).__name__, name)))
 
 
 def refuse_deletion(thing: Any, name: str) -> None:

@@ -34,7 +34,7 @@ from ..device.language import inside_kernel
 from ..device.number import Number
 from .arguments import Knob as Knob
 from .arguments import keep, knobs_of, record_arguments, refuse_deletion, set_attribute
-from .read_only import assign_whole, handed_out
+from .read_only import as_read_only, assign_whole_advice
 
 if TYPE_CHECKING:
     from ..device.memory import Memory
@@ -49,7 +49,7 @@ BENT, FAR = 1, 2  # a constraint turned in a substep by more than 26 degrees, by
 class Scene:
     """The scene to which a feature is bound: memory for its fields, particles, and shared objects."""
 
-    host_only = ("inv_mass", "residuals", "reach", "periodic")
+    host_only = ("inv_mass", "residuals", "multipliers_per_newton", "periodic")
 
     memory: "Memory"
     state: "State"
@@ -64,7 +64,7 @@ class Scene:
     periodic: Any = None  # the Periodic of the world
     # [s^2] multipliers of the last substep per newton, of rigid and of soft constraints: h2_effective, see Batch.relax. That of
     # rigid constraints includes the kick that they added where the substep was a start from velocities that lacked it.
-    reach: tuple[float, float] = (0.0, 0.0)
+    multipliers_per_newton: tuple[float, float] = (0.0, 0.0)
 
     @property
     def count(self) -> Number:
@@ -236,21 +236,21 @@ class Acceleration(Feature):
     decays = False
     rate = 0.0
     pairwise = False
-    room = 0  # initial room for listed neighbours, per particle
+    neighbours_per_particle = 0  # initial room for listed neighbours, per particle
 
     @property
     def does_work(self) -> bool:
         """Whether it accelerates particles and has no known potential."""
         return self.accelerates and not self.conservative
 
-    def settings(self) -> dict[str, Any]:
+    def kernel_values(self) -> dict[str, Any]:
         """Return the numbers and vectors that kernels read as `dev.name[None]`, computed from its knobs."""
         return {}
 
     def bind(self, scene: Scene) -> None:
         """Declare a field for each of its settings."""
         self.scene = scene
-        for name, value in self.settings().items():
+        for name, value in self.kernel_values().items():
             kind, width = ti.i32 if isinstance(value, int) else None, np.size(value) if np.ndim(value) else 0
             field = scene.memory.field(f"{type(self).__name__}.{name}", None, width=width, kind=kind, values=value)
             setattr(self.dev, name, field)
@@ -258,10 +258,10 @@ class Acceleration(Feature):
 
     def upload(self) -> None:
         """Write the settings to their fields."""
-        for name, value in self.settings().items():
+        for name, value in self.kernel_values().items():
             self.scene.memory.write(vars(self.dev)[name], value)
 
-    def join(self, scene: Scene, team: Any) -> Any:
+    def make_search(self, scene: Scene, team: Any) -> Any:
         """If it is pairwise, declare its neighbour list and return it; None if it has none."""
 
     def may_act_from(self, first: int) -> bool:
@@ -293,7 +293,7 @@ class Batch(Feature):
     breaks = False  # has constraints that a load can break
     clusters = False  # preserves shapes, see members_of() and shape_of()
     can_extend = False  # can be extended by more constraints, see extend()
-    drives = False  # prescribes positions of its particles instead of relaxing them
+    is_kinematic = False  # prescribes positions of its particles instead of relaxing them
     solvable_together = False  # the System of a solver may solve its constraints with others; see Scalar
     driven = False  # rest values change by themselves, by the Drive of drive_of()
     transcends = False  # computes angles, cube roots or exponentials, which SPIR-V has for f32 only
@@ -325,7 +325,7 @@ class Batch(Feature):
             return np.zeros(0)
         if self.scene is None:
             raise RuntimeError(f"{self!r}.residual: there is none before a world has been stepped with it.")
-        return np.zeros(self.count) if self.drives or not self.acts else self.scene.residuals(self)
+        return np.zeros(self.count) if self.is_kinematic or not self.acts else self.scene.residuals(self)
 
     @property
     def acts(self) -> bool:
@@ -354,9 +354,9 @@ class Batch(Feature):
         """Return the particles of constraint c."""
         return self.members.row(c)
 
-    def idle(self, inv_mass: np.ndarray) -> np.ndarray:
+    def immovable(self, inv_mass: np.ndarray) -> np.ndarray:
         """Return which constraints have no particle that can move, (m,)."""
-        return self.members.idle(inv_mass)
+        return self.members.immovable(inv_mass)
 
     def kept_mask(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the mask of the constraints that stay: those all of whose particles stay."""
@@ -368,7 +368,7 @@ class Batch(Feature):
         self.select(some, number)
         for name in self.each:
             if isinstance(rows := self.__dict__.get(name), np.ndarray):
-                self.__dict__[name] = handed_out(rows[some], getattr(rows, "advice", ""))
+                self.__dict__[name] = as_read_only(rows[some], getattr(rows, "advice", ""))
         self.note_arguments()
 
     def note_arguments(self) -> None:
@@ -401,7 +401,7 @@ class Batch(Feature):
             both = [vars(one).get(name) for one in (self, more)]
             if any(rows is not None for rows in both):
                 rows = [np.full(m, np.inf) if one is None else one for one, m in zip(both, counts, strict=True)]
-                self.__dict__[name] = handed_out(np.concatenate(rows), assign_whole(type(self).__name__, name))
+                self.__dict__[name] = as_read_only(np.concatenate(rows), assign_whole_advice(type(self).__name__, name))
         listing = self.listing, more.listing
         self.set_listing(np.concatenate(listing) if self.arity else [*listing[0], *listing[1]])
         self.note_arguments()

@@ -37,7 +37,7 @@ class Attractor(Acceleration):
         self._keep(dim=particles.dim)
         self.center = self.center
 
-    def settings(self) -> dict[str, Any]:
+    def kernel_values(self) -> dict[str, Any]:
         """Return center, strength and softening, for kernels."""
         return {"center": self.center, "strength": self.strength, "softening": self.softening}
 

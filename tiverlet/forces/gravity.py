@@ -37,7 +37,7 @@ class Gravity(Acceleration):
         self._keep(dim=particles.dim)
         self.g = self.g
 
-    def settings(self) -> dict[str, Any]:
+    def kernel_values(self) -> dict[str, Any]:
         """Return g as a vector, for kernels."""
         g = np.asarray(self.g, dtype=np.float64)
         return {"g": (g if g.ndim else g * [0.0, -1.0, 0.0][: self.dim]).tolist()}

@@ -32,7 +32,7 @@ class Wind(Acceleration):
         self._keep(dim=particles.dim)
         self.velocity = self.velocity
 
-    def settings(self) -> dict[str, Any]:
+    def kernel_values(self) -> dict[str, Any]:
         """Return rate * velocity, the part of the acceleration beside the drag -rate v, for kernels."""
         return {"push": self.rate * self.velocity}
 

@@ -118,7 +118,7 @@ class NeighbourSearch:
         remember is to be given to the next list by restore()."""
         n, stale = change.now.count, int(self.memory.seen(self.list.stale)[0])
         reach = 0 * radius if reach is None else reach
-        if change.goes and not self.list.saved:
+        if change.has_removed and not self.list.saved:
             self.list.drop(change.number)
             self.cells.drop(change.number)
         skin = self._skin(skin, radius, reach)
@@ -133,9 +133,9 @@ class NeighbourSearch:
             self.list.blocks = self._blocks(n)
             self.list.allocate(room)
         if self.linked:
-            begin = self.memory.seen(self.excluded_begin)[change.first]
+            begin = self.memory.seen(self.excluded_begin)[change.first_removed]
             self.memory.resize(self.excluded_begin, n + 1)
-            self.memory.write_from(self.excluded_begin, change.first, np.full(n + 1 - change.first, begin))
+            self.memory.write_from(self.excluded_begin, change.first_removed, np.full(n + 1 - change.first_removed, begin))
         came = n - change.kept
         if came:
             self.memory.write_from(self.origin, change.kept, np.full((came, self.dim), np.nan))

@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike
 
 from .. import checks
 from ..features.arguments import meant
-from ..features.read_only import read_only, structure
+from ..features.read_only import read_only, structure_advice
 
 LARGEST = 1e15  # [m] squared lengths up to 1e30 leave room below the largest f32, 3e38
 
@@ -141,7 +141,7 @@ class Particles:
 def _fixed(name: str, array: np.ndarray) -> np.ndarray:
     """Make an array of Particles read-only."""
     live = f" To move particles, assign to world.{name}." if name in ("position", "velocity") else ""
-    return read_only(array, structure("Particles", name) + live)
+    return read_only(array, structure_advice("Particles", name) + live)
 
 
 def in_range(who: str, name: str, position: np.ndarray) -> None:

@@ -102,7 +102,7 @@ class System:
 
     def left_out(self, batches: "list[Batch]") -> int:
         """How many constraints are relaxed by themselves, of those with a particle that can move."""
-        return sum(int((~b.idle(self.inv_mass) & (self.row(b) < 0)).sum()) for b in batches)
+        return sum(int((~b.immovable(self.inv_mass) & (self.row(b) < 0)).sum()) for b in batches)
 
     def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
         """Particles were placed anew: forget what was found out on the way to their old places. off: of batches, (m,), by how

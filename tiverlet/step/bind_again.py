@@ -95,8 +95,8 @@ def _check(world: Any, now: Particles, first: int, drivers: list[Batch], batches
     """Raise Differs where other batches would act than before, and ValueError for what building refuses. first: the number of the
     first particle that comes."""
     there = [f for f in world.features if isinstance(f, Batch) and f.count]
-    acting = [f for f in there if not f.drives and (inv_mass[f.indices] > 0).any()]
-    if acting != batches or [f for f in there if f.drives] != drivers:
+    acting = [f for f in there if not f.is_kinematic and (inv_mass[f.indices] > 0).any()]
+    if acting != batches or [f for f in there if f.is_kinematic] != drivers:
         raise Differs
     refuse_held_twice(now, world.features)
     if box := world._runner.scene.periodic:

@@ -145,8 +145,8 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     for first in [*of(Periodic), *of(Sleep)]:
         first.bind(scene)
     accelerations, walls = of(Acceleration), of(Collider)
-    drivers = [f for f in of(Batch) if f.drives and f.count]
-    batches = [f for f in of(Batch) if not f.drives and (scene.inv_mass[f.indices] > 0).any()]
+    drivers = [f for f in of(Batch) if f.is_kinematic and f.count]
+    batches = [f for f in of(Batch) if not f.is_kinematic and (scene.inv_mass[f.indices] > 0).any()]
     contact = next((c for c in of(PairContact) if c.matters), None)
     if contact or walls:
         scene.radius = Radii(memory, particles.radius, scene.count)
@@ -167,7 +167,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     )
     size = size_of(path, scale.work)
     team = Team(memory, size, len(particles), path == "parallel" and size == 1, pieces=PIECES if contact else size)
-    search = contact.join(scene, batches, team) if contact else None
+    search = contact.make_search(scene, batches, team) if contact else None
     if can_have_impacts(scene, batches) and any(w.has_restitution for w in walls):
         scene.impacts = BodyImpacts(scene, batches)
     for feature in of(Batch):
@@ -175,7 +175,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     for feature in [*accelerations, *drivers, *batches, *walls]:
         with memory.owned(feature):
             feature.bind(scene)
-    searches = [(f.join(scene, team), f.room) for f in accelerations if f.pairwise]
+    searches = [(f.make_search(scene, team), f.neighbours_per_particle) for f in accelerations if f.pairwise]
     for feature in features:
         feature.new_force = False  # the force has been on the device from the start
         feature.changed = feature in drivers  # they move to their targets in the first frame; other knobs are in fields already
@@ -190,7 +190,9 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         step.sleep = SleepPass(step, state.sleepers, drivers, batches)
     diagnostics = Diagnostics(step, solver)
     if search and contact:
-        search.list.allocate(int(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.room)) + 64)
+        search.list.allocate(
+            int(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.neighbours_per_particle)) + 64
+        )
     for each, room in searches:
         if each:
             each.list.allocate(len(particles) * room + 64)

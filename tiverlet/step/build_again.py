@@ -134,13 +134,13 @@ class Rebuild:
         """Put the parts into the world, and into these what stays."""
         world, last = self.world, self.world._runner
         contact = next((c for c in last.step.contacts if c in self.features), None)
-        reach, left = last.scene.reach, last.left
+        multipliers, left = last.scene.multipliers_per_newton, last.left
         world._clock.parted = None
         world._install(world._particles.regrouped(self.some, self.added), self.features, parts)
         runner = world._runner
         runner.memory.compiler.times.add(last.memory.compiler.times)
         runner.pass_on(left, self.some)
-        runner.scene.reach = reach
+        runner.scene.multipliers_per_newton = multipliers
         runner.memory.restore(state)
         for f, rows in self.noted.items():
             if f in self.features:

@@ -33,7 +33,7 @@ class ContactRows:
         runner.list_neighbours()
         return cls(contact.dev.geometry.candidates(runner.scene.state.get(runner.memory)), contact.start)
 
-    def idle(self, w: np.ndarray) -> np.ndarray:
+    def immovable(self, w: np.ndarray) -> np.ndarray:
         """Whether none of its particles can move."""
         return (w[self.indices] == 0).all(axis=1)
 

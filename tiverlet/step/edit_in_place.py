@@ -62,7 +62,7 @@ def planned(
     change = Regrouping(some, number, scene.particles, now, inv_mass, bodies)
     came = None if added is None else added.position
     known = {id(start): start for start in (world._particles, *(f.start for f in world.features))}
-    starts = {one: now.placed(change.joined(start.position, came)) for one, start in known.items()}
+    starts = {one: now.placed(change.regrouped_rows(start.position, came)) for one, start in known.items()}
     bound, tied = None, [f for f in batches if not f.can_regroup(change)]
     if links or tied:
         if any(not f.acts for f in tied):
@@ -91,11 +91,11 @@ def regroup(world: Any, edit: Edit, added: Particles | None) -> None:
     runner, change, bound = world._runner, edit.change, edit.bound
     scene, step, memory, count = runner.scene, runner.step, runner.memory, change.now.count
     search = runner.search
-    apart = search and ((search.list.saved and change.goes) or (bound and search.others(bound.linked, change)))
+    apart = search and ((search.list.saved and change.has_removed) or (bound and search.others(bound.linked, change)))
     pairs = _pairs(search.list, change) if apart else None
     rows = scene.count
     for one in runner.memories:
-        one.regroup(rows, change.first, change.stay[change.first :], count)
+        one.regroup(rows, change.first_removed, change.kept_indices[change.first_removed :], count)
     rows.set(count)
     scene.particles, scene.inv_mass = change.now, change.inv_mass
     scene.state.regroup(memory, change)
@@ -147,7 +147,7 @@ def grabbing(world: Any) -> Grab | None:
     for f in pins:
         if not (f.needs_new_state and f.acts):
             return None
-    driving, inv_mass, some = [f for f in pins if f.drives], scene.inv_mass, NOBODY
+    driving, inv_mass, some = [f for f in pins if f.is_kinematic], scene.inv_mass, NOBODY
     if driving:
         before, after = _joined([f.held for f in driving]), _joined([f.members.rows[:, 0] for f in driving])
         inv_mass, some = inv_mass.copy(), _joined([before, after])

@@ -208,7 +208,7 @@ def _seen(
     loose, loses = np.zeros(len(some), dtype=bool), world._clock.parted is not None
     for f in world.features:
         if isinstance(f, Pin) and f in features and f.needs_new_state:  # which takes others
-            if f.drives:
+            if f.is_kinematic:
                 loose[f.held] = loses = True
         elif isinstance(f, Batch | PairContact):
             stays = f.kept_mask(number)[0] if f in features else np.zeros(1, dtype=bool)

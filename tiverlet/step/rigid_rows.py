@@ -31,7 +31,7 @@ class RigidRows:
         self.broken = np.zeros(self.count, dtype=bool)
         self.start, self.dev = batch.start, SimpleNamespace(spring=SimpleNamespace(soft=False))
 
-    def idle(self, w: np.ndarray) -> np.ndarray:
+    def immovable(self, w: np.ndarray) -> np.ndarray:
         """No row: what nothing can move is left out already."""
         return np.zeros(self.count, dtype=bool)
 
@@ -112,7 +112,7 @@ def _coupled(batches: list, w: np.ndarray, every: bool = False) -> Iterator[tupl
     for b in batches:
         if b.clusters and b.count:
             shares = every | (np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) > 1)
-            yield b, (b.compliance == 0) & ~b.broken & ~b.idle(w) & shares
+            yield b, (b.compliance == 0) & ~b.broken & ~b.immovable(w) & shares
 
 
 def _wide(batch: Any) -> np.ndarray:

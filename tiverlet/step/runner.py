@@ -206,15 +206,15 @@ class Runner:
         self.left = None
         if self.sleep:
             self.settle(dt)
-        self.know_reach()
+        self.set_multipliers_per_newton()
         report, self.moved, self.released = self.report(substeps, iterations), 0.0, 0.0
         clock.softened = "softened" in report.flags
         return report
 
-    def know_reach(self) -> None:
+    def set_multipliers_per_newton(self) -> None:
         """Set the factors by which loads follow from the multipliers of the last substep."""
         factor = self.integrator.h2_factor
-        self.scene.reach = factor * h2_rigid_of(self.clock), factor * h2_effective_of(self.clock)
+        self.scene.multipliers_per_newton = factor * h2_rigid_of(self.clock), factor * h2_effective_of(self.clock)
 
     def find_ramps(self) -> None:
         """After knobs were uploaded: find the batches with new rest values."""

@@ -15,7 +15,7 @@ from ..device.interrupts import whole
 from ..device.patches.compiler import CachedLaunch
 from ..features.arguments import knobs_of, meant
 from ..features.feature import Feature
-from ..features.read_only import assign_whole, read_only
+from ..features.read_only import assign_whole_advice, read_only
 from ..particles import in_range
 from ..step import checkpoint, energy_bound, impulse
 from ..step import frames as kernel
@@ -130,7 +130,7 @@ class Worlds:
         world, runner, k = self._world, self._runner, int(k)
         runner.memory.choose(k)
         world._clock = runner.clock = self._clocks.of(k)
-        runner.know_reach()
+        runner.set_multipliers_per_newton()
         if self._sources:
             self._sources[k].put_on(world)
         self._knobs.show(k)
@@ -489,7 +489,7 @@ class Worlds:
     def position(self) -> np.ndarray:
         """Positions [m], (worlds, n, dim), a read-only copy in f64. Assign an array to move particles; velocities are kept."""
         with self._open():
-            return read_only(self._runner.scene.state.get(self._runner.memory), assign_whole("Worlds", "position"))
+            return read_only(self._runner.scene.state.get(self._runner.memory), assign_whole_advice("Worlds", "position"))
 
     def view(self, name: str = "position") -> np.ndarray:
         """Return the positions [m] of all worlds, (worlds, n, dim), as a view of device memory.
@@ -507,7 +507,9 @@ class Worlds:
         if name not in known:
             raise ValueError(f"Worlds.view: name = {name!r}, but it must be one of {', '.join(map(repr, known))}.")
         with self._open():
-            return read_only(self._runner.memory.seen(known[name])[:, : self._runner.n], assign_whole("Worlds", "position"))
+            return read_only(
+                self._runner.memory.seen(known[name])[:, : self._runner.n], assign_whole_advice("Worlds", "position")
+            )
 
     @position.setter
     def position(self, value) -> None:
@@ -534,7 +536,7 @@ class Worlds:
     def velocity(self) -> np.ndarray:
         """Velocities [m/s], (worlds, n, dim), a read-only copy in f64, accurate to the order of the world. Assign to set them."""
         with self._open():
-            return read_only(self._velocities(), assign_whole("Worlds", "velocity"))
+            return read_only(self._velocities(), assign_whole_advice("Worlds", "velocity"))
 
     def _velocities(self, links: bool = True, touches: bool = True) -> np.ndarray:
         """Return the velocities of all worlds.

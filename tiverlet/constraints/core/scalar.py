@@ -8,7 +8,7 @@ import numpy as np
 
 from ... import checks
 from ...features.feature import Batch, Knob, Scene
-from ...features.read_only import assign_whole, handed_out
+from ...features.read_only import as_read_only, assign_whole_advice
 from ...features.regrouping import Regrouping
 from ...geometry.ordered import distinct
 from .corner_passes import CornerPasses
@@ -138,7 +138,7 @@ class Scalar(Batch):
 
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether no particle of the batch goes or gets another number, and no constraint takes the size of the whole scene."""
-        return not (self.indices >= change.first).any() and not self._scene_sized
+        return not (self.indices >= change.first_removed).any() and not self._scene_sized
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """Return f at the given positions, (m,): the rest value when none is given."""
@@ -213,11 +213,11 @@ class Scalar(Batch):
 
     def start_from(self, rest: np.ndarray) -> None:
         """Set initial rest values (m,) that the user has not given, without marking the batch as changed."""
-        self.__dict__["rest"] = handed_out(rest, assign_whole(type(self).__name__, "rest"))
+        self.__dict__["rest"] = as_read_only(rest, assign_whole_advice(type(self).__name__, "rest"))
 
     def review(self, particles: "Particles", inv_mass: np.ndarray) -> None:
         """Warn of violated constraints between particles that cannot move."""
-        stuck = self.idle(inv_mass)
+        stuck = self.immovable(inv_mass)
         if stuck.any():
             C = self.violation(particles.position)
             wrong = stuck & (
@@ -357,8 +357,10 @@ class Scalar(Batch):
             return np.zeros(self.count)
         memory, missing = self.scene.memory, self.sagging
         known = memory.read(self.dev.equation.lam)[: self.count] - missing  # velocities contain it, as a spring force
-        scale = per_newton(self.scene.reach, self.compliance, lambda: self.weights(self.scene.state.get(memory)))
-        return -scale * missing - np.divide(known, self.scene.reach[1], out=np.zeros(self.count), where=known != 0)
+        scale = per_newton(self.scene.multipliers_per_newton, self.compliance, lambda: self.weights(self.scene.state.get(memory)))
+        return -scale * missing - np.divide(
+            known, self.scene.multipliers_per_newton[1], out=np.zeros(self.count), where=known != 0
+        )
 
     @property
     def _learns(self) -> bool:
