@@ -17,7 +17,7 @@ from .contact.rays import Hits, inside, ray
 from .contact.touches import ContactEvents, joined, no_events
 from .device.copies import Copies
 from .device.interrupts import whole
-from .features.arguments import meant
+from .features.arguments import suggest_name
 from .features.feature import Acceleration, Batch, Feature
 from .features.read_only import assign_whole_advice, read_only, structure_advice
 from .neighbours.queries import Contacts, PointSearch, near_by_all, nearest
@@ -706,7 +706,7 @@ class World:
 
     def __setattr__(self, name: str, value) -> None:
         if not name.startswith("_") and name not in LIVE:
-            guess = "" if hasattr(self, name) else meant(name, LIVE)
+            guess = "" if hasattr(self, name) else suggest_name(name, LIVE)
             raise AttributeError(
                 f"World.{name} cannot be set{guess}. Live are {', '.join(LIVE[:-1])} and {LIVE[-1]}, and the knobs of the "
                 "features; everything else is structure, fixed when the world is built."

@@ -183,7 +183,7 @@ class PairContact(Feature):
         dev = self.dev
         self.scene, dev.state, dev.w = scene, scene.state, scene.state.w
         dev.has_friction, dev.has_restitution, dev.turns = self.has_friction, self.has_restitution, self.turns
-        self.table.make_room(dev.has_friction, dev.has_restitution, dev.turns)
+        self.table.set_columns(dev.has_friction, dev.has_restitution, dev.turns)
         # `reports`: whether pairs that push each other are recorded, not only sensors. `events`: an EventLog, or None.
         dev.has_events, dev.reports, dev.events = self.has_events, bool(vars(self).get("events")), None
 
@@ -192,8 +192,8 @@ class PairContact(Feature):
 
         Groups that the settings do not name any more stay in the table, so dropping a name does not rebuild the world.
         """
-        named = self._pairs.named
-        told = self.table.named if self.scene and self.matters else frozenset()
+        named = self._pairs.named_groups
+        told = self.table.named_groups if self.scene and self.matters else frozenset()
         return super().build_values() | {"named": told if named <= told else named}
 
     def upload(self) -> None:

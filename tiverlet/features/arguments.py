@@ -96,7 +96,7 @@ def _refused(thing: Any, name: str) -> str:
             f"{thing!r}.{name} cannot be set: it is fixed when {kind.__name__} is made. {can}. For another {name} make "
             f"a new {kind.__name__}; in a world, world.remove(features=[old]) and world.add(features=[new])."
         )
-    return f"{thing!r} has no {name!r}{meant(name, [*live, *given])}. {can}."
+    return f"{thing!r} has no {name!r}{suggest_name(name, [*live, *given])}. {can}."
 
 
 @functools.cache
@@ -105,7 +105,7 @@ def knobs_of(kind: type) -> tuple[str, ...]:
     return tuple(name for name in dir(kind) if isinstance(getattr(kind, name, None), Knob))
 
 
-def meant(name: str, names: Iterable[str]) -> str:
+def suggest_name(name: str, names: Iterable[str]) -> str:
     """Guess which name a misspelt one meant, as the end of a sentence; empty if no name is similar."""
     near = difflib.get_close_matches(name, [*names], 1)
     return f"; did you mean {near[0]!r}?" if near else ""

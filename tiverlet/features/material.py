@@ -67,7 +67,7 @@ def refuse_turning(who: str) -> None:
 
 
 @ti.func
-def limited(v, most, length):
+def limit_length(v, most, length):
     """Return a vector v, shortened to `length` if it is longer than `most`: the part of a slip v that friction takes back."""
     size = v.norm()
     if size > most:
@@ -75,7 +75,7 @@ def limited(v, most, length):
     return v
 
 
-MOST = 1000  # groups of particles that the table can distinguish
+MAX_GROUPS = 1000  # groups of particles that the table can distinguish
 TOUCHES, SENSES, SENSED = 1, 2, 3  # a particle of the one group pushes that of the other, senses it, is sensed by it
 
 
@@ -114,7 +114,7 @@ class Table:
         self.turns = any(v.rolling > 0 or v.twisting > 0 for v in rub) or any(v.tangential > 0 for v in bounce)
         self.has_friction = any(v.static > 0 for v in rub) or self.turns
 
-    def pushing(self, group: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    def pushing_mask(self, group: np.ndarray, pairs: np.ndarray) -> np.ndarray:
         """Return which pairs (m, 2) of particles of these groups push each other, (m,)."""
         if not self.senses and self.touching is None:
             return np.ones(len(pairs), dtype=bool)
@@ -123,7 +123,7 @@ class Table:
         return table.reshape(m, m, -1)[rank[pairs[:, 0]], rank[pairs[:, 1]], 3] == TOUCHES
 
     @property
-    def named(self) -> frozenset[int]:
+    def named_groups(self) -> frozenset[int]:
         """The groups that the arguments name."""
         given = [v for v in (self.friction, self.restitution) if isinstance(v, Mapping)]
         return frozenset(k for pairs in (*given, self.touching or (), self.sensing) for pair in pairs for k in pair)
@@ -133,12 +133,12 @@ class Table:
 
         also: groups to distinguish in addition to those that are named.
         """
-        named = self.named | also
+        named = self.named_groups | also
         names, which, _ = distinct(group)
         at = {int(name): k for k, name in enumerate(name for name in names if name in named)}
         m = len(at) + (len(at) < len(names))  # all other groups share one rank
-        if m > MOST:
-            raise ValueError(f"{self.who}: {len(at)} groups of particles are named, but there can be {MOST}.")
+        if m > MAX_GROUPS:
+            raise ValueError(f"{self.who}: {len(at)} groups of particles are named, but there can be {MAX_GROUPS}.")
         rank = np.array([at.get(int(name), len(at)) for name in names], dtype=np.int64)[which]
         table = np.zeros((m, m, 7))
         table[..., 3] = self.touching is None
@@ -161,7 +161,7 @@ class Table:
                     table[at[a], at[b], columns] = table[at[b], at[a], columns] = row
         return rank, table.reshape(m * m, 7)
 
-    def make_room(self, has_friction: bool, has_restitution: bool, turns: bool) -> None:
+    def set_columns(self, has_friction: bool, has_restitution: bool, turns: bool) -> None:
         """Set which columns exist, even where all values are 0."""
         self.has_friction, self.has_restitution, self.turns = has_friction, has_restitution, turns
 
@@ -189,7 +189,7 @@ class Table:
     def upload(self, scene: "Scene", other: "Table") -> None:
         """Write the values of another table that names no other groups, for the same kernels."""
         if "entries" in vars(self):
-            rows = other.rows(scene.particles.group, self.named)[1][: 1 if self.uniform else None]
+            rows = other.rows(scene.particles.group, self.named_groups)[1][: 1 if self.uniform else None]
             scene.memory.write(self.entries, rows[:, : self.width])
 
     @ti.func
@@ -205,13 +205,13 @@ class Table:
         return self.entries[row]
 
     @ti.func
-    def held(self, i, j, n, normal, slip):
+    def friction_displacement(self, i, j, n, normal, slip):
         """Return the part of a slip [m] of particles i and j that friction takes back, for a normal displacement along n [m].
 
         It is at most friction times that displacement (Cundall and Strack 1979).
         """
         s, row = slip - slip.dot(n) * n, self.of(i, j)
-        return limited(s, row[0] * normal, row[1] * normal)
+        return limit_length(s, row[0] * normal, row[1] * normal)
 
     @inline
     def reach(self, radius, i, j):

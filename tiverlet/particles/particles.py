@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import checks
-from ..features.arguments import meant
+from ..features.arguments import suggest_name
 from ..features.read_only import read_only, structure_advice
 
 LARGEST = 1e15  # [m] squared lengths up to 1e30 leave room below the largest f32, 3e38
@@ -47,7 +47,7 @@ class Particles:
         self.radius = checks.per_item(who, "radius", radius, self.count, least=0.0)
         self.pinned = _pinned(who, pinned, self.count)
         self.group = _group(who, group, self.count)
-        self.spin, self.inertia, self.orientation = turning(self, spin, inertia, orientation)
+        self.spin, self.inertia, self.orientation = checked_rotation(self, spin, inertia, orientation)
         with np.errstate(divide="ignore"):
             self.inv_mass = np.where(self.pinned, 0.0, 1.0 / self.mass)
         self._fix()
@@ -95,7 +95,7 @@ class Particles:
             both = {name: np.concatenate([values, vars(added)[name]]) for name, values in both.items()}
         new = object.__new__(Particles)  # without __init__: all values were checked before
         vars(new).update(both, count=len(both["position"]), dim=self.dim)
-        vars(new).update(self._turning_of(some, added))
+        vars(new).update(self._rotation_of(some, added))
         new._fix()
         return new
 
@@ -105,7 +105,7 @@ class Particles:
         vars(new).update(vars(self), position=_fixed("position", position))
         return new
 
-    def _turning_of(self, some: np.ndarray, added: "Particles | None") -> dict[str, np.ndarray | None]:
+    def _rotation_of(self, some: np.ndarray, added: "Particles | None") -> dict[str, np.ndarray | None]:
         """Return spin, inertia and orientation of the particles in the mask and the added ones.
 
         If only some of them spin, the others spin from now on, starting at rest.
@@ -124,7 +124,7 @@ class Particles:
     def __setattr__(self, name: str, value) -> None:
         if getattr(self, "_fixed", False):
             if not hasattr(self, name):
-                raise AttributeError(f"Particles has no {name!r}{meant(name, vars(self))}. All of it is structure.")
+                raise AttributeError(f"Particles has no {name!r}{suggest_name(name, vars(self))}. All of it is structure.")
             raise AttributeError(
                 f"Particles.{name} is structure, fixed when a world is built. Make new Particles for a new world; "
                 "to move particles assign to world.position or world.velocity."
@@ -169,7 +169,9 @@ def at_rest(name: str, particles: "Particles") -> np.ndarray:
     return np.zeros(n) if flat else np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
 
 
-def turning(particles: "Particles", spin, inertia, orientation) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
+def checked_rotation(
+    particles: "Particles", spin, inertia, orientation
+) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
     """Return the checked arguments in TURNING for each particle; None for those that are absent."""
     who, n = "Particles", particles.count
     if spin is None and inertia is None and orientation is None:

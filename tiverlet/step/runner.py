@@ -10,7 +10,7 @@ from ..constraints.path import Path
 from ..contact.initial_overlap import overlapping
 from ..device.interrupts import whole
 from ..device.patches.compiler import CachedLaunch
-from ..particles.spin import moments
+from ..particles.spin import moments_of_inertia
 from . import high_order, initial_shape, initial_violation
 from .clock import Clock, slack
 from .contact_rows import ContactRows
@@ -408,7 +408,7 @@ class Runner:
             return np.zeros((self.n, particles.axes))
         half = self.spin() - self.memory.read(self.scene.state.spin.s)[: self.n] / clock.h
         r = particles.radius
-        return np.divide(moments(particles), r, out=np.zeros(len(r)), where=r > 0)[:, None] * half * (2 / clock.h)
+        return np.divide(moments_of_inertia(particles), r, out=np.zeros(len(r)), where=r > 0)[:, None] * half * (2 / clock.h)
 
     def shares(self) -> tuple[float, float]:
         """The shares of rigid and of soft constraints in velocities after the last substep, see shares_of()."""

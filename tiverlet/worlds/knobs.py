@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..features.arguments import knobs_of, meant
+from ..features.arguments import knobs_of, suggest_name
 from ..features.feature import Feature
 
 if TYPE_CHECKING:
@@ -57,7 +57,9 @@ class Knobs:
         for name, values in knobs.items():
             if name not in knobs_of(type(f)):
                 live = ", ".join(knobs_of(type(f))) or "nothing"
-                raise AttributeError(f"Worlds.set: {name} is no knob of {f!r}{meant(name, knobs_of(type(f)))}. Live are {live}.")
+                raise AttributeError(
+                    f"Worlds.set: {name} is no knob of {f!r}{suggest_name(name, knobs_of(type(f)))}. Live are {live}."
+                )
             one = not isinstance(values, (list, tuple)) and np.ndim(values) == 0
             if one or len(values) != len(chosen):
                 has = "one value" if one else f"{len(values)} values"

@@ -13,7 +13,7 @@ from ..device import runtime
 from ..device.copies import Copies
 from ..device.interrupts import whole
 from ..device.patches.compiler import CachedLaunch
-from ..features.arguments import knobs_of, meant
+from ..features.arguments import knobs_of, suggest_name
 from ..features.feature import Feature
 from ..features.read_only import assign_whole_advice, read_only
 from ..particles import in_range
@@ -687,7 +687,7 @@ class Worlds:
 
     def __setattr__(self, name: str, value: Any) -> None:
         if not name.startswith("_") and name not in LIVE:
-            guess = "" if hasattr(self, name) else meant(name, LIVE)
+            guess = "" if hasattr(self, name) else suggest_name(name, LIVE)
             raise AttributeError(f"Worlds.{name} cannot be set{guess}. Live are {', '.join(LIVE)}, and knobs by set().")
         object.__setattr__(self, name, value)
 
