@@ -321,7 +321,7 @@ class Contact(PairContact):
                             forced += share * tangential
                             spin_forced += share * turned
                     elif ti.static(self.dev.has_friction):
-                        want -= self.friction_displacement(i, j, n, pressed * shared + given, self.dev.slip.field[e]) / shared
+                        want -= self.held(i, j, n, pressed * shared + given, self.dev.slip.field[e]) / shared
                     total += w * want
                     if ti.static(self.dev.has_friction and not self.dev.spins):
                         if final != 0:
@@ -344,10 +344,10 @@ class Contact(PairContact):
             self.dev.restitution.lift[i] = lift
 
     @ti.func
-    def friction_displacement(self, i, j, n, normal, slip):
+    def held(self, i, j, n, normal, slip):
         """Return the part of a pair's slip [m], this substep included, that friction takes back for a normal displacement."""
         moved = self.dev.state.slid(slip + self.dev.state.d[i] - self.dev.state.d[j], i, j)
-        return self.table.friction_displacement(i, j, n, normal, moved)
+        return self.table.held(i, j, n, normal, moved)
 
     @ti.func
     def grip(self, i, j, e, n, reach, pressed, bounces):
@@ -360,7 +360,7 @@ class Contact(PairContact):
         if ti.static(self.dev.turns and self.dev.has_restitution):
             if bounces:
                 slip *= 1 + self.table.of(i, j)[6]
-        push = -self.table.friction_displacement(i, j, n, pressed * split_mass, slip) / split_mass
+        push = -self.table.held(i, j, n, pressed * split_mass, slip) / split_mass
         turned = self.dev.spinning.turned(i, m, push)
         if ti.static(self.dev.turns):
             turned += self.dev.spinning.resist(i, j, e, n, m, push, pressed)
@@ -430,11 +430,11 @@ class Contact(PairContact):
                             pressed = ti.max(overlap, pressed) / shared
                             reach = pressed * self.dev.spinning.split_mass(i, j)
                             slip = self.dev.slip.field[e] + self.dev.spinning.slip(i, j, self.dev.spinning.arm(i, j, n))
-                            slip = self.table.friction_displacement(i, j, n, reach, slip)
+                            slip = self.table.held(i, j, n, reach, slip)
                             if ti.static(self.dev.turns):
                                 turn = self.dev.spinning.left(i, j, e, n, pressed)
                         else:
-                            slip = self.friction_displacement(i, j, n, ti.max(overlap, pressed), self.dev.slip.field[e])
+                            slip = self.held(i, j, n, ti.max(overlap, pressed), self.dev.slip.field[e])
                     self.dev.slip.field[e] = slip
                     if ti.static(self.dev.turns):
                         self.dev.turn.field[e] = turn

@@ -308,7 +308,7 @@ class Polygons(PairContact):
                                 self.dev.geometry.impulse.field[e] = self.dev.geometry.impulse.field[e] + back / shared
                         want = back * n
                         if ti.static(self.dev.has_friction):
-                            want -= self.table.friction_displacement(v, a, n, overlap + missing, self.dev.slip.field[at] + d)
+                            want -= self.table.held(v, a, n, overlap + missing, self.dev.slip.field[at] + d)
                         total += share * want
                         if final != 0:
                             approach = -self.dev.geometry.relative(self.dev.forces.before, v, a, b, t).dot(n)
@@ -343,7 +343,7 @@ class Polygons(PairContact):
                     if found[0] > 0:
                         n, d = ti.Vector([found[2], found[3]]), self.dev.geometry.relative(self.dev.state.d, v, a, b, t)
                         overlap, _ = self.dev.geometry.share(self.dev.depths, at, v, a, b, t)
-                        slip = self.table.friction_displacement(v, a, n, overlap, self.dev.slip.field[e] + d)
+                        slip = self.table.held(v, a, n, overlap, self.dev.slip.field[e] + d)
                 self.dev.slip.field[e] = slip
         if ti.static(self.dev.has_restitution):
             for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):

@@ -205,7 +205,7 @@ class Table:
         return self.entries[row]
 
     @ti.func
-    def friction_displacement(self, i, j, n, normal, slip):
+    def held(self, i, j, n, normal, slip):
         """Return the part of a slip [m] of particles i and j that friction takes back, for a normal displacement along n [m].
 
         It is at most friction times that displacement (Cundall and Strack 1979).
