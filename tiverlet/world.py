@@ -78,7 +78,7 @@ class World:
                 contact.enable_shrink()  # before anything is compiled; later, the frame would have to be compiled again
 
     @staticmethod
-    def _of(
+    def _from_starts(
         particles: Particles, features: tuple[Feature, ...], starts: Sequence[Particles | None], copies: Copies | None = None,
         **settings,
     ) -> "World":  # fmt: skip
@@ -164,7 +164,7 @@ class World:
                     self._runner.begin(dt, self._substeps, self._iterations)
                     report = self._runner.advance(dt, self._substeps, self._iterations)
             except BaseException:
-                self._broken_off()
+                self._handle_failed_step()
                 raise
             self._runner.arrive()
             if self._clock.exceeds(report.energy, self._runner.sheet.item(KINETIC), report.overlap):
@@ -175,7 +175,7 @@ class World:
                 watcher.after(dt, report)
         return report
 
-    def _broken_off(self) -> None:
+    def _handle_failed_step(self) -> None:
         """Clean up after a step that ended with an exception: undo it, or inform recorders that no step leads to this state."""
         undo, self._undo, self._events = self._undo, None, (none := no_events(self._particles.dim), none)
         if undo:
@@ -199,29 +199,29 @@ class World:
             self._clock.bound = CHANGED
             if self._runner.sleep and not all(isinstance(f, Batch) and f.is_kinematic for f in waiting):
                 self._runner.wake()
-            self._adapt(steps=True)
+            self._rebuild_for_knobs(steps=True)
             self._upload()
 
     @property
-    def _force_waits(self) -> bool:
+    def _has_new_force(self) -> bool:
         """Whether a force has changed and the device still has the old one."""
         return any(f.changed and (f.new_force or isinstance(f, Acceleration)) for f in self._features)
 
-    def _settle_forces(self, steps: bool) -> None:
+    def _restart_for_new_forces(self, steps: bool) -> None:
         """Where a force has changed, turn displacements into velocities by the old force before it is lost.
 
-        The old force is lost when it is overwritten, or left out of a copy. steps: see _adapt().
+        The old force is lost when it is overwritten, or left out of a copy. steps: see _rebuild_for_knobs().
         """
         changed = [f for f in self._features if f.changed]
         if any(f.has_dropped_load for f in changed):
             if not steps:
                 self._runner.note_displacements()
-            self._let_go()
+            self._restart_with_reactions()
         elif any(f.new_force or isinstance(f, Acceleration) for f in changed):
             with self._runner.memory.compiler():
                 (self._runner.restart if steps else self._runner.restart_between)(self._iterations)
 
-    def _let_go(self) -> None:
+    def _restart_with_reactions(self) -> None:
         """Start from the present velocities, which include the reaction that is about to end."""
         if not self._clock.d_is_velocity:
             self._start_from(self.velocity)
@@ -231,12 +231,12 @@ class World:
             self._runner.start(velocity)
         self._clock.energy = None
 
-    def _adapt(self, steps: bool = False) -> None:
-        """Handle changed forces, see _settle_forces(), and rebuild the world where knobs need other kernels.
+    def _rebuild_for_knobs(self, steps: bool = False) -> None:
+        """Handle changed forces, see _restart_for_new_forces(), and rebuild the world where knobs need other kernels.
 
         steps: whether a frame follows at once, so that residuals of the last frame are not read before it.
         """
-        self._settle_forces(steps)
+        self._restart_for_new_forces(steps)
         if any(f.needs_other_kernels for f in self._features if f.changed):
             edit_scene.renew(self)
 
@@ -377,7 +377,7 @@ class World:
             if impulse.rubs(runner) or runner.probe:  # the change alters friction
                 seen = self.velocity
                 if not impulse.steer(runner, seen, seen, change, self._iterations, has):
-                    self._let_go()
+                    self._restart_with_reactions()
             runner.wake(np.flatnonzero(others))
             s = runner.memory.read(spin.s)[: runner.n]
             runner.memory.write(spin.s, has + change if clock.d_is_velocity else s + clock.h * change)
@@ -672,9 +672,9 @@ class World:
             raise TypeError(f"World.clone: {sorted(unknown)[0]} cannot be changed; one of {', '.join(settings)} can.")
         self._runner.memory.check()
         self._find_stiffened()
-        self._adapt()
+        self._rebuild_for_knobs()
         copies = tuple(f.copy_with_kernels() for f in self._features)
-        new = World._of(self._particles, copies, [f.start for f in self._features], **{**settings, **changes})
+        new = World._from_starts(self._particles, copies, [f.start for f in self._features], **{**settings, **changes})
         checkpoint.transfer(self, new)
         new._runner.pass_on(self._runner.left, np.ones(len(self._particles), dtype=bool))
         return new

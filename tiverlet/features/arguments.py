@@ -24,7 +24,7 @@ class Knob:
     """A live setting: checked when assigned, written to the device before the next frame.
 
     check: a function (feature, value) -> value that raises for an invalid value.
-    force: the knob changes a force, so displacements are turned into velocities first, see World._settle_forces().
+    force: the knob changes a force, so displacements are turned into velocities first, see World._restart_for_new_forces().
     compiled: kernels contain the value, so the world is rebuilt for another one, see Feature.needs_other_kernels.
     built: the world is rebuilt for another value, too, but with the same kernels.
     device: the attribute with the knob's field. Kernels read the setting by the knob's name; None where they do not read it.

@@ -275,4 +275,4 @@ def rebuild(
         feature.compiled_so_far = frozenset(names)
     settings = dict(scene["settings"])
     settings["solver"] = _made(settings["solver"], Solver, arrays, given)
-    return World._of(particles, tuple(features), starts, **settings)
+    return World._from_starts(particles, tuple(features), starts, **settings)

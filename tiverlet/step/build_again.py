@@ -66,8 +66,8 @@ class Rebuild:
         runner.note_displacements()
         pulled = (self.added is not None or not self.some.all()) and runner.step.has_pair_forces  # by others than before
         if any(isinstance(f, Collider) for f in self.went):
-            self.world._let_go()
-        elif pulled or self.world._force_waits or any(map(self._drives, (*self.came, *self.went, *self.extending.values()))):
+            self.world._restart_with_reactions()
+        elif pulled or self.world._has_new_force or any(map(self._drives, (*self.came, *self.went, *self.extending.values()))):
             with runner.memory.compiler():
                 runner.restart(self.world.iterations)
         else:

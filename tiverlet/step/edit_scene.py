@@ -136,7 +136,7 @@ def change(
     with world._runner.memory.compiler():
         told, (seen, loose, moved) = world._all_events(), _seen(world, some, number, features)
         others = (added is not None or not some.all()) and world._runner.step.has_pair_forces
-        if world._force_waits or others or any(more.soft for more in planned.more):
+        if world._has_new_force or others or any(more.soft for more in planned.more):
             world._runner.restart_between(world.iterations)
         world._clock.parted = None
         edit_in_place.regroup(world, planned, added)

@@ -6,20 +6,20 @@ from ..step.clock import Clock
 from ..step.integrator import FREE
 
 # Attributes with the same name and meaning in Clock.
-PLAIN = "time", "tick", "since", "h", "d_is_velocity", "started", "longest", "owed", "lacked", "softened", "kinetic", "parting"
+SCALARS = "time", "tick", "since", "h", "d_is_velocity", "started", "longest", "owed", "lacked", "softened", "kinetic", "parting"
 NONE = -1  # first_moved where no particle was placed
 
 
 class Clocks:
     """The values of a Clock for each of many worlds, as arrays; see Clock for their meaning.
 
-    energy, bound: NaN where unknown. first_moved: NONE where no particle was placed. frame: (worlds, 3). asks_drag: whether knobs
-    may need drag factors other than those in the clock and on the device.
+    energy, bound: NaN where unknown. first_moved: NONE where no particle was placed. frame: (worlds, 3). needs_drag: whether
+    knobs may need drag factors other than those in the clock and on the device.
     """
 
     def __init__(self, clocks: list[Clock]):
         self.count = len(clocks)
-        for name in PLAIN:
+        for name in SCALARS:
             setattr(self, name, np.array([getattr(clock, name) for clock in clocks]))
         self.frame = np.array([clock.frame for clock in clocks], dtype=np.float64)
         self.energy = np.array([np.nan if clock.energy is None else clock.energy for clock in clocks], dtype=np.float64)
@@ -28,7 +28,7 @@ class Clocks:
         self.first_moved = np.array([NONE if clock.first_moved is None else clock.first_moved for clock in clocks])
         # Lists, since these values rarely differ from world to world.
         self.drag = [clock.drag for clock in clocks]
-        self.asks_drag = np.zeros(self.count, dtype=bool)
+        self.needs_drag = np.zeros(self.count, dtype=bool)
         self.parted = {k: clock.parted for k, clock in enumerate(clocks) if clock.parted is not None}
 
     time: np.ndarray
@@ -46,7 +46,7 @@ class Clocks:
 
     def of(self, k: int) -> Clock:
         """Return the clock of world k."""
-        out = Clock(**{name: getattr(self, name)[k].item() for name in PLAIN})
+        out = Clock(**{name: getattr(self, name)[k].item() for name in SCALARS})
         since, length, count = self.frame[k].tolist()
         out.frame, out.drag, out.parted = (since, length, int(count)), self.drag[k], self.parted.get(k)
         out.energy = float(self.energy[k]) if self.known[k] else None
@@ -61,7 +61,7 @@ class Clocks:
 
     def put(self, k: int, clock: Clock) -> None:
         """Store the values of a clock for world k."""
-        for name in PLAIN:
+        for name in SCALARS:
             getattr(self, name)[k] = getattr(clock, name)
         self.frame[k], self.drag[k] = clock.frame, clock.drag
         self.known[k] = clock.energy is not None
@@ -74,15 +74,15 @@ class Clocks:
             self.parted[k] = clock.parted
 
     def copy(self) -> "Clocks":
-        """Return a copy, for return_to()."""
+        """Return a copy, for restore()."""
         return Clocks([self.of(k) for k in range(self.count)])
 
-    def return_to(self, other: "Clocks", some: np.ndarray) -> None:
+    def restore(self, other: "Clocks", some: np.ndarray) -> None:
         """Set the worlds in `some` to the values of other clocks."""
-        for name in (*PLAIN, "frame", "energy", "bound", "known", "first_moved"):
+        for name in (*SCALARS, "frame", "energy", "bound", "known", "first_moved"):
             getattr(self, name)[some] = getattr(other, name)[some]
         for k in map(int, some):
-            self.asks_drag[k] |= self.drag[k] != other.drag[k]
+            self.needs_drag[k] |= self.drag[k] != other.drag[k]
             self.drag[k] = other.drag[k]
             self.parted.pop(k, None)
             if k in other.parted:

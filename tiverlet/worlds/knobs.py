@@ -93,7 +93,7 @@ class Knobs:
             if f.changed and f.needs_other_kernels:
                 _refuse_other_kernels(f)
 
-    def idle(self) -> bool:
+    def has_nothing_to_upload(self) -> bool:
         """Whether no knob waits to be uploaded."""
         if self._set or any(f.changed or f.moving for f in self.features):
             return False
@@ -119,19 +119,19 @@ class Knobs:
         return True
 
     @property
-    def turned(self) -> np.ndarray:
+    def changed_worlds(self) -> np.ndarray:
         """The worlds in which a knob has another value than in the last frame, a mask."""
         if len(self._waiting) > 1 or any(f.changed for f in self.features):
             return np.ones(self.count, dtype=bool)
         return np.any([np.zeros(self.count, dtype=bool), *self._set.values()], axis=0)
 
-    def waiting_of(self, feature: Feature) -> np.ndarray:
+    def waiting_mask(self, feature: Feature) -> np.ndarray:
         """Return the mask of the worlds in which a knob of a feature waits."""
         of = self._set.get(self.features.index(feature), np.zeros(self.count, dtype=bool))
         return of | feature.changed
 
     @property
-    def waiting(self) -> np.ndarray:
+    def waiting_worlds(self) -> np.ndarray:
         """The numbers of the worlds in which a knob waits or a target moves."""
         if len(self._waiting) > 1 or any(f.changed or f.moving for f in self.features):
             return np.arange(self.count)

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from ..world import World
 
 
-def alike(worlds: "list[World]") -> "list[World]":
+def with_equal_kernels(worlds: "list[World]") -> "list[World]":
     """Return the worlds, with clones in place of those that were compiled differently.
 
     A world is cloned if it was compiled for a team of threads, if its knobs need other kernels now, or if it lacks shrinking
@@ -72,11 +72,11 @@ def _structure(world: "World") -> dict[str, Any]:
         "kernels": None,
     }
     if COMPILER == "taichi":  # the only compiler whose internals are known
-        out["kernels"] = _written(world)
+        out["kernels"] = _kernel_source(world)
     return out
 
 
-def _written(world: "World") -> Any:
+def _kernel_source(world: "World") -> Any:
     """Return the source of a world's kernels, with numbers in place of its fields."""
     from ..device.patches.sharing import Writing  # noqa: PLC0415
 

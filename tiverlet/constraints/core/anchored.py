@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ...particles import Particles
 
 
-def one_each(who: str, indices, count: int = checks.ANY) -> FixedSize:
+def one_each(who: str, indices, count: int = checks.UNKNOWN_COUNT) -> FixedSize:
     """Check particles below `count`, each of which has one place, and return them as members."""
     rows = checks.indices(who, "indices", indices, count)
     if len(rows) > 1 and len(np.unique(rows)) < len(rows):

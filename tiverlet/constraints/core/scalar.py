@@ -65,7 +65,9 @@ class Scalar(Batch):
 
     def fixed(self, indices, arity: int) -> FixedSize:
         """Check the indices of constraints on `arity` particles each, and return them as members."""
-        return FixedSize(type(self).__name__, checks.indices(repr(self), self.index_name, indices, checks.ANY, arity=arity))
+        return FixedSize(
+            type(self).__name__, checks.indices(repr(self), self.index_name, indices, checks.UNKNOWN_COUNT, arity=arity)
+        )
 
     def hold(self, quantity: Quantity) -> None:
         """Use this f, and act on its particles."""
