@@ -247,7 +247,7 @@ def test_pools_that_fork_are_refused():
 
 def test_workers_with_another_version_are_refused():
     job = part.Job(ball, height, {}, "tiverlet 0.0.1 on Taichi 1.0")
-    outcome = part.compute_in_worker(workers.pickle_job(job), part.Part(0, [{"speed": 1.0}]), 0)
+    outcome = part.compute_in_worker(workers.sent(job), part.Part(0, [{"speed": 1.0}]), 0)
     assert isinstance(outcome, RuntimeError) and "but the sweep was started with tiverlet 0.0.1 on Taichi 1.0" in str(outcome)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-UNKNOWN_COUNT = 2**31 - 1  # number of particles, while it is not yet known
+ANY = 2**31 - 1  # number of particles, while it is not yet known
 
 
 def number(who: str, name: str, value: Any, *, above=None, least=None, most=None, below=None) -> float:
@@ -16,7 +16,7 @@ def number(who: str, name: str, value: Any, *, above=None, least=None, most=None
         value = _real(who, name, value)
     if not math.isfinite(value):
         raise ValueError(f"{who}: {name} = {value}, but it must be finite.")
-    if words := _violated_bound(value, above, least, most, below):
+    if words := _missed(value, above, least, most, below):
         raise ValueError(f"{who}: {name} = {value:g}, but it must be {words}.")
     return value
 
@@ -111,7 +111,7 @@ def indices(who: str, name: str, value, count: int, *, arity: int | None = None,
         bad = (array < 0) | (array >= count)
         i = int(np.argmax(bad.any(axis=1) if arity else bad))
         least = int(array[i].min())
-        why = f"there are {count} {things} (0 ... {count - 1})" if count < UNKNOWN_COUNT else f"{things} are numbered from 0"
+        why = f"there are {count} {things} (0 ... {count - 1})" if count < ANY else f"{things} are numbered from 0"
         end = f"; count from the start, not {least} from the end" if least < 0 else ""
         raise ValueError(f"{who}: {name}[{i}] = {_show(array[i])}, but {why}{end}.")
     if arity:
@@ -149,7 +149,7 @@ def _floats(who: str, name: str, value) -> np.ndarray:
     return np.array(array, dtype=np.float64)
 
 
-def _violated_bound(value: float, above=None, least=None, most=None, below=None) -> str:
+def _missed(value: float, above=None, least=None, most=None, below=None) -> str:
     """Return the bound that a value violates, in words; empty if it is within the bounds."""
     if above is not None and not value > above:
         return f"above {above:g}"
@@ -165,8 +165,8 @@ def _violated_bound(value: float, above=None, least=None, most=None, below=None)
 def _bounds(who, name, array, **bounds) -> None:
     """Raise ValueError for the first element of an array that is out of bounds."""
     ends = {int(np.argmin(array)), int(np.argmax(array))} if len(array) else set()
-    if any(_violated_bound(array[i], **bounds) for i in ends):
-        i, words = next((i, words) for i, value in enumerate(array) if (words := _violated_bound(value, **bounds)))
+    if any(_missed(array[i], **bounds) for i in ends):
+        i, words = next((i, words) for i, value in enumerate(array) if (words := _missed(value, **bounds)))
         raise ValueError(f"{who}: {name}[{i}] = {array[i]:g}, but it must be {words}.")
 
 

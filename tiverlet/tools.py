@@ -24,7 +24,7 @@ def golden_steps(dim: int) -> tuple[int, ...]:
     return tuple(int(_BITS / root ** (k + 1)) | 1 for k in range(dim))
 
 
-def _kernel_or_python(kernel: Callable) -> Callable[[Callable], Callable]:
+def _both(kernel: Callable) -> Callable[[Callable], Callable]:
     """Make a function that runs `kernel`, a ti.func, while a kernel is compiled, and the decorated function otherwise."""
 
     def decorate(python: Callable) -> Callable:
@@ -86,7 +86,7 @@ def _golden_kernel(i, dim: ti.template() = 1):  # type: ignore[valid-type]
         return ti.Vector([_golden_axis(i, step) for step in ti.static(golden_steps(dim))])
 
 
-@_kernel_or_python(_golden_kernel)
+@_both(_golden_kernel)
 def golden(i, dim: int = 1):
     """Return the i-th point of the golden-ratio sequence: evenly spread over [0, 1)^dim for any number of points.
 
@@ -124,7 +124,7 @@ def _golden_index_kernel(value, dim: ti.template() = 1):  # type: ignore[valid-t
         return _golden_index_axis(value[0], ti.static(_golden_inverse(dim)))
 
 
-@_kernel_or_python(_golden_index_kernel)
+@_both(_golden_index_kernel)
 def golden_index(value, dim: int = 1):
     """Invert golden: return the i whose point is `value` (dim 1) or has `value` as its first coordinate; a u32 in kernels.
 

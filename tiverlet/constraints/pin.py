@@ -28,7 +28,7 @@ def _indices(pin: "Pin", indices) -> np.ndarray:
     """Check assigned indices and replace `members` by them. Returns the indices, (m, 1)."""
     rows = np.asarray(indices)
     rows = rows[:, 0] if rows.ndim == 2 and rows.shape[1] == 1 else rows  # (m, 1), the shape in which indices are read
-    members, own = one_each("Pin", rows, checks.UNKNOWN_COUNT if pin.start is None else pin.start.count), vars(pin)
+    members, own = one_each("Pin", rows, checks.ANY if pin.start is None else pin.start.count), vars(pin)
     before = pin.members.rows
     if members.count != len(before):
         raise ValueError(f"Pin: indices has {members.count} particles, but this Pin holds {pin.count}. Make another one.")

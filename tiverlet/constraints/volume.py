@@ -58,7 +58,7 @@ class Volume(Scalar):
     def quantity_of(self, indices) -> Quantity:
         """Return Surfaces for faces (k, 3), else Tetrahedra, which have simpler kernels of their own."""
         if np.ndim(indices) == 2 and np.shape(indices)[1] == 3:
-            return Surfaces(*_oriented(checks.indices("Volume", "cells", indices, checks.UNKNOWN_COUNT, arity=3)))
+            return Surfaces(*_oriented(checks.indices("Volume", "cells", indices, checks.ANY, arity=3)))
         return Tetrahedra(self.fixed(indices, 4))
 
     @property

@@ -39,7 +39,7 @@ def overlapping(scene: Scene, batches: list[Batch], table: Table, x: np.ndarray,
     else:
         near = _meet(scene.state, x, radius, i, j)
     pairs = number[np.stack([i, j], axis=1)[near & (free[i] | free[j])]]
-    pairs = pairs[table.pushing_mask(scene.particles.group, pairs)]
+    pairs = pairs[table.pushing(scene.particles.group, pairs)]
     if not len(pairs):
         return False
     linked = excluded_pairs(batches, scene.particles.radius)

@@ -12,7 +12,7 @@ def checked(loops: Iterable) -> list[np.ndarray]:
     loops = checks.rows("Polygons", "loops", loops, "a sequence of index sequences, one for each body,")
     if len(loops) and np.ndim(loops[0]) == 0:
         raise TypeError(f"Polygons: loops = {loops!r} is one body; write a list of bodies, [[...]].")
-    out = [checks.indices("Polygons", f"loops[{k}]", loop, checks.UNKNOWN_COUNT) for k, loop in enumerate(loops)]
+    out = [checks.indices("Polygons", f"loops[{k}]", loop, checks.ANY) for k, loop in enumerate(loops)]
     seen: dict[int, int] = {}
     for k, loop in enumerate(out):
         if len(loop) < 3:

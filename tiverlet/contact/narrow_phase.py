@@ -232,7 +232,7 @@ class DiscGeometry:
         """Return the listed pairs as possible contacts around positions x (n, dim) [m], for the host."""
         particles, (pairs, _) = self.scene.particles, self.list.entries()
         some = (pairs[:, 0] < pairs[:, 1]) | (self.scene.inv_mass[pairs[:, 1]] == 0)
-        who = pairs[some & self.search.table.pushing_mask(particles.group, pairs)]
+        who = pairs[some & self.search.table.pushing(particles.group, pairs)]
         radius = particles.radius.copy()
         if self.store:
             radius -= self.store.read(self.shrunk)[: len(radius)]
@@ -255,7 +255,7 @@ class DiscGeometry:
             low = pairs[:, 0] < pairs[:, 1]
             pairs, push = pairs[low], push[low]
         if self.senses:
-            touch = self.search.table.pushing_mask(self.scene.particles.group, pairs)
+            touch = self.search.table.pushing(self.scene.particles.group, pairs)
             pairs, push = pairs[touch], push[touch]
         d = between(x[pairs[:, 0]], x[pairs[:, 1]], self.scene.periodic)
         length = np.linalg.norm(d, axis=1)

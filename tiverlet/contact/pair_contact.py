@@ -192,8 +192,8 @@ class PairContact(Feature):
 
         Groups that the settings do not name any more stay in the table, so dropping a name does not rebuild the world.
         """
-        named = self._pairs.named_groups
-        told = self.table.named_groups if self.scene and self.matters else frozenset()
+        named = self._pairs.named
+        told = self.table.named if self.scene and self.matters else frozenset()
         return super().build_values() | {"named": told if named <= told else named}
 
     def upload(self) -> None:

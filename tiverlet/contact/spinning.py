@@ -74,9 +74,10 @@ class Spinning:
     def rolling_mass(self, i, j):
         """Return the change of rho per f, with split masses."""
         a = self.part(i, j)
-        return (1 - a) * (1 - a) * self.spin.inverse_inertia.of(i) * self.weight[i] + a * a * self.spin.inverse_inertia.of(
-            j
-        ) * self.weight[j]
+        return (
+            (1 - a) * (1 - a) * self.spin.inverse_inertia.of(i) * self.weight[i]
+            + a * a * self.spin.inverse_inertia.of(j) * self.weight[j]
+        )  # fmt: skip
 
     @ti.func
     def held(self, i, j, e, n, s_i, s_j, most):

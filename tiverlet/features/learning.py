@@ -22,7 +22,7 @@ class OwnWeight:
         self.state = scene.state
         self.field = scene.memory.field("own_weight", scene.count, state=True)
 
-    def set_forces(self, integrator: Any, loads: "list[Acceleration]") -> None:
+    def follow(self, integrator: Any, loads: "list[Acceleration]") -> None:
         """Set the integrator, which has all accelerations, and the known loads among them."""
         self.integrator, self.forces, self.loads = integrator, integrator.forces, loads
 

@@ -114,7 +114,7 @@ class Table:
         self.turns = any(v.rolling > 0 or v.twisting > 0 for v in rub) or any(v.tangential > 0 for v in bounce)
         self.has_friction = any(v.static > 0 for v in rub) or self.turns
 
-    def pushing_mask(self, group: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    def pushing(self, group: np.ndarray, pairs: np.ndarray) -> np.ndarray:
         """Return which pairs (m, 2) of particles of these groups push each other, (m,)."""
         if not self.senses and self.touching is None:
             return np.ones(len(pairs), dtype=bool)
@@ -123,7 +123,7 @@ class Table:
         return table.reshape(m, m, -1)[rank[pairs[:, 0]], rank[pairs[:, 1]], 3] == TOUCHES
 
     @property
-    def named_groups(self) -> frozenset[int]:
+    def named(self) -> frozenset[int]:
         """The groups that the arguments name."""
         given = [v for v in (self.friction, self.restitution) if isinstance(v, Mapping)]
         return frozenset(k for pairs in (*given, self.touching or (), self.sensing) for pair in pairs for k in pair)
@@ -133,7 +133,7 @@ class Table:
 
         also: groups to distinguish in addition to those that are named.
         """
-        named = self.named_groups | also
+        named = self.named | also
         names, which, _ = distinct(group)
         at = {int(name): k for k, name in enumerate(name for name in names if name in named)}
         m = len(at) + (len(at) < len(names))  # all other groups share one rank
@@ -189,7 +189,7 @@ class Table:
     def upload(self, scene: "Scene", other: "Table") -> None:
         """Write the values of another table that names no other groups, for the same kernels."""
         if "entries" in vars(self):
-            rows = other.rows(scene.particles.group, self.named_groups)[1][: 1 if self.uniform else None]
+            rows = other.rows(scene.particles.group, self.named)[1][: 1 if self.uniform else None]
             scene.memory.write(self.entries, rows[:, : self.width])
 
     @ti.func

@@ -28,7 +28,7 @@ class Regrouping:
     extensions: Mapping[Any, Any] = field(default_factory=dict)
 
     @cached_property
-    def first_removed(self) -> int:
+    def first(self) -> int:
         """The first removed particle; particles before it keep their numbers."""
         return int(np.argmin(self.some)) if self.has_removed else len(self.some)
 

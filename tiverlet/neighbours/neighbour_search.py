@@ -133,9 +133,9 @@ class NeighbourSearch:
             self.list.blocks = self._blocks(n)
             self.list.allocate(room)
         if self.linked:
-            begin = self.memory.seen(self.excluded_begin)[change.first_removed]
+            begin = self.memory.seen(self.excluded_begin)[change.first]
             self.memory.resize(self.excluded_begin, n + 1)
-            self.memory.write_from(self.excluded_begin, change.first_removed, np.full(n + 1 - change.first_removed, begin))
+            self.memory.write_from(self.excluded_begin, change.first, np.full(n + 1 - change.first, begin))
         came = n - change.kept
         if came:
             self.memory.write_from(self.origin, change.kept, np.full((came, self.dim), np.nan))

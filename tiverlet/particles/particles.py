@@ -47,7 +47,7 @@ class Particles:
         self.radius = checks.per_item(who, "radius", radius, self.count, least=0.0)
         self.pinned = _pinned(who, pinned, self.count)
         self.group = _group(who, group, self.count)
-        self.spin, self.inertia, self.orientation = checked_rotation(self, spin, inertia, orientation)
+        self.spin, self.inertia, self.orientation = turning(self, spin, inertia, orientation)
         with np.errstate(divide="ignore"):
             self.inv_mass = np.where(self.pinned, 0.0, 1.0 / self.mass)
         self._fix()
@@ -95,7 +95,7 @@ class Particles:
             both = {name: np.concatenate([values, vars(added)[name]]) for name, values in both.items()}
         new = object.__new__(Particles)  # without __init__: all values were checked before
         vars(new).update(both, count=len(both["position"]), dim=self.dim)
-        vars(new).update(self._rotation_of(some, added))
+        vars(new).update(self._turning_of(some, added))
         new._fix()
         return new
 
@@ -105,7 +105,7 @@ class Particles:
         vars(new).update(vars(self), position=_fixed("position", position))
         return new
 
-    def _rotation_of(self, some: np.ndarray, added: "Particles | None") -> dict[str, np.ndarray | None]:
+    def _turning_of(self, some: np.ndarray, added: "Particles | None") -> dict[str, np.ndarray | None]:
         """Return spin, inertia and orientation of the particles in the mask and the added ones.
 
         If only some of them spin, the others spin from now on, starting at rest.
@@ -169,9 +169,7 @@ def at_rest(name: str, particles: "Particles") -> np.ndarray:
     return np.zeros(n) if flat else np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
 
 
-def checked_rotation(
-    particles: "Particles", spin, inertia, orientation
-) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
+def turning(particles: "Particles", spin, inertia, orientation) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
     """Return the checked arguments in TURNING for each particle; None for those that are absent."""
     who, n = "Particles", particles.count
     if spin is None and inertia is None and orientation is None:

@@ -36,7 +36,7 @@ class Spin:
             width = 1 if self.dim == 2 else 4
             turned = np.asarray(particles.orientation).reshape(n, width)
             self.orientation = memory.field("orientation", number, width=width, kind=ti.f64, values=turned, state=True)
-            self.inverse_radius = PerParticle(memory, "inverse_radius", inverse_radii(particles.radius), number)
+            self.inverse_radius = PerParticle(memory, "inverse_radius", inverse(particles.radius), number)
 
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether particles can be added and removed in place."""
@@ -45,7 +45,7 @@ class Spin:
             inverse_inertias(now, change.inv_mass)
         ):
             return False
-        return not self.orients or self.inverse_radius.can_be(inverse_radii(now.radius))
+        return not self.orients or self.inverse_radius.can_be(inverse(now.radius))
 
     def regroup(self, memory: Memory, change: Regrouping) -> None:
         """Set spin and orientation of added particles, see State.regroup()."""
@@ -54,7 +54,7 @@ class Spin:
         self.inverse_inertia.become(memory, inverse_inertias(now, change.inv_mass))
         memory.write_from(self.s, first, self.from_rates(now.spin)[first:])
         if self.orients:
-            self.inverse_radius.become(memory, inverse_radii(now.radius))
+            self.inverse_radius.become(memory, inverse(now.radius))
             memory.write_from(self.orientation, first, np.asarray(now.orientation).reshape(now.count, -1)[first:])
 
     def can_weigh(self, particles: Particles, inv_mass: np.ndarray) -> bool:
@@ -137,7 +137,7 @@ class Spin:
                 self.orientation[i] = out / out.norm()
 
 
-def inverse_radii(radius: np.ndarray) -> np.ndarray:
+def inverse(radius: np.ndarray) -> np.ndarray:
     """Return 1 / r of each particle [1/m], 0 for points."""
     return np.divide(1, radius, out=np.zeros(len(radius)), where=radius > 0)
 

@@ -97,7 +97,7 @@ class Slots:
 
     def regroup(self, memory: Memory, change: Regrouping) -> None:
         """Particles that no constraint holds came and went."""
-        n, first = change.now.count, change.first_removed
+        n, first = change.now.count, change.first
         memory.resize(self.begin, n + 1)
         memory.write_from(self.begin, first, np.full(n + 1 - first, self.total))
 

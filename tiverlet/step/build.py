@@ -184,7 +184,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     forces = Forces(scene, [*accelerations, known.carried] if known else accelerations)
     integrator = Verlet(scene, forces, bool(contact)) if scene.order == 2 else high_order.Composition(scene, forces, batches)
     if scene.own_weight:
-        scene.own_weight.set_forces(integrator, [known.carried] if known else [])
+        scene.own_weight.follow(integrator, [known.carried] if known else [])
     step = Step(scene, integrator, batches, drivers, contact, search, walls, team)
     if state.sleepers:
         step.sleep = SleepPass(step, state.sleepers, drivers, batches)

@@ -95,7 +95,7 @@ def regroup(world: Any, edit: Edit, added: Particles | None) -> None:
     pairs = _pairs(search.list, change) if apart else None
     rows = scene.count
     for one in runner.memories:
-        one.regroup(rows, change.first_removed, change.kept_indices[change.first_removed :], count)
+        one.regroup(rows, change.first, change.kept_indices[change.first :], count)
     rows.set(count)
     scene.particles, scene.inv_mass = change.now, change.inv_mass
     scene.state.regroup(memory, change)

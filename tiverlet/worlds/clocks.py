@@ -6,7 +6,7 @@ from ..step.clock import Clock
 from ..step.integrator import FREE
 
 # Attributes with the same name and meaning in Clock.
-SCALARS = "time", "tick", "since", "h", "d_is_velocity", "started", "longest", "owed", "lacked", "softened", "kinetic", "parting"
+PLAIN = "time", "tick", "since", "h", "d_is_velocity", "started", "longest", "owed", "lacked", "softened", "kinetic", "parting"
 NONE = -1  # first_moved where no particle was placed
 
 
@@ -19,7 +19,7 @@ class Clocks:
 
     def __init__(self, clocks: list[Clock]):
         self.count = len(clocks)
-        for name in SCALARS:
+        for name in PLAIN:
             setattr(self, name, np.array([getattr(clock, name) for clock in clocks]))
         self.frame = np.array([clock.frame for clock in clocks], dtype=np.float64)
         self.energy = np.array([np.nan if clock.energy is None else clock.energy for clock in clocks], dtype=np.float64)
@@ -46,7 +46,7 @@ class Clocks:
 
     def of(self, k: int) -> Clock:
         """Return the clock of world k."""
-        out = Clock(**{name: getattr(self, name)[k].item() for name in SCALARS})
+        out = Clock(**{name: getattr(self, name)[k].item() for name in PLAIN})
         since, length, count = self.frame[k].tolist()
         out.frame, out.drag, out.parted = (since, length, int(count)), self.drag[k], self.parted.get(k)
         out.energy = float(self.energy[k]) if self.known[k] else None
@@ -61,7 +61,7 @@ class Clocks:
 
     def put(self, k: int, clock: Clock) -> None:
         """Store the values of a clock for world k."""
-        for name in SCALARS:
+        for name in PLAIN:
             getattr(self, name)[k] = getattr(clock, name)
         self.frame[k], self.drag[k] = clock.frame, clock.drag
         self.known[k] = clock.energy is not None
@@ -74,12 +74,12 @@ class Clocks:
             self.parted[k] = clock.parted
 
     def copy(self) -> "Clocks":
-        """Return a copy, for restore()."""
+        """Return a copy, for return_to()."""
         return Clocks([self.of(k) for k in range(self.count)])
 
-    def restore(self, other: "Clocks", some: np.ndarray) -> None:
+    def return_to(self, other: "Clocks", some: np.ndarray) -> None:
         """Set the worlds in `some` to the values of other clocks."""
-        for name in (*SCALARS, "frame", "energy", "bound", "known", "first_moved"):
+        for name in (*PLAIN, "frame", "energy", "bound", "known", "first_moved"):
             getattr(self, name)[some] = getattr(other, name)[some]
         for k in map(int, some):
             self.needs_drag[k] |= self.drag[k] != other.drag[k]

@@ -72,11 +72,11 @@ def _structure(world: "World") -> dict[str, Any]:
         "kernels": None,
     }
     if COMPILER == "taichi":  # the only compiler whose internals are known
-        out["kernels"] = _kernel_source(world)
+        out["kernels"] = _written(world)
     return out
 
 
-def _kernel_source(world: "World") -> Any:
+def _written(world: "World") -> Any:
     """Return the source of a world's kernels, with numbers in place of its fields."""
     from ..device.patches.sharing import Writing  # noqa: PLC0415
 

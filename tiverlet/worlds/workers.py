@@ -227,7 +227,7 @@ class ExecutorWorkers:
     def begin(self, part: Part) -> None:
         """Accept a part."""
         if self._fallback is None:
-            job = pickle_job(self._job) if self._pool else self._job
+            job = sent(self._job) if self._pool else self._job
             self._submitted += 1
             try:
                 self._waiting[self._executor.submit(compute_in_worker, job, part, self._submitted)] = part
@@ -272,7 +272,7 @@ class ExecutorWorkers:
 
     def _make_fallback(self) -> Workers:
         try:
-            return Processes(min(self._most, os.cpu_count() or 1), pickle_job(self._job))
+            return Processes(min(self._most, os.cpu_count() or 1), sent(self._job))
         except TypeError:
             return ThisProcess(self._job)
 
@@ -283,7 +283,7 @@ def choose_workers(executor: Any, job: Job) -> tuple[Workers, int]:
         return ThisProcess(job), 1
     if isinstance(executor, int):
         count = checks.integer("sweep", "executor", executor, least=1)
-        return Processes(count, pickle_job(job)), count
+        return Processes(count, sent(job)), count
     if isinstance(executor, type) or not callable(getattr(executor, "submit", None)):
         kind = "class, not an object" if isinstance(executor, type) else type(executor).__name__
         raise TypeError(
@@ -302,13 +302,13 @@ def choose_workers(executor: Any, job: Job) -> tuple[Workers, int]:
                 'sweep: executor forks its processes ("fork"), but Taichi hangs after a fork. Type executor=4 for four '
                 'processes, or ProcessPoolExecutor(4, mp_context=multiprocessing.get_context("spawn")).'
             )
-        pickle_job(job)
+        sent(job)
     of_client = getattr(executor, "get_executor", None)  # of Dask; not pure: a failed call may be repeated
     executor = of_client(pure=False) if callable(of_client) else executor
     return ExecutorWorkers(executor, job), 1
 
 
-def pickle_job(job: Job) -> bytes:
+def sent(job: Job) -> bytes:
     """Pickle a job for other processes. Raises TypeError if it cannot be pickled."""
     try:
         return pickle.dumps(job)

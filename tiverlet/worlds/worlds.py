@@ -79,7 +79,7 @@ class Worlds:
             self._sources = [_Source(world) for world in sources] if len(sources) > 1 else []
             self._clocks = Clocks([world._clock for world in sources])
             for k, world in enumerate(sources):
-                self._copy_state(k, world)
+                self._take(k, world)
             if len(sources) < count:
                 for memory in self._runner.memories:
                     memory.choose(0)
@@ -92,7 +92,7 @@ class Worlds:
         self._turned = np.zeros(len(self), dtype=bool)  # worlds whose knobs changed before the last frame
         self._start: _Start | None = None  # the state for reset(); set by the first step
 
-    def _copy_state(self, k: int, world: World) -> None:
+    def _take(self, k: int, world: World) -> None:
         """Copy the state of a world to copy k."""
         runner = self._runner
         runner.memory.choose(k)
@@ -425,7 +425,7 @@ class Worlds:
             if position is not None:
                 new = self._runner.scene.state.get(self._runner.memory)
                 new[chosen] = self._per_particle("position", position, len(chosen))
-                self._set_positions(new, chosen)
+                self._place(new, chosen)
             if velocity is not None:
                 self._set_velocities(self._per_particle("velocity", velocity, len(chosen)), chosen)
 
@@ -515,9 +515,9 @@ class Worlds:
     def position(self, value) -> None:
         """Move particles of all worlds to (worlds, n, dim), or to (n, dim) in each [m]. Velocities are kept."""
         with self._open():
-            self._set_positions(self._per_particle("position", value, len(self)), np.arange(len(self)))
+            self._place(self._per_particle("position", value, len(self)), np.arange(len(self)))
 
-    def _set_positions(self, position: np.ndarray, chosen: np.ndarray) -> None:
+    def _place(self, position: np.ndarray, chosen: np.ndarray) -> None:
         """Move the particles of the chosen worlds. position: (worlds, n, dim)."""
         rows = position[chosen].reshape(-1, position.shape[2])
         in_range("Worlds", "position", rows)
@@ -738,7 +738,7 @@ class _Start:
         for log in runner.logs:
             runner.memory.write_some(log.made, 0, chosen)
         runner.invalidate(chosen)
-        worlds._clocks.restore(self.clocks, chosen)
+        worlds._clocks.return_to(self.clocks, chosen)
         if runner.drags:
             runner.memory.write_some(runner.integrator.decay, [[self.clocks.drag[k]] for k in chosen], chosen)
 

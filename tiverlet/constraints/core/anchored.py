@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ...particles import Particles
 
 
-def one_each(who: str, indices, count: int = checks.UNKNOWN_COUNT) -> FixedSize:
+def one_each(who: str, indices, count: int = checks.ANY) -> FixedSize:
     """Check particles below `count`, each of which has one place, and return them as members."""
     rows = checks.indices(who, "indices", indices, count)
     if len(rows) > 1 and len(np.unique(rows)) < len(rows):
@@ -76,7 +76,7 @@ class Anchored(Batch):
 
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether none of its particles goes or gets another number."""
-        return not (self.indices >= change.first_removed).any()
+        return not (self.indices >= change.first).any()
 
     def regroup(self, change: Regrouping) -> None:
         """Update the size of the scene, which violations are relative to."""

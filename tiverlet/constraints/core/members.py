@@ -78,7 +78,7 @@ def rows(who: str, name: str, value: Any, least: int) -> list[np.ndarray]:
         value = [value]
     out = []
     for k, row in enumerate(value):
-        row = checks.indices(who, f"{name}[{k}]", row, checks.UNKNOWN_COUNT)
+        row = checks.indices(who, f"{name}[{k}]", row, checks.ANY)
         if len(row) < least:
             raise ValueError(f"{who}: {name}[{k}] has {len(row)} particles, but at least {least} are needed.")
         twice = np.flatnonzero(np.bincount(np.unique(row, return_inverse=True)[1]) > 1)

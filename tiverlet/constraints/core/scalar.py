@@ -65,9 +65,7 @@ class Scalar(Batch):
 
     def fixed(self, indices, arity: int) -> FixedSize:
         """Check the indices of constraints on `arity` particles each, and return them as members."""
-        return FixedSize(
-            type(self).__name__, checks.indices(repr(self), self.index_name, indices, checks.UNKNOWN_COUNT, arity=arity)
-        )
+        return FixedSize(type(self).__name__, checks.indices(repr(self), self.index_name, indices, checks.ANY, arity=arity))
 
     def hold(self, quantity: Quantity) -> None:
         """Use this f, and act on its particles."""
@@ -140,7 +138,7 @@ class Scalar(Batch):
 
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether no particle of the batch goes or gets another number, and no constraint takes the size of the whole scene."""
-        return not (self.indices >= change.first_removed).any() and not self._scene_sized
+        return not (self.indices >= change.first).any() and not self._scene_sized
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """Return f at the given positions, (m,): the rest value when none is given."""
