@@ -120,7 +120,7 @@ class ShapeMatch(Batch):
         self._radius = np.sqrt(square / total)
 
     @property
-    def grows(self) -> bool:
+    def can_extend(self) -> bool:
         """Whether more clusters can be appended: not where `rest` was given, which has a row for every particle."""
         return self._rest is None
 
