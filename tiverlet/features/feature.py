@@ -248,7 +248,7 @@ class Acceleration(Feature):
         return {}
 
     def bind(self, scene: Scene) -> None:
-        """Declare a field for each of its settings."""
+        """Declare a field for each of its kernel values."""
         self.scene = scene
         for name, value in self.kernel_values().items():
             kind, width = ti.i32 if isinstance(value, int) else None, np.size(value) if np.ndim(value) else 0
@@ -257,7 +257,7 @@ class Acceleration(Feature):
         self.changed = False
 
     def upload(self) -> None:
-        """Write the settings to their fields."""
+        """Write the kernel values to their fields."""
         for name, value in self.kernel_values().items():
             self.scene.memory.write(vars(self.dev)[name], value)
 
