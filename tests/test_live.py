@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.commands.play import built
+from tiverlet.commands.play import load_world
 from tiverlet.live import session
 from tiverlet.live.server import Server
 from tiverlet.live.session import Session
@@ -180,12 +180,12 @@ def test_the_world_of_a_script_is_found(tmp_path, world):
     start = "import tiverlet as tv\nw = lambda: tv.World(tv.Particles([[0.0, 0.0]]))\n"
     for text in ("build = lambda: (1, w())", "world = w()", "def play():\n    return w()\nbuild = None"):
         script.write_text(start + text)
-        found, each_frame = built(str(script))
+        found, each_frame = load_world(str(script))
         assert isinstance(found, tv.World) and each_frame is None
         found.close()
     script.write_text("x = 1")
     with pytest.raises(ValueError, match="no world to play"):
-        built(str(script))
+        load_world(str(script))
 
 
 def test_bodies_and_their_surfaces_are_found(world):

@@ -17,9 +17,9 @@ from .contact.rays import Hits, inside, ray
 from .contact.touches import ContactEvents, joined, no_events
 from .device.copies import Copies
 from .device.interrupts import deferred_signals
-from .features.arguments import meant
+from .features.arguments import suggest_name
 from .features.feature import Acceleration, Batch, Feature
-from .features.read_only import assign_whole, read_only, structure
+from .features.read_only import assign_whole_advice, read_only, structure_advice
 from .neighbours.queries import Contacts, PointSearch, near_by_all, nearest
 from .particles import Particles, at_rest, in_range, spin_of
 from .solvers.jacobi import Jacobi
@@ -78,7 +78,7 @@ class World:
                 contact.enable_shrink()  # before anything is compiled; later, the frame would have to be compiled again
 
     @staticmethod
-    def _of(
+    def _from_starts(
         particles: Particles, features: tuple[Feature, ...], starts: Sequence[Particles | None], copies: Copies | None = None,
         **settings,
     ) -> "World":  # fmt: skip
@@ -166,7 +166,7 @@ class World:
                     self._runner.begin(dt, self._substeps, self._iterations)
                     report = self._runner.advance(dt, self._substeps, self._iterations)
             except BaseException:
-                self._broken_off()
+                self._handle_failed_step()
                 raise
             self._runner.arrive()
             if self._clock.exceeds(report.energy, self._runner.sheet.item(KINETIC), report.overlap):
@@ -177,7 +177,7 @@ class World:
                 watcher.after(dt, report)
         return report
 
-    def _broken_off(self) -> None:
+    def _handle_failed_step(self) -> None:
         """Clean up after a step that ended with an exception: undo it, or inform recorders that no step leads to this state."""
         undo, self._undo, self._events = self._undo, None, (none := no_events(self._particles.dim), none)
         if undo:
@@ -199,31 +199,31 @@ class World:
         waiting = [f for f in self._features if f.changed or f.moving]
         if waiting:
             self._clock.bound = CHANGED
-            if self._runner.sleep and not all(isinstance(f, Batch) and f.drives for f in waiting):
+            if self._runner.sleep and not all(isinstance(f, Batch) and f.is_kinematic for f in waiting):
                 self._runner.wake()
-            self._adapt(steps=True)
+            self._rebuild_for_knobs(steps=True)
             self._upload()
 
     @property
-    def _force_waits(self) -> bool:
+    def _has_new_force(self) -> bool:
         """Whether a force has changed and the device still has the old one."""
         return any(f.changed and (f.new_force or isinstance(f, Acceleration)) for f in self._features)
 
-    def _settle_forces(self, steps: bool) -> None:
+    def _restart_for_new_forces(self, steps: bool) -> None:
         """Where a force has changed, turn displacements into velocities by the old force before it is lost.
 
-        The old force is lost when it is overwritten, or left out of a copy. steps: see _adapt().
+        The old force is lost when it is overwritten, or left out of a copy. steps: see _rebuild_for_knobs().
         """
         changed = [f for f in self._features if f.changed]
         if any(f.has_released_load for f in changed):
             if not steps:
                 self._runner.note_displacements()
-            self._let_go()
+            self._restart_with_reactions()
         elif any(f.new_force or isinstance(f, Acceleration) for f in changed):
             with self._runner.memory.compiler():
                 (self._runner.restart if steps else self._runner.restart_between)(self._iterations)
 
-    def _let_go(self) -> None:
+    def _restart_with_reactions(self) -> None:
         """Start from the present velocities, which include the reaction that is about to end."""
         if not self._clock.d_is_velocity:
             self._start_from(self.velocity)
@@ -233,13 +233,13 @@ class World:
             self._runner.start(velocity)
         self._clock.energy = None
 
-    def _adapt(self, steps: bool = False) -> None:
-        """Handle changed forces, see _settle_forces(), and rebuild the world where knobs need other kernels.
+    def _rebuild_for_knobs(self, steps: bool = False) -> None:
+        """Handle changed forces, see _restart_for_new_forces(), and rebuild the world where knobs need other kernels.
 
         steps: whether a frame follows at once, so that residuals of the last frame are not read before it.
         """
-        self._settle_forces(steps)
-        if any(f.outgrown for f in self._features if f.changed):
+        self._restart_for_new_forces(steps)
+        if any(f.needs_other_kernels for f in self._features if f.changed):
             edit_scene.renew(self)
 
     def _upload(self) -> None:
@@ -304,7 +304,7 @@ class World:
     @property
     def position(self) -> np.ndarray:
         """Positions [m], (n, dim), a read-only copy in f64. Assign an array to move particles; velocities are kept."""
-        return read_only(self._runner.scene.state.get(self._runner.memory), assign_whole("World", "position"))
+        return read_only(self._runner.scene.state.get(self._runner.memory), assign_whole_advice("World", "position"))
 
     @position.setter
     def position(self, value) -> None:
@@ -334,7 +334,7 @@ class World:
             self._runner.memory.check()
             with deferred_signals, self._runner.memory.compiler():
                 out = self._runner.velocity(self._iterations)
-        return read_only(out.copy(), assign_whole("World", "velocity"))
+        return read_only(out.copy(), assign_whole_advice("World", "velocity"))
 
     @velocity.setter
     def velocity(self, value) -> None:
@@ -354,10 +354,10 @@ class World:
         """Angular velocities [rad/s], (n,) in 2D, (n, 3) in 3D, a read-only copy in f64; second order. Assign to set them."""
         state = self._runner.scene.state
         if not state.spins:
-            return read_only(at_rest("spin", self._particles), assign_whole("World", "spin"))
+            return read_only(at_rest("spin", self._particles), assign_whole_advice("World", "spin"))
         self._runner.memory.check()
         with deferred_signals, self._runner.memory.compiler():
-            return read_only(state.spin.to_rates(self._runner.spin()), assign_whole("World", "spin"))
+            return read_only(state.spin.to_rates(self._runner.spin()), assign_whole_advice("World", "spin"))
 
     @spin.setter
     def spin(self, value) -> None:
@@ -379,7 +379,7 @@ class World:
             if impulse.rubs(runner) or runner.probe:  # the change alters friction
                 seen = self.velocity
                 if not impulse.steer(runner, seen, seen, change, self._iterations, has):
-                    self._let_go()
+                    self._restart_with_reactions()
             runner.wake(np.flatnonzero(others))
             s = runner.memory.read(spin.s)[: runner.n]
             runner.memory.write(spin.s, has + change if clock.d_is_velocity else s + clock.h * change)
@@ -391,7 +391,7 @@ class World:
         if self._particles.orientation is None:
             raise ValueError("World.orientation: nobody keeps track of it. Make particles with tv.Particles(..., orientation=0).")
         turned = self._runner.memory.read(self._runner.scene.state.spin.orientation)[: len(self._particles)]
-        return read_only(turned[:, 0] if self._particles.dim == 2 else turned, structure("World", "orientation"))
+        return read_only(turned[:, 0] if self._particles.dim == 2 else turned, structure_advice("World", "orientation"))
 
     def near(self, points, radius) -> np.ndarray:
         """Return which particles have their center within `radius` [m] of which points.
@@ -674,9 +674,9 @@ class World:
             raise TypeError(f"World.clone: {sorted(unknown)[0]} cannot be changed; one of {', '.join(settings)} can.")
         self._runner.memory.check()
         self._find_stiffened()
-        self._adapt()
-        copies = tuple(f.twin() for f in self._features)
-        new = World._of(self._particles, copies, [f.start for f in self._features], **{**settings, **changes})
+        self._rebuild_for_knobs()
+        copies = tuple(f.copy_with_kernels() for f in self._features)
+        new = World._from_starts(self._particles, copies, [f.start for f in self._features], **{**settings, **changes})
         checkpoint.transfer(self, new)
         new._runner.pass_on(self._runner.left, np.ones(len(self._particles), dtype=bool))
         return new
@@ -698,7 +698,7 @@ class World:
         for memory in self._runner.memories:
             memory.destroy()
         for feature in self._features:
-            feature.scene, feature.once = None, frozenset()
+            feature.scene, feature.compiled_so_far = None, frozenset()
 
     def __enter__(self) -> "World":
         return self
@@ -708,7 +708,7 @@ class World:
 
     def __setattr__(self, name: str, value) -> None:
         if not name.startswith("_") and name not in LIVE:
-            guess = "" if hasattr(self, name) else meant(name, LIVE)
+            guess = "" if hasattr(self, name) else suggest_name(name, LIVE)
             raise AttributeError(
                 f"World.{name} cannot be set{guess}. Live are {', '.join(LIVE[:-1])} and {LIVE[-1]}, and the knobs of the "
                 "features; everything else is structure, fixed when the world is built."

@@ -33,7 +33,7 @@ class Capsule(Collider):
     followed to where it meets the surface (sphere tracing, Hart 1996). No force can pull a particle through either.
     """
 
-    bulk = 0.6
+    code_size = 0.6
     a, b = _end("a"), _end("b")
     radius = Knob(lambda f, v: checks.number("Capsule", "radius", v, above=0.0), "Of the rod [m].", device="size")
 

@@ -90,18 +90,20 @@ class Collider(Feature):
     @property
     def has_friction(self) -> bool:
         """Whether there is friction, or was when kernels were compiled."""
-        return self.turns or friction_of(repr(self), "friction", self.friction).static > 0 or "has_friction" in self.once
+        return (
+            self.turns or friction_of(repr(self), "friction", self.friction).static > 0 or "has_friction" in self.compiled_so_far
+        )
 
     @property
     def has_restitution(self) -> bool:
         """Whether there is restitution, or was when kernels were compiled."""
-        return self._bounce.normal > 0 or "has_restitution" in self.once
+        return self._bounce.normal > 0 or "has_restitution" in self.compiled_so_far
 
     @property
     def turns(self) -> bool:
         """Whether it resists rolling, or bounces across the normal, or did when kernels were compiled."""
         rub = friction_of(repr(self), "friction", self.friction)
-        return max(rub.rolling, rub.twisting, self._bounce.tangential) > 0 or "turns" in self.once
+        return max(rub.rolling, rub.twisting, self._bounce.tangential) > 0 or "turns" in self.compiled_so_far
 
     @property
     def _bounce(self) -> Bounce:
@@ -120,7 +122,7 @@ class Collider(Feature):
     @property
     def has_switch(self) -> bool:
         """Whether the wall can be switched off, by the compiled kernels or those to be compiled."""
-        return self._switch or not self.active or "has_switch" in self.once
+        return self._switch or not self.active or "has_switch" in self.compiled_so_far
 
     def bind(self, scene: Scene) -> None:
         """Store the state, and make the surface."""

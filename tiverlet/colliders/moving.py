@@ -43,7 +43,7 @@ class Moving(Collider):
     after TOUCHES touches (in a wedge), it stays at the last one.
     """
 
-    bulk = 1.5
+    code_size = 1.5
     needs_start_position = poses = True
     radius: Any = Knob(
         lambda f, v: checks.number(repr(f), "radius", v, least=0.0), "It is rounded by so much [m].", compiled=True

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from ..device import at, inline, ti
-from ..features.material import limited, refuse_turning
+from ..features.material import limit_length, refuse_turning
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
@@ -238,29 +238,29 @@ class Surface:
         r N, both are solved for together. A particle that sticks stops as long as that moment holds it; one that rolls on does so
         against it.
         """
-        k, s = self.spin.share.of(i), self.spin.s[i]
+        k, s = self.spin.inverse_inertia.of(i), self.spin.s[i]
         most, least = self.static() * support, self.dynamic() * support
         slip = across - self.spin.surface(s, n)
         if ti.static(self.turns):
             if bounces:
                 slip *= 1 + self.rolling[None][2]
-        held = limited(slip / (1 + k), most, least)
+        held = limit_length(slip / (1 + k), most, least)
         if ti.static(self.turns):
             row = self.rolling[None]
             if row[0] > 0 and not bounces:
                 rolls = s - self.wall_turn(i)
                 rolls -= self.spin.along(rolls, n)
-                still = limited(across, most, least)
+                still = limit_length(across, most, least)
                 moment = self.spin.moment(n, still)
                 rolls += k * moment
-                resisted = limited(rolls, k * row[0] * support, k * row[0] * support)
+                resisted = limit_length(rolls, k * row[0] * support, k * row[0] * support)
                 held = still
                 if (resisted != rolls).any():
-                    held = limited((across - self.spin.surface(s - resisted, n)) / (1 + k), most, least)
+                    held = limit_length((across - self.spin.surface(s - resisted, n)) / (1 + k), most, least)
                 s -= resisted
             if row[1] > 0:
                 twist = self.spin.along(s - self.wall_turn(i), n)
-                s -= limited(twist, k * row[1] * support, k * row[1] * support)
+                s -= limit_length(twist, k * row[1] * support, k * row[1] * support)
         s += k * self.spin.moment(n, held)
         self.spin.s[i] = s
         left = across - held

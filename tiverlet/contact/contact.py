@@ -142,7 +142,7 @@ class Contact(PairContact):
         dev.splitting.regroup(n)
         dev.projection.regroup(n, dev.list.team)
 
-    def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
+    def make_search(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields and the neighbour search, and return the search."""
         dim, dev = scene.particles.dim, self.dev
         linked = excluded_pairs(batches, scene.particles.radius)

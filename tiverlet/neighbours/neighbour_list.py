@@ -64,7 +64,7 @@ class NeighbourList:
     capacity_number: Number
     pitch_number: Number
     host_only = ("room",)
-    told_apart = True  # see Feature
+    has_own_compile_time = True  # see Feature
 
     def __init__(self, memory: "Memory", count: Number, rooms: Number, pair_data: list[PairData], team: Team, short: int):
         self.team, self.n, self.memory, self.short = team, count, memory, short

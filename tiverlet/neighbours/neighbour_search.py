@@ -47,7 +47,7 @@ class NeighbourSearch:
     too_far: Any = OnDevice()  # the square of the displacement beyond which the list is stale [m^2]
     farthest: Any = OnDevice()  # the largest distance of listed pairs [m]
     n: Any = OnDevice()  # number of particles
-    told_apart = True  # see Feature
+    has_own_compile_time = True  # see Feature
 
     def __init__(
         self, scene: "Scene", skin: float, linked: np.ndarray, table: Any, pair_data: list[PairData], team: Team, scratch: Any,
@@ -122,7 +122,7 @@ class NeighbourSearch:
         """
         n, stale = change.now.count, int(self.memory.view(self.list.stale)[0])
         reach = 0 * radius if reach is None else reach
-        if change.goes and not self.list.saved:
+        if change.has_removed and not self.list.saved:
             self.list.drop(change.number)
             self.cells.drop(change.number)
         skin = self._skin(skin, radius, reach)

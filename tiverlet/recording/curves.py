@@ -8,7 +8,7 @@ from ..colliders.collider import Collider
 from ..constraints.core.anchored import Anchored
 from ..features.feature import Batch
 from ..measure import moment_sum
-from ..particles.spin import moments
+from ..particles.spin import moments_of_inertia
 from ..step.checkpoint import Checkpoint
 from ..step.step_report import StepReport
 
@@ -92,7 +92,7 @@ class Curves:
         p = world.particles
         self._mass = np.where(p.inv_mass > 0, p.mass, 0.0)
         # Factors that turn r omega into I omega.
-        self._lever = np.divide(moments(p), p.radius, out=np.zeros(len(p)), where=p.radius > 0)
+        self._lever = np.divide(moments_of_inertia(p), p.radius, out=np.zeros(len(p)), where=p.radius > 0)
 
     def add(self, frame: int, report: StepReport, now: Checkpoint) -> None:
         """Add the figures of a frame. Momentum is that of the displacements, half a substep ago, like energy."""

@@ -77,8 +77,8 @@ class Journal:
     def state(self, kind: str = "state") -> int:
         """Write the exact state; return the size of the entry [bytes]."""
         kept, world = checkpoint.keep(self.world), self.world
-        more = {"flags": checkpoint.flags(world), "reach": world._runner.scene.reach}
-        more["once"] = [sorted(f.once) for f in world.features]
+        more = {"flags": checkpoint.flags(world), "reach": world._runner.scene.multipliers_per_newton}
+        more["once"] = [sorted(f.compiled_so_far) for f in world.features]
         parted = kept.clock.parted
         arrays = kept.values if parted is None else kept.values | {PARTED: np.asarray(parted)}
         return self.put(kind, {"clock": kept.clock.named() | {"_parted": None}, **more}, arrays)

@@ -129,7 +129,7 @@ class Recorder:
     def _begin(self, title: str) -> None:
         """Write what holds for all frames, and the first frame."""
         world = self.world
-        world._adapt()  # rebuild for the present knobs first, so that the state belongs to their kernels
+        world._rebuild_for_knobs()  # rebuild for the present knobs first, so that the state belongs to their kernels
         explained = explain(world)
         self._picture = Picture(world, self._stream, explained, environment(), self._overlays)
         self._sent, self._flushed = perf_counter(), 0
@@ -268,7 +268,7 @@ class Recorder:
         picture.stamp(number)
         sparse = number - self._last_state >= SPARSE * self._stride // self.every
         due = picture.drawing.bytes - self._drawn > self._bytes_between_states or sparse
-        if number and due and not world._force_waits:  # a state does not contain the force under which it was computed
+        if number and due and not world._has_new_force:  # a state does not contain the force under which it was computed
             self._note_state(journal.state())
         if self._own:
             numbers = {name: value for name, value in self._own.items() if isinstance(value, float)}

@@ -266,7 +266,7 @@ class Replay:
         world = scene.rebuild(source.data, source.arrays, self._given, before, once)
         _set_controller(world, [e.data["now"] for e in self._entries[: start + 1] if "now" in e.data][-1])
         checkpoint.install(world, _recorded_checkpoint(state, world), state.data["flags"])
-        world._runner.scene.reach = tuple(state.data["reach"])
+        world._runner.scene.multipliers_per_newton = tuple(state.data["reach"])
         return world
 
     def _run(self, start: int, end: int) -> Iterator[tuple["World", Entry]]:
@@ -296,7 +296,7 @@ class Replay:
                 scene.set_knobs(world.features[k], values)
         elif entry.kind == "taken":
             checkpoint.install(world, _recorded_checkpoint(entry, world), entry.data["flags"])
-            world._runner.scene.reach = tuple(entry.data["reach"])
+            world._runner.scene.multipliers_per_newton = tuple(entry.data["reach"])
         elif entry.kind == "assigned":
             if entry.data["name"] not in ("position", "velocity", "spin"):
                 raise ValueError(f"replay: {self.path} says that {plain(entry.data['name'])!r} was assigned.")

@@ -272,7 +272,7 @@ def rebuild(
     for feature, names in zip(features, once, strict=True):
         if not {*names} <= {*feature.compiled_for}:
             raise ValueError(f"replay: kernels of {feature!r} cannot have {names}.")
-        feature.once = frozenset(names)
+        feature.compiled_so_far = frozenset(names)
     settings = dict(scene["settings"])
     settings["solver"] = _made(settings["solver"], Solver, arrays, given)
-    return World._of(particles, tuple(features), starts, **settings)
+    return World._from_starts(particles, tuple(features), starts, **settings)

@@ -50,7 +50,7 @@ def bound_again(
     runner, scene, memory = world._runner, world._runner.scene, world._runner.memory
     drivers, batches = runner.step.drivers, runner.batches
     bound = [*drivers, *batches]
-    if not (set(extend) <= set(bound)) or any(f.afresh for f in bound):
+    if not (set(extend) <= set(bound)) or any(f.needs_new_state for f in bound):
         return None
     if not batches or any(f.changed and f not in drivers for f in bound):
         return None
@@ -81,7 +81,7 @@ def bound_again(
                     f.bind(scene)
                 if f in ramps:
                     f.ramp.adopt(ramps[f])
-                f.built()
+                f.note_built()
         if not (memory.has_room(again.longest) and scene.slots.exact == exact and _structure(scene, bound) == structure):
             return None
         linked = excluded_pairs(batches, now.radius)
@@ -103,8 +103,8 @@ def _check(world: Any, now: Particles, first: int, drivers: list[Batch], batches
     first: the index of the first added particle.
     """
     there = [f for f in world.features if isinstance(f, Batch) and f.count]
-    acting = [f for f in there if not f.drives and (inv_mass[f.indices] > 0).any()]
-    if acting != batches or [f for f in there if f.drives] != drivers:
+    acting = [f for f in there if not f.is_kinematic and (inv_mass[f.indices] > 0).any()]
+    if acting != batches or [f for f in there if f.is_kinematic] != drivers:
         raise DeclarationsDiffer
     refuse_held_twice(now, world.features)
     if box := world._runner.scene.periodic:

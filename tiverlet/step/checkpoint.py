@@ -167,7 +167,8 @@ def transfer(old: "World", new: "World") -> None:
     kept = keep(old)
     if new._precision == old._precision and new._order == old._order:
         install(new, kept, flags(old))
-        new._runner.scene.reach = old._runner.scene.reach  # the factors from multipliers to loads
+        # the factors from multipliers to loads
+        new._runner.scene.multipliers_per_newton = old._runner.scene.multipliers_per_newton
         for mine, other in zip(new.features, old.features, strict=True):
             if isinstance(mine, Batch):  # its scratch data of the last substep; not those of walls, since a clone ran no frame
                 new._runner.memory.put_scratch(mine, old._runner.memory.scratch(other))

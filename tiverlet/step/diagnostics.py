@@ -41,7 +41,7 @@ class Diagnostics:
     """
 
     host_only = ("sheet", "report", "details", "force_stiffness")
-    told_apart = True  # its compile time is reported by itself, as that of a Feature
+    has_own_compile_time = True  # its compile time is reported by itself, as that of a Feature
     n: Any = OnDevice()  # particles
 
     def __init__(self, step: "Step", solver: Solver):

@@ -91,7 +91,7 @@ def check_extended(world: Any, extend: Mapping[Feature, Feature]) -> None:
             raise ValueError(f"World.add: extend: {feature!r} does not act in this world. Add it to features.")
         if not isinstance(more, Feature):
             raise TypeError(f"World.add: extend[{feature!r}] = {more!r} is a {type(more).__name__}; write {feature!r} of others.")
-        feature.check_more(more)
+        feature.check_extension(more)
 
 
 def remove(world: Any, particles: Any, features: Iterable[Feature]) -> None:
@@ -143,7 +143,7 @@ def change(
         return
     with world._runner.memory.compiler():
         others = (added is not None or not some.all()) and world._runner.step.has_pair_forces
-        restarts = world._force_waits or others or any(more.soft for more in planned.more)
+        restarts = world._has_new_force or others or any(more.soft for more in planned.more)
         told, (seen, loose, moved) = world._all_events(), _seen(world, some, number, features, restarts)
         if restarts:
             world._runner.restart_between(world.iterations)
@@ -221,8 +221,8 @@ def _seen(
     loose, clock = np.zeros(len(some), dtype=bool), world._clock
     loses = clock.parted is not None or (restarts and any(_holds(f) for f in world.features))
     for f in world.features:
-        if isinstance(f, Pin) and f in features and f.afresh:  # a pin that takes other particles
-            if f.drives:
+        if isinstance(f, Pin) and f in features and f.needs_new_state:  # a pin that takes other particles
+            if f.is_kinematic:
                 loose[f.held] = loses = True
         elif isinstance(f, Batch | PairContact):
             stays = f.kept_mask(number)[0] if f in features else np.zeros(1, dtype=bool)

@@ -136,7 +136,7 @@ def _masses(world: "World") -> np.ndarray:
 
 def _pull(world: "World") -> np.ndarray:
     """Return the absolute values of the components of gravity, (dim,) [m/s^2]."""
-    pulls = [np.abs(f.settings()["g"]) for f in world.features if isinstance(f, Gravity)]
+    pulls = [np.abs(f.kernel_values()["g"]) for f in world.features if isinstance(f, Gravity)]
     return sum(pulls, np.zeros(world.particles.dim))
 
 

@@ -1,7 +1,7 @@
 """Rigid clusters that the user placed out of their shape, or made rigid while deformed, are restored before the first substep.
 
-A pass restores a rigid cluster in one substep. The cluster itself is at rest after that, but linked particles and walls were struck:
-a square that sagged by 2 cm on a floor left it at 1500 m/s when it was made rigid, at 100 substeps. So, as
+A pass restores a rigid cluster in one substep. The cluster itself is at rest after that, but it has thrown off linked particles
+and walls: a square that sagged by 2 cm on a floor left it at 1500 m/s when it was made rigid, at 100 substeps. So, as
 initial_violation.py does for scalar constraints, clusters and the bodies linked to them first move to where the clusters are in
 shape and the links are met, as rigid bodies and without velocity. Walls push back along the normals along which they stopped a
 particle. Clusters that share particles with others are left to the passes.

@@ -126,7 +126,7 @@ def bound(runner: Any, x: np.ndarray, ratio: float) -> Rows | None:
     """
     w = runner.scene.inv_mass
     scalars = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
-    some = [b for b in scalars if (~b.idle(w) & ~b.broken).any()]
+    some = [b for b in scalars if (~b.immovable(w) & ~b.broken).any()]
     some += rigid_rows([b for b in runner.batches if b.clusters], w)
     if not some:
         return None

@@ -138,7 +138,7 @@ class ParticlePass:
         for weights in ti.static(self.weights):
             if now.damps != 0:
                 for i in range(first, end):
-                    weights.weigh(i, now)
+                    weights.store_weight(i, now)
         if ti.static(self.knows_loads and len(self.walls) > 0):
             self.look_ahead(first, end, now)
         for c in ti.static(self.contacts):

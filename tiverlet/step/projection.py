@@ -100,7 +100,7 @@ def project(
     if matters(stays, ratio):
         runner.released = stays
     if slots and slots.system and not slots.system.steps and not runner.clock.softened:  # it holds loads without a violation
-        batches = [b for b in batches if ((slots.rows(b) < 0) & ~b.idle(w)).any() or matters(_off(b, x), ratio)]
+        batches = [b for b in batches if ((slots.rows(b) < 0) & ~b.immovable(w)).any() or matters(_off(b, x), ratio)]
     batches += rigid_rows(runner.batches, w, every=contacts is not None)
     if not batches:
         return True
@@ -312,7 +312,7 @@ class Rows:
         self.batches, self.w, self.n, self.dim = batches, w, *x.shape
         self.mass = _over(np.ones_like(w), w)  # 0 for particles that cannot move
         self.box = box  # the Periodic of the world
-        self.some = [~b.idle(w) & ~b.broken if b.breaks else ~b.idle(w) for b in batches]
+        self.some = [~b.immovable(w) & ~b.broken if b.breaks else ~b.immovable(w) for b in batches]
         for b, some in zip(batches, self.some, strict=True):
             if drive := getattr(b.dev, "drive", None):
                 some &= ~drive.slips(b.dev.equation.lam)[: b.count]

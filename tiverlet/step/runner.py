@@ -10,7 +10,7 @@ from ..constraints.path import Path
 from ..contact.initial_overlap import overlapping
 from ..device.interrupts import deferred_signals
 from ..device.patches.compiler import CachedLaunch
-from ..particles.spin import moments
+from ..particles.spin import moments_of_inertia
 from . import high_order, initial_shape, initial_violation
 from .clock import Clock, slack
 from .contact_rows import ContactRows
@@ -206,15 +206,15 @@ class Runner:
         self.left = None
         if self.sleep:
             self.settle(dt)
-        self.know_reach()
+        self.set_multipliers_per_newton()
         report, self.moved, self.released = self.report(substeps, iterations), 0.0, 0.0
         clock.softened = "softened" in report.flags
         return report
 
-    def know_reach(self) -> None:
+    def set_multipliers_per_newton(self) -> None:
         """Set the factors by which loads follow from the multipliers of the last substep."""
         factor = self.integrator.h2_factor
-        self.scene.reach = factor * h2_rigid_of(self.clock), factor * h2_effective_of(self.clock)
+        self.scene.multipliers_per_newton = factor * h2_rigid_of(self.clock), factor * h2_effective_of(self.clock)
 
     def find_ramps(self) -> None:
         """After knobs were uploaded: find the batches with new rest values."""
@@ -408,7 +408,7 @@ class Runner:
             return np.zeros((self.n, particles.axes))
         half = self.spin() - self.memory.read(self.scene.state.spin.s)[: self.n] / clock.h
         r = particles.radius
-        return np.divide(moments(particles), r, out=np.zeros(len(r)), where=r > 0)[:, None] * half * (2 / clock.h)
+        return np.divide(moments_of_inertia(particles), r, out=np.zeros(len(r)), where=r > 0)[:, None] * half * (2 / clock.h)
 
     def shares(self) -> tuple[float, float]:
         """The shares of rigid and of soft constraints in velocities after the last substep, see shares_of()."""

@@ -144,7 +144,9 @@ def _apart(batches: list[Any], w: np.ndarray) -> list[tuple[Any, np.ndarray]]:
     """Return each batch of clusters, and a mask, (m,), of those that share no particle, are not broken, and can move."""
     clusters = [b for b in batches if b.clusters and b.count]
     degree = np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices for b in clusters)]), minlength=len(w))
-    return [(b, (np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) == 1) & ~b.idle(w) & ~b.broken) for b in clusters]
+    return [
+        (b, (np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) == 1) & ~b.immovable(w) & ~b.broken) for b in clusters
+    ]
 
 
 def _of(batch: Any, some: np.ndarray, columns: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:

@@ -487,7 +487,7 @@ class Step:
         if ti.static(self.orients):
             for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                 if self.state.awake(i):
-                    self.state.spin.turn(i)
+                    self.state.spin.update_orientation(i)
         for log in ti.static(self.wall_logs):
             n = self.n * now.final
             for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):

@@ -1,4 +1,4 @@
-"""Times of compiling kernels, in all and by parts marked `told_apart`; and a message for the waiting user.
+"""Times of compiling kernels, in all and by parts marked `has_own_compile_time`; and a message for the waiting user.
 
 While LLVM works, Taichi holds Python's lock, so nothing can change on a terminal. The message has to be printed before. LLVM
 takes longer than the translation, whose measured time decides whether to print it.
@@ -82,7 +82,7 @@ def _show_message(name: str, features: list[str]) -> Iterator[None]:
 def _called(self: Any, *args: Any, **kwargs: Any) -> Any:
     """Translate a function called in a kernel, and count its time for the object that it belongs to."""
     now = Translation.now
-    if now is None or not args or not getattr(args[0], "told_apart", False):
+    if now is None or not args or not getattr(args[0], "has_own_compile_time", False):
         return _call(self, *args, **kwargs)
     now.enter(repr(args[0]))
     try:
