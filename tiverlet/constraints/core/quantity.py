@@ -109,16 +109,6 @@ class Quantity:
         return f - self.rest[c]
 
     @ti.func
-    def rest_exactly(self, c):
-        """The rest value of constraint c in f64, where it moves: in f32 it would jerk, with rounding / h^2."""
-        rest = ti.cast(self.rest[c], ti.f64)
-        if ti.static(bool(self.drive)):
-            rest = self.drive.target[c]
-        if ti.static(self.ramp.made):
-            rest += self.ramp.low[c]
-        return rest
-
-    @ti.func
     def exactly(self, c):
         """Return f - rest of constraint c in f64."""
         return ti.cast(0, ti.f64)
@@ -143,7 +133,7 @@ class Quantity:
 
 @ti.func
 def rest_exactly(quantity: ti.template(), c):  # type: ignore[valid-type]
-    """The rest value of constraint c in f64. In f32, one that moves would jerk, with rounding / h^2."""
+    """Return the rest value of constraint c in f64. In f32, a moving rest value would jerk by rounding / h^2."""
     rest = ti.cast(quantity.rest[c], ti.f64)
     if ti.static(bool(quantity.drive)):
         rest = quantity.drive.target[c]
