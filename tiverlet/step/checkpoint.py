@@ -41,7 +41,7 @@ def state(world: "World", pairs: bool = True) -> dict[str, np.ndarray]:
     """
     out = {name: values for memory in world._runner.memories for name, values in memory.state().items()}
     if world._runner.search and pairs:
-        out[PAIRS], carried = world._runner.search.list.lasting_data()
+        out[PAIRS], carried = world._runner.search.list.persistent_data()
         out.update((f"{PAIR}{name}", values) for name, values in carried.items())
     return out | {f"{RESTS}{k}": np.stack(f.ramp.now()) for k, f in enumerate(world.features) if f.ramp and f.ramp.waits}
 
@@ -71,7 +71,7 @@ def _hashed(world: "World", values: dict[str, np.ndarray]) -> dict[str, np.ndarr
     """
     late, pieces = _late(world), _pieces(world)
     told = {e.name for memory in world._runner.memories for e in memory.entries if e.told}
-    told |= {name for name, piece in pieces.items() if piece.told}
+    told |= {name for name, piece in pieces.items() if piece.for_reports}
     out = {n: v for n, v in values.items() if not (n in told or n.startswith(RESTS) or (n in late and not v.any()))}
     if PAIRS in out:
         carried, some = [name for name in pieces if name in out], np.zeros(len(out[PAIRS]), dtype=bool)
@@ -88,7 +88,7 @@ def _late(world: "World") -> set[str]:
 
 def _pieces(world: "World") -> dict[str, Any]:
     """Return the data of pairs that are part of the state (PairData), by name."""
-    return {f"{PAIR}{piece.name}": piece for piece in world._runner.search.list.lasting} if world._runner.search else {}
+    return {f"{PAIR}{piece.name}": piece for piece in world._runner.search.list.persistent} if world._runner.search else {}
 
 
 def flags(world: "World") -> list[list[bool]]:

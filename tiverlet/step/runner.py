@@ -281,7 +281,7 @@ class Runner:
     def carry_loads(self) -> None:
         """After particles were added, removed or pinned: sum the known loads of their contacts again for each particle."""
         for known in self.known:
-            known.carry(self.scene, self.scene.state.get(self.memory), *self.search.list.lasting_data())
+            known.carry(self.scene, self.scene.state.get(self.memory), *self.search.list.persistent_data())
 
     def restart(self, iterations: int) -> None:
         """Turn displacements into velocities, so that the next substep is a start from the present state. iterations: of the
