@@ -54,7 +54,7 @@ class BodyImpacts:
         system = scene.slots.system
         self.passes = FEW if system else MANY
         self.spreads = not system  # from link to link; a system solves all links at once
-        self.exact = bool(scene.slots.exact and (not system or system.left_out(batches) == 0))
+        self.exact = bool(scene.slots.exact and (not system or system.count_relaxed_alone(batches) == 0))
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.state = scene.state
         self.rigid = add("impacts.rigid", n, kind=ti.i32)  # whether a rigid constraint holds it

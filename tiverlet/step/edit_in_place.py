@@ -167,7 +167,7 @@ def grabbing(world: Any) -> Grab | None:
         if any((inv_mass[b.indices] != scene.inv_mass[b.indices]).any() for b in runner.batches):
             return None
     soft = len(driving) < len(pins)
-    if soft and not scene.slots.can_grab(inv_mass, runner.batches):
+    if soft and not scene.slots.can_reassign(inv_mass, runner.batches):
         return None
     refuse_held_twice(world._particles, world._features, pins)
     return Grab(pins, soft, inv_mass, some)
@@ -185,7 +185,7 @@ def grab(world: Any, change: Grab) -> None:
             runner.invalidate()
     if change.soft:
         scene.particles = particles.placed(scene.state.get(memory))
-        scene.slots.grab(memory, change.inv_mass, runner.batches)
+        scene.slots.reassign(memory, change.inv_mass, runner.batches)
     for f in pins:
         f.grab(scene)
     for log in runner.logs:

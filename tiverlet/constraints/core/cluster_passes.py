@@ -197,7 +197,7 @@ class ClusterPasses(Passes):
                 # A NaN is not stored: the cluster keeps its last rotation.
                 self.turn[c] = end
             self.keep(self.pose, c, pose)
-            self.slots.note_turn(self.slots.turn(cosine, 1.0))
+            self.slots.record_turn(self.slots.classify_turn(cosine, 1.0))
             if ti.static(self.spring.soft):
                 R = rotation.matrix(start)
                 if first > 0:  # in the body frame

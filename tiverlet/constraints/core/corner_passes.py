@@ -84,7 +84,7 @@ class CornerPasses(Passes):
         """Compute what every solver needs of constraint c in a pass. It writes no state but the memory of soft constraints.
 
         Returns the violation A C + B + alpha' lam, A, alpha', lam, the mass-split weight W (0: no corner can move), directions n
-        and gradients g, both (arity, dim), how far it turned, see Slots.note_turn (n is g where too far), and C_(n+1) - C_n.
+        and gradients g, both (arity, dim), how far it turned, see Slots.record_turn (n is g where too far), and C_(n+1) - C_n.
         """
         now, start = self.seen.now_and_start(c)
         if first != 0:
@@ -102,7 +102,7 @@ class CornerPasses(Passes):
             both += split * g[k, :].dot(n[k, :])
             here += split * gg
             there += split * n[k, :].dot(n[k, :])
-        turn = self.slots.turn(both, ti.sqrt(here * there))
+        turn = self.slots.classify_turn(both, ti.sqrt(here * there))
         lost = turn == FAR
         if self.equation.has_cusp(c):
             lost, turn = True, 0
@@ -194,7 +194,7 @@ class CornerPasses(Passes):
         if ti.static(self.side != 0):  # a slack constraint has a direction, but exerts no force
             acts = W > 0 and (self.side * violation > 0 or lam != 0)
         if acts:
-            self.slots.note_turn(turn)
+            self.slots.record_turn(turn)
 
     @ti.func
     def relax_alone(self, c, violation, A, alpha, lam, W, n, turn, share, first):
@@ -213,7 +213,7 @@ class CornerPasses(Passes):
                 last = 0
             if not self.equation.has_cusp(c):  # the last step there had another direction
                 wanted = lam + self.slots.semi_iteration.step(last, step)
-            step = self.slots.limited(wanted, self.geometric_stiffness(c, W / 2)) - lam  # masses in W are split by two
+            step = self.slots.limit_multiplier(wanted, self.geometric_stiffness(c, W / 2)) - lam  # masses in W are split by two
             new = lam + step
         if ti.static(self.limit.acts):
             if W > 0:
@@ -333,7 +333,7 @@ class CornerPasses(Passes):
             f, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
             f0, n = self.quantity.remeasure(c, self.seen.apart(c, 1))
             if self.quantity.direction_reliable(f, f0):
-                self.slots.note_turn(self.slots.turn((g * n).sum(), g.norm() * n.norm()))
+                self.slots.record_turn(self.slots.classify_turn((g * n).sum(), g.norm() * n.norm()))
 
     @ti.func
     def push_reaction(self, c, h, firm, soft):

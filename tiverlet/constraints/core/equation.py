@@ -151,7 +151,7 @@ class Equation:
         """Return the multiplier after a Jacobi pass. Where it changes, record how far the constraint turned."""
         new = self.multiplier_of(c, violation, A, alpha, lam, W)
         if new != lam:
-            self.slots.note_turn(turn)
+            self.slots.record_turn(turn)
         return new
 
     @ti.func

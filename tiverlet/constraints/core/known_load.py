@@ -34,7 +34,7 @@ class KnownLoad:
     def __init__(self, scene: "Scene", name: str, batch: Any):
         self.learns, self.in_state = scene.slots.loads and batch.learns_loads, {}
         if self.learns:
-            self._memory, self.weights, self.bears = scene.memory, scene.own_weight, scene.slots.bears
+            self._memory, self.weights, self.body_load = scene.memory, scene.own_weight, scene.slots.body_load
             self.load = scene.memory.field(f"{name}.load", batch.count, state=True)  # [N]
             self.missing = scene.memory.field(f"{name}.missing", batch.count, state=True)  # missing load, summed over a window
             self.earlier = scene.memory.field(f"{name}.earlier", batch.count, state=True)  # its mean in the window before [N]
@@ -74,7 +74,7 @@ class KnownLoad:
         """
         pull = ti.abs(self.load[c] + self.missing[c] / WINDOW) * most
         if pull > 0:
-            ti.atomic_max(self.bears[self.body[c]], ti.select(own > 0, pull / own, ti.math.inf))
+            ti.atomic_max(self.body_load[self.body[c]], ti.select(own > 0, pull / own, ti.math.inf))
 
     @ti.func
     def learn(self, c, give, size, moved):
@@ -84,7 +84,7 @@ class KnownLoad:
         """
         load, mean = self.load[c], self.missing[c] / WINDOW
         if steady(mean, self.earlier[c]) and WINDOW * moved < STILL * give * ti.abs(load + mean):
-            k = self.bears[self.body[c]]
+            k = self.body_load[self.body[c]]
             share = gain(1.0, SLOW * k * k, WINDOW)
             load, mean = load + share * mean, (1 - share) * mean
             load = ti.max(-MOST * size / give, ti.min(load, MOST * size / give))

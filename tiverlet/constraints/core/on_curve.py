@@ -153,7 +153,7 @@ class OnCurve(Place):
         k, r, bent = self.foot(k, r, x, t, True)
         if bent:
             k, r, lost = self.foot(self.piece[c], self.rest[c], x, t, False)
-            self.slots.note_turn(FAR)
+            self.slots.record_turn(FAR)
         P, T = self.point(k, r)
         C = x - P
         ends = ti.static(not self.closed) and ((k == 0 and r <= 0) or (k == self.pieces - 1 and r >= self.lengths[k]))

@@ -35,7 +35,7 @@ class Passes:
 
     @ti.func
     def note_spring_turn(self, c):
-        """Where springs are forces (orders from 4 on): record how far this one turned in the last stage, see Slots.note_turn."""
+        """Where springs are forces (orders from 4 on): record how far it turned in the last stage, see Slots.record_turn."""
 
     @ti.func
     def push_reaction(self, c, h, firm, soft):

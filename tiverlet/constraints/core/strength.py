@@ -51,7 +51,8 @@ class Strength:
             total = batch.count if entries is None else entries
             self.over = scene.memory.field(f"{name}.over", total, width=width, state=True)
             epsilon = np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps
-            self.unsure = scene.memory.field(f"{name}.unsure", batch.count, values=MARGIN * epsilon * scene.slots.heft(batch))
+            least = MARGIN * epsilon * scene.slots.rounding_mass(batch)
+            self.unsure = scene.memory.field(f"{name}.unsure", batch.count, values=least)
             self.in_state = {"broken": self.stamp, "over": self.over}
 
     def upload(self, break_at: np.ndarray | None) -> None:
