@@ -89,7 +89,7 @@ class BodyImpacts:
         """
         holds = batch.dev.spring.is_rigid(c)
         if ti.static(batch.breaks):
-            holds = holds and batch.dev.strength.holds(c)
+            holds = holds and batch.dev.strength.is_intact(c)
         if holds:
             for k in ti.static(range(batch.arity)):
                 self.rigid[batch.dev.corners.member(c, k)] = 1

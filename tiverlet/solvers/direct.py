@@ -372,7 +372,7 @@ class Elimination(System):
         for r in range(begin, end):
             for k, b in ti.static(self.precise):
                 if self.batch[r] == k and self.alpha[r] == 0 and self.scale[r] != 0:
-                    self.violation[r] = b.dev.quantity.exactly(self.number[r])
+                    self.violation[r] = b.dev.quantity.exact_excess(self.number[r])
                     if ti.static(b.dev.limit.acts):
                         self.violation[r] -= b.dev.limit.postponed[self.number[r]]
 

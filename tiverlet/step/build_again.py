@@ -84,7 +84,7 @@ class Rebuild:
     def _take_apart(self) -> None:
         """Release features, and give them the new indices of their particles."""
         self.masks = {f: tuple(mask & (f not in self.came) for mask in f.kept_mask(self.number)) for f in self.before}
-        self.rests = {f: np.stack(f.ramp.now())[:, self.masks[f][0]] for f in self.features if f.ramp and f.ramp.waits}
+        self.rests = {f: np.stack(f.ramp.now())[:, self.masks[f][0]] for f in self.features if f.ramp and f.ramp.has_pending}
         for f in self.before:
             f.release()
             f.remap_indices(self.number, len(self.particles))

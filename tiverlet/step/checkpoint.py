@@ -43,7 +43,7 @@ def state(world: "World", pairs: bool = True) -> dict[str, np.ndarray]:
     if world._runner.search and pairs:
         out[PAIRS], carried = world._runner.search.list.persistent_data()
         out.update((f"{PAIR}{name}", values) for name, values in carried.items())
-    return out | {f"{RESTS}{k}": np.stack(f.ramp.now()) for k, f in enumerate(world.features) if f.ramp and f.ramp.waits}
+    return out | {f"{RESTS}{k}": np.stack(f.ramp.now()) for k, f in enumerate(world.features) if f.ramp and f.ramp.has_pending}
 
 
 def keep(world: "World", pairs: bool = True) -> Checkpoint:
@@ -127,8 +127,8 @@ def install(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None
     world._upload()
     undo(world, kept, flagged)
     for k, f in enumerate(world.features):
-        if f.ramp and f.ramp.waits and f"{RESTS}{k}" not in kept.values:  # in that world, no ramp was under way
-            f.ramp.arrive()
+        if f.ramp and f.ramp.has_pending and f"{RESTS}{k}" not in kept.values:  # in that world, no ramp was under way
+            f.ramp.finish()
 
 
 def check(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
@@ -184,7 +184,7 @@ def transfer(old: "World", new: "World") -> None:
     for mine, other in zip(new.features, old.features, strict=True):
         if isinstance(mine, Periodic) and isinstance(other, Periodic):
             mine.continued(other)
-        if mine.ramp and other.ramp and other.ramp.waits:
+        if mine.ramp and other.ramp and other.ramp.has_pending:
             mine.ramp.put(other.ramp.now())
             mine.changed = True
     for broke, breaks in zip(old._runner.step.breakers, new._runner.step.breakers, strict=True):

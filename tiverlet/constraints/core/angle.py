@@ -23,7 +23,7 @@ def _matrix(rows: int, columns: int, real: Any) -> Any:
     return ti.types.matrix(rows, columns, real)
 
 
-def corners_of(angle: Any) -> Any:
+def corner_matrix(angle: Any) -> Any:
     """Return the matrix type of the angle's corners and gradients."""
     return _matrix(angle.arity, angle.state.dim, angle.real)
 
@@ -35,23 +35,23 @@ class Angle(Quantity):
 
     def difference(self, f: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """Return differences of angles, in (-pi, pi]."""
-        return turned(f - goal)
+        return wrap_to_pi(f - goal)
 
     @ti.func
     def unwrap(self, f, other):
         """Return f plus whole turns, within half a turn of `other`."""
-        return wrapped(f, other)
+        return wrap_near(f, other)
 
     @ti.func
     def excess(self, c, f):
         """f - rest, to all digits of the low words, where there are any."""
         C = f - self.rest[c]
         if ti.static(self.state.carries):
-            C = ti.cast(wrapped(self.exactly(c), ti.cast(C, ti.f64)), self.real)
+            C = ti.cast(wrap_near(self.exact_excess(c), ti.cast(C, ti.f64)), self.real)
         return C
 
     @ti.func
-    def exactly(self, c):
+    def exact_excess(self, c):
         """f - rest in f64, within half a turn of 0."""
         q = ti.Matrix.zero(ti.f64, self.arity, self.state.dim)
         for k in ti.static(range(1, self.arity)):
@@ -59,9 +59,9 @@ class Angle(Quantity):
             for a in ti.static(range(self.state.dim)):
                 q[k, a] = r[a]
         f, _gradients = self.measure(c, q)
-        return wrapped(f - self.rest_exactly(c), ti.cast(0, ti.f64))
+        return wrap_near(f - self.exact_rest(c), ti.cast(0, ti.f64))
 
-    @called_with(lambda self: ((ti.i32, corners_of(self)), (self.real, corners_of(self))))
+    @called_with(lambda self: ((ti.i32, corner_matrix(self)), (self.real, corner_matrix(self))))
     @ti.func
     def remeasure(self, c, q):
         """Return measure(c, q), as one function: it is long and called from up to three places."""
@@ -79,14 +79,14 @@ class PathAngle(Angle):
         return path_angles(x[:, 0], x[:, 1], x[:, 2])
 
     @ti.func
-    def reach(self, q):
-        """Return the length of the shorter leg."""
-        return shorter_leg(q)
+    def trust_radius(self, q):
+        """Return the length of the shorter link."""
+        return shorter_link(q)
 
     @ti.func
     def measure(self, c, q):
         """Return path_angle(), without memory of the plane."""
-        return path_angle(q, 0 * q[0, :], False, faint(self.state, self.real))
+        return path_angle(q, 0 * q[0, :], False, least_sine(self.state, self.real))
 
 
 class DihedralAngle(Angle):
@@ -100,7 +100,7 @@ class DihedralAngle(Angle):
         return dihedral_angles(x[:, 0], x[:, 1], x[:, 2], x[:, 3])
 
     @ti.func
-    def reach(self, q):
+    def trust_radius(self, q):
         """Return the shortest distance from one end of the edge to another corner."""
         return ti.min(q[1, :].norm(), ti.min(q[2, :].norm(), q[3, :].norm()))
 
@@ -110,25 +110,25 @@ class DihedralAngle(Angle):
         return dihedral_angle(q)
 
 
-def turned(C: np.ndarray) -> np.ndarray:
+def wrap_to_pi(C: np.ndarray) -> np.ndarray:
     """Return differences of angles, in (-pi, pi]."""
     return C - TURN * np.round(C / TURN)
 
 
 @ti.func
-def wrapped(f, other):
+def wrap_near(f, other):
     """Return f plus whole turns, within half a turn of `other`."""
     return f - ti.static(TURN) * ti.round((f - other) * ti.static(1 / TURN))
 
 
 @ti.func
-def shorter_leg(q):
+def shorter_link(q):
     """Return the length of the shorter of the two links of a path."""
     return ti.min((q[1, :] - q[0, :]).norm(), (q[2, :] - q[1, :]).norm())
 
 
 @inline
-def faint(state, real):
+def least_sine(state, real):
     """Return |u x v| of unit vectors below which their normal is lost in rounding."""
     return ti.cast(1e-13 if state.double else 1e-6, real)
 

@@ -41,7 +41,7 @@ class Passes:
     def push_reaction(self, c, h, firm, soft):
         """Push what the constraint adds to h^2 a, along its directions at the present positions, about which it has no moment.
 
-        That is its move in the last substep, and for a spring also the change of its force since, see Spring.change().
+        That is its move in the last substep, and for a spring also the change of its force since, see Spring.force_change().
         firm, soft: h^2 divided by the multiplier of 1 N, for rigid and for soft constraints. With firm = 0, rigid constraints
         push nothing, not even a known load.
         """
