@@ -81,7 +81,7 @@ class Again:
 
     @ti.kernel
     def run(self):
-        self.search.pair_up(0)
+        self.search.count_and_fill(0)
 
 
 def lists(w) -> tuple[np.ndarray, np.ndarray]:
