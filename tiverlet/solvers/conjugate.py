@@ -228,7 +228,7 @@ class CGSystem(System):
         """Take one step of conjugate gradients. If it needs too large a tension, it is taken back, and no step follows."""
         self.compute_moves(thread)
         self.compute_step_length(thread)
-        self.take_step(thread)
+        self.apply_step(thread)
         self.update_direction(thread)
 
     @ti.func
@@ -275,7 +275,7 @@ class CGSystem(System):
         self.team.wait()
 
     @ti.func
-    def take_step(self, thread):
+    def apply_step(self, thread):
         """Take the step, and compute the residual and whether the step was too long."""
         for k in range(self.team.chunk_begin(BLOCKS * self.stride, thread), self.team.chunk_end(BLOCKS * self.stride, thread)):
             if k % self.stride == 0:
