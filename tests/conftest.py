@@ -210,7 +210,7 @@ def built_once(monkeypatch):
             worlds[key] = made(data, arrays, given, turned, once)
             worlds[key].__dict__["close"] = lambda: None
         for feature, told in zip(worlds[key].features, data["features"], strict=True):
-            scene.turn(feature, {name: scene.decode(value, arrays) for name, value in told["knobs"].items()})
+            scene.set_knobs(feature, {name: scene.decode(value, arrays) for name, value in told["knobs"].items()})
         return worlds[key]
 
     monkeypatch.setattr(scene, "rebuild", rebuild)

@@ -347,7 +347,7 @@ def test_memory_that_stays_for_what_went_is_shown_and_given_back():
     less = sum(w.fields.values())
     assert f"; {most - less} bytes more stay for what went" in w.explain() and 0 < most - less < less
     w.remove(np.arange(5, 28))  # fewer than half remain
-    spare = sum(memory.spare for memory in w._runner.memories)
+    spare = sum(memory.spare_bytes for memory in w._runner.memories)
     assert spare <= sum(w.fields.values()) < less
     w.step(1 / 60)
     w.close()

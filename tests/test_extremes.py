@@ -8,7 +8,7 @@ import pytest
 import tiverlet as tv
 from tiverlet.device import thread_team
 from tiverlet.report.stress.certificate import certify
-from tiverlet.report.stress.rows.motion import spoilt
+from tiverlet.report.stress.rows.motion import check_nan_flag
 
 from .chains import beyond
 from .conftest import ARCH, CASES, case, figures, pendulums, rerun, rms
@@ -126,7 +126,7 @@ def test_29_out_of_the_range_of_cells_is_flagged(world):
 @pytest.mark.parametrize("path", ["parallel", "launched"])
 def test_50_nan_is_flagged_on_both_paths(path):
     with thread_team.launching() if path == "launched" else contextlib.nullcontext():
-        found = spoilt(tv.Box((-9, -9), (99, 99)), path="parallel")
+        found = check_nan_flag(tv.Box((-9, -9), (99, 99)), path="parallel")
     assert all(found.values()), found
 
 

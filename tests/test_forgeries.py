@@ -113,7 +113,7 @@ def test_what_a_file_asks_for_is_bounded(original, tmp_path):
     # Rows that claim to unpack to 70 GB, and more data than is allowed.
     forged = Forgery(original)
     _, fields, _ = forged.messages[forged.chunks("world/scene/particles")[0]]
-    out = reader.Found(os.open(os.devnull, os.O_WRONLY), 1000)
+    out = reader.ResultFile(os.open(os.devnull, os.O_WRONLY), 1000)
     taker = reader.Reader(out, False)
     taker.stores.append(reader.store_of(fields[1]))
     with pytest.raises(reader.Damaged, match="unpack to"):

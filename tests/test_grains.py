@@ -11,17 +11,17 @@ from tiverlet.report.accuracy.grains import SIZE, Silo
 
 def test_a_super_ball_under_gravity_obeys_its_law():
     # Velocity and spin after three bounces, to rounding (test_spin.py has the other cases).
-    for velocity, _place in rolling.here(rolling.super_ball(), "f64", (5, 20)):
+    for velocity, _place in rolling.own_errors(rolling.super_ball(), "f64", (5, 20)):
         assert velocity <= 1e-12
 
 
 def test_other_engines_are_asked():
     # pymunk computes the friction that keeps a sphere rolling to rounding; its positions are of first order.
     given = [rolling.downhill(0.3, 0.3), rolling.super_ball()]
-    assert rolling.there("pymunk", ["no-such-python"], given, (5,))[0][0].startswith("FileNotFoundError")
-    assert rolling.there("pymunk", [], given, (5, 10)) == [["not installed"] * 2] * 2
+    assert rolling.engine_errors("pymunk", ["no-such-python"], given, (5,))[0][0].startswith("FileNotFoundError")
+    assert rolling.engine_errors("pymunk", [], given, (5, 10)) == [["not installed"] * 2] * 2
     pytest.importorskip("pymunk")
-    rolls, bounces = rolling.there("pymunk", [sys.executable], given, (5, 10))
+    rolls, bounces = rolling.engine_errors("pymunk", [sys.executable], given, (5, 10))
     assert bounces == ["no tangential restitution"] * 2
     assert max(velocity for velocity, _place in rolls) <= 1e-12
     assert rolls[0][1] / rolls[1][1] == pytest.approx(2, rel=0.05)

@@ -144,7 +144,7 @@ def test_a_handler_that_raises_nothing_is_called_after_the_frame(w):
     seen = []
     before = signal.signal(signal.SIGTERM, lambda *_: seen.append(frames_of(w)))
     try:
-        with interrupts.whole:
+        with interrupts.deferred_signals:
             signal.raise_signal(signal.SIGTERM)
             w.step(1 / 60)
             assert not seen

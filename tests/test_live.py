@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.commands.play import built
+from tiverlet.commands.play import load_world
 from tiverlet.live import session
 from tiverlet.live.server import Server
 from tiverlet.live.session import Session
@@ -77,9 +77,9 @@ def figures(message: bytes) -> tuple[dict, np.ndarray]:
 def hear(server, count: int) -> None:
     """Wait until `count` messages have arrived."""
     end = time.monotonic() + 10
-    while server.said.qsize() < count and time.monotonic() < end:
+    while server.received.qsize() < count and time.monotonic() < end:
         time.sleep(0.005)
-    assert server.said.qsize() >= count
+    assert server.received.qsize() >= count
 
 
 def test_what_pages_ask_for_is_done_recorded_and_replayed(rope, server, tmp_path):
@@ -92,7 +92,7 @@ def test_what_pages_ask_for_is_done_recorded_and_replayed(rope, server, tmp_path
                 there.send(json.dumps(message))
             hear(server, len(messages) + (not came))
             came.append(True)
-            live.turn()
+            live.advance()
             there.send('{"do": "shown"}')
             while isinstance(text := there.recv(timeout=10), str):
                 said.append(json.loads(text))
@@ -140,7 +140,7 @@ def test_what_pages_ask_for_is_done_recorded_and_replayed(rope, server, tmp_path
     live._restart()
     assert rope.time == 0.0 and rope.hash() == start
     live.paused = False
-    live.turn()
+    live.advance()
     live.close()
     assert len(tv.replay(tmp_path / "play.rrd").frames) == 2
 
@@ -151,11 +151,11 @@ def test_a_page_that_goes_lets_go_and_one_that_is_slow_is_not_waited_for(rope, s
         there.send(json.dumps({"do": "grab", "particle": 5, "target": [0, 0]}))
         hear(server, 2)
         for _ in range(20):  # the page never confirms a frame
-            live.turn()
+            live.advance()
         assert live.hand.particle == 5 and live.steps == 20
         assert server.viewers[0].waiting == session.AHEAD
     hear(server, 1)
-    live.turn()
+    live.advance()
     assert live.hand.particle == -1 and not server.viewers
 
 
@@ -180,12 +180,12 @@ def test_the_world_of_a_script_is_found(tmp_path, world):
     start = "import tiverlet as tv\nw = lambda: tv.World(tv.Particles([[0.0, 0.0]]))\n"
     for text in ("build = lambda: (1, w())", "world = w()", "def play():\n    return w()\nbuild = None"):
         script.write_text(start + text)
-        found, each_frame = built(str(script))
+        found, each_frame = load_world(str(script))
         assert isinstance(found, tv.World) and each_frame is None
         found.close()
     script.write_text("x = 1")
     with pytest.raises(ValueError, match="no world to play"):
-        built(str(script))
+        load_world(str(script))
 
 
 def test_bodies_and_their_surfaces_are_found(world):

@@ -223,7 +223,7 @@ def test_a_viewer_that_is_closed_ends_no_recording(tmp_path):
     with viewer.scratch() as folder:
         words = ("--serve-web", "--port", str(port), "--web-viewer-port", str(viewer.free_port()))
         process = viewer.launch(folder, *words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        watch._await(process, port)
+        watch._wait_for_port(process, port)
         with tv.Recorder(tmp_path / "a.rrd", world, live=f"rerun+http://127.0.0.1:{port}/proxy") as recorder:
             world.run(0.1, recorder=recorder)
             recorder.flush()

@@ -59,7 +59,7 @@ def hung(world, pin, gate, precision):
     So particles of a driving pin have no springs where positions are compared.
     """
     x = np.stack([np.arange(6) * 0.3, np.zeros(6)], axis=1)
-    links = tv.Distance([[4, 5]] if pin.drives else [[0, 1], [1, 2], [2, 3], [3, 4], [4, 5]], compliance=1e-4)
+    links = tv.Distance([[4, 5]] if pin.is_kinematic else [[0, 1], [1, 2], [2, 3], [3, 4], [4, 5]], compliance=1e-4)
     features, solver = [tv.Gravity(9.81), links, tv.Contact(), gate, pin], tv.Jacobi(0.5)
     return world(tv.Particles(x, radius=0.1), features, precision=precision, substeps=5, solver=solver)
 

@@ -251,11 +251,11 @@ def test_a_batch_is_its_constraints_and_a_clone_is_its_world(world, name):
     for part, batches in zip(parts, sets, strict=True):
         np.testing.assert_array_equal(whole.position[corners[batches]], part.position[corners[batches]])
     (f,) = whole.features
-    if not f.drives:
+    if not f.is_kinematic:
         np.testing.assert_array_equal(f.load, np.concatenate([g.load for part in parts for g in part.features]))
     twin = whole.clone()
     assert twin.hash() == whole.hash()
-    if not f.drives:
+    if not f.is_kinematic:
         np.testing.assert_array_equal(twin.features[0].load, f.load)  # loads of a substep that the clone has not made
     for w in (whole, twin):
         w.run(0.1)

@@ -47,7 +47,7 @@ def test_a_state_before_a_rest_value_was_assigned_knows_of_none(world):
         link.rest = 0.9 * L
         w.step(DT)
         link.rest = L
-        w._adapt()
+        w._rebuild_for_knobs()
         checkpoint.install(w, kept, flagged)
     assert hashes[0] == hashes[1]
 

@@ -257,7 +257,7 @@ def test_nothing_is_overwritten_unasked(falling, world, tmp_path, read_here):
 @pytest.mark.parametrize("how", ["removed", "replaced"])
 def test_a_file_that_is_gone_is_noticed(world, tmp_path, monkeypatch, how):
     w = world(tv.Particles(np.eye(2)), [tv.Gravity(1.0)])
-    monkeypatch.setattr(recorder, "LOOK", 0.0)
+    monkeypatch.setattr(recorder, "CHECK_INTERVAL", 0.0)
     recording = tv.Recorder(tmp_path / "a.rrd", w)
     recording.log()
     if how == "removed":
@@ -438,7 +438,7 @@ def test_a_world_without_particles_is_recorded(tmp_path, frames):
 def test_names_and_frames_of_pictures(falling, tmp_path, monkeypatch):
     taken = []
     monkeypatch.setattr(viewer, "launch", lambda *words, **options: subprocess.Popen(["true"], start_new_session=True))
-    monkeypatch.setattr(viewer, "_settled", lambda process, port, frame, name, view: taken.append((frame, name)))
+    monkeypatch.setattr(viewer, "_save_when_steady", lambda process, port, frame, name, view: taken.append((frame, name)))
     assert viewer.picture(str(falling), str(tmp_path / "100%.png")) == [str(tmp_path / "100%.png")] and taken[0][0] == 20
     viewer.picture(str(falling), str(tmp_path / "50%_%03d.png"), [0, 4])
     assert [pathlib.Path(name).name for _, name in taken[1:]] == ["50%_000.png", "50%_004.png"]
@@ -456,7 +456,7 @@ def test_a_picture_that_is_told_to_end_ends_its_viewer(falling, tmp_path, monkey
         return started[0]
 
     monkeypatch.setattr(viewer, "launch", start)
-    monkeypatch.setattr(viewer, "_settled", lambda *words: os.kill(os.getpid(), signal.SIGTERM))
+    monkeypatch.setattr(viewer, "_save_when_steady", lambda *words: os.kill(os.getpid(), signal.SIGTERM))
     before = signal.getsignal(signal.SIGTERM)
     with pytest.raises(SystemExit) as end:
         viewer.picture(str(falling), str(tmp_path / "a.png"))

@@ -6,7 +6,7 @@ import pytest
 import tiverlet as tv
 from tiverlet.device import layout, runtime, ti
 from tiverlet.device import memory as fields
-from tiverlet.device.host_copy import chain
+from tiverlet.device.host_copy import offsets_in_tree
 from tiverlet.device.memory import Memory
 from tiverlet.step import build
 
@@ -39,7 +39,7 @@ def test_the_host_sees_the_fields_as_kernels_do():
         shape = (length or 1,) + ((width,) if width else ())
         want[f"f{k}"] = (rng.normal(size=shape) * 1e6).astype(exact)
     memory.place()
-    views, entries = memory._seen(), memory.entries
+    views, entries = memory._host_views(), memory.entries
     assert len(views) == len(entries)
     for first, then in ((views, {}), ({}, views)):
         for sign in (-1, 1):
@@ -72,7 +72,7 @@ def test_f64_fields_can_stand_apart(monkeypatch):
             want[f"f{k}"] = value if kind in (ti.i32, ti.u32) else value / 7
             made[f"f{k}"] = memory.field(f"f{k}", length, width=width, kind=kind, values=want[f"f{k}"], state=True)
         memory.place()
-        roots = {e.name: chain(e.field)[1].id for e in memory.entries}
+        roots = {e.name: offsets_in_tree(e.field)[1].id for e in memory.entries}
         wide = {roots[e.name] for e in memory.entries if e.kind == np.float64}
         narrow = {roots[e.name] for e in memory.entries if e.kind != np.float64}
         assert not wide & narrow and len(wide | narrow) == (2 if name == "two" else 1)

@@ -150,7 +150,7 @@ def test_kernels_depend_on_no_number_of_anything(world, name, monkeypatch):
         return world(tv.Particles(x, mass=mass), [tv.Gravity(count), make(np.arange(count * m).reshape(count, m))], **options)
 
     def written(w):
-        return [sharing.Writing(part).key for part in (w._runner.step, w._runner.diagnostics)]
+        return [sharing.KernelInputs(part).key for part in (w._runner.step, w._runner.diagnostics)]
 
     one, more = built(2, 2, 0.0), built(4, 7, 20.0)
     first = written(one)
@@ -183,7 +183,7 @@ def test_kernels_depend_on_no_number_of_particles(world, dim):
         return world(tv.Particles(x, radius=0.1), [*(f.copy() for f in (*forces, *walls, *shapes)), touch])
 
     def written(w):
-        return [sharing.Writing(part).key for part in (w._runner.step, w._runner.diagnostics)]
+        return [sharing.KernelInputs(part).key for part in (w._runner.step, w._runner.diagnostics)]
 
     for touch in (tv.Contact(friction=0.1), None)[: 4 - dim]:  # None: one and two bodies
         one, more = built(3, touch), built(8, touch)
@@ -194,8 +194,8 @@ def test_kernels_depend_on_no_number_of_particles(world, dim):
 
 
 def test_what_is_left_out_of_the_writing_is_not_read(world, monkeypatch):
-    # Compiled code is a function of what is read. So while kernels are translated, nothing that sharing.Writing leaves out may be
-    # read: attributes for the host, and the content of arrays.
+    # Compiled code is a function of what is read. So while kernels are translated, nothing that sharing.KernelInputs leaves out
+    # may be read: attributes for the host, and the content of arrays.
     class Untold(np.ndarray):
         def refuse(self, *args, **kwargs):
             raise AssertionError("a kernel reads what an array holds")

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 ANY = 2**31 - 1  # number of particles, while it is not yet known
+OF_SHAPE = {"position": "position", "pairs": "links", "triples": "bends", "quads": "quads", "loops": "loops"}  # by argument
 
 
 def number(who: str, name: str, value: Any, *, above=None, least=None, most=None, below=None) -> float:
@@ -80,7 +81,8 @@ def vector(who: str, name: str, value, dim: int, *, infinite=False) -> np.ndarra
     """Check a (dim,) array of finite floats."""
     array = _floats(who, name, value)
     if array.shape != (dim,):
-        raise ValueError(f"{who}: {name} has shape {array.shape}, but {dim} numbers are needed in a {dim}D world.")
+        want = f"{dim} numbers are needed in a {dim}D world" if dim in (2, 3) else "2 numbers are needed in 2D, 3 in 3D"
+        raise ValueError(f"{who}: {name} has shape {array.shape}, but {want}.")
     if np.isnan(array).any() or (not infinite and np.isinf(array).any()):
         finite(who, name, array)
     return array
@@ -137,9 +139,14 @@ def rows(who: str, name: str, value: Any, what: str) -> list:
 def plain(who: str, name: str, value: Any) -> np.ndarray:
     """Return anything whose rows have equal lengths as an array."""
     try:
-        return np.asarray(value)
+        array = np.asarray(value)
     except ValueError:
         raise ValueError(f"{who}: {name} is ragged; its rows must have the same length.") from None
+    if array.dtype == object and array.ndim == 0 and value is not None:
+        part = OF_SHAPE.get(name, "")
+        write = f"; write shape.{part}" if part and hasattr(value, part) else ""
+        raise TypeError(f"{who}: {name} is a {type(value).__name__}, but an array is needed{write}.")
+    return array
 
 
 def _floats(who: str, name: str, value) -> np.ndarray:

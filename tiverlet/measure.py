@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .neighbours.queries import between
-from .particles.spin import moments
+from .particles.spin import moments_of_inertia
 
 if TYPE_CHECKING:
     from .neighbours import Periodic
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 def kinetic_energy(world: "World") -> float:
     """Return the sum of m v^2 / 2 and of I omega^2 / 2 [J]; static particles have none."""
-    m, moment, spin = _mass(world), moments(world.particles), _spin(world)
+    m, moment, spin = _mass(world), moments_of_inertia(world.particles), _spin(world)
     return float(0.5 * np.sum(m * np.sum(world.velocity**2, axis=1)) + 0.5 * np.sum(moment * np.sum(spin**2, axis=1)))
 
 
@@ -27,7 +27,7 @@ def angular_momentum(world: "World", about=None) -> np.ndarray:
     """Return the sum of m (x - about) x v + I omega [kg m^2/s], (1,) in 2D, (3,) in 3D; about the origin if no point is given."""
     r = world.position - (0.0 if about is None else np.asarray(about))
     p = _mass(world)[:, None] * world.velocity
-    return moments(world.particles) @ _spin(world) + moment_sum(r, p)
+    return moments_of_inertia(world.particles) @ _spin(world) + moment_sum(r, p)
 
 
 def moment_sum(r: np.ndarray, p: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from . import checks
 from .device import ti
 from .device.language import callable_in_kernels, inside_kernel
 
@@ -93,7 +94,7 @@ def golden(i, dim: int = 1):
     i: integer or integer array, 0 <= i < 2**32. Returns a number (dim 1) or dim numbers, added as the last axis.
     In 1 dimension the sequence is i / phi mod 1; in more dimensions the R_d sequence (Roberts 2018).
     """
-    index = np.asarray(i)
+    dim, index = checks.integer("golden", "dim", dim, least=1), np.asarray(i)
     if index.dtype.kind not in "iu":
         raise TypeError(f"golden: i has type {index.dtype}, but integers are needed.")
     if index.size and (index.min() < 0 or index.max() >= _BITS):
@@ -141,6 +142,6 @@ def golden_index(value, dim: int = 1):
 
 def golden_colors(count: int, saturation: float = 0.62, value: float = 0.95) -> np.ndarray:
     """Return `count` colours with hues at golden-ratio steps: (count, 3) uint8, red, green and blue."""
-    hues = golden(np.arange(count))
+    hues = golden(np.arange(checks.integer("golden_colors", "count", count, least=0)))
     rgb = [colorsys.hsv_to_rgb(hue, saturation, value) for hue in np.atleast_1d(hues)]
     return np.array(np.rint(np.array(rgb).reshape(count, 3) * 255), dtype=np.uint8)

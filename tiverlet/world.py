@@ -16,10 +16,10 @@ from .contact.pair_contact import PairContact
 from .contact.rays import Hits, inside, ray
 from .contact.touches import ContactEvents, joined, no_events
 from .device.copies import Copies
-from .device.interrupts import whole
-from .features.arguments import meant
+from .device.interrupts import deferred_signals
+from .features.arguments import suggest_name
 from .features.feature import Acceleration, Batch, Feature
-from .features.read_only import assign_whole, read_only, structure
+from .features.read_only import assign_whole_advice, read_only, structure_advice
 from .neighbours.queries import Contacts, PointSearch, near_by_brute_force, nearest
 from .particles import Particles, at_rest, in_range, spin_of
 from .solvers.jacobi import Jacobi
@@ -78,7 +78,7 @@ class World:
                 contact.enable_shrink()  # before anything is compiled; later, the frame would have to be compiled again
 
     @staticmethod
-    def _of(
+    def _from_starts(
         particles: Particles, features: tuple[Feature, ...], starts: Sequence[Particles | None], copies: Copies | None = None,
         **settings,
     ) -> "World":  # fmt: skip
@@ -132,8 +132,10 @@ class World:
 
         Without tolerance and budget the frame has `substeps` substeps; with substeps="auto", as many as it needs to be stable.
         tolerance: upper bound of the residual and the overlap, both relative; of phi^2 / 24, for the angle phi by which rigid
-        constraints turn in a substep; and of (omega h)^2 / 24 for forces that vary in space. The frame is repeated with more
-        substeps until all of these are met.
+        constraints, and beads on smooth curves, turn in a substep; of (omega h)^2 / 24 for forces that vary in space; and of
+        about (omega h)^2 A / 12 for springs that vibrate by a share A of their size. The frame is repeated with more substeps
+        until all of these are met. It does not cover errors of impacts, of sliding along curved walls or particles, and of soft
+        clusters.
         budget: seconds of computing that the frame may take. Without tolerance, it is spent on as many substeps as fit. The
         report gives the number of substeps, and has a flag if the aim was missed. Results of a budget depend on the speed of the
         machine.
@@ -146,7 +148,7 @@ class World:
         """
         self._runner.memory.check()
         dt = checks.number("World.step", "dt", dt, above=0.0)
-        with whole:
+        with deferred_signals:
             for watcher in self._watchers:
                 watcher.before()
             clock = perf_counter()
@@ -164,7 +166,7 @@ class World:
                     self._runner.begin(dt, self._substeps, self._iterations)
                     report = self._runner.advance(dt, self._substeps, self._iterations)
             except BaseException:
-                self._broken_off()
+                self._handle_failed_step()
                 raise
             self._runner.arrive()
             if self._clock.exceeds(report.energy, self._runner.sheet.item(KINETIC), report.overlap):
@@ -175,7 +177,7 @@ class World:
                 watcher.after(dt, report)
         return report
 
-    def _broken_off(self) -> None:
+    def _handle_failed_step(self) -> None:
         """Clean up after a step that ended with an exception: undo it, or inform recorders that no step leads to this state."""
         undo, self._undo, self._events = self._undo, None, (none := no_events(self._particles.dim), none)
         if undo:
@@ -197,31 +199,31 @@ class World:
         waiting = [f for f in self._features if f.changed or f.moving]
         if waiting:
             self._clock.bound = CHANGED
-            if self._runner.sleep and not all(isinstance(f, Batch) and f.drives for f in waiting):
+            if self._runner.sleep and not all(isinstance(f, Batch) and f.is_kinematic for f in waiting):
                 self._runner.wake()
-            self._adapt(steps=True)
+            self._rebuild_for_knobs(steps=True)
             self._upload()
 
     @property
-    def _force_waits(self) -> bool:
+    def _has_new_force(self) -> bool:
         """Whether a force has changed and the device still has the old one."""
         return any(f.changed and (f.new_force or isinstance(f, Acceleration)) for f in self._features)
 
-    def _settle_forces(self, steps: bool) -> None:
+    def _restart_for_new_forces(self, steps: bool) -> None:
         """Where a force has changed, turn displacements into velocities by the old force before it is lost.
 
-        The old force is lost when it is overwritten, or left out of a copy. steps: see _adapt().
+        The old force is lost when it is overwritten, or left out of a copy. steps: see _rebuild_for_knobs().
         """
         changed = [f for f in self._features if f.changed]
-        if any(f.lets_go for f in changed):
+        if any(f.has_released_load for f in changed):
             if not steps:
                 self._runner.note_displacements()
-            self._let_go()
+            self._restart_with_reactions()
         elif any(f.new_force or isinstance(f, Acceleration) for f in changed):
             with self._runner.memory.compiler():
                 (self._runner.restart if steps else self._runner.restart_between)(self._iterations)
 
-    def _let_go(self) -> None:
+    def _restart_with_reactions(self) -> None:
         """Start from the present velocities, which include the reaction that is about to end."""
         if not self._clock.d_is_velocity:
             self._start_from(self.velocity)
@@ -231,13 +233,13 @@ class World:
             self._runner.start(velocity)
         self._clock.energy = None
 
-    def _adapt(self, steps: bool = False) -> None:
-        """Handle changed forces, see _settle_forces(), and rebuild the world where knobs need other kernels.
+    def _rebuild_for_knobs(self, steps: bool = False) -> None:
+        """Handle changed forces, see _restart_for_new_forces(), and rebuild the world where knobs need other kernels.
 
         steps: whether a frame follows at once, so that residuals of the last frame are not read before it.
         """
-        self._settle_forces(steps)
-        if any(f.outgrown for f in self._features if f.changed):
+        self._restart_for_new_forces(steps)
+        if any(f.needs_other_kernels for f in self._features if f.changed):
             edit_scene.renew(self)
 
     def _upload(self) -> None:
@@ -279,7 +281,7 @@ class World:
             frames = track(frames, description=f"{len(self._particles)} particles")
         worst = None
         for _ in frames:
-            with whole:  # signals wait until the frame is in the file, too
+            with deferred_signals:  # signals wait until the frame is in the file, too
                 report = self.step(dt, tolerance, budget)
                 worst = report if worst is None else worst.worse(report)
                 if recorder is not None:
@@ -302,7 +304,7 @@ class World:
     @property
     def position(self) -> np.ndarray:
         """Positions [m], (n, dim), a read-only copy in f64. Assign an array to move particles; velocities are kept."""
-        return read_only(self._runner.scene.state.get(self._runner.memory), assign_whole("World", "position"))
+        return read_only(self._runner.scene.state.get(self._runner.memory), assign_whole_advice("World", "position"))
 
     @position.setter
     def position(self, value) -> None:
@@ -312,7 +314,7 @@ class World:
         if self._runner.step.contacts:
             self._runner.step.contacts[0].check_range(value)
         self._runner.memory.check()
-        with whole:
+        with deferred_signals:
             for watcher in self._watchers:
                 watcher.assigned("position", value)
             self._runner.place(value, self._iterations)
@@ -330,16 +332,16 @@ class World:
         out = self._clock.parted
         if out is None:
             self._runner.memory.check()
-            with whole, self._runner.memory.compiler():
+            with deferred_signals, self._runner.memory.compiler():
                 out = self._runner.velocity(self._iterations)
-        return read_only(out.copy(), assign_whole("World", "velocity"))
+        return read_only(out.copy(), assign_whole_advice("World", "velocity"))
 
     @velocity.setter
     def velocity(self, value) -> None:
         """Set the velocities with which particles continue, (n, dim) [m/s]."""
         value = checks.points("World", "velocity", value, dim=self._particles.dim, count=len(self._particles))
         self._runner.memory.check()
-        with whole:
+        with deferred_signals:
             for watcher in self._watchers:
                 watcher.assigned("velocity", value)
             seen = self.velocity
@@ -352,10 +354,10 @@ class World:
         """Angular velocities [rad/s], (n,) in 2D, (n, 3) in 3D, a read-only copy in f64; second order. Assign to set them."""
         state = self._runner.scene.state
         if not state.spins:
-            return read_only(at_rest("spin", self._particles), assign_whole("World", "spin"))
+            return read_only(at_rest("spin", self._particles), assign_whole_advice("World", "spin"))
         self._runner.memory.check()
-        with whole, self._runner.memory.compiler():
-            return read_only(state.spin.to_rates(self._runner.spin()), assign_whole("World", "spin"))
+        with deferred_signals, self._runner.memory.compiler():
+            return read_only(state.spin.to_rates(self._runner.spin()), assign_whole_advice("World", "spin"))
 
     @spin.setter
     def spin(self, value) -> None:
@@ -364,7 +366,7 @@ class World:
             raise ValueError("World.spin: these particles do not spin. Make them with tv.Particles(..., spin=0).")
         value = spin_of("World", value, self._particles)
         self._runner.memory.check()
-        with whole:
+        with deferred_signals:
             for watcher in self._watchers:
                 watcher.assigned("spin", value)
             runner, clock, spin = self._runner, self._clock, self._runner.scene.state.spin
@@ -377,7 +379,7 @@ class World:
             if impulse.rubs(runner) or runner.probe:  # the change alters friction
                 seen = self.velocity
                 if not impulse.steer(runner, seen, seen, change, self._iterations, has):
-                    self._let_go()
+                    self._restart_with_reactions()
             runner.wake(np.flatnonzero(others))
             s = runner.memory.read(spin.s)[: runner.n]
             runner.memory.write(spin.s, has + change if clock.d_is_velocity else s + clock.h * change)
@@ -389,7 +391,7 @@ class World:
         if self._particles.orientation is None:
             raise ValueError("World.orientation: nobody keeps track of it. Make particles with tv.Particles(..., orientation=0).")
         turned = self._runner.memory.read(self._runner.scene.state.spin.orientation)[: len(self._particles)]
-        return read_only(turned[:, 0] if self._particles.dim == 2 else turned, structure("World", "orientation"))
+        return read_only(turned[:, 0] if self._particles.dim == 2 else turned, structure_advice("World", "orientation"))
 
     def near(self, points, radius) -> np.ndarray:
         """Return which particles have their center within `radius` [m] of which points.
@@ -407,7 +409,7 @@ class World:
         points = points if box is None else box.wrap(points)
         if not self._runner.search:
             return near_by_brute_force(self.position, points, radius, box)
-        with whole:
+        with deferred_signals:
             self._runner.list_neighbours()
             with self._runner.memory.compiler():
                 self._search = self._search or PointSearch(self._runner.search)
@@ -475,7 +477,7 @@ class World:
             vectors = np.zeros((0, self._particles.dim))
             return Contacts(index, index[:, 0], none, none, vectors, vectors, none)
         contact = self._runner.step.contacts[0]
-        with whole:
+        with deferred_signals:
             self._runner.list_neighbours()
             if contact.detects and self._runner.step.launched:
                 self._runner.look()  # measures contacts; on other paths list_neighbours() has called it
@@ -631,7 +633,7 @@ class World:
 
         Raises the errors of World(); the world is then unchanged.
         """
-        with whole:
+        with deferred_signals:
             return edit_scene.add(self, particles, features, extend)
 
     def remove(self, particles: Any = (), features: Iterable[Feature] = ()) -> None:
@@ -648,7 +650,7 @@ class World:
 
         Raises ValueError or TypeError for particles or features that do not exist; the world is then unchanged.
         """
-        with whole:
+        with deferred_signals:
             edit_scene.remove(self, particles, features)
 
     def handle(self, particles: Any) -> Handle:
@@ -672,9 +674,9 @@ class World:
             raise TypeError(f"World.clone: {sorted(unknown)[0]} cannot be changed; one of {', '.join(settings)} can.")
         self._runner.memory.check()
         self._find_stiffened()
-        self._adapt()
-        copies = tuple(f.twin() for f in self._features)
-        new = World._of(self._particles, copies, [f.start for f in self._features], **{**settings, **changes})
+        self._rebuild_for_knobs()
+        copies = tuple(f.copy_with_kernels() for f in self._features)
+        new = World._from_starts(self._particles, copies, [f.start for f in self._features], **{**settings, **changes})
         checkpoint.transfer(self, new)
         new._runner.pass_on(self._runner.left, np.ones(len(self._particles), dtype=bool))
         return new
@@ -696,7 +698,7 @@ class World:
         for memory in self._runner.memories:
             memory.destroy()
         for feature in self._features:
-            feature.scene, feature.once = None, frozenset()
+            feature.scene, feature.compiled_so_far = None, frozenset()
 
     def __enter__(self) -> "World":
         return self
@@ -706,7 +708,7 @@ class World:
 
     def __setattr__(self, name: str, value) -> None:
         if not name.startswith("_") and name not in LIVE:
-            guess = "" if hasattr(self, name) else meant(name, LIVE)
+            guess = "" if hasattr(self, name) else suggest_name(name, LIVE)
             raise AttributeError(
                 f"World.{name} cannot be set{guess}. Live are {', '.join(LIVE[:-1])} and {LIVE[-1]}, and the knobs of the "
                 "features; everything else is structure, fixed when the world is built."

@@ -82,7 +82,7 @@ def excluded(features: list[Any], particles: Any) -> set[tuple[int, int]]:
     """Return the pairs that may overlap, because constraints fix their relative place."""
     out = set()
     for f in features:
-        if isinstance(f, Batch) and not f.drives and f.count and (particles.inv_mass[f.indices] > 0).any():
+        if isinstance(f, Batch) and not f.is_kinematic and f.count and (particles.inv_mass[f.indices] > 0).any():
             out |= {(min(a, b), max(a, b)) for a, b in f.excluded_pairs(particles).tolist()}
     return out
 
@@ -120,7 +120,7 @@ def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, 
     """
     worst, whole, steepest, reach = 0.0, True, 0.0, float(np.abs(x).max(initial=0.0))
     for f in features:
-        if not isinstance(f, Batch) or getattr(f, "drives", False) or not f.count:
+        if not isinstance(f, Batch) or getattr(f, "is_kinematic", False) or not f.count:
             continue
         if not isinstance(f, Scalar) or not f.arity or f.quantity.collapses or (f.compliance > 0).any():
             whole = False
@@ -133,7 +133,7 @@ def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, 
         start = f.rest_of(f.start.position)
         unit = f.quantity.unit or (float(np.abs(start).mean()) if np.any(start) else f.start.size)
         size = np.full(f.count, unit) if f.quantity.unit else np.where(f.goal != 0, np.abs(f.goal), unit)
-        some = (f.compliance == 0) & ~f.broken & ~f.idle(free) & ~shapeless(f, x)
+        some = (f.compliance == 0) & ~f.broken & ~f.immovable(free) & ~shapeless(f, x)
         worst = max(worst, float((C / size)[some].max(initial=0.0)))
         if f.arity and f.count:
             slope = np.linalg.norm(f.gradients(x), axis=-1).reshape(f.count, -1).sum(axis=1)
@@ -221,6 +221,6 @@ def height(features: list[Any], particles: Any, free: np.ndarray, low: np.ndarra
     out, m = 0.0, np.where(free > 0, particles.mass, 0.0)
     for f in features:
         if type(f).__name__ == "Gravity":
-            g = np.abs(np.asarray(f.settings()["g"]))
+            g = np.abs(np.asarray(f.kernel_values()["g"]))
             out += float(m.sum() * (g @ (high - low)))
     return out

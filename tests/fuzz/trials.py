@@ -81,7 +81,7 @@ class Trial:
         for f, values in zip(self.features, self.knobs, strict=True):
             if any(vars(f)[k] is not v for k, v in values.items()):
                 turn(f, values)
-        w._adapt()  # to what the features need: install() is for worlds that were just built
+        w._rebuild_for_knobs()  # to what the features need: install() is for worlds that were just built
         checkpoint.install(w, self.kept, self.flags)
         w._last = None
         w.substeps, w.iterations = 20, 1

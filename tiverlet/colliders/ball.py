@@ -11,7 +11,7 @@ from ..geometry.nearest import surface_normal
 from ..particles import Particles
 from .collider import Collider
 from .round_mesh import rounded
-from .surface import ALONG, GENTLY, NEAR, TOUCH
+from .surface import ALONG, FRICTIONLESS, NEAR, TOUCH
 from .track import Track
 
 
@@ -43,7 +43,7 @@ class Ball(Collider):
         self.center = center
         self.inside = bool(inside)
         self.radius = radius
-        self.surface(friction, restitution, push_out, active, events)
+        self.set_surface(friction, restitution, push_out, active, events)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the dimension, and that particles fit in."""
@@ -62,7 +62,7 @@ class Ball(Collider):
         return value
 
     @property
-    def repeats(self) -> bool:
+    def needs_repeat(self) -> bool:
         """Whether one round may not be enough.
 
         Inside, motion along the surface leads out, and a bounce may lead to the other end.
@@ -80,7 +80,7 @@ class Ball(Collider):
         """Move to the new center in the next frame."""
         Collider.upload(self)
         self.scene.memory.write(self.dev.size, self.radius)
-        self.dev.center.aim(self.center)
+        self.dev.center.set_target(self.center)
         self.moving = True
 
     def end_motion(self) -> None:
@@ -125,7 +125,7 @@ class Ball(Collider):
         return self.center if self.scene is None else self.dev.center.now
 
     @ti.func
-    def confine(self, i, radius, h, frame_fraction, turn):
+    def confine(self, i, radius, h, frame_fraction, mode):
         """Press the particle at the surface where it was met, or where it is nearest.
 
         For particles that slide inside, the normal is the one at the start of the displacement.
@@ -152,13 +152,13 @@ class Ball(Collider):
             close = self.dev.state.digits(i)
             bounced, _lift = self.dev.surface.bounced(i)
             near = d.norm() * ti.static(NEAR) + 4 * close
-            if turn != GENTLY and depth > -close and ti.abs(start_depth) <= near and not bounced:
+            if mode != FRICTIONLESS and depth > -close and ti.abs(start_depth) <= near and not bounced:
                 along, reach = r.dot(first), own - radius
                 root = along * along - (r.dot(r) - reach * reach)
                 if along < 0 and root > ti.static(ALONG * ALONG) * reach * reach:
                     depth, n = (r.dot(r) - reach * reach) / (ti.sqrt(root) - along), first
                     slides = True
-        self.dev.surface.push(i, depth, start_depth, n, moved, h, turn, slides)
+        self.dev.surface.push(i, depth, start_depth, n, moved, h, mode, slides)
 
     @ti.func
     def nearest(self, r, own, radius):

@@ -55,7 +55,7 @@ class Box(Collider):
     ):  # fmt: skip
         self.lower = lower
         self.upper = upper
-        self.surface(friction, restitution, push_out, active, events)
+        self.set_surface(friction, restitution, push_out, active, events)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the corners against the dimension and the widest particle."""
@@ -79,7 +79,7 @@ class Box(Collider):
             )
 
     @property
-    def repeats(self) -> bool:
+    def needs_repeat(self) -> bool:
         """Whether one round may not be enough.
 
         In a corner, friction on one side may lead into another, and a bounce may lead to the other end.
@@ -163,7 +163,7 @@ class Box(Collider):
 
     @ti.func
     def may_touch(self, i, radius):
-        """Return 1 if press() may have something to do, else 0."""
+        """Return 1 if push_without_slide() may have something to do, else 0."""
         out, x, close = 0, self.dev.state.place(i), self.dev.state.digits(i)
         for k in ti.static(range(self.dim)):
             out |= ti.cast(self.dev.now[k][0] + radius - x[k] > -close, ti.i32)
@@ -171,7 +171,7 @@ class Box(Collider):
         return out
 
     @ti.func
-    def confine(self, i, radius, h, frame_fraction, turn):
+    def confine(self, i, radius, h, frame_fraction, mode):
         """Press the particle at two planes per axis, lower ones first."""
         if self.may_touch(i, radius) != 0:
             for side in range(ti.static(2 * self.dim)):
@@ -182,4 +182,4 @@ class Box(Collider):
                         n[k], moved[k], depth = 1, shift, wall + radius - x[k]
                     elif side == k + self.dim:
                         n[k], moved[k], depth = -1, shift, x[k] + radius - wall
-                self.dev.surface.press(i, depth, depth + self.dev.surface.path(i, moved).dot(n), n, moved, h, turn)
+                self.dev.surface.push_without_slide(i, depth, depth + self.dev.surface.path(i, moved).dot(n), n, moved, h, mode)

@@ -33,7 +33,7 @@ class Capsule(Collider):
     followed to where it meets the surface (sphere tracing, Hart 1996). No force can pull a particle through either.
     """
 
-    bulk = 0.6
+    code_size = 0.6
     a, b = _end("a"), _end("b")
     radius = Knob(lambda f, v: checks.number("Capsule", "radius", v, above=0.0), "Of the rod [m].", device="size")
 
@@ -43,7 +43,7 @@ class Capsule(Collider):
     ):  # fmt: skip
         self.a, self.b = a, b
         self.radius = radius
-        self.surface(friction, restitution, push_out, active, events, one_way, len(self.a))
+        self.set_surface(friction, restitution, push_out, active, events, one_way, len(self.a))
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the dimension."""
@@ -61,8 +61,8 @@ class Capsule(Collider):
         """Move to the new ends in the next frame."""
         Collider.upload(self)
         self.scene.memory.write(self.dev.size, self.radius)
-        self.dev.a.aim(self.a)
-        self.dev.b.aim(self.b)
+        self.dev.a.set_target(self.a)
+        self.dev.b.set_target(self.b)
         self.moving = True
 
     def end_motion(self) -> None:
@@ -124,7 +124,7 @@ class Capsule(Collider):
         return a * (1 - t) + b * t + n * (length / ti.max(n.norm(), TOUCH))
 
     @ti.func
-    def confine(self, i, radius, h, frame_fraction, turn):
+    def confine(self, i, radius, h, frame_fraction, mode):
         """Press the particle at the surface where it was met, or where it is nearest."""
         a, b = self.dev.a.at(frame_fraction[1]), self.dev.b.at(frame_fraction[1])
         a_moved, b_moved = self.dev.a.step(frame_fraction), self.dev.b.step(frame_fraction)
@@ -158,4 +158,4 @@ class Capsule(Collider):
                             n, depth = m, (s - 1) * d.dot(m)
                     s = further
             if not self.dev.surface.lets_through(i, n, start_depth, contact_distance):
-                self.dev.surface.press(i, depth, start_depth, n, moved, h, turn)
+                self.dev.surface.push_without_slide(i, depth, start_depth, n, moved, h, mode)

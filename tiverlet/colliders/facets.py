@@ -190,8 +190,8 @@ class FacetShape(Shape):
         return ti.cast(self.close, self.real)
 
     @ti.func
-    def strike(self, a, e, contact_distance, close, limit):
-        """Find the first touch of any facet on the way, see Shape.strike().
+    def find_first_touch(self, a, e, contact_distance, close, limit):
+        """Find the first touch of any facet on the way, see Shape.find_first_touch().
 
         Where the start is inside of a closed shape, the nearest facet lets the particle out.
         """
@@ -214,7 +214,7 @@ class FacetShape(Shape):
                                 least, outside, exit = distance, side, -n
                             on_it = distance <= self.touch
                             if not on_it and distance <= on:
-                                on_it = at < 0 or not self.alone(at, self.normal[f])
+                                on_it = at < 0 or not self.is_nearest_feature(at, self.normal[f])
                             if on_it:
                                 # On the surface, within the particle's rounding, each touched facet uses its own normal.
                                 # At a corner that holds only where neighbours rise in front of it: the particle may lie on them.
@@ -231,7 +231,7 @@ class FacetShape(Shape):
                                 behind = ti.static(self.closed) and side < 0 and at < 0 and distance > 0
                                 hit = not behind and (toward or ti.min(below, limit - slope) > 2 * close)
                             if hit and (t < best or (t == best and below > depth)):
-                                if self.alone(at, n):
+                                if self.is_nearest_feature(at, n):
                                     best, depth, normal = t, below, n
                         elif slope < 0:
                             t -= gap / slope
@@ -249,7 +249,7 @@ class FacetShape(Shape):
         return best, depth, normal
 
     @ti.func
-    def alone(self, at, n):
+    def is_nearest_feature(self, at, n):
         """Whether no neighbour of a feature is nearer in the direction n."""
         out = True
         if at >= 0:

@@ -36,7 +36,7 @@ class HalfSpace(Collider):
         self.normal = normal / length
         self.normal.flags.writeable = False
         self.offset = offset
-        self.surface(friction, restitution, push_out, active, events)
+        self.set_surface(friction, restitution, push_out, active, events)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the dimension of the normal."""
@@ -93,7 +93,7 @@ class HalfSpace(Collider):
         return float(self.offset if self.scene is None else self.scene.memory.read(self.dev.offset)[0, 1])  # type: ignore[arg-type]
 
     @ti.func
-    def confine(self, i, radius, h, frame_fraction, turn):
+    def confine(self, i, radius, h, frame_fraction, mode):
         """Press the particle if it is below the plane."""
         n, offset = self.dev.normal[None], self.dev.offset[None]
         before, now = (
@@ -101,4 +101,4 @@ class HalfSpace(Collider):
             offset[0] * (1 - frame_fraction[1]) + offset[1] * frame_fraction[1],
         )
         depth, moved = now + radius - n.dot(self.dev.state.place(i)), (now - before) * n
-        self.dev.surface.press(i, depth, depth + self.dev.surface.path(i, moved).dot(n), n, moved, h, turn)
+        self.dev.surface.push_without_slide(i, depth, depth + self.dev.surface.path(i, moved).dot(n), n, moved, h, mode)

@@ -56,7 +56,7 @@ class Mesh(Moving):
         for array in (vertices, faces):
             array.flags.writeable = False
         self.place(position, rotation)
-        self.surface(friction, restitution, push_out, active, events, one_way, 3)
+        self.set_surface(friction, restitution, push_out, active, events, one_way, 3)
         self.facets = self._joined()
 
     def _outward(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -38,13 +38,13 @@ class Moving(Collider):
     wall at the contact point.
 
     It holds a Pose and a Shape. A particle is followed in the wall's frame, along the straight line from where it was at the
-    start of the substep. shape.strike() finds the first touch, surface.push() corrects it, and then the rest of the way is
-    followed. So nothing passes, at any speed of either, and corners need no special case. Where a particle still moves in after
-    TOUCHES touches (in a wedge), it stays at the last one.
+    start of the substep. shape.find_first_touch() finds the first touch, surface.push() corrects it, and then the rest of the way
+    is followed. So nothing passes, at any speed of either, and corners need no special case. Where a particle still moves in
+    after TOUCHES touches (in a wedge), it stays at the last one.
     """
 
-    bulk = 1.5
-    sweeps = poses = True
+    code_size = 1.5
+    needs_start_position = poses = True
     radius: Any = Knob(
         lambda f, v: checks.number(repr(f), "radius", v, least=0.0), "It is rounded by so much [m].", compiled=True
     )
@@ -69,13 +69,13 @@ class Moving(Collider):
         self.dev.pose = Pose(scene, repr(self), self.position, self.rotation, self.dev.surface.turns)
         self.dev.surface.poses = [self.dev.pose]
         self.dev.shape = self.host_shape(self.dim).on_device(scene, repr(self), self.radius)
-        self.dev.shape.slides = type(self.dev.shape).slides and not self.dev.surface.has_restitution
+        self.dev.shape.can_slide = type(self.dev.shape).can_slide and not self.dev.surface.has_restitution
         self.changed = False
 
     def upload(self) -> None:
         """Move and turn to the new pose in the next frame."""
         Collider.upload(self)
-        self.dev.pose.aim(self.position, self.rotation)
+        self.dev.pose.set_target(self.position, self.rotation)
         self.moving = True
 
     def end_motion(self) -> None:
@@ -86,7 +86,7 @@ class Moving(Collider):
         """Return points (..., dim) of the wall's frame in the world, for pictures."""
         return points @ rotation_matrix(self.rotation).T + self.position
 
-    def frame(self, dim: int) -> tuple[np.ndarray, np.ndarray]:
+    def current_pose(self, dim: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the present position (dim,) [m] and rotation matrix; outside of a world, for `dim` dimensions."""
         position, rotation = np.asarray(self.position), self.rotation
         if self.scene is not None:
@@ -99,12 +99,12 @@ class Moving(Collider):
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """Return the clearance of the shape, less `radius`."""
-        position, turn = self.frame(points.shape[1])
+        position, turn = self.current_pose(points.shape[1])
         return self.host_shape(points.shape[1]).clearance((points - position) @ turn) - self.radius
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the lengths and normals of the shape, cast in its frame."""
-        position, turn = self.frame(origin.shape[1])
+        position, turn = self.current_pose(origin.shape[1])
         shape = self.host_shape(origin.shape[1])
         distance, normal = shape.cast((origin - position) @ turn, direction @ turn, self.radius + radius)
         return distance, normal @ turn.T
@@ -115,7 +115,7 @@ class Moving(Collider):
         self.dev.pose.update(frame_fraction)
 
     @ti.func
-    def confine(self, i, radius, h, frame_fraction, turn):
+    def confine(self, i, radius, h, frame_fraction, mode):
         """Follow the displacement of particle i, and correct touch by touch.
 
         The wall moves by the motion of its point under the start of the particle, so a sticking particle rides along and does not
@@ -135,7 +135,7 @@ class Moving(Collider):
         a, going, touched = first, True, False
         for k in range(TOUCHES + 1):
             if going:
-                s, depth, n = self.dev.shape.strike(a, e, contact_distance, close, self.push_out * h)
+                s, depth, n = self.dev.shape.find_first_touch(a, e, contact_distance, close, self.push_out * h)
                 if s > 1:
                     going = False
                 elif k < TOUCHES:
@@ -145,15 +145,15 @@ class Moving(Collider):
                     else:
                         touched = True
                         out, slides = self.dev.pose.outward(1, n), False
-                        if ti.static(self.dev.shape.slides):
+                        if ti.static(self.dev.shape.can_slide):
                             slides = not lifted and start_depth <= 4 * close
-                        shift = self.dev.surface.push(i, depth, start_depth, out, moved, h, turn, slides)
+                        shift = self.dev.surface.push(i, depth, start_depth, out, moved, h, mode, slides)
                         a += s * e
                         e += self.dev.pose.inward(1, shift) - s * e
-        if ti.static(self.dev.shape.guesses):
-            if touched and not self.dev.shape.astray(first, contact_distance - 8 * close, close):
-                going = going or self.dev.shape.astray(a + e, contact_distance - 4 * close, close)
-                if going and self.dev.shape.astray(a, contact_distance, close):
+        if ti.static(self.dev.shape.may_miss_touches):
+            if touched and not self.dev.shape.is_penetrating(first, contact_distance - 8 * close, close):
+                going = going or self.dev.shape.is_penetrating(a + e, contact_distance - 4 * close, close)
+                if going and self.dev.shape.is_penetrating(a, contact_distance, close):
                     a = first
         if going:
             # It stays there, with no more speed than it had.

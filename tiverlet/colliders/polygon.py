@@ -59,7 +59,7 @@ class Polygon(Moving):
         self.vertices = vertices
         self.vertices.flags.writeable = False
         self.place(position, rotation)
-        self.surface(friction, restitution, push_out, active, events, one_way, 2)
+        self.set_surface(friction, restitution, push_out, active, events, one_way, 2)
         along = vertices[j] - vertices[i]
         along /= np.linalg.norm(along, axis=1)[:, None]
         features = np.stack([i, j], axis=1)

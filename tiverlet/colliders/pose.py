@@ -28,10 +28,10 @@ class Pose:
             self.spin = scene.memory.field(f"{name}.spin", None, width=len(np.atleast_1d(rotation)))
         self.in_state = {"position": self.position.ends, "rotation": self.rotation.ends}
 
-    def aim(self, position: np.ndarray, rotation) -> None:
+    def set_target(self, position: np.ndarray, rotation) -> None:
         """Move to this pose during the next frame."""
-        self.position.aim(position)
-        self.rotation.aim(np.atleast_1d(rotation))
+        self.position.set_target(position)
+        self.rotation.set_target(np.atleast_1d(rotation))
 
     def end_motion(self) -> None:
         """Stay where the last frame ended."""

@@ -58,24 +58,24 @@ class Sdf(Moving):
         ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
         None = None, events: bool = False,
     ):  # fmt: skip
-        self.function: Any = _taken("function", function)
-        self.gradient: Any = gradient and _taken("gradient", gradient)
+        self.function: Any = _checked_function("function", function)
+        self.gradient: Any = gradient and _checked_function("gradient", gradient)
         self.radius = radius
         self.place(position, rotation)
-        self.surface(friction, restitution, push_out, active, events)
+        self.set_surface(friction, restitution, push_out, active, events)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the dimension, and that the function is finite and a distance around the particles."""
         vars(self.dev).pop("probe", None)  # it may belong to an earlier start of Taichi
         Moving.prepare(self, particles, inv_mass)
-        self._try_around(particles)
+        self._check_around(particles)
 
     def check_added(self, particles: Particles, first: int) -> None:
         """Check the function around particles that are added in place; otherwise prepare() has checked it."""
         if self.scene is not None and first < particles.count:
-            self._try_around(particles)
+            self._check_around(particles)
 
-    def _try_around(self, particles: Particles) -> None:
+    def _check_around(self, particles: Particles) -> None:
         """Evaluate and check the function at the particles and around them."""
         x = particles.position
         if not len(x):
@@ -136,7 +136,7 @@ class Sdf(Moving):
 class FunctionShape(Shape):
     """The shape where a function of the position is negative, on the device."""
 
-    guesses = slides = True
+    may_miss_touches = can_slide = True
 
     def __init__(self, function: Any, gradient: Any, scene: Scene, dim: int):
         self.function, self.gradient, self.dim, self.real = function, gradient, dim, scene.real
@@ -146,7 +146,7 @@ class FunctionShape(Shape):
         self.step = 2.0**-6 if single else 2.0**-16
 
     @ti.func
-    def astray(self, q, contact_distance, close):
+    def is_penetrating(self, q, contact_distance, close):
         """Whether the function at q is below contact_distance by more than rounding."""
         return self.function(q) < contact_distance - close
 
@@ -205,8 +205,8 @@ class FunctionShape(Shape):
         return out
 
     @ti.func
-    def strike(self, a, e, contact_distance, close, limit):
-        """Find the first touch on the way from a to a + e, see Shape.strike().
+    def find_first_touch(self, a, e, contact_distance, close, limit):
+        """Find the first touch on the way from a to a + e, see Shape.find_first_touch().
 
         A particle that starts close to the surface is first held above the tangent plane there. If nothing bounces, the end of
         its way on that plane is tested, too. In a hollow the end is inside the surface, and is pushed on along the same normal,
@@ -234,7 +234,7 @@ class FunctionShape(Shape):
                     if k == 0:
                         below = -(gap + slope)
                         lies = False
-                        if ti.static(self.slides):
+                        if ti.static(self.can_slide):
                             lies = -4 * close <= gap <= fine
                         if lies:
                             first = n
@@ -400,7 +400,7 @@ def contour(grid: np.ndarray, value: np.ndarray) -> np.ndarray:
     return np.concatenate(out)
 
 
-def _taken(name: str, function):
+def _checked_function(name: str, function):
     """Check that a function is a ti.func of one argument, and return it."""
     if not is_kernel_function(function):
         raise TypeError(

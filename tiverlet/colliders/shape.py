@@ -37,15 +37,16 @@ class HostShape(Protocol):
 class Shape:
     """A shape that particles stay outside of, on the device, in a frame of its own; radius: by what it is thickened [m].
 
-    guesses: strike() may miss a touch, so the ends of displacements are tested with astray(). slides: nothing bounces, so a
-    particle that slides on the shape may be pushed along the normal at the start of its displacement.
+    may_miss_touches: find_first_touch() may miss a touch, so the ends of displacements are tested with is_penetrating().
+    can_slide: nothing bounces, so a particle that slides on the shape may be pushed along the normal at the start of its
+    displacement.
     """
 
-    guesses = False
-    slides = False
+    may_miss_touches = False
+    can_slide = False
 
     @ti.func
-    def strike(self, a, e, contact_distance, close, limit):
+    def find_first_touch(self, a, e, contact_distance, close, limit):
         """Find the first touch of a particle on its way from a to a + e.
 
         contact_distance: of its center from the shape. close: the size of rounding. limit: how far a start that is inside may be
@@ -60,6 +61,6 @@ class Shape:
         return 0 * q[0]
 
     @ti.func
-    def astray(self, q, contact_distance, close):
+    def is_penetrating(self, q, contact_distance, close):
         """Whether a particle with its center at q, in the shape's frame, is inside of the shape."""
         return False

@@ -3,16 +3,17 @@
 from typing import TYPE_CHECKING, Any
 
 from ..device import at, inline, ti
-from ..features.material import limited, refuse_turning
+from ..features.material import limit_length, refuse_turning
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
     from ..features.material import Bounce, Coefficients
     from .wall_log import WallLog
 
-# How a collider confines. FIRST: at any depth. AGAIN: only deeper than rounding. GENTLY: as AGAIN, without friction and bounces.
-# AHEAD: before contacts are solved, as AGAIN, without friction; particles that would bounce stay.
-FIRST, AGAIN, GENTLY, AHEAD = range(4)
+# How a collider confines. ANY_DEPTH: at any depth. BEYOND_ROUNDING: only deeper than rounding. FRICTIONLESS: as
+# BEYOND_ROUNDING, without friction and bounces. BEFORE_CONTACTS: before contacts are solved, as BEYOND_ROUNDING, without
+# friction; particles that would bounce stay.
+ANY_DEPTH, BEYOND_ROUNDING, FRICTIONLESS, BEFORE_CONTACTS = range(4)
 TOUCH = 2.0**-20  # of the size of a wall: a start no deeper inside than this counts as on the surface
 SLOW = 8.0  # a linked particle does not bounce if it approaches by less than this times what forces and links of a substep add
 NEAR = 1 / 64  # of its displacement: a particle that starts closer to a surface than this lies on it, and may slide along it
@@ -40,7 +41,7 @@ class Surface:
         self.impacts: Any = scene.impacts
         # A particle with spin and friction bounces alone, since the extra passes do not change its spin.
         self.has_impacts = self.has_restitution and scene.impacts is not None and not (scene.state.spins and friction)
-        self.log_number = self.impacts.enter(log) if self.has_impacts else -1
+        self.log_number = self.impacts.add_log(log) if self.has_impacts else -1
         self.poses: list[Any] = []
         self.spins, self.turns, self.radius = scene.state.spins and self.has_friction, turns, scene.radius
         self.spin: Any = scene.state.spin if scene.state.spins else None
@@ -71,7 +72,7 @@ class Surface:
             self._memory.write(self.active, float(active))
 
     @property
-    def stands(self) -> bool:
+    def was_active(self) -> bool:
         """Whether the wall was present in the last frame."""
         return not self.has_switch or bool(self._memory.read(self.active))
 
@@ -118,15 +119,16 @@ class Surface:
         return out
 
     @ti.func
-    def press(self, i, depth, start_depth, n, moved, h, turn):
+    def push_without_slide(self, i, depth, start_depth, n, moved, h, mode):
         """Push particle i out as push() does, where it does not slide along a curved surface."""
-        return self.push(i, depth, start_depth, n, moved, h, turn, False)
+        return self.push(i, depth, start_depth, n, moved, h, mode, False)
 
     @ti.func
-    def push(self, i, depth, start_depth, n, moved, h, turn, slides):
+    def push(self, i, depth, start_depth, n, moved, h, mode, slides):
         """Move particle i out of a wall that it entered by `depth` [m], along the normal n; the wall itself moved by `moved`.
 
-        start_depth: depth at the start of the substep, 0 or less outside [m]. turn: FIRST, AGAIN, GENTLY or AHEAD.
+        start_depth: depth at the start of the substep, 0 or less outside [m]. mode: ANY_DEPTH, BEYOND_ROUNDING, FRICTIONLESS or
+        BEFORE_CONTACTS.
         slides: whether n is the normal at the start of a displacement along a curved surface. The displacement then changes as
         much as the position; otherwise the particle would pass walls that follow displacements.
         A particle within rounding of the surface touches it, so that it does not sink, or slip, by the last digits of its
@@ -139,9 +141,9 @@ class Surface:
         if depth > -close:
             depth = ti.max(depth, ti.min(-leaving, close))
         if ti.static(self.has_impacts):
-            if self.impacts.waits(i):
+            if self.impacts.is_struck_now(i):
                 depth = ti.min(depth, 0)
-        if depth > ti.select(turn == FIRST, 0, close):
+        if depth > ti.select(mode == ANY_DEPTH, 0, close):
             move = ti.max(depth - ti.max(start_depth - self.push_out * h, 0), 0)
             # Normal displacement after the substep. A particle that bounced may be moved further than its displacement changes.
             after = leaving + move
@@ -151,18 +153,18 @@ class Surface:
             if ti.static(self.has_restitution):
                 # After an earlier bounce in this substep, the straight path to the present position begins at the height `gap`.
                 gap = -depth - leaving
-                if gap >= 0 and leaving < 0 and turn != GENTLY:
+                if gap >= 0 and leaving < 0 and mode != FRICTIONLESS:
                     before = (self.state.before[i] - moved).dot(n)
-                    if self.takes_along(i):
+                    if self.is_linked(i):
                         bounces = self.restitution[None] > 0 and -before > ti.static(SLOW) * ti.abs(before - leaving)
-                        if self.left_to_passes(i, n, moved, -self.restitution[None] * before, bounces, turn):
+                        if self.defer_impact(i, n, moved, -self.restitution[None] * before, bounces, mode):
                             move, after = 0 * depth, leaving
                     else:
                         rise, after, left = self.bounce(gap, leaving, before, after)
-                if turn == AHEAD and rise > 0:  # a particle that bounces in this substep is not supported by the wall
+                if mode == BEFORE_CONTACTS and rise > 0:  # a particle that bounces in this substep is not supported by the wall
                     move, rise, after = 0 * depth, 0 * depth, leaving
             if ti.static(self.has_log):
-                if turn != AHEAD:
+                if mode != BEFORE_CONTACTS:
                     self.log.note(i, depth, n, after - leaving, -leaving)
             change = (after - leaving) * n
             if ti.static(self.state.keeps_wall_push):
@@ -170,14 +172,14 @@ class Surface:
             shift = (move + rise) * n
             stuck = False
             if ti.static(self.spins):
-                if turn < GENTLY:
+                if mode < FRICTIONLESS:
                     high, _lift = self.bounced(i)
-                    held, rests = self.grip(i, n, d - leaving * n, after - leaving, rise > 0)
+                    held, rests = self.apply_spin_friction(i, n, d - leaving * n, after - leaving, rise > 0)
                     stuck = rests and rise == 0 and not high
                     change -= held
                     shift -= left * held  # from the impact on
             elif ti.static(self.has_friction):
-                if turn < GENTLY:
+                if mode < FRICTIONLESS:
                     slip = d - leaving * n
                     size, support = slip.norm(), after - leaving
                     if size > self.static() * support:
@@ -201,15 +203,15 @@ class Surface:
         return shift
 
     @ti.func
-    def takes_along(self, i):
+    def is_linked(self, i):
         """Whether particle i is linked, so that it does not bounce alone, see BodyImpacts."""
         out = False
         if ti.static(self.has_impacts):
-            out = self.impacts.linked(i)
+            out = self.impacts.is_linked(i)
         return out
 
     @ti.func
-    def left_to_passes(self, i, n, moved, target, bounces, turn):
+    def defer_impact(self, i, n, moved, target, bounces, mode):
         """Whether linked particle i is left where it is in this pass.
 
         If it bounces, later passes give it the normal displacement `target`.
@@ -219,16 +221,16 @@ class Surface:
             static = dynamic = 0 * target
             if ti.static(self.has_friction):
                 static, dynamic = self.static(), self.dynamic()
-            if turn == AHEAD:
+            if mode == BEFORE_CONTACTS:
                 out = bounces
             else:
-                self.impacts.calm_between(i, n)
+                self.impacts.cancel_bounce(i, n)
                 if bounces:
-                    out = self.impacts.strike(i, n, moved, target, static, dynamic, self.log_number)
+                    out = self.impacts.record_impact(i, n, moved, target, static, dynamic, self.log_number)
         return out
 
     @ti.func
-    def grip(self, i, n, across, support, bounces):
+    def apply_spin_friction(self, i, n, across, support, bounces):
         """Return what friction removes from the displacement `across` the normal of a spinning particle, and whether it rests.
 
         A particle rests where it neither slides nor rolls. support: the normal displacement from the wall. The spin is updated.
@@ -236,29 +238,29 @@ class Surface:
         r N, both are solved for together. A particle that sticks stops as long as that moment holds it; one that rolls on does so
         against it.
         """
-        k, s = self.spin.share.of(i), self.spin.s[i]
+        k, s = self.spin.inverse_inertia.of(i), self.spin.s[i]
         most, least = self.static() * support, self.dynamic() * support
         slip = across - self.spin.surface(s, n)
         if ti.static(self.turns):
             if bounces:
                 slip *= 1 + self.rolling[None][2]
-        held = limited(slip / (1 + k), most, least)
+        held = limit_length(slip / (1 + k), most, least)
         if ti.static(self.turns):
             row = self.rolling[None]
             if row[0] > 0 and not bounces:
                 rolls = s - self.wall_turn(i)
                 rolls -= self.spin.along(rolls, n)
-                still = limited(across, most, least)
+                still = limit_length(across, most, least)
                 moment = self.spin.moment(n, still)
                 rolls += k * moment
-                resisted = limited(rolls, k * row[0] * support, k * row[0] * support)
+                resisted = limit_length(rolls, k * row[0] * support, k * row[0] * support)
                 held = still
                 if (resisted != rolls).any():
-                    held = limited((across - self.spin.surface(s - resisted, n)) / (1 + k), most, least)
+                    held = limit_length((across - self.spin.surface(s - resisted, n)) / (1 + k), most, least)
                 s -= resisted
             if row[1] > 0:
                 twist = self.spin.along(s - self.wall_turn(i), n)
-                s -= limited(twist, k * row[1] * support, k * row[1] * support)
+                s -= limit_length(twist, k * row[1] * support, k * row[1] * support)
         s += k * self.spin.moment(n, held)
         self.spin.s[i] = s
         left = across - held

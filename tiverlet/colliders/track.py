@@ -17,7 +17,7 @@ class Track:
         self.ends = memory.field(name, 2, width=len(value), kind=kind, values=[value, value], state=True)
         self.in_state = {"ends": self.ends}
 
-    def aim(self, value: np.ndarray) -> None:
+    def set_target(self, value: np.ndarray) -> None:
         """Move to `value` during the next frame."""
         self._memory.write(self.ends, [self._memory.read(self.ends)[1], value])
 

@@ -14,7 +14,7 @@ ASIDE = 1e-6  # of an impulse: if it is longer by more than that than its part a
 
 
 class WallLog:
-    """A row for each particle, written where the wall presses it, see Surface.press().
+    """A row for each particle, written where the wall presses it, see Surface.push_without_slide().
 
     touching: whether it was pressed in the last substep of the last frame; only this is kept between frames. when: the substeps
     of the frame, from 1 on, in which it was first pressed and last pressed, or BEFORE or NEVER. impulse: the sum of the changes
@@ -27,12 +27,12 @@ class WallLog:
     def __init__(self, scene: "Scene", name: str):
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self._scene, self.state, self.radius = scene, scene.state, scene.radius
-        self.touching = add(f"events.{name}.touching", n, kind=ti.i32, state=True, told=True)
+        self.touching = add(f"events.{name}.touching", n, kind=ti.i32, state=True, for_reports=True)
         self.when = add(f"events.{name}.when", n, width=2, kind=ti.i32)
         self.impulse, self.speed = add(f"events.{name}.impulse", n, width=dim), add(f"events.{name}.speed", n)
         sleeps = bool(scene.state.sleepers)  # sleeping particles are not tested again, so their points are state
         self.normal, self.point = (
-            add(f"events.{name}.{what}", n, width=dim, state=sleeps, told=sleeps) for what in ("normal", "point")
+            add(f"events.{name}.{what}", n, width=dim, state=sleeps, for_reports=sleeps) for what in ("normal", "point")
         )
         self.substep = add(f"events.{name}.substep", None, kind=ti.i32)  # of the frame, from 1 on; 0 before any
         self.in_state = {"touching": self.touching} | ({"normal": self.normal, "point": self.point} if sleeps else {})

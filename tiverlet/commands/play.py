@@ -21,12 +21,12 @@ def main(args: argparse.Namespace) -> int:
     from .run import find
 
     path = find(args.script)
-    world, each_frame = built(str(path))
+    world, each_frame = load_world(str(path))
     play(world, record=args.record, each_frame=each_frame, title=path.stem, port=args.port, browser=args.browser)
     return 0
 
 
-def built(script: str) -> tuple[Any, Any]:
+def load_world(script: str) -> tuple[Any, Any]:
     """Return the world of a script's play() or build(), or its variable `world`; and its function each_frame(world) or None."""
     from ..world import World
 

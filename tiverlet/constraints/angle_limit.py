@@ -72,7 +72,7 @@ class AngleLimit(Scalar):
     """
 
     measures = AngleFromMiddle
-    bulk = 3.0
+    code_size = 3.0
     uploads_all = False  # limits are checked against each other, for a single world
     index_name = "triples"
     each = ("lower", "upper", "compliance", "damping", "break_at")

@@ -121,7 +121,7 @@ class Constraint(Scalar):
     """
 
     index_name = "indices"
-    grows = False  # the function may read the number of a constraint
+    can_extend = False  # the function may read the number of a constraint
     _size = 0.0  # of the part of the scene that it acts on [m]
     _cached_gradients: tuple[Any, Any, Any] = (None, None, None)  # positions, and values and gradients there
     rest = Knob(lambda f, v: checks.per_item(repr(f), "rest", v, f.count), "What function should be.")

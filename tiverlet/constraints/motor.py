@@ -59,9 +59,9 @@ class Motor(Scalar):
         if angle is not None:
             self.angle = angle
 
-    def check_more(self, more: Feature) -> None:
+    def check_extension(self, more: Feature) -> None:
         """Raise TypeError unless both motors turn at a speed, or both to angles."""
-        super().check_more(more)
+        super().check_extension(more)
         if more.serves != self.serves:  # type: ignore[attr-defined]
             raise TypeError("World.add: extend: one Motor turns to an angle, and the other at a speed. Add it to features.")
 

@@ -59,14 +59,14 @@ class Path(Anchored):
             self.at = at
 
     @property
-    def drives(self) -> bool:
+    def is_kinematic(self) -> bool:
         """Whether the particles are driven."""
         return bool(self.driver)
 
     @property
     def does_work(self) -> bool:
         """Whether the particles are driven, which may add energy."""
-        return self.drives
+        return self.is_kinematic
 
     def _drive(self, name: str, value) -> np.ndarray:
         if name != self.driver:
@@ -76,11 +76,11 @@ class Path(Anchored):
 
     def _compliance(self, value) -> np.ndarray:
         value = super()._compliance(value)
-        if self.drives and (value > 0).any():
+        if self.is_kinematic and (value > 0).any():
             raise ValueError("Path: driven particles take no compliance; they go along whatever pulls at them.")
         return value
 
-    exclusive = drives
+    exclusive = is_kinematic
 
     @property
     def length(self) -> float:
@@ -97,14 +97,14 @@ class Path(Anchored):
         checks.points("Path", "points", self.points, dim=particles.dim)
         rows = self.indices[:, 0]
         self._start = self.curve.nearest(particles.position[rows])
-        if self.drives:
+        if self.is_kinematic:
             inv_mass[rows] = 0.0
 
     def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Warn of particles that do not start on the curve."""
         x = particles.position[self.indices[:, 0]]
         off = np.linalg.norm(x - self.curve.at(self._start), axis=1)
-        if not self.drives and not self.soft and (off > 1e-2 * self.length).any():
+        if not self.is_kinematic and not self.soft and (off > 1e-2 * self.length).any():
             k = int(np.argmax(off))
             at = tuple(round(float(v), 6) for v in self.curve.at(self._start[k]))
             warnings.warn(
@@ -127,13 +127,13 @@ class Path(Anchored):
     def place_of(self, scene: Scene, passes: AnchorPasses) -> OnCurve:
         """Make the arc length of each particle, on the device."""
         extent, moves = float(np.ptp(self.points, axis=0).max()), "speed" in self.__dict__
-        target = None if not self.drives else self.speed if moves else self._start
+        target = None if not self.is_kinematic else self.speed if moves else self._start
         return OnCurve(scene, passes, self.curve, self._start, target, moves, extent)
 
     def upload(self) -> None:
         """Write the new speed, or the new target arc lengths."""
         super().upload()
-        if self.acts and self.drives:
+        if self.acts and self.is_kinematic:
             self.scene.memory.write(self.dev.place.target, self.speed if self.dev.place.moves else self.at)
             self.moving = not self.dev.place.moves
 

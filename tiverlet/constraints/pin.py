@@ -127,17 +127,17 @@ class Pin(Anchored):
         return value
 
     @property
-    def drives(self) -> bool:
+    def is_kinematic(self) -> bool:
         """Whether the particles follow the target exactly."""
         return not self.soft
 
     @property
-    def outgrown(self) -> bool:
+    def needs_other_kernels(self) -> bool:
         """Whether the world has to be rebuilt: also when other particles are held, since their masses and slots differ."""
-        return self._grabs or super().outgrown
+        return self._grabs or super().needs_other_kernels
 
     @property
-    def afresh(self) -> bool:
+    def needs_new_state(self) -> bool:
         """Whether the Pin starts anew when the world is rebuilt: when other particles were assigned."""
         return self._grabs
 
@@ -148,11 +148,11 @@ class Pin(Anchored):
 
     def grab(self, scene: Scene) -> None:
         """Hold the assigned particles as a new Pin would. A Pin that drives them takes only their positions from the state."""
-        memory, dev, own, drives, rows = scene.memory, self.dev, vars(self), self.drives, self.members.rows
+        memory, dev, own, kinematic, rows = scene.memory, self.dev, vars(self), self.is_kinematic, self.members.rows
         self.note_arguments()
-        own.update(_grabs=False, changed=drives, moving=False, new_force=False)
-        here = scene.state.get_some(memory, rows[:, 0]) if drives else own["target"]
-        if not drives:
+        own.update(_grabs=False, changed=kinematic, moving=False, new_force=False)
+        here = scene.state.get_some(memory, rows[:, 0]) if kinematic else own["target"]
+        if not kinematic:
             self.start = scene.particles
             memory.write(dev.lam, np.zeros_like(here))
             dev.spring.begin(self.compliance, self.damping)
@@ -175,7 +175,7 @@ class Pin(Anchored):
         rows = self.indices[:, 0]
         self._keep(dim=particles.dim)
         self.target = self.__dict__.get("target", particles.position[rows])
-        if self.drives:
+        if self.is_kinematic:
             inv_mass[rows] = 0.0
 
     def place_of(self, scene: Scene, passes: AnchorPasses) -> "Target":
@@ -185,12 +185,12 @@ class Pin(Anchored):
     def bind(self, scene: Scene) -> None:
         """Declare fields. Driven particles have to go from where they are to the target, so the target is uploaded first."""
         super().bind(scene)
-        self.changed = self.drives
+        self.changed = self.is_kinematic
 
     @property
     def _anchors(self) -> np.ndarray:
         """Where targets start, (m, dim): at the particles where they are driven, at the given target for springs."""
-        return self.start.position[self.indices[:, 0]] if self.drives else self.target
+        return self.start.position[self.indices[:, 0]] if self.is_kinematic else self.target
 
     def upload(self) -> None:
         """Write the new target, which the next frame moves to."""

@@ -93,17 +93,17 @@ class ShapeMatch(Batch):
     @property
     def soft(self) -> bool:
         """Whether any cluster has compliance, or had when kernels were compiled."""
-        return bool((self.compliance > 0).any()) or "soft" in self.once
+        return bool((self.compliance > 0).any()) or "soft" in self.compiled_so_far
 
     @property
     def breaks(self) -> bool:
         """Whether a load can break clusters, or could when kernels were compiled."""
-        return self.break_at is not None or "breaks" in self.once
+        return self.break_at is not None or "breaks" in self.compiled_so_far
 
     @property
     def transcends(self) -> bool:
         """Whether any cluster flows, at an exponential rate, or did when kernels were compiled."""
-        return bool((self.creep > 0).any()) or "transcends" in self.once
+        return bool((self.creep > 0).any()) or "transcends" in self.compiled_so_far
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Compute the rest shapes, each about its center of mass."""
@@ -120,11 +120,11 @@ class ShapeMatch(Batch):
         self._radius = np.sqrt(square / total)
 
     @property
-    def grows(self) -> bool:
+    def can_extend(self) -> bool:
         """Whether more clusters can be appended: not where `rest` was given, which has a row for every particle."""
         return self._rest is None
 
-    def hold_all(self, listing: Any) -> None:
+    def set_listing(self, listing: Any) -> None:
         """Replace the clusters by these."""
         self._keep(members=VariableSize("ShapeMatch", listing))
 
@@ -170,7 +170,7 @@ class ShapeMatch(Batch):
         w = self.scene.inv_mass[self.indices]
         mass = self.scene.memory.read(self.dev.mass)
         weights = np.divide(1.0, mass, out=np.zeros(self.count), where=mass > 0)
-        firm = per_newton(self.scene.reach, self.compliance, lambda: weights)
+        firm = per_newton(self.scene.multipliers_per_newton, self.compliance, lambda: weights)
         scale = np.divide(firm[self.owner], w, out=np.zeros_like(w), where=w > 0)
         pull = self.scene.memory.read(self.dev.pull).astype(np.float64)
         return np.maximum.reduceat(scale * np.linalg.norm(pull, axis=1), self.members.starts[:-1])

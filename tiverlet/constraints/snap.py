@@ -82,7 +82,7 @@ class Snap(Anchored):
     `load` is the force on each particle [N].
     """
 
-    grows = True
+    can_extend = True
 
     def __init__(self, indices, spacing, origin: ArrayLike = 0.0, *, compliance: ArrayLike, damping: ArrayLike = 0.0):
         self.setup(indices, compliance, damping)
@@ -95,9 +95,9 @@ class Snap(Anchored):
             raise ValueError(f"Snap: compliance[{i}] = 0, but a rigid grid leaves nothing free; use Pin, or a small compliance.")
         return value
 
-    def check_more(self, more: Feature) -> None:
+    def check_extension(self, more: Feature) -> None:
         """Raise TypeError unless `more` has the same grid."""
-        super().check_more(more)
+        super().check_extension(more)
         for name in ("spacing", "origin"):
             mine, other = getattr(self, name), getattr(more, name)
             if np.shape(mine) != np.shape(other) or np.any(np.asarray(mine) != other):

@@ -142,7 +142,7 @@ class Contact(PairContact):
         dev.splitting.regroup(n)
         dev.projection.regroup(n, dev.list.team)
 
-    def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
+    def make_search(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields and the neighbour search, and return the search."""
         dim, dev = scene.particles.dim, self.dev
         linked = excluded_pairs(batches, scene.particles.radius)
@@ -195,6 +195,11 @@ class Contact(PairContact):
             dev.spinning = Spinning(scene, self.table, dev.splitting.weight, dev.turn)
         dev.projection = VelocityProjection(scene, dev.list, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
         return dev.search
+
+    @property
+    def strikes_bodies(self) -> bool:
+        """Whether bodies of linked particles bounce as wholes: with restitution, unless friction turns particles."""
+        return self.dev.has_restitution and not self.dev.spins
 
     @ti.func
     def presses(self, i, e):

@@ -24,8 +24,8 @@ FOLDED = 0.25  # radii of the smaller particle: a link that is shorter at the st
 def excluded_pairs(batches: Sequence[Batch], radius: np.ndarray) -> np.ndarray:
     """Return pairs of particles that contacts leave out, (m, 2). radius: (n,) [m]."""
     own = [b.excluded_pairs(b.start) for b in batches]
-    ties = [b.ties() for b in batches]
-    links, lengths = (np.concatenate(some) for some in zip((np.zeros((0, 2), dtype=np.int32), np.zeros(0)), *ties, strict=True))
+    limits = [b.max_distances() for b in batches]
+    links, lengths = (np.concatenate(some) for some in zip((np.zeros((0, 2), dtype=np.int32), np.zeros(0)), *limits, strict=True))
     return np.concatenate([np.zeros((0, 2), dtype=np.int32), *own, _inside(links, lengths, radius)])
 
 

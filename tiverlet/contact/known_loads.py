@@ -6,7 +6,7 @@ import numpy as np
 
 from ..device import ti
 from ..features.feature import Acceleration
-from ..features.learning import gain, steady
+from ..features.learning import is_steady, learnt_share
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.queries import between
 
@@ -126,10 +126,10 @@ class KnownLoads:
     @ti.func
     def learn(self, i, j, e, load, mean):
         """Return the load of entry e after a window in which `mean` of it was missing on average [N]."""
-        if steady(mean, self.earlier.field[e]):
+        if is_steady(mean, self.earlier.field[e]):
             k = ti.abs(load + mean) * ti.max(self.state.w.of(i), self.state.w.of(j))
             own = ti.max(self.weights.field[i], self.weights.field[j])
-            share = gain(own * own, SLOW * k * k, WINDOW)
+            share = learnt_share(own * own, SLOW * k * k, WINDOW)
             load, mean = ti.max(load + share * mean, 0), (1 - share) * mean
         self.earlier.field[e] = mean
         return load

@@ -173,7 +173,7 @@ class DiscGeometry:
     def enable_shrink(self) -> None:
         """Prepare for shrink(): declare the field of shrunk radii, which exists only once it is needed."""
         if not self.shrinks:
-            self.store = self.scene.memory.more()
+            self.store = self.scene.memory.make_companion()
             self.shrunk = self.store.field(SHRUNK, self.scene.count, state=True)
             self.store.place()
             self.shrinks = True

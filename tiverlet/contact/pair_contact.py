@@ -65,8 +65,8 @@ class PairContact(Feature):
 
     bodies: arrays of particles that sleep and wake together.
 
-    A subclass defines prepare() and join(), which makes `dev.geometry` and `dev.forces`. In a pass of a substep its methods are
-    called in this order:
+    A subclass defines prepare() and make_search(), which makes `dev.geometry` and `dev.forces`. In a pass of a substep its
+    methods are called in this order:
 
     - detect(i, first), if it `detects`
     - count(begin, end, now) and busy(begin), by blocks of particles
@@ -89,8 +89,8 @@ class PairContact(Feature):
     table: Table  # bound to one world
     bodies: Sequence[np.ndarray] = ()
     matters = True
-    bulk = 3.0
-    room = 0  # initial list entries per particle, if more than discs need
+    code_size = 3.0
+    neighbours_per_particle = 0  # initial list entries per particle, if more than discs need
     detects = False  # whether each pass calls detect() for all particles, before contacts are counted
     projects = False  # whether it has a velocity projection of loaded pairs, see velocity_projection.py
 
@@ -132,17 +132,22 @@ class PairContact(Feature):
     @property
     def has_friction(self) -> bool:
         """Whether any pair has friction, or had friction when kernels were compiled."""
-        return self._pairs.has_friction or "has_friction" in self.once
+        return self._pairs.has_friction or "has_friction" in self.compiled_so_far
 
     @property
     def has_restitution(self) -> bool:
         """Whether any pair has restitution, or had restitution when kernels were compiled."""
-        return self._pairs.has_restitution or "has_restitution" in self.once
+        return self._pairs.has_restitution or "has_restitution" in self.compiled_so_far
+
+    @property
+    def strikes_bodies(self) -> bool:
+        """Whether bodies of linked particles bounce off each other as wholes, see BodyImpacts."""
+        return False
 
     @property
     def turns(self) -> bool:
         """Whether any pair has rolling, twisting or tangential restitution, now or when kernels were compiled."""
-        return self._pairs.turns or "turns" in self.once
+        return self._pairs.turns or "turns" in self.compiled_so_far
 
     @property
     def has_events(self) -> bool:
@@ -174,7 +179,7 @@ class PairContact(Feature):
         """The names of state fields that enable_shrink() declares. Their values are 0 before."""
         return self.dev.geometry.late
 
-    def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
+    def make_search(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields and the neighbour search, and return the search."""
         raise NotImplementedError
 
@@ -183,18 +188,18 @@ class PairContact(Feature):
         dev = self.dev
         self.scene, dev.state, dev.w = scene, scene.state, scene.state.w
         dev.has_friction, dev.has_restitution, dev.turns = self.has_friction, self.has_restitution, self.turns
-        self.table.make_room(dev.has_friction, dev.has_restitution, dev.turns)
+        self.table.set_columns(dev.has_friction, dev.has_restitution, dev.turns)
         # `reports`: whether pairs that push each other are recorded, not only sensors. `events`: an EventLog, or None.
         dev.has_events, dev.reports, dev.events = self.has_events, bool(vars(self).get("events")), None
 
-    def built_for(self) -> dict[str, Any]:
+    def build_values(self) -> dict[str, Any]:
         """Return the settings for which the world was built, and the groups of the table.
 
         Groups that the settings do not name any more stay in the table, so dropping a name does not rebuild the world.
         """
         named = self._pairs.named
         told = self.table.named if self.scene and self.matters else frozenset()
-        return super().built_for() | {"named": told if named <= told else named}
+        return super().build_values() | {"named": told if named <= told else named}
 
     def upload(self) -> None:
         """Write changed friction and restitution to the device."""

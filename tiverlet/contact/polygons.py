@@ -61,7 +61,7 @@ class Polygons(PairContact):
 
     detects = True
     _after: Any = None  # the copy with the bodies after a planned edit, see can_regroup()
-    room = 64  # the particles of near bodies
+    neighbours_per_particle = 64  # the particles of near bodies
 
     def __init__(
         self, loops: Iterable, friction: ArrayLike | Mapping = 0.0, restitution: ArrayLike | Mapping = 0.0, *, skin: float | str =
@@ -115,7 +115,7 @@ class Polygons(PairContact):
             new, whole = number[corner].astype(np.int32), np.bincount(owner, number[corner] < 0) == 0
             self._hold([new[begin[k] : begin[k + 1]] for k in np.flatnonzero(whole).tolist()])
 
-    def check_more(self, more: Feature) -> None:
+    def check_extension(self, more: Feature) -> None:
         """Raise unless `more` is a Polygons with the same settings."""
         if not isinstance(more, Polygons):
             raise TypeError(f"World.add: extend: {self!r} cannot take {more!r}, which is of another kind. Add it to features.")
@@ -142,10 +142,10 @@ class Polygons(PairContact):
             return False
         came, now = change.now.position[change.kept :], change.now
         after: Any = self.copy()
-        start = now.placed(change.joined(self.start.position, came))
+        start = now.placed(change.regrouped_rows(self.start.position, came))
         after.remap_indices(change.number, now.count)
-        if self in change.more:
-            start = extended(after, change.more[self], start, now, self.periodic)
+        if self in change.extensions:
+            start = extended(after, change.extensions[self], start, now, self.periodic)
         after.start = start
         after.prepare(start, change.inv_mass.copy())
         self._after = after
@@ -171,7 +171,7 @@ class Polygons(PairContact):
         ends = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in self.loops])
         return ends, np.arange(len(ends))
 
-    def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
+    def make_search(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields and the neighbour search, and return the search."""
         n, add, dev = scene.count, scene.memory.field, self.dev
         self.enter(scene)

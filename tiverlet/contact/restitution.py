@@ -31,6 +31,8 @@ class Restitution:
         self.geometry, self.list, self.table, self.state = geometry, geometry.list, table, scene.state
         self.struck, self.slack, self.impulse, self.events = struck, slack, impulse, events
         self.has_events = events is not None
+        self.strikes_bodies = False  # whether bodies of linked particles bounce as wholes
+        self.impacts: Any = None  # the BodyImpacts, if they do
         self.weight = add("Contact.struck", n)  # the split mass of the first pass, 0 without contact
         self.d_change = add("Contact.d_change", n, width=dim)
         self.lift = add("Contact.lift", n, width=dim)  # moves the position only
@@ -38,6 +40,12 @@ class Restitution:
         self.partner = add("Contact.partner", n, kind=ti.i32)
         self.first = add("Contact.first", n, kind=ti.i32)
         self.hit = add("Contact.hit", None, kind=ti.i32)
+
+    def bind(self, scene: Scene, impacts: Any) -> None:
+        """Leave impacts of linked particles to the extra passes of a BodyImpacts."""
+        n, dim, add = scene.count, scene.particles.dim, scene.memory.field
+        self.strikes_bodies, self.impacts = True, impacts
+        self.normal, self.target_of = add("Contact.normal", n, width=dim), add("Contact.target", n)
 
     @ti.func
     def clear(self, i, weight):
@@ -102,9 +110,11 @@ class Restitution:
     def choose(self, i):
         """Choose the earliest struck pair of particle i that still approaches, and store its impact on i."""
         first, partner, most, w = -1, -1, 0 * self.weight[i], self.state.w.of(i)
+        if ti.static(self.strikes_bodies):
+            self.impacts.begin_round(i)
         if self.weight[i] > 0:
             for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
-                if self.struck.field[e] > 0:
+                if self.struck.field[e] > 0 and not self.is_deferred(i, self.list.neighbour[e]):
                     j = self.list.neighbour[e]
                     contact_distance = self.geometry.contact_distance(i, j)
                     overlap, _each, n, _reach = self.geometry.impact(i, j, contact_distance, self.weight[i], False)
@@ -113,6 +123,8 @@ class Restitution:
                         if left > most or (left == most and earlier(i, j, partner)):
                             first, partner, most = e, j, left
                             self.d_change[i] = w / (w + self.state.w.of(j)) * given * n
+                            if ti.static(self.strikes_bodies):
+                                self.set_target(i, j, n, given)
                             if self.hit[None] == 0:
                                 self.hit[None] = 1
         self.first[i] = first
@@ -124,7 +136,11 @@ class Restitution:
         """Let particle i bounce off its partner, if the partner chose i, too, or cannot move."""
         j = self.partner[i]
         if j >= 0:
-            if self.partner[j] == i or self.state.w.of(j) == 0:
+            meets = self.partner[j] == i or self.state.w.of(j) == 0
+            if ti.static(self.strikes_bodies):
+                if meets:
+                    meets = not self.impacts.record_pair_impact(i, j, self.normal[i], self.target_of[i])
+            if meets:
                 e, d_change = self.first[i], self.d_change[i]
                 impulse = d_change.norm() / self.state.w.of(i)
                 self.impulse.field[e] = self.impulse.field[e] + impulse
@@ -134,6 +150,34 @@ class Restitution:
                 self.state.d[i] = self.state.d[i] + d_change
                 self.state.before[i] = self.state.before[i] + d_change
                 self.state.advance(i, self.left[i] * d_change)
+
+    @ti.func
+    def is_deferred(self, i, j):
+        """Whether extra passes make the impact of particles i and j, see BodyImpacts."""
+        out = False
+        if ti.static(self.strikes_bodies):
+            out = self.impacts.has_struck(i, j)
+        return out
+
+    @ti.func
+    def set_target(self, i, j, n, given):
+        """Store the displacement along n with which particle i is to leave particle j."""
+        self.normal[i] = n
+        self.target_of[i] = given + self.state.slid(self.state.d[i] - self.state.d[j], i, j).dot(n)
+
+    @ti.func
+    def push_body(self, i):
+        """In an extra pass: compute the push of particle i, and store its impulse. Returns whether its displacement was off."""
+        off, push = self.impacts.compute_pair_push(i)
+        if push != 0:
+            j = self.impacts.partner[i]
+            for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
+                if self.list.neighbour[e] == j:
+                    impulse = push / (self.state.w.of(i) + self.state.w.of(j))
+                    self.impulse.field[e] = self.impulse.field[e] + impulse
+                    if ti.static(self.has_events):
+                        self.events.note_impact(e, impulse, self.impacts.first_push[i] / (1 + self.table.of(i, j)[2]))
+        return off
 
 
 @ti.func

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from ..device import ti
-from ..features.material import Table, limited
+from ..features.material import Table, limit_length
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
@@ -53,17 +53,17 @@ class Spinning:
     @ti.func
     def split_mass(self, i, j):
         """Return the change of slip() per push across the normal, with split masses."""
-        out = 1 + self.spin.share.of(i)
-        if ti.static(self.spin.share.uniform):
+        out = 1 + self.spin.inverse_inertia.of(i)
+        if ti.static(self.spin.inverse_inertia.uniform):
             out *= self.weight[i] + self.weight[j]
         else:
-            out = out * self.weight[i] + (1 + self.spin.share.of(j)) * self.weight[j]
+            out = out * self.weight[i] + (1 + self.spin.inverse_inertia.of(j)) * self.weight[j]
         return out
 
     @ti.func
     def turned(self, i, m, push):
         """Return the change of s_i by a push across the normal, both per inverse mass [kg m]."""
-        return -self.spin.share.of(i) * self.spin.moment(m, push)
+        return -self.spin.inverse_inertia.of(i) * self.spin.moment(m, push)
 
     @ti.func
     def part(self, i, j):
@@ -74,7 +74,10 @@ class Spinning:
     def rolling_mass(self, i, j):
         """Return the change of rho per f, with split masses."""
         a = self.part(i, j)
-        return (1 - a) * (1 - a) * self.spin.share.of(i) * self.weight[i] + a * a * self.spin.share.of(j) * self.weight[j]
+        return (
+            (1 - a) * (1 - a) * self.spin.inverse_inertia.of(i) * self.weight[i]
+            + a * a * self.spin.inverse_inertia.of(j) * self.weight[j]
+        )  # fmt: skip
 
     @ti.func
     def held(self, i, j, e, n, s_i, s_j, most):
@@ -85,7 +88,7 @@ class Spinning:
         a, row = self.part(i, j), self.table.of(i, j)
         rolled = self.turn.field[e] + ((1 - a) * s_i - a * s_j)
         twist = self.spin.along(rolled, n)
-        return limited(rolled - twist, row[4] * most, row[4] * most) + limited(twist, row[5] * most, row[5] * most)
+        return limit_length(rolled - twist, row[4] * most, row[4] * most) + limit_length(twist, row[5] * most, row[5] * most)
 
     @ti.func
     def resist(self, i, j, e, n, m, push, pressed):
@@ -93,7 +96,7 @@ class Spinning:
 
         pressed: the push along the normal. push: friction of this pair, which acts first, with split masses [kg m].
         """
-        k_i, k_j, rolling_mass = self.spin.share.of(i), self.spin.share.of(j), self.rolling_mass(i, j)
+        k_i, k_j, rolling_mass = self.spin.inverse_inertia.of(i), self.spin.inverse_inertia.of(j), self.rolling_mass(i, j)
         out = 0 * self.spin.s[i]
         if rolling_mass > 0:
             moment = self.spin.moment(m, push)

@@ -29,7 +29,7 @@ class Copies:
         self.number: Any = None  # a field with one number: the chosen copy
         self._strides: set[int] = set()  # the strides of all fields
         self._now: tuple[Any, dict[int, Any]] = (None, {})  # a kernel, and the offset of its copy by stride
-        self._seen: np.ndarray | None = None  # the field `number` as an array, where the host can access it
+        self._view: np.ndarray | None = None  # the field `number` as an array, where the host can access it
 
     def add(self, field: Any, stride: int) -> None:
         """Mark a field as having `stride` elements for each copy."""
@@ -41,13 +41,13 @@ class Copies:
     def choose(self, copy: int | None) -> bool:
         """Choose one copy for the host, or all (None). Returns False if the caller has to write the choice to the field."""
         self.chosen = copy
-        if self._seen is not None and copy is not None:
-            self._seen[...] = copy
-        return self._seen is not None or copy is None
+        if self._view is not None and copy is not None:
+            self._view[...] = copy
+        return self._view is not None or copy is None
 
-    def see(self, array: np.ndarray | None) -> None:
+    def set_view(self, array: np.ndarray | None) -> None:
         """Keep the host's view of the field `number`."""
-        self._seen = array
+        self._view = array
 
     @inline
     def enter(self, copy):

@@ -23,13 +23,14 @@ class Entry:
     state: bool  # part of the exact state, hence of hash() and clone()
     copies: int = 0  # number of copies with `length` elements each; 0 where all copies share the field
     rows: Any = None  # the Number that its length follows; None where it follows none
-    told: bool = False  # state that only reports read, hence not part of hash()
-    below: int | None = None  # where kernels use its elements as indices: the size of what they index
+    for_reports: bool = False  # state that only reports read, hence not part of hash()
+    index_limit: int | None = None  # where kernels use its elements as indices: the size of what they index
 
     def of_length(self, length: int) -> "Entry":
         """Return the same entry with another length; dataclasses.replace() takes three times as long."""
         return Entry(
-            self.name, self.field, self.width, length, self.kind, self.state, self.copies, self.rows, self.told, self.below
+            self.name, self.field, self.width, length, self.kind, self.state, self.copies, self.rows, self.for_reports,
+            self.index_limit,
         )  # fmt: skip
 
     @property
@@ -49,7 +50,7 @@ class Entry:
         return self.kind.itemsize * max(1, self.width) * max(1, self.length)
 
 
-def chain(field) -> tuple[list[int], Any]:
+def offsets_in_tree(field) -> tuple[list[int], Any]:
     """Return the byte offset of each component of the first element from the begin of its tree, and the root of the tree."""
     offsets, node = [], None
     for component in field._get_field_members():
@@ -61,7 +62,7 @@ def chain(field) -> tuple[list[int], Any]:
 
 
 @ti.data_oriented
-class Places:
+class AddressFinder:
     """Finds the address of a field."""
 
     def __init__(self, field: Any):

@@ -17,8 +17,8 @@ from typing import Any
 SIGNALS = tuple(int(getattr(signal, name)) for name in ("SIGINT", "SIGTERM", "SIGALRM") if hasattr(signal, name))
 
 
-class Whole:
-    """A context, `with whole:`, that no signal handler may interrupt.
+class DeferredSignals:
+    """A context, `with deferred_signals:`, that no signal handler may interrupt.
 
     Python runs handlers in the main thread, so the context does nothing in other threads. Only handlers written in Python can
     raise, so only these are deferred. Contexts may be nested: handlers run after the outermost one. Entering and leaving takes
@@ -77,7 +77,7 @@ class Whole:
         self._noted.add(number)
 
 
-whole = Whole()
+deferred_signals = DeferredSignals()
 
 
 def uninterrupted(function: Callable) -> Callable:
@@ -86,7 +86,7 @@ def uninterrupted(function: Callable) -> Callable:
     @functools.wraps(function)
     def guarded(*args, **kwargs):
         """Call the function with signal handlers deferred."""
-        with whole:
+        with deferred_signals:
             return function(*args, **kwargs)
 
     return guarded

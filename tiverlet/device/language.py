@@ -72,7 +72,7 @@ def current() -> Any:
     return impl.get_runtime()
 
 
-def has(arch: str) -> bool:
+def supports(arch: str) -> bool:
     """Whether this machine and this compiler support an architecture, by its name in Taichi."""
     with contextlib.suppress(Exception):
         library: Any = ti._lib
@@ -95,7 +95,7 @@ def plain_field(thing: Any) -> bool:
     return type(thing) is _NUMBERS or type(thing) is _VECTORS
 
 
-def before_fields(check: Callable[[], None]) -> None:
+def check_before_fields(check: Callable[[], None]) -> None:
     """Have `check` called before any field is made, by anyone."""
     create: Any = impl.create_field_member
 

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from . import language, runtime
-from .host_copy import Places, chain
+from .host_copy import AddressFinder, offsets_in_tree
 from .language import ti
 from .patches import patched, roots
 
@@ -62,13 +62,13 @@ class Layout:
     def __init__(self, declared: tuple[Declared, ...], fields: list[Any] | None = None, shared: bool = False):
         check_trees()
         self.serial, self.runtime, self.shared = next(self._serials), language.current(), shared
-        self.fields = fields or [made(d.kind, d.width) for d in declared]
+        self.fields = fields or [make_field(d.kind, d.width) for d in declared]
         builders: dict[bool, Any] = {d.apart: None for d in declared}
         for apart in builders:
             builders[apart] = ti.FieldsBuilder()
         for d, field in zip(declared, self.fields, strict=True):
             (builders[d.apart].dense(ti.i, d.length) if d.length else builders[d.apart]).place(field)
-        self.trees = [roots.planned(builder) if shared else builder.finalize() for builder in builders.values()]
+        self.trees = [roots.finalize_without_memory(builder) if shared else builder.finalize() for builder in builders.values()]
         runtime.trees += len(self.trees)
         self.numbers: dict[Kind, list[int]] = {}  # if shared: the indices of its fields, by kind
         self.room = 0  # if shared: the most elements of a field
@@ -76,26 +76,26 @@ class Layout:
         self._places: list[tuple[int, tuple[int, ...]]] = []  # offset and strides of each field; empty without host access
         self.size = 0  # [bytes] of the tree; 0 without host access
         if shared or patched:
-            self.look()
+            self.find_addresses()
         if not shared and patched and _table[0] is not self.runtime:
-            _know(self.runtime, None)
+            _keep_table(self.runtime, None)
 
-    def look(self) -> None:
+    def find_addresses(self) -> None:
         """Find the addresses of the tree and its fields, where the host can access them. All fields must be placed already."""
         if self.size or runtime.architecture() != "cpu" or len(self.trees) > 1:
             return
-        (first, *_), tree = chain(self.fields[0])
+        (first, *_), tree = offsets_in_tree(self.fields[0])
         if not self.shared:
             addresses = np.zeros(1, dtype=np.uint64)
-            finder = Places(self.fields[0])
+            finder = AddressFinder(self.fields[0])
             if patched and _table[0] is not self.runtime:
-                _know(self.runtime, roots.table_of(finder, "find", addresses, self.trees[0].id, first))
+                _keep_table(self.runtime, roots.table_of(finder, "find", addresses, self.trees[0].id, first))
             else:
                 finder.find(addresses)
             self._now = int(addresses[0]) - first
         self.size = tree.cell_size_bytes
         for field in self.fields:
-            offsets, _ = chain(field)
+            offsets, _ = offsets_in_tree(field)
             steps = {b - a for a, b in pairwise(offsets)}
             if len(steps) > 1:
                 self._places = []  # components are not evenly spaced: copy by kernels instead
@@ -103,10 +103,10 @@ class Layout:
             cell = field.parent().ptr.cell_size_bytes
             self._places.append((offsets[0], (cell, steps.pop() if steps else cell)))
 
-    def lend(self) -> tuple[int, Any]:
+    def allocate(self) -> tuple[int, Any]:
         """Provide zeroed bytes for one more memory: return their address, and an object to keep as long as they are needed.
 
-        The address is 0 for Taichi's own bytes before look() has found them.
+        The address is 0 for Taichi's own bytes before find_addresses() has found them.
         """
         if not self.shared:
             return self._now, None
@@ -116,7 +116,7 @@ class Layout:
             raise MemoryError(f"The system has no room for one more world: {self.size >> 20} MiB of addresses ({e}).") from None
         return ctypes.addressof(ctypes.c_char.from_buffer(room)), room
 
-    def point(self, address: int) -> None:
+    def use_bytes(self, address: int) -> None:
         """Let kernels use the bytes at this address."""
         if address != self._now:
             _table[1][self.trees[0].id] = self._now = address
@@ -168,17 +168,17 @@ def unshared() -> Iterator[None]:
         _unshared = before
 
 
-def made(kind: Any, width: int) -> Any:
+def make_field(kind: Any, width: int) -> Any:
     """Make a field."""
     return ti.Vector.field(width, kind) if width else ti.field(kind)
 
 
 def field(kind: Any, width: int) -> Any:
-    """Make a field that take() will place."""
-    return language.unplaced_field(width) if patched else made(kind, width)
+    """Make a field that get_layout() will place."""
+    return language.unplaced_field(width) if patched else make_field(kind, width)
 
 
-def _know(of: Any, table: Any) -> None:
+def _keep_table(of: Any, table: Any) -> None:
     """Keep the table of tree addresses of a runtime; None if it has none."""
     global _table
     _table = of, table
@@ -187,11 +187,11 @@ def _know(of: Any, table: Any) -> None:
 def sharing() -> bool:
     """Whether worlds can share trees."""
     if patched and _table[0] is not language.current():
-        Layout((Declared(ti.i32, 0, 1, False),)).destroy()  # its look() searches for the table
+        Layout((Declared(ti.i32, 0, 1, False),)).destroy()  # its find_addresses() searches for the table
     return bool(LAZY) and _table[1] is not None and not _unshared
 
 
-def take(declared: list[Declared], fields: list[Any], held: list[Layout], shared: bool) -> tuple[Layout, list[int]]:
+def get_layout(declared: list[Declared], fields: list[Any], held: list[Layout], shared: bool) -> tuple[Layout, list[int]]:
     """Return a layout with the declared fields, and the index of each of them in it.
 
     fields: from field(); this function places them. held: the layouts that the world has already; they are not returned again,
@@ -228,7 +228,7 @@ def _shared(need: Counter[Kind], length: int, held: list[Layout]) -> Layout:
                 want |= has
         room = _room(want, length)
     kinds = sorted(want.elements(), key=lambda kind: (kind[2], kind[1], str(kind[0])))
-    layout = Layout(tuple(_roomy(*kind, room) for kind in kinds), shared=True)
+    layout = Layout(tuple(_with_room(*kind, room) for kind in kinds), shared=True)
     layout.numbers, layout.room = {kind: [k for k, one in enumerate(kinds) if one == kind] for kind in want}, room
     _known[layout] = want
     return layout
@@ -244,7 +244,7 @@ def _size(kind: Any, width: int) -> int:
     return (8 if kind == ti.f64 else 4) * max(1, width)
 
 
-def _roomy(kind: Any, width: int, many: bool, room: int) -> Declared:
+def _with_room(kind: Any, width: int, many: bool, room: int) -> Declared:
     """Declare a field of a shared tree.
 
     BETWEEN bytes separate two fields. Without this gap, two fields can begin at the same offset within a page. A processor then

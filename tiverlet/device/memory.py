@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from . import language, layout, runtime
-from .again import Again
 from .copies import Copies
 from .host_copy import Entry, Transfer
 from .language import ti
@@ -23,6 +22,7 @@ from .layout import Declared, Layout
 from .number import Number
 from .patches import patched
 from .patches.compiler import LEAN, Compiler
+from .redeclaration import Redeclaration
 
 GROUP = 16  # fields per transfer kernel; Taichi unrolls the loop over them
 
@@ -51,7 +51,7 @@ class Memory:
         self._in_order: list[Number] = []
         self._owned: dict[Any, tuple[range, list[Number]]] = {}  # fields and numbers, by owner
         self._valued: set[int] = set()  # indices of fields declared with values
-        self._again: Again | None = None  # set while owners declare their fields a second time
+        self._redeclaration: Redeclaration | None = None  # set while owners declare their fields a second time
         self._later: list[tuple[Entry, np.ndarray]] = []
         self._declared: list[Declared] = []
         self.numbers: dict[Any, tuple[Any, list[Number]]] = {}  # by type: the field, and the numbers that it holds
@@ -60,7 +60,7 @@ class Memory:
         self._which: list[int] = []  # the index of each field in the layout
         self._runtime = language.current()
         self._transfers: dict[tuple, Transfer] = {}  # kept, since compiling costs more than running
-        self._views: dict[int, np.ndarray] = {}  # see _seen()
+        self._views: dict[int, np.ndarray] = {}  # see _host_views()
         self._rooms: dict[int, np.ndarray] = {}  # of resized fields, by index: arrays of the whole reserved room
         self._address = 0  # of the bytes of this memory
         self._room: Any = None  # keeps the bytes alive, where they are not Taichi's own
@@ -69,27 +69,27 @@ class Memory:
         if copies and copies.number is None:
             copies.number = self.field("copy", None, kind=ti.i32, shared=True)
 
-    def more(self) -> "Memory":
+    def make_companion(self) -> "Memory":
         """Return another memory of the same world, for fields that are made and freed on their own."""
         return Memory(self.real, compiler=self.compiler, copies=self.copies)
 
     def field(
         self, name: str, length: int | Number | None, *, width: int = 0, kind=None, values=None, state: bool = False,
-        shared: bool = False, told: bool = False, below: int | None = None,
+        shared: bool = False, for_reports: bool = False, index_limit: int | None = None,
     ) -> Any:  # fmt: skip
         """Declare a field of `length` elements (None: one element, of 0 dimensions) and give it its first values.
 
         length: a Number makes the length follow that number, see regroup(). shared: all copies of the world share the field.
-        state, told, below: see Entry.
+        state, for_reports, index_limit: see Entry.
         """
         kind, rows = self.real if kind is None else kind, None
-        if self._again:
-            return self._again.field(length, width, np.dtype(_NUMPY[kind]), values)
+        if self._redeclaration:
+            return self._redeclaration.field(length, width, np.dtype(_NUMPY[kind]), values)
         if isinstance(length, Number):
             rows, length = length, int(length.now)
         length = 0 if length is None else max(1, length)  # a field of 0 elements breaks the runtime
         made = layout.field(kind, width)
-        self._declare(name, made, length, width, kind, state, shared, rows, told, below)
+        self._declare(name, made, length, width, kind, state, shared, rows, for_reports, index_limit)
         if values is not None and np.size(values):
             self._valued.add(len(self.entries) - 1)
             self._later.append((self.entries[-1], np.asarray(values, dtype=np.float64)))
@@ -97,7 +97,7 @@ class Memory:
 
     def _declare(
         self, name: str, made: Any, length: int, width: int, kind: Any, state: bool, shared: bool = False, rows: Any = None,
-        told: bool = False, below: int | None = None,
+        for_reports: bool = False, index_limit: int | None = None,
     ) -> None:  # fmt: skip
         copies = 0 if shared or not self.copies else self.copies.count
         in_all = max(1, length) * copies if copies else length
@@ -108,7 +108,9 @@ class Memory:
         same = self._named[name]
         name = f"{name} #{same}" if same > 1 else name  # several batches of a kind
         self._at[id(made)] = len(self.entries)
-        self.entries.append(Entry(name, made, width, length, np.dtype(_NUMPY[kind]), state, copies, rows, told, below))
+        self.entries.append(
+            Entry(name, made, width, length, np.dtype(_NUMPY[kind]), state, copies, rows, for_reports, index_limit)
+        )
 
     def number(self, value: float, kind=None) -> Number:
         """Declare a number that kernels read from a field, so that worlds with other values share kernels.
@@ -119,17 +121,17 @@ class Memory:
         if kind not in self.numbers:
             self.numbers[kind] = layout.field(kind, 0), []
         field, known = self.numbers[kind]
-        if self._again:
-            return self._again.number(value, field)
+        if self._redeclaration:
+            return self._redeclaration.number(value, field)
         known.append(Number(self, field, len(known), value))
         self._in_order.append(known[-1])
         return known[-1]
 
     @contextlib.contextmanager
     def owned(self, owner: Any) -> Iterator[None]:
-        """Within this context, declarations belong to `owner`, which may repeat them within again()."""
-        if self._again:
-            with self._again.owned(*self._owned[owner]):
+        """Within this context, declarations belong to `owner`, which may repeat them within redeclare()."""
+        if self._redeclaration:
+            with self._redeclaration.owned(*self._owned[owner]):
                 yield
             return
         fields, numbers = len(self.entries), len(self._in_order)
@@ -137,13 +139,13 @@ class Memory:
         self._owned[owner] = range(fields, len(self.entries)), self._in_order[numbers:]
 
     @contextlib.contextmanager
-    def again(self, counts: dict[Number, int]) -> "Iterator[Again]":
-        """Within this context, owners declare their fields a second time, see Again."""
-        self._again = Again(self, counts)
+    def redeclare(self, counts: dict[Number, int]) -> "Iterator[Redeclaration]":
+        """Within this context, owners declare their fields a second time, see Redeclaration."""
+        self._redeclaration = Redeclaration(self, counts)
         try:
-            yield self._again
+            yield self._redeclaration
         finally:
-            self._again = None
+            self._redeclaration = None
 
     def scratch(self, owner: Any) -> list[np.ndarray]:
         """Return copies of an owner's working fields: those declared without values and no part of the state.
@@ -174,12 +176,12 @@ class Memory:
 
     def fill(self, k: int, length: int, values: Any) -> None:
         """Give a field of an elastic memory, by its index, a length and the value of its elements."""
-        view = self._resized(k, length) if length else self._seen()[id(self.entries[k])]
+        view = self._resized(k, length) if length else self._host_views()[id(self.entries[k])]
         view[...] = values
 
     def set_number(self, number: Number) -> None:
         """Write a number to the device, if it is placed already. All copies get it, since they share kernels."""
-        if view := self._seen():
+        if view := self._host_views():
             view[id(self._find(number.field))][..., number.place] = number._value
         elif self._layout:
             with self.copies.all() if self.copies else contextlib.nullcontext():
@@ -198,22 +200,22 @@ class Memory:
         with self.compiler():
             shared = layout.sharing()
             held = [one for one, _ in self.compiler.places]
-            self._layout, self._which = layout.take(self._declared, [e.field for e in self.entries], held, shared)
+            self._layout, self._which = layout.get_layout(self._declared, [e.field for e in self.entries], held, shared)
         for e in self.entries:
             if e.copies and self.copies:
                 self.copies.add(e.field, max(1, e.length))
-        address, room = self._layout.lend()
+        address, room = self._layout.allocate()
         self._ends = weakref.finalize(self, _end, self._layout, address, self.compiler)
         self._ends.atexit = False
         self._address, self._room = address, room
         self.compiler.places.append((self._layout, address))
         if self._layout.shared:
-            self._layout.point(address)
+            self._layout.use_bytes(address)
         if self._later:
             self._load([entry for entry, _ in self._later], [values for _, values in self._later])
             self._later.clear()
 
-    def lengthen(self, length: int) -> bool:
+    def set_length(self, length: int) -> bool:
         """Give all fields `length` elements in place. Returns False and changes nothing where kernels would need recompiling."""
         if self.copies or not (self._layout and self._layout.shared and length <= self._layout.room):
             return False  # the offsets of copies would change with the length
@@ -224,9 +226,9 @@ class Memory:
     @property
     def elastic(self) -> bool:
         """Whether fields can change their lengths in place: on a CPU, for a single world."""
-        return not self.copies and bool(self._layout and self._layout.shared and self._seen())
+        return not self.copies and bool(self._layout and self._layout.shared and self._host_views())
 
-    def holds(self, length: int) -> bool:
+    def has_room(self, length: int) -> bool:
         """Whether there is room for `length` elements in each field."""
         return bool(self._layout) and length <= self._layout.room  # type: ignore[union-attr]
 
@@ -239,7 +241,7 @@ class Memory:
         kept = first + len(behind)
         for k, e in enumerate(self.entries):
             if e.rows is rows:
-                moved = self._seen()[id(e)].take(behind, axis=0) if len(behind) else 0
+                moved = self._host_views()[id(e)].take(behind, axis=0) if len(behind) else 0
                 view = self._resized(k, count)
                 view[first:kept], view[kept:] = moved, 0
 
@@ -252,7 +254,7 @@ class Memory:
 
     def _resized(self, k: int, length: int) -> np.ndarray:
         """Change the length of a field, by its index, and return the field as an array."""
-        old, views, length = self.entries[k], self._seen(), max(1, length)
+        old, views, length = self.entries[k], self._host_views(), max(1, length)
         if old.length == length:
             return views[id(old)]
         assert self._layout
@@ -264,12 +266,12 @@ class Memory:
         views[id(new)] = view = self._rooms[k][:length]
         most = max(length, self._most.get(k, old.length))
         if most > 2 * length:
-            self._give_back(self._rooms[k][length:most])
+            self._release_pages(self._rooms[k][length:most])
             most = length
         self._most[k] = most
         return view
 
-    def _give_back(self, rows: np.ndarray) -> None:
+    def _release_pages(self, rows: np.ndarray) -> None:
         """Return the memory of removed rows to the system, page by page; these rows then read as 0."""
         if not (self._room and hasattr(mmap, "MADV_DONTNEED")):
             return
@@ -279,24 +281,24 @@ class Memory:
             self._room.madvise(mmap.MADV_DONTNEED, first, end - first)
 
     @property
-    def spare(self) -> int:
+    def spare_bytes(self) -> int:
         """Memory kept after rows were removed: at most as much as the present rows take [bytes]."""
         return sum(max(0, most - self.entries[k].length) * self._rooms[k][:1].nbytes for k, most in self._most.items())
 
-    def _seen(self) -> dict[int, np.ndarray]:
+    def _host_views(self) -> dict[int, np.ndarray]:
         """Return the fields as arrays, by the id of the entry; empty if the host has no access.
 
         Access through kernels takes longer to compile than everything else takes to run.
         """
         if not self._views and self._layout:
-            self._layout.look()
+            self._layout.find_addresses()
             if self._layout.size:
                 wanted = [(k, e.whole, e.kind) for k, e in zip(self._which, self.entries, strict=True)]
                 views = self._layout.views(self._address, wanted)
                 for e, view in zip(self.entries, views, strict=False):
                     self._views[id(e)] = view.reshape(e.copies, *e.shape) if e.copies else view  # same bytes
                 if self.copies and views and self.entries[0].field is self.copies.number:
-                    self.copies.see(self._views[id(self.entries[0])])
+                    self.copies.set_view(self._views[id(self.entries[0])])
         return self._views
 
     def check(self) -> None:
@@ -344,7 +346,7 @@ class Memory:
     def write_from(self, field, first: int, values) -> None:
         """Overwrite elements of a field from index `first` on. For a single world (not one of many copies)."""
         self.check()
-        view = self._seen().get(id(self._find(field)))
+        view = self._host_views().get(id(self._find(field)))
         if view is None:
             rows = self.read(field)
             rows[first : first + len(values)] = values
@@ -355,7 +357,7 @@ class Memory:
     def write_rows(self, field, some: np.ndarray, values) -> None:
         """Overwrite some elements of a field, by index. For a single world (not one of many copies)."""
         self.check()
-        view = self._seen().get(id(self._find(field)))
+        view = self._host_views().get(id(self._find(field)))
         if view is None:
             rows = self.read(field)
             rows[some] = values
@@ -379,7 +381,7 @@ class Memory:
         self._load_some(chosen, [state.get(e.name, np.zeros(1)) for e in chosen], some)
 
     def _load_some(self, entries: list[Entry], arrays: list[np.ndarray], some: np.ndarray) -> None:
-        views = self._seen()
+        views = self._host_views()
         if views:
             for e, a in zip(entries, arrays, strict=True):
                 views[id(e)][some] = a
@@ -396,15 +398,15 @@ class Memory:
         Without a chosen copy, the array has one more axis, the first.
         """
         self.check()
-        entry, views = self._find(field), self._seen()
+        entry, views = self._find(field), self._host_views()
         if views:
             return np.array(self._one(entry, views[id(entry)]), dtype=kind)
         return self._dump([entry])[0].astype(kind or entry.kind, copy=False)
 
-    def seen(self, field) -> np.ndarray:
+    def view(self, field) -> np.ndarray:
         """Return the field itself as an array, where the host has access; otherwise a copy."""
         self.check()
-        view = self._seen().get(id(self._find(field)))
+        view = self._host_views().get(id(self._find(field)))
         return self.read(field) if view is None else view
 
     def state(self) -> dict[str, np.ndarray]:
@@ -420,7 +422,7 @@ class Memory:
         if chosen:
             self._load(chosen, [state.get(e.name, np.zeros(1)) for e in chosen])
 
-    def take(self, other: "Memory") -> None:
+    def copy_from(self, other: "Memory") -> None:
         """Copy into the chosen copy all fields of another memory with the same names.
 
         The sums of a frame ("survey.") are left out, since they may be fewer here.
@@ -430,7 +432,7 @@ class Memory:
         ours = [e for e in self.entries if e.name in theirs]
         self._load(ours, other._dump([theirs[e.name] for e in ours]))
 
-    def spread(self) -> None:
+    def copy_to_all(self) -> None:
         """Copy the fields of the chosen copy to all copies."""
         assert self.copies
         some = [e for e in self.entries if e.copies]
@@ -442,7 +444,7 @@ class Memory:
         return self.entries[self._at[id(field)]]
 
     def _load(self, entries: list[Entry], arrays: list[np.ndarray]) -> None:
-        views = self._seen()
+        views = self._host_views()
         if views:
             for e, a in zip(entries, arrays, strict=True):
                 self._one(e, views[id(e)])[...] = a
@@ -458,7 +460,7 @@ class Memory:
                 self._transfer(some).load(np.concatenate(parts).astype(np.float64))
 
     def _dump(self, entries: list[Entry]) -> list[np.ndarray]:
-        views = self._seen()
+        views = self._host_views()
         if views:
             return [self._one(e, views[id(e)]).copy() for e in entries]
         if self._all_of(entries):

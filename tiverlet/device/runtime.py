@@ -22,7 +22,7 @@ def _ask_for_start() -> None:
         )
 
 
-language.before_fields(_ask_for_start)
+language.check_before_fields(_ask_for_start)
 
 ARCHITECTURES = ("cpu", "cuda", "metal", "vulkan")
 LLVM = ("cpu", "cuda")  # compiled by LLVM; for the others Taichi writes SPIR-V
@@ -55,7 +55,7 @@ def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, see
             f"init: Taichi already runs (arch {architecture()}), and starting it again would destroy every live "
             "world's fields. Call tv.init before the first World and before any ti.init, or leave it out."
         )
-    if arch != "cpu" and not language.has(arch):
+    if arch != "cpu" and not language.supports(arch):
         offer = ", ".join(map(repr, available()))
         raise RuntimeError(f'init: arch "{arch}" is not available on this machine. Available: {offer}.')
     running = _threads()
@@ -72,8 +72,8 @@ def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, see
         found = architecture()
         ti.reset()
         raise RuntimeError(f'init: arch "{arch}" was asked for, but Taichi started "{found}". Use tv.init(arch="cpu").')
-    _adopt(wanted)
-    _settle(_threads() - running)
+    _register(wanted)
+    _pin_workers(_threads() - running)
 
 
 def _threads() -> set[int]:
@@ -83,7 +83,7 @@ def _threads() -> set[int]:
     return set()
 
 
-def _settle(started: set[int]) -> None:
+def _pin_workers(started: set[int]) -> None:
     """Pin each of Taichi's workers to a core of its own, if Taichi has a worker for every core. Taichi starts the workers last.
 
     Workers sleep between loops. Linux wakes the workers of a loop on one core, and moves one of them away only milliseconds
@@ -105,7 +105,7 @@ def architecture() -> str:
 
 def available() -> list[str]:
     """Return the architectures that this machine and this Taichi support."""
-    return [a for a in ARCHITECTURES if a == "cpu" or language.has(a)]
+    return [a for a in ARCHITECTURES if a == "cpu" or language.supports(a)]
 
 
 def threads() -> int:
@@ -146,7 +146,7 @@ def ensure_started() -> None:
     if ti.cfg is None:
         init()
     if _started.get("runtime") is not language.current():
-        _adopt()
+        _register()
     if forked():
         raise RuntimeError(
             "Taichi was started before this process was forked, and hangs in the child. Use the start method "
@@ -165,7 +165,7 @@ def _config() -> Any:
     return ti.cfg
 
 
-def _leave() -> None:
+def _keep_taichi_in_child() -> None:
     """In a forked child: keep Taichi from shutting down. It would wait forever for threads that only the parent has."""
     runtime = _started.get("runtime")
     if runtime is not None and runtime is language.current() and runtime.prog:
@@ -175,10 +175,10 @@ def _leave() -> None:
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_leave)
+    os.register_at_fork(after_in_child=_keep_taichi_in_child)
 
 
-def _adopt(wanted: dict | None = None) -> None:
+def _register(wanted: dict | None = None) -> None:
     """Register the running Taichi, with the arguments of init() if init() started it."""
     global trees
     trees = 0

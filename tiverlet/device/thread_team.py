@@ -89,15 +89,16 @@ class Team:
         self.size, self.launched, self.patience = size, launched, memory.number(PATIENCE + particles)
         self._pieces = pieces
         self.piece = memory.number(self.piece_of(particles))
-        self.spread = LEAST * size if size > 1 else 1
+        self.loop_length = LEAST * size if size > 1 else 1
         self._alone, self._frames = 0, 0
         self._in_substep: tuple[Any, Any] = (None, None)  # a kernel, and its number of active threads in the present substep
         self.memory = memory
         if size > 1:
             self.arrived = memory.field("team.arrived", 2 * LINE, kind=ti.i32)
             self.active_threads = memory.field("team.active_threads", None, kind=ti.i32, values=size)
-            self.late = memory.field("team.long_waits", None, kind=ti.i32)
-            self.ends = memory.field("team.ends", None, kind=ti.i32)  # 1: all threads but the first leave before the next substep
+            self.long_waits = memory.field("team.long_waits", None, kind=ti.i32)
+            # 1: all threads but the first leave before the next substep
+            self.others_leave = memory.field("team.ends", None, kind=ti.i32)
 
     def piece_of(self, particles: int) -> int:
         """Return how many particles make up a piece."""
@@ -122,7 +123,7 @@ class Team:
                     self.memory.write(self.active_threads, self.size)
 
     @inline
-    def works(self, thread):
+    def takes_part(self, thread):
         """Whether a thread takes part in the coming substep; all threads must call this.
 
         The number of active threads is kept in a variable up to the end of the substep. Each loop uses it, and reading a field
@@ -130,7 +131,7 @@ class Team:
         """
         if self.size == 1:
             return True
-        works = self._works(thread)
+        works = self._takes_part(thread)
         self._in_substep = current().compiling_callable, impl.expr_init(at(self.active_threads, None))
         return works
 
@@ -180,27 +181,27 @@ class Team:
         return self._wait() if self.size > 1 else None
 
     @ti.func
-    def _works(self, thread):
+    def _takes_part(self, thread):
         active = self.active_threads[None]
         out = thread < active
         if out:
-            if self.ends[None] != 0:
+            if self.others_leave[None] != 0:
                 self.wait_for(active)
                 if thread == 0:
-                    self.active_threads[None], self.ends[None] = 1, 0
+                    self.active_threads[None], self.others_leave[None] = 1, 0
                 self.wait_for(active)
                 out = thread == 0
         return out
 
     @ti.func
-    def watch(self, thread):
+    def check_waits(self, thread):
         """Decide whether the others leave before the next substep.
 
         Called once per substep, between two waits, so that all threads agree on it.
         """
         if ti.static(self.size > 1):
-            if thread == 0 and self.late[None] >= LONG and self.active_threads[None] > 1:
-                self.ends[None] = 1
+            if thread == 0 and self.long_waits[None] >= LONG and self.active_threads[None] > 1:
+                self.others_leave[None] = 1
 
     @inline
     def _share(self, n, k):
@@ -248,10 +249,10 @@ class Team:
                 while ti.atomic_add(self.arrived[LINE], 0) < turn:
                     looks += 1
                 if looks > self.patience:
-                    ti.atomic_add(self.late[None], 1)
+                    ti.atomic_add(self.long_waits[None], 1)
 
     @ti.func
     def reset_wait_count(self):
         """Restart the count of long waits."""
         if ti.static(self.size > 1):
-            self.late[None] = 0
+            self.long_waits[None] = 0

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..device import at
 from ..device.language import inside_kernel
-from .read_only import assign_whole, handed_out, structure
+from .read_only import as_read_only, assign_whole_advice, structure_advice
 
 TAKEN_BY = {"one_way": "Capsule, Polygon and Mesh"}  # arguments that only some features of a kind take
 
@@ -24,8 +24,8 @@ class Knob:
     """A live setting: checked when assigned, written to the device before the next frame.
 
     check: a function (feature, value) -> value that raises for an invalid value.
-    force: the knob changes a force, so displacements are turned into velocities first, see World._settle_forces().
-    compiled: kernels contain the value, so the world is rebuilt for another one, see Feature.outgrown.
+    force: the knob changes a force, so displacements are turned into velocities first, see World._restart_for_new_forces().
+    compiled: kernels contain the value, so the world is rebuilt for another one, see Feature.needs_other_kernels.
     built: the world is rebuilt for another value, too, but with the same kernels.
     device: the attribute with the knob's field. Kernels read the setting by the knob's name; None where they do not read it.
     """
@@ -51,7 +51,7 @@ class Knob:
 
     def __set__(self, feature, value) -> None:
         value, own = self.check(feature, value), feature.__dict__
-        own[self.name] = handed_out(value, assign_whole(type(feature).__name__, self.name))
+        own[self.name] = as_read_only(value, assign_whole_advice(type(feature).__name__, self.name))
         own["changed"] = True
         if self.force:
             own["new_force"] = True
@@ -78,7 +78,7 @@ def set_attribute(thing: Any, name: str, value: Any) -> None:
 def keep(thing: Any, **values: Any) -> None:
     """Set attributes that cannot be set from outside."""
     for name, value in values.items():
-        object.__setattr__(thing, name, handed_out(value, structure(type(thing).__name__, name)))
+        object.__setattr__(thing, name, as_read_only(value, structure_advice(type(thing).__name__, name)))
 
 
 def refuse_deletion(thing: Any, name: str) -> None:
@@ -96,7 +96,7 @@ def _refused(thing: Any, name: str) -> str:
             f"{thing!r}.{name} cannot be set: it is fixed when {kind.__name__} is made. {can}. For another {name} make "
             f"a new {kind.__name__}; in a world, world.remove(features=[old]) and world.add(features=[new])."
         )
-    return f"{thing!r} has no {name!r}{meant(name, [*live, *given])}. {can}."
+    return f"{thing!r} has no {name!r}{suggest_name(name, [*live, *given])}. {can}."
 
 
 @functools.cache
@@ -105,7 +105,7 @@ def knobs_of(kind: type) -> tuple[str, ...]:
     return tuple(name for name in dir(kind) if isinstance(getattr(kind, name, None), Knob))
 
 
-def meant(name: str, names: Iterable[str]) -> str:
+def suggest_name(name: str, names: Iterable[str]) -> str:
     """Guess which name a misspelt one meant, as the end of a sentence; empty if no name is similar."""
     near = difflib.get_close_matches(name, [*names], 1)
     return f"; did you mean {near[0]!r}?" if near else ""

@@ -34,7 +34,7 @@ from ..device.language import inside_kernel
 from ..device.number import Number
 from .arguments import Knob as Knob
 from .arguments import keep, knobs_of, record_arguments, refuse_deletion, set_attribute
-from .read_only import assign_whole, handed_out
+from .read_only import as_read_only, assign_whole_advice
 
 if TYPE_CHECKING:
     from ..device.memory import Memory
@@ -49,7 +49,7 @@ BENT, FAR = 1, 2  # a constraint turned in a substep by more than 26 degrees, by
 class Scene:
     """The scene to which a feature is bound: memory for its fields, particles, and shared objects."""
 
-    host_only = ("inv_mass", "residuals", "reach", "periodic")
+    host_only = ("inv_mass", "residuals", "multipliers_per_newton", "periodic")
 
     memory: "Memory"
     state: "State"
@@ -64,7 +64,7 @@ class Scene:
     periodic: Any = None  # the Periodic of the world
     # [s^2] multipliers of the last substep per newton, of rigid and of soft constraints: h2_effective, see Batch.relax. That of
     # rigid constraints includes the kick that they added where the substep was a start from velocities that lacked it.
-    reach: tuple[float, float] = (0.0, 0.0)
+    multipliers_per_newton: tuple[float, float] = (0.0, 0.0)
 
     @property
     def count(self) -> Number:
@@ -81,28 +81,30 @@ class Feature:
     """The base class of all features.
 
     arguments: the arguments of its __init__. changed: a knob waits to be uploaded. new_force: the waiting knob changes a force.
-    lets_go: the feature no longer bears the load that it had in the last frame. afresh: its state begins anew when the world is
-    rebuilt. moving: a target is being approached. once: names of compiled_for that its kernels have used in this world; they stay
-    in the kernels when the world is rebuilt.
+    has_released_load: the feature no longer bears the load that it had in the last frame. needs_new_state: its state begins anew
+    when the world is rebuilt. moving: a target is being approached. compiled_so_far: names of compiled_for that its kernels have
+    used in this world; they stay in the kernels when the world is rebuilt.
     """
 
     arguments: Mapping[str, Any] = MappingProxyType({})
     # Attributes that a world may set.
-    kept_by_world: tuple[str, ...] = ("scene", "start", "periodic", "changed", "moving", "new_force", "arguments", "once")
+    kept_by_world: tuple[str, ...] = (
+        "scene", "start", "periodic", "changed", "moving", "new_force", "arguments", "compiled_so_far",
+    )  # fmt: skip
     # Attributes that kernels do not read.
-    host_only: tuple[str, ...] = ("start", "periodic", "changed", "moving", "new_force", "arguments", "once")
+    host_only: tuple[str, ...] = ("start", "periodic", "changed", "moving", "new_force", "arguments", "compiled_so_far")
     uploads_all = False  # upload() and end_motion() also work for many worlds, where knobs have an additional first axis
     compiled_for: tuple[str, ...] = ()  # properties that decide the code of its kernels
-    told_apart = True  # compile times are reported per class
+    has_own_compile_time = True  # compile times are reported per class
     does_work = False  # it may add energy unknown to reports; motion that only a knob causes is seen by `changed`
-    for_all = False  # no data of it, on device or host, depends on which particles exist; see can_regroup()
-    bulk = 0.3  # size of its kernel code relative to that of a Distance; see build.LONG
+    has_no_particle_data = False  # no data of it, on device or host, depends on which particles exist; see can_regroup()
+    code_size = 0.3  # size of its kernel code relative to that of a Distance; see build.LONG
     changed = True
-    moving = new_force = lets_go = afresh = False
-    once: frozenset[str] = frozenset()
+    moving = new_force = has_released_load = needs_new_state = False
+    compiled_so_far: frozenset[str] = frozenset()
     scene: Any = None  # Scene, from bind() on
     periodic: Any = None  # the Periodic of its world, set before prepare()
-    _world_for: dict[str, Any] | None = None  # built_for() when the world was built; None where the feature does nothing
+    _built_values: dict[str, Any] | None = None  # build_values() when the world was built; None where the feature does nothing
     ramp: Any = None  # the Ramp of its rest values, while it is bound
     start: Any = None  # Particles as they were when it was added; used whenever it is bound again
 
@@ -140,44 +142,44 @@ class Feature:
         knobs = [name for name in knobs_of(type(self)) if getattr(type(self), name).compiled]
         return {name: getattr(self, name) for name in (*knobs, *self.compiled_for)}
 
-    def built_for(self) -> dict[str, Any]:
+    def build_values(self) -> dict[str, Any]:
         """Return compiled(), and the knobs for which worlds are built though kernels do not contain them."""
         knobs = [name for name in knobs_of(type(self)) if getattr(type(self), name).built]
         return self.compiled() | {name: getattr(self, name) for name in knobs}
 
-    def built(self) -> None:
+    def note_built(self) -> None:
         """Note the values for which a world was built with it. A world in which it does nothing has no kernels for it."""
         acts = not isinstance(self, Batch) or self.acts
-        self._world_for = self.built_for() if acts else None
-        self.once |= {name for name in self.compiled_for if acts and getattr(self, name)}
+        self._built_values = self.build_values() if acts else None
+        self.compiled_so_far |= {name for name in self.compiled_for if acts and getattr(self, name)}
 
     @property
-    def outgrown(self) -> bool:
+    def needs_other_kernels(self) -> bool:
         """Whether its knobs need other kernels than it has, so that the world has to be rebuilt around it.
 
-        What was compiled once stays when a knob no longer needs it, see `once`: changing friction from above 0 to 0 compiles
-        nothing. The additional code may change results in the last bits, so it also stays when the world is rebuilt, cloned or
-        replayed.
+        What was compiled once stays when a knob no longer needs it, see `compiled_so_far`: changing friction from above 0 to 0
+        compiles nothing. The additional code may change results in the last bits, so it also stays when the world is rebuilt,
+        cloned or replayed.
         """
-        return self._world_for is not None and self._world_for != self.built_for()
+        return self._built_values is not None and self._built_values != self.build_values()
 
     def copy(self) -> "Feature":
         """Return the same feature, unbound, with the same arrays and knobs, for another world."""
         new = object.__new__(type(self))
         new.__dict__.update(vars(self))
         new.release()
-        new.once = frozenset()
+        new.compiled_so_far = frozenset()
         return new
 
-    def twin(self) -> "Feature":
+    def copy_with_kernels(self) -> "Feature":
         """Return a copy for a world of the same state, with the same kernels."""
         new = self.copy()
-        new.once = self.once
+        new.compiled_so_far = self.compiled_so_far
         return new
 
     def release(self) -> None:
-        """Forget the world in which it acted. `once` stays, since that world may be rebuilt with it."""
-        for name in ("scene", "start", "periodic", "changed", "moving", "new_force", "dev", "_world_for"):
+        """Forget the world in which it acted. `compiled_so_far` stays, since that world may be rebuilt with it."""
+        for name in ("scene", "start", "periodic", "changed", "moving", "new_force", "dev", "_built_values"):
             self.__dict__.pop(name, None)
 
     def kept_mask(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -189,12 +191,12 @@ class Feature:
 
     def can_regroup(self, change: "Regrouping") -> bool:
         """Whether particles can be added and removed while it stays bound. If not, the world is rebuilt around it."""
-        return self.for_all
+        return self.has_no_particle_data
 
     def regroup(self, change: "Regrouping") -> None:
         """Set per-particle fields after particles were added and removed: to the rows of `change.now`, with 0 for new ones."""
 
-    def check_more(self, more: "Feature") -> None:
+    def check_extension(self, more: "Feature") -> None:
         """Raise TypeError if extend() cannot take `more`."""
         raise TypeError(f"World.add: extend: {self!r} cannot take more constraints. Add {more!r} to features.")
 
@@ -234,32 +236,32 @@ class Acceleration(Feature):
     decays = False
     rate = 0.0
     pairwise = False
-    room = 0  # initial room for listed neighbours, per particle
+    neighbours_per_particle = 0  # initial room for listed neighbours, per particle
 
     @property
     def does_work(self) -> bool:
         """Whether it accelerates particles and has no known potential."""
         return self.accelerates and not self.conservative
 
-    def settings(self) -> dict[str, Any]:
+    def kernel_values(self) -> dict[str, Any]:
         """Return the numbers and vectors that kernels read as `dev.name[None]`, computed from its knobs."""
         return {}
 
     def bind(self, scene: Scene) -> None:
-        """Declare a field for each of its settings."""
+        """Declare a field for each of its kernel values."""
         self.scene = scene
-        for name, value in self.settings().items():
+        for name, value in self.kernel_values().items():
             kind, width = ti.i32 if isinstance(value, int) else None, np.size(value) if np.ndim(value) else 0
             field = scene.memory.field(f"{type(self).__name__}.{name}", None, width=width, kind=kind, values=value)
             setattr(self.dev, name, field)
         self.changed = False
 
     def upload(self) -> None:
-        """Write the settings to their fields."""
-        for name, value in self.settings().items():
+        """Write the kernel values to their fields."""
+        for name, value in self.kernel_values().items():
             self.scene.memory.write(vars(self.dev)[name], value)
 
-    def join(self, scene: Scene, team: Any) -> Any:
+    def make_search(self, scene: Scene, team: Any) -> Any:
         """If it is pairwise, declare its neighbour list and return it; None if it has none."""
 
     def may_act_from(self, first: int) -> bool:
@@ -286,17 +288,17 @@ class Batch(Feature):
     """m constraints of one kind on `arity` particles each. Its `dev` has the kernels of a substep, see passes()."""
 
     arity = 0  # 0: each constraint has any number, see VariableSize
-    reweighs = False  # residual_of() needs reduce_block()
+    needs_reduce_block = False  # residual_of() needs reduce_block()
     soft = False  # has springs, which act at a start (the first substep after velocities were set)
     breaks = False  # has constraints that a load can break
     clusters = False  # preserves shapes, see members_of() and shape_of()
-    grows = False  # can be extended by more constraints, see extend()
-    drives = False  # prescribes positions of its particles instead of relaxing them
+    can_extend = False  # can be extended by more constraints, see extend()
+    is_kinematic = False  # prescribes positions of its particles instead of relaxing them
     solvable_together = False  # the System of a solver may solve its constraints with others; see Scalar
     driven = False  # rest values change by themselves, by the Drive of drive_of()
     transcends = False  # computes angles, cube roots or exponentials, which SPIR-V has for f32 only
     members: Any  # FixedSize or VariableSize: the particles of each constraint
-    bulk = 1.0
+    code_size = 1.0
     each: tuple[str, ...] = ()  # its arrays with one row per constraint, besides the indices
     rest_name = "rest"  # the argument of __init__ for `rest`
     index_name = "indices"  # the argument of __init__ for the indices, in the form of `listing`
@@ -323,7 +325,7 @@ class Batch(Feature):
             return np.zeros(0)
         if self.scene is None:
             raise RuntimeError(f"{self!r}.residual: there is none before a world has been stepped with it.")
-        return np.zeros(self.count) if self.drives or not self.acts else self.scene.residuals(self)
+        return np.zeros(self.count) if self.is_kinematic or not self.acts else self.scene.residuals(self)
 
     @property
     def acts(self) -> bool:
@@ -352,9 +354,9 @@ class Batch(Feature):
         """Return the particles of constraint c."""
         return self.members.row(c)
 
-    def idle(self, inv_mass: np.ndarray) -> np.ndarray:
+    def immovable(self, inv_mass: np.ndarray) -> np.ndarray:
         """Return which constraints have no particle that can move, (m,)."""
-        return self.members.idle(inv_mass)
+        return self.members.immovable(inv_mass)
 
     def kept_mask(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the mask of the constraints that stay: those all of whose particles stay."""
@@ -366,7 +368,7 @@ class Batch(Feature):
         self.select(some, number)
         for name in self.each:
             if isinstance(rows := self.__dict__.get(name), np.ndarray):
-                self.__dict__[name] = handed_out(rows[some], getattr(rows, "advice", ""))
+                self.__dict__[name] = as_read_only(rows[some], getattr(rows, "advice", ""))
         self.note_arguments()
 
     def note_arguments(self) -> None:
@@ -385,11 +387,11 @@ class Batch(Feature):
         """Keep the particles of the constraints in the mask `some`, by their new numbers."""
         self._keep(members=self.members.remapped(some, number))
 
-    def check_more(self, more: Feature) -> None:
+    def check_extension(self, more: Feature) -> None:
         """Raise TypeError unless `more` is of the same kind, on as many particles each."""
-        if not self.grows:
-            super().check_more(more)
-        if type(more) is not type(self) or more.arity != self.arity or not more.grows:  # type: ignore[attr-defined]
+        if not self.can_extend:
+            super().check_extension(more)
+        if type(more) is not type(self) or more.arity != self.arity or not more.can_extend:  # type: ignore[attr-defined]
             raise TypeError(f"World.add: extend: {self!r} cannot take {more!r}, which is of another kind. Add it to features.")
 
     def extend(self, more: "Batch") -> None:
@@ -399,12 +401,12 @@ class Batch(Feature):
             both = [vars(one).get(name) for one in (self, more)]
             if any(rows is not None for rows in both):
                 rows = [np.full(m, np.inf) if one is None else one for one, m in zip(both, counts, strict=True)]
-                self.__dict__[name] = handed_out(np.concatenate(rows), assign_whole(type(self).__name__, name))
+                self.__dict__[name] = as_read_only(np.concatenate(rows), assign_whole_advice(type(self).__name__, name))
         listing = self.listing, more.listing
-        self.hold_all(np.concatenate(listing) if self.arity else [*listing[0], *listing[1]])
+        self.set_listing(np.concatenate(listing) if self.arity else [*listing[0], *listing[1]])
         self.note_arguments()
 
-    def hold_all(self, listing: Any) -> None:
+    def set_listing(self, listing: Any) -> None:
         """Set the particles of all constraints, in the form of the argument of __init__."""
 
     def rods(self) -> tuple[np.ndarray, np.ndarray]:
@@ -418,7 +420,7 @@ class Batch(Feature):
         """Return pairs of particles that may overlap, (k, 2), because this batch sets their relative position."""
         return self.members.pairs()
 
-    def ties(self) -> tuple[np.ndarray, np.ndarray]:
+    def max_distances(self) -> tuple[np.ndarray, np.ndarray]:
         """Return pairs of particles that cannot get further apart than at the start, (k, 2), and that distance [m], (k,)."""
         return np.zeros((0, 2), dtype=np.int32), np.zeros(0)
 

@@ -27,7 +27,7 @@ class OwnWeight:
         self.integrator, self.forces, self.loads = integrator, integrator.forces, loads
 
     @ti.func
-    def weigh(self, i, now):
+    def store_weight(self, i, now):
         """Store the own weight of particle i."""
         x, v = self.state.place(i), self.state.d[i] / now.h
         a = self.forces.accelerate(i, x, v, now.time, self.forces.pull(now.time))
@@ -37,13 +37,13 @@ class OwnWeight:
 
 
 @ti.func
-def steady(mean, earlier):
+def is_steady(mean, earlier):
     """Whether the missing load equals that of the window before, within STEADY."""
     return ti.abs(mean - earlier) < STEADY * ti.abs(mean)
 
 
 @ti.func
-def gain(own, slow, window):
+def learnt_share(own, slow, window):
     """Return the share of the missing load that is learnt at the end of a window of so many substeps.
 
     Integral control must be slower than the decay of the slowest sound of the connected particles. This decay takes a number of

@@ -67,7 +67,7 @@ def refuse_turning(who: str) -> None:
 
 
 @ti.func
-def limited(v, most, length):
+def limit_length(v, most, length):
     """Return a vector v, shortened to `length` if it is longer than `most`: the part of a slip v that friction takes back."""
     size = v.norm()
     if size > most:
@@ -75,7 +75,7 @@ def limited(v, most, length):
     return v
 
 
-MOST = 1000  # groups of particles that the table can distinguish
+MAX_GROUPS = 1000  # groups of particles that the table can distinguish
 TOUCHES, SENSES, SENSED = 1, 2, 3  # a particle of the one group pushes that of the other, senses it, is sensed by it
 
 
@@ -137,8 +137,8 @@ class Table:
         names, which, _ = distinct(group)
         at = {int(name): k for k, name in enumerate(name for name in names if name in named)}
         m = len(at) + (len(at) < len(names))  # all other groups share one rank
-        if m > MOST:
-            raise ValueError(f"{self.who}: {len(at)} groups of particles are named, but there can be {MOST}.")
+        if m > MAX_GROUPS:
+            raise ValueError(f"{self.who}: {len(at)} groups of particles are named, but there can be {MAX_GROUPS}.")
         rank = np.array([at.get(int(name), len(at)) for name in names], dtype=np.int64)[which]
         table = np.zeros((m, m, 7))
         table[..., 3] = self.touching is None
@@ -161,7 +161,7 @@ class Table:
                     table[at[a], at[b], columns] = table[at[b], at[a], columns] = row
         return rank, table.reshape(m * m, 7)
 
-    def make_room(self, has_friction: bool, has_restitution: bool, turns: bool) -> None:
+    def set_columns(self, has_friction: bool, has_restitution: bool, turns: bool) -> None:
         """Set which columns exist, even where all values are 0."""
         self.has_friction, self.has_restitution, self.turns = has_friction, has_restitution, turns
 
@@ -211,7 +211,7 @@ class Table:
         It is at most friction times that displacement (Cundall and Strack 1979).
         """
         s, row = slip - slip.dot(n) * n, self.of(i, j)
-        return limited(s, row[0] * normal, row[1] * normal)
+        return limit_length(s, row[0] * normal, row[1] * normal)
 
     @inline
     def reach(self, radius, i, j):

@@ -87,7 +87,7 @@ class ReadOnlyMapping(Mapping):
         return repr(self._values)
 
 
-def handed_out(value: Any, advice: str) -> Any:
+def as_read_only(value: Any, advice: str) -> Any:
     """Return a value, read-only if it is an array or a mapping."""
     if isinstance(value, np.ndarray):
         return read_only(value, advice)
@@ -97,7 +97,7 @@ def handed_out(value: Any, advice: str) -> Any:
 
 
 @cache
-def assign_whole(owner: str, name: str) -> str:
+def assign_whole_advice(owner: str, name: str) -> str:
     """Return the advice for an array that is live as a whole."""
     return (
         f"{owner}.{name} is read-only, because a world does not notice when a part of it changes. Assign the whole: "
@@ -106,6 +106,6 @@ def assign_whole(owner: str, name: str) -> str:
 
 
 @cache
-def structure(owner: str, name: str) -> str:
+def structure_advice(owner: str, name: str) -> str:
     """Return the advice for an array that is not live."""
     return f"{owner}.{name} is read-only: it is structure, fixed when {owner} is made."

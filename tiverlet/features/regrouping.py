@@ -16,8 +16,8 @@ class Regrouping:
     """A change of the particles: those in the mask `some`, (n,), stay, in order; added ones come after them.
 
     number: new numbers of the old particles, -1 if removed. before: the particles as they were when the world was built. now: all
-    particles after the change, at their present positions. inv_mass: of the particles in `now`, after pins. more: a mapping from
-    features to others whose bodies they append.
+    particles after the change, at their present positions. inv_mass: of the particles in `now`, after pins. extensions: a mapping
+    from features to others whose bodies they append.
     """
 
     some: np.ndarray
@@ -25,12 +25,12 @@ class Regrouping:
     before: "Particles"
     now: "Particles"
     inv_mass: np.ndarray
-    more: Mapping[Any, Any] = field(default_factory=dict)
+    extensions: Mapping[Any, Any] = field(default_factory=dict)
 
     @cached_property
     def first(self) -> int:
         """The first removed particle; particles before it keep their numbers."""
-        return int(np.argmin(self.some)) if self.goes else len(self.some)
+        return int(np.argmin(self.some)) if self.has_removed else len(self.some)
 
     @cached_property
     def kept(self) -> int:
@@ -38,16 +38,16 @@ class Regrouping:
         return int(np.count_nonzero(self.some))
 
     @cached_property
-    def stay(self) -> np.ndarray:
+    def kept_indices(self) -> np.ndarray:
         """The old numbers of the particles that stay. NumPy takes rows by numbers ten times as fast as by a mask."""
         return np.flatnonzero(self.some)
 
-    def joined(self, rows: np.ndarray, added: np.ndarray | None) -> np.ndarray:
+    def regrouped_rows(self, rows: np.ndarray, added: np.ndarray | None) -> np.ndarray:
         """Return the rows of the particles that stay, out of rows for all old ones, and the added rows behind them."""
-        left = np.asarray(rows).take(self.stay, axis=0) if self.goes else np.asarray(rows)
+        left = np.asarray(rows).take(self.kept_indices, axis=0) if self.has_removed else np.asarray(rows)
         return left if added is None else np.concatenate([left, added])
 
     @property
-    def goes(self) -> bool:
+    def has_removed(self) -> bool:
         """Whether any particle is removed."""
         return self.kept < len(self.some)

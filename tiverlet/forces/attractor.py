@@ -20,7 +20,7 @@ class Attractor(Acceleration):
     center itself it is 0. Elsewhere the step resolves an orbit of angular velocity omega while omega h is well below 1.
     """
 
-    for_all = True
+    has_no_particle_data = True
     conservative = True
     center = Knob(lambda f, v: checks.vector("Attractor", "center", v, f.dim or len(np.atleast_1d(v))), "[m].")
     strength = Knob(lambda f, v: checks.number("Attractor", "strength", v), "G M [m^3/s^2].")
@@ -37,7 +37,7 @@ class Attractor(Acceleration):
         self._keep(dim=particles.dim)
         self.center = self.center
 
-    def settings(self) -> dict[str, Any]:
+    def kernel_values(self) -> dict[str, Any]:
         """Return center, strength and softening, for kernels."""
         return {"center": self.center, "strength": self.strength, "softening": self.softening}
 

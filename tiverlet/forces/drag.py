@@ -12,7 +12,7 @@ class Drag(Acceleration):
     With a constant acceleration a of other forces, the displacements obey d' = exp(-z) d + h^2 a (1 - exp(-z)) / z, z = rate h.
     """
 
-    for_all = True
+    has_no_particle_data = True
     accelerates = False
     decays = True
     rate = Knob(lambda f, v: checks.number("Drag", "rate", v, least=0.0), "Drag rate [1/s].")

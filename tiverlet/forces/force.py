@@ -33,7 +33,7 @@ class Force(Acceleration):
     whatever h is, see tiverlet/forces/README.md.
     """
 
-    for_all = True
+    has_no_particle_data = True
 
     def __init__(self, function):
         self.arity = check_function("Force", "function", function, ("x", "v", "t", "i"), (1, 2, 3, 4))

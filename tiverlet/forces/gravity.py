@@ -23,7 +23,7 @@ class Gravity(Acceleration):
     g: a number [m/s^2] along -y, or a vector (dim,). Live: assign to .g between frames.
     """
 
-    for_all = True
+    has_no_particle_data = True
     conservative = True
     uniform = common = True
     dim = 0
@@ -37,7 +37,7 @@ class Gravity(Acceleration):
         self._keep(dim=particles.dim)
         self.g = self.g
 
-    def settings(self) -> dict[str, Any]:
+    def kernel_values(self) -> dict[str, Any]:
         """Return g as a vector, for kernels."""
         g = np.asarray(self.g, dtype=np.float64)
         return {"g": (g if g.ndim else g * [0.0, -1.0, 0.0][: self.dim]).tolist()}

@@ -68,7 +68,7 @@ class Hand(Acceleration):
         self.remap_indices(change.number, change.now.count)
         self.upload()
 
-    def settings(self) -> dict[str, Any]:
+    def kernel_values(self) -> dict[str, Any]:
         """Return particle, target and rate, for kernels."""
         return {"particle": self.particle, "target": self.target, "rate": self.rate}
 

@@ -81,14 +81,14 @@ class PairForce(Acceleration):
         """Do nothing: the functions are checked when they are compiled."""
 
     def bind(self, scene: Scene) -> None:
-        """Declare two fields of accelerations, now and in the substep before. join() declares the list."""
+        """Declare two fields of accelerations, now and in the substep before. make_search() declares the list."""
         self.scene, dev = scene, self.dev
         dim = scene.particles.dim
         dev.state, dev.w, dev.real, dev.dim, dev.n = scene.state, scene.state.w, scene.real, dim, scene.count
         dev.now = scene.memory.field("PairForce.acceleration", scene.count, width=dim, state=True)
         dev.last = scene.memory.field("PairForce.acceleration_before", scene.count, width=dim)
 
-    def join(self, scene: Scene, team: Any) -> NeighbourSearch | None:
+    def make_search(self, scene: Scene, team: Any) -> NeighbourSearch | None:
         """Declare the neighbour search and return it; None without a radius."""
         dev = self.dev
         dev.search = dev.list = None
@@ -118,7 +118,7 @@ class PairForce(Acceleration):
         return (number >= 0,)
 
     @property
-    def room(self) -> int:
+    def neighbours_per_particle(self) -> int:
         """Initial room for listed neighbours per particle."""
         return ROOM[self.dev.dim - 2]
 

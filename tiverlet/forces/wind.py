@@ -16,7 +16,7 @@ class Wind(Acceleration):
     velocity: of the air, (dim,) [m/s]. rate: [1/s], at least 0. Both are live.
     """
 
-    for_all = True
+    has_no_particle_data = True
     velocity = Knob(lambda f, v: checks.vector("Wind", "velocity", v, f.dim or len(np.atleast_1d(v))), "Of the air [m/s].")
     rate = Knob(lambda f, v: checks.number("Wind", "rate", v, least=0.0), "Drag rate [1/s].")
     decays = True
@@ -32,7 +32,7 @@ class Wind(Acceleration):
         self._keep(dim=particles.dim)
         self.velocity = self.velocity
 
-    def settings(self) -> dict[str, Any]:
+    def kernel_values(self) -> dict[str, Any]:
         """Return rate * velocity, the part of the acceleration beside the drag -rate v, for kernels."""
         return {"push": self.rate * self.velocity}
 

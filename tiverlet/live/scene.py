@@ -53,7 +53,7 @@ def walls(world: "World", extent: tuple[np.ndarray, np.ndarray]) -> list[dict[st
     return out
 
 
-def told(text: str) -> str:
+def message(text: str) -> str:
     """Return a message for the user, as JSON."""
     return json.dumps({"kind": "told", "text": text})
 
@@ -63,7 +63,7 @@ def placed_walls(outlines: list[dict[str, Any]]) -> str:
     return json.dumps({"kind": "walls", "walls": outlines})
 
 
-def named(world: "World", i: int) -> str:
+def describe_particle(world: "World", i: int) -> str:
     """Describe a particle in words."""
     p = world.particles
     i = checks.indices("play", "particle", [i], len(p))[0]
@@ -82,5 +82,5 @@ def frame(world: "World", figures: dict[str, Any]) -> bytes:
     """Return a frame as bytes: the length of the JSON figures (u32, little-endian), the figures, and positions in f32."""
     text = json.dumps(figures).encode()
     text += b" " * (-len(text) % 4)
-    places = InBox().places(world, world.position)
+    places = InBox().drawn_positions(world, world.position)
     return len(text).to_bytes(4, "little") + text + places.astype("<f4").tobytes()

@@ -37,7 +37,7 @@ class Viewer:
 
 
 class Server:
-    """Serves the page at `url`. said: messages from pages, (viewer, message), in order of arrival.
+    """Serves the page at `url`. received: messages from pages, (viewer, message), in order of arrival.
 
     A request must contain the token, which is part of the address. It must name this machine as Host, which keeps out foreign
     pages whose host name resolves to this machine. A connection must also come from the page served here, by its Origin.
@@ -51,7 +51,7 @@ class Server:
                 "play: a page in the browser needs the package websockets: pip install 'tiverlet[play]'."
             ) from None
         self.token = secrets.token_urlsafe(16)
-        self.said: queue.Queue[tuple[Viewer, dict[str, Any]]] = queue.Queue()
+        self.received: queue.Queue[tuple[Viewer, dict[str, Any]]] = queue.Queue()
         self._viewers: list[Viewer] = []
         self._lock = threading.Lock()
         self._server = serve(self._listen, LOCAL, port, process_request=self._answer, compression=None, max_size=LARGEST)
@@ -100,7 +100,7 @@ class Server:
         elif message.get("do") == "shown":
             viewer.waiting = max(0, viewer.waiting - 1)
         else:
-            self.said.put((viewer, message))
+            self.received.put((viewer, message))
 
     def _listen(self, connection: Any) -> None:
         """Receive the messages of one page, in a thread of its own."""
@@ -109,7 +109,7 @@ class Server:
         viewer = Viewer(connection)
         with self._lock:
             self._viewers.append(viewer)
-        self.said.put((viewer, {"do": "came"}))
+        self.received.put((viewer, {"do": "came"}))
         try:
             with contextlib.suppress(ConnectionClosed):
                 for text in connection:
@@ -117,4 +117,4 @@ class Server:
         finally:
             with self._lock:
                 self._viewers.remove(viewer)
-            self.said.put((viewer, {"do": "went"}))
+            self.received.put((viewer, {"do": "went"}))

@@ -42,7 +42,7 @@ class Session:
             world.add(features=hands)
         self.hand = hands[0]
         self.paused, self.slower, self.steps, self.restarts = False, 1, 0, 0
-        self._one = False  # whether to compute one frame of a paused scene
+        self._single_frame = False  # whether to compute one frame of a paused scene
         self._start = checkpoint.keep(world), checkpoint.flags(world)
         self._extent = scene.bounds(world)
         self._computed: deque[tuple[float, float]] = deque(maxlen=30)  # for each frame: its begin [s] and computing time [ms]
@@ -65,11 +65,11 @@ class Session:
         if self._recorder is not None:
             self._recorder.close()
 
-    def turn(self) -> None:
+    def advance(self) -> None:
         """Process the messages of pages, compute a frame, and send it."""
-        heard = self._hear()
-        if not self.paused or self._one:
-            self._one = False
+        heard = self._process_requests()
+        if not self.paused or self._single_frame:
+            self._single_frame = False
             self._step()
         elif not heard and time.monotonic() - self._sent < REFRESH:
             return
@@ -80,7 +80,7 @@ class Session:
         due = time.perf_counter()
         while frames is None or frames > 0:
             frames = None if frames is None else frames - 1
-            self.turn()
+            self.advance()
             due = max(due + DT, time.perf_counter() - DT)  # do not catch up on lost time
             time.sleep(max(0.0, due - time.perf_counter()))
 
@@ -104,19 +104,19 @@ class Session:
         self.restarts += 1
         self._recording()
 
-    def _hear(self) -> bool:
+    def _process_requests(self) -> bool:
         """Process the requests of pages; return whether there were any."""
         heard = False
-        while not self.server.said.empty():
-            viewer, message = self.server.said.get()
+        while not self.server.received.empty():
+            viewer, message = self.server.received.get()
             heard = True
             try:
-                self._do(viewer, message)
+                self._process_request(viewer, message)
             except (ValueError, TypeError, KeyError) as e:  # an invalid request must not stop the scene
-                viewer.send(scene.told(str(e)))
+                viewer.send(scene.message(str(e)))
         return heard
 
-    def _do(self, viewer: Viewer, message: dict[str, Any]) -> None:
+    def _process_request(self, viewer: Viewer, message: dict[str, Any]) -> None:
         what = message.get("do")
         if what == "came":
             viewer.send(scene.scene(self.world, self.title))
@@ -124,7 +124,7 @@ class Session:
         elif what == "pause":
             self.paused = not self.paused
         elif what == "frame":
-            self.paused = self._one = True
+            self.paused = self._single_frame = True
         elif what == "restart":
             self._restart()
         elif what == "slower":
@@ -141,7 +141,7 @@ class Session:
             if self.hand.particle >= 0:
                 self.hand.particle = -1
         elif what == "name":
-            viewer.send(scene.told(scene.named(self.world, message["particle"])))
+            viewer.send(scene.message(scene.describe_particle(self.world, message["particle"])))
 
     def _wall_list(self) -> list[dict[str, Any]]:
         return scene.walls(self.world, self._extent)

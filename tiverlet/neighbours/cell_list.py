@@ -88,11 +88,11 @@ class CellList:
     def can_regroup(self, radius: np.ndarray, reach: np.ndarray) -> bool:
         """Whether particles of these sizes need as many tables as there are, and fit into the memory."""
         level = levels_of(radius, reach)
-        return int(level.max(initial=0)) + 1 == self.levels and self.memory.holds(4 * (len(radius) + 4**self.dim) + 2)
+        return int(level.max(initial=0)) + 1 == self.levels and self.memory.has_room(4 * (len(radius) + 4**self.dim) + 2)
 
     def remove_particles(self, number: np.ndarray) -> None:
         """Delete removed particles from the sorted cells and renumber the others. number: (n,) new indices, or -1 if removed."""
-        order, edge = self.memory.seen(self.sorted), self.memory.seen(self.edge)
+        order, edge = self.memory.view(self.sorted), self.memory.view(self.edge)
         new = number[order[: len(number)]]
         gone = np.flatnonzero(new < 0)
         order[: len(new) - len(gone)] = new[new >= 0]

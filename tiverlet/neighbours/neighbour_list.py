@@ -23,7 +23,8 @@ class PairData:
     """Data of each listed pair: a number, or a vector of `width`.
 
     persistent: it belongs to the state, beyond a substep. for_reports: it is for reports only. is_transferred: it is copied to
-    the next list; other data is recomputed. only_touching: it is 0 except for pairs whose bit in NeighbourList.touching is set.
+    the next
+    list; other data is recomputed. only_touching: it is 0 except for pairs whose bit in NeighbourList.touching is set.
     kind: type of the numbers; None for that of the world. field, old: the data of the present list, and of the old list while a
     new one is built.
     """
@@ -66,7 +67,7 @@ class NeighbourList:
     capacity_number: Number
     pitch_number: Number
     host_only = ("room",)
-    told_apart = True  # see Feature
+    has_own_compile_time = True  # see Feature
 
     def __init__(self, memory: "Memory", count: Number, rooms: Number, pair_data: list[PairData], team: Team, network_size: int):
         self.team, self.n, self.memory, self.network_size = team, count, memory, network_size
@@ -102,14 +103,14 @@ class NeighbourList:
         self.capacity_number.set(max(1, -(-capacity // self.blocks)))
         self.pitch_number.set(self.capacity + self.network_size)
         self.room = self.pitch * self.blocks
-        if self.store and self.store.lengthen(self.room):
+        if self.store and self.store.set_length(self.room):
             return False
         kept = []
         if self.store:
             with self._all_copies():
                 kept = [self.store.read(field) for field in self._fields()]
             self.store.destroy()
-        self.store = self.memory.more()
+        self.store = self.memory.make_companion()
         self.neighbour = self.store.field("grid.near", self.room, kind=ti.i32)
         self.old_neighbour = self.store.field("grid.aside", self.room, kind=ti.i32)
         for piece in self.pair_data:
@@ -196,7 +197,7 @@ class NeighbourList:
         The result does not depend on the layout of the list.
         """
         assert self.store
-        seen = self.store.seen if self.store.elastic else self.store.read
+        seen = self.store.view if self.store.elastic else self.store.read
         saved = bool(self.memory.read(self.old_saved)[0])  # restored by restore(), and not yet transferred to a new list
         first, number = (self.old_first, self.old_number) if saved else (self.first, self.number)
         i, at = self._entries(first, number)
@@ -226,7 +227,7 @@ class NeighbourList:
     @property
     def saved(self) -> bool:
         """Whether the old list is saved for a new one that is not built yet."""
-        return bool(self.memory.seen(self.old_saved)[0])
+        return bool(self.memory.view(self.old_saved)[0])
 
     def remove_particles(self, number: np.ndarray) -> None:
         """Delete the pairs of removed particles. number: (n,) new indices, -1 for removed particles.
@@ -235,9 +236,9 @@ class NeighbourList:
         are, or move up among the entries of their particle.
         """
         assert self.store
-        first, count, touching = (self.memory.seen(field) for field in (self.first, self.number, self.touching))
+        first, count, touching = (self.memory.view(field) for field in (self.first, self.number, self.touching))
         i, at = self._entries(self.first, self.number)
-        near = self.store.seen(self.neighbour)
+        near = self.store.view(self.neighbour)
         new = number.take(near.take(at))
         near[at] = new
         fewer = np.flatnonzero(np.bincount(i, new < 0, self.n))
@@ -249,7 +250,7 @@ class NeighbourList:
         i, at = i[stay], at[stay]
         place, before = np.arange(len(i)) - np.searchsorted(i, i), at - first[i]
         for field in (self.neighbour, *(piece.field for piece in self.pair_data)):
-            rows = self.store.seen(field)
+            rows = self.store.view(field)
             rows[first[i] + place] = rows[at]
         bits = np.zeros(self.n, dtype=np.uint32)
         bit = np.where(before < WORD, touching[i] >> np.minimum(before, WORD - 1) & 1, 1)  # 1 behind the first word: unknown

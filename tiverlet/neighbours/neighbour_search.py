@@ -47,7 +47,7 @@ class NeighbourSearch:
     too_far: Any = OnDevice()  # the square of the displacement beyond which the list is stale [m^2]
     farthest: Any = OnDevice()  # the largest distance of listed pairs [m]
     n: Any = OnDevice()  # number of particles
-    told_apart = True  # see Feature
+    has_own_compile_time = True  # see Feature
 
     def __init__(
         self, scene: "Scene", skin: float, linked: np.ndarray, table: Any, pair_data: list[PairData], team: Team, scratch: Any,
@@ -109,7 +109,7 @@ class NeighbourSearch:
         """Whether particles can be added and removed in place. radius, reach: of the particles there are now, (n,) [m]."""
         reach = 0 * radius if reach is None else reach
         n, store = change.now.count, self.list.store
-        room = store is not None and store.holds(self.list.room + (self.list.network_size + 1) * (n + 1))
+        room = store is not None and store.has_room(self.list.room + (self.list.network_size + 1) * (n + 1))
         static = bool((change.inv_mass == 0).any()) == self.has_static
         finds_all = not self.several_levels and not self.state.images and not reach.any()
         return (
@@ -126,9 +126,9 @@ class NeighbourSearch:
         The list is kept without the pairs of removed particles, unless skin or cells change. Added particles are not listed: they
         count as strays that moved too far. Where the old list is saved, restore() must give the pair data to the next list.
         """
-        n, stale = change.now.count, int(self.memory.seen(self.list.stale)[0])
+        n, stale = change.now.count, int(self.memory.view(self.list.stale)[0])
         reach = 0 * radius if reach is None else reach
-        if change.goes and not self.list.saved:
+        if change.has_removed and not self.list.saved:
             self.list.remove_particles(change.number)
             self.cells.remove_particles(change.number)
         skin = self._skin(skin, radius, reach)
@@ -143,7 +143,7 @@ class NeighbourSearch:
             self.list.blocks = self._blocks(n)
             self.list.allocate(room)
         if self.has_excluded:
-            begin = self.memory.seen(self.excluded_begin)[change.first]
+            begin = self.memory.view(self.excluded_begin)[change.first]
             self.memory.resize(self.excluded_begin, n + 1)
             self.memory.write_from(self.excluded_begin, change.first, np.full(n + 1 - change.first, begin))
         came = n - change.kept
@@ -166,7 +166,7 @@ class NeighbourSearch:
     def exclude(self, linked: np.ndarray) -> None:
         """Exclude these pairs, (m, 2), from the list; can_exclude() must allow it. Particles are numbered as they are now."""
         if self.has_excluded:
-            self._excluded_pairs, begin = _in_both_orders(linked, len(self.memory.seen(self.excluded_begin)) - 1)
+            self._excluded_pairs, begin = _in_both_orders(linked, len(self.memory.view(self.excluded_begin)) - 1)
             self.memory.resize(self.excluded, len(self._excluded_pairs))
             self.memory.write(self.excluded, self._excluded_pairs[:, 1])
             self.memory.write(self.excluded_begin, begin)

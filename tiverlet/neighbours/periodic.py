@@ -49,7 +49,7 @@ class Periodic(Feature):
     host_only = ("low", "high")
     _last_strain_and_offset = 0.0, 0.0
     shear = Knob(lambda f, v: checks.number("Periodic", "shear", v), "Rate of the shear [1/s].")
-    bulk = 0.1
+    code_size = 0.1
 
     def __init__(self, low: ArrayLike, high: ArrayLike, axes: Sequence[int] | None = None, *, shear: float = 0.0):
         low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
@@ -85,7 +85,7 @@ class Periodic(Feature):
     @property
     def sheared(self) -> bool:
         """Whether there is a shear, or kernels were compiled for one."""
-        return self.shear != 0 or "sheared" in self.once
+        return self.shear != 0 or "sheared" in self.compiled_so_far
 
     @property
     def lengths(self) -> np.ndarray:

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import checks
-from ..features.arguments import meant
-from ..features.read_only import read_only, structure
+from ..features.arguments import suggest_name
+from ..features.read_only import read_only, structure_advice
 
 LARGEST = 1e15  # [m] squared lengths up to 1e30 leave room below the largest f32, 3e38
 
@@ -124,7 +124,7 @@ class Particles:
     def __setattr__(self, name: str, value) -> None:
         if getattr(self, "_fixed", False):
             if not hasattr(self, name):
-                raise AttributeError(f"Particles has no {name!r}{meant(name, vars(self))}. All of it is structure.")
+                raise AttributeError(f"Particles has no {name!r}{suggest_name(name, vars(self))}. All of it is structure.")
             raise AttributeError(
                 f"Particles.{name} is structure, fixed when a world is built. Make new Particles for a new world; "
                 "to move particles assign to world.position or world.velocity."
@@ -141,7 +141,7 @@ class Particles:
 def _fixed(name: str, array: np.ndarray) -> np.ndarray:
     """Make an array of Particles read-only."""
     live = f" To move particles, assign to world.{name}." if name in ("position", "velocity") else ""
-    return read_only(array, structure("Particles", name) + live)
+    return read_only(array, structure_advice("Particles", name) + live)
 
 
 def in_range(who: str, name: str, position: np.ndarray) -> None:

@@ -48,7 +48,7 @@ class PerParticle:
         if self.uniform:
             self.become(memory, values)
         else:
-            memory.seen(self.field)[some] = values[some]
+            memory.view(self.field)[some] = values[some]
 
     @inline
     def of(self, i):

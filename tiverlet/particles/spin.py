@@ -17,9 +17,9 @@ class Spin:
 
     s = r phi is the distance that the surface of a particle turned in the last substep [m], with phi the angle (2D) or the
     rotation vector (3D). It is a displacement as d is; before a start (the first substep after velocities were set) it is a
-    velocity, r omega. share: k = m r^2 / I, 2 for discs, 5/2 for spheres. With s and k, the laws of friction contain no radius.
-    An impulse h p [kg m] at the point -r n from the center changes d by p / m and s by -k n x p / m. The surface there moves by d
-    - s x n, which changes by (1 + k) p / m across n.
+    velocity, r omega. inverse_inertia: k = m r^2 / I, 2 for discs, 5/2 for spheres. With s and k, the laws of friction contain no
+    radius. An impulse h p [kg m] at the point -r n from the center changes d by p / m and s by -k n x p / m. The surface there
+    moves by d - s x n, which changes by (1 + k) p / m across n.
 
     Only contacts and walls turn a particle. Between these s is constant, which is exact.
 
@@ -30,7 +30,7 @@ class Spin:
         n, self.dim, self.real = particles.count, particles.dim, memory.real
         self.axes, self.radius = particles.axes, particles.radius
         self.s = memory.field("spin", number, width=self.axes, values=self.from_rates(particles.spin), state=True)
-        self.share = PerParticle(memory, "spin_share", shares(particles, inv_mass), number)
+        self.inverse_inertia = PerParticle(memory, "spin_share", inverse_inertias(particles, inv_mass), number)
         self.orients = particles.orientation is not None
         if self.orients:
             width = 1 if self.dim == 2 else 4
@@ -41,7 +41,9 @@ class Spin:
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether particles can be added and removed in place."""
         now = change.now
-        if (now.orientation is not None) != self.orients or not self.share.can_be(shares(now, change.inv_mass)):
+        if (now.orientation is not None) != self.orients or not self.inverse_inertia.can_be(
+            inverse_inertias(now, change.inv_mass)
+        ):
             return False
         return not self.orients or self.inverse_radius.can_be(inverse(now.radius))
 
@@ -49,7 +51,7 @@ class Spin:
         """Set spin and orientation of added particles, see State.regroup()."""
         now, first = change.now, change.kept
         self.radius = now.radius
-        self.share.become(memory, shares(now, change.inv_mass))
+        self.inverse_inertia.become(memory, inverse_inertias(now, change.inv_mass))
         memory.write_from(self.s, first, self.from_rates(now.spin)[first:])
         if self.orients:
             self.inverse_radius.become(memory, inverse(now.radius))
@@ -57,11 +59,11 @@ class Spin:
 
     def can_weigh(self, particles: Particles, inv_mass: np.ndarray) -> bool:
         """Whether other inverse masses of the same particles can be written in place."""
-        return self.share.can_be(shares(particles, inv_mass))
+        return self.inverse_inertia.can_be(inverse_inertias(particles, inv_mass))
 
     def weigh(self, memory: Memory, particles: Particles, inv_mass: np.ndarray) -> None:
         """Write other inverse masses, for which can_weigh() is true."""
-        self.share.become(memory, shares(particles, inv_mass))
+        self.inverse_inertia.become(memory, inverse_inertias(particles, inv_mass))
 
     def from_rates(self, rates: Any) -> np.ndarray:
         """Convert angular velocities [rad/s] to r omega [m/s], (n, axes)."""
@@ -104,7 +106,7 @@ class Spin:
     @ti.func
     def energy(self, i):
         """Return I phi^2 / 2 of particle i per mass [m^2], f64."""
-        k, s, out = self.share.of(i), self.s[i] * ti.cast(1, ti.f64), ti.cast(0, ti.f64)
+        k, s, out = self.inverse_inertia.of(i), self.s[i] * ti.cast(1, ti.f64), ti.cast(0, ti.f64)
         if k > 0:
             out = 0.5 * s.dot(s) / k
         return out
@@ -120,7 +122,7 @@ class Spin:
         self.s[i] = self.s[i] / h
 
     @ti.func
-    def turn(self, i):
+    def update_orientation(self, i):
         """Update the orientation at the end of a substep. In 3D q' = (phi / |phi| sin |phi| / 2, cos |phi| / 2) q."""
         phi = self.inverse_radius.of(i) * self.s[i]
         if ti.static(self.dim == 2):
@@ -140,13 +142,13 @@ def inverse(radius: np.ndarray) -> np.ndarray:
     return np.divide(1, radius, out=np.zeros(len(radius)), where=radius > 0)
 
 
-def shares(particles: Particles, inv_mass: np.ndarray) -> np.ndarray:
+def inverse_inertias(particles: Particles, inv_mass: np.ndarray) -> np.ndarray:
     """Return k = m r^2 / I of each particle, 0 for points and for particles that cannot move."""
     inertia = at_rest("inertia", particles) if particles.inertia is None else np.asarray(particles.inertia)
     return np.where((particles.radius > 0) & (inv_mass > 0), 1 / inertia, 0.0)
 
 
-def moments(particles: Particles) -> np.ndarray:
+def moments_of_inertia(particles: Particles) -> np.ndarray:
     """Return the moments of inertia [kg m^2], (n,); 0 for particles that cannot move or have infinite inertia."""
     if particles.inertia is None:
         return np.zeros(particles.count)

@@ -87,8 +87,8 @@ class State:
 
     def get_some(self, memory: "Memory", some: np.ndarray) -> np.ndarray:
         """Return the positions of the particles `some`, by their numbers, as get() does. For a single world."""
-        out = memory.seen(self.x)[some].astype(np.float64)
-        return out + memory.seen(self.low)[some] if self.sums else out
+        out = memory.view(self.x)[some].astype(np.float64)
+        return out + memory.view(self.low)[some] if self.sums else out
 
     def put(self, memory: "Memory", position: np.ndarray) -> None:
         """Overwrite the positions."""

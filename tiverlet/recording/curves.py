@@ -8,7 +8,7 @@ from ..colliders.collider import Collider
 from ..constraints.core.anchored import Anchored
 from ..features.feature import Batch
 from ..measure import moment_sum
-from ..particles.spin import moments
+from ..particles.spin import moments_of_inertia
 from ..step.checkpoint import Checkpoint
 from ..step.step_report import StepReport
 
@@ -46,7 +46,7 @@ def curves_of(world: "World") -> dict[str, tuple[str, dict[str, Any]]]:
     return CURVES | {title: (end, {name: curves[name] for name in list(curves)[: world.particles.axes]})}
 
 
-def shown(world: "World") -> dict[str, tuple[str, list[bool]]]:
+def informative_views(world: "World") -> dict[str, tuple[str, list[bool]]]:
     """Return the views of curves that are informative for this scene, by title: last part of the path, and which curves to show.
 
     Left out are overlap without contacts, momentum where walls or pins change it, and substeps if their number is fixed.
@@ -83,7 +83,7 @@ class Curves:
         self.own: list[str] = []  # names of the user's quantities
         for title, (end, curves) in self._curves.items():
             titles, colors = zip(*(curves[name] for name in _names(curves, world)), strict=True)
-            _, those = shown(world).get(title, (end, [False] * len(titles)))
+            _, those = informative_views(world).get(title, (end, [False] * len(titles)))
             lines = rr.SeriesLines(names=titles, colors=colors, visible_series=those)
             stream.log(f"figures/{end}", lines, static=True, strict=True)
 
@@ -92,7 +92,7 @@ class Curves:
         p = world.particles
         self._mass = np.where(p.inv_mass > 0, p.mass, 0.0)
         # Factors that turn r omega into I omega.
-        self._lever = np.divide(moments(p), p.radius, out=np.zeros(len(p)), where=p.radius > 0)
+        self._lever = np.divide(moments_of_inertia(p), p.radius, out=np.zeros(len(p)), where=p.radius > 0)
 
     def add(self, frame: int, report: StepReport, now: Checkpoint) -> None:
         """Add the figures of a frame. Momentum is that of the displacements, half a substep ago, like energy."""

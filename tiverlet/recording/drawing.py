@@ -14,7 +14,7 @@ from ..forces import Gravity
 from ..neighbours import Periodic
 from ..tools import golden_colors
 from .fill import Fill, outlines, within
-from .images import InBox, box_of, torn
+from .images import InBox, box_of, crosses_box
 from .journal import PARTICLES
 from .layout import LEGEND, SCENE, WIDE
 from .lines import Lines
@@ -59,8 +59,8 @@ class Drawing:
         self.extent, self._overlays = extent, overlays
         self.hues: np.ndarray | None = None  # colours of particles in the coming frame, if they change
         self.scenes = 0  # how many scenes were begun
-        self._places = InBox()
-        self._touched = self._torn = False
+        self._in_box = InBox()
+        self._touched = self._broke_before = False
 
     def static(self, entity: str, *what: Any) -> None:
         """Log data that hold for all frames."""
@@ -93,7 +93,7 @@ class Drawing:
         self.static(f"{self._root}/{PARTICLES}", *what)
         held = np.flatnonzero(p.inv_mass == 0)
         if 0 < len(held) <= PINS:
-            at = self.shown(world.position)[held].astype(np.float32)
+            at = self.drawn_positions(world.position)[held].astype(np.float32)
             marks = self._points.from_fields(positions=at, radii=[-3.5], colors=[HELD], **self._above)
             self._log(f"{self._root}/held", marks)  # not static, since static data cannot be cleared when the scene ends
         if box := box_of(world):
@@ -141,18 +141,18 @@ class Drawing:
         if loops:
             self._fill = Fill(loops, world.position, hues, inside[self._pairs[under, 0]])
             self.static(f"{self._root}/fill", self._strips.from_fields(radii=self._fill.radii, draw_order=BELOW))
-        self._some, self._under = some, under
-        self._tears = [(k, np.flatnonzero(number == k), row[number == k]) for k, _ in found if k in self._broken]
+        self._line_links, self._surface_links = some, under
+        self._breakable_links = [(k, np.flatnonzero(number == k), row[number == k]) for k, _ in found if k in self._broken]
 
-    def shown(self, x: np.ndarray) -> np.ndarray:
+    def drawn_positions(self, x: np.ndarray) -> np.ndarray:
         """Return where particles at x, (n, dim) [m], are drawn: inside the periodic box, if there is one."""
-        return self._places.places(self.world, x)
+        return self._in_box.drawn_positions(self.world, x)
 
-    def frame(self, x: np.ndarray, x32: np.ndarray, turned: Iterable[int], torn: bool) -> None:
+    def frame(self, x: np.ndarray, x32: np.ndarray, changed_features: Iterable[int], broke: bool) -> None:
         """Draw a frame.
 
-        x, x32: positions, (n, dim) [m], in full and in f32. turned: numbers of features with other knobs than in the last frame.
-        torn: whether something broke since then.
+        x, x32: positions, (n, dim) [m], in full and in f32. changed_features: numbers of features with other knobs than in the
+        last frame. broke: whether something broke since then.
         """
         # Log everything in one row, so that LZ4 matches the points of lines and sheets with those of the particles.
         colored = {}
@@ -169,7 +169,7 @@ class Drawing:
         if len(self._pairs) or self._surface or self._fill:
             row += self._link(x, x32)
         self._log(f"{self._root}/{PARTICLES}", *row)
-        for k in turned:
+        for k in changed_features:
             self._wall(k)
         if self._overlays.forces and self.world._runner.step.contacts:
             self._load(x)
@@ -182,9 +182,9 @@ class Drawing:
             arrows = self._arrows.from_fields(origins=x32, vectors=way, colors=[ARROW], radii=[-0.7], **self._above)
             self._log(f"{self._root}/velocities", arrows)
             self.bytes += 2 * x32.nbytes
-        if torn or self._torn:
+        if broke or self._broke_before:
             self._breaks(x)
-            self._torn = torn
+            self._broke_before = broke
 
     def _mark(self, x: np.ndarray) -> None:
         """Draw how far particles have turned: a line from the centre to the rim of a disc, two dots on a sphere."""
@@ -206,21 +206,21 @@ class Drawing:
             level = levels(np.sqrt(np.einsum("ij,ij->i", r, r)) / self._rest - 1)
         if not self._overlays.strain:
             level[:] = LEVELS
-        level[torn(box_of(self.world), r)] = -1
-        for k, mine, rows in self._tears:
+        level[crosses_box(box_of(self.world), r)] = -1
+        for k, mine, rows in self._breakable_links:
             level[mine[self._broken[k][rows]]] = -1
         row = []
         if self._surface:
-            shades = self._surface.colors(x, level[self._under])
+            shades = self._surface.colors(x, level[self._surface_links])
             row.append(self._rr.Mesh3D.from_fields(vertex_positions=x32, vertex_colors=shades))
             self.bytes += shades.nbytes + x32.nbytes
         if self._lines:
-            particles, ends, shades = self._lines.strips(level[self._some])
+            particles, ends, shades = self._lines.strips(level[self._line_links])
             row.append(self._strips.from_fields(strips=self._packed(x32[particles], ends), colors=shades))
             self.bytes += shades.nbytes
         if self._fill:
             points, ends = self._fill.strips(x)
-            shades = self._fill.colors(level[self._under])
+            shades = self._fill.colors(level[self._surface_links])
             self._log(f"{self._root}/fill", self._strips.from_fields(strips=self._packed(points, ends), colors=shades))
             self.bytes += shades.nbytes
         return row
@@ -372,7 +372,7 @@ def bounds(world: "World") -> tuple[np.ndarray, np.ndarray]:
 
     The box includes finite walls, the ground below, and the circle around the point from which a body hangs.
     """
-    x, r = InBox().places(world, world.position), world.particles.radius[:, None]
+    x, r = InBox().drawn_positions(world, world.position), world.particles.radius[:, None]
     low = (x - r).min(axis=0, initial=np.inf) if len(x) else np.zeros(world.particles.dim)
     high = (x + r).max(axis=0, initial=-np.inf) if len(x) else np.ones(world.particles.dim)
     low, high = walled(world.features, low, high)

@@ -19,7 +19,7 @@ class InBox:
         self._known: tuple = (None, None)
         self._body = self._count = np.zeros(0, dtype=np.int64)
 
-    def places(self, world: "World", x: np.ndarray) -> np.ndarray:
+    def drawn_positions(self, world: "World", x: np.ndarray) -> np.ndarray:
         """Return where particles at x (n, dim) [m] are drawn; x itself if the world has no periodic box."""
         box = box_of(world)
         if box is None or not len(x):
@@ -37,6 +37,6 @@ def box_of(world: "World | Parts") -> Periodic | None:
     return next((f for f in world.features if isinstance(f, Periodic)), None)
 
 
-def torn(box: Periodic | None, r: np.ndarray) -> np.ndarray:
+def crosses_box(box: Periodic | None, r: np.ndarray) -> np.ndarray:
     """Whether each difference of drawn positions (m, dim) leads to an image farther off than the nearest one, (m,)."""
     return np.zeros(len(r), dtype=bool) if box is None else np.any(np.abs(r) > box.lengths / 2, axis=1)

@@ -93,7 +93,7 @@ def brief(digest: str) -> str:
     return base64.b85encode(bytes.fromhex(digest)[:16]).decode()
 
 
-def said(report: "StepReport | None") -> dict[str, Any]:
+def flags_to_record(report: "StepReport | None") -> dict[str, Any]:
     """Return flags and notes of a report if some flags do not follow from the steps alone; otherwise nothing."""
     return {"flags": sorted(report.flags), "notes": list(report.notes)} if report and report.flags & GUARD else {}
 

@@ -11,7 +11,7 @@ import numpy as np
 from ..step import checkpoint
 from ..step.step_report import StepReport
 from . import scene
-from .journal import FORMAT, PARTED, Entry, checksum, said
+from .journal import FORMAT, PARTED, Entry, checksum, flags_to_record
 
 if TYPE_CHECKING:
     from ..world import World
@@ -22,12 +22,12 @@ Write = Callable[[str, np.ndarray, str], None]
 class Journal:
     """Writes an entry for every change of the world that it observes."""
 
-    def __init__(self, world: "World", write: Write, told: dict[str, Any]):
-        self._told = told  # what the picture contains beyond scene and steps
+    def __init__(self, world: "World", write: Write, picture_settings: dict[str, Any]):
+        self._picture_settings = picture_settings  # what the picture contains beyond scene and steps
         self.world, self.frame, self.bytes = world, 0, 0
         self.worst: StepReport | None = None  # the worst report of the whole recording
         self.recent: StepReport | None = None  # the worst report since the last frame
-        self.stirred: set[int]  # features whose knobs were set since the last frame
+        self.changed_features: set[int]  # features whose knobs were set since the last frame
         self._write, self._serial, self._sum = write, 0, ""
         self._steps: list[list] = []
         self.scenes = self.size = 0  # the number of scenes, and the size of the last state [bytes]
@@ -39,10 +39,10 @@ class Journal:
         """Write the scene and its state: at the begin, and when the user has added or removed particles or features."""
         data, arrays = scene.describe(self.world)
         self._known = [copy.deepcopy(scene.knobs(f)) for f in self.world.features]
-        self.put("scene", {"format": FORMAT, **data, **self._told}, arrays)
+        self.put("scene", {"format": FORMAT, **data, **self._picture_settings}, arrays)
         self.size = self.state()
         self.scenes += 1
-        self.stirred = set(range(len(self.world.features)))  # draw all features
+        self.changed_features = set(range(len(self.world.features)))  # draw all features
 
     def put(self, kind: str, data: dict[str, Any], arrays: dict[str, np.ndarray] | None = None) -> int:
         """Write an entry; return its size [bytes]."""
@@ -65,9 +65,9 @@ class Journal:
     def frame_drawn(self, data: dict[str, Any]) -> None:
         """Write the entry of a frame that was drawn."""
         took = {"seconds": self.recent.seconds} if self.recent else {}
-        self.put("frame", {**data, **took, **said(self.recent)})
+        self.put("frame", {**data, **took, **flags_to_record(self.recent)})
         self.recent = None
-        self.stirred.clear()
+        self.changed_features.clear()
 
     def _now(self) -> list:
         """Return the user's settings for the next step, and the memory of the controller."""
@@ -77,8 +77,8 @@ class Journal:
     def state(self, kind: str = "state") -> int:
         """Write the exact state; return the size of the entry [bytes]."""
         kept, world = checkpoint.keep(self.world), self.world
-        more = {"flags": checkpoint.flags(world), "reach": world._runner.scene.reach}
-        more["once"] = [sorted(f.once) for f in world.features]
+        more = {"flags": checkpoint.flags(world), "reach": world._runner.scene.multipliers_per_newton}
+        more["once"] = [sorted(f.compiled_so_far) for f in world.features]
         parted = kept.clock.parted
         arrays = kept.values if parted is None else kept.values | {PARTED: np.asarray(parted)}
         return self.put(kind, {"clock": kept.clock.named() | {"_parted": None}, **more}, arrays)
@@ -86,16 +86,16 @@ class Journal:
     def before(self) -> None:
         """Before a step: write the knobs that were set since the last one."""
         arrays: dict[str, np.ndarray] = {}
-        turned = {}
+        changed = {}
         for k, feature in enumerate(self.world.features):
             if feature.changed:
                 now, known = scene.knobs(feature), self._known[k]
                 new = {name: v for name, v in now.items() if name not in known or not _same(v, known[name])}
-                turned[k] = {name: scene.encode(v, f"{k}.{name}", arrays, scene.Needs()) for name, v in new.items()}
+                changed[k] = {name: scene.encode(v, f"{k}.{name}", arrays, scene.Needs()) for name, v in new.items()}
                 known.update(copy.deepcopy(new))
-        if turned:
-            self.stirred.update(turned)
-            self.put("turned", {"features": turned}, arrays)
+        if changed:
+            self.changed_features.update(changed)
+            self.put("turned", {"features": changed}, arrays)
 
     def after(self, dt: float, report: StepReport) -> None:
         """After a step: record it."""

@@ -91,7 +91,8 @@ def blueprint(
 ) -> rrb.Blueprint:
     """Return the layout of a scene within the corners low and high [m]: the scene on the left, curves and text on the right.
 
-    figures: see shown() in curves.py. legend: the title of the colour scale, or None. up: the direction against gravity.
+    figures: see informative_views() in curves.py. legend: the title of the colour scale, or None. up: the direction against
+    gravity.
     """
     view = scene_view(low, high, up)
     curves = [

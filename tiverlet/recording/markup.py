@@ -30,13 +30,13 @@ def table(rows: Mapping[str, Any], title: str = "") -> str:
     """Return names and values as rows of a table."""
     head = f"<caption style='text-align:left;font-weight:bold'>{escape(title)}</caption>" if title else ""
     cells = "".join(
-        f"<tr><td style='text-align:left'>{escape(name)}</td><td style='text-align:left'>{escape(shown(value))}</td></tr>"
+        f"<tr><td style='text-align:left'>{escape(name)}</td><td style='text-align:left'>{escape(short_text(value))}</td></tr>"
         for name, value in rows.items()
     )
     return f"<table>{head}{cells}</table>"
 
 
-def shown(value: Any) -> str:
+def short_text(value: Any) -> str:
     """Return a value in a few words; for a large array its shape and range."""
     if isinstance(value, np.ndarray) and value.size > 8:
         ends = f", {np.nanmin(value):.4g} ... {np.nanmax(value):.4g}" if value.dtype.kind in "biuf" else ""
@@ -65,7 +65,7 @@ def of_world(world: "World") -> str:
     """Return the HTML of a world: its picture, and the text of explain(), folded."""
     try:
         more = f"<details><summary>explain()</summary><pre>{escape(world.explain())}</pre></details>"
-        image = picture(world, InBox().places(world, world.position))
+        image = picture(world, InBox().drawn_positions(world, world.position))
     except RuntimeError:  # the world was closed
         return f"<code>{escape(repr(world))}</code>"
     return f"<div><code>{escape(repr(world))}, {world.time:.4g} s</code><br>{image}{more}</div>"

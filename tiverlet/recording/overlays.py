@@ -43,10 +43,10 @@ class Overlays:
         return legend() if self.title(links) else None
 
     @staticmethod
-    def of(told: dict[str, Any]) -> "Overlays":
+    def of(stored: dict[str, Any]) -> "Overlays":
         """Return the overlays stored in a recording."""
-        color = told["color"]
-        return Overlays(told["strain"], told["forces"], told["velocities"], None if color is None else (*color,))  # type: ignore[arg-type]
+        color = stored["color"]
+        return Overlays(stored["strain"], stored["forces"], stored["velocities"], None if color is None else (*color,))  # type: ignore[arg-type]
 
 
 def checked_color(value: Any) -> tuple[str, float, float] | None:

@@ -49,7 +49,7 @@ class Picture:
         text = about(self.world, self._explained, self._environment, worst, frames, note)
         self.drawing.static("about", rr.TextDocument(text, media_type="text/markdown"))
 
-    def follow(self, world: "World") -> None:
+    def set_world(self, world: "World") -> None:
         """Draw another world from now on; the viewer shows no difference."""
         self.world = self.drawing.world = world
 
@@ -60,18 +60,18 @@ class Picture:
 
     def frame(
         self, number: int, now: Checkpoint, x: np.ndarray, x32: np.ndarray, report: StepReport | None, scenes: int,
-        stirred: Iterable[int],
+        changed_features: Iterable[int],
     ) -> None:  # fmt: skip
         """Draw a frame.
 
         now: the world's state. x, x32: positions, (n, dim), in full and in f32. report: the worst of the steps since the last
-        frame. scenes: the number of scenes so far. stirred: features whose knobs were set since the last frame.
+        frame. scenes: the number of scenes so far. changed_features: features whose knobs were set since the last frame.
         """
         if scenes > self.drawing.scenes:
             self.curves.weigh(self.world)
             self.drawing.begin()
         self._frame_all(x)
-        self.drawing.frame(x, x32, stirred, bool(report and report.broken))
+        self.drawing.frame(x, x32, changed_features, bool(report and report.broken))
         if report:
             self.curves.add(number, report, now)
             if report.flags - self._seen:
@@ -111,12 +111,12 @@ def layout(
     seen: corners of the visible region [m], and the factor of scale; None for what is known beforehand. own: names of the user's
     quantities that have curves.
     """
-    from .curves import OWN, shown
+    from .curves import OWN, informative_views
     from .drawing import bounds, links, upwards
     from .layout import blueprint, unit
 
     (low, high), scale = seen or (bounds(world), unit(*bounds(world)))
-    figures = {name: (f"{OWN}/{name}", [True]) for name in own} | shown(world)
+    figures = {name: (f"{OWN}/{name}", [True]) for name in own} | informative_views(world)
     return blueprint(scale * low, scale * high, overlays.title(bool(links(world))), figures, upwards(world))
 
 

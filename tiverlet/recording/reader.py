@@ -72,7 +72,7 @@ def store_of(data: bytes) -> tuple[int, str, str]:
     return parts.get(1, 0), record(parts.get(3, b""), "1").get(1, b"").decode(), parts.get(2, b"").decode()
 
 
-class Found:
+class ResultFile:
     """The output for the parent process: arrays one behind the other in the file, and their places."""
 
     def __init__(self, file: int, most: int):
@@ -104,7 +104,7 @@ class Found:
         self._file.close()
 
 
-def feed(into, array, depth: int = 0) -> None:
+def update_digest(into, array, depth: int = 0) -> None:
     """Add the contents of an Arrow array to a checksum. Equal arrays give equal checksums, whatever their layout in memory."""
     import numpy as np
     import pyarrow as pa
@@ -120,10 +120,10 @@ def feed(into, array, depth: int = 0) -> None:
         into.update(np.ascontiguousarray(array.to_numpy(zero_copy_only=False)))
     elif types.is_fixed_size_list(kind):
         into.update(b"fixed%d" % kind.list_size)
-        feed(into, array.flatten(), depth + 1)
+        update_digest(into, array.flatten(), depth + 1)
     elif types.is_list(kind):
         into.update(b"list" + np.diff(array.offsets.to_numpy()).tobytes())
-        feed(into, array.flatten(), depth + 1)
+        update_digest(into, array.flatten(), depth + 1)
     else:
         into.update(repr(array.to_pylist()).encode())
 
@@ -131,7 +131,7 @@ def feed(into, array, depth: int = 0) -> None:
 class Reader:
     """Reads messages, and keeps the requested parts."""
 
-    def __init__(self, found: Found, rows: bool):
+    def __init__(self, found: ResultFile, rows: bool):
         import numpy as np
         import pyarrow as pa
 
@@ -250,7 +250,7 @@ class Reader:
             if values[k].is_valid and name not in UNTOLD:
                 kind = f"{name} {told.get('rerun:archetype')} {told.get('rerun:component_type')} "
                 into.update(kind.encode())
-                feed(into, values[k].values)
+                update_digest(into, values[k].values)
         return into.digest()
 
     def write(self) -> None:
@@ -310,7 +310,7 @@ def read(file, out: int, rows: bool, limited: bool) -> dict:
     head = file.read(HEADER)
     if head[:4] != MAGIC or len(head) < HEADER:
         return {"foreign": True}
-    found = Found(out, SPARE + FOLD * size)
+    found = ResultFile(out, SPARE + FOLD * size)
     reader = Reader(found, rows)
     if limited:
         limit(size)

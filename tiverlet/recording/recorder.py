@@ -17,12 +17,12 @@ from ..step import checkpoint
 from ..step.explain import explain
 from ..world import World
 from ..worlds.worlds import Worlds
-from .journal import JOURNAL, brief, said
+from .journal import JOURNAL, brief, flags_to_record
 from .journal_writer import Journal
 from .overlays import Overlays, checked_color, checked_quantities
 from .picture import Picture, layout
 from .scene import environment
-from .sink import BACKLOG, LOOK, SMALL, Sink, file_error
+from .sink import BACKLOG, CHECK_INTERVAL, SMALL, Sink, file_error
 
 SEND = 1.0  # [s] between two transfers of curve points to rerun
 SHARE = 20  # an exact state is written once the pictures since the last one take so many times its bytes, uncompressed
@@ -87,7 +87,7 @@ class Recorder:
             raise ValueError(f"Recorder: the folder {folder} does not exist. Make it first: os.makedirs({folder!r}).")
         self.frames = self._calls = 0
         self._stride = self.every  # one of so many frames is drawn
-        self._each = 0  # about the bytes of a frame
+        self._frame_bytes = 0  # about the bytes of a frame
         self._note = ""  # which frames the budget has left out
         self._full = self._closed = False  # whether the budget has ended the recording; whether close() was called
         self._open(overwrite)
@@ -129,17 +129,17 @@ class Recorder:
     def _begin(self, title: str) -> None:
         """Write what holds for all frames, and the first frame."""
         world = self.world
-        world._adapt()  # rebuild for the present knobs first, so that the state belongs to their kernels
+        world._rebuild_for_knobs()  # rebuild for the present knobs first, so that the state belongs to their kernels
         explained = explain(world)
         self._picture = Picture(world, self._stream, explained, environment(), self._overlays)
         self._sent, self._flushed = perf_counter(), 0
         self._picture.stamp(0)
-        told = {"title": title, "explained": explained, "overlays": asdict(self._overlays)}
-        self._journal = Journal(world, self._write, told)
+        picture_settings = {"title": title, "explained": explained, "overlays": asdict(self._overlays)}
+        self._journal = Journal(world, self._write, picture_settings)
         self._note_state(self._journal.size)
         self._frame(0)
         self.flush()  # so that a process that ends early leaves a readable file
-        self._looked = perf_counter()
+        self._checked_at = perf_counter()
         if error := self._sink.error:
             raise file_error(error, f"Recorder: nothing could be written to {self.path}")
         least = self._sink.bytes + RESERVE
@@ -178,23 +178,23 @@ class Recorder:
         if quantities:
             self._own = checked_quantities(quantities, len(self.world.particles))
         self._calls += 1
-        if self.budget is not None and self._left() < self._each:
+        if self.budget is not None and self._bytes_left() < self._frame_bytes:
             self._thin()
         if self._full:
             return
         if self._calls % self._stride == 0:
             before = self._logged
             self._frame(self._calls)
-            self._each = max(self._each, self._logged - before)
+            self._frame_bytes = max(self._frame_bytes, self._logged - before)
         now = perf_counter()
         if now - self._sent > SEND:
             self._picture.curves.send()
             self._sent = now
         if self._logged - self._flushed > BACKLOG:
             self.flush()
-        if now - self._looked > LOOK:
+        if now - self._checked_at > CHECK_INTERVAL:
             self._sink.check()
-            self._looked = now
+            self._checked_at = now
         if self._sink.error:
             self._fail()
 
@@ -228,7 +228,7 @@ class Recorder:
         rest = "What was recorded is lost" if gone else "What the file holds can be replayed"
         raise file_error(error, f"Recorder: writing {self.path} failed at frame {self._calls}", f". {rest}") from None
 
-    def _left(self) -> int:
+    def _bytes_left(self) -> int:
         """Return the free bytes of the budget, after the data that wait to be written and the end of the recording."""
         assert self.budget is not None
         return self.budget - self.bytes - RESERVE
@@ -240,9 +240,9 @@ class Recorder:
         """
         assert self.budget is not None
         self.flush()
-        room = self._each
-        while self._left() < room and not self._sink.error:
-            self._stride, room = 2 * self._stride, max(self._each, self.budget // 4)
+        room = self._frame_bytes
+        while self._bytes_left() < room and not self._sink.error:
+            self._stride, room = 2 * self._stride, max(self._frame_bytes, self.budget // 4)
             self._journal.put("thinned", {"stride": self._stride})
             self.flush()
             self._note = (
@@ -251,14 +251,14 @@ class Recorder:
             )
             if self._calls < 2 * self._stride or not self._sink.thin(self._stride):
                 break
-        if self._left() < self._each:
+        if self._bytes_left() < self._frame_bytes:
             self._full = True
             self._note += f" They do not fit in it after frame {self._calls}, where the recording ends."
             self._finish()
 
     def _note_state(self, size: int) -> None:
         """Schedule the next exact state, after one of `size` bytes was written."""
-        self._due = SHARE * size
+        self._bytes_between_states = SHARE * size
         self._drawn, self._last_state = self._picture.drawing.bytes, self._calls
 
     @np.errstate(over="ignore")  # positions of a diverged simulation may exceed f32
@@ -267,8 +267,8 @@ class Recorder:
         journal.frame = number
         picture.stamp(number)
         sparse = number - self._last_state >= SPARSE * self._stride // self.every
-        due = picture.drawing.bytes - self._drawn > self._due or sparse
-        if number and due and not world._force_waits:  # a state does not contain the force under which it was computed
+        due = picture.drawing.bytes - self._drawn > self._bytes_between_states or sparse
+        if number and due and not world._has_new_force:  # a state does not contain the force under which it was computed
             self._note_state(journal.state())
         if self._own:
             numbers = {name: value for name, value in self._own.items() if isinstance(value, float)}
@@ -277,9 +277,9 @@ class Recorder:
             picture.log(number, self._own)
             self._own = {}
         now = checkpoint.keep(world, pairs=False)
-        x = picture.drawing.shown(now.position(len(world.particles)))
+        x = picture.drawing.drawn_positions(now.position(len(world.particles)))
         x32 = x.astype(np.float32)
-        picture.frame(number, now, x, x32, journal.rounded(), journal.scenes, journal.stirred)
+        picture.frame(number, now, x, x32, journal.rounded(), journal.scenes, journal.changed_features)
         journal.frame_drawn({"time": world.time, "hash": brief(checkpoint.digest(world, now)), "crc": zlib.crc32(x32.tobytes())})
         self.frames += 1
 
@@ -309,7 +309,7 @@ class Recorder:
             end["hash"] = world.hash()
         if "hash" in end:
             self._picture.end(journal.worst, self.frames, self._note)
-        journal.put("end", {**end, "note": self._note, **said(journal.worst)})
+        journal.put("end", {**end, "note": self._note, **flags_to_record(journal.worst)})
         if "hash" in end:
             self._sink.show(self._picture.layout())
         self._sink.flush()

@@ -61,15 +61,15 @@ def _digest(parts: dict[Any, Any]) -> bytes:
     into = hashlib.blake2b(digest_size=16)
     for name in sorted(parts, key=lambda name: name.component):
         into.update(f"{name.component} {name.archetype} {name.component_type} ".encode())
-        reader.feed(into, parts[name])
+        reader.update_digest(into, parts[name])
     return into.digest()
 
 
 class Redraw:
     """Draws the contents of a journal, from worlds that are computed again."""
 
-    def __init__(self, told: dict[str, Any]):
-        self._told, self._rows, self._stirred, self.scenes = told, Rows(), set[int](), 0
+    def __init__(self, scene_data: dict[str, Any]):
+        self._scene_data, self._rows, self._changed_features, self.scenes = scene_data, Rows(), set[int](), 0
         self._picture: Picture | None = None
         self._world: Any = None
         self._recent: StepReport | None = None
@@ -93,11 +93,11 @@ class Redraw:
         self._world = world
         world._watchers.append(self)
         if self._picture:
-            self._picture.follow(world)
+            self._picture.set_world(world)
             return
-        self._rows.log("__properties", rr.archetypes.RecordingInfo(name=self._told["title"]), static=True)
-        overlays = Overlays.of(self._told["overlays"])
-        self._picture = Picture(world, self._rows, self._told["explained"], self._told["environment"], overlays)
+        self._rows.log("__properties", rr.archetypes.RecordingInfo(name=self._scene_data["title"]), static=True)
+        overlays = Overlays.of(self._scene_data["overlays"])
+        self._picture = Picture(world, self._rows, self._scene_data["explained"], self._scene_data["environment"], overlays)
         self.layouts.append(_rows_of(layout(world, overlays)))
 
     def before(self) -> None:
@@ -117,11 +117,11 @@ class Redraw:
     def scene(self, features: int) -> None:
         """Begin a new scene."""
         self.scenes += 1
-        self._stirred = set(range(features))
+        self._changed_features = set(range(features))
 
-    def turned(self, features: dict[str, Any]) -> None:
+    def record_knobs(self, features: dict[str, Any]) -> None:
         """Record which features had knobs set."""
-        self._stirred.update(map(int, features))
+        self._changed_features.update(map(int, features))
 
     def thinned(self, entry: Entry) -> None:
         """Record that frames were removed from the picture."""
@@ -149,10 +149,10 @@ class Redraw:
         """Return the rows that must be in the file."""
         return self.rows if self.stride == 1 else self._thinned(found)
 
-    def shown(self, x: np.ndarray) -> np.ndarray:
+    def drawn_positions(self, x: np.ndarray) -> np.ndarray:
         """Return where particles at x, (n, dim) [m], are drawn."""
         assert self._picture
-        return self._picture.drawing.shown(x)
+        return self._picture.drawing.drawn_positions(x)
 
     def frame(self, entry: Entry, now: "Checkpoint", x: np.ndarray, x32: np.ndarray) -> str | None:
         """Draw a frame. Returns what is wrong with its entry in the journal, or None."""
@@ -164,8 +164,8 @@ class Redraw:
                 return wrong
             report = replace(report, seconds=entry.data["seconds"])
         self._picture.stamp(entry.frame)
-        self._picture.frame(entry.frame, now, x, x32, report, self.scenes, self._stirred)
-        self._recent, self._stirred = None, set()
+        self._picture.frame(entry.frame, now, x, x32, report, self.scenes, self._changed_features)
+        self._recent, self._changed_features = None, set()
         self.frames += 1
         return None
 
@@ -203,11 +203,11 @@ def _rows_of(blueprint: Any) -> list[Row]:
     return views.rows
 
 
-def _amended(report: StepReport, told: dict[str, Any]) -> tuple[StepReport, str | None]:
+def _amended(report: StepReport, recorded: dict[str, Any]) -> tuple[StepReport, str | None]:
     """Return a report with the flags of the journal, which may have more, and what is wrong with these flags, or None."""
-    if "flags" not in told:
+    if "flags" not in recorded:
         return report, None
-    flags, notes = set(told["flags"]), tuple(told["notes"])
+    flags, notes = set(recorded["flags"]), tuple(recorded["notes"])
     if not report.flags <= flags or flags - report.flags - GUARD or not set(report.notes) <= set(notes):
         return report, f"flags are {sorted(report.flags)}, but the journal says {sorted(flags)}"
     if any(not note.startswith("The frame is not as good") for note in set(notes) - set(report.notes)):

@@ -50,7 +50,7 @@ class Verdict:
         return self.text
 
 
-def _clear(function):
+def _with_clear_errors(function):
     """Turn the errors that a damaged file causes in Python into one clear ValueError."""
     signature = inspect.signature(function)
 
@@ -83,9 +83,9 @@ class Replay:
         ends = self._entries[-1].kind == "end"
         self._gap = gap or contents.why or ("" if ends else "the recording was not closed")  # why the recording is not complete
         self.complete = not self._gap
-        self.text = self._say()
+        self.text = self._describe()
 
-    def _say(self) -> str:
+    def _describe(self) -> str:
         s = {name: plain(str(value)) for name, value in self.scene["environment"].items()}
         out = f"{self.path}: {len(self.frames)} frames"
         if len(self.frames):
@@ -134,7 +134,7 @@ class Replay:
                     rows.append((e.frame, values))
         return {name: (np.array([k for k, _ in rows]), np.array([v for _, v in rows])) for name, rows in found.items()}
 
-    @_clear
+    @_with_clear_errors
     def world(self, frame: int) -> "World":
         """Return a world in the exact state of a frame, computed from the nearest earlier state and compared with the recording.
 
@@ -145,7 +145,7 @@ class Replay:
         world = None
         try:
             for world, entry in self._run(start, goal):
-                if entry.kind == "frame" and _brief(world, checkpoint.keep(world, pairs=False)) != entry.data["hash"]:
+                if entry.kind == "frame" and _short_hash(world, checkpoint.keep(world, pairs=False)) != entry.data["hash"]:
                     raise RuntimeError(f"replay: frame {entry.frame} of {self.path} does not come out as recorded. {self._why()}")
             assert world
             return world
@@ -154,7 +154,7 @@ class Replay:
                 world.close()
             raise
 
-    @_clear
+    @_with_clear_errors
     @np.errstate(over="ignore")  # positions of a diverged simulation may exceed f32, as in Recorder
     def verify(self) -> Verdict:
         """Compute and draw everything again from the first frame on, and compare hashes, states and every row of the picture.
@@ -185,8 +185,8 @@ class Replay:
                 redraw.watch(world)
                 if entry.kind == "frame":
                     now = checkpoint.keep(world, pairs=False)
-                    same = _brief(world, now) == entry.data["hash"] and world.time == entry.data["time"]
-                    x = redraw.shown(now.position(len(world.particles)))
+                    same = _short_hash(world, now) == entry.data["hash"] and world.time == entry.data["time"]
+                    x = redraw.drawn_positions(now.position(len(world.particles)))
                     x32 = x.astype(np.float32)
                     off = _differing(x32, self._shown(entry.frame, x32.shape))
                     if same and off is not None:
@@ -196,7 +196,7 @@ class Replay:
                         same = False
                     why = redraw.frame(entry, now, x, x32)
                 elif entry.kind == "state":
-                    now, then = checkpoint.keep(world), _kept(entry, world)
+                    now, then = checkpoint.keep(world), _recorded_checkpoint(entry, world)
                     same = checkpoint.digest(world, now) == checkpoint.digest(world, then)
                     changed = (k for k, v in now.values.items() if k in then.values and len(v) == len(world.particles))
                     found = (_differing(now.values[k], then.values[k]) for k in changed)
@@ -208,7 +208,7 @@ class Replay:
                 elif entry.kind == "thinned":
                     redraw.thinned(entry)
                 elif entry.kind == "turned":
-                    redraw.turned(entry.data["features"])
+                    redraw.record_knobs(entry.data["features"])
                 elif entry.kind == "end":
                     same = "hash" not in entry.data or world.hash() == entry.data["hash"]
                     why = redraw.end(entry)
@@ -224,7 +224,7 @@ class Replay:
                 world.close()
         if wrong is not None:
             before = sum(frame < wrong for frame in self._frames)
-            return self._changed(before, known, wrong, off, self._judge(wrong, entry.frame, off))
+            return self._changed(before, known, wrong, off, self._mismatch(wrong, entry.frame, off))
         dim = self._entries[0].arrays["position"].shape[1]
         result = compare(contents, redraw, f"tiverlet_{dim}d", self.complete)
         if isinstance(result, tuple):
@@ -246,7 +246,7 @@ class Replay:
     def _changed(self, frames: int, known: int, frame: int | None, particle: int | None, why: str) -> Verdict:
         return Verdict("changed", frames, known, frame, particle, f"{self.path}: {plain(why)}")
 
-    def _judge(self, frame: int, seen: int, particle: int | None) -> str:
+    def _mismatch(self, frame: int, seen: int, particle: int | None) -> str:
         where = "" if particle is None else f", first particle {particle}" + (f" (seen in frame {seen})" if seen != frame else "")
         return f"frame {frame} does not come out as recorded{where}. {self._why()}"
 
@@ -261,12 +261,12 @@ class Replay:
         """Make a world in the state of entry `start`."""
         state, base = self._entries[start], max(k for k in range(start) if self._entries[k].kind == "scene")
         source = self._entries[base]
-        before = [turned for e in self._entries[base:start] if e.kind == "turned" for turned in self._turned(e)]
+        before = [values for e in self._entries[base:start] if e.kind == "turned" for values in self._knob_values(e)]
         once = state.data.get("once", [[] for _ in source.data["features"]])
         world = scene.rebuild(source.data, source.arrays, self._given, before, once)
-        _settle(world, [e.data["now"] for e in self._entries[: start + 1] if "now" in e.data][-1])
-        checkpoint.install(world, _kept(state, world), state.data["flags"])
-        world._runner.scene.reach = tuple(state.data["reach"])
+        _set_controller(world, [e.data["now"] for e in self._entries[: start + 1] if "now" in e.data][-1])
+        checkpoint.install(world, _recorded_checkpoint(state, world), state.data["flags"])
+        world._runner.scene.multipliers_per_newton = tuple(state.data["reach"])
         return world
 
     def _run(self, start: int, end: int) -> Iterator[tuple["World", Entry]]:
@@ -292,26 +292,26 @@ class Replay:
                 world.step(dt)
         world.substeps, world.iterations = settings["substeps"], settings["iterations"]
         if entry.kind == "turned":
-            for k, values in self._turned(entry):
-                scene.turn(world.features[k], values)
+            for k, values in self._knob_values(entry):
+                scene.set_knobs(world.features[k], values)
         elif entry.kind == "taken":
-            checkpoint.install(world, _kept(entry, world), entry.data["flags"])
-            world._runner.scene.reach = tuple(entry.data["reach"])
+            checkpoint.install(world, _recorded_checkpoint(entry, world), entry.data["flags"])
+            world._runner.scene.multipliers_per_newton = tuple(entry.data["reach"])
         elif entry.kind == "assigned":
             if entry.data["name"] not in ("position", "velocity", "spin"):
                 raise ValueError(f"replay: {self.path} says that {plain(entry.data['name'])!r} was assigned.")
             setattr(world, entry.data["name"], entry.arrays["value"])
         if "now" in entry.data:
-            _settle(world, entry.data["now"])
+            _set_controller(world, entry.data["now"])
 
-    def _turned(self, entry: Entry) -> list[scene.Turned]:
+    def _knob_values(self, entry: Entry) -> list[scene.KnobValues]:
         return [
             (int(k), {name: scene.decode(v, entry.arrays) for name, v in values.items()})
             for k, values in entry.data["features"].items()
         ]
 
     @property
-    @_clear
+    @_with_clear_errors
     def scenes(self) -> list[tuple[Entry, list[int], list[tuple[int, int, dict[str, Any]]]]]:
         """The entry of each scene, the frames that show it, and the knobs set in it: (frame, number of the feature, knobs).
 
@@ -323,14 +323,14 @@ class Replay:
                 out.append((e, [], []))
                 waiting = []
             elif e.kind == "turned":
-                waiting += self._turned(e)
+                waiting += self._knob_values(e)
             elif e.kind == "frame" and e.frame in self._frames:
                 out[-1][1].append(e.frame)
                 out[-1][2].extend((e.frame, k, values) for k, values in waiting)
                 waiting = []
         return out
 
-    @_clear
+    @_with_clear_errors
     def parts(self, entry: Entry) -> scene.Parts:
         """Return particles and features of a scene, by its entry, for inspection without a world."""
         return scene.parts(entry.data, entry.arrays)
@@ -392,17 +392,17 @@ def _compiler(environment: dict[str, Any]) -> str:
     return plain(str(environment["compiler"])).partition(" ")[0]
 
 
-def _settle(world: "World", settings: list) -> None:
+def _set_controller(world: "World", settings: list) -> None:
     """Set substeps, iterations and the controller's memory as recorded."""
     world.substeps, world.iterations, world._controller.memory = *settings[:2], tuple(settings[2])
 
 
-def _brief(world: "World", kept: checkpoint.Checkpoint) -> str:
+def _short_hash(world: "World", kept: checkpoint.Checkpoint) -> str:
     """Return the hash of a state in the short form of the journal."""
     return journal.brief(checkpoint.digest(world, kept))
 
 
-def _kept(entry: Entry, world: "World") -> checkpoint.Checkpoint:
+def _recorded_checkpoint(entry: Entry, world: "World") -> checkpoint.Checkpoint:
     values = {name: value for name, value in entry.arrays.items() if name != journal.PARTED}
     clock = Clock.of(entry.data["clock"] | {"_parted": entry.arrays.get(journal.PARTED)})
     kept = checkpoint.Checkpoint(values, clock, world._controller.memory)

@@ -20,7 +20,7 @@ import numpy as np
 from . import reader
 
 PATIENCE = 120.0  # [s] allowed for reading, plus 1 s per MB of the file
-ENOUGH = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "ARROW_DEFAULT_MEMORY_POOL": "system"}
+SINGLE_THREADED = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "ARROW_DEFAULT_MEMORY_POOL": "system"}
 
 
 class Contents:
@@ -69,7 +69,7 @@ def read(path: str, rows: bool = False) -> Contents:
         words = [sys.executable, "-I", "-S", "-B", reader.__file__, str(out.fileno()), "rows" if rows else "read", *paths]
         process = subprocess.Popen(
             words, stdin=file, stdout=subprocess.PIPE, stderr=subprocess.PIPE, pass_fds=(out.fileno(),),
-            env={**os.environ, **ENOUGH},
+            env={**os.environ, **SINGLE_THREADED},
         )  # fmt: skip
         try:
             said, wrong = process.communicate(timeout=PATIENCE + size / 1e6)
@@ -79,14 +79,14 @@ def read(path: str, rows: bool = False) -> Contents:
             process.kill()
             process.wait()
         if process.returncode:
-            raise ValueError(f"replay: {path} cannot be read: {_ended(process.returncode, wrong)}.")
+            raise ValueError(f"replay: {path} cannot be read: {_end_reason(process.returncode, wrong)}.")
         found = json.loads(said)
         if "foreign" in found:
             raise ValueError(f"replay: {path} is not an .rrd file (or one of an old version of rerun).")
         return Contents(found, mmap.mmap(out.fileno(), 0, access=mmap.ACCESS_READ) if os.fstat(out.fileno()).st_size else b"")
 
 
-def _ended(status: int, wrong: bytes) -> str:
+def _end_reason(status: int, wrong: bytes) -> str:
     """Return why the reading process ended."""
     if status < 0:
         return f"it ends the process that reads it ({signal.Signals(-status).name})"

@@ -30,7 +30,7 @@ PUBLIC = {
     for name, kind in vars(module).items()
     if isinstance(kind, type) and issubclass(kind, (Feature, Solver))
 } | {"Sleep": Sleep}  # fmt: skip
-Turned = tuple[int, dict[str, Any]]  # the number of a feature, and the values of its knobs
+KnobValues = tuple[int, dict[str, Any]]  # the number of a feature, and the values of its knobs
 TAKES = {
     "Force": ("function",),
     "PairForce": ("function", "potential"),
@@ -125,7 +125,7 @@ def knobs(feature: Feature) -> dict[str, Any]:
     return {name: vars(feature)[name] for name in knobs_of(type(feature)) if name in vars(feature)}
 
 
-def turn(feature: Feature, values: Mapping[str, Any]) -> None:
+def set_knobs(feature: Feature, values: Mapping[str, Any]) -> None:
     """Set knobs together: some are checked against each other, so setting them one by one would depend on the order."""
     if wrong := set(values) - set(knobs_of(type(feature))):
         raise ValueError(f"replay: {feature!r} has no knob {sorted(wrong)[0]!r}.")
@@ -223,7 +223,7 @@ def parts(scene: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Parts:
         if any(isinstance(value, dict) and "given" in value for value in (data["class"], *data["arguments"].values())):
             continue
         feature = _made(data, Feature, arrays, {})
-        turn(feature, {name: decode(value, arrays) for name, value in data["knobs"].items()})
+        set_knobs(feature, {name: decode(value, arrays) for name, value in data["knobs"].items()})
         if isinstance(feature, Batch | Collider):  # sets the dimension, and the orientation of surfaces
             came = Particles(decode(data["start"], arrays)) if "start" in data else particles
             feature.prepare(came, came.inv_mass.copy())
@@ -237,13 +237,13 @@ def _particles(scene: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Parti
 
 
 def rebuild(
-    scene: dict[str, Any], arrays: Mapping[str, np.ndarray], given: Mapping[str, Any], turned: list[Turned],
+    scene: dict[str, Any], arrays: Mapping[str, np.ndarray], given: Mapping[str, Any], knob_values: list[KnobValues],
     once: list[list[str]],
 ) -> "World":  # fmt: skip
     """Make a world from a scene and the knobs set since.
 
-    turned: numbers of features, and their knobs. once: for each feature, the names in `compiled_for` that its kernels had, even
-    if the present knobs no longer need them.
+    knob_values: numbers of features, and their knobs. once: for each feature, the names in `compiled_for` that its kernels had,
+    even if the present knobs no longer need them.
     """
     from ..world import World
 
@@ -265,14 +265,14 @@ def rebuild(
         start = decode(data["start"], arrays) if "start" in data else None
         starts.append(None if start is None else particles.regrouped(everyone, position=start))
         feature = _made(data, Feature, arrays, given)
-        turn(feature, {name: decode(value, arrays) for name, value in data["knobs"].items()})
+        set_knobs(feature, {name: decode(value, arrays) for name, value in data["knobs"].items()})
         features.append(feature)
-    for k, values in turned:
-        turn(features[k], values)
+    for k, values in knob_values:
+        set_knobs(features[k], values)
     for feature, names in zip(features, once, strict=True):
         if not {*names} <= {*feature.compiled_for}:
             raise ValueError(f"replay: kernels of {feature!r} cannot have {names}.")
-        feature.once = frozenset(names)
+        feature.compiled_so_far = frozenset(names)
     settings = dict(scene["settings"])
     settings["solver"] = _made(settings["solver"], Solver, arrays, given)
-    return World._of(particles, tuple(features), starts, **settings)
+    return World._from_starts(particles, tuple(features), starts, **settings)

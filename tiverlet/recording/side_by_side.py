@@ -14,7 +14,7 @@ from ..world import World
 from ..worlds.worlds import Worlds
 from . import scene
 from .overlays import Overlays
-from .sink import BACKLOG, LOOK, SMALL, Sink, file_error
+from .sink import BACKLOG, CHECK_INTERVAL, SMALL, Sink, file_error
 
 MOST = 64  # most views in a recording
 FEW = 9  # views by default
@@ -59,8 +59,8 @@ class WorldsRecorder:
             raise ValueError(f"WorldsRecorder: the folder {folder} does not exist. Make it first: os.makedirs({folder!r}).")
         self.frames = self._calls = self._flushed = 0
         self._before = self._last = 0.0  # [s] the total time before the last reset; the time of the last frame
-        self._looked = perf_counter()
-        with interrupts.whole:
+        self._checked_at = perf_counter()
+        with interrupts.deferred_signals:
             self._open(overlays, overwrite)
 
     def _open(self, overlays: Overlays, overwrite: bool) -> None:
@@ -109,9 +109,9 @@ class WorldsRecorder:
         if bytes_drawn - self._flushed > BACKLOG:
             self._sink.flush()
             self._flushed = bytes_drawn
-        if perf_counter() - self._looked > LOOK:
+        if perf_counter() - self._checked_at > CHECK_INTERVAL:
             self._sink.check()
-            self._looked = perf_counter()
+            self._checked_at = perf_counter()
         self._fail()
 
     def _draw(self) -> None:
@@ -178,15 +178,15 @@ class _View:
         """Draw the world's present state."""
         self.drawing.world = world
         now = [scene.knobs(f) for f in world.features]
-        turned = [i for i, (new, old) in enumerate(zip(now, self._known, strict=True)) if not old or not _equal(new, old)]
+        changed = [i for i, (new, old) in enumerate(zip(now, self._known, strict=True)) if not old or not _equal(new, old)]
         self._known = now
         broken = sum(int(f.broken.sum()) for f in world.features if getattr(f, "breaks", False))  # type: ignore[attr-defined]
-        x, radius = self.drawing.shown(world.position), world.particles.radius[:, None]
+        x, radius = self.drawing.drawn_positions(world.position), world.particles.radius[:, None]
         some = np.isfinite(x).all(axis=1)
         if some.any():
             self.low = np.minimum(self.low, (x - radius)[some].min(axis=0))
             self.high = np.maximum(self.high, (x + radius)[some].max(axis=0))
-        self.drawing.frame(x, x.astype(np.float32), turned, broken != self._broken)
+        self.drawing.frame(x, x.astype(np.float32), changed, broken != self._broken)
         self._broken = broken
 
 

@@ -15,7 +15,7 @@ from .reader import SEAL
 
 WAIT = 10.0  # [s] longest wait for a flush
 PIECE = 1 << 20  # bytes read at a time
-LOOK = 0.2  # [s] between checks that the file still exists
+CHECK_INTERVAL = 0.2  # [s] between checks that the file still exists
 BACKLOG = 32 << 20  # most bytes waiting to be written
 SMALL = 2 << 20  # a file of fewer bytes is rewritten when it is closed: rows take less when put together
 TICK = 0.1  # [s] rerun's interval of sending rows older than that, so a row waits for at most two intervals
@@ -53,13 +53,14 @@ class Sink:
             if isinstance(e, FileExistsError):
                 raise
             raise type(e)(e.errno, f"Recorder: {path} cannot be written ({e.strerror}); choose another place") from None
-        self._look()
+        self._remember_file()
         self._copy: threading.Thread | None = None
-        self._rest, self._past, self._ended = bytearray(), HEADER, False  # part of a message; bytes of the header to pass on
+        # part of a message; bytes of the header to pass on
+        self._partial_message, self._header_left, self._ended = bytearray(), HEADER, False
         self._busy = threading.Lock()
         if os.path.isdir("/dev/fd"):
             self._out, into = os.pipe()
-            self._copy = threading.Thread(target=self._pump, daemon=True)
+            self._copy = threading.Thread(target=self._copy_messages, daemon=True)
             self._copy.start()
             self._open(f"/dev/fd/{into}", blueprint, viewer)
             os.close(into)
@@ -89,18 +90,18 @@ class Sink:
         if not os.path.isdir("/dev/fd"):
             return open(self.path, "wb", buffering=0)
         os.close(os.open(self.path, os.O_WRONLY))  # raises if the file is not writable
-        self._new = self._beside()
+        self._new = self._temporary_name()
         return open(self._new, "xb", buffering=0)
 
-    def _beside(self) -> str:
+    def _temporary_name(self) -> str:
         """Return a name for a file that will replace the recording's."""
         folder, name = os.path.split(os.path.realpath(self.path))
         return os.path.join(folder, f".{name}.{uuid.uuid4().hex[:8]}")
 
-    def _look(self) -> None:
+    def _remember_file(self) -> None:
         found = os.fstat(self._file.fileno())
         self._regular = stat.S_ISREG(found.st_mode)
-        self._same = (found.st_dev, found.st_ino)
+        self._file_id = (found.st_dev, found.st_ino)
 
     def keep(self) -> None:
         """Give the file its final name."""
@@ -110,22 +111,22 @@ class Sink:
 
     def discard(self) -> None:
         """Remove the file, if it is a regular file; one that was to be overwritten stays."""
-        if self._regular and self._own(self._new or self.path):
+        if self._regular and self._is_own_file(self._new or self.path):
             os.unlink(self._new or self.path)
 
-    def _own(self, path: str) -> bool:
+    def _is_own_file(self, path: str) -> bool:
         try:
             found = os.stat(path)
         except OSError:
             return False
-        return (found.st_dev, found.st_ino) == self._same
+        return (found.st_dev, found.st_ino) == self._file_id
 
     def check(self) -> None:
         """Set `error` if the file was removed or replaced by another one."""
-        if self._regular and self.error is None and not self._own(self._new or self.path):
+        if self._regular and self.error is None and not self._is_own_file(self._new or self.path):
             self.error = FileNotFoundError(errno.ENOENT, "the file was removed or replaced")
 
-    def _pump(self) -> None:
+    def _copy_messages(self) -> None:
         """Copy messages until rerun closes the pipe. Reading and writing share one lock, so that flush() waits for both."""
         while True:
             select.select([self._out], [], [])
@@ -135,35 +136,35 @@ class Sink:
                     break
                 if self.error is None:
                     try:
-                        self._take(piece)
+                        self._process(piece)
                     except Exception as e:  # keep reading the pipe, or rerun would wait forever
                         self.error = e
         os.close(self._out)
 
-    def _take(self, piece: bytes) -> None:
-        self._rest += piece
+    def _process(self, piece: bytes) -> None:
+        self._partial_message += piece
         at = 0
         while not self._ended:
-            if self._past:  # the header of the file
-                if len(self._rest) < self._past:
+            if self._header_left:  # the header of the file
+                if len(self._partial_message) < self._header_left:
                     return
-                self._put(self._rest[: self._past])
-                at, self._past = self._past, 0
-            if len(self._rest) - at < HEAD.size:
+                self._put(self._partial_message[: self._header_left])
+                at, self._header_left = self._header_left, 0
+            if len(self._partial_message) - at < HEAD.size:
                 break
-            kind, length = HEAD.unpack_from(self._rest, at)
+            kind, length = HEAD.unpack_from(self._partial_message, at)
             if kind == END:
                 seal = SEAL + self._sum.digest()
                 self._put(HEAD.pack(END, len(seal)) + seal)
                 self._ended = True
-            elif len(self._rest) - at - HEAD.size < length:
+            elif len(self._partial_message) - at - HEAD.size < length:
                 break
             else:
-                message = bytes(self._rest[at + HEAD.size : at + HEAD.size + length])
+                message = bytes(self._partial_message[at + HEAD.size : at + HEAD.size + length])
                 message = smaller(message) if kind == CHUNK else message
                 self._put(HEAD.pack(kind, len(message)) + message)
                 at += HEAD.size + length
-        del self._rest[: len(self._rest) if self._ended else at]
+        del self._partial_message[: len(self._partial_message) if self._ended else at]
 
     def _put(self, data: bytes | bytearray) -> None:
         left = memoryview(data)
@@ -187,7 +188,7 @@ class Sink:
             old = os.path.realpath(self.path) if self._new is None else self._new
             with open(old, "rb") as file:
                 data = file.read()
-            new, before, taken = self._beside(), (self._file, self._sum, self.bytes), False
+            new, before, taken = self._temporary_name(), (self._file, self._sum, self.bytes), False
             try:
                 self._file, self._sum, self.bytes = open(new, "xb", buffering=0), hashlib.sha256(), 0
                 os.chmod(new, stat.S_IMODE(os.fstat(before[0].fileno()).st_mode))
@@ -204,7 +205,7 @@ class Sink:
                     self._file, self._sum, self.bytes = before
             if taken:
                 before[0].close()
-            self._look()
+            self._remember_file()
         return taken
 
     def forked(self) -> bool:

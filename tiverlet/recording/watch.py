@@ -45,11 +45,11 @@ def address(live: bool | str) -> str | None:
         url = viewer.url_of(here, port)
         print(f"Recorder: watch it at {url}", flush=True)
         webbrowser.open(url)
-    _await(process, port)
+    _wait_for_port(process, port)
     return f"rerun+http://{viewer.LOCAL}:{port}/proxy"
 
 
-def _await(process: subprocess.Popen, port: int) -> None:
+def _wait_for_port(process: subprocess.Popen, port: int) -> None:
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end and process.poll() is None:
         with socket.socket() as s:

@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 from rich.progress import Progress
 
-from .output import said
+from .output import error_line
 
 T = TypeVar("T")
 Done = tuple[T, Any, str]  # a part, its result or None, and the error or ""
@@ -31,7 +31,7 @@ def _here(function: Callable[[T], Any], parts: Iterable[T]) -> Iterator[Done[T]]
         try:
             made, why = function(part), ""
         except Exception as error:
-            made, why = None, said(error)
+            made, why = None, error_line(error)
         yield part, made, why
 
 
@@ -41,10 +41,10 @@ def _submitted(function: Callable[[T], Any], parts: Iterable[T], executor: Any) 
         try:
             waiting[executor.submit(function, part)] = part
         except Exception as error:  # a pool that has lost a worker accepts no more jobs
-            yield part, None, said(error)
+            yield part, None, error_line(error)
     for future in as_completed(waiting):
         try:
             made, why = future.result(), ""
         except Exception as error:
-            made, why = None, said(error)
+            made, why = None, error_line(error)
         yield waiting[future], made, why

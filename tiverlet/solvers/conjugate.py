@@ -67,7 +67,7 @@ class ConjugateGradient(Solver):
     def system(self, scene: Scene, batches: list[Batch], slots: Slots) -> "CGSystem | None":
         """Return the system of a scene on the device; None where no constraint is solved together with others."""
         scalars = [b for b in solvable(batches) if b.side == 0]
-        joined = any((~b.relaxed_alone(scene) & ~b.idle(scene.inv_mass)).any() for b in scalars)
+        joined = any((~b.relaxed_alone(scene) & ~b.immovable(scene.inv_mass)).any() for b in scalars)
         return CGSystem(scene, batches, slots, scalars, self.steps) if joined else None
 
     def remedy(self, batches: list[Batch], slots: Slots, inv_mass: np.ndarray) -> str:

@@ -105,7 +105,7 @@ class System:
 
     def count_relaxed_alone(self, batches: "list[Batch]") -> int:
         """Return how many constraints with a movable particle are relaxed by themselves."""
-        return sum(int((~b.idle(self.inv_mass) & (self.row(b) < 0)).sum()) for b in batches)
+        return sum(int((~b.immovable(self.inv_mass) & (self.row(b) < 0)).sum()) for b in batches)
 
     def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
         """Reset data learnt from earlier positions, after particles were put elsewhere.

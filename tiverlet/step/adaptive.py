@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import checks
+from ..constraints.core.scalar import Scalar
+from ..constraints.path import Path
 from ..solvers.slots import TENSEST
 from . import checkpoint, energy_bound
 from .clock import room
@@ -21,6 +23,7 @@ MOST = 4096  # substeps of a frame
 PASSES = 64  # iterations of a substep
 RESIDUAL, OVERLAP = 1e-2, 0.1  # aims if no tolerance is given
 TENSION = 2.0  # (omega h)^2 across a tension: half the limit of stability
+STIFF = 2.0  # omega h from which on a spring is as good as rigid
 FORCE = 0.06  # (omega h)^2 in forces: 25 substeps per period, as in molecular dynamics
 RISKS = {"tunnelling-risk", "stiff-force", "non-finite"}
 GAIN = 1.4  # factor by which twice the effort must lower a figure; second order lowers it by 4, first order by 2
@@ -30,7 +33,7 @@ ROOM = 6.0  # factor by which all figures must be better than their aims before 
 PLENTY = 24.0  # four times that: after a try with half the effort there is still room, so failures are forgotten
 PATIENCE = 64  # most frames between two tries with less effort
 
-Figures = tuple[float, ...]  # residual, overlap, tension, turn, stiffness and energy, relative to their aims
+Figures = tuple[float, ...]  # residual, overlap, tension, motion, stiffness and energy, relative to their aims
 TENSE, ENERGY = 2, 5  # the indices of the tension and of the energy, which is the last, in Figures
 NOTHING: Figures = (1.0,) * 6
 WORST: Figures = (float("inf"),) * 6
@@ -47,7 +50,8 @@ class StepController:
     figures that stay wrong. If each try adds more energy than the one before, violations could not be removed first, and the
     best of the tries is kept.
     A body that turns by phi in a substep turns too fast or too slowly by phi^2 / 24 of that. This is a relative error like the
-    residual: for the 26 degrees above it is 1e-2, and a tolerance also applies to the turns of rigid constraints.
+    residual: for the 26 degrees above it is 1e-2. A tolerance also applies to the turns of rigid constraints and of beads on
+    curves, and to the vibrations of springs, see vibration_error().
     In the same way, motion in forces that vary in space is too fast by (omega h)^2 / 24; by default (omega h)^2 may be 0.06. A
     frame whose energy is wrong by more than a fiftieth of the kinetic energy, see energy_bound.missed(), is repeated as long as
     that helps. If it does not help, the frame counts as good, since the energy before it was computed with longer substeps.
@@ -95,8 +99,8 @@ class StepController:
             report = world._runner.advance(dt, n, k)
             took = perf_counter() - begun
             self.learn(took / (n * k))
-            angle, missed = turned(world) if tolerance else 0.0, energy_bound.missed(world, report, energy)
-            figures, risks = judge(report, tolerance, angle, stiffness(world), missed)
+            motion, missed = motion_error(world) if tolerance else 0.0, energy_bound.missed(world, report, energy)
+            figures, risks = judge(report, tolerance, motion, stiffness(world), missed)
             if tries.note(figures, risks, report.energy, world._runner.sheet.item(KINETIC)):
                 break
             if not tries.verdict and perf_counter() + 2 * took > end:
@@ -195,12 +199,55 @@ class Tries:
         return False
 
 
-def turned(world: "World") -> float:
-    """Return the largest angle [rad] by which a corner of a rigid constraint turned about its first one in the last substep."""
+def motion_error(world: "World") -> float:
+    """Return the largest relative error of the speed of constraints: phi^2 / 24 if they turn by phi in a substep, and the error
+    of springs, see vibration_error()."""
     state, memory = world._runner.scene.state, world._runner.memory
     x = state.get(memory)
-    d, worst = memory.read(state.d)[: len(x)].astype(np.float64), 0.0
+    d = memory.read(state.d)[: len(x)].astype(np.float64)
+    return max(turned(world, x, d) ** 2 / 24, vibration_error(world, x, d))
+
+
+def vibration_error(world: "World", x: np.ndarray, d: np.ndarray) -> float:
+    """Return the largest relative error of springs that vibrate, after a last move d to x [m].
+
+    For an amplitude A, relative to the size of the spring, it is A times
+
+        omega_h / omega - 1 = (omega h)^2 (1 / 24 - W / (8 w)),    omega^2 = w / alpha
+
+    with W = w of split masses: the step solves it as a spring of compliance alpha + W h^2 / 4, see Equation. A is the amplitude
+    that its speed would reach, |f - f_0| / (omega h), where f is its length now and f_0 before the substep. A spring stiffer than
+    the substep, from omega h = 2 on, does not vibrate, and is right to |f - f_0|.
+    """
+    runner, h, worst = world._runner, world._clock.h, 0.0
+    for b in runner.batches:
+        if not (isinstance(b, Scalar) and b.arity and h):
+            continue
+        some = (b.compliance > 0) & ~b.broken
+        if some.any():
+            squares, split = (b.gradients(x) ** 2).sum(axis=2), runner.memory.read(runner.scene.slots.split)[: len(x)]
+            w, shared = ((each[b.indices] * squares).sum(axis=1) for each in (runner.scene.inv_mass, split))
+            some &= w > 0
+            now, before = (b.violation(each) for each in (x, x - d))
+            if b.side:
+                now, before = (np.maximum(b.side * each, 0) for each in (now, before))
+            changed = np.abs(now - before) * b.inverse_size(x)
+            omega = np.minimum(h * np.sqrt(w[some] / b.compliance[some]), STIFF)
+            worst = max(worst, float((changed[some] * omega * (shared[some] / w[some] / 8 - 1 / 24)).max(initial=0.0)))
+    return worst
+
+
+def turned(world: "World", x: np.ndarray, d: np.ndarray) -> float:
+    """Return the largest angle [rad] by which a corner of a rigid constraint turned about its first one in the last substep, or a
+    bead with its curve, after a move d to x [m]."""
+    memory, worst = world._runner.memory, 0.0
     for b in world._runner.batches:
+        if isinstance(b, Path) and b.curve.smooth:
+            place, who = b.dev.place, b.indices[:, 0]
+            s = b.curve.starts[memory.read(place.piece)[: b.count]] + memory.read(place.rest)[: b.count]
+            way = b.curve.tangent(s)
+            back = b.curve.tangent(s - (way * d[who]).sum(axis=1))
+            worst = max(worst, float(((way - back) ** 2).sum(axis=1).max()))
         rigid = np.broadcast_to(getattr(b, "compliance", 0.0) == 0, b.count)
         if b.count and b.indices.size > b.count and rigid.any() and not getattr(b, "side", 0):
             starts = np.arange(b.count + 1) * b.arity if b.arity else b.members.starts
@@ -237,9 +284,9 @@ def pumps(energies: list[float], kinetic: float) -> bool:
 
 
 def judge(
-    report: StepReport, tolerance: float | None, angle: float, stiffness: float, missed: float
+    report: StepReport, tolerance: float | None, motion: float, stiffness: float, missed: float
 ) -> tuple[Figures, set[str]]:  # fmt: skip
-    """Return residual, overlap, tension, turn, stiffness and energy relative to their aims (1: just met), and the risks that
+    """Return residual, overlap, tension, motion, stiffness and energy relative to their aims (1: just met), and the risks that
     shorter substeps must remove."""
     risks = set(report.flags & RISKS)
     if report.turn:
@@ -250,7 +297,7 @@ def judge(
         report.residual / (tolerance or RESIDUAL),
         report.overlap / (tolerance or OVERLAP),
         report.tension / TENSION,
-        angle**2 / (24 * (tolerance or RESIDUAL)),
+        motion / (tolerance or RESIDUAL),
         stiffness / (24 * tolerance if tolerance else FORCE),
         missed,
     )

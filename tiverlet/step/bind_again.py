@@ -2,8 +2,8 @@
 
 The fields of a constraint depend on all constraints: slots are ordered by particle, and systems by elimination. So the code that
 binds constraints when a world is built runs once more. Each field that it declares is one that exists already, see
-device/again.py. If it would declare other fields, or kernels could read anything else than before, nothing is changed, and the
-world is rebuilt.
+device/redeclaration.py. If it would declare other fields, or kernels could read anything else than before, nothing is changed,
+and the world is rebuilt.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ import numpy as np
 
 from ..constraints.core.anchored import refuse_held_twice
 from ..contact.exclusions import excluded_pairs
-from ..device.again import Again, Differs
+from ..device.redeclaration import DeclarationsDiffer, Redeclaration
 from ..features.extending import extended
 from ..features.feature import Batch, Feature
 from ..features.regrouping import Regrouping
@@ -30,7 +30,7 @@ class Bound:
     extended.
     """
 
-    again: Again
+    again: Redeclaration
     inv_mass: np.ndarray
     linked: np.ndarray
     attributes: list[tuple[Any, dict[str, Any], dict[str, Any]]]
@@ -50,7 +50,7 @@ def bound_again(
     runner, scene, memory = world._runner, world._runner.scene, world._runner.memory
     drivers, batches = runner.step.drivers, runner.batches
     bound = [*drivers, *batches]
-    if not (set(extend) <= set(bound)) or any(f.afresh for f in bound):
+    if not (set(extend) <= set(bound)) or any(f.needs_new_state for f in bound):
         return None
     if not batches or any(f.changed and f not in drivers for f in bound):
         return None
@@ -70,7 +70,7 @@ def bound_again(
                 f.prepare(f.start, inv_mass)
         _check(world, now, int(np.count_nonzero(number >= 0)), drivers, batches, inv_mass)
         scene.particles, scene.inv_mass = now, inv_mass
-        with memory.again({scene.count: now.count}) as again:
+        with memory.redeclare({scene.count: now.count}) as again:
             system = scene.slots.system
             with memory.owned("slots"):
                 scene.slots.__init__(scene, batches, world._solver)
@@ -81,15 +81,15 @@ def bound_again(
                     f.bind(scene)
                 if f in ramps:
                     f.ramp.adopt(ramps[f])
-                f.built()
-        if not (memory.holds(again.longest) and scene.slots.exact == exact and _structure(scene, bound) == structure):
+                f.note_built()
+        if not (memory.has_room(again.longest) and scene.slots.exact == exact and _structure(scene, bound) == structure):
             return None
         linked = excluded_pairs(batches, now.radius)
         if runner.search and not runner.search.can_exclude(linked):
             return None
         attributes = [(one, old, dict(vars(one))) for one, old in zip(objects, before, strict=True)]
         return Bound(again, inv_mass, linked, attributes, kept, more)
-    except Differs:
+    except DeclarationsDiffer:
         return None
     finally:
         for one, values in zip(objects, before, strict=True):
@@ -98,14 +98,14 @@ def bound_again(
 
 
 def _check(world: Any, now: Particles, first: int, drivers: list[Batch], batches: list[Batch], inv_mass: np.ndarray) -> None:
-    """Raise Differs if other batches would act than before, and ValueError where building a world would.
+    """Raise DeclarationsDiffer if other batches would act than before, and ValueError where building a world would.
 
     first: the index of the first added particle.
     """
     there = [f for f in world.features if isinstance(f, Batch) and f.count]
-    acting = [f for f in there if not f.drives and (inv_mass[f.indices] > 0).any()]
-    if acting != batches or [f for f in there if f.drives] != drivers:
-        raise Differs
+    acting = [f for f in there if not f.is_kinematic and (inv_mass[f.indices] > 0).any()]
+    if acting != batches or [f for f in there if f.is_kinematic] != drivers:
+        raise DeclarationsDiffer
     refuse_held_twice(now, world.features)
     if box := world._runner.scene.periodic:
         from .misfits import refuse_misfits  # noqa: PLC0415  (it imports features that the world may not use)
@@ -121,11 +121,11 @@ def bind(world: Any, change: Regrouping, now: Bound) -> None:
     memory, particles = runner.memory, runner.scene.count
     names = {id(e.field): k for k, e in enumerate(memory.entries)}
     noted = {f: memory.scratch(f) for f in now.kept}
-    held = {k: memory.seen(memory.entries[k].field).copy() for k in now.again.state}
+    held = {k: memory.view(memory.entries[k].field).copy() for k in now.again.state}
     now.again.write()
     for k, values in held.items():
         if memory.entries[k].rows is particles:
-            memory.seen(memory.entries[k].field)[...] = values
+            memory.view(memory.entries[k].field)[...] = values
     for f, before, after in now.attributes:
         vars(f).clear()
         vars(f).update(after)
@@ -137,7 +137,7 @@ def bind(world: Any, change: Regrouping, now: Bound) -> None:
             choices = (change.some,) if getattr(vars(f.dev)[key[0]], "per_particle", False) else masks
             some = next((mask for mask in choices if len(mask) == len(values)), None)
             values = values if some is None else values[some]
-            memory.seen(memory.entries[new[key]].field)[: len(values)] = values
+            memory.view(memory.entries[new[key]].field)[: len(values)] = values
     for f, rows in noted.items():
         memory.put_scratch(f, rows, now.kept[f])
         if f.ramp and f.ramp.is_allocated:
@@ -151,9 +151,9 @@ def bind(world: Any, change: Regrouping, now: Bound) -> None:
 
 def _structure(scene: Any, bound: list[Batch]) -> Any:
     """Return a key of all that kernels can read of constraints."""
-    from ..device.patches.sharing import Writing  # noqa: PLC0415  (it uses Taichi's internals, and other worlds do not load it)
+    from ..device.patches.sharing import KernelInputs  # noqa: PLC0415  (it uses Taichi's internals; few worlds need it)
 
-    return Writing((scene.slots, *bound), known=(scene.memory, scene.state)).key
+    return KernelInputs((scene.slots, *bound), known=(scene.memory, scene.state)).key
 
 
 def _state(dev: Any, names: dict[int, int]) -> dict[tuple[str, str], int]:

@@ -127,12 +127,12 @@ def _passes(particles: Particles, features: tuple[Feature, ...], scale: Scale, c
 
     Each wall has code of its own; other features share code by kind.
     """
-    code = {f if isinstance(f, Collider) else type(f): f.bulk for f in features}
-    bulk = sum(code.values()) * (1.5 if particles.dim == 3 else 1.0)
-    often = copies is not None and copies.count >= COPIES and bulk < MIDDLING
-    if bulk > ENDLESS or (scale.particles < FEW and not often):
+    code = {f if isinstance(f, Collider) else type(f): f.code_size for f in features}
+    code_size = sum(code.values()) * (1.5 if particles.dim == 3 else 1.0)
+    often = copies is not None and copies.count >= COPIES and code_size < MIDDLING
+    if code_size > ENDLESS or (scale.particles < FEW and not often):
         return BRIEF
-    return UNSEARCHED if bulk > LONG and scale.particles < MANY else LEAN
+    return UNSEARCHED if code_size > LONG and scale.particles < MANY else LEAN
 
 
 def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, path: str, scale: Scale) -> Assembly:
@@ -145,8 +145,8 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     for first in [*of(Periodic), *of(Sleep)]:
         first.bind(scene)
     accelerations, walls = of(Acceleration), of(Collider)
-    drivers = [f for f in of(Batch) if f.drives and f.count]
-    batches = [f for f in of(Batch) if not f.drives and (scene.inv_mass[f.indices] > 0).any()]
+    drivers = [f for f in of(Batch) if f.is_kinematic and f.count]
+    batches = [f for f in of(Batch) if not f.is_kinematic and (scene.inv_mass[f.indices] > 0).any()]
     contact = next((c for c in of(PairContact) if c.matters), None)
     if contact or walls:
         scene.radius = Radii(memory, particles.radius, scene.count)
@@ -163,23 +163,30 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         if scene.order > 2:
             high_order.check_solved(batches, scene, solver)
     state.remember(
-        memory, has_friction or any(w.sweeps for w in walls) or (bounces and bool(walls)), bounces, bool(contact and walls)
+        memory,
+        has_friction or any(w.needs_start_position for w in walls) or (bounces and bool(walls)),
+        bounces,
+        bool(contact and walls),
     )
     size = size_of(path, scale.work)
     team = Team(memory, size, len(particles), path == "parallel" and size == 1, pieces=PIECES if contact else size)
-    search = contact.join(scene, batches, team) if contact else None
-    if can_have_impacts(scene, batches) and any(w.has_restitution for w in walls):
-        scene.impacts = BodyImpacts(scene, batches)
+    search = contact.make_search(scene, batches, team) if contact else None
+    if can_have_impacts(scene, batches):
+        pairs = bool(contact and contact.strikes_bodies)
+        if pairs or any(w.has_restitution for w in walls):
+            scene.impacts = BodyImpacts(scene, batches, pairs)
+        if contact and pairs:
+            contact.dev.restitution.bind(scene, scene.impacts)
     for feature in of(Batch):
         feature.scene = scene  # also for those that do nothing, because all of their particles are held
     for feature in [*accelerations, *drivers, *batches, *walls]:
         with memory.owned(feature):
             feature.bind(scene)
-    searches = [(f.join(scene, team), f.room) for f in accelerations if f.pairwise]
+    searches = [(f.make_search(scene, team), f.neighbours_per_particle) for f in accelerations if f.pairwise]
     for feature in features:
         feature.new_force = False  # the force has been on the device from the start
         feature.changed = feature in drivers  # they move to their targets in the first frame; other knobs are in fields already
-        feature.built()
+        feature.note_built()
     known = contact.known if contact else None
     forces = Forces(scene, [*accelerations, known.carried] if known else accelerations)
     integrator = Verlet(scene, forces, bool(contact)) if scene.order == 2 else high_order.Composition(scene, forces, batches)
@@ -190,7 +197,9 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         step.sleep = SleepPass(step, state.sleepers, drivers, batches)
     diagnostics = Diagnostics(step, solver)
     if search and contact:
-        search.list.allocate(int(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.room)) + 64)
+        search.list.allocate(
+            int(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.neighbours_per_particle)) + 64
+        )
     for each, room in searches:
         if each:
             each.list.allocate(len(particles) * room + 64)

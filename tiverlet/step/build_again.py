@@ -19,7 +19,7 @@ from .build import assemble
 class Rebuild:
     """A rebuild of a world with its particles in the mask `some`, added particles and these features, see edit_scene.change().
 
-    came, went: added and removed features; features that begin afresh are in both. extending: features by which others are
+    came, went: added and removed features; features whose state begins anew are in both. extending: features by which others are
     extended. If building fails, the world is left as it was.
     """
 
@@ -28,8 +28,8 @@ class Rebuild:
         extend: Mapping[Feature, Feature],
     ):  # fmt: skip
         self.world, self.some, self.added, self.features, self.before = world, some, added, features, world.features
-        self.came = [f for f in features if f not in self.before or f.afresh]
-        self.went = [f for f in self.before if f not in features or f.afresh]
+        self.came = [f for f in features if f not in self.before or f.needs_new_state]
+        self.went = [f for f in self.before if f not in features or f.needs_new_state]
         self.extending = {f: other.copy() for f, other in extend.items()}
         self.number = np.where(some, np.cumsum(some) - 1, -1)
         self.particles = world._particles.regrouped(some, added, world.position[some])
@@ -64,16 +64,21 @@ class Rebuild:
         """Store the state. If the forces on remaining particles will change, displacements become velocities first."""
         runner = self.world._runner
         runner.note_displacements()
-        pulled = (self.added is not None or not self.some.all()) and runner.step.has_pair_forces  # by other particles than before
         if any(isinstance(f, Collider) for f in self.went):
-            self.world._let_go()
-        elif pulled or self.world._force_waits or any(map(self._drives, (*self.came, *self.went, *self.extending.values()))):
+            self.world._restart_with_reactions()
+        elif self.restarts:
             with runner.memory.compiler():
                 runner.restart(self.world.iterations)
         else:
             self.old = self.checkpoint.values
             return
         self.old = checkpoint.state(self.world)
+
+    @property
+    def restarts(self) -> bool:
+        """Whether forces will be others."""
+        pulled = (self.added is not None or not self.some.all()) and self.world._runner.step.has_pair_forces  # by others
+        return pulled or self.world._has_new_force or any(map(self._drives, (*self.came, *self.went, *self.extending.values())))
 
     def _drives(self, feature: Feature) -> bool:
         """Whether adding or removing a feature changes the force on particles that remain."""
@@ -89,7 +94,7 @@ class Rebuild:
             f.release()
             f.remap_indices(self.number, len(self.particles))
         for f in self.went:
-            f.once = frozenset()
+            f.compiled_so_far = frozenset()
 
     def _assembled(self) -> Any:
         """Return the parts of the new world, see assemble()."""
@@ -134,13 +139,13 @@ class Rebuild:
         """Install the new parts in the world, with the state that was carried over."""
         world, last = self.world, self.world._runner
         contact = next((c for c in last.step.contacts if c in self.features), None)
-        reach, left = last.scene.reach, last.left
+        multipliers, left = last.scene.multipliers_per_newton, last.left
         world._clock.parted = None
         world._install(world._particles.regrouped(self.some, self.added), self.features, parts)
         runner = world._runner
         runner.memory.compiler.times.add(last.memory.compiler.times)
         runner.pass_on(left, self.some)
-        runner.scene.reach = reach
+        runner.scene.multipliers_per_newton = multipliers
         runner.memory.restore(state)
         for f, rows in self.noted.items():
             if f in self.features:

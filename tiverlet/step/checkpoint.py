@@ -70,7 +70,7 @@ def _hashed(world: "World", values: dict[str, np.ndarray]) -> dict[str, np.ndarr
     depends on the skin.
     """
     late, pieces = _late(world), _pieces(world)
-    told = {e.name for memory in world._runner.memories for e in memory.entries if e.told}
+    told = {e.name for memory in world._runner.memories for e in memory.entries if e.for_reports}
     told |= {name for name, piece in pieces.items() if piece.for_reports}
     out = {n: v for n, v in values.items() if not (n in told or n.startswith(RESTS) or (n in late and not v.any()))}
     if PAIRS in out:
@@ -139,7 +139,7 @@ def check(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
     optional = late | rests.keys()
     if set(present.values) - optional != set(kept.values) - optional:
         raise ValueError("The state is not one of this scene: it has other fields.")
-    most = {e.name: e.below for memory in world._runner.memories for e in memory.entries if e.below is not None}
+    most = {e.name: e.index_limit for memory in world._runner.memories for e in memory.entries if e.index_limit is not None}
     most[PAIRS] = len(world.particles)
     for name, value in kept.values.items():
         ours, free = present.values.get(name), name in pieces or name == PAIRS or name in late
@@ -167,7 +167,8 @@ def transfer(old: "World", new: "World") -> None:
     kept = keep(old)
     if new._precision == old._precision and new._order == old._order:
         install(new, kept, flags(old))
-        new._runner.scene.reach = old._runner.scene.reach  # the factors from multipliers to loads
+        # the factors from multipliers to loads
+        new._runner.scene.multipliers_per_newton = old._runner.scene.multipliers_per_newton
         for mine, other in zip(new.features, old.features, strict=True):
             if isinstance(mine, Batch):  # its scratch data of the last substep; not those of walls, since a clone ran no frame
                 new._runner.memory.put_scratch(mine, old._runner.memory.scratch(other))

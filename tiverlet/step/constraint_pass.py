@@ -34,7 +34,7 @@ class ConstraintPass:
         some: True for all of them, False for those whose residual needs the sums. Systems contain no such constraints, so later
         Newton steps have nothing to sum.
         """
-        for f in ti.static([f for f in self.ragged if f.reweighs or some]):
+        for f in ti.static([f for f in self.ragged if f.needs_reduce_block or some]):
             n = f.dev.corners.block_count * (1 - newton)
             for b in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                 if ti.static(bool(self.slots.state.sleepers) and some):
@@ -83,8 +83,8 @@ class ConstraintPass:
                 else:
                     out = False
         for impacts in ti.static(self.impacts):
-            if impacts.goes_on() and out:
-                out = impacts.reaches(f, c)
+            if impacts.is_later_extra_pass() and out:
+                out = impacts.is_reached(f, c)
         return out
 
     @ti.func
@@ -107,7 +107,7 @@ class ConstraintPass:
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                 for impacts in ti.static(self.impacts):
                     if now.first != 0:
-                        impacts.link(f, c)
+                        impacts.mark_linked(f, c)
                 if self.takes_part(f, c, now.newton):
                     f.dev.relax(c, now.h, h2_effective, now.frame_fraction, now.first, fresh)
         if ti.static(len(self.batches) > 0):

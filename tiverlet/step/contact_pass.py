@@ -93,6 +93,21 @@ class ContactPass:
                 self.team.wait()
 
     @ti.func
+    def push_bodies(self, now):
+        """In extra passes: push the particles of bodies that struck each other, see BodyImpacts."""
+        for c in ti.static(self.contacts):
+            if ti.static(c.has_restitution and c.strikes_bodies):
+                for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+                    if c.dev.state.awake(i):
+                        if c.dev.restitution.push_body(i):
+                            c.dev.restitution.impacts.request_pass(now)
+                self.team.wait()
+                for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+                    if c.dev.state.awake(i):
+                        c.dev.restitution.impacts.push_pair(i)
+                self.team.wait()
+
+    @ti.func
     def start_events(self, now):
         """Record the number of the substep, and at the start of a frame the pairs that touched before."""
         for c in ti.static(self.contacts):

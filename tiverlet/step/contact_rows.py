@@ -33,7 +33,7 @@ class ContactRows:
         runner.list_neighbours()
         return cls(contact.dev.geometry.candidates(runner.scene.state.get(runner.memory)), contact.start)
 
-    def idle(self, w: np.ndarray) -> np.ndarray:
+    def immovable(self, w: np.ndarray) -> np.ndarray:
         """Return a mask of rows none of whose particles can move, (m,)."""
         return (w[self.indices] == 0).all(axis=1)
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..constraints.core.corner_passes import LOST
 from ..device import runtime, ti
 from ..device.number import OnDevice
 from ..device.thread_team import LEAST
@@ -40,7 +41,7 @@ class Diagnostics:
     """
 
     host_only = ("sheet", "report", "details", "force_stiffness")
-    told_apart = True  # its compile time is reported by itself, as that of a Feature
+    has_own_compile_time = True  # its compile time is reported by itself, as that of a Feature
     n: Any = OnDevice()  # particles
 
     def __init__(self, step: "Step", solver: Solver):
@@ -318,7 +319,7 @@ class Residuals:
         if ti.static(self.step.team.size == 1):
             self.diagnostics.reduce_blocks(0, h64, fresh)
         elif ti.static(len(self.step.constraints.ragged) > 0):
-            for thread in range(self.step.team.spread):
+            for thread in range(self.step.team.loop_length):
                 if thread % LEAST == 0:
                     self.diagnostics.reduce_blocks(thread // LEAST, h64, fresh)
         for c in range(self.batch.count):
@@ -367,6 +368,7 @@ class Reporter:
         ).items():  # fmt: skip
             if there:
                 notes[flag] = self._note(flag, first, reach, overlap, moved, tension, stiff, released, residual, substeps)
+        damped = () if notes else self._damped(residual, substeps)
         report = StepReport.of(
             {
                 "time": time,
@@ -378,7 +380,7 @@ class Reporter:
                 "energy": energy,
                 "energy_change": 0.0 if before is None else energy - before,
                 "flags": frozenset(notes),
-                "notes": tuple(notes.values()),
+                "notes": (*notes.values(), *damped),
                 "bad": first,
                 "broken": int(broken),
                 "asleep": asleep,
@@ -389,6 +391,20 @@ class Reporter:
             }
         )
         return report, extent
+
+    def _damped(self, residual: float, substeps: int) -> tuple[str, ...]:
+        """A note where solvers that converge leave constraints off by so much that they act along their directions at the end of
+        the substep, which takes angular momentum from what turns, see CornerPasses. No flag: a load may do it to what is at
+        rest."""
+        slots = self.scene.slots
+        relaxes = slots and (slots.semi_iteration or (slots.system and slots.system.steps))
+        if not relaxes or residual <= LOST:
+            return ()
+        need = np.ceil(substeps * np.sqrt(residual / LOST)) + 1  # of order h^2 at least
+        return (
+            f"Constraints are off by {100 * residual:.3g} % of their size; beyond {100 * LOST:g} % they are damped: what turns "
+            f"loses energy and angular momentum. Use about {need:.7g} substeps, or more steps of the solver.",
+        )
 
     def _note(self, flag, first, reach, overlap, moved, tension, stiff, released, residual, substeps) -> str:
         """Return the note of a flag: its meaning and a remedy, with the figures of this frame."""

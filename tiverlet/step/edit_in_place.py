@@ -54,9 +54,9 @@ def planned(
     batches = [f for f in world.features if isinstance(f, Batch)]
     if not (count and len(some) and scene.order == 2):
         return None
-    if runner.launched or not all(memory.elastic and memory.holds(count + 1) for memory in runner.memories):
+    if runner.launched or not all(memory.elastic and memory.has_room(count + 1) for memory in runner.memories):
         return None
-    if any(f.changed and f.outgrown for f in world.features):
+    if any(f.changed and f.needs_other_kernels for f in world.features):
         return None
     stay = np.flatnonzero(some)
     now = world._particles.regrouped(some, added, scene.state.get(runner.memory).take(stay, axis=0))
@@ -66,7 +66,7 @@ def planned(
     change = Regrouping(some, number, scene.particles, now, inv_mass, bodies)
     came = None if added is None else added.position
     known = {id(start): start for start in (world._particles, *(f.start for f in world.features))}
-    starts = {one: now.placed(change.joined(start.position, came)) for one, start in known.items()}
+    starts = {one: now.placed(change.regrouped_rows(start.position, came)) for one, start in known.items()}
     bound, tied = None, [f for f in batches if not f.can_regroup(change)]
     if links or tied:
         if any(not f.acts for f in tied):
@@ -95,11 +95,11 @@ def regroup(world: Any, edit: Edit, added: Particles | None) -> None:
     runner, change, bound = world._runner, edit.change, edit.bound
     scene, step, memory, count = runner.scene, runner.step, runner.memory, change.now.count
     search = runner.search
-    apart = search and ((search.list.saved and change.goes) or (bound and search.exclusions_differ(bound.linked, change)))
+    apart = search and ((search.list.saved and change.has_removed) or (bound and search.exclusions_differ(bound.linked, change)))
     pairs = _pairs(search.list, change) if apart else None
     rows = scene.count
     for one in runner.memories:
-        one.regroup(rows, change.first, change.stay[change.first :], count)
+        one.regroup(rows, change.first, change.kept_indices[change.first :], count)
     rows.set(count)
     scene.particles, scene.inv_mass = change.now, change.inv_mass
     scene.state.regroup(memory, change)
@@ -150,13 +150,13 @@ def grabbing(world: Any) -> Grab | None:
     changes, for example, need a rebuild.
     """
     runner = world._runner
-    scene, pins = runner.scene, [f for f in world._features if f.changed and f.outgrown]
+    scene, pins = runner.scene, [f for f in world._features if f.changed and f.needs_other_kernels]
     if runner.sleep or runner.launched or scene.order > 2 or not runner.memory.elastic:
         return None
     for f in pins:
-        if not (f.afresh and f.acts):
+        if not (f.needs_new_state and f.acts):
             return None
-    driving, inv_mass, some = [f for f in pins if f.drives], scene.inv_mass, NOBODY
+    driving, inv_mass, some = [f for f in pins if f.is_kinematic], scene.inv_mass, NOBODY
     if driving:
         before, after = _joined([f.held for f in driving]), _joined([f.members.rows[:, 0] for f in driving])
         inv_mass, some = inv_mass.copy(), _joined([before, after])

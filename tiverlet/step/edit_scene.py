@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from .. import checks
+from ..colliders.collider import Collider
 from ..constraints.pin import Pin
 from ..contact.pair_contact import PairContact
 from ..contact.touches import ContactEvents
 from ..features.feature import Batch, Feature
 from ..neighbours.periodic import Periodic
 from ..particles import Particles
-from . import edit_in_place, impulse, initial_shape, initial_violation
+from . import edit_in_place, impulse, initial_violation, solids
 from .build import check_settings, checked_features, listed
 from .sleep import Sleep
 
@@ -90,7 +91,7 @@ def check_extended(world: Any, extend: Mapping[Feature, Feature]) -> None:
             raise ValueError(f"World.add: extend: {feature!r} does not act in this world. Add it to features.")
         if not isinstance(more, Feature):
             raise TypeError(f"World.add: extend[{feature!r}] = {more!r} is a {type(more).__name__}; write {feature!r} of others.")
-        feature.check_more(more)
+        feature.check_extension(more)
 
 
 def remove(world: Any, particles: Any, features: Iterable[Feature]) -> None:
@@ -115,6 +116,8 @@ def handle(world: Any, indices: np.ndarray) -> Handle:
 
 def chosen(world: Any, who: str, particles: Any) -> np.ndarray:
     """Return the indices of particles given as a handle, indices or a mask."""
+    if any(isinstance(f, Feature) for f in (particles if isinstance(particles, (list, tuple)) else [particles])):
+        raise TypeError(f"{who}: particles = {particles!r} are features; write features=[...].")
     array, n = np.asarray(particles), len(world.particles)
     if array.dtype == bool:
         if array.shape != (n,):
@@ -139,9 +142,10 @@ def change(
         build_again(world, some, added, features, extend)
         return
     with world._runner.memory.compiler():
-        told, (seen, loose, moved) = world._all_events(), _seen(world, some, number, features)
         others = (added is not None or not some.all()) and world._runner.step.has_pair_forces
-        if world._force_waits or others or any(more.soft for more in planned.more):
+        restarts = world._has_new_force or others or any(more.soft for more in planned.more)
+        told, (seen, loose, moved) = world._all_events(), _seen(world, some, number, features, restarts)
+        if restarts:
             world._runner.restart_between(world.iterations)
         world._clock.parted = None
         edit_in_place.regroup(world, planned, added)
@@ -166,7 +170,7 @@ def renew(world: Any) -> None:
     if seen is not None:
         had = seen[loose]
     elif not clock.d_is_velocity:
-        had = runner.memory.seen(runner.scene.state.d)[loose] / clock.h
+        had = runner.memory.view(runner.scene.state.d)[loose] / clock.h
     if grabbing.soft or not impulse.tells(runner):
         with runner.memory.compiler():
             runner.restart_between(world.iterations)
@@ -189,7 +193,7 @@ def build_again(
     world._runner.memory.check()
     again = world._rebuild(some, added, features, extend)
     before, told = world.features, world._all_events()
-    seen, loose, moved = _seen(world, some, again.number, features)
+    seen, loose, moved = _seen(world, some, again.number, features, again.restarts)
     again.run()
     walls = np.array([features.index(f) if f in features else -1 for f in before], dtype=np.int64)
     new = [*(f for f in again.came if f not in before), *again.extending.values()]
@@ -201,22 +205,24 @@ def _first_off(world: Any, new: list[Feature]) -> int | None:
     """Return the first particle of added rigid constraints and clusters that are violated; None where none is."""
     x, w = world.position, world._runner.scene.inv_mass
     clusters = [f for f in new if isinstance(f, Batch) and f.acts]
-    off = [initial_violation.first_off(new, x), initial_shape.first_off(clusters, w, x)]
+    off = [initial_violation.first_off(new, x), solids.first_off(clusters, w, x)]
     return min((i for i in off if i is not None), default=None)
 
 
 def _seen(
-    world: Any, some: np.ndarray, number: np.ndarray, features: tuple[Feature, ...]
+    world: Any, some: np.ndarray, number: np.ndarray, features: tuple[Feature, ...], restarts: bool
 ) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
     """Return velocities before an edit, the particles that it lets go, and the particles that can move: masks, (n,).
 
-    Velocities are None unless removed constraints or contacts contribute to them. The edit lets go of particles that are held by
-    rigid constraints which it removes. Driven particles cannot move.
+    Velocities are None unless removed constraints or contacts contribute to them, or the edit leaves the contribution of rigid
+    constraints, contacts and walls to the start after it. The edit lets go of particles that are held by rigid constraints which
+    it removes. Driven particles cannot move. restarts: whether displacements are about to become velocities.
     """
-    loose, loses = np.zeros(len(some), dtype=bool), world._clock.parted is not None
+    loose, clock = np.zeros(len(some), dtype=bool), world._clock
+    loses = clock.parted is not None or (restarts and any(_holds(f) for f in world.features))
     for f in world.features:
-        if isinstance(f, Pin) and f in features and f.afresh:  # a pin that takes other particles
-            if f.drives:
+        if isinstance(f, Pin) and f in features and f.needs_new_state:  # a pin that takes other particles
+            if f.is_kinematic:
                 loose[f.held] = loses = True
         elif isinstance(f, Batch | PairContact):
             stays = f.kept_mask(number)[0] if f in features else np.zeros(1, dtype=bool)
@@ -226,8 +232,13 @@ def _seen(
                     batch: Any = f
                     goes = ~np.broadcast_to(stays, f.count) & (batch.compliance == 0)
                     loose[f.indices.ravel()[goes[f.owner]]] = True
-    seen = world.velocity if loses and not world._clock.d_is_velocity else None
+    seen = clock.parted if clock.d_is_velocity or not loses else world.velocity
     return seen, loose, world._runner.scene.inv_mass > 0
+
+
+def _holds(feature: Any) -> bool:
+    """Whether it may hold particles."""
+    return feature.acts if isinstance(feature, Batch) else isinstance(feature, PairContact | Collider)
 
 
 def _edited(
@@ -257,16 +268,15 @@ def _edited(
     if seen is not None:  # removed constraints contributed to the velocities of particles that remain
         seen = seen[some] if added is None else np.concatenate([seen[some], added.velocity])
         _let_go(world, seen, np.concatenate([loose[some], np.zeros(m, dtype=bool)]))
-        if not clock.d_is_velocity:
-            clock.parted = _held(world._runner, seen, np.concatenate([moved[some], np.ones(m, dtype=bool)]))
+        clock.parted = _held(world._runner, seen, np.concatenate([moved[some], np.ones(m, dtype=bool)]))
     for watcher in world._watchers:
         watcher.regrouped()
 
 
 def _held(runner: Any, velocity: np.ndarray, moved: np.ndarray) -> np.ndarray:
     """Return velocities, (n, dim), with d / h for particles that moved freely before and are driven now. moved: (n,)."""
-    now = moved & (runner.scene.inv_mass == 0)
-    return np.where(now[:, None], runner.memory.read(runner.scene.state.d)[: runner.n] / runner.clock.h, velocity)
+    now, h = moved & (runner.scene.inv_mass == 0), 1.0 if runner.clock.d_is_velocity else runner.clock.h
+    return np.where(now[:, None], runner.memory.read(runner.scene.state.d)[: runner.n] / h, velocity)
 
 
 def _let_go(world: Any, seen: np.ndarray, loose: np.ndarray) -> None:

@@ -136,11 +136,11 @@ def _masses(world: "World") -> np.ndarray:
 
 def _pull(world: "World") -> np.ndarray:
     """Return the absolute values of the components of gravity, (dim,) [m/s^2]."""
-    pulls = [np.abs(f.settings()["g"]) for f in world.features if isinstance(f, Gravity)]
+    pulls = [np.abs(f.kernel_values()["g"]) for f in world.features if isinstance(f, Gravity)]
     return sum(pulls, np.zeros(world.particles.dim))
 
 
 def _walls(world: "World") -> list[Collider]:
     """Return the walls that are present and implement clearance(), which walls of the user need not do."""
-    walls = [f for f in world.features if isinstance(f, Collider) and f.stands]
+    walls = [f for f in world.features if isinstance(f, Collider) and f.was_active]
     return [wall for wall in walls if type(wall).clearance is not Collider.clearance]

@@ -37,7 +37,7 @@ def explain(world: "World") -> str:
         *(f"    {line}" for line in _absent(world)),
     ]
     total = sum(world.fields.values())
-    spare = sum(memory.spare for memory in world._runner.memories)
+    spare = sum(memory.spare_bytes for memory in world._runner.memories)
     room = f"; {spare} bytes more stay for what went" if spare else ""
     lines.append(f"Memory: {len(world.fields)} fields, {total} bytes, {total / max(1, len(p)):.0f} per particle{room}")
     for owner, own in groupby(sorted(world.fields, key=_owner), key=_owner):
@@ -95,9 +95,9 @@ def _present(world: "World") -> list[str]:
     out = []
     for f in world.features:
         if isinstance(f, Batch):
-            idle = int(f.idle(world._runner.scene.inv_mass).sum()) if f.count and not f.drives else 0
+            idle = int(f.immovable(world._runner.scene.inv_mass).sum()) if f.count and not f.is_kinematic else 0
             note = f", {idle} of them between particles that cannot move" if idle else ""
-            out.append(f"{f!r}: {f.count} {'driven particles' if f.drives else 'constraints'}{note}")
+            out.append(f"{f!r}: {f.count} {'driven particles' if f.is_kinematic else 'constraints'}{note}")
         elif isinstance(f, Acceleration) and f.pairwise:
             out.append(_pairs(f))
         elif isinstance(f, Acceleration):

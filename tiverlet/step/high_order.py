@@ -77,7 +77,7 @@ def refuse(order: int, features: tuple[Feature, ...], precision: str, path: str)
                 why = "can break, where motion has no derivatives of that order"
             elif not f.arity:
                 why = "has any number of corners, which this order is not made for"
-        elif isinstance(f, Batch) and not f.drives:
+        elif isinstance(f, Batch) and not f.is_kinematic:
             why = "is not one number, so that it cannot be solved exactly"
         if why:
             raise ValueError(f"{who}, but {f!r} {why}. Use order=2.")
@@ -87,7 +87,7 @@ def check_solved(batches: list[Batch], scene: Scene, solver: Solver) -> None:
     """Raise ValueError if the solver would relax a rigid constraint instead of solving it."""
     for b in batches:
         assert isinstance(b, Scalar)
-        left = ~b.acts_as_force(scene) & (scene.slots.rows(b) < 0) & ~b.idle(scene.inv_mass)
+        left = ~b.acts_as_force(scene) & (scene.slots.rows(b) < 0) & ~b.immovable(scene.inv_mass)
         if left.any():
             raise ValueError(
                 f"World: order = {scene.order} needs rigid constraints to be solved to the end, but {solver!r} relaxes {b!r} ("

@@ -228,7 +228,7 @@ def let_go(runner: Any, some: np.ndarray, want: np.ndarray, iterations: int) -> 
     first = int(some[0])
     lack = want - runner.velocity(iterations, first, int(some[-1]) + 1)[some - first]
     those = Displacements(
-        runner, moves[moves], lambda field: memory.seen(field)[some], lambda field, rows: memory.write_rows(field, some, rows)
+        runner, moves[moves], lambda field: memory.view(field)[some], lambda field, rows: memory.write_rows(field, some, rows)
     )
     those.lengthen(_factor(runner) * lack)
 
@@ -273,6 +273,6 @@ def _those(runner: Any, first: int, some: np.ndarray) -> Displacements:
     return Displacements(
         runner,
         some[None],
-        lambda field: memory.seen(field)[None, rows].copy(),
+        lambda field: memory.view(field)[None, rows].copy(),
         lambda field, v: memory.write_from(field, first, v[0]),
     )

@@ -1,10 +1,10 @@
-"""Shapes that are kept, for clusters that the user put out of them, or made rigid while they were.
+"""Rigid clusters that the user placed out of their shape, or made rigid while deformed, are restored before the first substep.
 
-A pass takes a rigid cluster back to its shape in one substep. By itself it is at rest after that, but what it is linked to, or
-stands on, it has sent off: a square that sagged on a floor by 2 cm as it was made rigid left it at 1500 m/s, at 100 substeps. So
-what initial_violation.py does for constraints that are one number is done first for clusters, and for what is linked to them:
-they go to where they are in shape and their links are met, as whole bodies, without velocity. Walls push back along the normals
-along which they stopped something. Clusters that share particles with others are left to passes.
+A pass restores a rigid cluster in one substep. The cluster itself is at rest after that, but it has thrown off linked particles
+and walls: a square that sagged by 2 cm on a floor left it at 1500 m/s when it was made rigid, at 100 substeps. So, as
+initial_violation.py does for scalar constraints, clusters and the bodies linked to them first move to where the clusters are in
+shape and the links are met, as rigid bodies and without velocity. Walls push back along the normals along which they stopped a
+particle. Clusters that share particles with others are left to the passes.
 """
 
 from typing import Any
@@ -16,26 +16,21 @@ from ..solvers.corners import bodies_of
 from .clock import MET
 from .initial_violation import ROUNDING, Rows
 from .jacobian import Jacobian
-from .overlap_release import Walls, moved, one_sided
+from .one_sided import Walls, moved, one_sided
 from .solids import Solids
 
-SEEN, BORNE = 1e-3, 4.0  # of the radius of a cluster: out of shape by more, and by so many times what its loads do to it
-ROUNDS = 64  # of Newton's method, at most, each with what walls stopped in the one before
-BETTER = 0.9  # of what is left: rounds that leave no less, this many of them, end it
-PATIENCE = 8
+ROUNDS = 64  # of Newton's method, at most, each with the walls that stopped particles in the one before
+BETTER = 0.9  # factor by which a round must lower the violation to count as progress
+PATIENCE = 8  # rounds without progress that end the iteration
 SOFT = 1e-6  # mu, see Jacobian
 
 
-def first_off(batches: list[Any], w: np.ndarray, x: np.ndarray) -> int | None:
-    """The first particle of rigid clusters that are out of shape at x, (n, dim); None where none is."""
-    solids = Solids.rigid(batches, w)
-    return min(solids.who[solids.far(x) > _most(solids)].tolist(), default=None) if solids.count else None
-
-
 def restore(runner: Any, placed: int) -> tuple[np.ndarray, float] | None:
-    """Move rigid clusters, and what is linked to them, to where they are in shape and rigid constraints are met; those that are
-    stay. placed: the first of the particles that were placed anew. Returns how far each particle went [m], (n,), and what was
-    taken out, as a share of the size of its cluster or constraint; None where nothing moved."""
+    """Move rigid clusters and linked bodies to where clusters are in shape and rigid constraints are met.
+
+    placed: the first particle that the user placed. Returns how far each particle moved, (n,) [m], and the largest violation that
+    was removed, relative to the size of its cluster or constraint; None if nothing moved.
+    """
     scene, w = runner.scene, runner.scene.inv_mass
     solids = Solids.rigid(runner.batches, w, placed)
     x = scene.state.get(runner.memory)
@@ -44,7 +39,7 @@ def restore(runner: Any, placed: int) -> tuple[np.ndarray, float] | None:
     rigid = [b for b in runner.batches if isinstance(b, Scalar) and b.count and (b.compliance == 0).any() and not b.broken.any()]
     rows = Rows(rigid, x, w, ROUNDING[scene.real]) if rigid else None
     far = _left(solids, rows, x, w)
-    if far <= _most(solids):
+    if far <= solids.borne:
         return None
     best, least, walls, waited = x, np.inf, Walls(x), 0
     for _ in range(ROUNDS):
@@ -72,11 +67,6 @@ def restore(runner: Any, placed: int) -> tuple[np.ndarray, float] | None:
             break
     scene.state.put(runner.memory, best)
     return np.linalg.norm(best - x, axis=1), far
-
-
-def _most(solids: Solids) -> float:
-    """What loads may leave."""
-    return max(SEEN, BORNE * solids.worst)
 
 
 def _left(solids: Solids, rows: Rows | None, x: np.ndarray, w: np.ndarray) -> float:

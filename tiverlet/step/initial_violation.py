@@ -330,7 +330,8 @@ class Rows:
         self.weights = self._weights(gradients) if weights is None else weights
         found = [b.violation(x) for b in batches]
         active = [
-            (b.compliance == 0) & ((C * b.side > 0) if b.side else True) & ~b.idle(w) for b, C in zip(batches, found, strict=True)
+            (b.compliance == 0) & ((C * b.side > 0) if b.side else True) & ~b.immovable(w)
+            for b, C in zip(batches, found, strict=True)
         ]
         self.active = list(zip(batches, active, strict=True))
         self.corners = [some[b.owner] for b, some in self.active]

@@ -27,7 +27,7 @@ class Launcher:
         )
         self.has_pair_forces, self.lists_pairs = step.has_pair_forces, bool(step.listed_forces)
         self.systems, self.steps = bool(step.constraints.systems), step.constraints.steps
-        self.impacts = step.impacts
+        self.impacts, self.has_pair_impacts = step.impacts, step.has_pair_impacts
         self.looks, self.applies_first = step.looks, step.particles.applies_first
         self.waiting: list[str] = []
         self.now: Any = None  # the half of a pass of the waiting phases
@@ -169,6 +169,10 @@ class Launcher:
         self.flush()
         self.put(now, "rebound")
         self.flush()
+
+    def push_bodies(self, now: Moment) -> None:
+        """Add this phase; the step calls it only where bodies can strike each other."""
+        self.put(now, "push_bodies")
 
     def apply_corrections(self, now: Moment) -> None:
         """Add the last phase of a pass, if particles have corrections to apply."""

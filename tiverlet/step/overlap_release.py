@@ -22,15 +22,14 @@ from ..contact.candidates import Candidates, DiscCandidates
 from .contact_rows import stored_by
 from .free_bodies import FreeBodies
 from .jacobian import Jacobian
+from .one_sided import Walls, moved, one_sided
 from .projection import Rows, given_back, matters, paid, seen, seen_before
 from .rails import tethered
 from .rigid_rows import rigid_rows
 from .solids import Solids
 
 SOFT, SOFTEST = 1e-2, 1e-5  # mu of the first round, and the least
-STEPS, ENOUGH = 32, 1e-6  # of conjugate gradients, at most; the share of r . z at which they end
 ROUNDS = 16  # of moves, at most, each with the contacts into which the last one led
-TURNS = 8  # at most, until no one-sided row pulls
 LEFT = 0.01  # of the energy that overlaps store: what may be left of it in the shorter substep
 
 
@@ -120,45 +119,6 @@ def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: f
     return jacobian
 
 
-def moved(runner: Any, before: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Put particles, which come from `before`, to x. Returns the positions before and after walls stop them, (n, dim) each."""
-    state, memory = runner.scene.state, runner.memory
-    state.put(memory, x)
-    sent = state.get(memory)
-    runner.stop_at_walls(before)
-    return sent, state.get(memory)
-
-
-def one_sided(jacobian: Jacobian, right: np.ndarray, one_way: np.ndarray, soft: float) -> np.ndarray:
-    """Return the least moves, (n, dim), without rows in the mask `one_way` that would pull."""
-    some = np.ones(len(right))
-    for _ in range(TURNS):
-        lam = jacobian.multipliers(right * some, some, ENOUGH, STEPS, soft)
-        pulls = one_way & (lam < 0)
-        if not pulls.any():
-            break
-        some[pulls] = 0.0
-    return jacobian.moves(lam)
-
-
-class Walls:
-    """The particles that walls have stopped, (k,), and the normals there, (k, dim)."""
-
-    def __init__(self, x: np.ndarray):
-        self.who, self.normal = np.zeros(0, dtype=np.int64), np.zeros((0, x.shape[1]))
-
-    def push(self, way: np.ndarray) -> None:
-        """Add particles that walls have moved back by `way`, (n, dim) [m]."""
-        length = np.linalg.norm(way, axis=1)
-        new = np.setdiff1d(np.flatnonzero(length > 0), self.who)
-        self.who = np.concatenate([self.who, new])
-        self.normal = np.concatenate([self.normal, way[new] / length[new, None]])
-
-    def along(self, way: np.ndarray) -> np.ndarray:
-        """Return the components of `way`, (n, dim), along the normals, (k,)."""
-        return (way[self.who] * self.normal).sum(axis=1)
-
-
 def bound(runner: Any, x: np.ndarray, ratio: float) -> Rows | None:
     """Return rows of the world's constraints and of rigid clusters that share particles with others; None without any.
 
@@ -166,7 +126,7 @@ def bound(runner: Any, x: np.ndarray, ratio: float) -> Rows | None:
     """
     w = runner.scene.inv_mass
     scalars = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
-    some = [b for b in scalars if (~b.idle(w) & ~b.broken).any()]
+    some = [b for b in scalars if (~b.immovable(w) & ~b.broken).any()]
     some += rigid_rows([b for b in runner.batches if b.clusters], w)
     if not some:
         return None

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from ..colliders.surface import AGAIN, AHEAD, FIRST, GENTLY
+from ..colliders.surface import ANY_DEPTH, BEFORE_CONTACTS, BEYOND_ROUNDING, FRICTIONLESS
 from ..contact.force_share import accumulate
 from ..device import inline, ti
 from ..device.number import OnDevice
@@ -138,7 +138,7 @@ class ParticlePass:
         for weights in ti.static(self.weights):
             if now.damps != 0:
                 for i in range(first, end):
-                    weights.weigh(i, now)
+                    weights.store_weight(i, now)
         if ti.static(self.knows_loads and len(self.walls) > 0):
             self.look_ahead(first, end, now)
         for c in ti.static(self.contacts):
@@ -173,7 +173,7 @@ class ParticlePass:
         moving = True
         for _ in range(SWEEPS):
             if moving:
-                moving = not self.touch_all(i, now.h, now.frame_fraction, AHEAD)
+                moving = not self.touch_all(i, now.h, now.frame_fraction, BEFORE_CONTACTS)
         self.leave_traces(i, before, wall_push)
         return self.state.d[i] - d
 
@@ -202,8 +202,8 @@ class ParticlePass:
             for impacts in ti.static(self.impacts):
                 d = self.state.d[i]
                 self.slots.gather(i, newton)
-                if impacts.goes_on():
-                    impacts.stir(i, self.state.d[i] - d)
+                if impacts.is_later_extra_pass():
+                    impacts.mark_reached(i, self.state.d[i] - d)
             if ti.static(len(self.impacts) == 0):
                 self.slots.gather(i, newton)
 
@@ -245,8 +245,8 @@ class ParticlePass:
         for impacts in ti.static(self.impacts):
             if now.it >= now.span.iterations:
                 for i in range(begin, end):
-                    if impacts.hold(i):
-                        impacts.ask(now)
+                    if impacts.correct_push(i):
+                        impacts.request_pass(now)
         if ti.static(len(self.walls) > 0 and self.few):
             for i in range(begin, end):
                 self.confine(i, now.h, now.frame_fraction)
@@ -258,8 +258,8 @@ class ParticlePass:
                         self.confine(i, now.h, now.frame_fraction)
         for impacts in ti.static(self.impacts):
             for i in range(begin, end):
-                if impacts.waits(i):
-                    impacts.ask(now)
+                if impacts.is_struck_now(i):
+                    impacts.request_pass(now)
         for c in ti.static(self.contacts):
             if now.checks_list != 0:
                 stale = 0
@@ -311,28 +311,28 @@ class ParticlePass:
     def confine(self, i, h, frame_fraction):
         """Apply the corrections of walls to particle i, in turn, until none changes anything, see Collider."""
         if self.state.moves(i):
-            if ti.static(len(self.walls) == 1 and not self.walls[0].repeats):
+            if ti.static(len(self.walls) == 1 and not self.walls[0].needs_repeat):
                 for f in ti.static(self.walls):
-                    self.touch(f, i, h, frame_fraction, FIRST)
+                    self.touch(f, i, h, frame_fraction, ANY_DEPTH)
             else:
-                moving, turn = True, FIRST
+                moving, mode = True, ANY_DEPTH
                 for k in range(SWEEPS + ROUNDS + 1):
                     if moving:
                         if k == SWEEPS + ROUNDS:
                             self.stay(i)
-                        settled = self.touch_all(i, h, frame_fraction, turn)
+                        settled = self.touch_all(i, h, frame_fraction, mode)
                         # A round with friction or bounces may return to where it began, although the particle is in a wall there.
-                        moving = not (settled and (turn == GENTLY or ti.static(not self.rough)))
-                        turn = FIRST if ti.static(len(self.walls) > 1) else AGAIN
+                        moving = not (settled and (mode == FRICTIONLESS or ti.static(not self.rough)))
+                        mode = ANY_DEPTH if ti.static(len(self.walls) > 1) else BEYOND_ROUNDING
                         if settled or k + 1 >= SWEEPS:
-                            turn = GENTLY
+                            mode = FRICTIONLESS
 
     @ti.func
-    def touch_all(self, i, h, frame_fraction, turn):
+    def touch_all(self, i, h, frame_fraction, mode):
         """Apply the correction of every wall once. Returns whether none changed anything."""
         x, d = self.state.x[i], self.state.d[i]
         for f in ti.static(self.walls):
-            self.touch(f, i, h, frame_fraction, turn)
+            self.touch(f, i, h, frame_fraction, mode)
         return (self.state.d[i] == d).all() and (self.state.x[i] == x).all()
 
     @ti.func
@@ -354,13 +354,13 @@ class ParticlePass:
             self.state.wall_push[i] = wall_push
 
     @ti.func
-    def touch(self, wall: ti.template(), i, h, frame_fraction, turn):  # type: ignore[valid-type]
+    def touch(self, wall: ti.template(), i, h, frame_fraction, mode):  # type: ignore[valid-type]
         """Apply the correction of one wall, if it is switched on."""
         if ti.static(wall.dev.surface.has_switch):
             if wall.dev.surface.active[None] != 0:
-                wall.confine(i, self.radius.of(i), h, frame_fraction, turn)
+                wall.confine(i, self.radius.of(i), h, frame_fraction, mode)
         else:
-            wall.confine(i, self.radius.of(i), h, frame_fraction, turn)
+            wall.confine(i, self.radius.of(i), h, frame_fraction, mode)
 
     @ti.func
     def stop(self, i, move):
@@ -376,7 +376,7 @@ class ParticlePass:
             if moving:
                 if k == ROUNDS:
                     self.stay(i)
-                moving = not self.touch_all(i, 0 * d[0], ti.Vector([0, 0], self.real), GENTLY)
+                moving = not self.touch_all(i, 0 * d[0], ti.Vector([0, 0], self.real), FRICTIONLESS)
         self.state.d[i] = d
         if ti.static(self.state.carries):
             self.state.d_low[i] = d_low
@@ -421,7 +421,7 @@ class ParticlePass:
                 push *= part
             reaction += push
         for impacts in ti.static(self.impacts):
-            if impacts.stirred[i] != 0:
+            if impacts.reached[i] != 0:
                 reaction, part = 0 * reaction, 0 * part
         return reaction, part
 

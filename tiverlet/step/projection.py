@@ -4,10 +4,11 @@ A pass holds a load F by a violation Z = D h^2 F, in addition to that of its com
 shorter substep h' makes that spring stiffer while it is stretched, and its energy (h / h')^2 times as large. So positions first
 move to where the same loads need the violations (h' / h)^2 Z, and velocities change so that they keep these:
 
-    x += w J^T lam,  C(x) = C - (1 - (h' / h)^2) Z;     v += w J^T lam,  (J w J^T + mu) lam = -J v
+    x += w J^T lam,  C(x) = C - (1 - (h' / h)^2) Z;     v += w J^T lam,  (J w J^T + mu) lam = u - J v
 
-Z is the residual violation of the last substep, C + alpha lam / h^2 for particles at rest. Springs that the substep resolves stay
-as they are. Positions move without changing velocities, as for contacts that an impact left overlapping.
+with u the rates of rest values, as those of motors. Z is the residual violation of the last substep, C + alpha lam / h^2 for
+particles at rest. Springs that the substep resolves stay as they are. Positions move without changing velocities, as for contacts
+that an impact left overlapping.
 
 Where contacts are in the way, they are rows, too (ContactRows). Moves may lead into further contacts, which become rows in a few
 rounds. Beads stay on their wires (Rails), and free bodies keep their angular momentum (FreeBodies).
@@ -24,6 +25,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ..constraints.core.drive import STALL
 from ..constraints.core.scalar import Scalar
 from ..neighbours.queries import between
 from ..particles import LARGEST
@@ -77,12 +79,15 @@ class Aims(NamedTuple):
     done: float
 
 
-def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | None = None) -> bool | None:
+def project(
+    runner: "Runner", h: float, dt: float, longest: float, contacts: ContactRows | None = None
+) -> bool | None:  # fmt: skip
     """Remove the energy that violations would store in a shorter substep; d holds velocities.
 
-    Nothing happens if violations are small, or if the moves would make contacts overlap more. h: the coming substep [s]. longest:
-    the longest substep since the last projection [s]. contacts: contacts that move together with links. Returns whether positions
-    are settled for h; None where contacts are in the way and the energy is more than a hundredth of the kinetic energy.
+    Nothing happens if violations are small, or if the moves would make contacts overlap more. h: the coming substep [s], of a
+    frame dt [s]. longest: the longest substep since the last projection [s]. contacts: contacts that move together with links.
+    Returns whether positions are settled for h; None where contacts are in the way and the energy is more than a hundredth of the
+    kinetic energy.
     """
     ratio = h / longest
     slots = runner.scene.slots
@@ -95,7 +100,7 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     if matters(stays, ratio):
         runner.released = stays
     if slots and slots.system and not slots.system.steps and not runner.clock.softened:  # it holds loads without a violation
-        batches = [b for b in batches if ((slots.rows(b) < 0) & ~b.idle(w)).any() or matters(_off(b, x), ratio)]
+        batches = [b for b in batches if ((slots.rows(b) < 0) & ~b.immovable(w)).any() or matters(_off(b, x), ratio)]
     batches += rigid_rows(runner.batches, w, every=contacts is not None)
     if not batches:
         return True
@@ -114,7 +119,7 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     steps = LOOKS if slots.converges or slots.exact else 0
     slight = SLIGHTEST * 2 * h * h * start.kinetic(v[:n])
     still = (undone != 0) & (start.theta > FIRM) & ~start.touches
-    v[:n] += rows.jacobian.solve(-rows.jacobian.rates(v[:n]) * still, still)
+    v[:n] += rows.jacobian.solve((rows.pace(runner, h, dt) - rows.jacobian.rates(v[:n])) * still, still)
     energy, overlap = seen_before(runner)
     finest = ratio**4 if frail else ratio**2  # by loads, or by energies
     aims = Aims(LEFT * finest, steps, 0.0 if frail else slight, SHARED if contacts else PRODUCTS, DONE[frail])
@@ -169,7 +174,7 @@ def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: Aims) -> tuple["
     """
     state, memory, before = runner.scene.state, runner.memory, rows.x
     enough = aims.share * start.stored
-    stopped: np.ndarray = rows.wall.any(axis=1)
+    stopped = np.linalg.norm(rows.wall, axis=1) > 0
     for _ in range(TURNS):
         state.put(memory, _newton(rows, enough, aims))
         sent = state.get(memory)
@@ -244,6 +249,17 @@ def _off(batch: Scalar, x: np.ndarray) -> float:
     return float((np.abs(C) if batch.side == 0 else C * batch.side).max(initial=0.0))
 
 
+def _pace(runner: Any, batch: Any, x: np.ndarray, h: float, dt: float) -> np.ndarray:
+    """How fast the rest value of each constraint goes in the coming substep h, of a frame dt, (m,); 0 where it waits at x."""
+    if getattr(batch, "driven", False):
+        off = np.abs(batch.violation(x)) * batch.inverse_size(batch.start.position)
+        return batch.dev.equation.drive.rates(h)[: batch.count] * (off < STALL)
+    if any(batch is b for b in runner.ramping):
+        _field, goal, difference = batch.tracks()[0]
+        return -difference(batch.ramp.now()[0], goal) / dt
+    return np.zeros(batch.count)
+
+
 def seen(runner: Any) -> tuple[float, float]:
     """Return the energy [J], and the overlap of the worst contact, in radii."""
     runner.look()
@@ -296,7 +312,7 @@ class Rows:
         self.batches, self.w, self.n, self.dim = batches, w, *x.shape
         self.mass = _over(np.ones_like(w), w)  # 0 for particles that cannot move
         self.box = box  # the Periodic of the world
-        self.some = [~b.idle(w) & ~b.broken if b.breaks else ~b.idle(w) for b in batches]
+        self.some = [~b.immovable(w) & ~b.broken if b.breaks else ~b.immovable(w) for b in batches]
         for b, some in zip(batches, self.some, strict=True):
             if drive := getattr(b.dev, "drive", None):
                 some &= ~drive.is_at_limit(b.dev.equation.lam)[: b.count]
@@ -440,6 +456,10 @@ class Rows:
             for b in self.batches
         ]
         return self._bounded(gamma * self.C + (1 - gamma) * self._bounded(self._each(before)) + self._each(borne))
+
+    def pace(self, runner: Any, h: float, dt: float) -> np.ndarray:
+        """How fast rest values go in the coming substep h, of a frame dt."""
+        return self._each([_pace(runner, b, self.x, h, dt) for b in self.batches])
 
     def would_break(self, undone: np.ndarray, h: float, longest: float) -> bool:
         """Whether a violation would pull so much harder in a substep h that the change counts beside break_at of its row."""

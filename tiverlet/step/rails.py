@@ -17,7 +17,7 @@ class Rails:
     """
 
     def __init__(self, runner: "Runner", x: np.ndarray):
-        wires = [b for b in runner.batches if isinstance(b, Anchored) and not b.drives and (b.compliance == 0).any()]
+        wires = [b for b in runner.batches if isinstance(b, Anchored) and not b.is_kinematic and (b.compliance == 0).any()]
         rigid = [b.compliance == 0 for b in wires]
         self.who = np.concatenate(
             [np.zeros(0, dtype=np.int64), *(b.indices[some, 0] for b, some in zip(wires, rigid, strict=True))]

@@ -32,8 +32,8 @@ class RigidRows:
         self.broken = np.zeros(self.count, dtype=bool)
         self.start, self.dev = batch.start, SimpleNamespace(spring=SimpleNamespace(soft=False))
 
-    def idle(self, w: np.ndarray) -> np.ndarray:
-        """Return a mask of idle rows, (m,): none, because clusters that cannot move are left out already."""
+    def immovable(self, w: np.ndarray) -> np.ndarray:
+        """Return a mask of immovable rows, (m,): none, because clusters that cannot move are left out already."""
         return np.zeros(self.count, dtype=bool)
 
     def violation(self, x: np.ndarray) -> np.ndarray:
@@ -118,7 +118,7 @@ def _coupled(batches: list, w: np.ndarray, every: bool = False) -> Iterator[tupl
     for b in batches:
         if b.clusters and b.count:
             shares = every | (np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) > 1)
-            yield b, (b.compliance == 0) & ~b.broken & ~b.idle(w) & shares
+            yield b, (b.compliance == 0) & ~b.broken & ~b.immovable(w) & shares
 
 
 def _wide(batch: Any) -> np.ndarray:

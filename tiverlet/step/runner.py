@@ -8,9 +8,9 @@ import numpy as np
 
 from ..constraints.path import Path
 from ..contact.initial_overlap import overlapping
-from ..device.interrupts import whole
+from ..device.interrupts import deferred_signals
 from ..device.patches.compiler import CachedLaunch
-from ..particles.spin import moments
+from ..particles.spin import moments_of_inertia
 from . import high_order, initial_shape, initial_violation
 from .clock import Clock, slack
 from .contact_rows import ContactRows
@@ -144,10 +144,10 @@ class Runner:
                 self.restart(iterations)
                 if h < clock.longest and not self.probe:
                     released = release(self, h, clock.longest)
-                    projected = project(self, h, clock.longest)
+                    projected = project(self, h, dt, clock.longest)
                     # Links and contacts must move together. With frames of slightly uneven length, stacks would creep sideways.
                     if projected is None and (dt == clock.frame[1] or 2 * h <= clock.longest):
-                        projected = project(self, h, clock.longest, ContactRows.of(self))
+                        projected = project(self, h, dt, clock.longest, ContactRows.of(self))
                     if projected is None and not released:
                         released = release(self, h, clock.longest, small=True)
                     if projected or projected is None or released:
@@ -206,15 +206,15 @@ class Runner:
         self.left = None
         if self.sleep:
             self.settle(dt)
-        self.know_reach()
+        self.set_multipliers_per_newton()
         report, self.moved, self.released = self.report(substeps, iterations), 0.0, 0.0
         clock.softened = "softened" in report.flags
         return report
 
-    def know_reach(self) -> None:
+    def set_multipliers_per_newton(self) -> None:
         """Set the factors by which loads follow from the multipliers of the last substep."""
         factor = self.integrator.h2_factor
-        self.scene.reach = factor * h2_rigid_of(self.clock), factor * h2_effective_of(self.clock)
+        self.scene.multipliers_per_newton = factor * h2_rigid_of(self.clock), factor * h2_effective_of(self.clock)
 
     def find_ramps(self) -> None:
         """After knobs were uploaded: find the batches with new rest values."""
@@ -408,7 +408,7 @@ class Runner:
             return np.zeros((self.n, particles.axes))
         half = self.spin() - self.memory.read(self.scene.state.spin.s)[: self.n] / clock.h
         r = particles.radius
-        return np.divide(moments(particles), r, out=np.zeros(len(r)), where=r > 0)[:, None] * half * (2 / clock.h)
+        return np.divide(moments_of_inertia(particles), r, out=np.zeros(len(r)), where=r > 0)[:, None] * half * (2 / clock.h)
 
     def shares(self) -> tuple[float, float]:
         """The shares of rigid and of soft constraints in velocities after the last substep, see shares_of()."""
@@ -492,7 +492,7 @@ class Runner:
     def raise_signals(self) -> None:
         """In a long frame: call the handlers of pending signals. If one raises, the frame is undone, see World.step."""
         if self.interruptible:
-            whole.raise_pending()
+            deferred_signals.raise_pending()
 
     def look(self, bare: bool = False) -> None:
         """Diagnose a state that no frame has diagnosed. bare: compute only its energy, in a third of the time."""

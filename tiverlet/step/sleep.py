@@ -54,7 +54,7 @@ class Sleep(Feature):
 
     speed = Knob(lambda f, v: checks.number("Sleep", "speed", v, above=0.0), "Below which a particle is slow [m/s].")
     time = Knob(lambda f, v: checks.number("Sleep", "time", v, above=0.0), "For which it has to be slow [s].")
-    bulk = 0.5
+    code_size = 0.5
 
     def __init__(self, speed: float = 0.01, time: float = 0.5):
         self.speed, self.time = speed, time
@@ -192,7 +192,7 @@ class SleepPass:
     """
 
     host_only = ("sheet", "rests", "goes_on")
-    told_apart = True  # its compile time is reported by itself, as that of a Feature
+    has_own_compile_time = True  # its compile time is reported by itself, as that of a Feature
     n: Any = OnDevice()  # particles
     links: Any = OnDevice()  # pairs of particles that constraints hold together
 

@@ -9,6 +9,8 @@ from .block_matrix import summed
 from .integrator import h2_effective_of
 from .rigid_rows import HEAVY
 
+SEEN, BORNE = 1e-3, 4.0  # of the radius: out of shape by more, and by so many times what loads do to a cluster
+
 
 class Solids:
     """Clusters that share no particle with another one, with the shapes that they have at rest or under their loads.
@@ -70,6 +72,11 @@ class Solids:
         """Return the lengths of vectors of corners, as shares of the radius of their cluster, (corners,)."""
         return np.divide(np.linalg.norm(way, axis=1), self.radius, out=np.zeros_like(self.radius), where=self.radius > 0)
 
+    @property
+    def borne(self) -> float:
+        """How far rigid ones may be from their shapes under their loads, as a share of the radius."""
+        return max(SEEN, BORNE * self.worst)
+
     def far(self, x: np.ndarray) -> np.ndarray:
         """Return how far movable particles at x are from the best fit of their cluster's shape, as shares of its radius."""
         return self._shares(np.where(self.free, x - self.fitted(x), 0.0)[self.who]) if self.count else np.zeros(0)
@@ -127,11 +134,19 @@ class Solids:
         return project
 
 
+def first_off(batches: list[Any], w: np.ndarray, x: np.ndarray) -> int | None:
+    """The first particle of rigid clusters that are out of shape at x, (n, dim); None where none is."""
+    solids = Solids.rigid(batches, w)
+    return min(solids.who[solids.far(x) > solids.borne].tolist(), default=None) if solids.count else None
+
+
 def _apart(batches: list[Any], w: np.ndarray) -> list[tuple[Any, np.ndarray]]:
     """Return each batch of clusters, and a mask, (m,), of those that share no particle, are not broken, and can move."""
     clusters = [b for b in batches if b.clusters and b.count]
     degree = np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices for b in clusters)]), minlength=len(w))
-    return [(b, (np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) == 1) & ~b.idle(w) & ~b.broken) for b in clusters]
+    return [
+        (b, (np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) == 1) & ~b.immovable(w) & ~b.broken) for b in clusters
+    ]
 
 
 def _of(batch: Any, some: np.ndarray, columns: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:

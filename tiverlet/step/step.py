@@ -68,6 +68,9 @@ def substep(do, now):
                     for _ in range(REBOUNDS):
                         if this_pass.first != 0 and do.any_struck() != 0:
                             do.rebound(this_pass)
+                if ti.static(do.has_pair_impacts):
+                    if not do.is_regular(now, half):
+                        do.push_bodies(this_pass)
                 do.apply_corrections(this_pass)
     if ti.static(do.finishes):
         if do.ends_substep(now):
@@ -111,6 +114,7 @@ class Step:
         self.halves = 2 if batches and contact else 1  # of a pass; each begins with a valid list
         self.impacts: Any = scene.impacts
         self.has_impacts = bool(scene.impacts)
+        self.has_pair_impacts = self.has_impacts and self.impacts.pairs
         self.newton_steps = 2 if scene.slots and scene.slots.refines else 1  # most of them in a pass
         self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
         self.orients = self.state.spins and self.state.spin.orients
@@ -135,7 +139,7 @@ class Step:
     def fused(self, sheet: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """Run all substeps of a frame and its diagnostics in one launch; with 0 substeps, only the diagnostics."""
         ti.loop_config(serialize=self.team.size == 1)
-        for thread in range(self.team.spread):
+        for thread in range(self.team.loop_length):
             if thread % LEAST == 0:
                 self.run(integer(sheet, FIRST) + thread // LEAST, sheet)
 
@@ -186,7 +190,7 @@ class Step:
     @ti.func
     def takes_part(self, now):
         """Whether this thread takes part in the substep. All threads must call it."""
-        return self.team.works(now.thread) and self.halted() == 0
+        return self.team.takes_part(now.thread) and self.halted() == 0
 
     @ti.func
     def resumes(self, now):
@@ -233,7 +237,7 @@ class Step:
         out = True
         if ti.static(self.has_impacts):
             if not self.is_regular(now, half):
-                out = self.impacts.wanted(self.pass_of(now, half))
+                out = self.impacts.needs_pass(self.pass_of(now, half))
         return out
 
     @ti.func
@@ -322,10 +326,10 @@ class Step:
         if ti.static(self.has_impacts):
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, now.thread)):
-                self.impacts.close()
+                self.impacts.clear_requests()
         self.particles.integrate(now)
         self.team.wait()
-        self.team.watch(now.thread)
+        self.team.check_waits(now.thread)
 
     @ti.func
     def drive(self, now):
@@ -456,6 +460,11 @@ class Step:
         self.contact_pass.rebound(now.thread)
 
     @ti.func
+    def push_bodies(self, now):
+        """In extra passes: push bodies that struck each other."""
+        self.contact_pass.push_bodies(now)
+
+    @ti.func
     def apply_corrections(self, now):
         """Move particles as contacts and constraints want; walls have the last word."""
         self.particles.apply_corrections(now)
@@ -478,7 +487,7 @@ class Step:
         if ti.static(self.orients):
             for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                 if self.state.awake(i):
-                    self.state.spin.turn(i)
+                    self.state.spin.update_orientation(i)
         for log in ti.static(self.wall_logs):
             n = self.n * now.final
             for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
@@ -580,7 +589,7 @@ class Step:
             if ti.static(self.team.size == 1):
                 self.constraints.spring_forces(0, h)
             else:
-                for thread in range(self.team.spread):
+                for thread in range(self.team.loop_length):
                     if thread % LEAST == 0:
                         self.constraints.spring_forces(thread // LEAST, h)
         for i in range(self.n):

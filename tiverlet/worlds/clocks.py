@@ -13,8 +13,8 @@ NONE = -1  # first_moved where no particle was placed
 class Clocks:
     """The values of a Clock for each of many worlds, as arrays; see Clock for their meaning.
 
-    energy, bound: NaN where unknown. first_moved: NONE where no particle was placed. frame: (worlds, 3). asks_drag: whether knobs
-    may need drag factors other than those in the clock and on the device.
+    energy, bound: NaN where unknown. first_moved: NONE where no particle was placed. frame: (worlds, 3). needs_drag: whether
+    knobs may need drag factors other than those in the clock and on the device.
     """
 
     def __init__(self, clocks: list[Clock]):
@@ -28,7 +28,7 @@ class Clocks:
         self.first_moved = np.array([NONE if clock.first_moved is None else clock.first_moved for clock in clocks])
         # Lists, since these values rarely differ from world to world.
         self.drag = [clock.drag for clock in clocks]
-        self.asks_drag = np.zeros(self.count, dtype=bool)
+        self.needs_drag = np.zeros(self.count, dtype=bool)
         self.parted = {k: clock.parted for k, clock in enumerate(clocks) if clock.parted is not None}
 
     time: np.ndarray
@@ -82,7 +82,7 @@ class Clocks:
         for name in (*PLAIN, "frame", "energy", "bound", "known", "first_moved"):
             getattr(self, name)[some] = getattr(other, name)[some]
         for k in map(int, some):
-            self.asks_drag[k] |= self.drag[k] != other.drag[k]
+            self.needs_drag[k] |= self.drag[k] != other.drag[k]
             self.drag[k] = other.drag[k]
             self.parted.pop(k, None)
             if k in other.parted:

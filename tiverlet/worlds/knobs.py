@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..features.arguments import knobs_of, meant
+from ..features.arguments import knobs_of, suggest_name
 from ..features.feature import Feature
 
 if TYPE_CHECKING:
@@ -57,7 +57,9 @@ class Knobs:
         for name, values in knobs.items():
             if name not in knobs_of(type(f)):
                 live = ", ".join(knobs_of(type(f))) or "nothing"
-                raise AttributeError(f"Worlds.set: {name} is no knob of {f!r}{meant(name, knobs_of(type(f)))}. Live are {live}.")
+                raise AttributeError(
+                    f"Worlds.set: {name} is no knob of {f!r}{suggest_name(name, knobs_of(type(f)))}. Live are {live}."
+                )
             one = not isinstance(values, (list, tuple)) and np.ndim(values) == 0
             if one or len(values) != len(chosen):
                 has = "one value" if one else f"{len(values)} values"
@@ -88,10 +90,10 @@ class Knobs:
     def check_kernels(self) -> None:
         """Raise ValueError if a knob that was assigned for all worlds needs other kernels; for the world that is shown."""
         for f in self.features:
-            if f.changed and f.outgrown:
-                _refuse_outgrown(f)
+            if f.changed and f.needs_other_kernels:
+                _refuse_other_kernels(f)
 
-    def idle(self) -> bool:
+    def has_nothing_to_upload(self) -> bool:
         """Whether no knob waits to be uploaded."""
         if self._set or any(f.changed or f.moving for f in self.features):
             return False
@@ -117,19 +119,19 @@ class Knobs:
         return True
 
     @property
-    def turned(self) -> np.ndarray:
+    def changed_worlds(self) -> np.ndarray:
         """The worlds in which a knob has another value than in the last frame, a mask."""
         if len(self._waiting) > 1 or any(f.changed for f in self.features):
             return np.ones(self.count, dtype=bool)
         return np.any([np.zeros(self.count, dtype=bool), *self._set.values()], axis=0)
 
-    def waiting_of(self, feature: Feature) -> np.ndarray:
+    def waiting_mask(self, feature: Feature) -> np.ndarray:
         """Return the mask of the worlds in which a knob of a feature waits."""
         of = self._set.get(self.features.index(feature), np.zeros(self.count, dtype=bool))
         return of | feature.changed
 
     @property
-    def waiting(self) -> np.ndarray:
+    def waiting_worlds(self) -> np.ndarray:
         """The numbers of the worlds in which a knob waits or a target moves."""
         if len(self._waiting) > 1 or any(f.changed or f.moving for f in self.features):
             return np.arange(self.count)
@@ -161,13 +163,13 @@ def _check_fits(feature: Feature, name: str, value: Any) -> None:
     """Raise ValueError if a value of a knob needs other kernels."""
     before, vars(feature)[name] = vars(feature)[name], value
     try:
-        if feature.outgrown:
-            _refuse_outgrown(feature)
+        if feature.needs_other_kernels:
+            _refuse_other_kernels(feature)
     finally:
         vars(feature)[name] = before
 
 
-def _refuse_outgrown(feature: Feature) -> None:
+def _refuse_other_kernels(feature: Feature) -> None:
     raise ValueError(
         f"Worlds: a knob of {feature!r} asks for what these kernels do not have, such as friction where there was none. Give the "
         "World that Worlds is made of a value other than 0 first."

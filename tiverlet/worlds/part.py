@@ -32,8 +32,8 @@ class Part:
 
     def __str__(self) -> str:
         if len(self.rows) == 1:
-            return named(self.first, self.rows[0])
-        return f"parameters {self.first} to {self.numbers[-1]}, {call(self.rows[0])} to {call(self.rows[-1])}"
+            return describe_parameters(self.first, self.rows[0])
+        return f"parameters {self.first} to {self.numbers[-1]}, {format_call(self.rows[0])} to {format_call(self.rows[-1])}"
 
 
 @dataclass(frozen=True)
@@ -47,56 +47,58 @@ class Lost:
 class Job:
     """The work for each part: functions and plain data, which can be sent to another process.
 
-    settings: arguments of tv.init in the process that started the sweep. built: the versions that determine results bit for bit,
+    settings: arguments of tv.init in the process that started the sweep. versions: those that determine results bit for bit,
     which must be equal everywhere.
     """
 
     make: Callable[..., World]
     figures: Callable[[Any], Mapping[str, Any]]
     settings: dict[str, Any]
-    built: str
+    versions: str
 
 
-def call(row: dict[str, Any]) -> str:
+def format_call(row: dict[str, Any]) -> str:
     """Return the call of make() with these parameters, as one line."""
     return f"make({', '.join(f'{name}={_short(value)}' for name, value in row.items())})"
 
 
-def named(number: int, row: dict[str, Any]) -> str:
+def describe_parameters(number: int, row: dict[str, Any]) -> str:
     """Return the number and the call of one set of parameters."""
-    return f"parameters {number}, {call(row)}"
+    return f"parameters {number}, {format_call(row)}"
 
 
-def compute(job: Job, part: Part, tell: Callable[[int], None] = lambda number: None) -> Outcome:
+def compute(job: Job, part: Part, report_number: Callable[[int], None] = lambda number: None) -> Outcome:
     """Return the figures of a part, or the exception of the user's functions, with a note that names the parameters.
 
-    Exceptions are returned, so that one that is raised in a worker means a failure of the worker itself. tell: called with the
-    number of each world before it is made, and with -1 after the last.
+    Exceptions are returned, so that one that is raised in a worker means a failure of the worker itself. report_number: called
+    with the number of each world before it is made, and with -1 after the last.
     """
     try:
-        return _figures(job, part, tell)
+        return _figures(job, part, report_number)
     except Exception as error:
         return error
 
 
-def compute_in_worker(job: Job | bytes, part: Part, attempt: int, tell: Callable[[int], None] = lambda number: None) -> Outcome:
+def compute_in_worker(
+    job: Job | bytes, part: Part, attempt: int, report_number: Callable[[int], None] = lambda number: None
+) -> Outcome:
     """Run compute() in a process of an executor. attempt: makes repeated calls differ, for executors that cache by arguments.
 
     Taichi belongs to the thread that started it. Workers of some executors have several threads, so one dedicated thread does all
     parts there.
     """
     if threading.current_thread() is threading.main_thread():
-        return _prepared(job, part, tell)
-    return _thread().submit(_prepared, job, part, tell).result()
+        return _prepared(job, part, report_number)
+    return _thread().submit(_prepared, job, part, report_number).result()
 
 
-def _prepared(job: Job | bytes, part: Part, tell: Callable[[int], None]) -> Outcome:
+def _prepared(job: Job | bytes, part: Part, report_number: Callable[[int], None]) -> Outcome:
     try:
         job = _loaded(job) if isinstance(job, bytes) else job
-        if job.built != built():
+        if job.versions != describe_versions():
             raise RuntimeError(
-                f"sweep: a worker has {built()}, but the sweep was started with {job.built}, so the bits could differ. "
-                "Install the same versions on all machines."
+                f"sweep: a worker has {describe_versions()}, but the sweep was started with {job.versions}, so the bits could "
+                "differ. Install the same versions on all machines."
             )
         if ti.cfg is None:
             runtime.share = runtime.share or _cores_of_worker()
@@ -104,25 +106,25 @@ def _prepared(job: Job | bytes, part: Part, tell: Callable[[int], None]) -> Outc
                 runtime.init(**job.settings)
     except Exception as error:
         return _sendable(error)
-    outcome = compute(job, part, tell)
+    outcome = compute(job, part, report_number)
     return _sendable(outcome) if isinstance(outcome, Exception) else outcome
 
 
-def _figures(job: Job, part: Part, tell: Callable[[int], None]) -> dict[str, np.ndarray]:
+def _figures(job: Job, part: Part, report_number: Callable[[int], None]) -> dict[str, np.ndarray]:
     from .worlds import Worlds
 
     with contextlib.ExitStack() as stack:
         made: dict[int, World] = {}
         for number, row in zip(part.numbers, part.rows, strict=True):
-            tell(number)
-            with _noted(f"sweep: raised by {named(number, row)}"):
+            report_number(number)
+            with _noted(f"sweep: raised by {describe_parameters(number, row)}"):
                 world = job.make(**row)
                 if not isinstance(world, World):
                     raise TypeError(f"sweep: make returned {world!r}, a {type(world).__name__}, but a tv.World is needed.")
                 if id(world) in made:
                     raise ValueError("sweep: make returned the same World again. Make a new one for each call.")
             made[id(world)] = stack.enter_context(world)
-        tell(-1)
+        report_number(-1)
         with _noted(f"sweep: raised by the worlds of {part}"):
             worlds = Worlds(list(made.values()))
             stack.callback(worlds.close)
@@ -181,7 +183,7 @@ def settings() -> dict[str, Any]:
     return {k: v for k, v in runtime.wanted().items() if k != "threads"} | {"arch": runtime.architecture()}
 
 
-def built() -> str:
+def describe_versions() -> str:
     """Return the versions that determine results bit for bit: of tiverlet and of the compiler."""
     from .. import __version__
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from ..world import World
 
 
-def alike(worlds: "list[World]") -> "list[World]":
+def with_equal_kernels(worlds: "list[World]") -> "list[World]":
     """Return the worlds, with clones in place of those that were compiled differently.
 
     A world is cloned if it was compiled for a team of threads, if its knobs need other kernels now, or if it lacks shrinking
@@ -21,8 +21,10 @@ def alike(worlds: "list[World]") -> "list[World]":
     out = []
     for world, has in zip(worlds, shrinks, strict=True):
         lacks = any(shrinks) and not has
-        outgrown = any(f.changed and f.outgrown for f in world.features)  # knobs need other kernels, which a clone gets
-        if lacks or outgrown or world.path != "fused":
+        outdated = any(
+            f.changed and f.needs_other_kernels for f in world.features
+        )  # knobs need other kernels, which a clone gets
+        if lacks or outdated or world.path != "fused":
             world = world.clone(path="fused")
         if lacks:
             world._runner.step.contacts[0].enable_shrink()
@@ -61,7 +63,7 @@ def _difference(ours: list[Any], theirs: list[Any]) -> tuple[str, str]:
 
 def _structure(world: "World") -> dict[str, Any]:
     """Return the data that must be equal in all worlds."""
-    built = [(type(f).__name__, *(f._world_for or {}).items()) for f in world.features]
+    built = [(type(f).__name__, *(f._built_values or {}).items()) for f in world.features]
     out: dict[str, Any] = {
         "settings": [(name, "=", repr(value)) for name, value in world.settings.items()],
         "features": built,
@@ -76,14 +78,14 @@ def _structure(world: "World") -> dict[str, Any]:
 
 def _written(world: "World") -> Any:
     """Return the source of a world's kernels, with numbers in place of its fields."""
-    from ..device.patches.sharing import Writing  # noqa: PLC0415
+    from ..device.patches.sharing import KernelInputs  # noqa: PLC0415
 
     fields = [vars(e.field) for memory in world._runner.memories for e in memory.entries]
     before = [known.get("place_name") for known in fields]
     for k, known in enumerate(fields):
         known["place_name"] = "field", k
     try:
-        return Writing(world._runner.step).key
+        return KernelInputs(world._runner.step).key
     finally:
         for known, name in zip(fields, before, strict=True):
             known["place_name"] = name

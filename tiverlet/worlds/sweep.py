@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import checks
 from ..world import World
-from .part import Job, Lost, Part, built, named, settings
+from .part import Job, Lost, Part, describe_parameters, describe_versions, settings
 
 if TYPE_CHECKING:
     from .workers import Workers
@@ -75,13 +75,13 @@ def sweep(
     """
     from rich.progress import Progress  # noqa: PLC0415
 
-    from .workers import chosen  # noqa: PLC0415
+    from .workers import choose_workers  # noqa: PLC0415
 
     rows = _rows(make, parameters, figures)
     at_once = checks.integer("sweep", "at_once", at_once, least=1)
     progress = checks.flag("sweep", "progress", progress)
-    job = Job(make, figures, settings(), built())
-    workers, least = chosen(executor, job)
+    job = Job(make, figures, settings(), describe_versions())
+    workers, least = choose_workers(executor, job)
     size = _ceil(len(rows), least * _ceil(len(rows), least * at_once))  # the same number of parts for each process
     parts = [Part(first, rows[first : first + size]) for first in range(0, len(rows), size)]
     found: dict[int, dict[str, np.ndarray]] = {}
@@ -165,7 +165,7 @@ def _rows(make: Any, parameters: Any, figures: Any) -> list[dict[str, Any]]:
         try:
             signature.bind(**row)
         except TypeError as why:
-            raise TypeError(f"sweep: make{signature} does not take {named(k, row)}: {why}.") from None
+            raise TypeError(f"sweep: make{signature} does not take {describe_parameters(k, row)}: {why}.") from None
     return rows
 
 

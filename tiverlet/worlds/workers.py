@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from .. import checks
 from ..device import runtime
-from .part import Job, Lost, Outcome, Part, call, compute, compute_in_worker
+from .part import Job, Lost, Outcome, Part, compute, compute_in_worker, format_call
 
 
 class Workers(Protocol):
@@ -126,7 +126,7 @@ class _Process:
             how += " (perhaps because memory is short)" if code == -9 else ""
         when = 'before it began; in a script, call tv.sweep below `if __name__ == "__main__":`'
         if self.at is not None and part:
-            making = f"in {call(part.rows[self.at - part.first])}, number {self.at}"
+            making = f"in {format_call(part.rows[self.at - part.first])}, number {self.at}"
             when = making if self.at >= 0 else "after all worlds were made"
         return f"worker process {self.process.pid} {how} {when}"
 
@@ -191,7 +191,7 @@ def _serve(pipe: Any, job: bytes, threads: int) -> None:
             pipe.send(compute_in_worker(job, pipe.recv(), 0, pipe.send))
 
 
-class Given:
+class ExecutorWorkers:
     """A user's executor with submit(). If it accepts no more parts after a loss, processes of the sweep do the rest.
 
     A part that ended a worker is not computed in this process, which it might end, too. The exception is a job that cannot be
@@ -205,28 +205,28 @@ class Given:
         self._most: int = getattr(executor, "_max_workers", 1) if self._pool else 2**31
         self._waiting: dict[Any, Part] = {}
         self._submitted, self._lost = 0, False
-        self._instead: Workers | None = None
+        self._fallback: Workers | None = None
 
     @property
     def name(self) -> str:
         """The name for messages."""
-        return self._instead.name if self._instead else "the executor"
+        return self._fallback.name if self._fallback else "the executor"
 
     @property
     def free(self) -> bool:
         """Whether it accepts a part now."""
-        if self._instead:
-            return not self._waiting and self._instead.free
+        if self._fallback:
+            return not self._waiting and self._fallback.free
         return len(self._waiting) < self._most
 
     @property
     def busy(self) -> bool:
         """Whether a part is unfinished."""
-        return bool(self._waiting) or (self._instead is not None and self._instead.busy)
+        return bool(self._waiting) or (self._fallback is not None and self._fallback.busy)
 
     def begin(self, part: Part) -> None:
         """Accept a part."""
-        if self._instead is None:
+        if self._fallback is None:
             job = sent(self._job) if self._pool else self._job
             self._submitted += 1
             try:
@@ -235,13 +235,13 @@ class Given:
             except Exception:
                 if not self._lost:  # the executor never worked
                     raise
-            self._instead = self._successor()
-        self._instead.begin(part)
+            self._fallback = self._make_fallback()
+        self._fallback.begin(part)
 
     def finished(self) -> list[tuple[Part, Outcome | Lost]]:
         """Wait for at least one part, and return the finished parts."""
-        if not self._waiting and self._instead:
-            return self._instead.finished()
+        if not self._waiting and self._fallback:
+            return self._fallback.finished()
         out: list[tuple[Part, Outcome | Lost]] = []
         done = self._done()
         while done:
@@ -261,8 +261,8 @@ class Given:
         for future in self._waiting:
             with contextlib.suppress(Exception):
                 future.cancel()
-        if self._instead:
-            self._instead.close()
+        if self._fallback:
+            self._fallback.close()
 
     def _done(self) -> list[Any]:
         first = next(iter(self._waiting))
@@ -270,14 +270,14 @@ class Given:
             return list(wait(self._waiting, return_when=FIRST_COMPLETED).done)
         return [first]  # futures of other kinds are awaited one by one
 
-    def _successor(self) -> Workers:
+    def _make_fallback(self) -> Workers:
         try:
             return Processes(min(self._most, os.cpu_count() or 1), sent(self._job))
         except TypeError:
             return ThisProcess(self._job)
 
 
-def chosen(executor: Any, job: Job) -> tuple[Workers, int]:
+def choose_workers(executor: Any, job: Job) -> tuple[Workers, int]:
     """Return the workers, and the least number of parts."""
     if executor is None:
         return ThisProcess(job), 1
@@ -305,7 +305,7 @@ def chosen(executor: Any, job: Job) -> tuple[Workers, int]:
         sent(job)
     of_client = getattr(executor, "get_executor", None)  # of Dask; not pure: a failed call may be repeated
     executor = of_client(pure=False) if callable(of_client) else executor
-    return Given(executor, job), 1
+    return ExecutorWorkers(executor, job), 1
 
 
 def sent(job: Job) -> bytes:

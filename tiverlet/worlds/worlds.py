@@ -11,11 +11,11 @@ from .. import checks
 from ..constraints.core.scalar import Scalar
 from ..device import runtime
 from ..device.copies import Copies
-from ..device.interrupts import whole
+from ..device.interrupts import deferred_signals
 from ..device.patches.compiler import CachedLaunch
-from ..features.arguments import knobs_of, meant
+from ..features.arguments import knobs_of, suggest_name
 from ..features.feature import Feature
-from ..features.read_only import assign_whole, read_only
+from ..features.read_only import assign_whole_advice, read_only
 from ..particles import in_range
 from ..step import checkpoint, energy_bound, impulse
 from ..step import frames as kernel
@@ -26,7 +26,7 @@ from ..world import World
 from .clocks import NONE, Clocks
 from .knobs import Knobs
 from .report import WorldsReport
-from .structure import alike, check_structure
+from .structure import check_structure, with_equal_kernels
 
 WORK = 30_000_000  # particles and constraints, times passes, in a launch of about a second
 LOGGED = 1 << 22  # figures of frames that are kept per launch, at most
@@ -65,12 +65,12 @@ class Worlds:
             count = checks.integer("Worlds", "count", 1 if count is None else count, least=1)
         else:
             count = len(sources)
-        with whole:
+        with deferred_signals:
             self._originals = first.features  # the user may name features by these
-            sources = alike(sources)
+            sources = with_equal_kernels(sources)
             self._copies = Copies(count)
-            self._world = World._of(
-                first.particles, tuple(f.twin() for f in first.features), [f.start for f in first.features],
+            self._world = World._from_starts(
+                first.particles, tuple(f.copy_with_kernels() for f in first.features), [f.start for f in first.features],
                 copies=self._copies, **(first.settings | {"path": "fused"}),
             )  # fmt: skip
             self._runner = self._world._runner
@@ -83,10 +83,10 @@ class Worlds:
             if len(sources) < count:
                 for memory in self._runner.memories:
                     memory.choose(0)
-                    memory.spread()
+                    memory.copy_to_all()
                 self._clocks = Clocks([self._clocks.of(0)] * count)
             self._knobs = Knobs(self._world.features, sources, count)
-            self._rest()
+            self._deselect()
         self._copies.closed = True
         self._last: WorldsReport | None = None
         self._turned = np.zeros(len(self), dtype=bool)  # worlds whose knobs changed before the last frame
@@ -97,7 +97,7 @@ class Worlds:
         runner = self._runner
         runner.memory.choose(k)
         numbers = [(search.list.capacity, search.list.pitch) for search in runner.step.searches]
-        runner.memory.take(world._runner.memory)
+        runner.memory.copy_from(world._runner.memory)
         for search, (capacity, pitch) in zip(runner.step.searches, numbers, strict=True):
             search.list.capacity_number.set(capacity)
             search.list.pitch_number.set(pitch)
@@ -108,7 +108,7 @@ class Worlds:
     @contextlib.contextmanager
     def _open(self) -> Iterator[None]:
         """Make fields those of all worlds, and delay signals, while the context lasts."""
-        with whole, self._copies.all():
+        with deferred_signals, self._copies.all():
             self._runner.memory.check()
             self._knobs.forget_assigned()
             yield
@@ -119,18 +119,18 @@ class Worlds:
         assert self._runner.frames
         return self._runner.frames
 
-    def _rest(self) -> None:
+    def _deselect(self) -> None:
         """Choose no world."""
         self._runner.memory.choose(None)
         self._knobs.show(None)
 
     @contextlib.contextmanager
-    def _at(self, k: Any) -> Iterator[World]:
+    def _as_world(self, k: Any) -> Iterator[World]:
         """Make the internal world stand for world k while the context lasts."""
         world, runner, k = self._world, self._runner, int(k)
         runner.memory.choose(k)
         world._clock = runner.clock = self._clocks.of(k)
-        runner.know_reach()
+        runner.set_multipliers_per_newton()
         if self._sources:
             self._sources[k].put_on(world)
         self._knobs.show(k)
@@ -138,7 +138,7 @@ class Worlds:
             yield world
         finally:
             self._clocks.put(k, world._clock)
-            self._rest()
+            self._deselect()
 
     # The step.
 
@@ -206,21 +206,21 @@ class Worlds:
         """
         world, runner, clocks = self._world, self._runner, self._clocks
         for drag in runner.drags:
-            clocks.asks_drag |= self._knobs.waiting_of(drag)
+            clocks.needs_drag |= self._knobs.waiting_mask(drag)
         self._upload()
         h = dt / world.substeps * runner.integrator.first
-        ready = (clocks.first_moved == NONE) & (clocks.h == h) & ~clocks.asks_drag
+        ready = (clocks.first_moved == NONE) & (clocks.h == h) & ~clocks.needs_drag
         clocks.since[ready & clocks.d_is_velocity] = 0
         moved, released, jumped = np.zeros(len(self)), np.zeros(len(self)), np.zeros(len(self), dtype=bool)
         some = np.flatnonzero(~ready)
         with runner.memory.compiler():
             for k in some:
-                with self._at(k):
+                with self._as_world(k):
                     runner.prepare(dt, world.substeps, world.iterations)
                     moved[k], released[k], jumped[k] = runner.moved, runner.released, runner.jumped
         unknown = np.flatnonzero(~clocks.known)
         if len(unknown):
-            figures = self._look(unknown)
+            figures = self._measure_worlds(unknown)
             energy, overlap = figures[:, ENERGY], figures[:, OVERLAP]
             clocks.energy[unknown], clocks.known[unknown] = energy, True
             placed = clocks.first_moved[unknown] != NONE
@@ -231,15 +231,15 @@ class Worlds:
             clocks.kinetic[unknown] = np.where(first, 0.0, clocks.kinetic[unknown])
             clocks.parting[unknown] = np.where(placed, overlap > 0, clocks.parting[unknown])
             for k in unknown[(overlap > 0) & placed]:
-                with self._at(k), runner.memory.compiler():
+                with self._as_world(k), runner.memory.compiler():
                     runner.ease(int(clocks.first_moved[k]))
         for contact in runner.step.contacts:
             runner.memory.write_some(contact.dev.fast, 1, np.flatnonzero(jumped))
-        clocks.first_moved[some], clocks.asks_drag[some] = NONE, False
+        clocks.first_moved[some], clocks.needs_drag[some] = NONE, False
         self._start = self._start or _Start(self)
         return moved, released
 
-    def _look(self, some: np.ndarray) -> np.ndarray:
+    def _measure_worlds(self, some: np.ndarray) -> np.ndarray:
         """Return the figures of the worlds `some` in their present state, (k, FIGURES)."""
         clocks = self._clocks
         origin = np.where(clocks.d_is_velocity, UNSTEPPED, np.where(clocks.started, STARTED, STEPPED))
@@ -250,26 +250,26 @@ class Worlds:
         plan = np.zeros(kernel.PLAN, dtype=np.int32)
         plan[kernel.FRAMES] = plan[kernel.KEEPS] = 1
         figures = np.zeros((len(self), 1, kernel.FIGURES))
-        self._go(plan, some, sheets, np.zeros((len(self), kernel.DATES)), figures, np.zeros(1))
+        self._launch_worlds(plan, some, sheets, np.zeros((len(self), kernel.DATES)), figures, np.zeros(1))
         return figures[some, 0]
 
     def _upload(self) -> None:
         """Write knobs to the device: those assigned for all worlds, and those set for some."""
         world, features, knobs = self._world, self._world.features, self._knobs
-        if knobs.idle():
+        if knobs.has_nothing_to_upload():
             return
-        turned = knobs.turned
+        turned = knobs.changed_worlds
         # Targets move only in worlds whose knobs changed before the last frame.
         works = np.where(turned | (self._turned & any(f.moving for f in features)), CHANGED, self._clocks.bound)
         self._turned = turned
-        with self._at(0):
+        with self._as_world(0):
             knobs.check_kernels()
         if knobs.upload_to_all():
             self._runner.find_ramps()
         else:
             still = np.zeros(len(features), dtype=bool)
-            for k in knobs.waiting:
-                with self._at(k), knobs.flagged(k):
+            for k in knobs.waiting_worlds:
+                with self._as_world(k), knobs.flagged(k):
                     world._find_stiffened()
                     world._upload_parameters()
                     still |= [f.moving for f in features]
@@ -303,7 +303,7 @@ class Worlds:
         plan[kernel.ROWS] = track.shape[1] if track is not None else 0
         figures = np.zeros((len(self), frames, kernel.FIGURES))
         flat = np.zeros(1) if track is None else track.reshape(-1)
-        self._go(plan, np.arange(len(self)), sheets, dates, figures, flat)
+        self._launch_worlds(plan, np.arange(len(self)), sheets, dates, figures, flat)
         energy = np.where(clocks.known, clocks.energy, np.nan)
         runner.arrive()
         clocks.advance(substeps, frames, started)
@@ -311,7 +311,7 @@ class Worlds:
             self._last = self._report(figures, energy, moved, released, perf_counter() - begun)
         return self._last
 
-    def _go(
+    def _launch_worlds(
         self, plan: np.ndarray, some: np.ndarray, sheets: np.ndarray, dates: np.ndarray, figures: np.ndarray, track: np.ndarray
     ) -> None:
         """Launch frames of the worlds `some`, and relaunch those that stopped for a longer list."""
@@ -329,7 +329,7 @@ class Worlds:
             sheets = memory.read(self._kernels.sheet)
             some = some[kernel.waits(sheets[some])]
             for k in some:
-                with self._at(k):
+                with self._as_world(k):
                     runner.sheet[:] = sheets[k]
                     kernel.resume(sheets[k], *runner.take_halt())
                     runner.grow()
@@ -388,7 +388,7 @@ class Worlds:
             gain[:, k] = energy[:, k] - room(clocks.bound, clocks.kinetic, energy[:, k])
         out = gain > 0
         for k in np.flatnonzero(out.any(1)):
-            with self._at(k) as world:
+            with self._as_world(k) as world:
                 if energy_bound.works(world):
                     world._clock.bound, out[k] = None, False
                 else:
@@ -427,7 +427,7 @@ class Worlds:
                 new[chosen] = self._per_particle("position", position, len(chosen))
                 self._place(new, chosen)
             if velocity is not None:
-                self._give(self._per_particle("velocity", velocity, len(chosen)), chosen)
+                self._set_velocities(self._per_particle("velocity", velocity, len(chosen)), chosen)
 
     def _feature(self, feature: Feature) -> int:
         """Return the number of a feature."""
@@ -461,8 +461,10 @@ class Worlds:
 
     def __getitem__(self, k: int) -> World:
         """Return world k as a World of its own, in its present state. Changing it does not change these worlds."""
+        if not -len(self) <= k < len(self):
+            raise IndexError(f"Worlds: world {k}, but there are {len(self)} (0 ... {len(self) - 1}).")
         k = range(len(self))[k]
-        with self._open(), self._at(k) as world, self._knobs.flagged(k):
+        with self._open(), self._as_world(k) as world, self._knobs.flagged(k):
             self._knobs.check_kernels()
             return world.clone(path="auto")
 
@@ -476,20 +478,20 @@ class Worlds:
         out = []
         with self._open():
             for k in self._chosen("Worlds.each", some):
-                with self._at(k) as world:
+                with self._as_world(k) as world:
                     out.append(ask(world))
         return out
 
     def hash(self, k: int) -> str:
         """Return the hash of world k, see World.hash()."""
-        with self._open(), self._at(range(len(self))[k]) as world:
+        with self._open(), self._as_world(range(len(self))[k]) as world:
             return world.hash()
 
     @property
     def position(self) -> np.ndarray:
         """Positions [m], (worlds, n, dim), a read-only copy in f64. Assign an array to move particles; velocities are kept."""
         with self._open():
-            return read_only(self._runner.scene.state.get(self._runner.memory), assign_whole("Worlds", "position"))
+            return read_only(self._runner.scene.state.get(self._runner.memory), assign_whole_advice("Worlds", "position"))
 
     def view(self, name: str = "position") -> np.ndarray:
         """Return the positions [m] of all worlds, (worlds, n, dim), as a view of device memory.
@@ -507,7 +509,9 @@ class Worlds:
         if name not in known:
             raise ValueError(f"Worlds.view: name = {name!r}, but it must be one of {', '.join(map(repr, known))}.")
         with self._open():
-            return read_only(self._runner.memory.seen(known[name])[:, : self._runner.n], assign_whole("Worlds", "position"))
+            return read_only(
+                self._runner.memory.view(known[name])[:, : self._runner.n], assign_whole_advice("Worlds", "position")
+            )
 
     @position.setter
     def position(self, value) -> None:
@@ -523,7 +527,7 @@ class Worlds:
             contact.check_range(rows)
         bound = any(isinstance(b, Scalar) for b in self._runner.batches)
         for k in chosen if bound else chosen[~self._clocks.d_is_velocity[chosen]]:
-            with self._at(k) as world, self._runner.memory.compiler():
+            with self._as_world(k) as world, self._runner.memory.compiler():
                 self._runner.restart(world.iterations)
                 self._runner.forget_loads(position[k])
         self._runner.scene.state.put(self._runner.memory, position)
@@ -534,7 +538,7 @@ class Worlds:
     def velocity(self) -> np.ndarray:
         """Velocities [m/s], (worlds, n, dim), a read-only copy in f64, accurate to the order of the world. Assign to set them."""
         with self._open():
-            return read_only(self._velocities(), assign_whole("Worlds", "velocity"))
+            return read_only(self._velocities(), assign_whole_advice("Worlds", "velocity"))
 
     def _velocities(self, links: bool = True, touches: bool = True) -> np.ndarray:
         """Return the velocities of all worlds.
@@ -561,7 +565,7 @@ class Worlds:
                 path.point_along(turned, clocks.frame[some, 1], some)
                 out[some] = turned
         for k in np.flatnonzero(alone):
-            with self._at(k) as world, runner.memory.compiler():
+            with self._as_world(k) as world, runner.memory.compiler():
                 out[k] = runner.velocity(world.iterations, links=links, touches=touches)
         return out
 
@@ -569,7 +573,7 @@ class Worlds:
     def velocity(self, value) -> None:
         """Set the velocities with which particles continue, (worlds, n, dim), or (n, dim) for each world [m/s]."""
         with self._open():
-            self._give(self._per_particle("velocity", value, len(self)), np.arange(len(self)))
+            self._set_velocities(self._per_particle("velocity", value, len(self)), np.arange(len(self)))
 
     def _per_particle(self, name: str, value, count: int) -> np.ndarray:
         """Return an array with a row per particle of `count` worlds; (n, dim) is repeated for all of them."""
@@ -582,7 +586,7 @@ class Worlds:
         value = checks.points("Worlds", name, np.broadcast_to(value, shape).reshape(-1, dim), dim=dim, count=count * n)
         return value.reshape(shape)
 
-    def _give(self, velocity: np.ndarray, chosen: np.ndarray) -> None:
+    def _set_velocities(self, velocity: np.ndarray, chosen: np.ndarray) -> None:
         """Give chosen worlds these velocities, (chosen, n, dim), see World.velocity."""
         clocks, runner = self._clocks, self._runner
         seen = self._velocities()[chosen]
@@ -608,7 +612,7 @@ class Worlds:
                 want, change, seen, had, bare, free, pulled, rubs, lambda: self._velocities()[some], clocks.h[some], drag
             )
             for k, parts in zip(some[found], share[found], strict=True) if runner.scene.state.spins else ():
-                with self._at(k):
+                with self._as_world(k):
                     impulse.turn_on(runner, 0, parts)
             steered[steered] = found
             clocks.known[some] = False
@@ -620,7 +624,7 @@ class Worlds:
         """Start chosen worlds from these velocities, (chosen, n, dim)."""
         clocks, memory, state = self._clocks, self._runner.memory, self._runner.scene.state
         for k in chosen[~clocks.d_is_velocity[chosen]] if state.spins else ():
-            with self._at(k), memory.compiler():
+            with self._as_world(k), memory.compiler():
                 memory.write(state.spin.s, self._runner.spin())
         memory.write_some(state.d, velocity, chosen)
         if state.carries:
@@ -676,7 +680,7 @@ class Worlds:
     def explain(self) -> str:
         """Describe what one world consists of, as World.explain() does, and the memory of all worlds."""
         bytes_in_all = sum(self.fields.values())
-        with self._open(), self._at(0) as world:
+        with self._open(), self._as_world(0) as world:
             said = world.explain()
         return (
             f"{len(self)} worlds, all frames of each on one thread: {bytes_in_all} bytes, {bytes_in_all // len(self)} per world. "
@@ -685,7 +689,7 @@ class Worlds:
 
     def __setattr__(self, name: str, value: Any) -> None:
         if not name.startswith("_") and name not in LIVE:
-            guess = "" if hasattr(self, name) else meant(name, LIVE)
+            guess = "" if hasattr(self, name) else suggest_name(name, LIVE)
             raise AttributeError(f"Worlds.{name} cannot be set{guess}. Live are {', '.join(LIVE)}, and knobs by set().")
         object.__setattr__(self, name, value)
 
@@ -716,7 +720,7 @@ class _Start:
                 self.values[name] = values[:1].copy()
         self.pairs: list[Any] = []  # pairs of each world with their data; one for all if the worlds are copies
         for k in range(len(worlds) if worlds._sources else 1) if runner.search else ():
-            with worlds._at(k):
+            with worlds._as_world(k):
                 self.pairs.append(runner.search.list.persistent_data())
 
     def put_back(self, worlds: Worlds, chosen: np.ndarray) -> None:
@@ -731,7 +735,7 @@ class _Start:
             for k in chosen:
                 pairs = self.pairs[k if len(self.pairs) > 1 else 0]
                 if len(pairs[0]):
-                    with worlds._at(k):
+                    with worlds._as_world(k):
                         runner.search.list.restore(*pairs)
         for log in runner.logs:
             runner.memory.write_some(log.made, 0, chosen)

@@ -18,7 +18,7 @@ class Place:
     name: distinguishes it from other features. in_state: its fields in the exact state, by name.
     """
 
-    told_apart = True
+    has_own_compile_time = True
     name: str
     in_state: dict[str, Any]
 
@@ -53,7 +53,7 @@ class AnchorPasses(Passes):
         self.state, self.slots, self.w, self.real = scene.state, scene.slots, scene.state.w, scene.real
         self.corners = batch.members.bind(scene, batch)
         self.size = scene.memory.number(batch.start.size, scene.real)
-        if not batch.drives:
+        if not batch.is_kinematic:
             self.lam = scene.memory.field(f"{name}.multiplier", batch.count, width=scene.particles.dim, state=True)
             compliance, damping = (batch.compliance, batch.damping) if batch.soft else (None, None)
             self.spring = Spring(scene, name, compliance, damping, start)

@@ -53,7 +53,7 @@ class Anchored(Batch):
         """The particle of each constraint, (m,)."""
         return self.indices[:, 0]
 
-    def hold_all(self, listing: Any) -> None:
+    def set_listing(self, listing: Any) -> None:
         """Act on these particles."""
         self._keep(members=one_each(repr(self), listing))
 
@@ -63,11 +63,11 @@ class Anchored(Batch):
         rows = self.compliance
         if rows is not self._soft_cache[0]:  # cached: a pin that takes other particles reads it ten times
             self._soft_cache = rows, bool((rows > 0).any())
-        return self._soft_cache[1] or "soft" in self.once
+        return self._soft_cache[1] or "soft" in self.compiled_so_far
 
     def upload(self) -> None:
         """Write new stiffnesses to the device."""
-        if self.acts and not self.drives:
+        if self.acts and not self.is_kinematic:
             self.dev.spring.upload(self.compliance, self.damping)
 
     def prepare(self, particles: "Particles", inv_mass: np.ndarray) -> None:
@@ -106,11 +106,11 @@ class Anchored(Batch):
             return np.zeros((0, 0 if self.start is None else self.start.dim))
         if self.scene is None:
             raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")
-        if self.drives:
+        if self.is_kinematic:
             raise RuntimeError(f"{self!r}.load: driven particles are taken along whatever it takes; give compliance to measure.")
         if not self.acts:
             return np.zeros((self.count, self.scene.particles.dim))
-        scale = per_newton(self.scene.reach, self.compliance, lambda: self.scene.inv_mass[self.indices[:, 0]])
+        scale = per_newton(self.scene.multipliers_per_newton, self.compliance, lambda: self.scene.inv_mass[self.indices[:, 0]])
         return scale[:, None] * self.scene.memory.read(self.dev.lam)[: self.count].astype(np.float64)
 
 
@@ -123,7 +123,9 @@ def refuse_held_twice(particles: "Particles", features: tuple[Feature, ...], som
     if some is not None and len(tethers) == 1 and not particles.pinned[tethers[0][1].members.rows].any():
         return
     holder = np.full(len(particles), -1)
-    for k, f in sorted(tethers, key=lambda item: not item[1].drives):  # springs last: they have no effect on driven particles
+    for k, f in sorted(
+        tethers, key=lambda item: not item[1].is_kinematic
+    ):  # springs last: they have no effect on driven particles
         rows = f.indices[:, 0]
         wrong = particles.pinned[rows] | (holder[rows] >= 0)
         if wrong.any():
@@ -132,5 +134,5 @@ def refuse_held_twice(particles: "Particles", features: tuple[Feature, ...], som
             raise ValueError(
                 f"World: features[{k}] = {f!r} holds particle {i}, which {other}. It has one place; leave one of them out."
             )
-        if f.drives:
+        if f.is_kinematic:
             holder[rows] = k

@@ -9,7 +9,7 @@ from ... import checks
 from ...device import called_with, inline, ti
 from ...features.feature import Knob
 from ...geometry.intervals import cross
-from .quantity import Quantity
+from .quantity import Quantity, exact_rest
 
 TURN = 2 * np.pi
 SHORT = 1e-24  # [m^2] squared length below which a link has no direction: representable in f32, and far below any in use
@@ -45,21 +45,12 @@ class Angle(Quantity):
     @ti.func
     def excess(self, c, f):
         """f - rest, to all digits of the low words, where there are any."""
-        C = f - self.rest[c]
-        if ti.static(self.state.carries):
-            C = ti.cast(wrap_near(self.exact_excess(c), ti.cast(C, ti.f64)), self.real)
-        return C
+        return excess_of(self, c, f)
 
     @ti.func
     def exact_excess(self, c):
         """f - rest in f64, within half a turn of 0."""
-        q = ti.Matrix.zero(ti.f64, self.arity, self.state.dim)
-        for k in ti.static(range(1, self.arity)):
-            r = self.state.between(self.corners.member(c, k), self.corners.member(c, 0))
-            for a in ti.static(range(self.state.dim)):
-                q[k, a] = r[a]
-        f, _gradients = self.measure(c, q)
-        return wrap_near(f - self.exact_rest(c), ti.cast(0, ti.f64))
+        return exactly_off(self, c)
 
     @called_with(lambda self: ((ti.i32, corner_matrix(self)), (self.real, corner_matrix(self))))
     @ti.func
@@ -108,6 +99,27 @@ class DihedralAngle(Angle):
     def measure(self, c, q):
         """Return dihedral_angle()."""
         return dihedral_angle(q)
+
+
+@ti.func
+def excess_of(angle: ti.template(), c, f):  # type: ignore[valid-type]
+    """See Angle.excess()."""
+    C = f - angle.rest[c]
+    if ti.static(angle.state.carries):
+        C = ti.cast(wrap_near(exactly_off(angle, c), ti.cast(C, ti.f64)), angle.real)
+    return C
+
+
+@ti.func
+def exactly_off(angle: ti.template(), c):  # type: ignore[valid-type]
+    """See Angle.exact_excess()."""
+    q = ti.Matrix.zero(ti.f64, angle.arity, angle.state.dim)
+    for k in ti.static(range(1, angle.arity)):
+        r = angle.state.between(angle.corners.member(c, k), angle.corners.member(c, 0))
+        for a in ti.static(range(angle.state.dim)):
+            q[k, a] = r[a]
+    f, _gradients = angle.measure(c, q)
+    return wrap_near(f - exact_rest(angle, c), ti.cast(0, ti.f64))
 
 
 def wrap_to_pi(C: np.ndarray) -> np.ndarray:

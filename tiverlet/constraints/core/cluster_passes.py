@@ -258,7 +258,7 @@ class ClusterPasses(Passes):
     def reaction(self, e, c, middle, center, R, h, firm, soft):
         """Return the move of corner e: of the last substep, plus the change of its spring force since.
 
-        middle, center, R: see best_fit().
+        It is 0 if its cluster has broken. middle, center, R: see best_fit().
         """
         move = firm * ti.cast(self.pull[e], ti.f64)
         if ti.static(self.spring.soft):
@@ -270,6 +270,9 @@ class ClusterPasses(Passes):
                     grown = ti.cast(C - R @ ti.cast(self.spring.last[e], ti.f64), self.real)
                     n = self.slots.split[self.corners.members[e]] / w
                     move += ti.cast(self.spring.force_change(c, grown / mass, h, 1 / mass, n / mass), ti.f64)
+        if ti.static(self.strength.breaks):
+            if not self.strength.is_intact(c):
+                move = 0 * move
         return move
 
     @ti.func

@@ -236,9 +236,9 @@ class CornerPasses(Passes):
         It is 0 outside of the extra passes after impacts on walls, see BodyImpacts.
         """
         out = 0 * violation
-        if self.impacts.notes():
+        if self.impacts.is_first_extra_pass():
             self.left[c] = ti.select(ti.static(self.side == 0) or self.side * violation > 0 or lam != 0, violation, out)
-        if self.impacts.notes() or self.impacts.goes_on():
+        if self.impacts.is_first_extra_pass() or self.impacts.is_later_extra_pass():
             out = self.left[c]
         return out
 

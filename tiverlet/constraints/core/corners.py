@@ -84,7 +84,7 @@ class VariableCorners:
         relax(c)   adds up its blocks, blocks[c] to blocks[c + 1], in order, and solves
         scatter_corner(e)  gives corner e its move, with write_move(e, move)
 
-    The same loops run before push_spring_force(), and reduce_block() before residual_of() where the batch `reweighs`.
+    The same loops run before push_spring_force(), and reduce_block() before residual_of() where the batch `needs_reduce_block`.
     count, total, block_count: of constraints, corners, blocks. members, owner: the particle and the constraint of each corner.
     starts: the first corner of each constraint.
     """

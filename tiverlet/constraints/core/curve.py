@@ -13,7 +13,7 @@ class Curve:
     """
 
     def __init__(self, points: np.ndarray, closed: bool, smooth: bool):
-        self.closed = closed
+        self.closed, self.smooth = closed, smooth
         through = np.concatenate([points, points[:1]]) if closed else points
         lengths = np.linalg.norm(np.diff(through, axis=0), axis=1)
         if smooth:

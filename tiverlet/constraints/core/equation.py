@@ -186,7 +186,7 @@ class Equation:
 
     @ti.func
     def reaction(self, c, f, w, W, h, firm, soft):
-        """Return h^2 F of the last substep; for a spring, corrected by how much F has changed since.
+        """Return h^2 F of the last substep; for a spring, corrected by how much F has changed since; 0 once it has broken.
 
         f: now. w, W: as in Spring.force_change(). firm, soft: as in Passes.push_reaction().
         """
@@ -202,6 +202,9 @@ class Equation:
                         pull = -self.clip_to_side(-pull)
                     if ti.static(self.driven):
                         pull = h * h * self.drive.clamp_force(c, pull / (h * h))
+        if ti.static(self.strength.breaks):
+            if not self.strength.is_intact(c):
+                pull = 0 * pull
         return pull
 
     @ti.func

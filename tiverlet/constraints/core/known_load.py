@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from ...device import ti
-from ...features.learning import gain, steady
+from ...features.learning import is_steady, learnt_share
 
 if TYPE_CHECKING:
     from ...features.feature import Scene
@@ -20,7 +20,7 @@ class KnownLoad:
     With one pass per substep, a load is borne by a violation C = W h^2 F, as by a spring of stiffness 1 / (W h^2), and a net of
     such springs sags. A known load needs no violation: the first pass gives lam = -(C / W + h^2 F). F is learnt gradually, by
     integral control. Over a window, violations at the start of substeps push by C / (W h^2) on average. If that is within a fifth
-    of the average of the window before, F grows by a share of it, see gain().
+    of the average of the window before, F grows by a share of it, see learnt_share().
 
     With L, an eigenvalue of the pass, a mode has s^2 + L s + L (1 + K / s) = 0, with time in substeps, and K the share that is
     learnt in each: stable where K < L. For k links that hang in a chain the least L is 0.62 / k^2, and K = 1 / (SLOW k^2), with
@@ -84,9 +84,9 @@ class KnownLoad:
         substep.
         """
         load, mean = self.load[c], self.missing[c] / WINDOW
-        if steady(mean, self.earlier[c]) and WINDOW * moved < STILL * violation_per_newton * ti.abs(load + mean):
+        if is_steady(mean, self.earlier[c]) and WINDOW * moved < STILL * violation_per_newton * ti.abs(load + mean):
             k = self.body_load[self.body[c]]
-            share = gain(1.0, SLOW * k * k, WINDOW)
+            share = learnt_share(1.0, SLOW * k * k, WINDOW)
             load, mean = load + share * mean, (1 - share) * mean
             load = ti.max(-MOST * size / violation_per_newton, ti.min(load, MOST * size / violation_per_newton))
         self.load[c], self.earlier[c], self.missing[c] = load, mean, 0 * mean

@@ -7,7 +7,7 @@ import numpy as np
 from ... import checks
 from ...device import ti
 from ...features.feature import Knob
-from .quantity import Quantity
+from .quantity import Quantity, exact_rest
 
 if TYPE_CHECKING:
     from .scalar import Scalar
@@ -53,7 +53,7 @@ class Length(Quantity):
         if ti.static(self.state.carries):
             if f + rest > 0:
                 r = self.state.between(self.corners.member(c, 0), self.corners.member(c, 1))
-                goal = self.exact_rest(c)
+                goal = exact_rest(self, c)
                 C = ti.cast(r.dot(r) - goal * goal, self.real) / (f + rest)
         return C
 
@@ -72,7 +72,7 @@ class Length(Quantity):
     def exact_excess(self, c):
         """Return f - rest in f64; the difference of two lengths in f32 loses digits."""
         r = self.state.between(self.corners.member(c, 0), self.corners.member(c, 1))
-        return ti.sqrt(r.dot(r)) - self.exact_rest(c)
+        return ti.sqrt(r.dot(r)) - exact_rest(self, c)
 
 
 def is_link(feature: Any) -> "TypeGuard[Scalar]":

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ... import checks
-from ...features.read_only import handed_out, structure
+from ...features.read_only import as_read_only, structure_advice
 from .corners import FixedCorners, VariableCorners
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ class FixedSize:
     def __init__(self, kind: str, indices: np.ndarray):
         self.kind = kind
         self.rows = np.asarray(indices, dtype=np.int32)
-        self.indices = handed_out(self.rows, structure(kind, "indices"))  # for users: read-only, with advice in its error
+        self.indices = as_read_only(self.rows, structure_advice(kind, "indices"))  # for users, with advice in its error
         self.arity = self.rows.shape[1]
 
     @property
@@ -49,7 +49,7 @@ class FixedSize:
         """Raise ValueError for a particle that is none of `count`; name: the argument of `who` that has the indices."""
         checks.indices(who, name, self.indices, count, arity=self.arity)
 
-    def idle(self, inv_mass: np.ndarray) -> np.ndarray:
+    def immovable(self, inv_mass: np.ndarray) -> np.ndarray:
         """Whether each constraint has no particle that can move, (m,)."""
         return (inv_mass[self.indices] == 0).all(axis=1)
 
@@ -68,7 +68,7 @@ class FixedSize:
 
     def bind(self, scene: "Scene", batch: Any) -> FixedCorners:
         """Return the corners on the device, for a batch; with slots, unless the batch drives its particles."""
-        return FixedCorners(scene, repr(batch), self.indices, None if batch.drives else scene.slots.places(batch))
+        return FixedCorners(scene, repr(batch), self.indices, None if batch.is_kinematic else scene.slots.places(batch))
 
 
 def rows(who: str, name: str, value: Any, least: int) -> list[np.ndarray]:
@@ -100,7 +100,7 @@ class VariableSize:
         sizes = np.array([len(r) for r in members], dtype=np.int64)
         self.starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
         indices = np.concatenate([*members, np.zeros(0, dtype=np.int32)]).astype(np.int32)
-        self.indices = handed_out(indices, structure(kind, "indices"))
+        self.indices = as_read_only(indices, structure_advice(kind, "indices"))
 
     @property
     def count(self) -> int:
@@ -128,7 +128,7 @@ class VariableSize:
             k = int(self.owner[wrong[0]])
             checks.indices(who, f"{name}[{k}]", self.row(k), count)
 
-    def idle(self, inv_mass: np.ndarray) -> np.ndarray:
+    def immovable(self, inv_mass: np.ndarray) -> np.ndarray:
         """Whether each constraint has no particle that can move, (m,)."""
         return np.bincount(self.owner, weights=inv_mass[self.indices] > 0, minlength=self.count) == 0
 
@@ -141,7 +141,9 @@ class VariableSize:
         """Return the constraints in the mask `some`, with the new numbers of their particles."""
         out, sizes = copy(self), np.diff(self.starts)[some]
         out.starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
-        out.indices = handed_out(number[self.indices[some[self.owner]]].astype(np.int32), structure(self.kind, "indices"))
+        out.indices = as_read_only(
+            number[self.indices[some[self.owner]]].astype(np.int32), structure_advice(self.kind, "indices")
+        )
         return out
 
     def pairs(self) -> np.ndarray:

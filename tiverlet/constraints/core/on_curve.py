@@ -36,7 +36,7 @@ class OnCurve(Place):
         )
         self.lengths = add("Path.lengths", self.pieces, values=curve.lengths)
         piece, rest = curve.split(start)
-        self.piece = add("Path.piece", m, kind=ti.i32, values=piece, state=True, below=self.pieces)
+        self.piece = add("Path.piece", m, kind=ti.i32, values=piece, state=True, index_limit=self.pieces)
         self.rest = add("Path.rest", m, values=rest, state=True)
         self.in_state = {"piece": self.piece, "rest": self.rest}
         self.least = extent * (2.0**-22 if scene.real == ti.f32 else 2.0**-44)

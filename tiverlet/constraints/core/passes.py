@@ -13,7 +13,7 @@ class Passes:
     corners: FixedCorners or VariableCorners, its particles and slots. name: distinguishes it from other batches.
     """
 
-    told_apart = True
+    has_own_compile_time = True
     corners: Any
     name: str
 

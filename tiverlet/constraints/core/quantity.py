@@ -141,6 +141,17 @@ class Quantity:
         return True
 
 
+@ti.func
+def exact_rest(quantity: ti.template(), c):  # type: ignore[valid-type]
+    """The rest value of constraint c in f64. In f32, one that moves would jerk, with rounding / h^2."""
+    rest = ti.cast(quantity.rest[c], ti.f64)
+    if ti.static(bool(quantity.drive)):
+        rest = quantity.drive.target[c]
+    if ti.static(quantity.ramp.is_allocated):
+        rest += quantity.ramp.low[c]
+    return rest
+
+
 def differences(values: Callable, x: np.ndarray) -> np.ndarray:
     """Return gradients of values(x) by each corner of x (m, arity, dim), by central differences.
 

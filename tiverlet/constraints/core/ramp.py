@@ -95,7 +95,7 @@ class Ramp:
     def _make(self) -> None:
         """Allocate the fields of the ramp, in a world that exists already."""
         self.fields = [field for field, _, _ in self._batch.tracks()]
-        self.memory, name, m = self._memory.more(), repr(self._batch), self._batch.count
+        self.memory, name, m = self._memory.make_companion(), repr(self._batch), self._batch.count
         self.begin = [self.memory.field(f"{name}.rest_at_begin", m) for _ in self.fields]
         self.goal = [self.memory.field(f"{name}.rest_at_end", m) for _ in self.fields]
         self.step = self.memory.field(f"{name}.step_of_rest", m)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ... import checks
 from ...features.feature import Batch, Knob, Scene
-from ...features.read_only import assign_whole, handed_out
+from ...features.read_only import as_read_only, assign_whole_advice
 from ...features.regrouping import Regrouping
 from ...geometry.ordered import distinct
 from .corner_passes import CornerPasses
@@ -48,11 +48,11 @@ class Scalar(Batch):
     each = ("rest", "compliance", "damping", "break_at")
     uploads_all = True
     _scene_sized = False  # whether any constraint without a size of its own takes the size of the whole scene
-    grows = True
+    can_extend = True
 
     def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
         """Store the arguments of __init__; prepare() checks what depends on the particles."""
-        self.hold_all(indices)
+        self.set_listing(indices)
         self._warn_duplicates()
         if rest is not None:
             type(self).rest.check(self, rest)
@@ -102,10 +102,10 @@ class Scalar(Batch):
 
         The constraint direction is not defined there.
         """
-        return self.quantity.has_cusp_at_zero and bool((self.goal == 0).any()) or "cusp" in self.once
+        return self.quantity.has_cusp_at_zero and bool((self.goal == 0).any()) or "cusp" in self.compiled_so_far
 
     @property
-    def reweighs(self) -> bool:
+    def needs_reduce_block(self) -> bool:
         """Whether residual_of() needs reduce_block(), as for outlines."""
         return self.arity == 0
 
@@ -122,17 +122,17 @@ class Scalar(Batch):
         """Return pairs that may overlap: all corners of a constraint, but only neighbours of an outline."""
         return self.quantity.pairs()
 
-    def ties(self) -> tuple[np.ndarray, np.ndarray]:
+    def max_distances(self) -> tuple[np.ndarray, np.ndarray]:
         """Return rigid links and ropes that nothing drives or breaks, and their initial lengths."""
         if not self.quantity.is_distance or self.side < 0 or self.driven or self.breaks or self.soft or not self.count:
-            return super().ties()
+            return super().max_distances()
         return self.indices, self.rest_of(self.start.position)
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return f of corners x (m, arity, dim), (m,); for outlines, of all positions (n, dim)."""
         return self.quantity.values(x)
 
-    def hold_all(self, listing: Any) -> None:
+    def set_listing(self, listing: Any) -> None:
         """Act on these particles, given as the user gives them."""
         self.hold(self.quantity_of(listing))
 
@@ -213,11 +213,11 @@ class Scalar(Batch):
 
     def start_from(self, rest: np.ndarray) -> None:
         """Set initial rest values (m,) that the user has not given, without marking the batch as changed."""
-        self.__dict__["rest"] = handed_out(rest, assign_whole(type(self).__name__, "rest"))
+        self.__dict__["rest"] = as_read_only(rest, assign_whole_advice(type(self).__name__, "rest"))
 
     def review(self, particles: "Particles", inv_mass: np.ndarray) -> None:
         """Warn of violated constraints between particles that cannot move."""
-        stuck = self.idle(inv_mass)
+        stuck = self.immovable(inv_mass)
         if stuck.any():
             C = self.violation(particles.position)
             wrong = stuck & (
@@ -235,17 +235,17 @@ class Scalar(Batch):
     @property
     def soft(self) -> bool:
         """Whether any constraint of the batch has compliance, or had when kernels were compiled."""
-        return bool((self.compliance > 0).any()) or "soft" in self.once
+        return bool((self.compliance > 0).any()) or "soft" in self.compiled_so_far
 
     @property
     def damped(self) -> bool:
         """Whether any constraint has a dashpot, or had when kernels were compiled."""
-        return self.soft and bool((self.damping > 0).any()) or "damped" in self.once
+        return self.soft and bool((self.damping > 0).any()) or "damped" in self.compiled_so_far
 
     @property
     def breaks(self) -> bool:
         """Whether a load can break constraints of the batch, or could when kernels were compiled."""
-        return self.break_at is not None or "breaks" in self.once
+        return self.break_at is not None or "breaks" in self.compiled_so_far
 
     @property
     def _strictly(self) -> bytes | None:
@@ -266,16 +266,16 @@ class Scalar(Batch):
         return self.acts_as_force(scene) | (self.cusp & (self.goal == 0) & (self.compliance == 0))
 
     @property
-    def outgrown(self) -> bool:
+    def needs_other_kernels(self) -> bool:
         """Whether the world has to be rebuilt.
 
         It has to be where other constraints than before must be relaxed alone, or where compliances differ in a world of order
         above 2. The result depends on the current values of knobs, not on earlier ones.
         """
         if not (self.scene and self.acts):
-            return super().outgrown
+            return super().needs_other_kernels
         others = self.solvable_together and bool((self._alone != self.relaxed_alone(self.scene)).any())
-        return super().outgrown or others or self._made_for != self._strictly
+        return super().needs_other_kernels or others or self._made_for != self._strictly
 
     def drive_of(self, scene: Scene) -> Drive:
         """Make the Drive that moves the rest values of a driven batch."""
@@ -293,7 +293,7 @@ class Scalar(Batch):
     @property
     def capped(self) -> bool:
         """Whether any load of a drive is limited, or was when kernels were compiled."""
-        return self.driven and (bool(np.isfinite(self.largest).any()) or "capped" in self.once)
+        return self.driven and (bool(np.isfinite(self.largest).any()) or "capped" in self.compiled_so_far)
 
     def start_at(self, position: np.ndarray, first: int) -> None:
         """Adapt a driven batch after particles from number `first` on were placed at `position`, (n, dim)."""
@@ -304,7 +304,7 @@ class Scalar(Batch):
 
         They are limited where f is curved and any constraint is rigid.
         """
-        return self.quantity.curved and bool((self.compliance == 0).any()) or "limited" in self.once
+        return self.quantity.curved and bool((self.compliance == 0).any()) or "limited" in self.compiled_so_far
 
     @property
     def solvable_together(self) -> bool:
@@ -357,8 +357,10 @@ class Scalar(Batch):
             return np.zeros(self.count)
         memory, missing = self.scene.memory, self.sagging
         known = memory.read(self.dev.equation.lam)[: self.count] - missing  # velocities contain it, as a spring force
-        scale = per_newton(self.scene.reach, self.compliance, lambda: self.weights(self.scene.state.get(memory)))
-        return -scale * missing - np.divide(known, self.scene.reach[1], out=np.zeros(self.count), where=known != 0)
+        scale = per_newton(self.scene.multipliers_per_newton, self.compliance, lambda: self.weights(self.scene.state.get(memory)))
+        return -scale * missing - np.divide(
+            known, self.scene.multipliers_per_newton[1], out=np.zeros(self.count), where=known != 0
+        )
 
     @property
     def _learns(self) -> bool:

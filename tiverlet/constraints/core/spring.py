@@ -47,13 +47,13 @@ def law(alpha, damping, h, w, fresh):
     return A, now, last
 
 
-def per_newton(reach: tuple[float, float], compliance: np.ndarray, weights: Callable[[], np.ndarray]) -> np.ndarray:
+def per_newton(multipliers: tuple[float, float], compliance: np.ndarray, weights: Callable[[], np.ndarray]) -> np.ndarray:
     """Return the factors from multipliers of the last substep to forces, (m,); 0 before the first substep.
 
-    reach: of the Scene. weights: returns w of each constraint, see stiff(); called only where springs differ from rigid
-    constraints.
+    multipliers: those of the Scene, per newton. weights: returns w of each constraint, see stiff(); called only where springs
+    differ from rigid constraints.
     """
-    h2_rigid, h2_effective = reach
+    h2_rigid, h2_effective = multipliers
     late, soft, share = h2_rigid - h2_effective, compliance > 0, np.ones(len(compliance))
     if late > 0 and soft.any():
         w = weights()

@@ -80,7 +80,7 @@ def ray(
     nearer, which = meet(Rods(world.particles.radius[pairs].min(axis=1) + radius, x[pairs[:, 0]], ends))
     particle[nearer], link[nearer] = -1, number[which]
     for f, feature in enumerate(world.features):
-        if f in some and isinstance(feature, Collider) and feature.stands and k:
+        if f in some and isinstance(feature, Collider) and feature.was_active and k:
             distance, out = feature.cast(origin, direction, radius)
             nearer = (distance < np.inf) & ((distance < best) | ((distance == best) & ~there))
             best[nearer], normal[nearer], there[nearer] = distance[nearer], out[nearer], True

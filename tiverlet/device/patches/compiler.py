@@ -88,11 +88,11 @@ class Compiler:
         """
         return bool(self._host) and self.passes is BRIEF and not (self.many or self.launches or self.thorough)
 
-    def point(self) -> None:
+    def use_fields(self) -> None:
         """Let kernels use the fields of this world."""
         for layout, address in self.places:
             if layout.shared:
-                layout.point(address)
+                layout.use_bytes(address)
 
     def __call__(self) -> contextlib.AbstractContextManager[None]:
         """Return the context; nested in itself it does nothing."""
@@ -114,7 +114,7 @@ class Compiler:
             _set(config, self.passes if self._host and not self.thorough else SAFE)
             active.append(self)
             self._thread = threading.get_ident()
-            self.point()
+            self.use_fields()
             collects = gc.isenabled()
             gc.disable()  # trees are many small objects, none of them garbage
             try:
@@ -130,11 +130,11 @@ class Compiler:
                     restore_switches()
                     self._fast = False
                 if active:
-                    active[-1].point()
+                    active[-1].use_fields()
                 runtime.set_default_fp(literals)
                 _set(config, before)
                 if collects:
-                    _pass_over()
+                    _age_objects()
                     gc.enable()
 
     def compile_fast(self) -> None:
@@ -190,7 +190,7 @@ class CachedLaunch:
     def launch(self) -> None:
         """Launch the kernel, which must be compiled."""
         with _lock:  # so that no other thread points kernels at another world in between
-            self.compiler.point()
+            self.compiler.use_fields()
             self._ready()
 
     def _prepared(self) -> Callable[[], Any]:
@@ -211,7 +211,7 @@ class CachedLaunch:
         return context
 
 
-def _pass_over() -> None:
+def _age_objects() -> None:
     """Move all objects to Python's oldest generation after a compilation. Most of them stay, and examining them takes 50 ms."""
     if gc.get_count()[0] > MADE and not gc.get_freeze_count():  # else unfreeze() would also thaw what the user froze
         gc.freeze()

@@ -16,7 +16,7 @@ NEAR = 64  # the table begins within so many words of the runtime's begin; it be
 TREES = 512  # entries of the table
 
 
-def planned(builder: Any) -> Any:
+def finalize_without_memory(builder: Any) -> Any:
     """Finalize a tree of fields without memory. Kernels can be compiled for it; it needs an address before they run."""
     return builder._finalize_for_aot()
 

@@ -28,24 +28,24 @@ from taichi.lang.kernel_impl import Func, Kernel
 from ..language import OURS, TAICHI, active
 
 OF_TAICHI = ("taichi", "numpy", "math")  # modules that do not change
-EQUAL = frozenset((int, str, bool, type(None), bytes, complex))  # types compared by value
-ITSELF = frozenset((type, types.ModuleType, types.BuiltinFunctionType, np.ufunc, np.dtype, type(ti.f32)))
+COMPARED_BY_VALUE = frozenset((int, str, bool, type(None), bytes, complex))  # types compared by value
+COMPARED_BY_IDENTITY = frozenset((type, types.ModuleType, types.BuiltinFunctionType, np.ufunc, np.dtype, type(ti.f32)))
 
 
-class Same:
+class ByIdentity:
     """An object that is equal only to itself; it lives as long as this wrapper."""
 
     def __init__(self, value: Any):
         self.value = value
 
     def __eq__(self, other: object) -> bool:
-        return type(other) is Same and other.value is self.value
+        return type(other) is ByIdentity and other.value is self.value
 
     def __hash__(self) -> int:
         return id(self.value)
 
 
-class Writing:
+class KernelInputs:
     """The list of everything that kernels could read of an object, in order. known: objects whose contents are left out."""
 
     def __init__(self, value: Any, known: tuple[Any, ...] = ()):
@@ -56,29 +56,29 @@ class Writing:
         self.write(value)
 
     @property
-    def key(self) -> tuple[bytes, tuple[Same, ...]]:
+    def key(self) -> tuple[bytes, tuple[ByIdentity, ...]]:
         """The list in short: a digest, and the objects that are compared by identity."""
-        text = repr([0 if type(word) is Same else word for word in self.out])
-        return blake2b(text.encode()).digest(), tuple(word for word in self.out if type(word) is Same)
+        text = repr([0 if type(word) is ByIdentity else word for word in self.out])
+        return blake2b(text.encode()).digest(), tuple(word for word in self.out if type(word) is ByIdentity)
 
     def write(self, value: Any) -> None:
         """Append one object."""
         out, kind = self.out, type(value)
-        if kind in EQUAL:
+        if kind in COMPARED_BY_VALUE:
             out += (kind, value)
             return
         if kind is float:
             out.append(value.hex())
             return
-        if kind in ITSELF:
-            out.append(Same(value))
+        if kind in COMPARED_BY_IDENTITY:
+            out.append(ByIdentity(value))
             return
         if id(value) in self._numbers:
             out += ("again", self._numbers[id(value)])
             return
         self._numbers[id(value)] = len(self._numbers)
         self._alive.append(value)
-        _way(kind)(self, value)
+        _writer_of(kind)(self, value)
 
     def _write_row(self, value: Any) -> None:
         """Append a list or a tuple. In tiverlet's objects the two count as equal: replay turns arguments into lists."""
@@ -125,13 +125,13 @@ class Writing:
 
     def _write_field(self, value: Any) -> None:
         """Append a field, by its place."""
-        self.out.append(vars(value).get("place_name") or Same(value))
+        self.out.append(vars(value).get("place_name") or ByIdentity(value))
 
     def _write_object(self, value: Any) -> None:
         """Append an object, by the attributes that kernels may read."""
         kind, own = type(value), vars(value)
         before, self._ours = self._ours, _is_ours(kind)
-        self.out.append(Same(kind))
+        self.out.append(ByIdentity(kind))
         for name in _read_of(kind, tuple(own)):
             self.out.append(name)
             self.write(own[name])
@@ -141,11 +141,11 @@ class Writing:
 
     def _write_itself(self, value: Any) -> None:
         """Append an object that is compared by identity."""
-        self.out.append(Same(value))
+        self.out.append(ByIdentity(value))
 
     def _write_function(self, function: Any) -> None:
         """Append a function, with its defaults and the values that it refers to from outside."""
-        self.out.append(Same(function.__code__))
+        self.out.append(ByIdentity(function.__code__))
         if function.__code__.co_filename.startswith((OURS, TAICHI)) and not function.__closure__:
             return
         before, self._ours = self._ours, False
@@ -172,15 +172,15 @@ def _names(code: types.CodeType) -> list[str]:
 
 
 @lru_cache(None)
-def _way(kind: type) -> Callable[[Writing, Any], None]:
-    """Return the method of Writing for objects of a class."""
+def _writer_of(kind: type) -> Callable[[KernelInputs, Any], None]:
+    """Return the method of KernelInputs for objects of a class."""
     if kind in (types.FunctionType, types.MethodType, partial):
-        ways = {types.FunctionType: Writing._write_function, types.MethodType: Writing._write_method}
-        return ways.get(kind, Writing._write_partial)
-    for kinds, way in WAYS:
+        writers = {types.FunctionType: KernelInputs._write_function, types.MethodType: KernelInputs._write_method}
+        return writers.get(kind, KernelInputs._write_partial)
+    for kinds, writer in WRITERS:
         if issubclass(kind, kinds):
-            return way
-    return Writing._write_object if kind.__dictoffset__ else Writing._write_itself
+            return writer
+    return KernelInputs._write_object if kind.__dictoffset__ else KernelInputs._write_itself
 
 
 @lru_cache(None)
@@ -205,14 +205,14 @@ def may_read(kind: type, name: str) -> bool:
     return name in only and not any(name in base.get("host_only", ()) for base in said)
 
 
-WAYS: tuple[tuple[Any, Callable[[Writing, Any], None]], ...] = (
-    ((tuple, list), Writing._write_row), ((set, frozenset), Writing._write_set), (dict, Writing._write_mapping),
-    (np.ndarray, Writing._write_array), (np.generic, Writing._write_number), ((Func, Kernel), Writing._write_kernel),
-    (Field, Writing._write_field),
+WRITERS: tuple[tuple[Any, Callable[[KernelInputs, Any], None]], ...] = (
+    ((tuple, list), KernelInputs._write_row), ((set, frozenset), KernelInputs._write_set), (dict, KernelInputs._write_mapping),
+    (np.ndarray, KernelInputs._write_array), (np.generic, KernelInputs._write_number),
+    ((Func, Kernel), KernelInputs._write_kernel), (Field, KernelInputs._write_field),
 )  # fmt: skip
-_known: dict[tuple, str] = {}  # the name of the shared kernel, by the key of a Writing
+_known: dict[tuple, str] = {}  # the name of the shared kernel, by the key of a KernelInputs
 _names_of: weakref.WeakKeyDictionary[Any, dict[tuple, str]] = weakref.WeakKeyDictionary()  # names of kernels, by object
-_keys_of: weakref.WeakKeyDictionary[Any, tuple] = weakref.WeakKeyDictionary()  # the key of the Writing, by object
+_keys_of: weakref.WeakKeyDictionary[Any, tuple] = weakref.WeakKeyDictionary()  # the key of the KernelInputs, by object
 
 
 def _ensured(self: Any, *args: Any) -> Any:
@@ -225,7 +225,7 @@ def _ensured(self: Any, *args: Any) -> Any:
     if which not in known:
         options = (compiler.real, compiler.thorough, tuple(compiler.passes.items()))
         if args[0] not in _keys_of:
-            _keys_of[args[0]] = Writing(args[0]).key
+            _keys_of[args[0]] = KernelInputs(args[0]).key
         writing = (self.func, options, features[1:], _keys_of[args[0]])
         known[which] = _known.setdefault(writing, f"shared{len(_known)}")
     key = (self.func, known[which], self.autodiff_mode)

@@ -1,4 +1,4 @@
-"""Times of compiling kernels, in all and by parts marked `told_apart`; and a message for the waiting user.
+"""Times of compiling kernels, in all and by parts marked `has_own_compile_time`; and a message for the waiting user.
 
 While LLVM works, Taichi holds Python's lock, so nothing can change on a terminal. The message has to be printed before. LLVM
 takes longer than the translation, whose measured time decides whether to print it.
@@ -57,7 +57,7 @@ def compiled(kernel: Any, key: Any, name: str, translate: Any) -> None:
         Translation.now = outer
     program: Any = impl.get_runtime().prog
     own = {feature: seconds for feature, seconds in translation.seconds.items() if feature}
-    with _told(name, [*own]) if perf_counter() - begin > LONG else contextlib.nullcontext():
+    with _show_message(name, [*own]) if perf_counter() - begin > LONG else contextlib.nullcontext():
         program.compile_kernel(program.config(), program.get_device_caps(), kernel.compiled_kernels[key])
     taken, times = perf_counter() - begin, active[-1].times
     times.kernels[name] = times.kernels.get(name, 0.0) + taken
@@ -67,7 +67,7 @@ def compiled(kernel: Any, key: Any, name: str, translate: Any) -> None:
 
 
 @contextlib.contextmanager
-def _told(name: str, features: list[str]) -> Iterator[None]:
+def _show_message(name: str, features: list[str]) -> Iterator[None]:
     """Show what is compiled in a line on the terminal, as long as the context lasts."""
     from rich.console import Console  # noqa: PLC0415  # importing it takes 50 ms
 
@@ -82,7 +82,7 @@ def _told(name: str, features: list[str]) -> Iterator[None]:
 def _called(self: Any, *args: Any, **kwargs: Any) -> Any:
     """Translate a function called in a kernel, and count its time for the object that it belongs to."""
     now = Translation.now
-    if now is None or not args or not getattr(args[0], "told_apart", False):
+    if now is None or not args or not getattr(args[0], "has_own_compile_time", False):
         return _call(self, *args, **kwargs)
     now.enter(repr(args[0]))
     try:

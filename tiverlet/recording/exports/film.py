@@ -13,7 +13,7 @@ import numpy as np
 
 from ...shapes import Shape
 from ..drawing import upwards
-from ..scene import turn
+from ..scene import set_knobs
 from .extras import needed
 from .sketch import Sketch, View, extent
 from .stretch import Stretch, stretches
@@ -80,10 +80,10 @@ def _stretch(
     """Yield the pictures of one stretch, with walls at their places in each frame."""
     sketch = Sketch(image, draw, stretch.parts, stretch.geometry(shape), view, ends)
     features = dict(zip(stretch.parts.numbers, stretch.parts.features, strict=True))
-    turned = list(stretch.turned)
+    changes = list(stretch.knob_changes)
     for frame in wanted:
-        while turned and turned[0][0] <= frame:
-            _, k, values = turned.pop(0)
+        while changes and changes[0][0] <= frame:
+            _, k, values = changes.pop(0)
             if k in features:
-                turn(features[k], values)
+                set_knobs(features[k], values)
         yield sketch.frame(stretch.recording.position(frame))

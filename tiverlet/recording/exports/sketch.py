@@ -13,7 +13,7 @@ from ...colliders.collider import Collider
 from ...constraints import Path
 from ...neighbours import Periodic
 from ..drawing import OPEN, WALL, upwards, walled
-from ..images import box_of, torn
+from ..images import box_of, crosses_box
 from ..scene import Parts
 from ..surfaces import Surface
 from .geometry import Geometry
@@ -119,7 +119,7 @@ class Sketch:
     def _links(self, x: np.ndarray) -> list[tuple]:
         at, near = self._view.place(x)
         out, width, links = [], round(2 * FINE * LINE), self._geometry.links
-        across = torn(box_of(self._parts), x[links[:, 0]] - x[links[:, 1]]) if len(links) else np.zeros(0, dtype=bool)
+        across = crosses_box(box_of(self._parts), x[links[:, 0]] - x[links[:, 1]]) if len(links) else np.zeros(0, dtype=bool)
         for i, j in links[~across].tolist():
             places = [*at[i].tolist(), *at[j].tolist()]
             out.append(((near[i] + near[j]) / 2, "line", places, tuple(map(int, self._geometry.hues[i])), width))

@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 class Stretch:
     """Frames with the same particles and features.
 
-    entry: the entry of the scene. frames: their numbers. times [s]. turned: the knobs that the user set: before which frame, the
-    number of the feature, and the values of its knobs.
+    entry: the entry of the scene. frames: their numbers. times [s]. knob_changes: the knobs that the user set: before which
+    frame, the number of the feature, and the values of its knobs.
     """
 
     recording: "Replay"
     entry: Entry
     frames: np.ndarray
     times: np.ndarray
-    turned: list[tuple[int, int, dict[str, Any]]]
+    knob_changes: list[tuple[int, int, dict[str, Any]]]
 
     def __iter__(self) -> Iterator[tuple[int, float, np.ndarray]]:
         """Yield number, time [s] and positions [m] of each frame."""
@@ -59,9 +59,9 @@ def stretches(recording: "Replay") -> list[Stretch]:
     """Return the stretches of a recording, in order."""
     times = dict(zip(recording.frames.tolist(), recording.times.tolist(), strict=True))
     out = []
-    for entry, frames, turned in recording.scenes:
+    for entry, frames, knob_changes in recording.scenes:
         if frames:
-            out.append(Stretch(recording, entry, np.array(frames), np.array([times[k] for k in frames]), turned))
+            out.append(Stretch(recording, entry, np.array(frames), np.array([times[k] for k in frames]), knob_changes))
     return out
 
 

@@ -70,11 +70,11 @@ class Heap:
         fixed[:, flat] = corners
         fixed[:, 1] = -SIZE / 2
         self.flat, self.start = flat, particles(x, radius, fixed, SIZE / 2, spins)
-        self.box, self.contact = Box(*self.walls(self.half)), Contact(friction=self.grip(0.5, 0.0))
-        self.floor = HalfSpace(np.eye(dim)[1], -1.2, friction=self.grip(0.5, 0.1))
+        self.box, self.contact = Box(*self.walls(self.half)), Contact(friction=self.friction_argument(0.5, 0.0))
+        self.floor = HalfSpace(np.eye(dim)[1], -1.2, friction=self.friction_argument(0.5, 0.1))
         self.world = World(self.start, [Gravity(G), self.contact, self.box, self.floor], substeps=SUBSTEPS)
 
-    def grip(self, friction: float, resistance: float):
+    def friction_argument(self, friction: float, resistance: float):
         """Return the friction argument: with rolling resistance if the grains spin."""
         return (friction, friction, resistance) if self.spins else friction
 
@@ -94,7 +94,7 @@ class Heap:
         w.position, w.velocity = p.position, p.velocity
         if self.spins:
             w.spin = p.spin
-        self.contact.friction = self.grip(friction, resistance)
+        self.contact.friction = self.friction_argument(friction, resistance)
         self.box.lower, self.box.upper = self.walls(self.half)
         w.run(1.0)
         gap = 0.0
@@ -206,7 +206,7 @@ class Silo:
         return World(start, [Gravity(G), Contact(friction=grip, loads=self.loads), *walls, ground], substeps=SUBSTEPS), walls
 
 
-def borne(world: World) -> float:
+def load_on_pinned(world: World) -> float:
     """Return the downward force of grains on pinned particles, along contact normals [N]."""
     found, pinned = world.contacts, world.particles.pinned
     i, j = found.pairs.T
@@ -232,7 +232,7 @@ def janssen(
             for wall in walls:
                 wall.position = (0.0, rise * (frame + 1) * FRAME)
             world.step(FRAME)
-            loads.append(borne(world))
+            loads.append(load_on_pinned(world))
         p = world.particles
         free = ~p.pinned
         # The height that the column has at the packing fraction of its lower nine tenths.
@@ -328,7 +328,7 @@ def flow_in_lammps(
         "size": SIZE, "friction": silo.friction, "gravity": G, "frame": FRAME, "frames": round(seconds / FRAME), "settle": settle,
         "gone": gate.gone.tolist(),
     }  # fmt: skip
-    answer = rolling.ask(grain_peers.SILO, pythons, [job])
+    answer = rolling.run_engine(grain_peers.SILO, pythons, [job])
     if isinstance(answer, str):
         return answer
     return steady(silo, gate, answer[0]["out"], packed(silo, p, np.array(answer[0]["settled"])), least)
@@ -342,7 +342,7 @@ def beverloo(openings: ArrayLike, rates: ArrayLike) -> tuple[float, float, float
     return float(slope**1.5), float(-begin / slope), float(1 - rest @ rest / ((root - root.mean()) ** 2).sum())
 
 
-def shown(values: np.ndarray) -> str:
+def with_error(values: np.ndarray) -> str:
     """Return the mean of values and its standard error as text."""
     mean, error = mean_and_error(values)
     return f"{mean:.1f} +- {error:.1f}"
@@ -357,10 +357,10 @@ def heaps(n: int, half: float, dim: int, seeds: Sequence[int], rollings: Sequenc
     pairs = [(friction, resistance) for resistance in rollings for friction in FRICTIONS]
     rows = repose(n, half, dim, seeds, pairs).reshape(len(rollings), len(FRICTIONS), -1)
     for resistance, row in zip(rollings, rows, strict=True):
-        table.add_row(str(resistance), *(shown(cell) for cell in row))
+        table.add_row(str(resistance), *(with_error(cell) for cell in row))
     if skaters:
         pairs = [(friction, 0.0) for friction in FRICTIONS]
-        table.add_row("do not spin", *(shown(cell) for cell in repose(n, half, dim, seeds, pairs, spins=False)))
+        table.add_row("do not spin", *(with_error(cell) for cell in repose(n, half, dim, seeds, pairs, spins=False)))
     return table
 
 

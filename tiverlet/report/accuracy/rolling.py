@@ -19,7 +19,7 @@ from ...contact import Contact
 from ...forces import Gravity
 from ...particles import Particles
 from ...world import World
-from ..output import said
+from ..output import error_line
 from . import grain_peers
 
 G, K, RADIUS, FRAME = 9.81, 2.5, 0.1, 1 / 60
@@ -198,7 +198,7 @@ def cases() -> list[Case]:
     ]  # fmt: skip
 
 
-def here(case: Case, precision: str, substeps: Iterable[int] = SUBSTEPS) -> list[tuple[float, float]]:
+def own_errors(case: Case, precision: str, substeps: Iterable[int] = SUBSTEPS) -> list[tuple[float, float]]:
     """Return the errors of tiverlet in velocity and position, for each number of substeps."""
     out = []
     with case.world(precision) as world:
@@ -210,7 +210,7 @@ def here(case: Case, precision: str, substeps: Iterable[int] = SUBSTEPS) -> list
     return out
 
 
-def ask(engine: str, pythons: Sequence[str], jobs: list[dict]) -> list | str:
+def run_engine(engine: str, pythons: Sequence[str], jobs: list[dict]) -> list | str:
     """Return the answers of grain_peers by the first Python that has the engine, or why there are none."""
     why = "not installed"
     for python in pythons:
@@ -219,7 +219,7 @@ def ask(engine: str, pythons: Sequence[str], jobs: list[dict]) -> list | str:
             done = subprocess.run(command, input=json.dumps(jobs), capture_output=True, text=True, timeout=PATIENCE)
             done.check_returncode()
         except (OSError, subprocess.SubprocessError) as error:
-            why = said(error)
+            why = error_line(error)
             continue
         answers = json.loads(done.stdout)
         if not isinstance(answers[0], str) or not answers[0].startswith("not installed"):
@@ -227,9 +227,9 @@ def ask(engine: str, pythons: Sequence[str], jobs: list[dict]) -> list | str:
     return why
 
 
-def there(engine: str, pythons: Sequence[str], given: Sequence[Case], substeps: Sequence[int] = SUBSTEPS) -> list[list]:
+def engine_errors(engine: str, pythons: Sequence[str], given: Sequence[Case], substeps: Sequence[int] = SUBSTEPS) -> list[list]:
     """Return the errors of another engine: for each case a list by substeps, of errors or reasons why there are none."""
-    answers = ask(engine, pythons, [case.job(n) for n in substeps for case in given])
+    answers = run_engine(engine, pythons, [case.job(n) for n in substeps for case in given])
     if isinstance(answers, str):
         return [[answers] * len(substeps) for _ in given]
     return [
@@ -250,10 +250,10 @@ def measured(pythons: Sequence[str], log: Callable[[str], None]) -> dict[str, li
     given, rows = cases(), {}
     for precision in ("f32", "f64"):
         log(f"tiverlet, {precision}")
-        rows[f"tiverlet, {precision}"] = [here(case, precision) for case in given]
+        rows[f"tiverlet, {precision}"] = [own_errors(case, precision) for case in given]
     for engine in grain_peers.ENGINES:
         log(engine)
-        rows[engine] = there(engine, pythons, given)
+        rows[engine] = engine_errors(engine, pythons, given)
     return rows
 
 

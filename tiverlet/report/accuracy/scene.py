@@ -228,14 +228,14 @@ class Runner:
         """Run all substeps `efforts` with one solver in one precision. done: called after each."""
         clone, out = self.world.clone(solver=solver, precision=precision, substeps=1), []
         try:
-            self.go(clone, 1)  # compiles
+            self.run_once(clone, 1)  # compiles
             for n in efforts:
                 times, report = [], None
                 for _ in range(RUNS):
                     if self.fresh:
                         clone.close()
                         clone = self.world.clone(solver=solver, precision=precision, substeps=n)
-                    report, energy, t = self.go(clone, n)
+                    report, energy, t = self.run_once(clone, n)
                     times.append(t)
                 assert report
                 flags = tuple(sorted(report.flags))
@@ -245,7 +245,7 @@ class Runner:
             clone.close()
         return out
 
-    def go(self, clone: World, substeps: int) -> tuple[Any, float, float]:
+    def run_once(self, clone: World, substeps: int) -> tuple[Any, float, float]:
         """Run once: return the worst report, the change of energy [J], and the seconds by the median frame."""
         if not self.fresh:
             clone.position, clone.velocity = self.start

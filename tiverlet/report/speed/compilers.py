@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.table import Table
 
-WAYS = {
+VARIANTS = {
     "Taichi": {"TIVERLET_COMPILER": "taichi"},
     "Taichi, no patches": {"TIVERLET_COMPILER": "taichi", "TIVERLET_PATCHES": "0"},
     "Quadrants": {"TIVERLET_COMPILER": "quadrants"},
@@ -39,7 +39,7 @@ def compilers(sizes: tuple[int, ...] = SIZES) -> "Table":
     """Return a table of starts, frames and memory by compiler; Quadrants only if it is installed. sizes: discs of the piles."""
     from rich.table import Table
 
-    ways = [way for way in WAYS if way.startswith("Taichi") or find_spec("quadrants")]
+    ways = [way for way in VARIANTS if way.startswith("Taichi") or find_spec("quadrants")]
     found: dict[str, list[dict[str, float]]] = {way: [] for way in ways}
     for turn in range(TURNS):
         for way in ways if turn == 0 else [way for way in ways if "no patches" not in way]:
@@ -59,7 +59,7 @@ def measured(way: str, cache: str, sizes: tuple[int, ...]) -> dict[str, float]:
     """Return the figures that a process of one way measures."""
     from .processes import started
 
-    with started(START, sizes, cache, **({"TIVERLET_PATCHES": "1"} | WAYS[way])) as talker:
+    with started(START, sizes, cache, **({"TIVERLET_PATCHES": "1"} | VARIANTS[way])) as talker:
         return talker.ask()
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from rich.progress import Progress
 
 from ... import checks
-from ..output import machine, said
+from ..output import error_line, machine
 from . import c_baseline, processes, stripped
 from . import peers as others
 from . import waits as edits
@@ -60,14 +60,14 @@ def speed(
         for name, sizes_ in ladder.items():
             for n in sizes_:
                 bar.update(row, description=f"{name}, {n}")
-                with session.noting(f"{name}, {n} particles"):
+                with session.errors_as_notes(f"{name}, {n} particles"):
                     session.runs += session.point(name, n)
                 bar.advance(row)
         for name in names if peers else ():
             session.beside(name, min(ladder[name], key=lambda n: abs(n - others.SIZES.get(name, n))))
         for name in names if absent else ():
             if SCENES[name].needs is not None:
-                with session.noting(f"{name} without the rest of the package"):
+                with session.errors_as_notes(f"{name} without the rest of the package"):
                     session.absent.append(session.without(name, min(ladder[name], key=lambda n: abs(n - 1000))))
         found = session.waits(peers) if waits and "pile" in names else []
         copy = {t: bandwidth(t) if arch == "cpu" else session.copy() for t in cores}
@@ -94,12 +94,12 @@ class Session:
         self.notes.append(f"pile.c: {how}." if self.program else f"Left out: the yardstick pile.c, since {how}.")
 
     @contextmanager
-    def noting(self, what: str) -> Iterator[None]:
+    def errors_as_notes(self, what: str) -> Iterator[None]:
         """Turn errors inside the context into notes."""
         try:
             yield
         except (RuntimeError, OSError) as error:
-            self.notes.append(f"Missing: {what}: {said(error)}")
+            self.notes.append(f"Missing: {what}: {error_line(error)}")
 
     def cache(self) -> str:
         """Return the path of a new, empty folder for compiled kernels."""
@@ -167,7 +167,7 @@ class Session:
                 if why := peer.missing():
                     self.notes.append(f"Left out: {peer.name} on {name}, since {why}.")
                     continue
-                with self.noting(f"{peer.name} on {name}, {n} particles"):
+                with self.errors_as_notes(f"{peer.name} on {name}, {n} particles"):
                     self.peers.append(self.compare(peer, name, n))
 
     def compare(self, peer: "others.Engine", name: str, n: int) -> Peer:
@@ -198,7 +198,7 @@ class Session:
     def waits(self, peers: bool) -> list[Wait]:
         """Measure the time of edits of a pile, by tiverlet and by the installed peers."""
         names = [peer.name for peer in others.PEERS.values() if peers and not peer.missing()]
-        with self.noting("waits"):
+        with self.errors_as_notes("waits"):
             few = self.rounds != ROUNDS
             return edits.waits(EDITED // 10 if few else EDITED, edits.QUICK if few else edits.TIMES, self.cache(), names)
         return []

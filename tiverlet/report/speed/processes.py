@@ -86,12 +86,12 @@ def side_by_side(
     is one restart, then this many untimed frames, and each round continues from the one before.
     """
     if settles:
-        begin(talkers, settles)
+        restart(talkers, settles)
     out: list[list[float]] = [[] for _ in talkers]
     spent = 0.0
     while len(out[0]) < rounds and spent < seconds * (1 if len(out[0]) >= 3 else 5):
         if not settles:
-            begin(talkers, 0)
+            restart(talkers, 0)
         total = [0.0] * len(talkers)
         for done in range(0, frames, group):
             for k, talker in enumerate(talkers):
@@ -103,7 +103,7 @@ def side_by_side(
     return out
 
 
-def begin(talkers: Sequence[Talker], settles: int) -> None:
+def restart(talkers: Sequence[Talker], settles: int) -> None:
     """Restart each process, and run `settles` untimed frames."""
     for talker in talkers:
         talker.ask("restart")
@@ -116,7 +116,7 @@ def quality(talker: Talker, frames: int, settles: int = 0, looks: int = 6) -> di
 
     The frames begin at the start, or `settles` frames later.
     """
-    begin([talker], settles)
+    restart([talker], settles)
     seen = []
     for _ in range(looks):
         talker.ask(f"run {max(1, frames // looks)}")

@@ -123,7 +123,7 @@ def worlds(threads: tuple[int, ...] = (), quick: bool = False, peers: bool = Tru
                     with started(START, job, cache) as talker:
                         rows = talker.ask()
                 except (RuntimeError, OSError) as error:
-                    notes.append(f"Missing: {name} on {count} threads: {output.said(error)}")
+                    notes.append(f"Missing: {name} on {count} threads: {output.error_line(error)}")
                     continue
                 heads, before = tables.get(part.title, (("threads", *part.heads), ()))
                 tables[part.title] = heads, (*before, *((str(count), *row) for row in rows))

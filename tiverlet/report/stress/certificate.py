@@ -13,7 +13,7 @@ from rich.table import Table
 
 from .. import output
 from ..jobs import done
-from ..output import said
+from ..output import error_line
 from .rows import ROWS, NotAvailable
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def certify(number: int) -> Result:
     except NotAvailable as why:
         figure, how, failing = str(why), ABSENT, ()
     except Exception as error:
-        figure, how, failing = "", FAILED, (said(error),)
+        figure, how, failing = "", FAILED, (error_line(error),)
     return Result(row.number, row.what, row.criterion, figure, how, failing, perf_counter() - clock)
 
 

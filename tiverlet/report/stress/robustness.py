@@ -21,7 +21,7 @@ from ...measure import kinetic_energy
 from ...particles import Particles
 from ...world import World
 from .. import output
-from ..output import said
+from ..output import error_line
 
 if TYPE_CHECKING:
     from ...step.step_report import StepReport
@@ -104,7 +104,7 @@ def perturbed(world: World, *, seconds: float = 1.0, dt: float = 1 / 60, shift: 
     """
     seconds = checks.number("stress", "seconds", seconds, above=0.0)
     dt = checks.number("stress", "dt", dt, above=0.0)
-    plain = look(world, scene_of(world, dt), seconds, None)
+    plain = run_scene(world, scene_of(world, dt), seconds, None)
     tries: list[tuple[str, Callable[[], Scene | str]]] = [
         ("dt x 10", lambda: scene_of(world, 10 * dt)),
         ("all masses x 1e6", lambda: heavier(world, dt, None)),
@@ -120,18 +120,18 @@ def perturbed(world: World, *, seconds: float = 1.0, dt: float = 1 / 60, shift: 
             if isinstance(scene, str):
                 outcomes.append(Outcome(parameter, UNTRIED, scene))
                 continue
-            seen = look(world, scene, seconds, plain, moves=parameter.startswith("shifted") and shift)
+            seen = run_scene(world, scene, seconds, plain, moves=parameter.startswith("shifted") and shift)
             outcomes.append(
                 Outcome(parameter, BREAKS if seen.faults else STANDS, "; ".join(seen.faults) or seen.figure, seen.particle)
             )
         except (ValueError, TypeError, RuntimeError) as error:
-            outcomes.append(Outcome(parameter, REFUSED, said(error)))
-    outcomes.append(spoilt(world))
+            outcomes.append(Outcome(parameter, REFUSED, error_line(error)))
+    outcomes.append(check_nan(world))
     return Endurance(outcomes)
 
 
 @dataclass
-class Seen:
+class RunResult:
     """The result of one run: the worst report, final positions, faults, a figure in words, and the first particle affected."""
 
     report: "StepReport"
@@ -141,7 +141,7 @@ class Seen:
     particle: int | None
 
 
-def look(world: World, scene: Scene, seconds: float, plain: Seen | None, moves: Any = False) -> Seen:
+def run_scene(world: World, scene: Scene, seconds: float, plain: RunResult | None, moves: Any = False) -> RunResult:
     """Run a scene and compare it with the run of the unperturbed scene. moves: the shift along x [m], or False."""
     with scene.build(world) as w:
         first = w.step(scene.dt)
@@ -155,12 +155,12 @@ def look(world: World, scene: Scene, seconds: float, plain: Seen | None, moves: 
         if not np.isfinite(x).all():
             bad = ~np.isfinite(x).all(axis=1)
             particle = int(np.argmax(bad)) if particle is None else particle
-            faults.append(f"the state of particle {particle} is not finite{tied(w, particle)}")
+            faults.append(f"the state of particle {particle} is not finite{constraint_of(w, particle)}")
         new = report.flags - (plain.report.flags if plain else frozenset())
         faults += [note for flag, note in zip(sorted(report.flags), sorted_notes(report), strict=False) if flag in new]
         before = plain.report.residual if plain else 0.0
         if report.residual > max(LOOSE, 2 * before):
-            worst = loosest(w)
+            worst = most_violated(w)
             faults.append(f"constraints are off by {report.residual:.2g} of their size{worst[0]}")
             particle = worst[1] if particle is None else particle
         span = float(np.ptp(x[np.isfinite(x).all(axis=1)], axis=0).max(initial=0.0)) + 1e-12
@@ -181,7 +181,7 @@ def look(world: World, scene: Scene, seconds: float, plain: Seen | None, moves: 
                     + ('; use precision="f32-compensated"' if w.precision == "f32" else "")
                 )
         figure = f"residual {report.residual:.1e}, kinetic energy {top:.1e} J at most"
-        return Seen(report, x, faults, figure, particle)
+        return RunResult(report, x, faults, figure, particle)
 
 
 def gravity_of(w: World) -> float:
@@ -200,7 +200,7 @@ def sorted_notes(report: "StepReport") -> list[str]:
     return [told.get(flag, flag) for flag in sorted(report.flags)]
 
 
-def tied(w: World, particle: int) -> str:
+def constraint_of(w: World, particle: int) -> str:
     """Return the first constraint of a particle, in words; empty if it has none."""
     for f in w.features:
         if isinstance(f, Batch) and f.arity:
@@ -210,7 +210,7 @@ def tied(w: World, particle: int) -> str:
     return ""
 
 
-def loosest(w: World) -> tuple[str, int | None]:
+def most_violated(w: World) -> tuple[str, int | None]:
     """Return the most violated constraint, in words, and its first particle that can move."""
     worst, said_, who = 0.0, "", None
     for f in w.features:
@@ -283,7 +283,7 @@ def gathered(world: World, dt: float) -> Scene | str:
     return scene
 
 
-def spoilt(world: World) -> Outcome:
+def check_nan(world: World) -> Outcome:
     """Check that NaN in position and velocity is refused by name, and that the world is unchanged."""
     parameter, before = "NaN in one input", world.hash()
     k = last(world) or 0

@@ -62,13 +62,13 @@ def elastic() -> tuple[Particles, list[Feature]]:
     return Particles([[0, 0], p["x0"]], pinned=[0]), [Gravity(p["g"]), Distance([[0, 1]], p["L"], compliance=p["alpha"])]
 
 
-def lone(angle: float) -> tuple[Particles, list[Feature]]:
+def single_pendulum(angle: float) -> tuple[Particles, list[Feature]]:
     """Build a pendulum of 1 m, released at `angle` [rad] from the vertical."""
     start = Particles([[0, 0], [np.sin(angle), -np.cos(angle)]], pinned=[0])
     return start, [Gravity(9.81), Distance([[0, 1]])]
 
 
-def late(run: Run) -> float:
+def period_error(run: Run) -> float:
     """Return the relative error of the period: after a quarter of it the pendulum should pass its lowest point."""
     x, v = run.world.position[1], run.world.velocity[1]
     return abs(float(np.arctan2(x[0], -x[1]) / (v[0] * run.times[-1])))
@@ -104,8 +104,8 @@ def period(degrees: int, seconds: float, limit: float) -> Case:
     angle, frame = np.radians(degrees), seconds / 160
     title = f"Pendulum, period of {degrees} degrees"
     return Case(
-        f"R06_pendulum_period:{degrees}", title, lambda: lone(angle), seconds / 4, late, limit, 0.1, "relative", frame,
-        methods=("Jacobi",),
+        f"R06_pendulum_period:{degrees}", title, lambda: single_pendulum(angle), seconds / 4, period_error, limit, 0.1,
+        "relative", frame, methods=("Jacobi",),
     )  # fmt: skip
 
 
@@ -114,7 +114,7 @@ def state(degrees: int, t: int, limit: float) -> Case:
     v, angle = known("R06b_pendulum_state")["values"][f"{degrees}deg_t{t}"], np.radians(degrees)
     title = f"Pendulum of {degrees} degrees after {t} s"
     error = ends_at([1], [[v["x"], v["y"]]])
-    return Case(f"R06b_pendulum_state:{degrees}", title, lambda: lone(angle), t, error, limit, 0.5)
+    return Case(f"R06b_pendulum_state:{degrees}", title, lambda: single_pendulum(angle), t, error, limit, 0.5)
 
 
 def _entry(name: str, t: str, key: str):

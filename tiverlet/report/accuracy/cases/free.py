@@ -156,7 +156,7 @@ def swollen(run) -> float:
     return abs(float(area.rest_of(run.world.position)[0] / area.rest[0]) - 1)
 
 
-def cast() -> tuple[Particles, list[Feature]]:
+def thrown_net() -> tuple[Particles, list[Feature]]:
     """Build a net of unequal masses, soft in places, that flies and tumbles."""
     rng = np.random.default_rng(4)
     k = np.arange(36).reshape(6, 6)
@@ -168,7 +168,7 @@ def cast() -> tuple[Particles, list[Feature]]:
     return Particles(x, velocity=v, mass=mass), [Gravity(9.81), net]
 
 
-def astray(run) -> float:
+def parabola_error(run) -> float:
     """Return the distance of the centre of mass from its parabola [m]."""
     p, t = run.world.particles, run.times[-1]
     share = p.mass / p.mass.sum()
@@ -181,8 +181,8 @@ EXACT = {"order": None, "efforts": (1, 2, 4, 8), "at": 2}
 
 CASES = [
     Case(
-        "M01_thrown_net", "Centre of mass of a net that is thrown", cast, 1.0, astray, 1e-11, order=None, momentum=sideways,
-        conserves=False,
+        "M01_thrown_net", "Centre of mass of a net that is thrown", thrown_net, 1.0, parabola_error, 1e-11, order=None,
+        momentum=sideways, conserves=False,
     ),
     Case(
         "S05_tennis_racket", "Tennis racket: six masses that tumble", racket, 2.0,

@@ -120,7 +120,7 @@ def _spoilt(x, v, t, i):
     return f
 
 
-def spoilt(*features, **settings) -> dict[str, bool]:
+def check_nan_flag(*features, **settings) -> dict[str, bool]:
     """Check that NaN of particle 3 is flagged in its frame, with the particle. Returns whether each part holds."""
     with world(Particles(np.arange(12.0).reshape(6, 2), radius=0.1), [Force(_spoilt), *features], substeps=4, **settings) as w:
         seen = [w.step(0.05) for _ in range(4)]
@@ -131,17 +131,17 @@ def spoilt(*features, **settings) -> dict[str, bool]:
 
 @row(50, "NaN at run time", "flagged on its frame, with the particle; in f32 and f64")
 def _nan() -> Finding:
-    return Finding("particle 3 named", {f"{p}: {k}": v for p in ("f32", "f64") for k, v in spoilt(precision=p).items()})
+    return Finding("particle 3 named", {f"{p}: {k}": v for p in ("f32", "f64") for k, v in check_nan_flag(precision=p).items()})
 
 
 @row(51, "NaN and walls, which would clamp it", "flagged all the same")
 def _clamped() -> Finding:
-    return Finding("particle 3 named", spoilt(Box((-9, -9), (99, 99)), HalfSpace((0, 1), -5)))
+    return Finding("particle 3 named", check_nan_flag(Box((-9, -9), (99, 99)), HalfSpace((0, 1), -5)))
 
 
 @row(52, "NaN and the cells of contacts", "flagged, and no memory is overwritten")
 def _celled() -> Finding:
-    return Finding("particle 3 named", spoilt(Contact(), precision="f32"))
+    return Finding("particle 3 named", check_nan_flag(Contact(), precision="f32"))
 
 
 @row(53, "infinite velocity", "error when it is set")

@@ -12,16 +12,16 @@ if TYPE_CHECKING:
     from .memory import Memory
 
 
-class Differs(Exception):
+class DeclarationsDiffer(Exception):
     """Raised when an owner would declare other fields than before, so that kernels would have to be compiled again."""
 
 
-class Again:
+class Redeclaration:
     """Stands in for Memory.field() and Memory.number() while owners declare their fields a second time.
 
     Each owner gets the fields and numbers that it declared the first time, in the same order. Memory does not change until
-    write(). counts: the coming values of numbers that other owners hold. Raises Differs where a declaration is not the same as
-    the first.
+    write(). counts: the coming values of numbers that other owners hold. Raises DeclarationsDiffer where a declaration is not the
+    same as the first.
     """
 
     def __init__(self, memory: "Memory", counts: dict[Number, int]):
@@ -37,18 +37,18 @@ class Again:
         self._fields, self._places = iter(fields), iter(numbers)
         yield
         if next(self._fields, None) is not None or next(self._places, None) is not None:
-            raise Differs
+            raise DeclarationsDiffer
 
     def field(self, length: int | Number | None, width: int, kind: np.dtype, values: Any) -> Any:
         """Return the owner's next field, and note its new length and values."""
         k = next(self._fields, None)
         if k is None:
-            raise Differs
+            raise DeclarationsDiffer
         entry = self._memory.entries[k]
         if isinstance(length, Number):
             length = self._counts.get(length, length.now)
         if entry.width != width or entry.kind != kind or (entry.length == 0) != (length is None):
-            raise Differs
+            raise DeclarationsDiffer
         self.wanted.append((k, 0 if length is None else max(1, int(length)), values))
         return entry.field
 
@@ -56,7 +56,7 @@ class Again:
         """Return the owner's next number, with a new value."""
         old = next(self._places, None)
         if old is None or old.field is not field:
-            raise Differs
+            raise DeclarationsDiffer
         self.numbers.append(Number(self._memory, field, old.place, value))
         return self.numbers[-1]
 
