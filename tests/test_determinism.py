@@ -159,7 +159,7 @@ def test_all_paths_have_the_same_bits(world, acting):
         w.run(0.5)
         made.append((w.hash(), w.last.energy, w.last.residual, w.last.overlap))
         if acting:
-            assert w.last.contacts > 60 and (w._runner.search.list.lasting_data()[1]["load"] > 0).any()
+            assert w.last.contacts > 60 and (w._runner.search.list.persistent_data()[1]["load"] > 0).any()
         else:
             assert 0 < features[1].broken.sum() < len(pairs)
     assert made[0] == made[1] == made[2]

@@ -71,7 +71,7 @@ def test_what_can_give_way_holds_nothing_inside(world):
     x = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
     for more in ({}, {"compliance": 1e-3}, {"break_at": 5.0}):
         w = world(tv.Particles(x, radius=1.5), [tv.Distance([[0, 1], [1, 2]], **more), tv.Contact()])
-        assert ([0, 2] in w._runner.search._both.tolist()) is (not more)  # pairs not listed; swing() shows the effect
+        assert ([0, 2] in w._runner.search._excluded_pairs.tolist()) is (not more)  # pairs not listed; swing() shows the effect
 
 
 def test_edits_and_copies_leave_out_the_same(world):

@@ -81,7 +81,7 @@ class Again:
 
     @ti.kernel
     def run(self):
-        self.search.pair_up(0)
+        self.search.count_and_fill(0)
 
 
 def lists(w) -> tuple[np.ndarray, np.ndarray]:
@@ -94,12 +94,12 @@ def lists(w) -> tuple[np.ndarray, np.ndarray]:
 def shuffle(w, rng) -> None:
     """Reorder the particles within each bucket at random."""
     cells = w._runner.search.cells
-    begin, who, place = (w._runner.memory.read(f) for f in (cells.edge, cells.sorted, cells.place))
+    begin, who, place = (w._runner.memory.read(f) for f in (cells.edge, cells.sorted, cells.sorted_position))
     bucket = np.repeat(np.arange(cells.buckets), np.diff(begin[1 : cells.buckets + 2]))
     order = np.lexsort((rng.random(N), bucket))
     assert (order != np.arange(N)).sum() > N / 8
     w._runner.memory.write(cells.sorted, who[order])
-    w._runner.memory.write(cells.place, place[order])
+    w._runner.memory.write(cells.sorted_position, place[order])
 
 
 @pytest.mark.parametrize("dim, sizes", [(3, "one"), (2, "several"), (3, "several")])  # (2, "one"): test_pairs.py
@@ -180,7 +180,7 @@ def test_a_few_that_fly_far_have_no_list_built_until_they_meet_something(world):
                 if always:
                     w._runner.invalidate()
                 w.step(1.0)
-                at = w._runner.memory.read(search.origin)
+                at = w._runner.memory.read(search.position_at_build)
                 built, origin = built + (not np.array_equal(at, origin)), at
                 if always:
                     continue

@@ -105,7 +105,7 @@ def test_a_load_is_learnt_where_it_is_steady_and_lost_where_it_is_let_go(world):
     # leaves 1 - 128 / (64 + 0.3 k^2) of that part, k = 99, and the overlap of the pair is proportional to it.
     def known(w):
         """Return the known load of the pair [N]."""
-        pairs, values = w._runner.search.list.lasting_data()
+        pairs, values = w._runner.search.list.persistent_data()
         return values["load"][(pairs == (0, 1)).all(axis=1)].sum()
 
     w = smooth(world, None, [1.0, 99.0], substeps=128)

@@ -6,7 +6,7 @@ import pytest
 import tiverlet as tv
 from tiverlet.device import ti
 from tiverlet.device.patches.compiler import CachedLaunch
-from tiverlet.geometry.bounding_tree import BoundingTree, ahead
+from tiverlet.geometry.bounding_tree import BoundingTree, ray_entry_bound
 from tiverlet.geometry.intervals import ball, entry, rounding
 
 NONE = -1
@@ -224,7 +224,7 @@ def test_the_tree_and_brute_force_find_the_same(dim):
         return entry(ball(o[q], d[q], center[i], radius[i]), rounding(o[q], center[i]))
 
     tree = BoundingTree(center - radius[:, None], center + radius[:, None])
-    distance, which = tree.first(k, most, ahead(o, d, 0.0), value)
+    distance, which = tree.find_least(k, most, ray_entry_bound(o, d, 0.0), value)
     every = value(*np.indices((k, n)).reshape(2, -1)).reshape(k, n)
     every[every > most[:, None]] = np.inf
     np.testing.assert_array_equal(distance, every.min(axis=1))

@@ -9,7 +9,7 @@ import tiverlet as tv
 from tiverlet.device import ti
 from tiverlet.report.accuracy import points
 from tiverlet.solvers.solver import SemiIteration, Solver
-from tiverlet.solvers.spectrum import largest
+from tiverlet.solvers.spectrum import largest_eigenvalue
 
 from .conftest import unprojected
 
@@ -40,7 +40,7 @@ def test_largest_eigenvalue_of_a_net(world, shear, figure):
     alive = D > 0
     A = np.einsum("jia,i,kia->jk", G, inv, G)[np.ix_(alive, alive)] / np.sqrt(np.outer(D[alive], D[alive]))
     value = float(np.linalg.eigvalsh(A).max())
-    assert largest(w._runner.scene, [w.features[1]], split) == pytest.approx(value, rel=1e-3)
+    assert largest_eigenvalue(w._runner.scene, [w.features[1]], split) == pytest.approx(value, rel=1e-3)
     assert value == pytest.approx(figure, rel=0.03)
     assert w._runner.scene.slots.relaxation == pytest.approx(1.2 / value, rel=1e-3)
     assert f"relaxation {1.2 / value:.3g}" in w.explain()

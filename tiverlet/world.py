@@ -20,7 +20,7 @@ from .device.interrupts import deferred_signals
 from .features.arguments import suggest_name
 from .features.feature import Acceleration, Batch, Feature
 from .features.read_only import assign_whole_advice, read_only, structure_advice
-from .neighbours.queries import Contacts, PointSearch, near_by_all, nearest
+from .neighbours.queries import Contacts, PointSearch, near_by_brute_force, nearest
 from .particles import Particles, at_rest, in_range, spin_of
 from .solvers.jacobi import Jacobi
 from .solvers.solver import Solver
@@ -408,7 +408,7 @@ class World:
         box = self._runner.scene.periodic
         points = points if box is None else box.wrap(points)
         if not self._runner.search:
-            return near_by_all(self.position, points, radius, box)
+            return near_by_brute_force(self.position, points, radius, box)
         with deferred_signals:
             self._runner.list_neighbours()
             with self._runner.memory.compiler():

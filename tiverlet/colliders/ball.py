@@ -7,7 +7,7 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..geometry.intervals import ball, entry, exit_of, rounding
-from ..geometry.nearest import away
+from ..geometry.nearest import surface_normal
 from ..particles import Particles
 from .collider import Collider
 from .round_mesh import rounded
@@ -117,7 +117,7 @@ class Ball(Collider):
         close = rounding(origin, center[None])
         distance = exit_of(way, close) if self.inside else entry(way, close)
         r = origin + np.where(distance < np.inf, distance, np.nan)[:, None] * direction - center
-        return distance, away(-r if self.inside else r, np.zeros_like(r), direction, np.zeros_like(r), close)
+        return distance, surface_normal(-r if self.inside else r, np.zeros_like(r), direction, np.zeros_like(r), close)
 
     @property
     def _middle(self) -> np.ndarray:

@@ -61,7 +61,7 @@ class BodyImpacts:
         self.passes = FEW if system and not pairs else MANY
         self.lightest = CAREFUL if pairs else LIGHTEST
         self.spreads = not system  # from link to link; a system solves all links at once
-        self.exact = bool(scene.slots.exact and (not system or system.left_out(batches) == 0))
+        self.exact = bool(scene.slots.exact and (not system or system.count_relaxed_alone(batches) == 0))
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.state = scene.state
         self.rigid = add("impacts.rigid", n, kind=ti.i32)  # whether a rigid constraint holds it
@@ -101,7 +101,7 @@ class BodyImpacts:
         """
         holds = batch.dev.spring.is_rigid(c)
         if ti.static(batch.breaks):
-            holds = holds and batch.dev.strength.holds(c)
+            holds = holds and batch.dev.strength.is_intact(c)
         if holds:
             for k in ti.static(range(batch.arity)):
                 self.rigid[batch.dev.corners.member(c, k)] = 1

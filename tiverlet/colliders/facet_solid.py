@@ -4,9 +4,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..geometry.bounding_tree import BoundingTree, ahead, apart, beyond
+from ..geometry.bounding_tree import BoundingTree, distance_bound, ray_entry_bound, ray_exit_bound
 from ..geometry.intervals import ROUNDING, dot, entry, rounded, rounding, triangle
-from ..geometry.nearest import away, on_facet
+from ..geometry.nearest import nearest_on_facet, surface_normal
 
 if TYPE_CHECKING:
     from .facets import Facets
@@ -32,12 +32,12 @@ class FacetSolid:
 
         def distance(q: np.ndarray, f: np.ndarray) -> np.ndarray:
             """Return the distances of points q[i] to facets f[i]."""
-            r = points[q] - on_facet(points[q], corners[f])[0]
+            r = points[q] - nearest_on_facet(points[q], corners[f])[0]
             return np.sqrt(dot(r, r))
 
-        length, f = self._tree.first(len(points), np.full(len(points), np.inf), apart(points), distance)
+        length, f = self._tree.find_least(len(points), np.full(len(points), np.inf), distance_bound(points), distance)
         if self._facets.closed and len(points):
-            at, part = on_facet(points, corners[f])
+            at, part = nearest_on_facet(points, corners[f])
             facing = np.where((part < 0)[:, None], self._normals[f], self._facets.facing[self._facets.features[f, part]])
             length = np.where(dot(points - at, facing) < 0, -length, length)
         return length
@@ -56,7 +56,7 @@ class FacetSolid:
             normal[met] = np.where((dot(n, d) > 0)[:, None], -n, n)
         else:
             x = origin[met] + distance[met, None] * d
-            normal[met] = away(x, on_facet(x, corners)[0], d, np.zeros_like(d), np.zeros(len(d)))
+            normal[met] = surface_normal(x, nearest_on_facet(x, corners)[0], d, np.zeros_like(d), np.zeros(len(d)))
         return distance, normal
 
     def _bare(self, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -74,7 +74,7 @@ class FacetSolid:
                 return entry((t, t), close)
             return np.where((t >= -close) & (slope < 0), np.maximum(t, 0.0), np.inf)
 
-        return self._tree.first(len(origin), np.full(len(origin), np.inf), ahead(origin, direction, 0.0), enter)
+        return self._tree.find_least(len(origin), np.full(len(origin), np.inf), ray_entry_bound(origin, direction, 0.0), enter)
 
     def _thick(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
         """Return distances and facets where rays first come within `radius`. A ray that starts in the solid leaves it first."""
@@ -89,7 +89,7 @@ class FacetSolid:
             c = corners[f]
             return entry(rounded(o[q], d[q], c, radius), rounding(o[q], c[:, 0], c[:, 1]) + ROUNDING * radius)
 
-        more, f[some] = self._tree.first(len(o), np.full(len(o), np.inf), ahead(o, d, radius), enter)
+        more, f[some] = self._tree.find_least(len(o), np.full(len(o), np.inf), ray_entry_bound(o, d, radius), enter)
         distance[some] = start[some] + more
         return distance, f
 
@@ -118,7 +118,7 @@ class FacetSolid:
         deep: points further inside than the surroundings of any facet; their step is to the next facet.
         """
         corners = self._facets.corners
-        to_boxes, out_of_boxes = ahead(x, d, 0.0), beyond(x, d, radius)
+        to_boxes, out_of_boxes = ray_entry_bound(x, d, 0.0), ray_exit_bound(x, d, radius)
 
         def bound(q: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
             """Return bounds of the values in boxes around facets."""
@@ -134,5 +134,5 @@ class FacetSolid:
             out[some] = np.where((enter <= close[q[some]]) & (leave > close[q[some]]), -leave, np.inf)
             return out
 
-        step, f = self._tree.first(len(x), np.full(len(x), np.inf), bound, value)
+        step, f = self._tree.find_least(len(x), np.full(len(x), np.inf), bound, value)
         return np.where(f >= 0, np.abs(step), np.where(deep, np.inf, 0.0))

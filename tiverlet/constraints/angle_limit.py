@@ -10,7 +10,7 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles
-from .core.angle import TURN, Angle, faint, path_angle, path_angles, shorter_leg, turned, wrapped
+from .core.angle import TURN, Angle, least_sine, path_angle, path_angles, shorter_link, wrap_near, wrap_to_pi
 from .core.quantity import differences
 from .core.scalar import Scalar
 
@@ -36,9 +36,9 @@ class AngleFromMiddle(Angle):
         return bound
 
     @ti.func
-    def reach(self, q):
-        """Return the length of the shorter leg."""
-        return shorter_leg(q)
+    def trust_radius(self, q):
+        """Return the length of the shorter link."""
+        return shorter_link(q)
 
     @ti.func
     def unwrap(self, f, other):
@@ -48,9 +48,9 @@ class AngleFromMiddle(Angle):
     @ti.func
     def measure(self, c, q):
         """Return |angle - middle| and its gradients: the gradients of the angle, with the sign of angle - middle."""
-        f, g = path_angle(q, 0 * q[0, :], False, faint(self.state, self.real))
+        f, g = path_angle(q, 0 * q[0, :], False, least_sine(self.state, self.real))
         middle = self.middle[c]
-        f = wrapped(f, middle) - middle
+        f = wrap_near(f, middle) - middle
         side = ti.select(f < 0, ti.cast(-1, self.real), ti.cast(1, self.real))
         return side * f, side * g
 
@@ -113,7 +113,7 @@ class AngleLimit(Scalar):
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return how far the angles are from the middle [rad]. x may hold several copies of all corners, one after the other."""
-        return np.abs(turned(super().values(x) - np.tile(self.middle, len(x) // max(1, self.count))))
+        return np.abs(wrap_to_pi(super().values(x) - np.tile(self.middle, len(x) // max(1, self.count))))
 
     def gradients(self, position: np.ndarray) -> np.ndarray:
         """Return the gradients of |angle - middle| by each corner, (m, 3, dim)."""
@@ -129,4 +129,4 @@ class AngleLimit(Scalar):
     def violation(self, position: np.ndarray) -> np.ndarray:
         """Return C at the given positions, (m,)."""
         half, middle = self.ramp.now() if self.ramp and self.ramp.under_way else (self.rest, self.middle)
-        return np.abs(turned(super().values(self.placed(position)) - middle)) - half
+        return np.abs(wrap_to_pi(super().values(self.placed(position)) - middle)) - half

@@ -93,7 +93,7 @@ class Triangles(Quantity):
         return np.linalg.norm(cross(b - a, c - a), axis=1) / 2
 
     @ti.func
-    def reach(self, q):
+    def trust_radius(self, q):
         """Return the size of a triangle [m]."""
         return q.norm()
 

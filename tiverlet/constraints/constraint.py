@@ -16,7 +16,8 @@ from .core.finite_differences import NumericGradient
 from .core.quantity import Quantity
 from .core.scalar import Scalar
 
-WRONG = 1e-4  # a relative difference between the given gradient and finite differences that rounding does not explain
+# A relative difference between the given gradient and finite differences that rounding does not explain.
+GRADIENT_TOLERANCE = 1e-4
 
 
 class Function(Quantity):
@@ -39,9 +40,9 @@ class Function(Quantity):
         bound.size = scene.memory.number(self._size, ti.f64)
         return bound
 
-    def frame(self, corners: Any) -> "Frame":
+    def relative_corners(self, corners: Any) -> "RelativeCorners":
         """Return corners relative to the origin, or to the first corner."""
-        return Frame(corners, self.origin)
+        return RelativeCorners(corners, self.origin)
 
     @ti.func
     def measure(self, c, q):
@@ -57,7 +58,7 @@ class Function(Quantity):
         return ti.select(good, ti.cast(f, self.real), 0), n
 
 
-class Frame:
+class RelativeCorners:
     """The corners of constraints relative to an origin, given in two words, or to the first corner where origin is None."""
 
     def __init__(self, corners: Any, origin: Any):
@@ -122,7 +123,7 @@ class Constraint(Scalar):
     index_name = "indices"
     can_extend = False  # the function may read the number of a constraint
     _size = 0.0  # of the part of the scene that it acts on [m]
-    _known: tuple[Any, Any, Any] = (None, None, None)  # positions, and values and gradients there
+    _cached_gradients: tuple[Any, Any, Any] = (None, None, None)  # positions, and values and gradients there
     rest = Knob(lambda f, v: checks.per_item(repr(f), "rest", v, f.count), "What function should be.")
 
     def __init__(
@@ -134,8 +135,8 @@ class Constraint(Scalar):
         if indices.ndim == 1:
             indices = indices[:, None]
         self.arity = indices.shape[1] if indices.ndim == 2 else 0
-        self.function = self._taken("function", function)
-        self.gradient = None if gradient is None else self._taken("gradient", gradient)
+        self.function = self._check_function("function", function)
+        self.gradient = None if gradient is None else self._check_function("gradient", gradient)
         if side not in (-1, 0, 1):
             raise ValueError(f"{self!r}: side = {side!r}, but it must be 0 (equal), 1 (at most) or -1 (at least).")
         self.side = side
@@ -150,7 +151,7 @@ class Constraint(Scalar):
     def __repr__(self) -> str:
         return f"Constraint({self.name})"
 
-    def _taken(self, name: str, function) -> Any:
+    def _check_function(self, name: str, function) -> Any:
         """Check the function. Returns it for kernels, and whether it takes the number of the constraint."""
         if not callable(function):
             raise TypeError(f"Constraint: {name} = {function!r} is not a function.")
@@ -178,14 +179,14 @@ class Constraint(Scalar):
         mine = self.indices.ravel()  # only its own particles, so that no other particle changes a bit of the result
         extent = float(np.ptp(particles.position[mine], axis=0).max()) if len(mine) else 0.0
         self._keep(_size=extent or float(particles.radius[mine].max(initial=0.0)) or 1.0)
-        self._keep(_known=(None, None, None))
+        self._keep(_cached_gradients=(None, None, None))
         self._derivative = NumericGradient(self.function, self.gradient, self.arity, particles.dim, int(self.origin is None))
         self.hold(Function(self.members, self._unit, self._derivative, words, self._size))
         Scalar.prepare(self, particles, inv_mass)
         values, slopes = np.zeros(0), np.zeros((0, self.arity, particles.dim))
         if self.count:
             values, slopes, _ = self._derivative(self._corners(particles.position), self._size)
-        self._keep(_known=(particles.position, values, slopes))
+        self._keep(_cached_gradients=(particles.position, values, slopes))
         if not np.isfinite(values).all():
             i = int(np.argmin(np.isfinite(values)))
             raise ValueError(f"{self!r}: the function is {values[i]} for {self.index_name}[{i}] at its initial position.")
@@ -203,7 +204,7 @@ class Constraint(Scalar):
             q = q + k * 0.01 * self._size * (golden(np.arange(1, q.size + 1) + 1000 * k).reshape(q.shape) - 0.5)
             _, given, differences = self._derivative(q, self._size)
             size = np.abs(differences).max(axis=(1, 2), keepdims=True)
-            off = ~(np.abs(given - differences) <= WRONG * size + 1e-9 * np.abs(given))
+            off = ~(np.abs(given - differences) <= GRADIENT_TOLERANCE * size + 1e-9 * np.abs(given))
             wrong += off & np.isfinite(differences)
             found.append((given, differences))
         if (wrong > 2).any():
@@ -221,14 +222,14 @@ class Constraint(Scalar):
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """Return the values of function, (m,)."""
-        known, values, _ = self._known
+        known, values, _ = self._cached_gradients
         if position is known:  # Taichi cannot launch kernels while the world's fields are being declared
             return values
         return self._derivative(self._corners(position), self._size)[0] if self.count else np.zeros(0)
 
     def gradients(self, position: np.ndarray) -> np.ndarray:
         """Return the gradients of function, (m, arity, dim)."""
-        known, _, slopes = self._known
+        known, _, slopes = self._cached_gradients
         if position is known:
             return slopes
         if not self.count:

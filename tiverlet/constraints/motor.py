@@ -12,7 +12,7 @@ from .core.angle import TURN, DihedralAngle, PathAngle
 from .core.drive import Drive, largest_load
 from .core.scalar import Scalar
 
-SETTLE = 0.1  # [s] time constant with which a servo approaches its angle
+TIME_CONSTANT = 0.1  # [s] time constant with which a servo approaches its angle
 PLACED = 0.2  # [rad] hinges that were placed further than this from their rest angle continue from their new angle
 
 
@@ -99,7 +99,7 @@ class Motor(Scalar):
         """Make the drive, which goes to the angle, or on without end."""
         largest, ends = self.torque if self.capped else None, scene.state.dim == 3 and self.arity == 3  # it ends at 0 and pi
         endless, period = not (self.serves or ends), 0.0 if ends else TURN
-        return Drive(scene, "Motor", self._begin, *self.course(), largest, endless, period, SETTLE * self.serves)
+        return Drive(scene, "Motor", self._begin, *self.course(), largest, endless, period, TIME_CONSTANT * self.serves)
 
     def course(self) -> tuple[Any, Any]:
         """Return the goals of the rest angles [rad] and the speeds [rad/s]."""

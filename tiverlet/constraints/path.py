@@ -127,8 +127,8 @@ class Path(Anchored):
     def place_of(self, scene: Scene, passes: AnchorPasses) -> OnCurve:
         """Make the arc length of each particle, on the device."""
         extent, moves = float(np.ptp(self.points, axis=0).max()), "speed" in self.__dict__
-        pace = None if not self.is_kinematic else self.speed if moves else self._start
-        return OnCurve(scene, passes, self.curve, self._start, pace, moves, extent)
+        target = None if not self.is_kinematic else self.speed if moves else self._start
+        return OnCurve(scene, passes, self.curve, self._start, target, moves, extent)
 
     def upload(self) -> None:
         """Write the new speed, or the new target arc lengths."""

@@ -58,7 +58,7 @@ class Volume(Scalar):
     def quantity_of(self, indices) -> Quantity:
         """Return Surfaces for faces (k, 3), else Tetrahedra, which have simpler kernels of their own."""
         if np.ndim(indices) == 2 and np.shape(indices)[1] == 3:
-            return Surfaces(*_oriented(checks.indices("Volume", "cells", indices, checks.ANY, arity=3)))
+            return Surfaces(*_orient_faces(checks.indices("Volume", "cells", indices, checks.ANY, arity=3)))
         return Tetrahedra(self.fixed(indices, 4))
 
     @property
@@ -104,7 +104,7 @@ class Tetrahedra(Quantity):
         return np.einsum("ij,ij->i", b - a, cross(c - a, d - a)) / 6
 
     @ti.func
-    def reach(self, q):
+    def trust_radius(self, q):
         """Return the size of a tetrahedron [m]."""
         return q.norm()
 
@@ -149,11 +149,11 @@ class Surfaces(Quantity):
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return the signed volumes, (m,) [m^3]."""
-        a, b, c = self._seen(x)
+        a, b, c = self._face_corners(x)
         parts = np.einsum("ij,ij->i", a, cross(b, c)) / 6
         return np.bincount(self.surface, weights=parts, minlength=self.members.count)
 
-    def _seen(self, x: np.ndarray) -> np.ndarray:
+    def _face_corners(self, x: np.ndarray) -> np.ndarray:
         """Return the corners of each face, (3, k, 3), relative to one of the particles of its surface."""
         eye = x[self.members.indices[self.members.starts[:-1]]][self.surface][:, None]
         return np.moveaxis(x[self.faces] - eye, 1, 0)
@@ -161,7 +161,7 @@ class Surfaces(Quantity):
     def gradients(self, x: np.ndarray) -> np.ndarray:
         """Return the gradients of the volumes by each corner, (total, 3)."""
         members, corner = self.members, self._corner
-        a, b, c = self._seen(x)
+        a, b, c = self._face_corners(x)
         parts = np.stack([cross(b, c), cross(c, a), cross(a, b)], axis=1).reshape(-1, 3) / 6
         return np.stack([np.bincount(corner, part, minlength=len(members.indices)) for part in parts.T], axis=1)
 
@@ -210,7 +210,7 @@ def _edges(faces: np.ndarray) -> np.ndarray:
     return np.concatenate([np.stack([faces[:, a], faces[:, (a + 1) % 3], f], axis=1) for a in range(3)])
 
 
-def _oriented(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _orient_faces(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Orient faces so that the two at each edge run along it in opposite senses. Returns the faces and the surface of each."""
     edges = _edges(faces)
     forward = edges[:, 0] < edges[:, 1]

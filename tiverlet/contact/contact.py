@@ -150,16 +150,18 @@ class Contact(PairContact):
         dev.move = scene.memory.field("Contact.move", scene.count, width=dim)
         self.table.bind(scene)
         # The push of the pair in the last substep, per inverse mass [kg m].
-        dev.push = PairData("push", 0, lasting=True, marked=True)
-        dev.slip = PairData("slip", dim, lasting=True)
+        dev.push = PairData("push", 0, persistent=True, only_touching=True)
+        dev.slip = PairData("slip", dim, persistent=True)
         dev.spins, dev.axes = scene.state.spins and dev.has_friction, scene.particles.axes
-        dev.turn = PairData("turn", dev.axes, lasting=True) if dev.turns else None
-        dev.slack = PairData("slack", 0, lasting=True, marked=True)  # the part of the overlap that is not pushed out [m]
-        dev.impulse = PairData("given", 0, lasting=True, for_reports=True)  # pushes and impacts in the last substep [kg m]
+        dev.turn = PairData("turn", dev.axes, persistent=True) if dev.turns else None
+        dev.slack = PairData(
+            "slack", 0, persistent=True, only_touching=True
+        )  # the part of the overlap that is not pushed out [m]
+        dev.impulse = PairData("given", 0, persistent=True, for_reports=True)  # pushes and impacts in the last substep [kg m]
         dev.has_loads = self.has_loads
         dev.known = KnownLoads(scene) if dev.has_loads else None
         loads = dev.known.pair_data if dev.known else []
-        struck, bouncing = PairData("struck", 0, lasting=False), [dev.slack] if dev.has_restitution else []
+        struck, bouncing = PairData("struck", 0, persistent=False), [dev.slack] if dev.has_restitution else []
         pair_data = [
             dev.push,
             *loads,
@@ -251,7 +253,7 @@ class Contact(PairContact):
         carries = ti.cast(ti.select(first != 0 and fresh == 0, 1, 0), self.scene.real)
         own, least = self.dev.splitting.weight[i], ti.cast(1, self.scene.real)  # least: the smallest push of i
         if own > 0:
-            for word in range(self.dev.list.words(i)):
+            for word in range(self.dev.list.word_count(i)):
                 bits = self.dev.splitting.touching(i, word)
                 while bits != 0:
                     e = self.dev.list.entry(i, word, bits)
@@ -381,8 +383,8 @@ class Contact(PairContact):
         """
         total, w = 0 * self.dev.state.d[i], self.dev.w.of(i)
         if self.dev.splitting.weight[i] > 0:
-            for word in range(self.dev.list.words(i)):
-                bits = self.dev.list.touched(i, word)
+            for word in range(self.dev.list.word_count(i)):
+                bits = self.dev.list.touching_bits(i, word)
                 while bits != 0:
                     e = self.dev.list.entry(i, word, bits)
                     bits &= bits - ti.u32(1)
@@ -417,7 +419,7 @@ class Contact(PairContact):
         Pairs that began to overlap after the pushes wait until the next substep: a list with a narrow skin may not have them yet.
         """
         if ti.static(self.dev.has_friction):
-            for word in range(self.dev.list.words(i)):
+            for word in range(self.dev.list.word_count(i)):
                 bits = self.dev.splitting.sliding(i, word, now)
                 while bits != 0:
                     e = self.dev.list.entry(i, word, bits)

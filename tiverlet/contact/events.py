@@ -41,7 +41,7 @@ class EventLog:
         dim, add = scene.particles.dim, scene.memory.field
         self.state, self.radius, self.table, self.senses = scene.state, scene.radius, table, table.senses
         self.can_sleep = bool(scene.state.sleepers)
-        self.touched = PairData("touched", 0, lasting=True, kind=ti.i32, for_reports=True)
+        self.touched = PairData("touched", 0, persistent=True, kind=ti.i32, for_reports=True)
         self.pair, self.when = Column("events.pair", 2, ti.i32), Column("events.when", 2, ti.i32)
         self.impulse, self.speed = Column("events.impulse"), Column("events.speed")
         self.normal, self.point = Column("events.normal", dim), Column("events.point", dim)

@@ -59,9 +59,9 @@ class KnownLoads:
 
     def __init__(self, scene: "Scene"):
         self.state, self.weights = scene.state, scene.own_weight
-        self.load = PairData("load", 0, lasting=True, marked=True)  # [N]
-        self.borne = PairData("borne", 0, lasting=True, marked=True)  # sum of the missing part in this window [kg m]
-        self.earlier = PairData("earlier", 0, lasting=True, marked=True)  # mean missing part in the window before [N]
+        self.load = PairData("load", 0, persistent=True, only_touching=True)  # [N]
+        self.borne = PairData("borne", 0, persistent=True, only_touching=True)  # sum of the missing part in this window [kg m]
+        self.earlier = PairData("earlier", 0, persistent=True, only_touching=True)  # mean missing part in the window before [N]
         self.pair_data = [self.load, self.borne, self.earlier]
         n, dim = scene.count, scene.particles.dim
         self.carried = Carried(scene)
@@ -74,7 +74,7 @@ class KnownLoads:
 
     def forget(self, scene: "Scene", x: np.ndarray) -> None:
         """Clear the loads of pairs whose relative position changes, before particles are moved to x (n, dim) [m]."""
-        pairs, values = self.list.lasting_data()
+        pairs, values = self.list.persistent_data()
         if not values["load"].any():
             return
         i, j = pairs.T
@@ -89,7 +89,7 @@ class KnownLoads:
     def carry(self, scene: "Scene", x: np.ndarray, pairs: np.ndarray, values: dict[str, np.ndarray]) -> None:
         """Set the accelerations of particles at x (n, dim) [m] by the loads of pairs (m, 2).
 
-        values: as returned by NeighbourList.lasting_data().
+        values: as returned by NeighbourList.persistent_data().
         """
         i, j = pairs.T
         r = between(x[i], x[j], scene.periodic)

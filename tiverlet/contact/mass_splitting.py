@@ -143,7 +143,7 @@ class MassSplitting:
         pairs, others = ti.math.popcnt(bits), self.list.touching[i] != bits
         self.clear(i, 0, self.list.touching[i] & ~bits, now)
         self.list.touching[i] = bits
-        for word in range(1, self.list.words(i)):
+        for word in range(1, self.list.word_count(i)):
             bits = self.touches(i, word)
             pairs += ti.math.popcnt(bits)
             if ti.static(not self.has_friction):
@@ -179,7 +179,7 @@ class MassSplitting:
         """Return and store m, a bound of the eigenvalues of S of particle i, see Contact; at most the number of pairs."""
         tensor = ti.Matrix.zero(self.real, self.state.dim, self.state.dim)
         deepest = ti.cast(1, self.real)
-        for word in range(self.list.words(i)):
+        for word in range(self.list.word_count(i)):
             bits = self.touching(i, word)
             while bits != 0:
                 j = self.list.neighbour[self.list.entry(i, word, bits)]
@@ -204,7 +204,7 @@ class MassSplitting:
     def normals(self, i):
         """Return S, the sum of n n^T over the touching pairs of particle i, and of the identity for pairs in the same place."""
         tensor = ti.Matrix.zero(self.real, self.state.dim, self.state.dim)
-        for word in range(self.list.words(i)):
+        for word in range(self.list.word_count(i)):
             bits = self.touching(i, word)
             while bits != 0:
                 j = self.list.neighbour[self.list.entry(i, word, bits)]
@@ -237,7 +237,7 @@ class MassSplitting:
         With one pass these are the touching pairs. With several passes a pair may touch in some of them only, so all entries
         count.
         """
-        return ti.select(now.span.iterations == 1, self.list.touched(i, word), self.list.all_bits(i, word))
+        return ti.select(now.span.iterations == 1, self.list.touching_bits(i, word), self.list.all_bits(i, word))
 
 
 @ti.func

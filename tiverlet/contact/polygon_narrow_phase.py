@@ -78,10 +78,15 @@ class PolygonGeometry:
         # manifold: for each entry the contact of which its particle is the vertex: overlap, place on the edge (DISCS without an
         # edge) and normal. back: the offsets, in the other particle's list, of the contacts in which this particle is the start,
         # and the end, of the edge; -1 without one.
-        self.manifold, self.back = PairData("met", 4, False, kept=False), PairData("back", 2, False, kept=False)
-        self.most = PairData("most", 0, False, kept=False)  # how far the contact alone may be pushed out in this substep [m]
-        self.impulse = PairData("given", 0, lasting=True, for_reports=True)  # pushes and impacts in the last substep [kg m]
-        self.usual = PairData("usual", 0, lasting=True)  # the depth, averaged over substeps with the latest weighing most [m]
+        self.manifold, self.back = (
+            PairData("met", 4, False, is_transferred=False),
+            PairData("back", 2, False, is_transferred=False),
+        )
+        self.most = PairData(
+            "most", 0, False, is_transferred=False
+        )  # how far the contact alone may be pushed out in this substep [m]
+        self.impulse = PairData("given", 0, persistent=True, for_reports=True)  # pushes and impacts in the last substep [kg m]
+        self.usual = PairData("usual", 0, persistent=True)  # the depth, averaged over substeps with the latest weighing most [m]
         self.carried = [self.manifold, self.back, self.most, self.impulse, self.usual]
 
     @staticmethod

@@ -181,7 +181,7 @@ class Polygons(PairContact):
         dev.depths = add("Contact.depths", n)  # S_i: the usual depths of the contacts of i, see PolygonGeometry.share()
         dev.fast = add("Contact.fast", None, kind=ti.i32)
         self.table.bind(scene, asked=True)
-        dev.slip = PairData("slip", 2, lasting=True)
+        dev.slip = PairData("slip", 2, persistent=True)
         if dev.has_restitution:
             dev.restitution = PolygonRestitution(scene, dev.geometry, self.table)
             dev.hit = dev.restitution.hit
@@ -361,8 +361,8 @@ class PolygonRestitution:
         self.d_change = add("Contact.d_change", n, width=2)
         self.lift = add("Contact.lift", n, width=2)  # moves the position only
         self.hit = add("Contact.hit", None, kind=ti.i32)
-        self.aim = PairData("aim", 2, lasting=False)  # the displacement with which each contact leaves, times its normal [m]
-        self.last = PairData("pushed", 0, lasting=True)  # push of the last substep, 0 after an impact [kg m]
+        self.aim = PairData("aim", 2, persistent=False)  # the displacement with which each contact leaves, times its normal [m]
+        self.last = PairData("pushed", 0, persistent=True)  # push of the last substep, 0 after an impact [kg m]
 
     @ti.func
     def target(self, at, v, a, b, t, n, overlap, leaving):

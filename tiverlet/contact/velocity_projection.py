@@ -67,9 +67,9 @@ class VelocityProjection:
         first, w = self.list.first[i], self.state.w.of(i)
         at = first
         if self.weight[i] > 0 and self.state.awake(i):
-            for word in range(self.list.words(i)):
+            for word in range(self.list.word_count(i)):
                 # Not touches(): the pair may have parted in this pass, and both of its particles have to agree.
-                bits = self.list.touched(i, word)
+                bits = self.list.touching_bits(i, word)
                 while bits != 0:
                     e = first + word * WORD + lowest_bit(bits)
                     bits &= bits - ti.u32(1)

@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-WIDE = 4  # children of a node, and boxes in a leaf
-FEW = 1 << 13  # pairs of a query and a box up to which comparing all pairs takes less time than building a tree
-ONCE = 2  # queries for which no tree pays, for any number of boxes
+CHILDREN = 4  # children of a node, and boxes in a leaf
+FEW_PAIRS = 1 << 13  # pairs of a query and a box up to which comparing all pairs takes less time than building a tree
+FEW_QUERIES = 2  # queries for which no tree pays, for any number of boxes
 CHUNK = 1 << 14  # queries that descend the tree together
 TINY = 1e-300  # replaces 0 as a component of a direction: a ray beside a slab stays beside it
 SLACK = 2.0**-40  # of the largest coordinate: boxes are enlarged by so much, for rounding
@@ -27,25 +27,26 @@ class BoundingTree:
         self.low, self.high, self.count = low - slack, high + slack, len(low)
         self._first = -1  # index of the first leaf; -1 until the tree is built
 
-    def first(self, questions: int, most: np.ndarray, bound: Callable, value: Callable) -> Answer:
+    def find_least(self, queries: int, most: np.ndarray, bound: Callable, value: Callable) -> Answer:
         """Return for each query the least value of all boxes up to most[q], and its box; (inf, -1) where there is none.
 
         bound(q, low, high): a lower bound of the values in larger boxes (k, ..., dim) for queries q (k,); inf where these hold
         none. value(q, b): the value of query q[i] and box b[i]. Of equal values, the box with the lower index is returned.
         """
-        if not self.count or not questions:
-            return np.full(questions, np.inf), np.full(questions, -1)
-        all_of_them = questions <= ONCE or questions * self.count <= FEW
-        step = max(1, FEW // self.count) if all_of_them else CHUNK
-        chunks = [np.arange(q, min(q + step, questions)) for q in range(0, questions, step)]
-        if not all_of_them and self._first < 0:
-            self._grow()
+        if not self.count or not queries:
+            return np.full(queries, np.inf), np.full(queries, -1)
+        compare_all = queries <= FEW_QUERIES or queries * self.count <= FEW_PAIRS
+        step = max(1, FEW_PAIRS // self.count) if compare_all else CHUNK
+        chunks = [np.arange(q, min(q + step, queries)) for q in range(0, queries, step)]
+        if not compare_all and self._first < 0:
+            self._build()
         answers = [
-            self._compare(q, most[q], bound, value) if all_of_them else self._descend(q, most[q], bound, value) for q in chunks
+            self._compare_all(q, most[q], bound, value) if compare_all else self._descend(q, most[q], bound, value)
+            for q in chunks
         ]
         return np.concatenate([a for a, _ in answers]), np.concatenate([b for _, b in answers])
 
-    def _compare(self, some: np.ndarray, most: np.ndarray, bound: Callable, value: Callable) -> Answer:
+    def _compare_all(self, some: np.ndarray, most: np.ndarray, bound: Callable, value: Callable) -> Answer:
         """Answer queries by comparing each with all boxes."""
         with np.errstate(over="ignore"):
             near = bound(some, self.low[None], self.high[None])
@@ -57,29 +58,32 @@ class BoundingTree:
         found = (best <= most) & (best < np.inf)
         return np.where(found, best, np.inf), np.where(found, at, -1)
 
-    def _grow(self) -> None:
+    def _build(self) -> None:
         """Build the tree: sort the boxes and make the nodes from the leaves up. Missing children are NaN, which no query hits."""
         dim = self.low.shape[1]
         depth = 0
-        while WIDE ** (depth + 1) < self.count:
+        while CHILDREN ** (depth + 1) < self.count:
             depth += 1
         order = np.argsort(_morton(self.low / 2 + self.high / 2), kind="stable")
-        self._items = np.full(WIDE ** (depth + 1), -1)
+        self._items = np.full(CHILDREN ** (depth + 1), -1)
         self._items[: self.count] = order
         low, high = (np.full((len(self._items), dim), np.nan) for _ in range(2))
         low[: self.count], high[: self.count] = self.low[order], self.high[order]
         lows, highs = [], []
         for _ in range(depth + 1):
-            low, high = np.fmin.reduce(low.reshape(-1, WIDE, dim), axis=1), np.fmax.reduce(high.reshape(-1, WIDE, dim), axis=1)
+            low, high = (
+                np.fmin.reduce(low.reshape(-1, CHILDREN, dim), axis=1),
+                np.fmax.reduce(high.reshape(-1, CHILDREN, dim), axis=1),
+            )
             lows.append(low)
             highs.append(high)
         self._low, self._high = np.concatenate(lows[::-1]), np.concatenate(highs[::-1])
-        self._first, self._depth = (WIDE**depth - 1) // (WIDE - 1), depth
+        self._first, self._depth = (CHILDREN**depth - 1) // (CHILDREN - 1), depth
 
     def _descend(self, some: np.ndarray, most: np.ndarray, bound: Callable, value: Callable) -> Answer:
         """Answer queries by descending the tree."""
         best, found = most.astype(float), np.full(len(some), -1)
-        room = (WIDE - 1) * self._depth + 2
+        room = (CHILDREN - 1) * self._depth + 2
         node, least = np.zeros((len(some), room), dtype=np.int32), np.full((len(some), room), -np.inf)
         top = np.ones(len(some), dtype=np.int32)
         going = np.arange(len(some))
@@ -89,15 +93,15 @@ class BoundingTree:
             leaf = here >= self._first
             rows = going[leaf & enough]
             if len(rows):
-                self._look(rows, here[leaf & enough], some, best, found, value)
+                self._search_leaf(rows, here[leaf & enough], some, best, found, value)
             rows, here = going[~leaf & enough], here[~leaf & enough]
             if len(rows):
-                children = WIDE * here[:, None] + np.arange(1, WIDE + 1)
+                children = CHILDREN * here[:, None] + np.arange(1, CHILDREN + 1)
                 with np.errstate(invalid="ignore", over="ignore"):
                     near = bound(some[rows], self._low[children], self._high[children])
                     near = np.where(near <= best[rows, None], near, np.inf)
                 order = np.argsort(-near, axis=1, kind="stable")
-                for k in range(WIDE):
+                for k in range(CHILDREN):
                     pick = order[:, k]
                     at = np.arange(len(rows))
                     wanted = near[at, pick] < np.inf
@@ -107,9 +111,9 @@ class BoundingTree:
             going = going[top[going] > 0]
         return np.where(found >= 0, best, np.inf), found
 
-    def _look(self, rows, here, some, best, found, value) -> None:
+    def _search_leaf(self, rows, here, some, best, found, value) -> None:
         """Compare each row's query with the boxes of one leaf, and update `best` and `found`."""
-        items = self._items[WIDE * (here - self._first)[:, None] + np.arange(WIDE)]
+        items = self._items[CHILDREN * (here - self._first)[:, None] + np.arange(CHILDREN)]
         there = items >= 0
         values = np.full(items.shape, np.inf)
         values[there] = value(np.broadcast_to(some[rows][:, None], items.shape)[there], items[there])
@@ -121,7 +125,7 @@ class BoundingTree:
         best[rows[better]], found[rows[better]] = least[better], number[better]
 
 
-def ahead(origin: np.ndarray, direction: np.ndarray, extra: float) -> Callable:
+def ray_entry_bound(origin: np.ndarray, direction: np.ndarray, extra: float) -> Callable:
     """Return a bound for rays: the distance to a box that is enlarged by `extra` [m]."""
     inverse = 1.0 / np.where(np.abs(direction) < TINY, TINY, direction)
     extra = extra + SLACK * np.abs(origin).max(axis=1)
@@ -134,7 +138,7 @@ def ahead(origin: np.ndarray, direction: np.ndarray, extra: float) -> Callable:
     return bound
 
 
-def beyond(origin: np.ndarray, direction: np.ndarray, extra: float) -> Callable:
+def ray_exit_bound(origin: np.ndarray, direction: np.ndarray, extra: float) -> Callable:
     """Return a bound for rays in boxes that are enlarged by `extra` [m]: minus the distance to the exit from the box."""
     inverse = 1.0 / np.where(np.abs(direction) < TINY, TINY, direction)
     extra = extra + SLACK * np.abs(origin).max(axis=1)
@@ -147,7 +151,7 @@ def beyond(origin: np.ndarray, direction: np.ndarray, extra: float) -> Callable:
     return bound
 
 
-def apart(points: np.ndarray) -> Callable:
+def distance_bound(points: np.ndarray) -> Callable:
     """Return a bound for points: their distance from a box."""
 
     def bound(q: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:

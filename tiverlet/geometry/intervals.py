@@ -58,12 +58,12 @@ def union(*intervals: Interval) -> Interval:
     return enter, leave
 
 
-def common(*intervals: Interval) -> Interval:
+def intersection(*intervals: Interval) -> Interval:
     """Return the intersection of intervals."""
     enter, leave = intervals[0]
     for a, b in intervals[1:]:
         enter, leave = np.maximum(enter, a), np.minimum(leave, b)
-    return _unless(enter > leave, enter, leave)
+    return _unless_missed(enter > leave, enter, leave)
 
 
 def ball(origin: np.ndarray, direction: np.ndarray, center: np.ndarray, radius) -> Interval:
@@ -82,14 +82,14 @@ def capsule(origin: np.ndarray, direction: np.ndarray, a: np.ndarray, b: np.ndar
     along, speed = dot(m, u), dot(direction, u)
     mp, dp = m - along[:, None] * u, direction - speed[:, None] * u
     square = dot(dp, dp)
-    lies = square <= PARALLEL
-    square = np.where(lies, 1.0, square)
-    middle = np.where(lies, 0.0, -dot(mp, dp) / square)
+    is_parallel = square <= PARALLEL
+    square = np.where(is_parallel, 1.0, square)
+    middle = np.where(is_parallel, 0.0, -dot(mp, dp) / square)
     close = rounding(m, origin, axis)
-    enter, leave = _chord(middle, mp + middle[:, None] * np.where(lies[:, None], 0.0, dp), square, radius, close)
+    enter, leave = _chord(middle, mp + middle[:, None] * np.where(is_parallel[:, None], 0.0, dp), square, radius, close)
     within = enter <= leave
-    enter, leave = np.where(lies & within, -np.inf, enter), np.where(lies & within, np.inf, leave)
-    rod = common((enter, leave), slab(along, speed, -close, length + close))
+    enter, leave = np.where(is_parallel & within, -np.inf, enter), np.where(is_parallel & within, np.inf, leave)
+    rod = intersection((enter, leave), slab(along, speed, -close, length + close))
     return union(rod, ball(origin, direction, a, radius), ball(origin, direction, b, radius))
 
 
@@ -98,20 +98,20 @@ def slab(place: np.ndarray, speed: np.ndarray, low, high, close: np.ndarray | fl
 
     low, high: may be infinite. close: a place as near as this to a bound counts as on the bound.
     """
-    stands = speed == 0
-    inverse = 1.0 / np.where(stands, 1.0, speed)
+    is_parallel = speed == 0
+    inverse = 1.0 / np.where(is_parallel, 1.0, speed)
     below, above = low - place, high - place
     below, above = np.where(np.abs(below) <= close, 0.0, below), np.where(np.abs(above) <= close, 0.0, above)
     one, two = below * inverse, above * inverse
     inside = (below <= 0) & (above >= 0)
-    enter = np.where(stands, np.where(inside, -np.inf, np.inf), np.minimum(one, two))
-    leave = np.where(stands, np.where(inside, np.inf, -np.inf), np.maximum(one, two))
-    return _unless((enter > leave) | (below > above), enter, leave)
+    enter = np.where(is_parallel, np.where(inside, -np.inf, np.inf), np.minimum(one, two))
+    leave = np.where(is_parallel, np.where(inside, np.inf, -np.inf), np.maximum(one, two))
+    return _unless_missed((enter > leave) | (below > above), enter, leave)
 
 
 def box(origin: np.ndarray, direction: np.ndarray, low: np.ndarray, high: np.ndarray, close: np.ndarray) -> Interval:
     """Return the intervals inside a box between two corners (dim,)."""
-    return common(*(slab(origin[:, k], direction[:, k], low[k], high[k], close) for k in range(origin.shape[1])))
+    return intersection(*(slab(origin[:, k], direction[:, k], low[k], high[k], close) for k in range(origin.shape[1])))
 
 
 def triangle(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray) -> Interval:
@@ -121,7 +121,7 @@ def triangle(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray) -> 
     bit alike for all facets that share it.
     """
     if origin.shape[1] == 2:
-        sides = _turn(direction[:, None], corners - origin[:, None])
+        sides = _cross_2d(direction[:, None], corners - origin[:, None])
         sides = np.stack([sides[:, 0], -sides[:, 1]], axis=1)
         edge = corners[:, 1] - corners[:, 0]
         normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1)
@@ -132,7 +132,7 @@ def triangle(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray) -> 
     across = dot(normal, direction)
     hit = ((sides >= 0).all(axis=1) | (sides <= 0).all(axis=1)) & (across != 0)
     t = dot(normal, corners[:, 0] - origin) / np.where(hit, across, 1.0)
-    return _unless(~hit, t, t)
+    return _unless_missed(~hit, t, t)
 
 
 def rounded(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray, radius) -> Interval:
@@ -147,7 +147,7 @@ def rounded(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray, radi
     for k in range(3):
         out = np.cross(corners[:, (k + 1) % 3] - corners[:, k], normal)
         sides.append(slab(dot(origin - corners[:, k], out), dot(direction, out), -np.inf, np.zeros(len(origin))))
-    return union(common(*sides), *edges)
+    return union(intersection(*sides), *edges)
 
 
 def _chord(middle: np.ndarray, off: np.ndarray, square: np.ndarray, radius, close: np.ndarray) -> Interval:
@@ -157,12 +157,12 @@ def _chord(middle: np.ndarray, off: np.ndarray, square: np.ndarray, radius, clos
     """
     h = np.sqrt(dot(off, off))
     half = np.sqrt(np.maximum((radius - h) * (radius + h), 0.0) / square)
-    return _unless((h > radius + close) | (np.asarray(radius) < 0), middle - half, middle + half)
+    return _unless_missed((h > radius + close) | (np.asarray(radius) < 0), middle - half, middle + half)
 
 
-def _turn(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def _cross_2d(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
-def _unless(missed: np.ndarray, enter: np.ndarray, leave: np.ndarray) -> Interval:
+def _unless_missed(missed: np.ndarray, enter: np.ndarray, leave: np.ndarray) -> Interval:
     return np.where(missed, np.inf, enter), np.where(missed, -np.inf, leave)

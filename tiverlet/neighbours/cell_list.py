@@ -39,39 +39,41 @@ class CellList:
 
     n: Any = OnDevice()  # number of particles
     buckets: Any = OnDevice()  # number of buckets in all tables
-    coarsest: Any = OnDevice()  # cells per meter at level 0
+    level_0_scale: Any = OnDevice()  # cells per meter at level 0
 
     def __init__(self, scene: "Scene", radius: np.ndarray, reach: np.ndarray, skin: float, team: "Team", scratch: Any):
         self.team = team
-        self.place = scratch  # positions in sorted order, while a list is built: the search then reads memory sequentially
+        self.sorted_position = (
+            scratch  # positions in sorted order, while a list is built: the search then reads memory sequentially
+        )
         self.memory = scene.memory
         dim, add = scene.particles.dim, scene.memory.field
         self.n, self.dim, self.state, self.real = scene.count, dim, scene.state, scene.real
         self.serial = not team.launched  # on a CPU, counting on one thread is faster than atomic counters on several
         level = levels_of(radius, reach)
         self.levels = int(level.max(initial=0)) + 1
-        self.sizes, self.bits, offsets = self._tables(radius, reach, skin, level)
-        self.coarsest = scene.memory.number(float(1 / self.sizes[0]), scene.real)
+        self.sizes, self.bits, offsets = self._size_tables(radius, reach, skin, level)
+        self.level_0_scale = scene.memory.number(float(1 / self.sizes[0]), scene.real)
         self.buckets = scene.memory.number(int(offsets[-1]))
         self.images, self._lengths = scene.state.images, np.full(dim, np.inf)
         self.axes, self.sheared = (self.images.axes, self.images.sheared) if self.images else ((), False)
         if self.images:
             self._lengths = scene.periodic.lengths
-        self._shapes = self.shapes(np.array(scene.particles.extent))
+        self._axis_bits = self.choose_axis_bits(np.array(scene.particles.extent))
         self.sums = Sums(self.buckets + 2, team)
         self.edge = add("grid.edge", self.sums.room, kind=ti.i32)
         self.sorted = add("grid.sorted", scene.particles.count, kind=ti.i32)
         if self.state.compensated:
-            self.low = add("grid.place_low", scene.count, width=dim)
-        self.shape = add("grid.shape", self.levels, width=dim, kind=ti.i32, values=self._shapes)
+            self.sorted_low = add("grid.place_low", scene.count, width=dim)
+        self.axis_bits = add("grid.shape", self.levels, width=dim, kind=ti.i32, values=self._axis_bits)
         if self.images:
-            self.count = add("grid.cells", self.levels, width=dim, kind=ti.i32, values=self.counts(self._shapes))
+            self.cells_per_axis = add("grid.cells", self.levels, width=dim, kind=ti.i32, values=self.count_cells(self._axis_bits))
         if self.levels > 1:
             self.level = add("grid.level", scene.count, kind=ti.i32, values=level)
-            self.per_meter = add("grid.cells_per_meter", self.levels, values=1 / self.sizes)
+            self.level_scale = add("grid.cells_per_meter", self.levels, values=1 / self.sizes)
             self.offset = add("grid.offset", self.levels, kind=ti.i32, values=offsets[:-1])
 
-    def _tables(
+    def _size_tables(
         self, radius: np.ndarray, reach: np.ndarray, skin: float, level: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
         """Return cell sizes [m] and log2 of bucket numbers, (levels,), and the first bucket of each table, (levels + 1,)."""
@@ -88,7 +90,7 @@ class CellList:
         level = levels_of(radius, reach)
         return int(level.max(initial=0)) + 1 == self.levels and self.memory.has_room(4 * (len(radius) + 4**self.dim) + 2)
 
-    def drop(self, number: np.ndarray) -> None:
+    def remove_particles(self, number: np.ndarray) -> None:
         """Delete removed particles from the sorted cells and renumber the others. number: (n,) new indices, or -1 if removed."""
         order, edge = self.memory.view(self.sorted), self.memory.view(self.edge)
         new = number[order[: len(number)]]
@@ -103,22 +105,22 @@ class CellList:
         """
         level, memory = levels_of(radius, reach), self.memory
         memory.resize(self.sorted, len(radius))
-        sizes, bits, offsets = self._tables(radius, reach, skin, level)
+        sizes, bits, offsets = self._size_tables(radius, reach, skin, level)
         if self.levels > 1:
             memory.write(self.level, level)
         if np.array_equal(sizes, self.sizes) and np.array_equal(bits, self.bits):
             return True
-        self.sizes, self.bits, self.coarsest, self.buckets = sizes, bits, float(1 / sizes[0]), int(offsets[-1])
+        self.sizes, self.bits, self.level_0_scale, self.buckets = sizes, bits, float(1 / sizes[0]), int(offsets[-1])
         self.sums.room = self.buckets + 2
         memory.resize(self.edge, self.sums.room)
         if self.levels > 1:
-            memory.write(self.per_meter, 1 / sizes)
+            memory.write(self.level_scale, 1 / sizes)
             memory.write(self.offset, offsets[:-1])
-        self._shapes = np.zeros((0, self.dim))
+        self._axis_bits = np.zeros((0, self.dim))
         self.fit(extent)
         return False
 
-    def shapes(self, extent: np.ndarray) -> np.ndarray:
+    def choose_axis_bits(self, extent: np.ndarray) -> np.ndarray:
         """Return log2 of the buckets along each axis of each table, (levels, dim).
 
         Each axis has at least 2 bits. Further bits go to the axis with the most cells per bucket.
@@ -138,23 +140,23 @@ class CellList:
 
         Returns whether any changed.
         """
-        shapes = self.shapes(extent)
-        changed = not np.array_equal(shapes, self._shapes)
+        axis_bits = self.choose_axis_bits(extent)
+        changed = not np.array_equal(axis_bits, self._axis_bits)
         if changed:
-            self._shapes = shapes
-            self.memory.write(self.shape, shapes)
+            self._axis_bits = axis_bits
+            self.memory.write(self.axis_bits, axis_bits)
             if self.images:
-                self.memory.write(self.count, self.counts(shapes))
+                self.memory.write(self.cells_per_axis, self.count_cells(axis_bits))
         return changed
 
-    def counts(self, shapes: np.ndarray) -> np.ndarray:
+    def count_cells(self, axis_bits: np.ndarray) -> np.ndarray:
         """Return the number of cells of each table along periodic axes, (levels, dim); 1 along other axes.
 
         Cells are not smaller than the search needs. A number above that of the buckets is a multiple of it, so that the three
         cells around the end of the box fall into different buckets.
         """
         most = np.where(np.isfinite(self._lengths), self._lengths, 0.0) / self.sizes[:, None]
-        fitting, buckets = np.minimum(most, 2.0**30), 2.0**shapes
+        fitting, buckets = np.minimum(most, 2.0**30), 2.0**axis_bits
         each = np.where(fitting < buckets, 1.0, buckets)
         return np.maximum(1, np.floor(fitting / each) * each).astype(int)
 
@@ -171,34 +173,34 @@ class CellList:
         """Return the cell of particle i at level m."""
         cell = ti.floor(self.state.x[i] * self.scale(m), ti.i32)
         for k in ti.static(self.axes):
-            cell[k] = self.images.cell(self.state.x[i], k, 0, self.count[m][k])
+            cell[k] = self.images.cell(self.state.x[i], k, 0, self.cells_per_axis[m][k])
         return cell
 
     @ti.func
-    def around(self, point, radius, m, k: ti.template()):  # type: ignore[valid-type]
+    def cell_range(self, point, radius, m, k: ti.template()):  # type: ignore[valid-type]
         """Return the first cell along periodic axis k that may hold particles within `radius` of a point, and their number.
 
         One cell is added on each side for rounding. In a sheared box these are all cells along FLOW. The point is in the box.
         """
-        count, size = self.count[m][k], self.images.length[None][k]
+        count, size = self.cells_per_axis[m][k], self.images.length[None][k]
         low = ti.floor((point[k] - radius) / size * count, ti.i32) - 1
         number = ti.floor((point[k] + radius) / size * count, ti.i32) + 2 - low
         if ti.static(self.sheared and k == FLOW):
             number = count
-        return low, ti.min(number, count, 1 << self.shape[m][k])
+        return low, ti.min(number, count, 1 << self.axis_bits[m][k])
 
     @ti.func
     def scale(self, m):
         """Return the cells per meter at level m."""
-        scale = ti.cast(self.coarsest, self.real)
+        scale = ti.cast(self.level_0_scale, self.real)
         if ti.static(self.levels > 1):
-            scale = self.per_meter[m]
+            scale = self.level_scale[m]
         return scale
 
     @ti.func
     def bucket(self, cell, m):
         """Return the bucket of a cell at level m. Axis 0 varies fastest."""
-        bits = self.shape[m]
+        bits = self.axis_bits[m]
         b = cell[self.dim - 1] & ((1 << bits[self.dim - 1]) - 1)
         for k in ti.static(range(self.dim - 2, -1, -1)):
             b = (b << bits[k]) | (cell[k] & ((1 << bits[k]) - 1))
@@ -229,38 +231,38 @@ class CellList:
             i = self.n - 1 - back
             k = add_to(self.edge, self.bucket_of(i) + 1, -1, self.serial) - 1
             self.sorted[k] = i
-            self.place[k] = self.state.x[i]
+            self.sorted_position[k] = self.state.x[i]
             if ti.static(self.state.compensated):
-                self.low[k] = self.state.low[i]
+                self.sorted_low[k] = self.state.low[i]
         self.team.wait()
 
     @ti.func
     def apart(self, i, k):
         """Return the vector from the k-th sorted particle to particle i [m], as State.apart() does for two particle indices."""
-        r = self.state.x[i] - self.place[k]
+        r = self.state.x[i] - self.sorted_position[k]
         if ti.static(self.state.compensated and len(self.axes) > 0):
-            far = ti.cast(self.state.x[i], ti.f64) - ti.cast(self.place[k], ti.f64)
-            r = ti.cast(self.state.nearest(far + (self.state.low[i] - self.low[k])), self.real)
+            far = ti.cast(self.state.x[i], ti.f64) - ti.cast(self.sorted_position[k], ti.f64)
+            r = ti.cast(self.state.nearest(far + (self.state.low[i] - self.sorted_low[k])), self.real)
         elif ti.static(self.state.compensated):
-            r += self.state.low[i] - self.low[k]
+            r += self.state.low[i] - self.sorted_low[k]
         elif ti.static(len(self.axes) > 0):
             r = self.state.nearest(r)
         return r
 
     @ti.func
-    def row(self, i, cell, m, r):
+    def row_of_cells(self, i, cell, m, r):
         """Return row r of the 3^(dim - 1) rows of three cells around a cell at level m, for particle i.
 
         Returned are the first bucket of the whole row of the table, the coordinate along axis 0 of the first of the three cells,
         the number of pieces into which the three fall, and the cells in each piece: 3, or 1 where the torus wraps between cells.
         """
-        at, rest, turn, parts, mask = cell, r, 0, 3, (1 << self.shape[m][0]) - 1
+        at, rest, turn, parts, mask = cell, r, 0, 3, (1 << self.axis_bits[m][0]) - 1
         for k in ti.static(range(1, self.dim)):
             side = rest % 3
             at[k] += side - 1
             rest = rest // 3
             if ti.static(k in self.axes):
-                count = self.count[m][k]
+                count = self.cells_per_axis[m][k]
                 if side >= count:  # an axis with one or two cells: all have been read
                     parts = 0
                 if at[k] < 0 or at[k] >= count:
@@ -269,28 +271,30 @@ class CellList:
                     if ti.static(self.sheared and k == GRADIENT):
                         turn = way
         if ti.static(self.sheared):
-            at[0] = self.images.cell(self.state.x[i], 0, turn, self.count[m][0])
+            at[0] = self.images.cell(self.state.x[i], 0, turn, self.cells_per_axis[m][0])
         low, span = at[0] - 1, 1
         at[0] = 0
         if ti.static(0 in self.axes):
-            count = self.count[m][0]
+            count = self.cells_per_axis[m][0]
             low = ti.select(low < 0, low + count, low)
             if low + 2 < count and (low & mask) + 2 <= mask and parts > 0:
                 span, parts = 3, 1
             parts = ti.min(parts, count)
             if ti.static(self.sheared):
-                if self.count[m][GRADIENT] < 3 and parts > 0:  # the next row is a neighbour on both sides, at two offsets
+                if (
+                    self.cells_per_axis[m][GRADIENT] < 3 and parts > 0
+                ):  # the next row is a neighbour on both sides, at two offsets
                     span, parts = 1, ti.min(count, mask + 1)
         elif (low & mask) + 2 <= mask:
             span, parts = 3, parts // 3
         return self.bucket(at, m), low, parts, span
 
     @ti.func
-    def along(self, cell, m):
+    def position_in_row(self, cell, m):
         """Return the position of a cell's bucket in its row. The cell may lie beyond the end of the box, where it wraps."""
         if ti.static(0 in self.axes):
-            cell = ti.select(cell < self.count[m][0], cell, cell - self.count[m][0])
-        return cell & ((1 << self.shape[m][0]) - 1)
+            cell = ti.select(cell < self.cells_per_axis[m][0], cell, cell - self.cells_per_axis[m][0])
+        return cell & ((1 << self.axis_bits[m][0]) - 1)
 
 
 def levels_of(radius: np.ndarray, reach: np.ndarray) -> np.ndarray:

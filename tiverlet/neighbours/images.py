@@ -25,7 +25,7 @@ class Images:
         kind = ti.f64 if scene.state.compensated else scene.real  # compensated positions have differences in f64
         self.length = add("Periodic.length", None, width=dim, kind=kind, values=box.away(np.eye(dim, dtype=int)).diagonal())
         self.per_length = add("Periodic.per_length", None, width=dim, kind=kind, values=1 / box.lengths)
-        self.near = add("Periodic.near", None, kind=kind, values=(1 - 2.0**-20) * box.shortest**2 / 4)
+        self.half_box_squared = add("Periodic.near", None, kind=kind, values=(1 - 2.0**-20) * box.shortest**2 / 4)
         self.middle = add("Periodic.middle", None, width=dim, values=box.middle)
         self.kind = kind
         self.in_state: dict[str, Any] = {}
@@ -37,27 +37,27 @@ class Images:
             self.in_state = {"strain": self.strain, "shift": self.shift}
 
     @ti.func
-    def turns(self, r, axis: ti.template()):  # type: ignore[valid-type]
+    def count_boxes(self, r, axis: ti.template()):  # type: ignore[valid-type]
         """Return the number of box lengths nearest to r along an axis."""
         return ti.floor(r[axis] * self.per_length[None][axis] + ti.cast(0.5, self.real))
 
     @ti.func
     def nearest(self, r):
         """Return the shortest of the differences r + whole boxes. Fast path: for most pairs this is r itself."""
-        if r.dot(r) > self.near[None]:
-            r = self.reduced(r)
+        if r.dot(r) > self.half_box_squared[None]:
+            r = self.minimum_image(r)
         return r
 
     @ti.func
-    def reduced(self, r):
+    def minimum_image(self, r):
         """Return the shortest of the differences r + whole boxes, axis by axis."""
         if ti.static(self.sheared):
-            k = self.turns(r, GRADIENT)
+            k = self.count_boxes(r, GRADIENT)
             r[GRADIENT] -= k * self.length[None][GRADIENT]
             r[FLOW] -= k * self.shift[None][0]
         for axis in ti.static(self.axes):
             if ti.static(not (self.sheared and axis == GRADIENT)):
-                r[axis] -= self.turns(r, axis) * self.length[None][axis]
+                r[axis] -= self.count_boxes(r, axis) * self.length[None][axis]
         return r
 
     @ti.func
@@ -72,7 +72,7 @@ class Images:
 
         moved: their relative displacement [m]. r: the vector between them [m].
         """
-        moved[FLOW] -= self.turns(r, GRADIENT) * self.shift[None][1]
+        moved[FLOW] -= self.count_boxes(r, GRADIENT) * self.shift[None][1]
         return moved
 
     @ti.func
@@ -90,7 +90,7 @@ class Images:
         return ti.min(ti.cast(part * count, ti.i32), count - 1)
 
     @ti.func
-    def slide(self, h):
+    def advance_shear(self, h):
         """Advance the strain and the offset of images by a substep of h [s]."""
         step = self.rate[None] * ti.cast(h, ti.f64)
         self.strain[None] = self.strain[None] + step

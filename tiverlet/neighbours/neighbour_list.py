@@ -22,20 +22,23 @@ WORD, FULL = 32, 2**32 - 1  # entries that one word of bits covers, and a word w
 class PairData:
     """Data of each listed pair: a number, or a vector of `width`.
 
-    lasting: it belongs to the state, beyond a substep. for_reports: it is for reports only. kept: it is transferred to the next
-    list; other data is recomputed. marked: it is 0 except for pairs whose bit in NeighbourList.touching is set. kind: type of the
-    numbers; None for that of the world. field, old: the data of the present list, and of the old list while a new one is built.
+    persistent: it belongs to the state, beyond a substep. for_reports: it is for reports only. is_transferred: it is copied to
+    the next
+    list; other data is recomputed. only_touching: it is 0 except for pairs whose bit in NeighbourList.touching is set.
+    kind: type of the numbers; None for that of the world. field, old: the data of the present list, and of the old list while a
+    new one is built.
     """
 
     field: Any
     old: Any
 
     def __init__(
-        self, name: str, width: int, lasting: bool, kept: bool = True, marked: bool = False, kind: Any = None,
+        self, name: str, width: int, persistent: bool, is_transferred: bool = True, only_touching: bool = False, kind: Any = None,
         for_reports: bool = False,
     ):  # fmt: skip
-        self.name, self.width, self.lasting, self.kept, self.marked, self.kind = name, width, lasting, kept, marked, kind
-        self.for_reports = for_reports
+        self.name, self.width, self.kind = name, width, kind
+        self.persistent, self.is_transferred = persistent, is_transferred
+        self.only_touching, self.for_reports = only_touching, for_reports
 
 
 class Column:
@@ -54,7 +57,7 @@ class NeighbourList:
     """The neighbour list: pairs of particles closer than contact distance + skin. Each pair is listed for both particles.
 
     The neighbours of particle i are the `number[i]` entries from `first[i]` on, sorted by index. pair_data: the data of each
-    pair. short: entries of room after each block.
+    pair. network_size: length of the longest part that a sorting network sorts; as many entries of room follow each block.
     """
 
     n: Any = OnDevice()  # number of particles
@@ -66,12 +69,12 @@ class NeighbourList:
     host_only = ("room",)
     has_own_compile_time = True  # see Feature
 
-    def __init__(self, memory: "Memory", count: Number, rooms: Number, pair_data: list[PairData], team: Team, short: int):
-        self.team, self.n, self.memory, self.short = team, count, memory, short
+    def __init__(self, memory: "Memory", count: Number, rooms: Number, pair_data: list[PairData], team: Team, network_size: int):
+        self.team, self.n, self.memory, self.network_size = team, count, memory, network_size
         self.capacity, self.pitch = memory.number(0), memory.number(0)
         self.pair_data = pair_data
-        self.lasting, self.transferred = [p for p in pair_data if p.lasting], [p for p in pair_data if p.kept]
-        self.marked = all(p.marked for p in self.transferred)
+        self.persistent, self.transferred = [p for p in pair_data if p.persistent], [p for p in pair_data if p.is_transferred]
+        self.only_touching = all(p.only_touching for p in self.transferred)
         add = memory.field
         self.first = add("grid.first", rooms, kind=ti.i32)
         self.number = add("grid.number", count, kind=ti.i32)
@@ -98,13 +101,13 @@ class NeighbourList:
         if 2 * capacity > 2**31 - 1:
             raise MemoryError(f"{capacity} near pairs exceed what a list can index; the particles overlap too much.")
         self.capacity_number.set(max(1, -(-capacity // self.blocks)))
-        self.pitch_number.set(self.capacity + self.short)
+        self.pitch_number.set(self.capacity + self.network_size)
         self.room = self.pitch * self.blocks
         if self.store and self.store.set_length(self.room):
             return False
         kept = []
         if self.store:
-            with self._of_all():
+            with self._all_copies():
                 kept = [self.store.read(field) for field in self._fields()]
             self.store.destroy()
         self.store = self.memory.make_companion()
@@ -112,12 +115,12 @@ class NeighbourList:
         self.old_neighbour = self.store.field("grid.aside", self.room, kind=ti.i32)
         for piece in self.pair_data:
             piece.field = self.store.field(f"grid.{piece.name}", self.room, width=piece.width, kind=piece.kind)
-            if piece.kept:
+            if piece.is_transferred:
                 piece.old = self.store.field(f"grid.{piece.name}_aside", self.room, width=piece.width, kind=piece.kind)
         for column in self.columns:
             column.field = self.store.field(f"grid.{column.name}", self.room, width=column.width, kind=column.kind)
         self.store.place()
-        with self._of_all():
+        with self._all_copies():
             for field, values in zip(self._fields(), kept, strict=False):
                 self._write_padded(field, values)
         return True
@@ -127,7 +130,7 @@ class NeighbourList:
 
         Returns whether kernels must be compiled again.
         """
-        with self._of_all():
+        with self._all_copies():
             need = int(self.memory.read(self.need).max())
         each = need * self.blocks / self.n
         if each > CROWDED:
@@ -148,7 +151,7 @@ class NeighbourList:
         old = [self.old_neighbour, *(piece.old for piece in self.transferred), *(column.field for column in self.columns)]
         return [*old, self.neighbour, *(piece.field for piece in self.pair_data)] if self.memory.copies else old
 
-    def _of_all(self) -> contextlib.AbstractContextManager[None]:
+    def _all_copies(self) -> contextlib.AbstractContextManager[None]:
         """Return a context in which reads and writes are for all copies of the world."""
         return self.memory.copies.all() if self.memory.copies else contextlib.nullcontext()
 
@@ -188,8 +191,8 @@ class NeighbourList:
         i = np.repeat(np.arange(self.n), number)
         return i, np.repeat(first, number) + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)
 
-    def lasting_data(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Return the listed pairs (i, j) with lasting data other than 0, sorted, and their data by name.
+    def persistent_data(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Return the listed pairs (i, j) with persistent data other than 0, sorted, and their data by name.
 
         The result does not depend on the layout of the list.
         """
@@ -199,7 +202,7 @@ class NeighbourList:
         first, number = (self.old_first, self.old_number) if saved else (self.first, self.number)
         i, at = self._entries(first, number)
         near = seen(self.old_neighbour if saved else self.neighbour).take(at)
-        values = {piece.name: seen(piece.old if saved else piece.field).take(at, axis=0) for piece in self.lasting}
+        values = {piece.name: seen(piece.old if saved else piece.field).take(at, axis=0) for piece in self.persistent}
         some = np.zeros(len(i), dtype=bool)
         for value in values.values():
             for column in value.T if value.ndim > 1 else [value]:  # any(axis=1) takes ten times as long
@@ -208,13 +211,13 @@ class NeighbourList:
         return np.stack([i[kept], near[kept]], axis=1), {name: value.take(kept, axis=0) for name, value in values.items()}
 
     def restore(self, pairs: np.ndarray, values: dict[str, np.ndarray]) -> None:
-        """Store the result of lasting_data() as the old list, from which the next build takes the data of pairs."""
+        """Store the result of persistent_data() as the old list, from which the next build takes the data of pairs."""
         if len(pairs) > self.room:
             self.allocate(len(pairs))
         self._write_begin(self.old_neighbour, pairs[:, 1].astype(np.int32))
         for piece in self.transferred:
             nothing = np.zeros((len(pairs), *[piece.width] * (piece.width > 0)))
-            self._write_begin(piece.old, values[piece.name] if piece.lasting else nothing)
+            self._write_begin(piece.old, values[piece.name] if piece.persistent else nothing)
         counts = np.bincount(pairs[:, 0], minlength=max(1, self.n))
         self.memory.write(self.old_first, np.cumsum(counts) - counts)
         self.memory.write(self.old_number, counts)
@@ -226,7 +229,7 @@ class NeighbourList:
         """Whether the old list is saved for a new one that is not built yet."""
         return bool(self.memory.view(self.old_saved)[0])
 
-    def drop(self, number: np.ndarray) -> None:
+    def remove_particles(self, number: np.ndarray) -> None:
         """Delete the pairs of removed particles. number: (n,) new indices, -1 for removed particles.
 
         For an elastic list that is not saved, whose rows of particles are already in the new order. Other pairs stay where they
@@ -273,8 +276,8 @@ class NeighbourList:
         """Save the pairs of particle i that have data other than 0."""
         first = self.first[i]
         at = first
-        for word in range(self.words(i)):
-            bits = self.touched(i, word) if ti.static(self.marked) else self.all_bits(i, word)
+        for word in range(self.word_count(i)):
+            bits = self.touching_bits(i, word) if ti.static(self.only_touching) else self.all_bits(i, word)
             while bits != 0:
                 e = first + word * WORD + lowest_bit(bits)
                 bits &= bits - ti.u32(1)
@@ -295,7 +298,7 @@ class NeighbourList:
     def transfer_pair_data(self, i):
         """Copy the data of each pair of particle i from the old list. Both lists are sorted.
 
-        Returns a word of bits: which of the first entries received data other than 0 of a marked kind.
+        Returns a word of bits: which of the first entries received data other than 0 that is only_touching.
         """
         first, number = self.first[i], self.number[i]
         for piece in ti.static(self.pair_data):
@@ -314,7 +317,7 @@ class NeighbourList:
                     some = 0
                     for piece in ti.static(self.transferred):
                         piece.field[first + at] = piece.old[old]
-                        if ti.static(piece.marked):
+                        if ti.static(piece.only_touching):
                             some |= ti.cast(piece.old[old] != 0, ti.i32)
                     if some != 0 and at < WORD:
                         bits |= ti.u32(1) << ti.cast(at, ti.u32)
@@ -326,7 +329,7 @@ class NeighbourList:
         return self.first[i] + word * WORD + lowest_bit(bits)
 
     @ti.func
-    def words(self, i):
+    def word_count(self, i):
         """Return the number of words of bits that cover the entries of particle i."""
         return (self.number[i] + (WORD - 1)) >> 5  # a division by WORD would test the sign
 
@@ -337,7 +340,7 @@ class NeighbourList:
         return ti.select(left < WORD, (ti.u32(1) << ti.cast(left & (WORD - 1), ti.u32)) - ti.u32(1), ti.u32(FULL))
 
     @ti.func
-    def touched(self, i, word):
+    def touching_bits(self, i, word):
         """Return the bits of entries that touched at the last test. Words beyond the first are not stored: all bits are set."""
         return ti.select(word == 0, self.touching[i], self.all_bits(i, word))
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 COUNT, FILL = range(2)  # whether a scan of the cells around a particle counts neighbours or lists them
 
 
-def _both(linked: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+def _in_both_orders(linked: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Return pairs of n particles in both orders, each once and sorted, and where the pairs of each particle begin, (n + 1,)."""
     both = distinct(np.concatenate([linked, linked[:, ::-1]]))[0]
     return both, np.searchsorted(both[:, 0], np.arange(n + 1))
@@ -57,10 +57,10 @@ class NeighbourSearch:
         self.n, self.memory, self.real, self.team = scene.count, scene.memory, scene.real, team
         self.sums = Sums(n, team, capped=True)  # on the launched path it has a room of its own
         # Entries of a list that is sorted without branches. Compiling that takes an eighth of the compile time.
-        short = 1 if scene.memory.compiler.few else 8 if dim == 2 else 16
+        network_size = 1 if scene.memory.compiler.few else 8 if dim == 2 else 16
         rooms = self.sums.room if team.launched else scene.count
-        self.list = NeighbourList(scene.memory, scene.count, rooms, pair_data, team, short)
-        self.network = sorting_network(short)
+        self.list = NeighbourList(scene.memory, scene.count, rooms, pair_data, team, network_size)
+        self.network = sorting_network(network_size)
         self.dim, self.state, self.radius = dim, scene.state, scene.radius
         self.table = table
         number, real = scene.memory.number, scene.real
@@ -74,19 +74,19 @@ class NeighbourSearch:
         self.cells = CellList(scene, radius, reach, skin, team, scratch)
         self.several_levels = self.cells.levels > 1
         # Whether a particle finds all neighbours in the 3^dim cells around it, even after it has moved far (see Strays).
-        self.lone = not self.several_levels and not self.state.images and not reach.any()
-        self.counts = self.several_levels or team.launched  # neighbours are counted before they are listed
-        self.serial = not self.counts or (team.size == 1 and not team.launched)  # one thread writes each list, in order
+        self.finds_all_neighbours = not self.several_levels and not self.state.images and not reach.any()
+        self.counts_first = self.several_levels or team.launched  # neighbours are counted before they are listed
+        self.serial = not self.counts_first or (team.size == 1 and not team.launched)  # one thread writes each list, in order
         self.list.blocks = number(self._blocks(n))
-        self.origin = add("grid.built_at", scene.count, width=dim)
+        self.position_at_build = add("grid.built_at", scene.count, width=dim)
         if self.sheared:
-            self.strain = add("grid.built_strain", None, kind=ti.f64)
+            self.strain_at_build = add("grid.built_strain", None, kind=ti.f64)
             self.farthest = number(float(self.cells.sizes.max()), real)
         self.has_static = bool((scene.inv_mass == 0).any())  # whether there may be pairs in which neither particle can move
-        self.linked = len(linked) > 0
-        if self.linked:
-            self._both, begin = _both(linked, n)
-            self.excluded = add("grid.linked", len(self._both), kind=ti.i32, values=self._both[:, 1])
+        self.has_excluded = len(linked) > 0
+        if self.has_excluded:
+            self._excluded_pairs, begin = _in_both_orders(linked, n)
+            self.excluded = add("grid.linked", len(self._excluded_pairs), kind=ti.i32, values=self._excluded_pairs[:, 1])
             self.excluded_begin = add("grid.linked_begin", n + 1, kind=ti.i32, values=begin)
 
     def __repr__(self) -> str:
@@ -103,16 +103,22 @@ class NeighbourSearch:
 
     def _blocks(self, n: int) -> int:
         """Return the number of blocks of a list of n particles."""
-        return max(1, -(-n // self.team.piece)) if self.team.size > 1 and not self.counts else 1
+        return max(1, -(-n // self.team.piece)) if self.team.size > 1 and not self.counts_first else 1
 
     def can_regroup(self, change: Regrouping, radius: np.ndarray, reach: np.ndarray | None = None) -> bool:
         """Whether particles can be added and removed in place. radius, reach: of the particles there are now, (n,) [m]."""
         reach = 0 * radius if reach is None else reach
         n, store = change.now.count, self.list.store
-        room = store is not None and store.has_room(self.list.room + (self.list.short + 1) * (n + 1))
+        room = store is not None and store.has_room(self.list.room + (self.list.network_size + 1) * (n + 1))
         static = bool((change.inv_mass == 0).any()) == self.has_static
-        lone = not self.several_levels and not self.state.images and not reach.any()
-        return room and static and not self.team.launched and lone == self.lone and self.cells.can_regroup(radius, reach)
+        finds_all = not self.several_levels and not self.state.images and not reach.any()
+        return (
+            room
+            and static
+            and not self.team.launched
+            and finds_all == self.finds_all_neighbours
+            and self.cells.can_regroup(radius, reach)
+        )
 
     def regroup(self, change: Regrouping, skin: float, radius: np.ndarray, reach: np.ndarray | None = None) -> None:
         """Adapt the list to added and removed particles, after the team was adapted.
@@ -123,10 +129,10 @@ class NeighbourSearch:
         n, stale = change.now.count, int(self.memory.view(self.list.stale)[0])
         reach = 0 * radius if reach is None else reach
         if change.has_removed and not self.list.saved:
-            self.list.drop(change.number)
-            self.cells.drop(change.number)
+            self.list.remove_particles(change.number)
+            self.cells.remove_particles(change.number)
         skin = self._skin(skin, radius, reach)
-        stays = self.lone and not self.list.saved and stale != 1 and skin == self.skin
+        stays = self.finds_all_neighbours and not self.list.saved and stale != 1 and skin == self.skin
         self.skin, self.too_far = skin, (STALE * skin) ** 2
         stays &= self.cells.regroup(radius, reach, skin, np.array(change.now.extent))
         if self.sheared:
@@ -136,33 +142,33 @@ class NeighbourSearch:
             room = self.list.room  # the old list uses this memory
             self.list.blocks = self._blocks(n)
             self.list.allocate(room)
-        if self.linked:
+        if self.has_excluded:
             begin = self.memory.view(self.excluded_begin)[change.first]
             self.memory.resize(self.excluded_begin, n + 1)
             self.memory.write_from(self.excluded_begin, change.first, np.full(n + 1 - change.first, begin))
         came = n - change.kept
         if came:
-            self.memory.write_from(self.origin, change.kept, np.full((came, self.dim), np.nan))
+            self.memory.write_from(self.position_at_build, change.kept, np.full((came, self.dim), np.nan))
         self.memory.write(self.list.stale, (MOVED if came else stale) if stays else 1)
 
     def can_exclude(self, linked: np.ndarray) -> bool:
         """Whether exclude() can take these pairs, (m, 2): kernels are compiled either with excluded pairs or without."""
-        return self.linked == (len(linked) > 0)
+        return self.has_excluded == (len(linked) > 0)
 
-    def others(self, linked: np.ndarray, change: Regrouping) -> bool:
+    def exclusions_differ(self, linked: np.ndarray, change: Regrouping) -> bool:
         """Whether the excluded pairs `linked`, (m, 2), differ from the present ones, among particles that remain."""
-        if not self.linked:
+        if not self.has_excluded:
             return False
-        before, now = change.number[self._both], _both(linked, change.now.count)[0]
+        before, now = change.number[self._excluded_pairs], _in_both_orders(linked, change.now.count)[0]
         stay = before[(before >= 0).all(axis=1)]
         return not np.array_equal(stay, now[(now < change.kept).all(axis=1)])
 
     def exclude(self, linked: np.ndarray) -> None:
         """Exclude these pairs, (m, 2), from the list; can_exclude() must allow it. Particles are numbered as they are now."""
-        if self.linked:
-            self._both, begin = _both(linked, len(self.memory.view(self.excluded_begin)) - 1)
-            self.memory.resize(self.excluded, len(self._both))
-            self.memory.write(self.excluded, self._both[:, 1])
+        if self.has_excluded:
+            self._excluded_pairs, begin = _in_both_orders(linked, len(self.memory.view(self.excluded_begin)) - 1)
+            self.memory.resize(self.excluded, len(self._excluded_pairs))
+            self.memory.write(self.excluded, self._excluded_pairs[:, 1])
             self.memory.write(self.excluded_begin, begin)
 
     @property
@@ -182,11 +188,11 @@ class NeighbourSearch:
     @ti.func
     def moved_too_far(self, i):
         """Return 1 if particle i has moved by half the skin since the list was built, so that the list is stale."""
-        r, limit = self.state.x[i] - self.origin[i], self.too_far
+        r, limit = self.state.x[i] - self.position_at_build[i], self.too_far
         if ti.static(self.sheared):
             # The mean strain is not counted as motion. It moves listed pairs apart by at most strain * farthest.
-            strain = ti.cast(self.state.images.strain[None] - self.strain[None], self.real)
-            r[FLOW] -= strain * self.origin[i][GRADIENT]
+            strain = ti.cast(self.state.images.strain[None] - self.strain_at_build[None], self.real)
+            r[FLOW] -= strain * self.position_at_build[i][GRADIENT]
             left = ti.max(self.skin - ti.abs(strain) * self.farthest, 0)
             limit = ti.static(STALE**2) * left * left
         return ti.select(r.dot(r) <= limit, 0, 1)  # 1 for NaN
@@ -196,25 +202,25 @@ class NeighbourSearch:
         """Rebuild the list: sort the particles into cells, then list the neighbours of each. `thread`: see Team."""
         self.list.save_old_list(thread)
         self.cells.sort(thread)
-        if ti.static(self.counts):
-            self.pair_up(thread)
+        if ti.static(self.counts_first):
+            self.count_and_fill(thread)
         else:
             for k in range(self.team.dealt_count(self.list.blocks, 1, thread)):
-                self.fill(self.team.dealt_index(k, 1, thread))
+                self.fill_block(self.team.dealt_index(k, 1, thread))
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-            self.origin[i] = self.state.x[i]
+            self.position_at_build[i] = self.state.x[i]
         self.team.wait()
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
             self.list.stale[None] = 0
             if ti.static(self.sheared):
-                self.strain[None] = self.state.images.strain[None]
+                self.strain_at_build[None] = self.state.images.strain[None]
             if self.list.need[None] <= self.list.capacity:
                 self.list.old_saved[None] = 0
         self.team.wait()
 
     @ti.func
-    def fill(self, block):
+    def fill_block(self, block):
         """List the neighbours of a block of particles, one after the other, where there is one level of cells.
 
         Neighbours for which there is no room are only counted.
@@ -228,11 +234,11 @@ class NeighbourSearch:
             used = self.scan(i, FILL, start, ti.min(used, MOST))
             self.list.number[i] = ti.max(ti.min(used, room) - begin, 0)
         for i in range(block * size, ti.min((block + 1) * size, self.n)):
-            self.finish(i)
+            self.finish_entries(i)
         ti.atomic_max(self.list.need[None], used)
 
     @ti.func
-    def pair_up(self, thread):
+    def count_and_fill(self, thread):
         """Count the neighbours of all particles, then list them: on a GPU, and where there are several levels of cells.
 
         On a GPU each particle has a thread. With several levels, the finer particle of a pair finds it and lists it for both.
@@ -251,7 +257,7 @@ class NeighbourSearch:
                 if what == COUNT:
                     self.make_room(thread)
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-            self.finish(i)
+            self.finish_entries(i)
 
     @ti.func
     def scan_all(self, what: ti.template(), thread):  # type: ignore[valid-type]
@@ -282,9 +288,9 @@ class NeighbourSearch:
         self.team.wait()
 
     @ti.func
-    def finish(self, i):
+    def finish_entries(self, i):
         """Sort the entries of particle i, and transfer the data of its pairs from the old list."""
-        self.order(self.list.first[i], self.list.number[i])
+        self.sort_entries(self.list.first[i], self.list.number[i])
         self.list.touching[i] = self.list.transfer_pair_data(i)
 
     @ti.func
@@ -298,13 +304,13 @@ class NeighbourSearch:
         for m in range(own + 1):
             cell = self.cells.cell_of(i, m)
             for r in range(ti.static(3 ** (self.dim - 1))):
-                base, low, parts, span = self.cells.row(i, cell, m, r)
+                base, low, parts, span = self.cells.row_of_cells(i, cell, m, r)
                 for part in range(parts):
-                    b = base + self.cells.along(low + part, m)
+                    b = base + self.cells.position_in_row(low + part, m)
                     for e in range(self.cells.edge[b + 1], self.cells.edge[b + span + 1]):
                         j = self.cells.sorted[e]
-                        listed = self.listed(i, j, self.cells.apart(i, e))
-                        if ti.static(not self.counts):
+                        listed = self.belongs_on_list(i, j, self.cells.apart(i, e))
+                        if ti.static(not self.counts_first):
                             # No branch, which the CPU could not predict. The next entry overwrites one that is not listed.
                             self.list.neighbour[start + ti.min(used, self.list.capacity)] = j
                         elif (what != COUNT or m < own) and listed != 0:
@@ -321,8 +327,8 @@ class NeighbourSearch:
                         used += listed
         for old in range(self.list.old_first[i], self.list.old_first[i] + self.list.old_number[i]):
             j = self.list.old_neighbour[old]
-            if self.listed(i, j, self.state.apart(i, j)) == 0:
-                if ti.static(not self.counts):
+            if self.belongs_on_list(i, j, self.state.apart(i, j)) == 0:
+                if ti.static(not self.counts_first):
                     self.list.neighbour[start + ti.min(used, self.list.capacity)] = j
                 elif what != COUNT:
                     at = used
@@ -333,7 +339,7 @@ class NeighbourSearch:
         return used
 
     @ti.func
-    def listed(self, i, j, r):
+    def belongs_on_list(self, i, j, r):
         """Return 1 if a pair with difference r [m] belongs on the list: near, movable, not excluded."""
         far = self.table.reach(self.radius, i, j) + ti.cast(self.skin, self.real)
         yes = ti.cast(r.dot(r) < far * far, ti.i32) & ti.cast(i != j, ti.i32)
@@ -343,7 +349,7 @@ class NeighbourSearch:
         if ti.static(not self.table.uniform):
             if yes != 0:
                 yes = ti.cast(self.table.of(i, j)[3] > 0, ti.i32)
-        if ti.static(self.linked):
+        if ti.static(self.has_excluded):
             if yes != 0:
                 for e in range(self.excluded_begin[i], self.excluded_begin[i + 1]):
                     if self.excluded[e] == j:
@@ -351,12 +357,12 @@ class NeighbourSearch:
         return yes
 
     @ti.func
-    def order(self, begin, count):
+    def sort_entries(self, begin, count):
         """Sort `count` entries from `begin` on by index, which makes every sum over the list independent of the cells."""
-        if ti.static(self.several_levels or self.list.short == 1):
+        if ti.static(self.several_levels or self.list.network_size == 1):
             sort(self.list.neighbour, begin, count, self.serial)
-        elif count > ti.static(self.list.short):
+        elif count > ti.static(self.list.network_size):
             sort(self.list.neighbour, begin, count, self.serial)
         else:
             # Where particles close in space have close indices, the entries are already sorted, which exchange() tests first.
-            exchange(self.list.neighbour, begin, count, self.network, self.list.short)
+            exchange(self.list.neighbour, begin, count, self.network, self.list.network_size)

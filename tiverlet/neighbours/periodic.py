@@ -47,7 +47,7 @@ class Periodic(Feature):
 
     compiled_for = ("sheared",)
     host_only = ("low", "high")
-    _last = 0.0, 0.0
+    _last_strain_and_offset = 0.0, 0.0
     shear = Knob(lambda f, v: checks.number("Periodic", "shear", v), "Rate of the shear [1/s].")
     code_size = 0.1
 
@@ -119,34 +119,34 @@ class Periodic(Feature):
     @property
     def strain(self) -> float:
         """The shear strain: the integral of the rate over time."""
-        return self._come[0]
+        return self._strain_and_offset[0]
 
     @property
-    def _come(self) -> tuple[float, float]:
+    def _strain_and_offset(self) -> tuple[float, float]:
         """The strain, and the offset along x of the image one box further along y [m]."""
         images = vars(self.dev).get("images")
         if images and images.sheared:
             with contextlib.suppress(RuntimeError):  # fields cannot be read before the world is complete or after it is closed
                 read = self.scene.memory.read
-                self._last = float(read(images.strain)[0]), float(read(images.shift)[0, 0])
-        return self._last
+                self._last_strain_and_offset = float(read(images.strain)[0]), float(read(images.shift)[0, 0])
+        return self._last_strain_and_offset
 
     def continued(self, other: "Periodic") -> None:
         """Take over the strain and offset of the same box in another world."""
         if self.dev.images.sheared:
-            strain, offset = other._come
+            strain, offset = other._strain_and_offset
             self.scene.memory.write(self.dev.images.strain, strain)
             self.scene.memory.write(self.dev.images.shift, [offset, 0.0])
 
     def copy(self) -> "Periodic":
         """Return a copy without the strain, which belongs to a world."""
         new: Any = super().copy()
-        new._last = 0.0, 0.0
+        new._last_strain_and_offset = 0.0, 0.0
         return new
 
     def release(self) -> None:
         """Store strain and offset before the fields are freed: a world that is rebuilt reads them meanwhile."""
-        self._last = self._come
+        self._last_strain_and_offset = self._strain_and_offset
         super().release()
 
     def can_regroup(self, change: Regrouping) -> bool:
@@ -169,7 +169,7 @@ class Periodic(Feature):
     @property
     def offset(self) -> float:
         """Offset along x of the image one box further along y [m]."""
-        return self._come[1]
+        return self._strain_and_offset[1]
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """Return the edges of the box for drawing, (m, 2, dim) [m].
@@ -187,7 +187,7 @@ class Periodic(Feature):
 
         With shear, the velocity of the image in the box is v_x - boxes[:, 1] * shear * height.
         """
-        return self._turns(np.asarray(position, dtype=np.float64) - self.middle)
+        return self._count_boxes(np.asarray(position, dtype=np.float64) - self.middle)
 
     def wrap(self, position: ArrayLike) -> np.ndarray:
         """Return the images of positions (n, dim) [m] in the box: low <= x < high along periodic axes, up to rounding."""
@@ -197,7 +197,7 @@ class Periodic(Feature):
     def difference(self, a: ArrayLike, b: ArrayLike) -> np.ndarray:
         """Return a - b between nearest images [m], for positions (..., dim)."""
         r = np.asarray(a, dtype=np.float64) - np.asarray(b, dtype=np.float64)
-        return r - self.away(self._turns(r))
+        return r - self.away(self._count_boxes(r))
 
     def away(self, boxes: ArrayLike) -> np.ndarray:
         """Return the displacement by `boxes`, (..., dim), numbers of boxes along each axis, (..., dim) [m]."""
@@ -225,7 +225,7 @@ class Periodic(Feature):
                 places.append(image[near])
         return np.concatenate(found), np.concatenate(places)
 
-    def _turns(self, r: np.ndarray) -> np.ndarray:
+    def _count_boxes(self, r: np.ndarray) -> np.ndarray:
         """Return the number of boxes along each axis nearest to r, (..., dim); 0 where r is NaN or exceeds COUNTED boxes."""
         out = np.zeros(r.shape, dtype=np.int64)
 

@@ -56,10 +56,10 @@ class PointSearch:
             low = ti.floor((point - radius) * scale, ti.i32) - 1  # one more cell on each side, for rounding
             count = ti.floor((point + radius) * scale, ti.i32) + 2 - low
             for k in ti.static(self.cells.axes):
-                low[k], count[k] = self.cells.around(point, radius, m, k)
+                low[k], count[k] = self.cells.cell_range(point, radius, m, k)
             total = 1
             for k in ti.static(range(self.dim)):
-                count[k] = ti.min(count[k], 1 << self.cells.shape[m][k])  # each bucket of the torus is read once
+                count[k] = ti.min(count[k], 1 << self.cells.axis_bits[m][k])  # each bucket of the torus is read once
                 total *= count[k]
             for c in range(total):
                 cell, rest = low, c
@@ -67,7 +67,7 @@ class PointSearch:
                     cell[k] += rest % count[k]
                     rest = rest // count[k]
                 for k in ti.static(self.cells.axes):
-                    cell[k] = cell[k] % self.cells.count[m][k]
+                    cell[k] = cell[k] % self.cells.cells_per_axis[m][k]
                 b = self.cells.bucket(cell, m)
                 for e in range(self.cells.edge[b + 1], self.cells.edge[b + 2]):
                     i = self.cells.sorted[e]
@@ -109,7 +109,9 @@ def between(a: np.ndarray, b: np.ndarray, box: "Periodic | None") -> np.ndarray:
     return a - b if box is None else box.difference(a, b)
 
 
-def near_by_all(position: np.ndarray, points: np.ndarray, radius: np.ndarray, box: "Periodic | None" = None) -> np.ndarray:
+def near_by_brute_force(
+    position: np.ndarray, points: np.ndarray, radius: np.ndarray, box: "Periodic | None" = None
+) -> np.ndarray:
     """Return what PointSearch.near() does, by comparing each point with each particle, for worlds without contacts."""
     found = ((between(position, p, box) ** 2).sum(axis=1) <= r * r for p, r in zip(points, radius, strict=True))
     rows = [np.flatnonzero(some) for some in found]

@@ -26,16 +26,16 @@ class Strays:
     """
 
     n: Any = OnDevice()  # number of particles
-    most: Any = OnDevice()  # number of strays for which there is room
+    max_strays: Any = OnDevice()  # number of strays for which there is room
 
     def __init__(self, scene: "Scene", search: "NeighbourSearch", team: "Team"):
         self.search, self.list, self.cells, self.team = search, search.list, search.cells, team
         self.state, self.real = scene.state, scene.real
         most = min(MOST, scene.particles.count // SHARE)
-        self.n, self.most = scene.count, scene.memory.number(most)
+        self.n, self.max_strays = scene.count, scene.memory.number(most)
         self.stray = scene.memory.field("grid.strays", max(1, most), kind=ti.i32)
         self.number = scene.memory.field("grid.stray_number", None, kind=ti.i32)
-        self.met = scene.memory.field("grid.strays_met", None, kind=ti.i32)  # 1: a stray is near an unlisted particle
+        self.found_unlisted = scene.memory.field("grid.strays_met", None, kind=ti.i32)  # 1: a stray is near an unlisted particle
 
     @ti.func
     def keep_list(self, thread):
@@ -43,59 +43,59 @@ class Strays:
         if self.list.stale[None] == MOVED:
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, thread)):
-                self.number[None], self.met[None] = 0, 0
+                self.number[None], self.found_unlisted[None] = 0, 0
             self.team.wait()
-            self.find(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread))
+            self.find_strays(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread))
             self.team.wait()
             number = self.number[None]
-            if number <= self.most:
+            if number <= self.max_strays:
                 for k in range(self.team.chunk_begin(number, thread), self.team.chunk_end(number, thread)):
-                    if self.meets(self.stray[k], number) != 0:
-                        self.met[None] = 1  # all write the same
+                    if self.is_near_unlisted(self.stray[k], number) != 0:
+                        self.found_unlisted[None] = 1  # all write the same
             self.team.wait()
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, thread)):
-                if number <= self.most and self.met[None] == 0:
+                if number <= self.max_strays and self.found_unlisted[None] == 0:
                     self.list.stale[None] = 0
             self.team.wait()
 
     @ti.func
-    def find(self, begin, end):
+    def find_strays(self, begin, end):
         """List the strays among particles from `begin` up to `end`, in any order. The search stops once there are too many."""
         for b in range(blocks(begin, end)):
             low, high = block(b, begin, end)
             far = 0
             for i in range(low, high):
                 far |= self.search.moved_too_far(i)
-            if far != 0 and self.number[None] <= self.most:
+            if far != 0 and self.number[None] <= self.max_strays:
                 for i in range(low, high):
                     if self.search.moved_too_far(i) != 0:
                         k = ti.atomic_add(self.number[None], 1)
-                        if k < self.most:
+                        if k < self.max_strays:
                             self.stray[k] = i
 
     @ti.func
-    def meets(self, i, number):
+    def is_near_unlisted(self, i, number):
         """Return 1 if stray i is near a particle that is not on its list."""
         out, cell = 0, self.cells.cell_of(i, 0)
         for r in range(ti.static(3 ** (self.state.dim - 1))):
-            base, low, parts, span = self.cells.row(i, cell, 0, r)
+            base, low, parts, span = self.cells.row_of_cells(i, cell, 0, r)
             for part in range(parts):
-                b = base + self.cells.along(low + part, 0)
+                b = base + self.cells.position_in_row(low + part, 0)
                 for e in range(self.cells.edge[b + 1], self.cells.edge[b + span + 1]):
                     j = self.cells.sorted[e]
-                    out |= self.missing(i, j)
+                    out |= self.is_unlisted(i, j)
         for k in range(number):
-            out |= self.missing(i, self.stray[k])
+            out |= self.is_unlisted(i, self.stray[k])
         return out
 
     @ti.func
-    def missing(self, i, j):
+    def is_unlisted(self, i, j):
         """Return 1 if a pair belongs on the list, is nearer than any unlisted pair of a valid list can be, and is not listed."""
         near = self.search.table.reach(self.search.radius, i, j) + ti.static(1 - 2 * STALE) * ti.cast(self.search.skin, self.real)
         r, out = self.state.apart(i, j), 0
         if r.dot(r) < near * near:
-            out = self.search.listed(i, j, r)
+            out = self.search.belongs_on_list(i, j, r)
             for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
                 if self.list.neighbour[e] == j:
                     out = 0

@@ -19,45 +19,46 @@ if TYPE_CHECKING:
     from ..constraints.core.scalar import Scalar
     from ..features.feature import Batch, Scene
 
-USUAL = 1 / 1200  # [s] substep: 20 of a frame of 1/60 s
-MANY = 200  # stiff constraints from which conjugate gradients are worth their sums
-BODY = 25  # stiff constraints in a piece from which they count: in a pile of braced boxes Jacobi is best at equal time, 6e-3
-STEPS = 5  # of conjugate gradients: at equal time, residuals of 5 to 20 steps are about the same; 5 take the least of a frame
+USUAL_SUBSTEP = 1 / 1200  # [s] substep: 20 of a frame of 1/60 s
+MANY_STIFF = 200  # stiff constraints from which conjugate gradients are worth their sums
+# Stiff constraints in a piece from which they count: in a pile of braced boxes Jacobi is best at equal time, 6e-3.
+LARGE_PIECE = 25
+CG_STEPS = 5  # of conjugate gradients: at equal time, residuals of 5 to 20 steps are about the same; 5 take the least of a frame
 CHAIN = 2  # width of chains, trees, loops, joints of up to 3 rods
 BEAM = 5  # width of trusses, triangles on hinges, chains that bend: elimination takes two to three times as long as Jacobi
 RING = 8  # width of rings that bend: at 20 substeps Jacobi loses 0.5 to 60 % of their energy in 20 s, elimination 0 to 7 %
-LONG = 2000  # constraints in a piece up to which it is tried as a beam: refusing a larger net would take long
+MOST_TRIED = 2000  # constraints in a piece up to which it is tried as a beam: refusing a larger net would take long
 
 
-def by_structure(batches: "list[Batch]", scene: "Scene") -> Solver:
+def choose_solver(batches: "list[Batch]", scene: "Scene") -> Solver:
     """Return the default solver: the one that leaves few stiff constraints to Jacobi.
 
-    This is ConjugateGradient if elimination would leave MANY or more stiff constraints, in connected pieces of BODY or more, such
-    as cloth. Its residual is two thirds of that of Jacobi and Chebyshev at equal time, and an eighth with as many substeps. Else
-    it is Direct if pieces are chains, trees, loops or beams: its residual is some 1e-4 of the length of a link, that of Jacobi a
-    tenth. Else it is Jacobi, for few or soft links, and for pieces that start with violated constraints. These may contradict
-    each other; relaxed, they settle on a compromise.
+    This is ConjugateGradient if elimination would leave MANY_STIFF or more stiff constraints, in connected pieces of LARGE_PIECE
+    or more, such as cloth. Its residual is two thirds of that of Jacobi and Chebyshev at equal time, and an eighth with as many
+    substeps. Else it is Direct if pieces are chains, trees, loops or beams: its residual is some 1e-4 of the length of a link,
+    that of Jacobi a tenth. Else it is Jacobi, for few or soft links, and for pieces that start with violated constraints. These
+    may contradict each other; relaxed, they settle on a compromise.
     """
     links = solvable(batches)
     if not links:
         return Jacobi()
     pieces = Pieces(links, scene)
-    direct, taken = pieces.direct()
-    if pieces.many(~taken) and all(_converges(b, scene) for b in links):
-        return ConjugateGradient(STEPS)
+    direct, taken = pieces.choose_direct()
+    if pieces.has_many_stiff(~taken) and all(_may_iterate(b, scene) for b in links):
+        return ConjugateGradient(CG_STEPS)
     return direct or Jacobi()
 
 
-def reason(solver: Solver) -> str:
-    """Return why by_structure() has chosen this solver."""
+def explain_choice(solver: Solver) -> str:
+    """Return why choose_solver() has chosen this solver."""
     if isinstance(solver, Direct):
-        return f"links hang together like chains, trees, loops or beams, but for fewer than {MANY} stiff ones"
+        return f"links hang together like chains, trees, loops or beams, but for fewer than {MANY_STIFF} stiff ones"
     if isinstance(solver, ConjugateGradient):
-        return f"links are stiff, at least {MANY}, and hang together more closely than elimination takes"
+        return f"links are stiff, at least {MANY_STIFF}, and hang together more closely than elimination takes"
     return "links are few, soft or violated at the start, or there are angles that elimination is not for, or none"
 
 
-def _eliminates(b: "Scalar", scene: "Scene") -> bool:
+def _may_eliminate(b: "Scalar", scene: "Scene") -> bool:
     """Whether the default may use elimination in scenes with these constraints.
 
     It may for links, and for angles in 2D that are springs or are relaxed alone, such as motors of limited torque. Elimination
@@ -68,7 +69,7 @@ def _eliminates(b: "Scalar", scene: "Scene") -> bool:
     return b.arity <= 2 or bool(b.quantity.curved and b.arity == 3 and scene.particles.dim == 2 and not b.side and soft.all())
 
 
-def _converges(b: "Scalar", scene: "Scene") -> bool:
+def _may_iterate(b: "Scalar", scene: "Scene") -> bool:
     """Whether the default may use conjugate gradients in scenes with these constraints.
 
     It may not with rigid angles of paths in 3D, nor with the user's own rigid constraints on more than two particles. Limits of
@@ -90,21 +91,21 @@ class Pieces:
         self.acts = np.bincount(self.owner, minlength=self.count) > 0
         self.pair = np.concatenate([np.zeros((0, 2), dtype=np.int64), *(b.indices for b in links if b.arity == 2)])
         self.pair_of = np.flatnonzero(np.repeat([b.arity == 2 for b in links], counts))
-        self.bends = self._any(np.repeat([b.arity > 2 for b in links], counts))
-        off = np.concatenate([_off(b) for b in links])
-        self.exact = not off.any() and all(_eliminates(b, scene) for b in links)
+        self.has_angles = self._any(np.repeat([b.arity > 2 for b in links], counts))
+        off = np.concatenate([_is_violated(b) for b in links])
+        self.can_eliminate = not off.any() and all(_may_eliminate(b, scene) for b in links)
         degree = np.bincount(np.concatenate([b.indices.ravel() for b in links]), minlength=len(w))
         self.solved = self.acts & ~np.concatenate([b.relaxed_alone(scene) for b in links])
         stiff = np.concatenate([_stiff(b, degree * w) for b in links]) & self.solved
-        self.firm = stiff | ~self.solved | np.repeat([b.arity == 2 for b in links], counts)
+        self.is_counted = stiff | ~self.solved | np.repeat([b.arity == 2 for b in links], counts)
         self.stiff = stiff & ~self._any(off)
-        self.stands = self._stands(owner[~free], item[~free])
+        self.is_determinate = self._is_determinate(owner[~free], item[~free])
 
     def _any(self, some: np.ndarray) -> np.ndarray:
         """Return for each constraint, (m,), whether its piece has any constraint in the mask `some`, (m,)."""
         return np.bincount(self.piece, weights=some & self.acts, minlength=self.count)[self.piece] > 0
 
-    def _stands(self, owner: np.ndarray, item: np.ndarray) -> np.ndarray:
+    def _is_determinate(self, owner: np.ndarray, item: np.ndarray) -> np.ndarray:
         """Return for each constraint, (m,), whether its piece is held in one place at most and is not overconstrained.
 
         Springs of angles do not count as constraints here, because they bear any load. Any other piece may bear loads that no
@@ -113,19 +114,19 @@ class Pieces:
         minus the rigid motions of the piece.
         """
         place = components(self.count, owner, item)
-        pins, places = self._number(owner, item), self._number(owner, place[owner])
+        pins, places = self._count_distinct(owner, item), self._count_distinct(owner, place[owner])
         whole = np.array([3, 1, 0] if self.dim == 2 else [6, 3, 1, 0])  # rigid motions of a piece with 0, 1, 2, ... pins
-        n = self._number(self.owner, self.item)
+        n = self._count_distinct(self.owner, self.item)
         freedoms = np.where(n + pins > 2, self.dim * n - whole[np.minimum(pins, len(whole) - 1)], 1)
-        rows = np.bincount(self.piece[self.acts & self.firm], minlength=self.count)
+        rows = np.bincount(self.piece[self.acts & self.is_counted], minlength=self.count)
         return ((places <= 1) & (rows <= freedoms))[self.piece]
 
-    def _number(self, owner: np.ndarray, what: np.ndarray) -> np.ndarray:
+    def _count_distinct(self, owner: np.ndarray, what: np.ndarray) -> np.ndarray:
         """Return how many distinct values of `what` the constraints `owner` of each piece have, (m,)."""
         each = distinct(np.stack([self.piece[owner], what], axis=1))[0]
         return np.bincount(each[:, 0], minlength=self.count)
 
-    def _open(self, some: np.ndarray) -> np.ndarray:
+    def _count_open_loops(self, some: np.ndarray) -> np.ndarray:
         """Return how many loops of links in each of the pieces `some` are not made of triangles.
 
         E links between V particles have E - V + 1 loops. A net held by a corner has many, and gains energy from elimination when
@@ -142,34 +143,34 @@ class Pieces:
         particles = np.bincount([k for k, _ in near], minlength=self.count)
         return np.rint(np.bincount(edges[:, 0], 1 - triangles, self.count) - particles + 1).astype(int)[some]
 
-    def direct(self) -> tuple[Direct | None, np.ndarray]:
+    def choose_direct(self) -> tuple[Direct | None, np.ndarray]:
         """Return Direct with the largest width that is trusted, or None; and a mask of the constraints that it takes, (m,).
 
         It is None where no width is trusted, or only single links would be taken. Pieces that are wider than CHAIN or have angles
-        must satisfy _stands(), and consist of triangles or of one loop with springs of angles.
+        must satisfy _is_determinate(), and consist of triangles or of one loop with springs of angles.
         """
         taken = np.zeros(self.count, dtype=bool)
         longest = np.bincount(self.piece[self.acts], minlength=1).max()
-        for width in ((CHAIN,) if longest > LONG else (RING, BEAM, CHAIN)) if self.exact else ():
+        for width in ((CHAIN,) if longest > MOST_TRIED else (RING, BEAM, CHAIN)) if self.can_eliminate else ():
             found = plan(self.count, self.owner, self.item, width)
             first = found.rows[found.part_begin[:-1]]
             widths = np.array(found.widths, dtype=int)
             wide = widths > CHAIN
             if width > CHAIN and not self._any(self.stiff)[first[wide]].any():
                 continue
-            if not self.stands[first[wide | self.bends[first]]].all():
+            if not self.is_determinate[first[wide | self.has_angles[first]]].all():
                 continue
-            loops, ring = self._open(self.piece[first[wide]]), self.bends[first[wide]]
+            loops, ring = self._count_open_loops(self.piece[first[wide]]), self.has_angles[first[wide]]
             if np.where(widths[wide] > BEAM, ring & (loops == 1), loops <= ring).all():
                 taken[found.rows] = True
                 crowd = np.bincount(self.item[(taken & self.solved)[self.owner]], minlength=1)
                 return (Direct(max([CHAIN, *found.widths])) if crowd.max() > 1 else None), taken
         return None, taken
 
-    def many(self, some: np.ndarray) -> bool:
-        """Whether MANY or more constraints in the mask `some` are stiff, two-sided, and in pieces with BODY or more of these."""
+    def has_many_stiff(self, some: np.ndarray) -> bool:
+        """Whether MANY_STIFF or more in the mask `some` are stiff, two-sided, and in pieces with LARGE_PIECE or more of these."""
         sizes = np.bincount(self.piece[some & self.stiff], minlength=1)
-        return sizes[sizes >= BODY].sum() >= MANY
+        return sizes[sizes >= LARGE_PIECE].sum() >= MANY_STIFF
 
 
 def _stiff(b: "Scalar", split: np.ndarray) -> np.ndarray:
@@ -179,10 +180,10 @@ def _stiff(b: "Scalar", split: np.ndarray) -> np.ndarray:
     """
     if b.side or b.arity != 2:
         return (b.compliance == 0) & (not b.side)
-    return b.compliance < split[b.indices].sum(axis=1) * USUAL**2
+    return b.compliance < split[b.indices].sum(axis=1) * USUAL_SUBSTEP**2
 
 
-def _off(b: "Scalar") -> np.ndarray:
+def _is_violated(b: "Scalar") -> np.ndarray:
     """Return which constraints are violated at the start by more than LOST of their size, (m,)."""
     C = b.violation(b.start.position)
     return np.where(b.side, np.maximum(b.side * C, 0), np.abs(C)) * b.inverse_size(b.start.position) > LOST

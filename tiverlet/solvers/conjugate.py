@@ -13,7 +13,7 @@ from ..geometry.ordered import distinct
 from .corners import components
 from .slots import TENSEST, Slots
 from .solver import Solver
-from .spectrum import largest
+from .spectrum import largest_eigenvalue
 from .system import REDUNDANT, SLACK, System, solvable
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ NULL = 8  # rounding errors of d . W d: if d . A d is below that, or below REDUN
 BLOCKS = 64  # partial sums: a fixed number, so that totals are the same bit for bit on any number of threads
 # Indices into `sums`: r . z; the length of the step, later the weight of the old direction in the next one; the length of a step
 # that is taken back; r . z at the start of the iteration.
-LEFT, FACTOR, BACK, FIRST = range(4)
+RZ, FACTOR, TAKEN_BACK, RZ_START = range(4)
 
 
 class ConjugateGradient(Solver):
@@ -77,7 +77,7 @@ class ConjugateGradient(Solver):
     def explain(self, batches: list[Batch], slots: Slots) -> str:
         """Return how many constraints are solved together, and how many relaxed alone."""
         rows = slots.system.rows if slots.system else 0
-        alone = slots.system.left_out(batches) if rows else sum(b.count for b in batches)
+        alone = slots.system.count_relaxed_alone(batches) if rows else sum(b.count for b in batches)
         return f"{self!r}: {rows} constraints together" + (f"; {alone} relaxed as by Jacobi" if alone else "")
 
     def __repr__(self) -> str:
@@ -89,7 +89,7 @@ class CGSystem(System):
 
     n: Any = OnDevice()  # number of particles
     least: Any = OnDevice()  # first value of a floor
-    groups: Any = OnDevice()  # number of parts, plus one for particles in none
+    part_count: Any = OnDevice()  # number of parts, plus one for particles in none
 
     def __init__(self, scene: Scene, batches: list[Batch], slots: Slots, scalars: "list[Scalar]", steps: int):
         places = [slots.places(b) for b in scalars]
@@ -106,27 +106,28 @@ class CGSystem(System):
         ends = np.concatenate([[0], np.cumsum(np.bincount(row[free], minlength=self.rows))])
         self.corner_begin = self.ints("corner_begin", ends)
         self.corner = self.ints("corner", np.stack([slot[free], who[free]], axis=1)[order], 2)
-        self.direction, self.residual, self.applied = self.vector("direction"), self.vector("residual"), self.vector("applied")
+        self.direction, self.residual = self.vector("direction"), self.vector("residual")
+        self.matrix_times_direction = self.vector("applied")
         self.inverse_diagonal, self.shift = self.vector("preconditioner"), self.vector("shift")
         self.gradient = scene.memory.field("system.gradient", slots.total, width=self.dim)
-        self.pulled = scene.memory.field("system.pulled", scene.count, width=self.dim)
+        self.particle_move = scene.memory.field("system.pulled", scene.count, width=self.dim)
         self.partial, self.worst = self.reals("partial_sums", BLOCKS), self.reals("worst", BLOCKS)
         if self.limits_steps:
-            self.gain, self.over = self.reals("gain", BLOCKS), self.reals("over", BLOCKS)
+            self.gain, self.too_long = self.reals("gain", BLOCKS), self.reals("over", BLOCKS)
         self.sums = scene.memory.field("system.sums", None, width=4, kind=ti.f64)
-        self.noise, self.loud = self.reals("noise"), self.reals("loud", BLOCKS)  # r z of rounding; 1 if a row is above it
+        self.noise, self.above_noise = self.reals("noise"), self.reals("loud", BLOCKS)  # r z of rounding; 1 if a row is above it
         self.null = max(REDUNDANT, NULL * self.epsilon)
         self.rounding = self.epsilon ** (2 if scene.state.compensated else 1)  # of positions
-        least = 1.2 * largest(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
+        least = 1.2 * largest_eigenvalue(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
         self.least = self.memory.number(least, scene.real)
         _, part, _ = distinct(components(len(rows), row[free], who[free]))
         self._part_of = np.zeros(scene.particles.count, dtype=np.int32)  # the part of each particle, counted from 1; 0: none
         self._part_of[who[free]] = part[row[free]] + 1
-        self.part, self.lead = self.ints("part", part + 1), self.ints("lead", self.leads(scalars, slots))
+        self.part, self.representative = self.ints("part", part + 1), self.ints("lead", self.representatives(scalars, slots))
         self.part_of = scene.memory.field("system.part_of", scene.count, kind=ti.i32, values=self._part_of)
         count = int(part.max(initial=0)) + 2
-        self.groups = self.memory.number(count)
-        self.strained = self.ints("strained", np.zeros(count, dtype=np.int32))  # parts whose floor is too low
+        self.part_count = self.memory.number(count)
+        self.floor_too_low = self.ints("strained", np.zeros(count, dtype=np.int32))  # parts whose floor is too low
         self.floor = scene.memory.field("system.floor", scene.count, kind=ti.f64, state=True)  # floor of its part, by particle
 
     def vector(self, name: str):
@@ -138,7 +139,7 @@ class CGSystem(System):
 
         Where constraints contradict each other there, floors begin at HIGHEST.
         """
-        floor, contradicted = np.zeros(self.n), np.zeros(self.groups, dtype=bool)
+        floor, contradicted = np.zeros(self.n), np.zeros(self.part_count, dtype=bool)
         part_of = self._part_of[: self.n]  # particles added or removed since are in no part, and behind all that are in one
         for batch, share in off:
             some = (share > 0) & (self.row(batch) >= 0)
@@ -154,7 +155,7 @@ class CGSystem(System):
         zero = 0 * violation
         self.step[r] = ti.select(W > 0, ti.cast(0, ti.f64), -ti.cast(lam, ti.f64))
         self.residual[r] = ti.select(W > 0, -violation / A, zero)
-        self.shift[r] = ti.select(W > 0, alpha / A + ti.cast(self.floor[self.lead[r]], self.real) * W, zero)
+        self.shift[r] = ti.select(W > 0, alpha / A + ti.cast(self.floor[self.representative[r]], self.real) * W, zero)
         self.inverse_diagonal[r] = ti.select(W > 0, 1 / (W + self.shift[r]), zero)
         self.direction[r] = self.inverse_diagonal[r] * self.residual[r]
 
@@ -165,12 +166,12 @@ class CGSystem(System):
             self.gradient[place] = gradient
 
     @ti.func
-    def begin_of(self, b):
+    def first_row_of(self, b):
         """Return the first row of block b."""
         return b * ((self.rows + BLOCKS - 1) // BLOCKS)
 
     @ti.func
-    def summed(self):
+    def sum_partials(self):
         """Return the sum of the partial sums, in order."""
         out = ti.cast(0, ti.f64)
         for b in range(BLOCKS):
@@ -182,10 +183,10 @@ class CGSystem(System):
         """Compute r . z of the first residual; and for each row, r z of a violation that is only rounding, 2 eps |x| |grad C|."""
         for k in range(self.team.chunk_begin(BLOCKS * self.stride, thread), self.team.chunk_end(BLOCKS * self.stride, thread)):
             if k % self.stride == 0:
-                b, total, loud = k // self.stride, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
-                for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
+                b, total, above = k // self.stride, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+                for r in range(self.first_row_of(b), ti.min(self.first_row_of(b + 1), self.rows)):
                     if ti.static(bool(self.state.sleepers)):
-                        if not self.state.awake(self.lead[r]):  # rows of sleeping particles were not set in this pass
+                        if not self.state.awake(self.representative[r]):  # rows of sleeping particles were not set in this pass
                             self.residual[r], self.direction[r], self.step[r] = 0, 0, 0
                     far, squares = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
                     for c in range(self.corner_begin[r], self.corner_begin[r + 1]):
@@ -196,12 +197,12 @@ class CGSystem(System):
                     here = ti.cast(self.residual[r], ti.f64) * self.direction[r]
                     total += here
                     if here > self.noise[r]:
-                        loud = 1.0
-                self.partial[b], self.loud[b] = total, loud
+                        above = 1.0
+                self.partial[b], self.above_noise[b] = total, above
         self.team.wait()
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
-            now = self.summed()
+            now = self.sum_partials()
             self.sums[None] = ti.Vector([now, 0, 0, now], ti.f64)
         self.team.wait()
 
@@ -209,29 +210,29 @@ class CGSystem(System):
     def end(self, thread):
         """Raise the floors of parts where steps have not converged, or a tension came near the limit of the substep."""
         for r in range(self.team.chunk_begin(self.rows, thread), self.team.chunk_end(self.rows, thread)):
-            share = CONVERGED * self.sums[None][FIRST]
-            if self.sums[None][LEFT] > share:
+            share = CONVERGED * self.sums[None][RZ_START]
+            if self.sums[None][RZ] > share:
                 if self.rows * ti.cast(self.inverse_diagonal[r] * self.residual[r], ti.f64) * self.residual[r] > share:
-                    self.strained[self.part[r]] = 1  # all write the same
+                    self.floor_too_low[self.part[r]] = 1  # all write the same
         self.team.wait()
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-            if self.strained[self.part_of[i]] != 0:
+            if self.floor_too_low[self.part_of[i]] != 0:
                 self.floor[i] = ti.max(self.least, ti.min(GROWTH * self.floor[i], HIGHEST))
         self.team.wait()
-        for p in range(self.team.chunk_begin(self.groups, thread), self.team.chunk_end(self.groups, thread)):
-            self.strained[p] = 0
+        for p in range(self.team.chunk_begin(self.part_count, thread), self.team.chunk_end(self.part_count, thread)):
+            self.floor_too_low[p] = 0
         self.team.wait()
 
     @ti.func
     def iterate(self, thread):
         """Take one step of conjugate gradients. If it needs too large a tension, it is taken back, and no step follows."""
-        self.pull(thread)
-        self.curve(thread)
-        self.advance(thread)
-        self.turn(thread)
+        self.compute_moves(thread)
+        self.compute_step_length(thread)
+        self.apply_step(thread)
+        self.update_direction(thread)
 
     @ti.func
-    def pull(self, thread):
+    def compute_moves(self, thread):
         """Compute w G^T d, the move of each particle along the direction."""
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             if self.w.positive(i):
@@ -240,59 +241,59 @@ class CGSystem(System):
                     r = self.row_of[s]
                     if r >= 0:
                         total += self.direction[r] * self.move[s]
-                if ti.static(self.shares):
-                    total *= self.share[i]
-                self.pulled[i] = total
+                if ti.static(self.has_shared_particles):
+                    total *= self.blocks_of[i]
+                self.particle_move[i] = total
         self.team.wait()
 
     @ti.func
-    def curve(self, thread):
+    def compute_step_length(self, thread):
         """Compute A d, and the length of the step, r . z / d . A d; 0 if only rounding is left and d is in the null space."""
         for k in range(self.team.chunk_begin(BLOCKS * self.stride, thread), self.team.chunk_end(BLOCKS * self.stride, thread)):
             if k % self.stride == 0:
                 b, total, size = k // self.stride, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
-                for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
+                for r in range(self.first_row_of(b), ti.min(self.first_row_of(b + 1), self.rows)):
                     value = self.shift[r] * self.direction[r]
                     if self.inverse_diagonal[r] > 0:
                         size += ti.cast(self.direction[r], ti.f64) * self.direction[r] / self.inverse_diagonal[r]
                     for c in range(self.corner_begin[r], self.corner_begin[r + 1]):
                         at = self.corner[c]
-                        value += self.gradient[at[0]].dot(self.pulled[at[1]])
-                    self.applied[r] = value
+                        value += self.gradient[at[0]].dot(self.particle_move[at[1]])
+                    self.matrix_times_direction[r] = value
                     total += ti.cast(value, ti.f64) * self.direction[r]
                 self.partial[b], self.worst[b] = total, size
         self.team.wait()
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
-            curve, size, loud = self.summed(), ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+            curve, size, above = self.sum_partials(), ti.cast(0, ti.f64), ti.cast(0, ti.f64)
             for b in range(BLOCKS):
                 size += self.worst[b]
-                loud = ti.max(loud, self.loud[b])
-            if loud == 0 and curve <= ti.static(self.null) * size:
-                self.sums[None][LEFT] = 0
-            self.sums[None][FACTOR] = ti.select(curve > 0, self.sums[None][LEFT] / curve, ti.cast(0, ti.f64))
+                above = ti.max(above, self.above_noise[b])
+            if above == 0 and curve <= ti.static(self.null) * size:
+                self.sums[None][RZ] = 0
+            self.sums[None][FACTOR] = ti.select(curve > 0, self.sums[None][RZ] / curve, ti.cast(0, ti.f64))
         self.team.wait()
 
     @ti.func
-    def advance(self, thread):
+    def apply_step(self, thread):
         """Take the step, and compute the residual and whether the step was too long."""
         for k in range(self.team.chunk_begin(BLOCKS * self.stride, thread), self.team.chunk_end(BLOCKS * self.stride, thread)):
             if k % self.stride == 0:
                 b, total, worst = k // self.stride, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
                 far, gain, over = self.sums[None][FACTOR], ti.cast(0, ti.f64), ti.cast(0, ti.f64)
-                loud = ti.cast(0, ti.f64)
-                for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
+                above = ti.cast(0, ti.f64)
+                for r in range(self.first_row_of(b), ti.min(self.first_row_of(b + 1), self.rows)):
                     self.step[r] = self.step[r] + far * self.direction[r]
-                    left = self.residual[r] - ti.cast(far, self.real) * self.applied[r]
+                    left = self.residual[r] - ti.cast(far, self.real) * self.matrix_times_direction[r]
                     self.residual[r] = left
                     here = ti.cast(self.inverse_diagonal[r] * left, ti.f64) * left
                     total += here
                     if here > self.noise[r]:
-                        loud = 1.0
+                        above = 1.0
                     tension = self.geometric_stiffness[r] * ti.abs(self.lam[r] + self.step[r])
                     worst = ti.max(worst, tension)
                     if tension > TENSEST / 2:
-                        self.strained[self.part[r]] = 1
+                        self.floor_too_low[self.part[r]] = 1
                     if ti.static(self.limits_steps):
                         if self.scale[r] != 0:
                             change = self.violation[r] + self.scale[r] * (left + self.shift[r] * self.step[r])
@@ -300,37 +301,37 @@ class CGSystem(System):
                             gain -= SLACK * ti.abs(self.step[r] * self.violation[r])
                             if ti.abs(self.step[r]) > self.trusted_step[r]:
                                 over = 1.0
-                self.partial[b], self.worst[b], self.loud[b] = total, worst, loud
+                self.partial[b], self.worst[b], self.above_noise[b] = total, worst, above
                 if ti.static(self.limits_steps):
-                    self.gain[b], self.over[b] = gain, over
+                    self.gain[b], self.too_long[b] = gain, over
         self.team.wait()
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
-            before, worst = self.sums[None][LEFT], self.worst[0]
-            now = ti.select(before > 0, self.summed(), 0 * before)
+            before, worst = self.sums[None][RZ], self.worst[0]
+            now = ti.select(before > 0, self.sum_partials(), 0 * before)
             for b in range(1, BLOCKS):
                 worst = ti.max(worst, self.worst[b])
             ti.atomic_max(self.tension[None], worst)
             if ti.static(self.limits_steps):
-                gain, over = self.gain[0], self.over[0]
+                gain, over = self.gain[0], self.too_long[0]
                 for b in range(1, BLOCKS):
                     gain += self.gain[b]
-                    over += self.over[b]
+                    over += self.too_long[b]
                 if gain > 0 and over > 0:  # as in Elimination.limit_steps(): such a step is taken back, too
                     worst = 2 * TENSEST
             back = ti.select(worst > TENSEST, self.sums[None][FACTOR], 0 * now)
             if worst > TENSEST:
                 now = 0
-            first = self.sums[None][FIRST]
+            first = self.sums[None][RZ_START]
             self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back, first], ti.f64)
         self.team.wait()
 
     @ti.func
-    def turn(self, thread):
+    def update_direction(self, thread):
         """Take a step back that was too long, and compute the next direction, z + (r . z / r . z before) d."""
         for r in range(self.team.chunk_begin(self.rows, thread), self.team.chunk_end(self.rows, thread)):
-            if self.sums[None][BACK] != 0:
-                self.step[r] = self.step[r] - self.sums[None][BACK] * self.direction[r]
+            if self.sums[None][TAKEN_BACK] != 0:
+                self.step[r] = self.step[r] - self.sums[None][TAKEN_BACK] * self.direction[r]
                 self.residual[r] = 0
             self.direction[r] = (
                 self.inverse_diagonal[r] * self.residual[r] + ti.cast(self.sums[None][FACTOR], self.real) * self.direction[r]

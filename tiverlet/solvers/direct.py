@@ -23,9 +23,9 @@ AGREEMENT = 0.25  # of the tension: how far solutions with directions at the two
 STABLE = 2.0  # (omega h)^2 that is allowed there: half the limit of stability
 ROUNDS = 8  # at most, in search of the ropes that pull, and of the softness of a system
 
-# A system takes a second Newton step if a particle moved by more than the square root of LONG, in lengths, unless a tension was
-# above CALM, (omega h)^2. Such vibrations are not resolved and gain energy; the error of the first step removes it.
-LONG, CALM = 1e-5, 0.35
+# A system takes a second Newton step if a particle moved by more than the square root of LONG_MOVE, in lengths, unless a tension
+# was above CALM_TENSION, (omega h)^2. Such vibrations are not resolved and gain energy; the error of the first step removes it.
+LONG_MOVE, CALM_TENSION = 1e-5, 0.35
 UNKNOWN, UNMET, ENDED = range(3)  # whether a system takes it: decided by the moves of the first step; yes; no
 
 # (omega h)^2 to which tensions are softened, with directions at the end of the substep. There the move is a step down the
@@ -88,7 +88,7 @@ class Direct(Solver):
         system = slots.system
         if not system:
             return f"{self!r}: no system; all are relaxed as by Jacobi (wider than {self.width}, or not one number)"
-        alone = system.left_out(batches)
+        alone = system.count_relaxed_alone(batches)
         parts = f"{system.rows} constraints by elimination (systems: {system.parts}, width: {max(system.plan.widths)})"
         alone = f"; {alone} relaxed as by Jacobi (wider than {self.width}, or not one number)" if alone else ""
         return f"{self!r}: {parts}{alone}"
@@ -123,7 +123,7 @@ class Elimination(System):
         who = np.zeros(slots.total, dtype=np.int64)
         who[slot] = item
         self.particle_of, self.w, self.inverse_size = ints("who", who), scene.state.w, reals("close")
-        self.refines = scene.order == 2 and not self.limits_steps and not self.shares
+        self.refines = scene.order == 2 and not self.limits_steps and not self.has_shared_particles
         if self.refines:
             parts = np.repeat(np.arange(found.parts), np.diff(found.part_begin))
             self.part_of, self.newton = ints("part_of", parts), ints("newton", np.full(found.parts, UNKNOWN))
@@ -131,11 +131,11 @@ class Elimination(System):
             for b in scalars:
                 inside = self.row(b) >= 0
                 np.maximum.at(near, b.indices[inside], b.inverse_size(b.start.position)[inside, None])
-            self.near = scene.memory.field("system.near", scene.count, values=near)
+            self.particle_inverse_size = scene.memory.field("system.near", scene.count, values=near)
             self.any_unmet = scene.memory.field("system.any_unmet", None, kind=ti.i32)
         self.sleeps = bool(scene.state.sleepers)
         if self.sleeps:  # all particles of a system sleep, or none
-            self.lead = ints("lead", self.leads(scalars, slots)[found.part_begin[:-1]])
+            self.representative = ints("lead", self.representatives(scalars, slots)[found.part_begin[:-1]])
         parts = [scene.inv_mass[b.indices] * (b.gradients(b.start.position) ** 2).sum(axis=2) for b in scalars]
         least = np.concatenate([np.where(p > 0, p, np.inf).min(axis=1, initial=np.inf) for p in parts])[found.rows]
         small = np.where(np.isfinite(least), SMALL_PIVOT * least, 0.0)
@@ -164,12 +164,12 @@ class Elimination(System):
     def set_gradient(self, place, i, gradient):
         """Set the gradient at a corner with slot `place` and particle i."""
         if place >= 0:
-            if ti.static(self.shares):
-                gradient *= self.share[i]
+            if ti.static(self.has_shared_particles):
+                gradient *= self.blocks_of[i]
             self.gradient[place] = gradient
 
     @ti.func
-    def acts(self, r):
+    def is_active(self, r):
         """Whether row r takes part in the system."""
         out = self.scale[r] != 0
         if ti.static(self.one_sided):
@@ -189,7 +189,7 @@ class Elimination(System):
                 self.value[rows + e] = 0
                 self.value[rows + entries + e] = 0
         for r in range(begin, end):
-            if self.acts(r):
+            if self.is_active(r):
                 for q in range(self.product_begin[r], self.product_begin[r + 1]):
                     at = self.product[q]
                     self.value[at[0]] = self.value[at[0]] + self.scale[r] * self.coupling(at, at_end)
@@ -216,8 +216,8 @@ class Elimination(System):
         """Return the move of the corner with slot s for a multiplier of 1, along the gradient at the end of the substep."""
         i = self.particle_of[s]
         move = self.gradient[s] * self.w.of(i)
-        if ti.static(self.shares):
-            move /= self.share[i]
+        if ti.static(self.has_shared_particles):
+            move /= self.blocks_of[i]
         return move
 
     @ti.func
@@ -323,7 +323,7 @@ class Elimination(System):
         return found
 
     @ti.func
-    def stretch(self, r):
+    def relative_length(self, r):
         """Return the length of constraint r relative to its rest length. A longer one has a lower transverse frequency."""
         out = ti.cast(1, ti.f64)
         if self.scale[r] != 0:
@@ -341,7 +341,7 @@ class Elimination(System):
         for r in range(begin, end):
             step, geometric_stiffness = self.step[r], self.geometric_stiffness[r]
             if at_end != 0:
-                geometric_stiffness /= self.stretch(r)
+                geometric_stiffness /= self.relative_length(r)
             worst = ti.max(worst, geometric_stiffness * ti.abs(self.lam[r] + step))
             total += geometric_stiffness * (self.lam[r] + step)
             size += ti.abs(self.violation[r])
@@ -350,7 +350,7 @@ class Elimination(System):
         return worst, total, ti.select(steps > 0, size / steps, 0 * size), most
 
     @ti.func
-    def bears(self, begin, end):
+    def earlier_tension(self, begin, end):
         """Return the largest (omega h)^2 of a transverse vibration under the multipliers of the earlier passes."""
         worst = ti.cast(0, ti.f64)
         for r in range(begin, end):
@@ -358,7 +358,7 @@ class Elimination(System):
         return worst
 
     @ti.func
-    def stay(self, begin, end):
+    def clear_steps(self, begin, end):
         """Set all steps to 0."""
         for r in range(begin, end):
             self.step[r] = 0
@@ -372,7 +372,7 @@ class Elimination(System):
         for r in range(begin, end):
             for k, b in ti.static(self.precise):
                 if self.batch[r] == k and self.alpha[r] == 0 and self.scale[r] != 0:
-                    self.violation[r] = b.dev.quantity.exactly(self.number[r])
+                    self.violation[r] = b.dev.quantity.exact_excess(self.number[r])
                     if ti.static(b.dev.limit.acts):
                         self.violation[r] -= b.dev.limit.postponed[self.number[r]]
 
@@ -381,7 +381,7 @@ class Elimination(System):
         """Limit each multiplier to the tension with (omega h)^2 = SOFTENED_TO."""
         for r in range(begin, end):
             if self.geometric_stiffness[r] > 0:
-                most = SOFTENED_TO * self.stretch(r) / self.geometric_stiffness[r]
+                most = SOFTENED_TO * self.relative_length(r) / self.geometric_stiffness[r]
                 self.step[r] = ti.max(-most, ti.min(most, self.lam[r] + self.step[r])) - self.lam[r]
 
     @ti.func
@@ -407,12 +407,12 @@ class Elimination(System):
         return self.newton[self.part_of[r]] == UNMET
 
     @ti.func
-    def note_move(self, i, begin, end, move):
+    def record_move(self, i, begin, end, move):
         """Mark the system of particle i for another Newton step if i moved so far that rigid constraints stay violated.
 
         A length l whose ends moved across it by u relative to each other is violated by |u|^2 / (2 l).
         """
-        if (self.near[i] * move).norm_sqr() > LONG:
+        if (self.particle_inverse_size[i] * move).norm_sqr() > LONG_MOVE:
             for s in range(begin, end):
                 r = self.row_of[s]
                 b = self.part_of[r]
@@ -431,7 +431,7 @@ class Elimination(System):
         """
         begin, end = self.part_begin[b], self.part_begin[b + 1]
         if ti.static(self.sleeps):
-            if not self.state.awake(self.lead[b]):
+            if not self.state.awake(self.representative[b]):
                 end = begin
         zero = ti.cast(0, ti.f64)
         softness, least, inverse, tension_at_start, total_at_start = zero, zero, zero, zero, zero
@@ -448,7 +448,7 @@ class Elimination(System):
                 if (hard == 0 and tension <= TENSEST) or stage == AGAIN:
                     ti.atomic_max(self.tension[None], tension)
                     stage = DONE
-                    if tension > CALM:
+                    if tension > CALM_TENSION:
                         self.end_newton(b)
                 elif stage == ROUGH:
                     self.refine_violations(begin, end)
@@ -469,8 +469,8 @@ class Elimination(System):
                     ti.atomic_max(self.tension[None], ti.select(bound, tension_at_start, ti.min(tension, TENSEST)))
                     softness, stage = LEAST_SOFTNESS * most, GIVE_WAY
                     self.end_newton(b)
-                    if self.bears(begin, end) > SOFTENED_TO:
-                        self.stay(begin, end)
+                    if self.earlier_tension(begin, end) > SOFTENED_TO:
+                        self.clear_steps(begin, end)
                         stage = DONE
             else:
                 k += 1

@@ -10,8 +10,8 @@ import numpy as np
 from ..geometry.ordered import distinct
 from .corners import components, corners_of
 
-SHORT = 4096  # corners of a part up to which its plan is cached
-COUNTED = (("entry", "column"), ("product", "product"), ("update", "update"))  # X of each X_begin, and the array it indexes
+MOST_CACHED = 4096  # corners of a part up to which its plan is cached
+BEGINS = (("entry", "column"), ("product", "product"), ("update", "update"))  # X of each X_begin, and the array it indexes
 
 
 @dataclass
@@ -57,25 +57,25 @@ def plan(count: int, owner: np.ndarray, item: np.ndarray, width: int) -> Plan:
     corners = np.flatnonzero(~np.isin(label[owner], refused))
     corners = corners[np.argsort(label[owner[corners]], kind="stable")]  # part by part
     _, part, sizes = distinct(label[owner[corners]])
-    owners, own = _numbered(part, owner[corners], len(sizes))
-    _, its = _numbered(part, item[corners], len(sizes))
+    owners, own = _number_within_parts(part, owner[corners], len(sizes))
+    _, its = _number_within_parts(part, item[corners], len(sizes))
     firsts, ends = np.searchsorted(owners[:, 0], np.arange(len(sizes))).tolist(), np.cumsum(sizes).tolist()
     found = []
     for first, size, end in zip(firsts, sizes.tolist(), ends, strict=True):
         mine = slice(end - size, end)
-        plan = (_known if size <= SHORT else _planned)(width, own[mine].tobytes(), its[mine].tobytes())
+        plan = (_plan_part_cached if size <= MOST_CACHED else _plan_part)(width, own[mine].tobytes(), its[mine].tobytes())
         if plan:
             found.append((plan, first, end - size))
-    return _joined(found, owners[:, 1], corners)
+    return _join_plans(found, owners[:, 1], corners)
 
 
-def _numbered(part: np.ndarray, what: np.ndarray, parts: int) -> tuple[np.ndarray, np.ndarray]:
+def _number_within_parts(part: np.ndarray, what: np.ndarray, parts: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the distinct pairs (part, what), (k, 2); and for each element of `what` its index among those of its part."""
     each, which, _ = distinct(np.stack([part, what], axis=1))
     return each, (which - np.searchsorted(each[:, 0], np.arange(parts))[part]).astype(np.int32)
 
 
-def _planned(width: int, owner: bytes, item: bytes) -> Plan | None:
+def _plan_part(width: int, owner: bytes, item: bytes) -> Plan | None:
     """Return the plan of one part; None where it is wider than `width`. owner, item: numbered from 0, as bytes of i32."""
     owners, items = (np.frombuffer(one, dtype=np.int32).tolist() for one in (owner, item))
     corners: dict[int, list[int]] = defaultdict(list)
@@ -85,14 +85,14 @@ def _planned(width: int, owner: bytes, item: bytes) -> Plan | None:
         sharing[i].append(k)
     near = {c: {owners[k] for b in corners[c] for k in sharing[items[b]]} - {c} for c in range(len(corners))}
     found = _eliminate(near, width)
-    return _addresses(found, corners, sharing, owners, items) if found else None
+    return _assign_addresses(found, corners, sharing, owners, items) if found else None
 
 
 # Many parts are alike, as ropes of one length are, and an edited world has mostly the parts that it had.
-_known = lru_cache(maxsize=64)(_planned)
+_plan_part_cached = lru_cache(maxsize=64)(_plan_part)
 
 
-def _joined(found: list[tuple[Plan, int, int]], owners: np.ndarray, corners: np.ndarray) -> Plan:
+def _join_plans(found: list[tuple[Plan, int, int]], owners: np.ndarray, corners: np.ndarray) -> Plan:
     """Return the plan of all parts. found: for each part its plan, and the first of its owners and of its corners."""
     plans = [one for one, _, _ in found]
 
@@ -121,7 +121,7 @@ def _joined(found: list[tuple[Plan, int, int]], owners: np.ndarray, corners: np.
     product = np.concatenate([*(one.product for one in plans), np.zeros((0, 3), dtype=np.int64)])
     begin = np.repeat(np.array([k for _, _, k in found], dtype=np.int64), sizes("product"))[:, None]
     product = np.column_stack([shifted(product[:, 0], "product"), corners[product[:, 1:] + begin]])
-    starts = [np.concatenate([[0], joined(f"{name}_begin", ends(of), 1)]) for name, of in COUNTED]
+    starts = [np.concatenate([[0], joined(f"{name}_begin", ends(of), 1)]) for name, of in BEGINS]
     return Plan(
         owners[joined("rows", [k for _, k, _ in found])], rows, starts[0], joined("column", rows), starts[1], product,
         starts[2], shifted(joined("update", [0] * len(plans)), "update"), [w for one in plans for w in one.widths],
@@ -149,7 +149,7 @@ def _eliminate(near: dict[int, set[int]], width: int) -> list[tuple[int, list[in
     return out
 
 
-def _addresses(found: list[tuple[int, list[int]]], corners, sharing, owners, items) -> Plan:
+def _assign_addresses(found: list[tuple[int, list[int]]], corners, sharing, owners, items) -> Plan:
     """Return the plan of one part. found: the result of _eliminate()."""
     order, later = [c for c, _ in found], dict(found)
     at = {c: r for r, c in enumerate(order)}

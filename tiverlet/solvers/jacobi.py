@@ -5,7 +5,7 @@ import numpy as np
 from .. import checks
 from ..features.feature import Batch, Scene
 from .solver import Solver
-from .spectrum import largest
+from .spectrum import largest_eigenvalue
 from .system import solvable
 
 
@@ -40,7 +40,7 @@ class Jacobi(Solver):
                 return 1.0
             limit, why = 4 / 3, "4/3 where constraints are soft or not one number"
         else:
-            value = max(largest(scene, scalars, split), 1e-3)
+            value = max(largest_eigenvalue(scene, scalars, split), 1e-3)
             if self.relaxation == "auto":
                 return max(1.0, 1.2 / value)
             limit, why = (

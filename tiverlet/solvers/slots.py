@@ -16,7 +16,7 @@ from .system import solvable
 TENSEST = 4.0  # (omega h)^2 of a transverse vibration under a tension, beyond which Verlet diverges
 
 
-def arranged(batches: list[Batch], inv_mass: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray]:
+def assign_slots(batches: list[Batch], inv_mass: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray]:
     """Return the slot of each corner, by the id of its batch, and the number of slots of each particle, (n,).
 
     Corners that cannot move have the slot -1.
@@ -39,8 +39,8 @@ class Slots:
     The slots of a particle are adjacent, in the order of batches and constraints, so a particle always sums them in the same
     order. Corners that cannot move have no slot.
 
-    loads: whether constraints that are relaxed by themselves learn their loads, see KnownLoad. bears: if so, the largest load in
-    each body at the end of a window, in weights of a particle. split: the mass-split weight n w of each particle, for the n
+    loads: whether constraints that are relaxed by themselves learn their loads, see KnownLoad. body_load: if so, the largest load
+    in each body at the end of a window, in weights of a particle. split: the mass-split weight n w of each particle, for the n
     blocks of constraints that it belongs to. A block is a system, or a constraint that is relaxed by itself.
     """
 
@@ -50,7 +50,7 @@ class Slots:
 
     def __init__(self, scene: Scene, batches: list[Batch], solver):
         memory, state, inv_mass = scene.memory, scene.state, scene.inv_mass
-        self._places, degree = arranged(batches, inv_mass)
+        self._places, degree = assign_slots(batches, inv_mass)
         self.total, begin = int(degree.sum()), np.concatenate([[0], np.cumsum(degree)])
         self.state = state
         self.move = memory.field("slots.move", self.total, width=state.dim)
@@ -71,34 +71,34 @@ class Slots:
         self._scalars = bool(scalars)
         blocks = self.system.blocks if self.system else degree
         if self.loads or any(b.breaks for b in batches):
-            self._bodies, self._hefts = self._tied(batches, inv_mass)
+            self._bodies, self._rounding_masses = self._connected_bodies(batches, inv_mass)
         if self.loads:
             self.bodies = memory.number(1 + max(int(b.max(initial=0)) for b in self._bodies.values()))
-            self.bears = memory.field("slots.bears", self.bodies)
+            self.body_load = memory.field("slots.bears", self.bodies)
         self.split = memory.field("slots.split_mass", scene.count, values=blocks * inv_mass)
         self.relaxation = solver.relaxed_by(scene, batches, blocks * inv_mass)
 
     @staticmethod
-    def _tied(batches: list[Batch], inv_mass: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray]:
-        """Return the body of each constraint, by the id of its batch, and the heft of each body, see heft() [kg].
+    def _connected_bodies(batches: list[Batch], inv_mass: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray]:
+        """Return the body of each constraint, by the id of its batch, and the mass of rounding_mass() of each body [kg].
 
-        Constraints that share movable particles, directly or through other constraints, are of one body. The heft is the root of
-        the sum of the squared masses.
+        Constraints that share movable particles, directly or through other constraints, are of one body. That mass is the root
+        of the sum of the squared masses.
         """
         ends = np.cumsum([b.count for b in batches])
         label, body = bodies_of(int(ends[-1]), *corners_of(batches), inv_mass)
         parts = np.split(label, ends[:-1])
         squares = np.divide(1, inv_mass, out=np.zeros(len(inv_mass)), where=inv_mass > 0) ** 2
-        hefts = np.sqrt(np.bincount(body, weights=squares, minlength=int(ends[-1]) + 1))
-        return {id(b): part for b, part in zip(batches, parts, strict=True)}, hefts
+        masses = np.sqrt(np.bincount(body, weights=squares, minlength=int(ends[-1]) + 1))
+        return {id(b): part for b, part in zip(batches, parts, strict=True)}, masses
 
     def body(self, batch: Batch) -> np.ndarray:
         """Return the body of each constraint of a batch, (m,), where constraints learn loads or break."""
         return self._bodies[id(batch)]
 
-    def heft(self, batch: Batch) -> np.ndarray:
-        """Return the heft of the body of each constraint, (m,) [kg]: the mass that rounding of positions moves, see Strength."""
-        return self._hefts[self.body(batch)]
+    def rounding_mass(self, batch: Batch) -> np.ndarray:
+        """Return the mass in the body of each constraint that rounding of positions moves, (m,) [kg], see Strength."""
+        return self._rounding_masses[self.body(batch)]
 
     def regroup(self, memory: Memory, change: Regrouping) -> None:
         """Adapt the slots to added and removed particles, none of which any constraint holds."""
@@ -106,19 +106,19 @@ class Slots:
         memory.resize(self.begin, n + 1)
         memory.write_from(self.begin, first, np.full(n + 1 - first, self.total))
 
-    def can_grab(self, inv_mass: np.ndarray, batches: list[Batch]) -> bool:
+    def can_reassign(self, inv_mass: np.ndarray, batches: list[Batch]) -> bool:
         """Whether constraints can be moved to other particles with the same kernels.
 
         That requires that each is relaxed by itself, and that the number of slots and `exact` stay the same.
         """
         if self.system or self.semi_iteration or not all(b.arity for b in batches):
             return False
-        degree = arranged(batches, inv_mass)[1]
+        degree = assign_slots(batches, inv_mass)[1]
         return int(degree.sum()) == self.total and self.exact == (self._scalars and bool(degree.max(initial=0) <= 1))
 
-    def grab(self, memory: Memory, inv_mass: np.ndarray, batches: list[Batch]) -> None:
+    def reassign(self, memory: Memory, inv_mass: np.ndarray, batches: list[Batch]) -> None:
         """Move constraints to other particles: assign slots from their present corners."""
-        self._places, degree = arranged(batches, inv_mass)
+        self._places, degree = assign_slots(batches, inv_mass)
         memory.write(self.begin, np.concatenate([[0], np.cumsum(degree)]))
         memory.write(self.split, degree * inv_mass)
         for b in batches:
@@ -133,7 +133,7 @@ class Slots:
         return self.system.row(batch) if self.system else np.full(batch.count, -1)
 
     @ti.func
-    def limited(self, wanted, geometric_stiffness):
+    def limit_multiplier(self, wanted, geometric_stiffness):
         """Return the multiplier `wanted`, limited so that (omega h)^2 = geometric_stiffness |multiplier| is at most TENSEST.
 
         Where the limit acts, the value without the limit is stored for the report.
@@ -144,7 +144,7 @@ class Slots:
         return ti.max(-most, ti.min(most, wanted))
 
     @ti.func
-    def turn(self, along, sizes):
+    def classify_turn(self, along, sizes):
         """Return how far a direction turned: 0, BENT or FAR.
 
         along: the dot product of the old and new direction. sizes: the product of their norms.
@@ -157,7 +157,7 @@ class Slots:
         return out
 
     @ti.func
-    def note_turn(self, turn):
+    def record_turn(self, turn):
         """Store the largest turn. The field is read first, because atomic writes to one place make threads wait."""
         if turn > self.turned[None]:
             ti.atomic_max(self.turned[None], turn)
@@ -171,7 +171,7 @@ class Slots:
         return total
 
     @ti.func
-    def wanted(self, i):
+    def correction_of(self, i):
         """Return the correction of particle i: the sum of its moves [m]. With a system it is in f64, as large moves cancel."""
         total = 0 * self.state.x[i]
         if ti.static(self.has_system):
@@ -190,7 +190,7 @@ class Slots:
                 if r < 0 or not self.system.is_unmet(r):
                     end = begin
         if end > begin:
-            wanted = self.wanted(i)
-            self.state.shift(i, wanted)
+            correction = self.correction_of(i)
+            self.state.shift(i, correction)
             if ti.static(self.refines):
-                self.system.note_move(i, begin, end, wanted)
+                self.system.record_move(i, begin, end, correction)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 ROUNDS = 300  # of power iteration, which converges from below; the margin from 1.2 to 4/3 covers its error
 
 
-def largest(scene: "Scene", scalars: "list[Scalar]", split: np.ndarray, rounds: int = ROUNDS) -> float:
+def largest_eigenvalue(scene: "Scene", scalars: "list[Scalar]", split: np.ndarray, rounds: int = ROUNDS) -> float:
     """Return lambda_max of D^-1 A for the scene as it starts: A = G w G^T, and D is its diagonal with mass-split weights."""
     w, n, dim = scene.inv_mass, len(scene.inv_mass), scene.particles.dim
     row, who = corners_of(scalars)

@@ -47,7 +47,7 @@ class System:
         row = np.full(sum(counts), -1)
         row[rows] = np.arange(len(rows))
         self._rows = dict(zip(map(id, scalars), np.split(row, np.cumsum(counts)[:-1]), strict=True))
-        self.blocks, self.shares = self._blocks(batches, scene)
+        self.blocks, self.has_shared_particles = self._blocks(batches, scene)
         of_slot = np.full(sum(b.indices.size for b in batches), -1)
         for b in scalars:
             slot = slots.places(b)
@@ -60,8 +60,8 @@ class System:
         if self.limits_steps:
             self.motion, self.spare_energy, self.own_step = self.reals("toward"), self.reals("spare"), self.reals("instead")
             self.trusted_step = self.reals("most")
-        if self.shares:
-            self.share = scene.memory.field("system.share", scene.count, kind=ti.i32, values=self.blocks)
+        if self.has_shared_particles:
+            self.blocks_of = scene.memory.field("system.share", scene.count, kind=ti.i32, values=self.blocks)
 
     def ints(self, name: str, values: np.ndarray, width: int = 0):
         """Declare a field of integers with these values."""
@@ -94,7 +94,7 @@ class System:
         """Return the row of each constraint of a batch, (m,), -1 for constraints that are relaxed alone."""
         return self._rows.get(id(batch), np.full(batch.count, -1))
 
-    def leads(self, scalars: "list[Scalar]", slots: "Slots") -> np.ndarray:
+    def representatives(self, scalars: "list[Scalar]", slots: "Slots") -> np.ndarray:
         """Return a movable particle of each row, (rows,)."""
         out = np.zeros(self.rows, dtype=np.int64)
         for b in scalars:
@@ -103,7 +103,7 @@ class System:
             out[row[free]] = b.indices[free]
         return out
 
-    def left_out(self, batches: "list[Batch]") -> int:
+    def count_relaxed_alone(self, batches: "list[Batch]") -> int:
         """Return how many constraints with a movable particle are relaxed by themselves."""
         return sum(int((~b.immovable(self.inv_mass) & (self.row(b) < 0)).sum()) for b in batches)
 
@@ -148,7 +148,7 @@ class System:
         return False
 
     @ti.func
-    def note_move(self, i, begin, end, move):
+    def record_move(self, i, begin, end, move):
         """Record that particle i, with slots from `begin` up to `end`, has moved by `move` [m]. Called where `refines`."""
 
     @ti.func

@@ -57,7 +57,7 @@ def bound_again(
     structure = runner.structure = runner.structure or _structure(scene, bound)
     objects = [scene, scene.slots, *bound]
     before, exact = [dict(vars(one)) for one in objects], scene.slots.exact
-    kept, ramps = {f: f.kept_mask(number) for f in bound}, {f: f.ramp for f in bound if f.ramp and f.ramp.made}
+    kept, ramps = {f: f.kept_mask(number) for f in bound}, {f: f.ramp for f in bound if f.ramp and f.ramp.is_allocated}
     more, inv_mass = {f: other.copy() for f, other in extend.items()}, now.inv_mass.copy()
     try:
         for f in world.features:
@@ -140,8 +140,8 @@ def bind(world: Any, change: Regrouping, now: Bound) -> None:
             memory.view(memory.entries[new[key]].field)[: len(values)] = values
     for f, rows in noted.items():
         memory.put_scratch(f, rows, now.kept[f])
-        if f.ramp and f.ramp.made:
-            f.ramp.fit()
+        if f.ramp and f.ramp.is_allocated:
+            f.ramp.resize()
     constraints = runner.step.constraints
     constraints.systems[:] = [runner.scene.slots.system] if constraints.systems else []
     constraints.semi_iterations[:] = [runner.scene.slots.semi_iteration] if constraints.semi_iterations else []

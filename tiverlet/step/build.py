@@ -19,7 +19,7 @@ from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.periodic import Periodic
 from ..particles import Particles, Radii, State
 from ..particles.spin import Spin
-from ..solvers.choice import by_structure
+from ..solvers.choice import choose_solver
 from ..solvers.direct import Direct
 from ..solvers.slots import Slots
 from ..solvers.solver import Solver
@@ -152,7 +152,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         scene.radius = Radii(memory, particles.radius, scene.count)
     surfaces = [*walls, *([contact] if contact else [])]
     has_friction, bounces = any(f.has_friction for f in surfaces), any(f.has_restitution for f in surfaces)
-    solver = solver or (by_structure(batches, scene) if scene.order == 2 else Direct())
+    solver = solver or (choose_solver(batches, scene) if scene.order == 2 else Direct())
     if (batches and solver.loads) or (contact and contact.has_loads):
         scene.own_weight = OwnWeight(scene)
     if batches:

@@ -89,7 +89,7 @@ class Rebuild:
     def _take_apart(self) -> None:
         """Release features, and give them the new indices of their particles."""
         self.masks = {f: tuple(mask & (f not in self.came) for mask in f.kept_mask(self.number)) for f in self.before}
-        self.rests = {f: np.stack(f.ramp.now())[:, self.masks[f][0]] for f in self.features if f.ramp and f.ramp.waits}
+        self.rests = {f: np.stack(f.ramp.now())[:, self.masks[f][0]] for f in self.features if f.ramp and f.ramp.has_pending}
         for f in self.before:
             f.release()
             f.remap_indices(self.number, len(self.particles))
@@ -178,7 +178,7 @@ class Rebuild:
         assert search
         both = (pairs >= 0).all(axis=1)
         # Data without an old value, of features that were just added, is 0.
-        nothing = {p.name: np.zeros((len(pairs), p.width) if p.width else len(pairs)) for p in search.list.lasting}
+        nothing = {p.name: np.zeros((len(pairs), p.width) if p.width else len(pairs)) for p in search.list.persistent}
         search.list.restore(pairs[both], {name: self.old.get(f"Contact.{name}", none)[both] for name, none in nothing.items()})
         self.world._runner.carry_loads()
 

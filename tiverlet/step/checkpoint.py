@@ -41,9 +41,9 @@ def state(world: "World", pairs: bool = True) -> dict[str, np.ndarray]:
     """
     out = {name: values for memory in world._runner.memories for name, values in memory.state().items()}
     if world._runner.search and pairs:
-        out[PAIRS], carried = world._runner.search.list.lasting_data()
+        out[PAIRS], carried = world._runner.search.list.persistent_data()
         out.update((f"{PAIR}{name}", values) for name, values in carried.items())
-    return out | {f"{RESTS}{k}": np.stack(f.ramp.now()) for k, f in enumerate(world.features) if f.ramp and f.ramp.waits}
+    return out | {f"{RESTS}{k}": np.stack(f.ramp.now()) for k, f in enumerate(world.features) if f.ramp and f.ramp.has_pending}
 
 
 def keep(world: "World", pairs: bool = True) -> Checkpoint:
@@ -88,7 +88,7 @@ def _late(world: "World") -> set[str]:
 
 def _pieces(world: "World") -> dict[str, Any]:
     """Return the data of pairs that are part of the state (PairData), by name."""
-    return {f"{PAIR}{piece.name}": piece for piece in world._runner.search.list.lasting} if world._runner.search else {}
+    return {f"{PAIR}{piece.name}": piece for piece in world._runner.search.list.persistent} if world._runner.search else {}
 
 
 def flags(world: "World") -> list[list[bool]]:
@@ -127,8 +127,8 @@ def install(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None
     world._upload()
     undo(world, kept, flagged)
     for k, f in enumerate(world.features):
-        if f.ramp and f.ramp.waits and f"{RESTS}{k}" not in kept.values:  # in that world, no ramp was under way
-            f.ramp.arrive()
+        if f.ramp and f.ramp.has_pending and f"{RESTS}{k}" not in kept.values:  # in that world, no ramp was under way
+            f.ramp.finish()
 
 
 def check(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
@@ -185,7 +185,7 @@ def transfer(old: "World", new: "World") -> None:
     for mine, other in zip(new.features, old.features, strict=True):
         if isinstance(mine, Periodic) and isinstance(other, Periodic):
             mine.continued(other)
-        if mine.ramp and other.ramp and other.ramp.waits:
+        if mine.ramp and other.ramp and other.ramp.has_pending:
             mine.ramp.put(other.ramp.now())
             mine.changed = True
     for broke, breaks in zip(old._runner.step.breakers, new._runner.step.breakers, strict=True):

@@ -121,7 +121,7 @@ class ConstraintPass:
             ends = ti.cast((now.span.since + now.s) % WINDOW == WINDOW - 1, ti.i32)
             n = ends * self.slots.bodies
             for b in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
-                self.slots.bears[b] = 0
+                self.slots.body_load[b] = 0
             self.team.wait()
             for f in ti.static(self.learners):
                 n = ends * f.count

@@ -95,7 +95,7 @@ def regroup(world: Any, edit: Edit, added: Particles | None) -> None:
     runner, change, bound = world._runner, edit.change, edit.bound
     scene, step, memory, count = runner.scene, runner.step, runner.memory, change.now.count
     search = runner.search
-    apart = search and ((search.list.saved and change.has_removed) or (bound and search.others(bound.linked, change)))
+    apart = search and ((search.list.saved and change.has_removed) or (bound and search.exclusions_differ(bound.linked, change)))
     pairs = _pairs(search.list, change) if apart else None
     rows = scene.count
     for one in runner.memories:
@@ -167,7 +167,7 @@ def grabbing(world: Any) -> Grab | None:
         if any((inv_mass[b.indices] != scene.inv_mass[b.indices]).any() for b in runner.batches):
             return None
     soft = len(driving) < len(pins)
-    if soft and not scene.slots.can_grab(inv_mass, runner.batches):
+    if soft and not scene.slots.can_reassign(inv_mass, runner.batches):
         return None
     refuse_held_twice(world._particles, world._features, pins)
     return Grab(pins, soft, inv_mass, some)
@@ -185,7 +185,7 @@ def grab(world: Any, change: Grab) -> None:
             runner.invalidate()
     if change.soft:
         scene.particles = particles.placed(scene.state.get(memory))
-        scene.slots.grab(memory, change.inv_mass, runner.batches)
+        scene.slots.reassign(memory, change.inv_mass, runner.batches)
     for f in pins:
         f.grab(scene)
     for log in runner.logs:
@@ -199,8 +199,8 @@ def _joined(some: list[np.ndarray]) -> np.ndarray:
 
 
 def _pairs(near: Any, change: Regrouping) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return the lasting pairs between particles that remain, (m, 2) by their new indices, and their data by name."""
-    pairs, values = near.lasting_data()
+    """Return the persistent pairs between particles that remain, (m, 2) by their new indices, and their data by name."""
+    pairs, values = near.persistent_data()
     pairs = change.number[pairs]
     both = np.flatnonzero((pairs[:, 0] >= 0) & (pairs[:, 1] >= 0))
     return pairs.take(both, axis=0), {name: value.take(both, axis=0) for name, value in values.items()}

@@ -12,7 +12,7 @@ from ..features.feature import Acceleration, Batch
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.periodic import Periodic
 from ..shapes.shape import morton
-from ..solvers.choice import reason
+from ..solvers.choice import explain_choice
 from .sleep import Sleep
 from .step import REBOUNDS
 
@@ -45,7 +45,7 @@ def explain(world: "World") -> str:
         size = sum(world.fields[name] for name in names)
         lines.append(f"    {owner:10s} {size:>9d} bytes: {', '.join(n.partition('.')[2] or n for n in names)}")
     if step.batches:
-        why = "" if world._requested[0] else f"; chosen because {reason(world._runner.solver)}"
+        why = "" if world._requested[0] else f"; chosen because {explain_choice(world._runner.solver)}"
         lines.append(f"Solved by {world._runner.solver.explain(step.batches, step.slots)}{why}")
         lines.append(f"Constraint corners that can move: {step.slots.total} of {sum(b.indices.size for b in step.batches)}")
     if _scattered(p.position):

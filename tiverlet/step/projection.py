@@ -315,7 +315,7 @@ class Rows:
         self.some = [~b.immovable(w) & ~b.broken if b.breaks else ~b.immovable(w) for b in batches]
         for b, some in zip(batches, self.some, strict=True):
             if drive := getattr(b.dev, "drive", None):
-                some &= ~drive.slips(b.dev.equation.lam)[: b.count]
+                some &= ~drive.is_at_limit(b.dev.equation.lam)[: b.count]
         self.touches = self._each([np.full(b.count, isinstance(b, ContactRows)) for b in batches])
         self.side, arity = (self._each([of(b) for b in batches]) for of in (lambda b: np.full(b.count, b.side), sizes))
         self.m = len(self.side)

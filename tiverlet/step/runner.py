@@ -225,12 +225,12 @@ class Runner:
         if self.ramping and self.clock.first_moved is not None:
             tied = initial_violation.tied(self.scene, self.batches, self.clock.first_moved)
             for b in self.ramping:
-                b.ramp.jump(np.bincount(b.owner, tied[b.indices.ravel()], minlength=b.count) > 0)
+                b.ramp.jump_to_goals(np.bincount(b.owner, tied[b.indices.ravel()], minlength=b.count) > 0)
 
     def set_out(self) -> None:
         """Start the ramps of assigned rest values, which they reach during the coming frame."""
         if self.ramping:
-            new = [b.ramp.memory for b in self.ramping if b.ramp.set_out()]
+            new = [b.ramp.memory for b in self.ramping if b.ramp.start_moving()]
             self.ramping = [b for b in self.ramping if b.ramp.under_way]
             if new:
                 self.ramps, self.structure = [*self.ramps, *new], None
@@ -239,7 +239,7 @@ class Runner:
     def arrive(self) -> None:
         """End the ramps of rest values, after a frame that will not be repeated."""
         for b in self.ramping:
-            b.ramp.arrive()
+            b.ramp.finish()
         self.ramping = []
 
     def settle(self, dt: float) -> None:
@@ -281,7 +281,7 @@ class Runner:
     def carry_loads(self) -> None:
         """After particles were added, removed or pinned: sum the known loads of their contacts again for each particle."""
         for known in self.known:
-            known.carry(self.scene, self.scene.state.get(self.memory), *self.search.list.lasting_data())
+            known.carry(self.scene, self.scene.state.get(self.memory), *self.search.list.persistent_data())
 
     def restart(self, iterations: int) -> None:
         """Turn displacements into velocities, so that the next substep is a start from the present state. iterations: of the

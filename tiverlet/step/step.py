@@ -124,7 +124,7 @@ class Step:
         self.sleepers = scene.state.sleepers
         self.looks = bool(search) and bool(self.sleepers)  # for contacts between awake and sleeping particles
         self.detects = any(c.detects for c in self.contacts)
-        apart = search and search.lone and not self.launched and not scene.memory.compiler.few
+        apart = search and search.finds_all_neighbours and not self.launched and not scene.memory.compiler.few
         self.strays: Any = Strays(scene, search, team) if apart else None
         self.pair_forces: list[Any] = integrator.forces.pairwise
         self.has_pair_forces = bool(self.pair_forces)
@@ -321,7 +321,7 @@ class Step:
         if ti.static(self.sheared):
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, now.thread)):
-                self.state.images.slide(now.h)
+                self.state.images.advance_shear(now.h)
             self.team.wait()
         if ti.static(self.has_impacts):
             ti.loop_config(serialize=True)

@@ -721,7 +721,7 @@ class _Start:
         self.pairs: list[Any] = []  # pairs of each world with their data; one for all if the worlds are copies
         for k in range(len(worlds) if worlds._sources else 1) if runner.search else ():
             with worlds._as_world(k):
-                self.pairs.append(runner.search.list.lasting_data())
+                self.pairs.append(runner.search.list.persistent_data())
 
     def put_back(self, worlds: Worlds, chosen: np.ndarray) -> None:
         """Return the chosen worlds to it."""

@@ -74,7 +74,7 @@ class AnchorPasses(Passes):
                 alpha = self.spring.alpha[c] / h2_effective
                 A, now, last = self.spring.law(c, h, w, fresh)
                 if first != 0:
-                    self.spring.history[c] = now * C0 + last * self.spring.before(c, C0, fresh)
+                    self.spring.history[c] = now * C0 + last * self.spring.last_value(c, C0, fresh)
                     self.spring.last[c] = C0
                 B = self.spring.history[c]
             K = A * self.slots.split[self.corners.member(c, 0)] + alpha
@@ -87,7 +87,7 @@ class AnchorPasses(Passes):
         """Draw the particle to its place."""
         lam, new, size = self.solve(c, h, h2_effective, frame_fraction, first, fresh)
         self.lam[c] = new
-        self.corners.push(c, 0, self.w.of(self.corners.member(c, 0)) * (new - lam))
+        self.corners.write_move(c, 0, self.w.of(self.corners.member(c, 0)) * (new - lam))
 
     @ti.func
     def push_spring_force(self, c, h):
@@ -99,7 +99,7 @@ class AnchorPasses(Passes):
                 C = self.place.offset_now(c, 0)
                 rate = self.place.offset_change(c) / h
                 move = -h * h * w * (1 - stiff(alpha, h, w)) * (C / alpha + self.spring.damping[c] * rate)
-        self.corners.push(c, 0, move)
+        self.corners.write_move(c, 0, move)
 
     @ti.func
     def push_reaction(self, c, h, firm, soft):
@@ -109,8 +109,8 @@ class AnchorPasses(Passes):
         if ti.static(self.spring.soft):
             if w > 0 and self.spring.alpha[c] > 0:
                 grown = self.place.offset_now(c, 0) - self.spring.last[c]
-                pull = soft * self.lam[c] + self.spring.change(c, grown, h, w, self.slots.split[i])
-        self.corners.push(c, 0, w * pull)
+                pull = soft * self.lam[c] + self.spring.force_change(c, grown, h, w, self.slots.split[i])
+        self.corners.write_move(c, 0, w * pull)
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
@@ -127,7 +127,7 @@ class AnchorPasses(Passes):
             if alpha > 0:
                 C = self.place.offset_now(c, back)
                 out = ti.cast(C.dot(C) / (2 * alpha), ti.f64)
-                out *= self.spring.solved(self.lam[c].norm() * alpha, h2_effective, residual * self.size.now)
+                out *= self.spring.bearing_share(self.lam[c].norm() * alpha, h2_effective, residual * self.size.now)
                 force, w = ti.cast(self.lam[c].norm(), ti.f64), self.w.of(self.corners.member(c, 0))
                 if h2_effective > 0:
                     force /= h2_effective

@@ -38,7 +38,7 @@ class Anchored(Batch):
     compliance = Knob(lambda f, v: f._compliance(v), "Inverse stiffness [m/N].", force=True)
     damping = Knob(lambda f, v: checks.per_item(repr(f), "damping", v, f.count, least=0.0), "Of the dashpot [N s/m].", force=True)
     compiled_for = ("soft",)
-    _asked: tuple[Any, bool] = (None, False)  # compliances, and whether any of them is above 0
+    _soft_cache: tuple[Any, bool] = (None, False)  # compliances, and whether any of them is above 0
 
     def setup(self, indices, compliance, damping) -> None:
         """Store the arguments of __init__."""
@@ -61,9 +61,9 @@ class Anchored(Batch):
     def soft(self) -> bool:
         """Whether any of the constraints is a spring, or was when kernels were compiled."""
         rows = self.compliance
-        if rows is not self._asked[0]:  # cached: a pin that takes other particles reads it ten times
-            self._asked = rows, bool((rows > 0).any())
-        return self._asked[1] or "soft" in self.compiled_so_far
+        if rows is not self._soft_cache[0]:  # cached: a pin that takes other particles reads it ten times
+            self._soft_cache = rows, bool((rows > 0).any())
+        return self._soft_cache[1] or "soft" in self.compiled_so_far
 
     def upload(self) -> None:
         """Write new stiffnesses to the device."""

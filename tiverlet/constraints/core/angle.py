@@ -9,7 +9,7 @@ from ... import checks
 from ...device import called_with, inline, ti
 from ...features.feature import Knob
 from ...geometry.intervals import cross
-from .quantity import Quantity, rest_exactly
+from .quantity import Quantity, exact_rest
 
 TURN = 2 * np.pi
 SHORT = 1e-24  # [m^2] squared length below which a link has no direction: representable in f32, and far below any in use
@@ -23,7 +23,7 @@ def _matrix(rows: int, columns: int, real: Any) -> Any:
     return ti.types.matrix(rows, columns, real)
 
 
-def corners_of(angle: Any) -> Any:
+def corner_matrix(angle: Any) -> Any:
     """Return the matrix type of the angle's corners and gradients."""
     return _matrix(angle.arity, angle.state.dim, angle.real)
 
@@ -35,12 +35,12 @@ class Angle(Quantity):
 
     def difference(self, f: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """Return differences of angles, in (-pi, pi]."""
-        return turned(f - goal)
+        return wrap_to_pi(f - goal)
 
     @ti.func
     def unwrap(self, f, other):
         """Return f plus whole turns, within half a turn of `other`."""
-        return wrapped(f, other)
+        return wrap_near(f, other)
 
     @ti.func
     def excess(self, c, f):
@@ -48,11 +48,11 @@ class Angle(Quantity):
         return excess_of(self, c, f)
 
     @ti.func
-    def exactly(self, c):
+    def exact_excess(self, c):
         """f - rest in f64, within half a turn of 0."""
         return exactly_off(self, c)
 
-    @called_with(lambda self: ((ti.i32, corners_of(self)), (self.real, corners_of(self))))
+    @called_with(lambda self: ((ti.i32, corner_matrix(self)), (self.real, corner_matrix(self))))
     @ti.func
     def remeasure(self, c, q):
         """Return measure(c, q), as one function: it is long and called from up to three places."""
@@ -70,14 +70,14 @@ class PathAngle(Angle):
         return path_angles(x[:, 0], x[:, 1], x[:, 2])
 
     @ti.func
-    def reach(self, q):
-        """Return the length of the shorter leg."""
-        return shorter_leg(q)
+    def trust_radius(self, q):
+        """Return the length of the shorter link."""
+        return shorter_link(q)
 
     @ti.func
     def measure(self, c, q):
         """Return path_angle(), without memory of the plane."""
-        return path_angle(q, 0 * q[0, :], False, faint(self.state, self.real))
+        return path_angle(q, 0 * q[0, :], False, least_sine(self.state, self.real))
 
 
 class DihedralAngle(Angle):
@@ -91,7 +91,7 @@ class DihedralAngle(Angle):
         return dihedral_angles(x[:, 0], x[:, 1], x[:, 2], x[:, 3])
 
     @ti.func
-    def reach(self, q):
+    def trust_radius(self, q):
         """Return the shortest distance from one end of the edge to another corner."""
         return ti.min(q[1, :].norm(), ti.min(q[2, :].norm(), q[3, :].norm()))
 
@@ -106,41 +106,41 @@ def excess_of(angle: ti.template(), c, f):  # type: ignore[valid-type]
     """See Angle.excess()."""
     C = f - angle.rest[c]
     if ti.static(angle.state.carries):
-        C = ti.cast(wrapped(exactly_off(angle, c), ti.cast(C, ti.f64)), angle.real)
+        C = ti.cast(wrap_near(exactly_off(angle, c), ti.cast(C, ti.f64)), angle.real)
     return C
 
 
 @ti.func
 def exactly_off(angle: ti.template(), c):  # type: ignore[valid-type]
-    """See Angle.exactly()."""
+    """See Angle.exact_excess()."""
     q = ti.Matrix.zero(ti.f64, angle.arity, angle.state.dim)
     for k in ti.static(range(1, angle.arity)):
         r = angle.state.between(angle.corners.member(c, k), angle.corners.member(c, 0))
         for a in ti.static(range(angle.state.dim)):
             q[k, a] = r[a]
     f, _gradients = angle.measure(c, q)
-    return wrapped(f - rest_exactly(angle, c), ti.cast(0, ti.f64))
+    return wrap_near(f - exact_rest(angle, c), ti.cast(0, ti.f64))
 
 
-def turned(C: np.ndarray) -> np.ndarray:
+def wrap_to_pi(C: np.ndarray) -> np.ndarray:
     """Return differences of angles, in (-pi, pi]."""
     return C - TURN * np.round(C / TURN)
 
 
 @ti.func
-def wrapped(f, other):
+def wrap_near(f, other):
     """Return f plus whole turns, within half a turn of `other`."""
     return f - ti.static(TURN) * ti.round((f - other) * ti.static(1 / TURN))
 
 
 @ti.func
-def shorter_leg(q):
+def shorter_link(q):
     """Return the length of the shorter of the two links of a path."""
     return ti.min((q[1, :] - q[0, :]).norm(), (q[2, :] - q[1, :]).norm())
 
 
 @inline
-def faint(state, real):
+def least_sine(state, real):
     """Return |u x v| of unit vectors below which their normal is lost in rounding."""
     return ti.cast(1e-13 if state.double else 1e-6, real)
 

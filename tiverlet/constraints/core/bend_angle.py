@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...device import ti
-from .angle import Angle, faint, path_angle, path_angles, shorter_leg
+from .angle import Angle, least_sine, path_angle, path_angles, shorter_link
 
 if TYPE_CHECKING:
     from ...features.feature import Scene
@@ -37,9 +37,9 @@ class BendAngle(Angle):
         return bound
 
     @ti.func
-    def reach(self, q):
-        """Return the length of the shorter leg."""
-        return shorter_leg(q)
+    def trust_radius(self, q):
+        """Return the length of the shorter link."""
+        return shorter_link(q)
 
     @ti.func
     def measure(self, c, q):
@@ -47,7 +47,7 @@ class BendAngle(Angle):
         axis = 0 * q[0, :]
         if ti.static(self.state.dim == 3):
             axis = self.axis[c]
-        return path_angle(q, axis, self.mirrored(c), faint(self.state, self.real))
+        return path_angle(q, axis, self.mirrored(c), least_sine(self.state, self.real))
 
     @ti.func
     def mirrored(self, c):
@@ -74,10 +74,10 @@ class BendAngle(Angle):
         if ti.static(self.state.dim == 3):
             if fresh != 0:
                 self.axis[c] = ti.Vector.zero(self.real, 3)
-            least = 10 * faint(self.state, self.real)
-            e = crossed(start)
+            least = 10 * least_sine(self.state, self.real)
+            e = path_cross(start)
             if e.norm() < least:
-                e = crossed(now)
+                e = path_cross(now)
             if e.norm() > least:
                 side = ti.cast(1, self.real)
                 if self.mirrored(c) and self.axis[c].dot(e) < 0:
@@ -86,6 +86,6 @@ class BendAngle(Angle):
 
 
 @ti.func
-def crossed(q):
+def path_cross(q):
     """Return u x v of a path in 3D."""
     return (q[1, :] - q[0, :]).normalized(1e-30).cross((q[2, :] - q[1, :]).normalized(1e-30))

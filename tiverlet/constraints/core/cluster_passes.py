@@ -43,9 +43,9 @@ class ClusterPasses(Passes):
         self.pull: Any = add(f"{name}.multiplier", total, width=dim, state=True)
         self.strength = Strength(scene, name, batch, total, dim)
         self.turn = add(f"{name}.turn", m, width=len(turn), kind=ti.f64, values=[turn] * m, state=True)
-        told = bool(scene.state.sleepers)  # the report reads it for clusters that sleep, in a clone too
-        self.pose = add(f"{name}.pose", m, width=dim * dim, kind=ti.f64, state=told)
-        self.place = add(f"{name}.place", m, width=dim, kind=ti.f64, state=told)
+        for_reports = bool(scene.state.sleepers)  # the report reads it for clusters that sleep, in a clone too
+        self.pose = add(f"{name}.pose", m, width=dim * dim, kind=ti.f64, state=for_reports)
+        self.place = add(f"{name}.place", m, width=dim, kind=ti.f64, state=for_reports)
 
         def moment(what, width):
             """Add a field with a row for each block, to be summed up."""
@@ -58,20 +58,20 @@ class ClusterPasses(Passes):
         self.spring: Any = Spring(scene, name, compliance, damping, np.zeros((total, dim)))
         if self.spring.soft:
             self.v, self.U = moment("v", dim), moment("U", dim * dim)
-            self.fit = add(f"{name}.fit", m, width=dim * dim, kind=ti.f64, state=told)
+            self.fit = add(f"{name}.fit", m, width=dim * dim, kind=ti.f64, state=for_reports)
             self.middle = add(f"{name}.middle", m, width=dim, kind=ti.f64)
-            self.mean = add(f"{name}.mean", m, width=dim, kind=ti.f64, state=told)
+            self.mean = add(f"{name}.mean", m, width=dim, kind=ti.f64, state=for_reports)
         if self.plastic:
             self.creep = add(f"{name}.creep", m, values=batch.creep)
             self.yield_size = add(f"{name}.yield", m, values=batch.yield_strain * radius)
 
     @ti.func
-    def nothing(self) -> Any:
+    def zero_vector(self) -> Any:
         """Return a vector of zeros. A product of 0 and a field may be NaN."""
         return ti.Vector.zero(ti.f64, self.state.dim)
 
     @ti.func
-    def arm(self, e, i0, back):
+    def relative_position(self, e, i0, back):
         """Return corner e relative to particle i0, at x - back d.
 
         It is in f64, so that positions at the start and predicted positions differ by exactly d.
@@ -84,7 +84,7 @@ class ClusterPasses(Passes):
     def law(self, c, h, h2_effective, fresh):
         """Return the coefficients of C_(n+1) (rigid part, soft part), C_n and C_(n-1), and alpha M / h^2: alpha' of a move."""
         rigid, soft = ti.cast(1, self.real), ti.cast(0, self.real)
-        now, last, give = 0 * soft, 0 * soft, 0 * soft
+        now, last, alpha_prime = 0 * soft, 0 * soft, 0 * soft
         if ti.static(self.spring.soft):
             alpha, mass = self.spring.alpha[c], self.mass[c]
             if alpha > 0 and mass > 0:
@@ -93,20 +93,20 @@ class ClusterPasses(Passes):
                     soft, now = ti.cast(1 / 64, self.real), now + soft - 1 / 64
                 rigid = ti.min(stiff(alpha, h, 1 / mass), soft)
                 soft -= rigid
-                give = alpha * mass / h2_effective
-        return rigid, soft, now, last, give
+                alpha_prime = alpha * mass / h2_effective
+        return rigid, soft, now, last, alpha_prime
 
     @ti.func
-    def share(self, e, A, give):
+    def mass_in_pass(self, e, A, alpha_prime):
         """Return mu of corner e in a pass: its mass, times its move for a violation of 1."""
         i = self.corners.members[e]
         w, mu = self.w.of(i), ti.cast(HEAVY * self.mass[self.corners.owner[e]], ti.f64)
         if w > 0:
-            mu = 1 / ti.cast(A * self.slots.split[i] + give * w, ti.f64)
+            mu = 1 / ti.cast(A * self.slots.split[i] + alpha_prime * w, ti.f64)
         return mu
 
     @ti.func
-    def weight(self, e, c):
+    def mass_in_fit(self, e, c):
         """Return the mass of corner e in a fit."""
         w, mu = self.w.of(self.corners.members[e]), ti.cast(HEAVY * self.mass[c], ti.f64)
         if w > 0:
@@ -121,15 +121,20 @@ class ClusterPasses(Passes):
         positions.
         """
         begin, end, c = self.corners.block[b]
-        i0 = self.corners.hub(c)
-        rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
-        total, p1, q1, s1 = ti.cast(0, ti.f64), self.nothing(), self.nothing(), self.nothing()
+        i0 = self.corners.reference_particle(c)
+        rigid, soft, now, last, alpha_prime = self.law(c, h, h2_effective, fresh)
+        total, p1, q1, s1 = ti.cast(0, ti.f64), self.zero_vector(), self.zero_vector(), self.zero_vector()
         K = p1.outer_product(p1)
         X, v1, U = 0 * K, 0 * p1, 0 * K
         for e in range(begin, end):
-            mu, p, q, s = self.share(e, rigid + soft, give), self.arm(e, i0, 0), self.shape[e], self.arm(e, i0, 1)
+            mu, p, q, s = (
+                self.mass_in_pass(e, rigid + soft, alpha_prime),
+                self.relative_position(e, i0, 0),
+                self.shape[e],
+                self.relative_position(e, i0, 1),
+            )
             if first < 0:
-                mu, s = self.weight(e, c), p
+                mu, s = self.mass_in_fit(e, c), p
             total += mu
             p1 += mu * p
             q1 += mu * q
@@ -137,22 +142,22 @@ class ClusterPasses(Passes):
             K += (mu * q).outer_product(s)
             X += (mu * p).outer_product(s)
             if ti.static(self.spring.soft):
-                v = mu * last * self.spring.before(e, ti.cast(self.nothing(), self.real), fresh)
+                v = mu * last * self.spring.last_value(e, ti.cast(self.zero_vector(), self.real), fresh)
                 if first == 0:
-                    v = mu * (self.spring.history[e] + give * self.pull[e])
+                    v = mu * (self.spring.history[e] + alpha_prime * self.pull[e])
                 v1 += v
                 U += v.outer_product(s)
         self.total[b], self.p[b], self.q[b], self.s[b] = total, p1, q1, s1
-        self.keep(self.K, b, K)
-        self.keep(self.X, b, X)
+        self.write_matrix(self.K, b, K)
+        self.write_matrix(self.X, b, X)
         if ti.static(self.spring.soft):
             self.v[b] = v1
-            self.keep(self.U, b, U)
+            self.write_matrix(self.U, b, U)
 
     @ti.func
     def moments(self, c):
         """Return the sum of mu, the means of p, q and s, and the moments of q and p about these means."""
-        total, p, q, s = ti.cast(0, ti.f64), self.nothing(), self.nothing(), self.nothing()
+        total, p, q, s = ti.cast(0, ti.f64), self.zero_vector(), self.zero_vector(), self.zero_vector()
         K = p.outer_product(p)
         X = 0 * K
         for b in range(self.corners.blocks[c], self.corners.blocks[c + 1]):
@@ -160,20 +165,20 @@ class ClusterPasses(Passes):
             p += self.p[b]
             q += self.q[b]
             s += self.s[b]
-            K += self.kept(self.K, b)
-            X += self.kept(self.X, b)
+            K += self.read_matrix(self.K, b)
+            X += self.read_matrix(self.X, b)
         p, q, s = p / total, q / total, s / total
         return total, p, q, s, K - total * q.outer_product(s), X - total * p.outer_product(s)
 
     @ti.func
-    def keep(self, field: ti.template(), c, R):
+    def write_matrix(self, field: ti.template(), c, R):
         """Write a matrix."""
         for j in ti.static(range(self.state.dim)):
             for k in ti.static(range(self.state.dim)):
                 field[c][self.state.dim * j + k] = R[j, k]
 
     @ti.func
-    def kept(self, field: ti.template(), c):
+    def read_matrix(self, field: ti.template(), c):
         """Read a matrix."""
         dim = ti.static(self.state.dim)
         return ti.Matrix([[field[c][dim * j + k] for k in ti.static(range(dim))] for j in ti.static(range(dim))])
@@ -183,27 +188,27 @@ class ClusterPasses(Passes):
         """Compute the position and rotation of the cluster."""
         if self.mass[c] > 0:
             total, p, q, s, K, X = self.moments(c)
-            rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
+            rigid, soft, now, last, alpha_prime = self.law(c, h, h2_effective, fresh)
             mean, U = 0 * p, 0 * K
             if ti.static(self.spring.soft):
                 for b in range(self.corners.blocks[c], self.corners.blocks[c + 1]):
                     mean += self.v[b] / total
-                    U += self.kept(self.U, b)
+                    U += self.read_matrix(self.U, b)
                 U -= total * mean.outer_product(s)
-            start, end, cosine = rotation.turn(K, X, U, first > 0, rigid, soft, self.turn[c], LEAST, self.spring.soft)
+            start, end, cosine = rotation.step_rotation(K, X, U, first > 0, rigid, soft, self.turn[c], LEAST, self.spring.soft)
             pose = rotation.matrix(end)
             self.place[c] = p - pose @ q
             if not ti.math.isnan(end.sum()):  # type: ignore[reportOptionalCall]
                 # A NaN is not stored: the cluster keeps its last rotation.
                 self.turn[c] = end
-            self.keep(self.pose, c, pose)
-            self.slots.note_turn(self.slots.turn(cosine, 1.0))
+            self.write_matrix(self.pose, c, pose)
+            self.slots.record_turn(self.slots.classify_turn(cosine, 1.0))
             if ti.static(self.spring.soft):
                 R = rotation.matrix(start)
                 if first > 0:  # in the body frame
                     mean = R @ mean
                 self.middle[c], self.mean[c] = s - R @ q, mean
-                self.keep(self.fit, c, R)
+                self.write_matrix(self.fit, c, R)
 
     @ti.func
     def push_spring_force(self, c, h):
@@ -215,7 +220,7 @@ class ClusterPasses(Passes):
             total, p, q, s, K, X = self.moments(c)
             R = rotation.matrix(rotation.fit(K, self.turn[c], LEAST))
             self.place[c] = s - R @ q
-            self.keep(self.pose, c, R)
+            self.write_matrix(self.pose, c, R)
 
     @ti.func
     def push_reaction(self, c, h, firm, soft):
@@ -224,26 +229,30 @@ class ClusterPasses(Passes):
         The moment is removed as the rotation of least sum m move^2. Moves have no mean and no moment about the positions at the
         start. Where a particle cannot move, outside forces give both, and nothing is removed.
         """
-        begin, end, i0 = self.corners.starts[c], self.corners.starts[c + 1], self.corners.hub(c)
+        begin, end, i0 = self.corners.starts[c], self.corners.starts[c + 1], self.corners.reference_particle(c)
         middle, center, R = self.best_fit(c, 0)
-        total, mean, pull, held = ti.cast(0, ti.f64), self.nothing(), self.nothing(), False
+        total, mean, pull, held = ti.cast(0, ti.f64), self.zero_vector(), self.zero_vector(), False
         S = mean.outer_product(mean)
         X = 0 * S
         for e in range(begin, end):
             held = held or self.w.of(self.corners.members[e]) == 0
-            m, r, move = self.weight(e, c), self.arm(e, i0, 0), self.reaction(e, c, middle, center, R, h, firm, soft)
+            m, r, move = (
+                self.mass_in_fit(e, c),
+                self.relative_position(e, i0, 0),
+                self.reaction(e, c, middle, center, R, h, firm, soft),
+            )
             total += m
             mean += m * r
             pull += m * move
             S += m * r.outer_product(r)
             X += m * r.outer_product(move)
         mean, pull = mean / total, pull / total
-        spin = rotation.spin(S - total * mean.outer_product(mean), X - total * mean.outer_product(pull))
+        spin = rotation.rigid_rotation(S - total * mean.outer_product(mean), X - total * mean.outer_product(pull))
         for e in range(begin, end):
             move = self.reaction(e, c, middle, center, R, h, firm, soft)
             if not held:
-                move -= pull + spin @ (self.arm(e, i0, 0) - mean)
-            self.corners.give(e, ti.cast(move, self.real))
+                move -= pull + spin @ (self.relative_position(e, i0, 0) - mean)
+            self.corners.write_move(e, ti.cast(move, self.real))
 
     @ti.func
     def reaction(self, e, c, middle, center, R, h, firm, soft):
@@ -256,26 +265,26 @@ class ClusterPasses(Passes):
             w, mass = self.w.of(self.corners.members[e]), self.mass[c]
             if self.spring.alpha[c] > 0:
                 move = soft * ti.cast(self.pull[e], ti.f64)
-                if w > 0 and self.strength.holds(c):
-                    C = self.arm(e, self.corners.hub(c), 0) - middle - R @ (self.shape[e] - center)
+                if w > 0 and self.strength.is_intact(c):
+                    C = self.relative_position(e, self.corners.reference_particle(c), 0) - middle - R @ (self.shape[e] - center)
                     grown = ti.cast(C - R @ ti.cast(self.spring.last[e], ti.f64), self.real)
                     n = self.slots.split[self.corners.members[e]] / w
-                    move += ti.cast(self.spring.change(c, grown / mass, h, 1 / mass, n / mass), ti.f64)
+                    move += ti.cast(self.spring.force_change(c, grown / mass, h, 1 / mass, n / mass), ti.f64)
         if ti.static(self.strength.breaks):
-            if not self.strength.holds(c):
+            if not self.strength.is_intact(c):
                 move = 0 * move
         return move
 
     @ti.func
     def best_fit(self, c, back):
         """Return, for a soft cluster c at x - back d, the mean position, the mean of its shape, and the best-fit rotation."""
-        middle, center = self.nothing(), self.nothing()
+        middle, center = self.zero_vector(), self.zero_vector()
         R = middle.outer_product(center)
         if ti.static(self.spring.soft):
-            total, K, i0 = ti.cast(0, ti.f64), R, self.corners.hub(c)
+            total, K, i0 = ti.cast(0, ti.f64), R, self.corners.reference_particle(c)
             for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
-                mu = self.weight(e, c)
-                x = self.arm(e, i0, back)
+                mu = self.mass_in_fit(e, c)
+                x = self.relative_position(e, i0, back)
                 total += mu
                 middle += mu * x
                 center += mu * self.shape[e]
@@ -285,9 +294,13 @@ class ClusterPasses(Passes):
         return middle, center, R
 
     @ti.func
-    def off(self, e, c):
+    def offset_of(self, e, c):
         """Return C_i at the present positions."""
-        return self.arm(e, self.corners.hub(c), 0) - self.place[c] - self.kept(self.pose, c) @ self.shape[e]
+        return (
+            self.relative_position(e, self.corners.reference_particle(c), 0)
+            - self.place[c]
+            - self.read_matrix(self.pose, c) @ self.shape[e]
+        )
 
     @ti.func
     def scatter_corner(self, e, h, h2_effective, first, fresh):
@@ -295,39 +308,39 @@ class ClusterPasses(Passes):
         c, i = self.corners.owner[e], self.corners.members[e]
         w, relaxation = self.w.of(i), self.slots.relaxation
         if first > 0:
-            self.pull[e] = ti.cast(self.nothing(), self.real)
-        if not self.strength.holds(c):
-            self.corners.give(e, ti.cast(self.nothing(), self.real))
+            self.pull[e] = ti.cast(self.zero_vector(), self.real)
+        if not self.strength.is_intact(c):
+            self.corners.write_move(e, ti.cast(self.zero_vector(), self.real))
         elif w > 0:
-            C, n = self.off(e, c), self.slots.split[i] / w
+            C, n = self.offset_of(e, c), self.slots.split[i] / w
             if ti.static(not self.spring.soft):
                 move = ti.cast(-relaxation * C / n, self.real)
                 if first >= 0:
                     self.pull[e] = self.pull[e] + move
-                self.corners.give(e, move)
+                self.corners.write_move(e, move)
             elif first < 0:
-                self.corners.give(e, ti.cast(self.spring_move(e, c, C, h), self.real))
+                self.corners.write_move(e, ti.cast(self.spring_move(e, c, C, h), self.real))
             else:
-                rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
+                rigid, soft, now, last, alpha_prime = self.law(c, h, h2_effective, fresh)
                 if first > 0:
-                    self.look_back(e, c, h, now, last, fresh)
-                C = self.wrong(e, c, C, rigid, soft, give)
-                move = ti.cast(-relaxation * C / ((rigid + soft) * n + give), self.real)
+                    self.store_history(e, c, h, now, last, fresh)
+                C = self.soft_violation(e, c, C, rigid, soft, alpha_prime)
+                move = ti.cast(-relaxation * C / ((rigid + soft) * n + alpha_prime), self.real)
                 self.pull[e] = self.pull[e] + move
-                self.corners.give(e, move)
+                self.corners.write_move(e, move)
 
     @ti.func
-    def wrong(self, e, c, C, rigid, soft, give):
+    def soft_violation(self, e, c, C, rigid, soft, alpha_prime):
         """Return C* + alpha' lam of a soft cluster, with the soft part of C_(n+1) = C in the frame at the start."""
-        back = self.kept(self.fit, c) @ (self.kept(self.pose, c).transpose() @ C)
-        return rigid * C + soft * back + self.spring.history[e] + give * self.pull[e] - self.mean[c]
+        back = self.read_matrix(self.fit, c) @ (self.read_matrix(self.pose, c).transpose() @ C)
+        return rigid * C + soft * back + self.spring.history[e] + alpha_prime * self.pull[e] - self.mean[c]
 
     @ti.func
-    def look_back(self, e, c, h, now, last, fresh):
+    def store_history(self, e, c, h, now, last, fresh):
         """Store the terms of C_n and C_(n-1) in the violation; and let a plastic shape flow."""
-        R = self.kept(self.fit, c)
-        C = self.arm(e, self.corners.hub(c), 1) - self.middle[c] - R @ self.shape[e]
-        self.spring.history[e] = now * C + last * (R @ self.spring.before(e, ti.cast(self.nothing(), self.real), fresh))
+        R = self.read_matrix(self.fit, c)
+        C = self.relative_position(e, self.corners.reference_particle(c), 1) - self.middle[c] - R @ self.shape[e]
+        self.spring.history[e] = now * C + last * (R @ self.spring.last_value(e, ti.cast(self.zero_vector(), self.real), fresh))
         body = R.transpose() @ C
         if ti.static(self.plastic):
             size = body.norm()
@@ -343,39 +356,39 @@ class ClusterPasses(Passes):
         alpha, mass = self.spring.alpha[c], self.mass[c]
         out = 0 * C
         if alpha > 0:
-            rate = (C - self.kept(self.pose, c) @ self.spring.last[e]) / h
+            rate = (C - self.read_matrix(self.pose, c) @ self.spring.last[e]) / h
             out = -h * h * (1 - stiff(alpha, h, 1 / mass)) * (C / alpha + self.spring.damping[c] * rate) / mass
         return out
 
     @ti.func
     def break_overloaded(self, c, h2_rigid, h2_effective, tick):
         """Break cluster c if the force on one of its particles was too large, see Strength."""
-        if self.strength.holds(c):
-            w, i0, snaps = self.mass[c], self.corners.hub(c), False
+        if self.strength.is_intact(c):
+            w, i0, snaps = self.mass[c], self.corners.reference_particle(c), False
             if w > 0:
                 w = 1 / w
-            reach = self.spring.reach(c, w, h2_rigid, h2_effective)
+            per_newton = self.spring.multiplier_per_newton(c, w, h2_rigid, h2_effective)
             for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
                 i = self.corners.members[e]
                 if self.w.of(i) > 0:
-                    past = self.strength.exceeded(c, e, self.pull[e] / self.w.of(i), reach)
+                    past = self.strength.add_excess(c, e, self.pull[e] / self.w.of(i), per_newton)
                     snaps = snaps or past > self.strength.rounding(c, i, i0)
             if snaps:
-                self.strength.snap(c, tick)
+                self.strength.mark_broken(c, tick)
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
         """Return the largest violation that is left, relative to the radius, with the rotation of the last pass."""
-        worst, total, mean, holds = ti.cast(0, ti.f64), ti.cast(0, ti.f64), self.nothing(), self.strength.holds(c)
-        rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
+        worst, total, mean, holds = ti.cast(0, ti.f64), ti.cast(0, ti.f64), self.zero_vector(), self.strength.is_intact(c)
+        rigid, soft, now, last, alpha_prime = self.law(c, h, h2_effective, fresh)
         for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
-            total += self.weight(e, c)
-            mean += self.weight(e, c) * self.off(e, c)
+            total += self.mass_in_fit(e, c)
+            mean += self.mass_in_fit(e, c) * self.offset_of(e, c)
         for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
             if self.w.of(self.corners.members[e]) > 0 and holds:
-                C = self.off(e, c) - mean / total  # positions are relative to a particle that has moved since
+                C = self.offset_of(e, c) - mean / total  # positions are relative to a particle that has moved since
                 if ti.static(self.spring.soft):
-                    C = self.wrong(e, c, C, rigid, soft, give)
+                    C = self.soft_violation(e, c, C, rigid, soft, alpha_prime)
                 worst = ti.max(worst, C.norm())
         return ti.cast(worst / self.size[c], self.real)
 
@@ -383,16 +396,16 @@ class ClusterPasses(Passes):
     def energy(self, c, back, h2_effective, residual):
         """Return the elastic energy [J]: the sum of m |C|^2 / (2 alpha M) at x - back d, about the best fit there.
 
-        It counts only the part that bears loads, see Spring.solved().
+        It counts only the part that bears loads, see Spring.bearing_share().
         """
         out = ti.cast(0, ti.f64)
         if ti.static(self.spring.soft):
-            alpha, mass, i0 = self.spring.alpha[c], self.mass[c], self.corners.hub(c)
-            if alpha > 0 and mass > 0 and self.strength.holds(c):
+            alpha, mass, i0 = self.spring.alpha[c], self.mass[c], self.corners.reference_particle(c)
+            if alpha > 0 and mass > 0 and self.strength.is_intact(c):
                 s, q, R = self.best_fit(c, back)
                 most, borne = ti.cast(0, self.real), ti.cast(0, ti.f64)
                 for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
-                    C = self.arm(e, i0, back) - s - R @ (self.shape[e] - q)
+                    C = self.relative_position(e, i0, back) - s - R @ (self.shape[e] - q)
                     if self.w.of(self.corners.members[e]) > 0:
                         out += C.dot(C) / (2 * alpha * mass * self.w.of(self.corners.members[e]))
                         most = ti.max(most, self.pull[e].norm())
@@ -400,6 +413,6 @@ class ClusterPasses(Passes):
                         if h2_effective > 0:
                             pull /= h2_effective
                         borne += pull * pull * alpha * mass / (2 * self.w.of(self.corners.members[e]))
-                out *= self.spring.solved(most * alpha * mass, h2_effective, residual * self.size[c])
+                out *= self.spring.bearing_share(most * alpha * mass, h2_effective, residual * self.size[c])
                 out = self.spring.energy(c, 1 / mass, h2_effective, out, borne)
         return out

@@ -35,22 +35,22 @@ class CornerPasses(Passes):
         self.equation = Equation(scene, batch, self.corners, start)
         self.spring, self.strength, self.limit = self.equation.spring, self.equation.strength, self.equation.limit
         self.quantity, self.drive, self.side = self.equation.quantity, self.equation.drive, batch.side
-        self.seen = self.quantity.frame(self.corners)
+        self.relative_corners = self.quantity.relative_corners(self.corners)
         rows = scene.slots.rows(batch)
-        self.in_system, self.outside = bool((rows >= 0).any()), bool((rows < 0).any())
+        self.in_system, self.has_outside = bool((rows >= 0).any()), bool((rows < 0).any())
         if self.in_system:
             self.row = add(f"{name}.row", m, kind=ti.i32, values=rows)
         self.converges = batch.solvable_together and (self.in_system or bool(scene.slots.semi_iteration))
         if self.converges:
             self.inverse_size = add(f"{name}.close", m, values=batch.inverse_size(batch.start.position))
-        alone = self.converges and scene.slots.semi_iteration and self.outside
-        self.steps = bool(alone and not (self.side or batch.driven))
-        if self.steps:
+        alone = self.converges and scene.slots.semi_iteration and self.has_outside
+        self.semi_iterates = bool(alone and not (self.side or batch.driven))
+        if self.semi_iterates:
             self.step = add(f"{name}.step", m)
         self.known = KnownLoad(scene, name, batch)
         self.impacts: Any = scene.impacts
-        self.leaves = bool(self.impacts) and not self.impacts.exact  # violations are left to the next substep
-        if self.leaves:
+        self.stores_left = bool(self.impacts) and not self.impacts.exact  # violations are left to the next substep
+        if self.stores_left:
             self.left = add(f"{name}.left", m)  # the violation that the regular passes of the substep left
 
     @ti.func
@@ -59,34 +59,34 @@ class CornerPasses(Passes):
 
         Where c belongs to a system, dlam comes from the system: c fills in its row there, and writes w_j grad_j C into its slots.
         """
-        if ti.static(self.equation.ramp.made):
+        if ti.static(self.equation.ramp.is_allocated):
             if first != 0:
-                self.equation.ramp.follow(c, frame_fraction)
+                self.equation.ramp.update_rest(c, frame_fraction)
         share = frame_fraction[1] - frame_fraction[0]
         violation, A, alpha, lam, W, n, g, turn, moved = self.linearise(c, h, h2_effective, share, first, fresh)
         step = ti.cast(1, self.real)
-        if ti.static(self.leaves):
-            violation -= self.left_before(c, violation, lam)
+        if ti.static(self.stores_left):
+            violation -= self.violation_left(c, violation, lam)
         if ti.static(self.in_system):
             if self.row[c] >= 0:
-                self.tell_system(c, violation, A, alpha, lam, W, n, g, turn, moved, share)
-        if ti.static(self.outside):
-            if self.outside_systems(c):
+                self.fill_row(c, violation, A, alpha, lam, W, n, g, turn, moved, share)
+        if ti.static(self.has_outside):
+            if self.is_outside_systems(c):
                 if ti.static(self.known.learns):
                     if first != 0:
                         violation += self.known_violation(c, violation - moved, W, h, h2_effective)
                 step = self.relax_alone(c, violation, A, alpha, lam, W, n, turn, share, first)
         for k in ti.static(range(self.arity)):
-            self.corners.push(c, k, self.w.of(self.corners.member(c, k)) * step * n[k, :])
+            self.corners.write_move(c, k, self.w.of(self.corners.member(c, k)) * step * n[k, :])
 
     @ti.func
     def linearise(self, c, h, h2_effective, share, first, fresh):
         """Compute what every solver needs of constraint c in a pass. It writes no state but the memory of soft constraints.
 
         Returns the violation A C + B + alpha' lam, A, alpha', lam, the mass-split weight W (0: no corner can move), directions n
-        and gradients g, both (arity, dim), how far it turned, see Slots.note_turn (n is g where too far), and C_(n+1) - C_n.
+        and gradients g, both (arity, dim), how far it turned, see Slots.record_turn (n is g where too far), and C_(n+1) - C_n.
         """
-        now, start = self.seen.now_and_start(c)
+        now, start = self.relative_corners.now_and_start(c)
         if first != 0:
             self.quantity.start_substep(c, now, start, fresh)
         f, g = self.quantity.measure(c, now)
@@ -102,13 +102,13 @@ class CornerPasses(Passes):
             both += split * g[k, :].dot(n[k, :])
             here += split * gg
             there += split * n[k, :].dot(n[k, :])
-        turn = self.slots.turn(both, ti.sqrt(here * there))
+        turn = self.slots.classify_turn(both, ti.sqrt(here * there))
         lost = turn == FAR
         if self.equation.has_cusp(c):
             lost, turn = True, 0
         if ti.static(self.converges):
             if self.spring.is_rigid(c):
-                lost = lost or ti.abs(self.equation.bounded(f0 - self.equation.rest[c])) * self.inverse_size[c] > LOST
+                lost = lost or ti.abs(self.equation.clip_to_side(f0 - self.equation.rest[c])) * self.inverse_size[c] > LOST
         if lost:
             resolved = False
             if ti.static(self.spring.soft):
@@ -162,12 +162,12 @@ class CornerPasses(Passes):
         far = False
         if self.spring.is_rigid(c):
             u, W, longest, fastest = self.motion(c, n, together)
-            reach, size = self.quantity.reach(self.seen.apart(c, 0)), self.equation.residual_scale(c)
-            new, far = self.limit.limit(c, lam, new, u, W, longest, fastest, reach, size, share)
+            trust_radius, size = self.quantity.trust_radius(self.relative_corners.apart(c, 0)), self.equation.residual_scale(c)
+            new, far = self.limit.limit(c, lam, new, u, W, longest, fastest, trust_radius, size, share)
         return new, far
 
     @ti.func
-    def tell_system(self, c, violation, A, alpha, lam, W, n, g, turn, moved, share):
+    def fill_row(self, c, violation, A, alpha, lam, W, n, g, turn, moved, share):
         """Fill in the row of constraint c, from what linearise() returns.
 
         share: the length of the substep as a share of the frame.
@@ -186,7 +186,7 @@ class CornerPasses(Passes):
             if split > 0 and self.spring.is_rigid(c):
                 spare = 2 * (violation - moved) ** 2 / split
                 if ti.static(self.limit.acts):
-                    most = TRUST * self.quantity.reach(self.seen.apart(c, 0)) / longest
+                    most = TRUST * self.quantity.trust_radius(self.relative_corners.apart(c, 0)) / longest
             self.slots.system.limit_row(row, u, spare, most, lam - new)
         for k in ti.static(range(self.arity)):
             self.slots.system.set_gradient(self.corners.places[c][k], self.corners.member(c, k), g[k, :])
@@ -194,7 +194,7 @@ class CornerPasses(Passes):
         if ti.static(self.side != 0):  # a slack constraint has a direction, but exerts no force
             acts = W > 0 and (self.side * violation > 0 or lam != 0)
         if acts:
-            self.slots.note_turn(turn)
+            self.slots.record_turn(turn)
 
     @ti.func
     def relax_alone(self, c, violation, A, alpha, lam, W, n, turn, share, first):
@@ -205,15 +205,15 @@ class CornerPasses(Passes):
             for k in ti.static(range(self.arity)):
                 w = self.w.of(self.corners.member(c, k))
                 move += w * w * n[k, :].dot(n[k, :])
-            new = self.limit.limit_collapse(lam, new, self.equation.rest[c], self.seen.apart(c, 0).norm_sqr(), move)
+            new = self.limit.limit_collapse(lam, new, self.equation.rest[c], self.relative_corners.apart(c, 0).norm_sqr(), move)
         step = new - lam
-        if ti.static(self.steps):
+        if ti.static(self.semi_iterates):
             last, wanted = self.step[c], new
             if first != 0:
                 last = 0
             if not self.equation.has_cusp(c):  # the last step there had another direction
                 wanted = lam + self.slots.semi_iteration.step(last, step)
-            step = self.slots.limited(wanted, self.geometric_stiffness(c, W / 2)) - lam  # masses in W are split by two
+            step = self.slots.limit_multiplier(wanted, self.geometric_stiffness(c, W / 2)) - lam  # masses in W are split by two
             new = lam + step
         if ti.static(self.limit.acts):
             if W > 0:
@@ -221,16 +221,16 @@ class CornerPasses(Passes):
                 if ti.static(self.equation.driven):
                     new = self.drive.clamp(c, new)
                 step = new - lam
-        if ti.static(self.steps):
+        if ti.static(self.semi_iterates):
             self.step[c] = step
         self.equation.lam[c] = new
         if ti.static(self.known.learns):
             if new == 0 and (W == 0 or ti.static(self.side != 0)):
-                self.known.let_go(c)
+                self.known.drop_load(c)
         return step
 
     @ti.func
-    def left_before(self, c, violation, lam):
+    def violation_left(self, c, violation, lam):
         """Return the violation that the regular passes left.
 
         It is 0 outside of the extra passes after impacts on walls, see BodyImpacts.
@@ -253,23 +253,23 @@ class CornerPasses(Passes):
             missing = self.slots.relaxation * start / W
             if ti.static(self.side != 0):
                 missing = ti.select(self.side * (missing + h2_effective * self.known.load[c]) > 0, missing, 0 * missing)
-            out = -self.known.give(c, missing, h, h2_effective) * W / self.slots.relaxation
+            out = -self.known.apply_load(c, missing, h, h2_effective) * W / self.slots.relaxation
         return out
 
     @ti.func
     def weigh_load(self, c):
-        """At the end of a window: call KnownLoad.weigh()."""
-        _, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
+        """At the end of a window: call KnownLoad.record_body_load()."""
+        _, g = self.quantity.remeasure(c, self.relative_corners.apart(c, 0))
         _, _, most, _ = self.motion(c, g, 0)
         own = ti.cast(0, self.real)
         for k in ti.static(range(self.arity)):
             own = ti.max(own, self.known.weights.field[self.corners.member(c, k)])
-        self.known.weigh(c, most, own)
+        self.known.record_body_load(c, most, own)
 
     @ti.func
     def learn_load(self, c, h):
         """After weigh_load(): call KnownLoad.learn()."""
-        _, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
+        _, g = self.quantity.remeasure(c, self.relative_corners.apart(c, 0))
         _, W, _, fastest = self.motion(c, g, 0)
         self.known.learn(c, h * h * W, self.equation.residual_scale(c), ti.sqrt(fastest))
 
@@ -282,7 +282,7 @@ class CornerPasses(Passes):
         return 2 * W * self.inverse_size[c]
 
     @ti.func
-    def outside_systems(self, c):
+    def is_outside_systems(self, c):
         """Whether constraint c belongs to no system."""
         out = True
         if ti.static(self.in_system):
@@ -312,11 +312,11 @@ class CornerPasses(Passes):
 
         Rigid links get their force in the next substep, except for the load that they know.
         """
-        f, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
+        f, g = self.quantity.remeasure(c, self.relative_corners.apart(c, 0))
         f = self.quantity.unwrap(f, self.equation.rest[c])
         f0, w = f, ti.cast(0, self.real)
         if ti.static(self.spring.damped):
-            f0, _ = self.quantity.remeasure(c, self.seen.apart(c, 1))
+            f0, _ = self.quantity.remeasure(c, self.relative_corners.apart(c, 1))
         for k in ti.static(range(self.arity)):
             w += self.w.of(self.corners.member(c, k)) * g[k, :].dot(g[k, :])
         force = self.equation.spring_force(c, f, self.quantity.unwrap(f0, f), w, h)
@@ -324,21 +324,21 @@ class CornerPasses(Passes):
             if self.spring.is_rigid(c):
                 force = -self.known.load[c]
         for k in ti.static(range(self.arity)):
-            self.corners.push(c, k, h * h * self.w.of(self.corners.member(c, k)) * force * g[k, :])
+            self.corners.write_move(c, k, h * h * self.w.of(self.corners.member(c, k)) * force * g[k, :])
 
     @ti.func
     def note_spring_turn(self, c):
         """Record how far a spring turned. A spring without rest length is left out, since it passes through length 0."""
         if not self.spring.is_rigid(c) and (ti.static(not self.equation.cusp) or self.equation.rest[c] != 0):
-            f, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
-            f0, n = self.quantity.remeasure(c, self.seen.apart(c, 1))
+            f, g = self.quantity.remeasure(c, self.relative_corners.apart(c, 0))
+            f0, n = self.quantity.remeasure(c, self.relative_corners.apart(c, 1))
             if self.quantity.direction_reliable(f, f0):
-                self.slots.note_turn(self.slots.turn((g * n).sum(), g.norm() * n.norm()))
+                self.slots.record_turn(self.slots.classify_turn((g * n).sum(), g.norm() * n.norm()))
 
     @ti.func
     def push_reaction(self, c, h, firm, soft):
         """Push h^2 w_j F grad_j C, with F of Equation.reaction()."""
-        f, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
+        f, g = self.quantity.remeasure(c, self.relative_corners.apart(c, 0))
         w, W = ti.cast(0, self.real), ti.cast(0, self.real)
         if ti.static(self.spring.soft):
             f = self.quantity.unwrap(f, self.equation.rest[c])
@@ -351,7 +351,7 @@ class CornerPasses(Passes):
             if self.spring.is_rigid(c):
                 pull += ti.select(firm == 0, 0 * firm, soft - firm) * self.known.given[c]
         for k in ti.static(range(self.arity)):
-            self.corners.push(c, k, self.w.of(self.corners.member(c, k)) * pull * g[k, :])
+            self.corners.write_move(c, k, self.w.of(self.corners.member(c, k)) * pull * g[k, :])
 
     @ti.func
     def break_overloaded(self, c, h2_rigid, h2_effective, tick):
@@ -363,20 +363,20 @@ class CornerPasses(Passes):
         if ti.static(self.spring.soft):
             if h2_rigid > h2_effective:
                 w = self.weight(c)
-        reach = self.spring.reach(c, w, h2_rigid, h2_effective)
+        per_newton = self.spring.multiplier_per_newton(c, w, h2_rigid, h2_effective)
         if ti.static(self.known.learns):
-            lam += (reach / h2_effective - 1) * self.known.given[c]
-        if self.strength.holds(c):
-            past, unsure = self.strength.exceeded(c, c, lam, reach), 0 * lam
+            lam += (per_newton / h2_effective - 1) * self.known.given[c]
+        if self.strength.is_intact(c):
+            past, unsure = self.strength.add_excess(c, c, lam, per_newton), 0 * lam
             if past > 0:
                 if ti.static(not (self.quantity.precise and self.state.carries)):
-                    _, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
+                    _, g = self.quantity.remeasure(c, self.relative_corners.apart(c, 0))
                     for k in ti.static(range(self.arity)):
                         if g[k, :].norm() > 0:
                             rounding = self.strength.rounding(c, self.corners.member(c, k), self.corners.member(c, 0))
                             unsure = ti.max(unsure, rounding / g[k, :].norm())
                 if past > unsure:
-                    self.strength.snap(c, tick)
+                    self.strength.mark_broken(c, tick)
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
@@ -385,7 +385,7 @@ class CornerPasses(Passes):
         W is computed from the current gradients alone: it cancels, unless the multiplier is bounded. Without gradients no pass
         reduces the violation, so all of it is left; a spring correctly exerts no force there.
         """
-        f, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
+        f, g = self.quantity.remeasure(c, self.relative_corners.apart(c, 0))
         f = self.quantity.unwrap(f, self.equation.rest[c])
         w, W, free = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
         for k in ti.static(range(self.arity)):
@@ -394,10 +394,10 @@ class CornerPasses(Passes):
             W += self.slots.split[i] * gg
             free += self.w.of(i)
         violation, A, alpha, lam, W = self.equation.terms(c, f, f, w, W, h, h2_effective, 0, fresh)
-        left = self.equation.removed(c, violation, A, alpha, lam, W)
-        if g.norm_sqr() == 0 and free > 0 and self.strength.holds(c):
+        left = self.equation.removable_violation(c, violation, A, alpha, lam, W)
+        if g.norm_sqr() == 0 and free > 0 and self.strength.is_intact(c):
             if ti.static(self.quantity.collapses > 0) or self.spring.is_rigid(c):
-                left = ti.abs(self.equation.bounded(f - self.equation.rest[c]))
+                left = ti.abs(self.equation.clip_to_side(f - self.equation.rest[c]))
         return left / self.equation.residual_scale(c)
 
     @ti.func
@@ -405,15 +405,15 @@ class CornerPasses(Passes):
         """Return the energy of the constraint's spring."""
         out = ti.cast(0, ti.f64)
         if ti.static(self.spring.soft):
-            if self.equation.stores(c):
-                f, _ = self.quantity.remeasure(c, self.seen.apart(c, back))
+            if self.equation.stores_energy(c):
+                f, _ = self.quantity.remeasure(c, self.relative_corners.apart(c, back))
                 out = self.equation.energy(c, f, self.weight(c), h2_effective, residual)
         return out
 
     @ti.func
     def weight(self, c):
         """Return sum_j w_j |grad_j f|^2 at the present positions."""
-        _, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
+        _, g = self.quantity.remeasure(c, self.relative_corners.apart(c, 0))
         w = ti.cast(0, self.real)
         for k in ti.static(range(self.arity)):
             w += self.w.of(self.corners.member(c, k)) * g[k, :].dot(g[k, :])

@@ -43,7 +43,7 @@ class FixedCorners:
         return asleep == 0
 
     @ti.func
-    def push(self, c, k: ti.template(), move):  # type: ignore[valid-type]
+    def write_move(self, c, k: ti.template(), move):  # type: ignore[valid-type]
         """Write the move of corner k into its slot; a particle that cannot move has none."""
         place = self.places[c][k]
         if place >= 0:
@@ -82,7 +82,7 @@ class VariableCorners:
 
         reduce_block(b)   sums over at most BLOCK corners of one constraint: block[b] = first corner, last + 1, constraint
         relax(c)   adds up its blocks, blocks[c] to blocks[c + 1], in order, and solves
-        scatter_corner(e)  gives corner e its move, with give(e, move)
+        scatter_corner(e)  gives corner e its move, with write_move(e, move)
 
     The same loops run before push_spring_force(), and reduce_block() before residual_of() where the batch `needs_reduce_block`.
     count, total, block_count: of constraints, corners, blocks. members, owner: the particle and the constraint of each corner.
@@ -123,19 +123,19 @@ class VariableCorners:
         return at(sleepers.asleep, at(self.mover, c)) == 0 if sleepers else ti.cast(1, ti.i32) > 0
 
     @ti.func
-    def give(self, e, move):
+    def write_move(self, e, move):
         """Write the move of corner e into its slot; a particle that cannot move has none."""
         place = self.places[e]
         if place >= 0:
             self.slots.move[place] = move
 
     @ti.func
-    def hub(self, c):
+    def reference_particle(self, c):
         """Return the particle that corners of constraint c are relative to, so that f32 loses no digits."""
         return self.members[self.starts[c]]
 
     @ti.func
-    def arm(self, e, i0, back):
+    def relative_position(self, e, i0, back):
         """Return corner e relative to particle i0, at x - back d."""
         i = self.members[e]
         return self.state.apart(i, i0) - back * (self.state.d[i] - self.state.d[i0])

@@ -17,7 +17,7 @@ class Curve:
         through = np.concatenate([points, points[:1]]) if closed else points
         lengths = np.linalg.norm(np.diff(through, axis=0), axis=1)
         if smooth:
-            through, lengths = _by_length(through, lengths, closed)
+            through, lengths = _resample(through, lengths, closed)
             slope = _slopes(through, lengths, closed)
         else:
             slope = None
@@ -85,14 +85,14 @@ def _slopes(x: np.ndarray, step: np.ndarray, closed: bool) -> np.ndarray:
         return _parabola(x, step)
     a, b = step[:-1], step[1:]
     right = 3 * (b[:, None] * chord[:-1] + a[:, None] * chord[1:])
-    first, last = _end(x, step), _end(x[::-1], step[::-1]) * -1
+    first, last = _end_slope(x, step), _end_slope(x[::-1], step[::-1]) * -1
     right[0] -= b[0] * first
     right[-1] -= a[-1] * last
     inner = _thomas(b, 2 * (a + b), a, right)
     return np.concatenate([first[None], inner, last[None]])
 
 
-def _end(x: np.ndarray, step: np.ndarray) -> np.ndarray:
+def _end_slope(x: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Return the slope at the first point, of the cubic through the first four."""
     t = np.concatenate([[0.0], np.cumsum(step[:3])])
     return np.linalg.solve(np.vander(t, 4, increasing=True), x[:4])[1]
@@ -131,7 +131,7 @@ def _cyclic(low, main, up, right) -> np.ndarray:
     return y - np.outer(q, (v @ y) / (1 + v @ q))
 
 
-def _by_length(x: np.ndarray, step: np.ndarray, closed: bool) -> tuple[np.ndarray, np.ndarray]:
+def _resample(x: np.ndarray, step: np.ndarray, closed: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return points on the spline through x at equal distances along it, PIECES for each step, and these distances."""
     m, nodes = _slopes(x, step, closed), np.polynomial.legendre.leggauss(5)
     chord = np.diff(x, axis=0) / step[:, None]

@@ -23,9 +23,9 @@ def largest_load(batch: "Batch", name: str, value: Any) -> np.ndarray:
 class Drive:
     """The moving rest values of a batch on the device, and the largest loads against which they move.
 
-    In a substep h the rest value moves by `pace` h towards `goal`, or without end where the drive is `endless` (pace then has a
-    sign). With a time to `settle` it nears the goal at no more than distance / settle. Otherwise a body that a limited load has
-    to stop would overshoot, and swing back as fast, for ever. The multiplier is clamped to
+    In a substep h the rest value moves by `speed` h towards `goal`, or without end where the drive is `endless` (speed then has a
+    sign). With a `time_constant` it nears the goal at no more than distance / time_constant. Otherwise a body that a limited load
+    has to stop would overshoot, and swing back as fast, for ever. The multiplier is clamped to
 
         |lam| <= largest h^2
 
@@ -37,20 +37,20 @@ class Drive:
     velocities, and h (h + h_old) / 2 where these velocities lack half of the last kick, see Integrator.h2_rigid().
 
     The rest value is kept in f64, where slow motion is not lost in rounding. start: the initial rest values, (m,). largest: (m,),
-    or None where all are infinite, which costs nothing. period: of equivalent values, 0 for none. settle: [s]. in_state: its
-    fields in the exact state, by name.
+    or None where all are infinite, which costs nothing. period: of equivalent values, 0 for none. time_constant: [s]. in_state:
+    its fields in the exact state, by name.
     """
 
     def __init__(
-        self, scene: "Scene", name: str, start: np.ndarray, goal: np.ndarray, pace: np.ndarray, largest: Any,
-        endless: bool, period: float, settle: float,
+        self, scene: "Scene", name: str, start: np.ndarray, goal: np.ndarray, speed: np.ndarray, largest: Any,
+        endless: bool, period: float, time_constant: float,
     ):  # fmt: skip
         add, m = scene.memory.field, len(start)
         self._memory, self.real = scene.memory, scene.real
-        self.endless, self.period, self.settle, self.capped = endless, period, settle, largest is not None
+        self.endless, self.period, self.time_constant, self.capped = endless, period, time_constant, largest is not None
         self.target = add(f"{name}.target", m, kind=ti.f64, values=start, state=True)
         self.goal = add(f"{name}.goal", m, kind=ti.f64, values=np.clip(goal, -LARGEST, LARGEST))
-        self.pace = add(f"{name}.pace", m, kind=ti.f64, values=pace)
+        self.speed = add(f"{name}.pace", m, kind=ti.f64, values=speed)
         self.step = add(f"{name}.step_of_rest", m)
         self.in_state = {"target": self.target}
         if largest is not None:
@@ -59,10 +59,10 @@ class Drive:
             self.h2_rigid = add(f"{name}.h2_rigid", None)
             self.in_state["most"] = self.most
 
-    def upload(self, goal: np.ndarray, pace: np.ndarray, largest: np.ndarray) -> None:
+    def upload(self, goal: np.ndarray, speed: np.ndarray, largest: np.ndarray) -> None:
         """Write new values to the device, as far as kernels read them."""
         self._memory.write(self.goal, np.clip(goal, -LARGEST, LARGEST))
-        self._memory.write(self.pace, pace)
+        self._memory.write(self.speed, speed)
         if self.capped:
             self._memory.write(self.largest, np.minimum(largest, LARGEST))
 
@@ -72,15 +72,15 @@ class Drive:
 
     def rates(self, h: float) -> np.ndarray:
         """How fast they go in a substep h, where nothing holds them up, (m,)."""
-        pace = self._memory.read(self.pace)
+        speed = self._memory.read(self.speed)
         if self.endless:
-            return pace
+            return speed
         way = self._memory.read(self.goal) - self.values()
         if self.period > 0:
             way -= self.period * np.round(way / self.period)
-        return np.clip(way / (h + self.settle), -np.abs(pace), np.abs(pace))
+        return np.clip(way / (h + self.time_constant), -np.abs(speed), np.abs(speed))
 
-    def slips(self, lam: ti.Field) -> np.ndarray:
+    def is_at_limit(self, lam: ti.Field) -> np.ndarray:
         """Return which multipliers of the field `lam` have reached the largest, (m,).
 
         These constraints act as forces and hold nothing.
@@ -93,7 +93,7 @@ class Drive:
         self._memory.write(self.target, values)
 
     @ti.func
-    def near(self, value, other):
+    def nearest_equivalent(self, value, other):
         """Return the value equivalent to `value` that is nearest to `other`."""
         if ti.static(self.period > 0):
             value -= self.period * ti.round((value - other) * ti.static(1 / self.period))
@@ -105,9 +105,9 @@ class Drive:
 
         side, W: see Equation. alpha: compliance. lam: the multiplier of the last substep. size: of the constraint.
         """
-        old, pace = self.target[c], self.pace[c]
+        old, speed = self.target[c], self.speed[c]
         lag = ti.cast(f, ti.f64) - old
-        lag = self.near(lag, 0 * lag)
+        lag = self.nearest_equivalent(lag, 0 * lag)
         start = ti.cast(f, ti.f64) - lag  # the rest value, as the equivalent value nearest to f
         if ti.static(self.capped):
             most = self.largest[c] * ti.select(alpha == 0, self.h2_rigid[None], h2_effective)
@@ -117,11 +117,11 @@ class Drive:
                 start = ti.cast(f, ti.f64) - slack
             elif ti.static(side == 0) and lag < -slack:
                 start = ti.cast(f, ti.f64) + slack
-        way = pace * h
+        way = speed * h
         if ti.static(not self.endless):
-            reach, way = ti.abs(pace) * h, self.near(self.goal[c] - start, 0 * start)
-            if ti.static(self.settle > 0):
-                way *= h / (h + ti.static(self.settle))
+            reach, way = ti.abs(speed) * h, self.nearest_equivalent(self.goal[c] - start, 0 * start)
+            if ti.static(self.time_constant > 0):
+                way *= h / (h + ti.static(self.time_constant))
             way = ti.max(-reach, ti.min(reach, way))
         stall = ti.cast(STALL * size + alpha / h2_effective * ti.abs(lam), ti.f64)
         if ti.static(self.period > 0):
@@ -129,7 +129,7 @@ class Drive:
         lag = ti.cast(f, ti.f64) - start
         if (lag > stall and way < 0) or (ti.static(side == 0) and lag < -stall and way > 0):
             way = 0 * way
-        start = self.near(start + way, 0 * start)
+        start = self.nearest_equivalent(start + way, 0 * start)
         if not ti.math.isnan(start):  # a NaN is not stored: the rest value keeps its last number
             self.target[c] = start
         self.step[c] = ti.cast(way, self.real)

@@ -42,7 +42,7 @@ class Equation:
         name, m, add, unit = repr(batch), batch.count, scene.memory.field, batch.quantity.unit
         self.slots, self.real, self.side, self.corners = scene.slots, scene.real, batch.side, corners
         self.forces = bool(batch.acts_as_force(scene).any())
-        least = SMALLEST * batch.start.size if batch.quantity.apart else 0.0
+        least = SMALLEST * batch.start.size if batch.quantity.is_distance else 0.0
         self.scene_sized = not unit and not (np.abs(start) > least).any()
         scale = unit or (batch.start.size if self.scene_sized else float(np.abs(start).mean()))
         self.scale = scene.memory.number(scale, scene.real)
@@ -59,7 +59,7 @@ class Equation:
         self.in_state = {"lam": self.lam} | ({"rest": self.rest} if batch.driven else {})
 
     @ti.func
-    def bounded(self, value):
+    def clip_to_side(self, value):
         """Return `value` where the constraint acts on its side, else 0."""
         if ti.static(self.side != 0):
             value = ti.max(self.side * value, 0) * self.side
@@ -80,7 +80,7 @@ class Equation:
         f, f0: f at the end and at the start of the substep. w: see stiff().
         """
         if ti.static(self.strength.breaks):
-            if not self.strength.holds(c):
+            if not self.strength.is_intact(c):
                 W = 0
         if ti.static(self.forces):
             if not self.spring.is_rigid(c):
@@ -95,8 +95,10 @@ class Equation:
                 A, now, last = self.spring.law(c, h, w, fresh)
                 alpha = self.spring.alpha[c] / h2_effective
                 if first != 0:
-                    f_last = self.quantity.unwrap(self.spring.before(c, f0, fresh), f0)
-                    B = now * self.bounded(self.violation_then(c, f0, 1)) + last * self.bounded(self.violation_then(c, f_last, 2))
+                    f_last = self.quantity.unwrap(self.spring.last_value(c, f0, fresh), f0)
+                    B = now * self.clip_to_side(self.earlier_violation(c, f0, 1)) + last * self.clip_to_side(
+                        self.earlier_violation(c, f_last, 2)
+                    )
                     self.spring.history[c] = B
                     self.spring.last[c] = f0
                 else:
@@ -107,12 +109,12 @@ class Equation:
         return A * C + B + alpha * lam, A, alpha, lam, W
 
     @ti.func
-    def violation_then(self, c, f, ago: ti.template()):  # type: ignore[valid-type]
+    def earlier_violation(self, c, f, ago: ti.template()):  # type: ignore[valid-type]
         """Return f - rest with the rest value of `ago` substeps ago."""
         C = f - self.rest[c]
         if ti.static(self.driven):
             C += ago * self.drive.step[c]
-        elif ti.static(self.ramp.made and not self.quantity.centred):
+        elif ti.static(self.ramp.is_allocated and not self.quantity.centred):
             C += ago * self.ramp.step[c]
         return C
 
@@ -128,7 +130,7 @@ class Equation:
             if ti.static(self.driven):  # the motion of the drive in this substep is not postponed
                 C += self.drive.step[c]
             if self.spring.is_rigid(c):
-                out = self.limit.postpone(c, self.bounded(C), W * ti.abs(self.lam[c]), self.residual_scale(c), share)
+                out = self.limit.postpone(c, self.clip_to_side(C), W * ti.abs(self.lam[c]), self.residual_scale(c), share)
             self.limit.postponed[c] = out
         elif share > 0:
             out = self.limit.postponed[c]
@@ -141,7 +143,7 @@ class Equation:
         if W > 0:
             new = lam - self.slots.relaxation * violation / (A * W + alpha)
             if ti.static(self.side != 0):
-                new = -self.bounded(-new)
+                new = -self.clip_to_side(-new)
             if ti.static(self.driven):
                 new = self.drive.clamp(c, new)
         return new
@@ -151,11 +153,11 @@ class Equation:
         """Return the multiplier after a Jacobi pass. Where it changes, record how far the constraint turned."""
         new = self.multiplier_of(c, violation, A, alpha, lam, W)
         if new != lam:
-            self.slots.note_turn(turn)
+            self.slots.record_turn(turn)
         return new
 
     @ti.func
-    def removed(self, c, violation, A, alpha, lam, W):
+    def removable_violation(self, c, violation, A, alpha, lam, W):
         """Return the size of the violation that a Jacobi pass would remove."""
         size = ti.cast(0, self.real)
         if W > 0:
@@ -169,11 +171,11 @@ class Equation:
         force = ti.cast(0, self.real)
         if ti.static(self.spring.soft):
             alpha = self.spring.alpha[c]
-            if w > 0 and alpha > 0 and self.strength.holds(c):
+            if w > 0 and alpha > 0 and self.strength.is_intact(c):
                 resolved = ti.cast(1, self.real)
                 if ti.static(not self.forces):
                     resolved -= stiff(alpha, h, w)
-                C = self.bounded(f - self.rest[c])
+                C = self.clip_to_side(f - self.rest[c])
                 force = -resolved * C / alpha
                 if ti.static(self.spring.damped):
                     if ti.static(self.side == 0) or C != 0:
@@ -186,41 +188,41 @@ class Equation:
     def reaction(self, c, f, w, W, h, firm, soft):
         """Return h^2 F of the last substep; for a spring, corrected by how much F has changed since; 0 once it has broken.
 
-        f: now. w, W: as in Spring.change(). firm, soft: as in Passes.push_reaction().
+        f: now. w, W: as in Spring.force_change(). firm, soft: as in Passes.push_reaction().
         """
         pull = firm * self.lam[c]
         if ti.static(self.spring.soft):
             if not self.spring.is_rigid(c):
                 pull = soft * self.lam[c]
-                if w > 0 and self.strength.holds(c):
-                    now, last = self.bounded(f - self.rest[c]), self.quantity.unwrap(self.spring.last[c], f)
-                    grown = now - self.bounded(self.violation_then(c, last, 1))
-                    pull += self.spring.change(c, grown, h, w, W)
+                if w > 0 and self.strength.is_intact(c):
+                    now, last = self.clip_to_side(f - self.rest[c]), self.quantity.unwrap(self.spring.last[c], f)
+                    grown = now - self.clip_to_side(self.earlier_violation(c, last, 1))
+                    pull += self.spring.force_change(c, grown, h, w, W)
                     if ti.static(self.side != 0):
-                        pull = -self.bounded(-pull)
+                        pull = -self.clip_to_side(-pull)
                     if ti.static(self.driven):
                         pull = h * h * self.drive.clamp_force(c, pull / (h * h))
         if ti.static(self.strength.breaks):
-            if not self.strength.holds(c):
+            if not self.strength.is_intact(c):
                 pull = 0 * pull
         return pull
 
     @ti.func
-    def stores(self, c):
+    def stores_energy(self, c):
         """Whether constraint c is a spring that holds, and can store energy."""
-        return self.spring.alpha[c] > 0 and self.strength.holds(c)
+        return self.spring.alpha[c] > 0 and self.strength.is_intact(c)
 
     @ti.func
     def energy(self, c, f, w, h2_effective, residual):
         """Return the elastic energy [J] of a spring at f: F C / 2, which is C^2 / (2 alpha) once solved.
 
-        See Spring.solved() and Spring.energy(). h2_effective: F = -lam / h2_effective; 0 before the first substep.
+        See Spring.bearing_share() and Spring.energy(). h2_effective: F = -lam / h2_effective; 0 before the first substep.
         """
         alpha = self.spring.alpha[c]
-        C = self.bounded(self.quantity.unwrap(f, self.rest[c]) - self.rest[c])
+        C = self.clip_to_side(self.quantity.unwrap(f, self.rest[c]) - self.rest[c])
         out = ti.cast(C, ti.f64) * C / (2 * alpha)
         if ti.static(not self.forces):
-            out *= self.spring.solved(ti.abs(self.lam[c]) * alpha, h2_effective, residual * self.residual_scale(c))
+            out *= self.spring.bearing_share(ti.abs(self.lam[c]) * alpha, h2_effective, residual * self.residual_scale(c))
             force = ti.cast(self.lam[c], ti.f64)
             if h2_effective > 0:
                 force /= h2_effective

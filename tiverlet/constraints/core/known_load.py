@@ -34,7 +34,7 @@ class KnownLoad:
     def __init__(self, scene: "Scene", name: str, batch: Any):
         self.learns, self.in_state = scene.slots.loads and batch.learns_loads, {}
         if self.learns:
-            self._memory, self.weights, self.bears = scene.memory, scene.own_weight, scene.slots.bears
+            self._memory, self.weights, self.body_load = scene.memory, scene.own_weight, scene.slots.body_load
             self.load = scene.memory.field(f"{name}.load", batch.count, state=True)  # [N]
             self.missing = scene.memory.field(f"{name}.missing", batch.count, state=True)  # missing load, summed over a window
             self.earlier = scene.memory.field(f"{name}.earlier", batch.count, state=True)  # its mean in the window before [N]
@@ -50,7 +50,7 @@ class KnownLoad:
             self._memory.write(field, values)
 
     @ti.func
-    def give(self, c, share, h, h2_effective):
+    def apply_load(self, c, share, h, h2_effective):
         """Return the multiplier of the load that constraint c knows.
 
         Add `share` to the missing load: the multiplier that the violation at the start of the substep needs besides.
@@ -61,12 +61,12 @@ class KnownLoad:
         return lam
 
     @ti.func
-    def let_go(self, c):
+    def drop_load(self, c):
         """Forget the load of constraint c, which is slack or broken."""
         self.load[c] = self.missing[c] = self.earlier[c] = self.given[c] = ti.cast(0, self.load.dtype)
 
     @ti.func
-    def weigh(self, c, most, own):
+    def record_body_load(self, c, most, own):
         """At the end of a window: record how many particles the body of constraint c bears.
 
         most: the largest acceleration of a corner of c by 1 N; own: the acceleration by forces. Without forces the number is
@@ -74,18 +74,19 @@ class KnownLoad:
         """
         pull = ti.abs(self.load[c] + self.missing[c] / WINDOW) * most
         if pull > 0:
-            ti.atomic_max(self.bears[self.body[c]], ti.select(own > 0, pull / own, ti.math.inf))
+            ti.atomic_max(self.body_load[self.body[c]], ti.select(own > 0, pull / own, ti.math.inf))
 
     @ti.func
-    def learn(self, c, give, size, moved):
-        """After weigh(): update the load that constraint c knows.
+    def learn(self, c, violation_per_newton, size, moved):
+        """After record_body_load(): update the load that constraint c knows.
 
-        give: its violation under 1 N; size: of c; moved: motion of its corners relative to each other in the last substep.
+        violation_per_newton: its violation under 1 N; size: of c; moved: motion of its corners relative to each other in the last
+        substep.
         """
         load, mean = self.load[c], self.missing[c] / WINDOW
-        if is_steady(mean, self.earlier[c]) and WINDOW * moved < STILL * give * ti.abs(load + mean):
-            k = self.bears[self.body[c]]
+        if is_steady(mean, self.earlier[c]) and WINDOW * moved < STILL * violation_per_newton * ti.abs(load + mean):
+            k = self.body_load[self.body[c]]
             share = learnt_share(1.0, SLOW * k * k, WINDOW)
             load, mean = load + share * mean, (1 - share) * mean
-            load = ti.max(-MOST * size / give, ti.min(load, MOST * size / give))
+            load = ti.max(-MOST * size / violation_per_newton, ti.min(load, MOST * size / violation_per_newton))
         self.load[c], self.earlier[c], self.missing[c] = load, mean, 0 * mean

@@ -7,7 +7,7 @@ import numpy as np
 from ... import checks
 from ...device import ti
 from ...features.feature import Knob
-from .quantity import Quantity, rest_exactly
+from .quantity import Quantity, exact_rest
 
 if TYPE_CHECKING:
     from .scalar import Scalar
@@ -30,9 +30,9 @@ class Length(Quantity):
     Two particles in the same place have no direction between them; +x replaces it.
     """
 
-    arity, apart = 2, True
+    arity, is_distance = 2, True
     exchangeable = ((0, 1),)
-    ends = precise = True
+    has_cusp_at_zero = precise = True
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return the lengths of the links, (m,)."""
@@ -53,7 +53,7 @@ class Length(Quantity):
         if ti.static(self.state.carries):
             if f + rest > 0:
                 r = self.state.between(self.corners.member(c, 0), self.corners.member(c, 1))
-                goal = rest_exactly(self, c)
+                goal = exact_rest(self, c)
                 C = ti.cast(r.dot(r) - goal * goal, self.real) / (f + rest)
         return C
 
@@ -69,10 +69,10 @@ class Length(Quantity):
         return length, ti.Matrix.rows([n, -n])
 
     @ti.func
-    def exactly(self, c):
+    def exact_excess(self, c):
         """Return f - rest in f64; the difference of two lengths in f32 loses digits."""
         r = self.state.between(self.corners.member(c, 0), self.corners.member(c, 1))
-        return ti.sqrt(r.dot(r)) - rest_exactly(self, c)
+        return ti.sqrt(r.dot(r)) - exact_rest(self, c)
 
 
 def is_link(feature: Any) -> "TypeGuard[Scalar]":

@@ -18,12 +18,12 @@ WALK = 64  # steps along the pieces of a path that a search takes at most
 class OnCurve(Place):
     """Places of particles on a curve: the piece, and the distance along it.
 
-    start: initial arc lengths, (m,). extent: of the curve [m]. pace: of driven particles, speeds where it `moves`, else arc
+    start: initial arc lengths, (m,). extent: of the curve [m]. target: of driven particles, speeds where it `moves`, else arc
     lengths; None where particles slide.
     """
 
     def __init__(
-        self, scene: "Scene", passes: AnchorPasses, curve: "Curve", start: np.ndarray, pace: np.ndarray | None, moves: bool,
+        self, scene: "Scene", passes: AnchorPasses, curve: "Curve", start: np.ndarray, target: np.ndarray | None, moves: bool,
         extent: float,
     ):  # fmt: skip
         dim, add, m = scene.particles.dim, scene.memory.field, len(start)
@@ -40,13 +40,13 @@ class OnCurve(Place):
         self.rest = add("Path.rest", m, values=rest, state=True)
         self.in_state = {"piece": self.piece, "rest": self.rest}
         self.least = extent * (2.0**-22 if scene.real == ti.f32 else 2.0**-44)
-        if pace is None:
+        if target is None:
             self.tangent = add("Path.tangent", m, width=dim)
         else:
             self.moves = moves
             self.begin = add("Path.begin", self.pieces + 1, kind=ti.f64, values=curve.starts)
             self.source = add("Path.from", m, kind=ti.f64, values=start, state=True)
-            self.target = add("Path.to", m, kind=ti.f64, values=pace, state=True)
+            self.target = add("Path.to", m, kind=ti.f64, values=target, state=True)
             self.in_state |= {"source": self.source, "target": self.target}
 
     @ti.func
@@ -86,7 +86,7 @@ class OnCurve(Place):
             self.state.advance(i, d)
 
     @ti.func
-    def search(self, x):
+    def find_nearest(self, x):
         """Return the piece nearest to x, and the distance along it, with pieces taken for straight lines."""
         best, piece, rest = ti.cast(ti.math.inf, self.real), 0, 0 * x[0]
         for k in range(self.pieces):
@@ -99,13 +99,13 @@ class OnCurve(Place):
         return piece, rest
 
     @ti.func
-    def foot(self, k, r, x, t, across):
+    def find_foot(self, k, r, x, t, across):
         """Return where the plane through x normal to t meets the curve, or with `across` False the point nearest to x.
 
         The search starts at distance r along piece k. Also returns whether the curve turned away from t by more than 41 degrees,
         or the search was too long.
         """
-        going, bent, came = True, False, -1
+        going, bent, previous = True, False, -1
         for _ in range(WALK):
             if going:
                 P, T = self.point(k, r)
@@ -118,18 +118,18 @@ class OnCurve(Place):
                     going = False
                 elif r + step > length:
                     ahead = k + 1 if k + 1 < self.pieces else 0
-                    if ahead == came or (ti.static(not self.closed) and ahead == 0):
+                    if ahead == previous or (ti.static(not self.closed) and ahead == 0):
                         r, going = length, False
                     else:
-                        came, k, r = k, ahead, 0 * r
+                        previous, k, r = k, ahead, 0 * r
                 elif r + step < 0:
                     ahead = k - 1 if k > 0 else self.pieces - 1
-                    if ahead == came or (ti.static(not self.closed) and k == 0):
+                    if ahead == previous or (ti.static(not self.closed) and k == 0):
                         r, going = 0 * r, False
                     else:
-                        came, k, r = k, ahead, self.lengths[ahead]
+                        previous, k, r = k, ahead, self.lengths[ahead]
                 else:
-                    r, came, going = r + step, -1, ti.abs(step) > self.least
+                    r, previous, going = r + step, -1, ti.abs(step) > self.least
         return k, r, bent or going
 
     @ti.func
@@ -144,16 +144,16 @@ class OnCurve(Place):
         if first != 0:
             start = x - self.state.d[i]
             if fresh != 0:
-                k, r = self.search(start)
-            k, r, lost = self.foot(k, r, start, t, False)
+                k, r = self.find_nearest(start)
+            k, r, lost = self.find_foot(k, r, start, t, False)
             self.piece[c], self.rest[c] = k, r
             P, T = self.point(k, r)
             t, C0 = T / T.norm(), start - P
             self.tangent[c] = t
-        k, r, bent = self.foot(k, r, x, t, True)
+        k, r, bent = self.find_foot(k, r, x, t, True)
         if bent:
-            k, r, lost = self.foot(self.piece[c], self.rest[c], x, t, False)
-            self.slots.note_turn(FAR)
+            k, r, lost = self.find_foot(self.piece[c], self.rest[c], x, t, False)
+            self.slots.record_turn(FAR)
         P, T = self.point(k, r)
         C = x - P
         ends = ti.static(not self.closed) and ((k == 0 and r <= 0) or (k == self.pieces - 1 and r >= self.lengths[k]))
@@ -166,7 +166,7 @@ class OnCurve(Place):
         """Return the offset from the nearest point."""
         i = self.corners.member(c, 0)
         x = self.state.place(i) - back * self.state.d[i]
-        k, r, lost = self.foot(self.piece[c], self.rest[c], x, x, False)
+        k, r, lost = self.find_foot(self.piece[c], self.rest[c], x, x, False)
         P, T = self.point(k, r)
         return x - P
 

@@ -31,7 +31,7 @@ class OutlinePasses(Passes):
         self.sums = add(f"{name}.sums", self.corners.block_count, width=8)
         self.start = add(f"{name}.gradient", self.corners.total, width=self.dim)
         self.change = add(f"{name}.change", m)
-        self.astray = add(f"{name}.turned", m, kind=ti.i32)
+        self.use_current_gradient = add(f"{name}.turned", m, kind=ti.i32)
 
     @ti.func
     def reduce_block(self, b, h, h2_effective, first, fresh):
@@ -40,29 +40,29 @@ class OutlinePasses(Passes):
         The last is the squared displacement by a multiplier of 1.
         """
         begin, end, c = self.corners.block[b]
-        i0 = self.corners.hub(c)
+        i0 = self.corners.reference_particle(c)
         sums = ti.Vector.zero(self.real, 8)
         for e in range(begin, end):
             i = self.corners.members[e]
             g, n = self.quantity.slope(e, 0), self.quantity.slope(e, 1)
-            sums[0] += self.corners.arm(e, i0, 0).dot(g)
-            sums[1] += self.corners.arm(e, i0, 1).dot(n)
+            sums[0] += self.corners.relative_position(e, i0, 0).dot(g)
+            sums[1] += self.corners.relative_position(e, i0, 1).dot(n)
             sums[2] += self.w.of(i) * g.dot(g)
             sums[3] += self.slots.split[i] * g.dot(n)
             sums[4] += self.slots.split[i] * g.dot(g)
             sums[5] += self.slots.split[i] * n.dot(n)
-            sums[6] += self.corners.arm(e, i0, 0).norm_sqr()
+            sums[6] += self.corners.relative_position(e, i0, 0).norm_sqr()
             sums[7] += self.w.of(i) * self.w.of(i) * ti.max(g.dot(g), n.dot(n))
             self.start[e] = n
         self.sums[b] = sums
 
     @ti.func
-    def total(self, c):
+    def sum_blocks(self, c):
         """Return f, f0, the sum of w |grad|^2, the mass-split weight, how far it turned, and the last two sums."""
         sums = ti.Vector.zero(self.real, 8)
         for b in range(self.corners.blocks[c], self.corners.blocks[c + 1]):
             sums += self.sums[b]
-        turn = self.slots.turn(sums[3], ti.sqrt(sums[4] * sums[5]))
+        turn = self.slots.classify_turn(sums[3], ti.sqrt(sums[4] * sums[5]))
         W = sums[3]
         if turn == FAR:
             W = sums[4]
@@ -71,69 +71,73 @@ class OutlinePasses(Passes):
     @ti.func
     def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
         """Compute dlam; scatter_corner() moves the corners."""
-        if ti.static(self.equation.ramp.made):
+        if ti.static(self.equation.ramp.is_allocated):
             if first != 0:
-                self.equation.ramp.follow(c, frame_fraction)
-        f, f0, w, W, turn, extent, move = self.total(c)
+                self.equation.ramp.update_rest(c, frame_fraction)
+        f, f0, w, W, turn, extent, move = self.sum_blocks(c)
         violation, A, alpha, lam, W = self.equation.terms(c, f, f0, w, W, h, h2_effective, first, fresh)
         if ti.static(self.limit.acts):
             violation -= A * self.equation.postpone(c, f0, W, frame_fraction[1] - frame_fraction[0], first)
         new = self.equation.jacobi_update(c, violation, A, alpha, lam, W, turn)
         new = self.limit.limit_collapse(lam, new, self.equation.rest[c], extent, move)
-        self.equation.lam[c], self.change[c], self.astray[c] = new, new - lam, turn == FAR
+        self.equation.lam[c], self.change[c], self.use_current_gradient[c] = new, new - lam, turn == FAR
 
     @ti.func
     def scatter_corner(self, e, h, h2_effective, first, fresh):
         """Move corner e by w_j dlam grad_j C."""
         c = self.corners.owner[e]
         n = self.start[e]
-        if self.astray[c] != 0:
+        if self.use_current_gradient[c] != 0:
             n = self.quantity.slope(e, 0)
-        self.corners.give(e, self.w.of(self.corners.members[e]) * self.change[c] * n)
+        self.corners.write_move(e, self.w.of(self.corners.members[e]) * self.change[c] * n)
 
     @ti.func
     def push_spring_force(self, c, h):
         """Compute h^2 F as in CornerPasses; scatter_corner() pushes it."""
-        f, f0, w, W, turn, extent, move = self.total(c)
-        self.change[c], self.astray[c] = h * h * self.equation.spring_force(c, f, f0, w, h), 1
+        f, f0, w, W, turn, extent, move = self.sum_blocks(c)
+        self.change[c], self.use_current_gradient[c] = h * h * self.equation.spring_force(c, f, f0, w, h), 1
 
     @ti.func
     def push_reaction(self, c, h, firm, soft):
         """Push h^2 w_j F grad_j C, as in CornerPasses."""
-        f, w, W, i0 = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real), self.corners.hub(c)
+        f, w, W, i0 = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real), self.corners.reference_particle(c)
         if ti.static(self.spring.soft):
             for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
                 i, g = self.corners.members[e], self.quantity.slope(e, 0)
-                f += self.corners.arm(e, i0, 0).dot(g) / self.dim
+                f += self.corners.relative_position(e, i0, 0).dot(g) / self.dim
                 w += self.w.of(i) * g.dot(g)
                 W += self.slots.split[i] * g.dot(g)
         pull = self.equation.reaction(c, f, w, W, h, firm, soft)
         for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
-            self.corners.give(e, self.w.of(self.corners.members[e]) * pull * self.quantity.slope(e, 0))
+            self.corners.write_move(e, self.w.of(self.corners.members[e]) * pull * self.quantity.slope(e, 0))
 
     @ti.func
     def break_overloaded(self, c, h2_rigid, h2_effective, tick):
         """Break constraint c if its multiplier, or the sum over many substeps, is too large, see Strength."""
-        if self.strength.holds(c):
-            reach = self.equation.spring.reach(c, self.weight(c), h2_rigid, h2_effective)
-            past, unsure, i0 = self.strength.exceeded(c, c, self.equation.lam[c], reach), 0 * reach, self.corners.hub(c)
+        if self.strength.is_intact(c):
+            per_newton = self.equation.spring.multiplier_per_newton(c, self.weight(c), h2_rigid, h2_effective)
+            past, unsure, i0 = (
+                self.strength.add_excess(c, c, self.equation.lam[c], per_newton),
+                0 * per_newton,
+                self.corners.reference_particle(c),
+            )
             if past > 0:
                 for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
                     g = self.quantity.slope(e, 0).norm()
                     if g > 0:
                         unsure = ti.max(unsure, self.strength.rounding(c, self.corners.members[e], i0) / g)
                 if past > unsure:
-                    self.strength.snap(c, tick)
+                    self.strength.mark_broken(c, tick)
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
         """Return the violation that is left, as in CornerPasses."""
-        f, f0, w, W, turn, extent, move = self.total(c)
+        f, f0, w, W, turn, extent, move = self.sum_blocks(c)
         violation, A, alpha, lam, W = self.equation.terms(c, f, f0, w, W, h, h2_effective, 0, fresh)
-        left = self.equation.removed(c, violation, A, alpha, lam, W)
+        left = self.equation.removable_violation(c, violation, A, alpha, lam, W)
         if w == 0:  # collapsed, or static
             for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
-                if self.w.of(self.corners.members[e]) > 0 and self.strength.holds(c):
+                if self.w.of(self.corners.members[e]) > 0 and self.strength.is_intact(c):
                     left = ti.abs(f - self.equation.rest[c])
         return left / self.equation.residual_scale(c)
 
@@ -142,10 +146,10 @@ class OutlinePasses(Passes):
         """Return the energy of the constraint's spring, with f by Euler's theorem."""
         out = ti.cast(0, ti.f64)
         if ti.static(self.spring.soft):
-            if self.equation.stores(c):
-                f, i0 = ti.cast(0, self.real), self.corners.hub(c)
+            if self.equation.stores_energy(c):
+                f, i0 = ti.cast(0, self.real), self.corners.reference_particle(c)
                 for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
-                    f += self.corners.arm(e, i0, back).dot(self.quantity.slope(e, back))
+                    f += self.corners.relative_position(e, i0, back).dot(self.quantity.slope(e, back))
                 out = self.equation.energy(c, f / self.dim, self.weight(c), h2_effective, residual)
         return out
 

@@ -35,13 +35,13 @@ class Passes:
 
     @ti.func
     def note_spring_turn(self, c):
-        """Where springs are forces (orders from 4 on): record how far this one turned in the last stage, see Slots.note_turn."""
+        """Where springs are forces (orders from 4 on): record how far it turned in the last stage, see Slots.record_turn."""
 
     @ti.func
     def push_reaction(self, c, h, firm, soft):
         """Push what the constraint adds to h^2 a, along its directions at the present positions, about which it has no moment.
 
-        That is its move in the last substep, and for a spring also the change of its force since, see Spring.change().
+        That is its move in the last substep, and for a spring also the change of its force since, see Spring.force_change().
         firm, soft: h^2 divided by the multiplier of 1 N, for rigid and for soft constraints. With firm = 0, rigid constraints
         push nothing, not even a known load.
         """

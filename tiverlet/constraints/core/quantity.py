@@ -18,19 +18,19 @@ class Quantity:
     """The contract of f in C(x) = f(x) - rest (a length, an angle, an area), with defaults that suit most quantities.
 
     A new quantity implements values() and measure(), and overrides what differs from a plain number. unwrap() and difference():
-    where several values are equivalent. `curved` and reach(): where its gradient is valid only near by. Kernels call the object
-    that bind() returns. For outlines (arity 0), f is a polynomial of degree dim in the corners, and slope() replaces measure(),
-    see OutlinePasses.
+    where several values are equivalent. `curved` and trust_radius(): where its gradient is valid only near by. Kernels call the
+    object that bind() returns. For outlines (arity 0), f is a polynomial of degree dim in the corners, and slope() replaces
+    measure(), see OutlinePasses.
 
     members: FixedSize or VariableSize, the particles of each constraint.
     """
 
     arity = 0  # corners of each constraint; 0: a variable number
-    apart = False  # whether f is the distance between two particles
+    is_distance = False  # whether f is the distance between two particles
     exchangeable: tuple[tuple[int, ...], ...] = ()  # groups of corners that may be exchanged
     unit: float | None = None  # scale of residuals; None: the rest value
-    precise = False  # whether exactly() computes f to all digits of the positions
-    ends = False  # whether gradients are discontinuous at f = 0
+    precise = False  # whether exact_excess() computes f to all digits of the positions
+    has_cusp_at_zero = False  # whether gradients are discontinuous at f = 0
     curved = False  # whether f is so curved that a Newton step from afar is meaningless
     collapses = 0  # the power of a length that f is, where gradients vanish with the size of the body; else 0
     transcends = False  # needs angles, cube roots or exponentials, which SPIR-V has for f32 only
@@ -79,7 +79,7 @@ class Quantity:
         bound.corners, bound.rest, bound.drive, bound.ramp = equation.corners, equation.rest, equation.drive, equation.ramp
         return bound
 
-    def frame(self, corners: Any) -> Any:
+    def relative_corners(self, corners: Any) -> Any:
         """Return the object that gives measure() its corners: by default relative to the first corner of each constraint."""
         return corners
 
@@ -109,12 +109,12 @@ class Quantity:
         return f - self.rest[c]
 
     @ti.func
-    def exactly(self, c):
+    def exact_excess(self, c):
         """Return f - rest of constraint c in f64."""
         return ti.cast(0, ti.f64)
 
     @ti.func
-    def reach(self, q):
+    def trust_radius(self, q):
         """Return how far a corner may move before the gradient no longer describes f.
 
         q: the corners. The result is about the size of the body.
@@ -132,12 +132,12 @@ class Quantity:
 
 
 @ti.func
-def rest_exactly(quantity: ti.template(), c):  # type: ignore[valid-type]
+def exact_rest(quantity: ti.template(), c):  # type: ignore[valid-type]
     """Return the rest value of constraint c in f64. In f32, a moving rest value would jerk by rounding / h^2."""
     rest = ti.cast(quantity.rest[c], ti.f64)
     if ti.static(bool(quantity.drive)):
         rest = quantity.drive.target[c]
-    if ti.static(quantity.ramp.made):
+    if ti.static(quantity.ramp.is_allocated):
         rest += quantity.ramp.low[c]
     return rest
 

@@ -19,19 +19,19 @@ class Ramp:
     of C / h. With the ramp the speeds are C / dt, whatever the substep. Without a ramp under way, begin = goal, which gives the
     bits of the goal.
 
-    batch: the Scalar, whose tracks() list what moves. The fields of a ramp are `made` when rest values are assigned for the first
-    time, in a `memory` of their own: until then a ramp costs nothing. under_way: whether rest values move in the coming frame.
-    step: how far the first of the tracks moves in this substep. low: what rounding takes from its present value.
+    batch: the Scalar, whose tracks() list what moves. The fields of a ramp are allocated when rest values are assigned for the
+    first time, in a `memory` of their own: until then a ramp costs nothing. under_way: whether rest values move in the coming
+    frame. step: how far the first of the tracks moves in this substep. low: what rounding takes from its present value.
     """
 
     host_only = ("memory", "under_way")
 
     def __init__(self, memory: "Memory", batch: Any):
         self._memory, self._batch, self.memory = memory, batch, memory
-        self.made, self.under_way, self.real = False, False, memory.real
+        self.is_allocated, self.under_way, self.real = False, False, memory.real
 
     @property
-    def waits(self) -> bool:
+    def has_pending(self) -> bool:
         """Whether rest values on the device may differ from the assigned ones."""
         return (self._batch.changed or self.under_way) and not self._batch.driven and self._batch.count > 0
 
@@ -50,9 +50,9 @@ class Ramp:
         for (field, _, _), rows in zip(self._batch.tracks(), values, strict=True):
             self._memory.write(field, rows)
 
-    def assigned(self) -> None:
+    def check_goals(self) -> None:
         """After knobs were assigned: find out whether rest values changed."""
-        self.under_way = self.under_way or self.made or self._off_goal()
+        self.under_way = self.under_way or self.is_allocated or self._off_goal()
 
     def _off_goal(self) -> bool:
         """Whether rest values on the device differ from the assigned ones."""
@@ -60,7 +60,7 @@ class Ramp:
         goals = [goal for _, goal, _ in self._batch.tracks()]
         return any((now != goal.astype(real)).any() for now, goal in zip(self.now(), goals, strict=True))
 
-    def jump(self, some: np.ndarray) -> None:
+    def jump_to_goals(self, some: np.ndarray) -> None:
         """Set the rest values of constraints in the mask `some`, (m,), to their goals before the frame.
 
         Their particles were placed where the goals are met.
@@ -68,27 +68,27 @@ class Ramp:
         goals = [goal for _, goal, _ in self._batch.tracks()]
         self.put([np.where(some, goal, now) for now, goal in zip(self.now(), goals, strict=True)])
 
-    def set_out(self) -> bool:
+    def start_moving(self) -> bool:
         """Start moving rest values, so that they reach their goals as the coming frame ends.
 
         Returns whether kernels have to be compiled for it.
         """
         self.under_way = self._off_goal()
-        new = self.under_way and not self.made
+        new = self.under_way and not self.is_allocated
         if new:
             self._make()
-        if self.made:
+        if self.is_allocated:
             tracks = list(zip(self.now(), self._batch.tracks(), strict=True))
             goals = [goal for _, (_, goal, _) in tracks]
-            self._aim([goal + difference(now, goal) for now, (_, goal, difference) in tracks], goals)
+            self._write_goals([goal + difference(now, goal) for now, (_, goal, difference) in tracks], goals)
         return new
 
-    def arrive(self) -> None:
+    def finish(self) -> None:
         """Set rest values to the assigned ones: the frame is over, or nothing was under way."""
         goals = [goal for _, goal, _ in self._batch.tracks()]
         self.put(goals)
-        if self.made:
-            self._aim(goals, goals)
+        if self.is_allocated:
+            self._write_goals(goals, goals)
             self.memory.write(self.low, np.zeros(self.shape[1]))
         self.under_way = False
 
@@ -101,26 +101,26 @@ class Ramp:
         self.step = self.memory.field(f"{name}.step_of_rest", m)
         self.low = self.memory.field(f"{name}.rest_low", m)
         self.memory.place()
-        self.made = True
+        self.is_allocated = True
 
     def adopt(self, before: "Ramp") -> None:
         """Take over the fields of a ramp of the same batch, made when it had other constraints."""
-        self.fields, self.memory, self.made = before.fields, before.memory, True
+        self.fields, self.memory, self.is_allocated = before.fields, before.memory, True
         self.begin, self.goal, self.step, self.low = before.begin, before.goal, before.step, before.low
 
-    def fit(self) -> None:
+    def resize(self) -> None:
         """Resize the fields to one row for each constraint. No rest value is under way."""
         for field in (*self.begin, *self.goal, self.step, self.low):
             self.memory.resize(field, self._batch.count)
-        self.arrive()
+        self.finish()
 
-    def _aim(self, begin: list[np.ndarray], goal: list[np.ndarray]) -> None:
+    def _write_goals(self, begin: list[np.ndarray], goal: list[np.ndarray]) -> None:
         """Set begin and end of the ramp in the coming frame."""
         for field, values in zip([*self.begin, *self.goal], [*begin, *goal], strict=True):
             self.memory.write(field, values)
 
     @ti.func
-    def follow(self, c, frame_fraction):
+    def update_rest(self, c, frame_fraction):
         """Set the rest value of constraint c to its value at the end of the substep."""
         for k in ti.static(range(len(self.fields))):
             way = self.goal[k][c] - self.begin[k][c]

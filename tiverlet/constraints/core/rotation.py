@@ -30,7 +30,7 @@ def matrix(r):
 
 
 @ti.func
-def after(a, b):
+def compose(a, b):
     """Return rotation b followed by a, normalized."""
     c = 0 * a
     if ti.static(a.n == 2):
@@ -68,7 +68,7 @@ def diagonal(value, like):
 
 
 @ti.func
-def solved(H, r):
+def solve_3x3(H, r):
     """Return the solution of H x = r by cofactors, and det H."""
     a, b, c = H[0, :], H[1, :], H[2, :]
     det = a.dot(b.cross(c))
@@ -76,7 +76,7 @@ def solved(H, r):
 
 
 @ti.func
-def spin(S, X):
+def rigid_rotation(S, X):
     """Return the rotation, as a matrix, of a body whose parts move by y: S = sum m r r^T, X = sum m r y^T, about its centre."""
     gap, out, size = axial(X.transpose()), 0 * S, S.trace()
     if size > 0:
@@ -85,13 +85,13 @@ def spin(S, X):
             out[0, 1] = -out[1, 0]
         else:
             # The rotation about a line of particles is arbitrary. As a literal, 1 + 2^-46 would be 1 in f32.
-            x, _ = solved(diagonal(size + ti.static(2.0**-46) * size, S) - S, gap)
+            x, _ = solve_3x3(diagonal(size + ti.static(2.0**-46) * size, S) - S, gap)
             out = ti.Matrix([[0 * size, -x[2], x[1]], [x[2], 0 * size, -x[0]], [-x[1], x[0], 0 * size]])
     return out
 
 
 @ti.func
-def newton(M, gap, least):
+def newton_step(M, gap, least):
     """Return a rotation vector that closes the gap of axial(M) for M = R K, and whether it is longer than `least`.
 
     It is along the gap where M has no curvature to use.
@@ -101,7 +101,7 @@ def newton(M, gap, least):
         step = gap / size
         H = diagonal(M.trace(), M) - M
         if H[0, 0] > 0 and H[0, 0] * H[1, 1] > H[0, 1] * H[1, 0]:
-            x, det = solved(H, gap)
+            x, det = solve_3x3(H, gap)
             if det > 1e-6 * size * size * size:
                 step = x
     length = step.norm()
@@ -130,13 +130,13 @@ def fit(K, kept, least):
         for _ in range(STEPS):
             if going:
                 B = matrix(r) @ K
-                step, going = newton(B, -axial(B), least)
-                r = after(quaternion(step), r)
+                step, going = newton_step(B, -axial(B), least)
+                r = compose(quaternion(step), r)
     return r
 
 
 @ti.func
-def turn(K, X, U, body, stiff, soft, kept, least, deforms: ti.template()):  # type: ignore[valid-type]
+def step_rotation(K, X, U, body, stiff, soft, kept, least, deforms: ti.template()):  # type: ignore[valid-type]
     """Return rotations of a body at the start and at the end of a step, at most 90 degrees apart, and the cosine of that angle.
 
     At the start, with K = sum mu q s^T, it is the fit R. At the end it is D R, with
@@ -162,7 +162,7 @@ def turn(K, X, U, body, stiff, soft, kept, least, deforms: ti.template()):  # ty
             sine = ti.min(ti.max(c / size, -1), 1)
             cosine = ti.sqrt(1 - sine * sine)
             D = ti.Vector([(a * cosine + b * sine) / size, (a * sine - b * cosine) / size])
-            end, cosine = after(D, start), D[0]
+            end, cosine = compose(D, start), D[0]
     else:
         stage, S = 0, K  # 0: the fit; 1: the rotation of the step; 2: done
         for k in range(2 * STEPS):
@@ -172,11 +172,11 @@ def turn(K, X, U, body, stiff, soft, kept, least, deforms: ti.template()):  # ty
                 if stage == 1:
                     gap = stiff * (axial(X) + gap)
                     if ti.static(deforms):
-                        Y = matrix(after(start, turned_back(end))) @ X
+                        Y = matrix(compose(start, inverse(end))) @ X
                         gap += soft * (axial(Y) - axial(S)) + pull
                         M = stiff * B + soft * Y
-                step, going = newton(M, gap, least)
-                end = after(quaternion(step), end)
+                step, going = newton_step(M, gap, least)
+                end = compose(quaternion(step), end)
                 if stage == 0 and (not going or k == STEPS - 1):
                     stage, start, S = 1, end, matrix(end) @ K
                     if ti.static(deforms):
@@ -184,7 +184,7 @@ def turn(K, X, U, body, stiff, soft, kept, least, deforms: ti.template()):  # ty
                             pull = axial(matrix(end) @ U)
                 elif not going:
                     stage = 2
-        D = after(end, turned_back(start))
+        D = compose(end, inverse(start))
         if D[0] < 0:
             D = -D
         cosine = 2 * D[0] * D[0] - 1
@@ -192,11 +192,11 @@ def turn(K, X, U, body, stiff, soft, kept, least, deforms: ti.template()):  # ty
             u = ti.Vector([D[1], D[2], D[3]])
             half = ti.sqrt(0.5 + 0 * cosine)
             u *= half / u.norm()
-            end = after(ti.Vector([half, u[0], u[1], u[2]]), start)
+            end = compose(ti.Vector([half, u[0], u[1], u[2]]), start)
     return start, end, cosine
 
 
 @ti.func
-def turned_back(r):
+def inverse(r):
     """Return the inverse of a quaternion."""
     return ti.Vector([r[0], -r[1], -r[2], -r[3]])

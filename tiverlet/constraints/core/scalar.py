@@ -102,7 +102,7 @@ class Scalar(Batch):
 
         The constraint direction is not defined there.
         """
-        return self.quantity.ends and bool((self.goal == 0).any()) or "cusp" in self.compiled_so_far
+        return self.quantity.has_cusp_at_zero and bool((self.goal == 0).any()) or "cusp" in self.compiled_so_far
 
     @property
     def needs_reduce_block(self) -> bool:
@@ -124,7 +124,7 @@ class Scalar(Batch):
 
     def max_distances(self) -> tuple[np.ndarray, np.ndarray]:
         """Return rigid links and ropes that nothing drives or breaks, and their initial lengths."""
-        if not self.quantity.apart or self.side < 0 or self.driven or self.breaks or self.soft or not self.count:
+        if not self.quantity.is_distance or self.side < 0 or self.driven or self.breaks or self.soft or not self.count:
             return super().max_distances()
         return self.indices, self.rest_of(self.start.position)
 
@@ -190,7 +190,7 @@ class Scalar(Batch):
         if self.arity:
             x = self.placed(position)
             size = np.linalg.norm(x - x[:, :1], axis=2).max(axis=1, initial=0.0)
-            if self.quantity.apart:
+            if self.quantity.is_distance:
                 some = size > SMALLEST * self.start.size
                 size = np.where(some, size, size[some].mean() if some.any() else self.start.size)
             size *= np.sqrt(squares.sum(axis=(1, 2)) / 2)
@@ -337,7 +337,7 @@ class Scalar(Batch):
             if self.driven:
                 self.dev.drive.upload(*self.course(), self.largest)
             else:
-                self.dev.equation.ramp.assigned()
+                self.dev.equation.ramp.check_goals()
             self.dev.spring.upload(self.compliance, self.damping)
             self.dev.strength.upload(self.break_at)
 

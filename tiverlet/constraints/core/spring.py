@@ -24,7 +24,7 @@ def stiff(alpha, h, w):
 
 
 @ti.pyfunc
-def made_up(alpha, w, h2_effective, late):
+def late_share(alpha, w, h2_effective, late):
     """Return the share of `late` that a spring makes up for in a start: 1 where stiff, 0 where resolved.
 
     `late` is what a rigid constraint makes up for in a start. Velocities lack half a kick, h_old F / 2, of rigid constraints, and
@@ -59,7 +59,7 @@ def per_newton(multipliers: tuple[float, float], compliance: np.ndarray, weights
         w = weights()
         some = soft & (w > 0)
         share[soft] = 0.0
-        share[some] = made_up(compliance[some], w[some], h2_effective, late)
+        share[some] = late_share(compliance[some], w[some], h2_effective, late)
     stands_for = h2_effective + share * late
     return np.divide(1, stands_for, out=np.zeros(len(compliance)), where=stands_for > 0)
 
@@ -107,7 +107,7 @@ class Spring:
         return out
 
     @ti.func
-    def reach(self, c, w, h2_rigid, h2_effective):
+    def multiplier_per_newton(self, c, w, h2_rigid, h2_effective):
         """Return the multiplier of 1 N in constraint c. w: see stiff()."""
         late = h2_rigid - h2_effective
         share = ti.cast(1, self.real)
@@ -115,7 +115,7 @@ class Spring:
             if self.alpha[c] > 0:
                 share = 0 * share
                 if late > 0 and w > 0:
-                    share = made_up(self.alpha[c], w, h2_effective, late)
+                    share = late_share(self.alpha[c], w, h2_effective, late)
         return h2_effective + share * late
 
     @ti.func
@@ -127,7 +127,7 @@ class Spring:
         return out
 
     @ti.func
-    def solved(self, borne, h2_effective, left):
+    def bearing_share(self, borne, h2_effective, left):
         """Return F C / 2 relative to C^2 / (2 alpha): the share of a violation that bears the load.
 
         The part that the solver leaves, `left`, bears no load. The spring is then as soft as it was solved: F = C / (alpha + the
@@ -153,7 +153,7 @@ class Spring:
         return stored + theta * (borne - stored)
 
     @ti.func
-    def change(self, c, grown, h, w, W):
+    def force_change(self, c, grown, h, w, W):
         """Return how much h^2 times the force of constraint c has changed since the start of the last substep h, where it acted.
 
         grown: growth of its violation since. w: see stiff(). W: its weight with split masses.
@@ -164,7 +164,7 @@ class Spring:
         return -(1 - stiff(alpha, h, w)) * grown / (alpha / (h * h) + W / 4)
 
     @ti.func
-    def before(self, c, present, fresh):
+    def last_value(self, c, present, fresh):
         """Return the remembered value of the last substep; at a start `present`, since the memory may be NaN."""
         return ti.select(fresh != 0, present, self.last[c])
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 APPROACH = 1 / 3  # of its size (1 rad for angles), per frame: how fast a violation that no load explains is removed
 BORNE = 0.25  # of its size: the largest violation of an angle that a load explains
-TRUST = 0.5  # of its reach: beyond this move of a corner in a pass, the gradient does not describe f
+TRUST = 0.5  # of its trust radius: beyond this move of a corner in a pass, the gradient does not describe f
 
 
 class StepLimit:
@@ -22,8 +22,8 @@ class StepLimit:
     rest value that jumped, or a goal that other constraints prevent. Where f is curved, W falls as corners move away (an angle
     between two pins L apart, seen from a distance r, has the gradient L / r^2), and that spring pumps energy. So of the part that
     the multiplier of the last substep does not explain, |C_n| - W |lam|, at most APPROACH of the size is removed per frame; the
-    rest is postponed. Where a violation is postponed, or a pass would move a corner by more than TRUST of its reach, the step
-    only removes motion. With u = sum_j grad_j C . d_j, the motion along the constraint in this substep,
+    rest is postponed. Where a violation is postponed, or a pass would move a corner by more than TRUST of its trust radius, the
+    step only removes motion. With u = sum_j grad_j C . d_j, the motion along the constraint in this substep,
 
         |u + W dlam| <= max(|u|, pace)
 
@@ -63,16 +63,15 @@ class StepLimit:
         return out
 
     @ti.func
-    def limit(self, c, lam, new, u, W, longest, fastest, reach, size, share):
+    def limit(self, c, lam, new, u, W, longest, fastest, trust_radius, size, share):
         """Return the multiplier `new` of constraint c, or one that only removes motion; and whether it is the latter.
 
-        It only removes motion where a Newton step is not valid. u, W, longest, fastest: see CornerPasses.motion. reach: see
-        Quantity.
-        size, share: see postpone().
+        It only removes motion where a Newton step is not valid. u, W, longest, fastest: see CornerPasses.motion. trust_radius:
+        see Quantity. size, share: see postpone().
         """
         far = False
-        if W > 0 and (self.postponed[c] != 0 or ti.abs(new - lam) * longest > TRUST * reach):
-            pace = APPROACH * share * ti.min(size, W * ti.min(reach, self.span[c]) / longest)
+        if W > 0 and (self.postponed[c] != 0 or ti.abs(new - lam) * longest > TRUST * trust_radius):
+            pace = APPROACH * share * ti.min(size, W * ti.min(trust_radius, self.span[c]) / longest)
             if fastest * W * W > (2 * pace * longest) ** 2:
                 pace *= 0
             most = ti.max(ti.abs(u), pace)

@@ -49,10 +49,11 @@ class Strength:
             self.limit = scene.memory.field(f"{name}.break_at", batch.count, values=limit)
             self.stamp = scene.memory.field(f"{name}.broken", batch.count, kind=ti.i32, state=True)
             total = batch.count if entries is None else entries
-            self.over = scene.memory.field(f"{name}.over", total, width=width, state=True)
+            self.excess = scene.memory.field(f"{name}.over", total, width=width, state=True)
             epsilon = np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps
-            self.unsure = scene.memory.field(f"{name}.unsure", batch.count, values=MARGIN * epsilon * scene.slots.heft(batch))
-            self.in_state = {"broken": self.stamp, "over": self.over}
+            least = MARGIN * epsilon * scene.slots.rounding_mass(batch)
+            self.rounding_scale = scene.memory.field(f"{name}.unsure", batch.count, values=least)
+            self.in_state = {"broken": self.stamp, "over": self.excess}
 
     def upload(self, break_at: np.ndarray | None) -> None:
         """Write new values to the device, if anything could break when kernels were compiled."""
@@ -64,7 +65,7 @@ class Strength:
         return self._memory.read(self.stamp)
 
     @ti.func
-    def holds(self, c):
+    def is_intact(self, c):
         """Whether constraint c has not broken."""
         out = True
         if ti.static(self.breaks):
@@ -72,23 +73,23 @@ class Strength:
         return out
 
     @ti.func
-    def exceeded(self, c, e, load, reach):
+    def add_excess(self, c, e, load, per_newton):
         """Add the load of entry e of constraint c in this substep, a multiplier, to the sum of its excess.
 
-        Returns the size of the sum, negative while there is no excess. reach: the multiplier of 1 N.
+        Returns the size of the sum, negative while there is no excess. per_newton: the multiplier of 1 N.
         """
-        total = self.over[e] + load
-        size = 0 * reach
+        total = self.excess[e] + load
+        size = 0 * per_newton
         if ti.static(self.width == 0):
             size = ti.abs(total)
         else:
             size = total.norm()
-        past, share = size - self.limit[c] * reach, 0 * size
+        past, share = size - self.limit[c] * per_newton, 0 * size
         if past > 0:
             share = past / size
         else:
             past = share
-        self.over[e] = share * total
+        self.excess[e] = share * total
         return past
 
     @ti.func
@@ -98,10 +99,10 @@ class Strength:
         x = self.state.x[i]
         if ti.static(self.state.compensated):
             x = self.state.apart(i, j)
-        return self.unsure[c] * x.norm()
+        return self.rounding_scale[c] * x.norm()
 
     @ti.func
-    def snap(self, c, tick):
+    def mark_broken(self, c, tick):
         """Break constraint c in this substep."""
         self.stamp[c] = tick % ti.static(BREAKS) + 1
         self.counter[None] += 1

@@ -9,9 +9,9 @@ import numpy as np
 from ... import checks
 from ...colliders.collider import Collider
 from ...features.feature import Feature
-from ...geometry.bounding_tree import BoundingTree, ahead
+from ...geometry.bounding_tree import BoundingTree, ray_entry_bound
 from ...geometry.intervals import ball, capsule, entry, rounding
-from ...geometry.nearest import away, on_segment
+from ...geometry.nearest import nearest_on_segment, surface_normal
 from ...neighbours.queries import between
 from ...particles import in_range
 
@@ -114,12 +114,12 @@ class Rods:
             way = ball(o, d, a, radius) if self._discs else capsule(o, d, a, b, radius)
             return entry(way, rounding(o, a, b))
 
-        return self._tree.first(len(origin), most, ahead(origin, direction, 0.0), value)
+        return self._tree.find_least(len(origin), most, ray_entry_bound(origin, direction, 0.0), value)
 
     def normal(self, point: np.ndarray, direction: np.ndarray, which: np.ndarray) -> np.ndarray:
         """Return unit normals (k, dim) at points (k, dim) on the surface of rods, met by rays in these directions."""
         a, b = self._a[which], self._b[which]
-        return away(point, on_segment(point, a, b)[0], direction, b - a, rounding(point, a, b))
+        return surface_normal(point, nearest_on_segment(point, a, b)[0], direction, b - a, rounding(point, a, b))
 
 
 def _rays(origin: Any, direction: Any, dim: int) -> tuple[bool, np.ndarray, np.ndarray]:
