@@ -390,7 +390,8 @@ class SleepPass:
         iterations: ti.i32, half: ti.i32,
     ):  # fmt: skip
         """Wake the called islands, and integrate their particles as all others were in substep s; not if s = substeps."""
-        now = self.step.pass_of(self.step.moment(Span(h64, start, start, tick, since, fresh, 0.0, 0, substeps, iterations), s), half)
+        span = Span(h64, start, start, tick, since, fresh, 0.0, 0, substeps, iterations)
+        now = self.step.pass_of(self.step.moment(span, s), half)
         for i in range(self.n):
             if not self.sleepers.awake(i):
                 if self.sleepers.called[self.sleepers.island[i]] != 0:
