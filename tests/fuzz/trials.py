@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 
 import tiverlet as tv
-from tiverlet.recording.scene import knobs, turn
+from tiverlet.recording.scene import knobs, set_knobs
 from tiverlet.step import checkpoint
 
 from . import oracles
@@ -80,7 +80,7 @@ class Trial:
         w = self.world
         for f, values in zip(self.features, self.knobs, strict=True):
             if any(vars(f)[k] is not v for k, v in values.items()):
-                turn(f, values)
+                set_knobs(f, values)
         w._rebuild_for_knobs()  # to what the features need: install() is for worlds that were just built
         checkpoint.install(w, self.kept, self.flags)
         w._last = None

@@ -95,7 +95,7 @@ class Launcher:
 
     def is_regular(self, now: Moment, half: int) -> bool:
         """Whether every substep has this half of a pass; bodies that struck walls add further ones."""
-        return half < now.span.iterations * self.halves or now.s >= now.span.substeps
+        return half // self.halves < now.span.iterations or now.s >= now.span.substeps
 
     def runs_half(self, now: Moment, half: int) -> bool:
         """Whether this half of a pass is run. If bodies may bounce off walls, the host has to wait for the answer."""

@@ -400,7 +400,8 @@ class ParticlePass:
         Also returns the share of the push of walls that it contains. firm, soft: see Passes.push_reaction(); with firm = 0, known
         loads of contacts are subtracted, too.
         The push of walls counts as far as it balances all other forces. So a body at rest has velocity 0, but half of a blow is
-        not added to the velocity of a particle that has just bounced, nor to the other particles of its body.
+        not added to the velocity of a particle that has just bounced, nor to the other particles of its body, whose walls and
+        rigid constraints count for nothing.
         """
         reaction, part = 0 * self.state.d[i], 1 + 0 * h
         if ti.static(self.held):
@@ -418,11 +419,10 @@ class ParticlePass:
                 limit = ti.max(limit, load * ti.sqrt(1 + f.dev.surface.static() ** 2))
             if size > limit:
                 part = limit / size
-                push *= part
-            reaction += push
-        for impacts in ti.static(self.impacts):
-            if impacts.reached[i] != 0:
-                reaction, part = 0 * reaction, 0 * part
+            for impacts in ti.static(self.impacts):
+                if impacts.reached[i] != 0:
+                    part = 0 * part
+            reaction += part * push
         return reaction, part
 
     @ti.func

@@ -228,7 +228,7 @@ class Step:
         """Whether every substep has this half of a pass; bodies that struck walls add further ones."""
         out = True
         if ti.static(self.has_impacts):
-            out = half < now.span.iterations * self.halves or now.s >= now.span.substeps
+            out = half // self.halves < now.span.iterations or now.s >= now.span.substeps
         return out
 
     @ti.func

@@ -337,7 +337,7 @@ class CornerPasses(Passes):
 
     @ti.func
     def push_reaction(self, c, h, firm, soft):
-        """Push h^2 w_j F grad_j C, with F of Equation.reaction()."""
+        """Push h^2 w_j F grad_j C, with F of Equation.reaction(); nothing if the multiplier contains an impact, which is over."""
         f, g = self.quantity.remeasure(c, self.relative_corners.apart(c, 0))
         w, W = ti.cast(0, self.real), ti.cast(0, self.real)
         if ti.static(self.spring.soft):
@@ -347,6 +347,10 @@ class CornerPasses(Passes):
                 w += self.w.of(i) * gg
                 W += self.slots.split[i] * gg
         pull = self.equation.reaction(c, f, w, W, h, firm, soft)
+        if ti.static(bool(self.impacts)):
+            if self.spring.is_rigid(c):
+                for k in ti.static(range(self.arity)):
+                    pull *= ti.select(self.impacts.reached[self.corners.member(c, k)] != 0, 0 * pull, 1 + 0 * pull)
         if ti.static(self.known.learns):
             if self.spring.is_rigid(c):
                 pull += ti.select(firm == 0, 0 * firm, soft - firm) * self.known.given[c]
