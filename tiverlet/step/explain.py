@@ -87,8 +87,11 @@ def _launches(world: "World") -> str:
     solved = world.iterations * (step.constraints.steps + 1) if step.constraints.steps else 0
     rounds = REBOUNDS + 1 if step.has_restitution else 0
     each = (world.iterations * step.halves if step.particles.acts else 1) + solved + rounds
+    waits = "one"
+    if step.has_impacts:  # after each substep the host reads whether linked particles struck anything
+        each, waits = each + step.finishes, str(world.substeps + 1)
     more = ", and those behind a stale list again, once it was built" if step.searches else ""
-    return f"{world.substeps * each + 1 + bool(step.searches)} launches per frame, of which the host waits for one{more}"
+    return f"{world.substeps * each + 1 + bool(step.searches)} launches per frame, of which the host waits for {waits}{more}"
 
 
 def _present(world: "World") -> list[str]:

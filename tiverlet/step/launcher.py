@@ -29,6 +29,7 @@ class Launcher:
         self.systems, self.steps = bool(step.constraints.systems), step.constraints.steps
         self.impacts, self.has_pair_impacts = step.impacts, step.has_pair_impacts
         self.looks, self.applies_first = step.looks, step.particles.applies_first
+        self.needs_more = True  # whether extra passes of this substep may be needed, see BodyImpacts
         self.waiting: list[str] = []
         self.now: Any = None  # the half of a pass of the waiting phases
 
@@ -102,8 +103,12 @@ class Launcher:
         if self.is_regular(now, half):
             return True
         it = half // self.halves - now.span.iterations
-        self.flush()
-        return bool(self.runner.memory.read(self.impacts.open)[it])
+        if it == 0 and half % self.halves == 0:
+            self.needs_more = True  # each extra pass is requested by the one before, so after one that is not needed none is
+        if self.needs_more:
+            self.flush()
+            self.needs_more = bool(self.runner.memory.read(self.impacts.open)[it])
+        return self.needs_more
 
     def begins_round(self, now: Moment) -> bool:
         """Whether this round (a substep, or the one after all substeps) begins here instead of resuming."""
