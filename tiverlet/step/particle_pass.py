@@ -159,11 +159,11 @@ class ParticlePass:
                 low, high = block(b, begin, end)
                 near = self.near_walls(low, high)
                 for i in range(low, high):
-                    lean = ti.zero(self.state.x[i])
+                    wall_move = ti.zero(self.state.x[i])
                     if near != 0:
                         if self.state.moves(i) and c.dev.splitting.weight[i] > 0:
-                            lean = self.leave_walls(i, now)
-                    c.dev.known.lean[i] = lean
+                            wall_move = self.leave_walls(i, now)
+                    c.dev.known.wall_move[i] = wall_move
 
     @ti.func
     def leave_walls(self, i, now):
@@ -182,9 +182,9 @@ class ParticlePass:
         """Undo look_ahead(): move particles back to where they were."""
         for c in ti.static(self.contacts):
             for i in range(begin, end):
-                lean = c.dev.known.lean[i]
-                if (lean != 0).any():
-                    self.state.shift(i, -lean)
+                wall_move = c.dev.known.wall_move[i]
+                if (wall_move != 0).any():
+                    self.state.shift(i, -wall_move)
 
     @ti.func
     def apply_constraints(self, now):
