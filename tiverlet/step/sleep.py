@@ -360,7 +360,7 @@ class SleepPass:
             self.sleepers.blocks[b] = stirs
 
     @ti.func
-    def look(self, i, before):
+    def call_touched(self, i, before):
         """Call the sleeping islands that particle i touches; if it is driven, also those that it touched at the substep's start.
 
         before: 1 if constraints are solved before contacts in this pass. Then also call islands that the particle would touch if
