@@ -7,7 +7,7 @@ import tiverlet as tv
 from tiverlet.device import ti
 from tiverlet.step import block_matrix, projection
 from tiverlet.step.adaptive import StepController
-from tiverlet.step.projection import Rows, paid
+from tiverlet.step.projection import Rows, take_energy
 
 from .chains import Scene, hung
 from .conftest import rerun
@@ -537,7 +537,7 @@ def test_what_cannot_be_paid_or_said_in_numbers(world):
     w = world(tv.Particles([[0.0, 0.0], [1.0, 0.0]], pinned=[0]), [tv.Gravity(), link], solver=tv.Direct())
     v = np.array([[0.0, 0.0], [0.0, 2.0]])
     rows = Rows([link], w._runner.scene.inv_mass, w.position)
-    np.testing.assert_array_equal(paid(rows.jacobian, v, np.zeros((2, 2)), 1e-4), v)
+    np.testing.assert_array_equal(take_energy(rows.jacobian, v, np.zeros((2, 2)), 1e-4), v)
     w.step(1 / 60)
     reporter = w._runner.diagnostics.report
     reporter.figures[9] = np.inf

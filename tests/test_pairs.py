@@ -93,7 +93,7 @@ def test_pairs_equal_brute_force(world, path, name, radius, several):
             assert ((in_bucket > 0).sum(), in_bucket.max()) == filled
         if path == "parallel" and name != "plane":
             continue  # a team's frames are compiled for one cloud; diagnostics sum all clouds in one way
-        w._runner.look()
+        w._runner.diagnose_state()
         touching = w._runner.report()
         reach, *extent = w._runner.diagnostics.report.figures[[REACH, *range(EXTENT, EXTENT + w.particles.dim)]]
         assert reach == np.abs(position).max() and extent == np.ptp(position, axis=0).tolist()

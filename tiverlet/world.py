@@ -168,7 +168,7 @@ class World:
             except BaseException:
                 self._handle_failed_step()
                 raise
-            self._runner.arrive()
+            self._runner.end_ramps()
             if self._clock.exceeds(report.energy, self._runner.sheet.item(KINETIC), report.overlap):
                 report = energy_bound.checked(self, report)
             report.__dict__["seconds"] = perf_counter() - clock  # the report is frozen; this field is not compared
@@ -480,7 +480,7 @@ class World:
         with deferred_signals:
             self._runner.list_neighbours()
             if contact.detects and self._runner.step.launched:
-                self._runner.look()  # measures contacts; on other paths list_neighbours() has called it
+                self._runner.diagnose_state()  # measures contacts; on other paths list_neighbours() has called it
         return contact.found(self.position, self._clock.h or 1.0)
 
     def events(self, groups: Iterable | None = None) -> ContactEvents:

@@ -111,21 +111,21 @@ class Contact(PairContact):
         if self.wanted.turns and not particles.spins:
             refuse_turning("Contact")
         self._measure(particles.radius)
-        self._keep(matters=bool((particles.radius > 0).any()), table=self.wanted)
-        if self.matters:
+        self._keep(can_touch=bool((particles.radius > 0).any()), table=self.wanted)
+        if self.can_touch:
             self.check_range(particles.position)
 
     def _measure(self, radius: np.ndarray) -> None:
         """Store the skin [m] and the smallest radius [m] of particles with these radii (n,) [m]."""
         some = radius[radius > 0]
         auto = 0.75 * median(some) if len(some) else 1.0
-        self._listed = auto if self.skin == "auto" else float(self.skin)
-        self._finest = float(radius.min(initial=np.inf))
+        self._present_skin = auto if self.skin == "auto" else float(self.skin)
+        self._smallest_radius = float(radius.min(initial=np.inf))
 
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether particles can come and go in place: not if the groups, the blocks or the neighbour search would differ."""
         dev, now = self.dev, change.now
-        if not self.matters:
+        if not self.can_touch:
             return not bool((now.radius > 0).any())
         alike = self.table.can_be(change.before.group, now.group)
         splits = dev.splitting.can_regroup(dev.list.team.piece_of(now.count))
@@ -133,12 +133,12 @@ class Contact(PairContact):
 
     def regroup(self, change: Regrouping) -> None:
         """Resize the fields after particles came and went. The thread team already has the new number."""
-        if not self.matters:
+        if not self.can_touch:
             return
         dev, n = self.dev, change.now.count
         self._measure(change.now.radius)
         self.table.regroup(self.scene, change.now.group)
-        dev.search.regroup(change, self._listed, change.now.radius)
+        dev.search.regroup(change, self._present_skin, change.now.radius)
         dev.splitting.regroup(n)
         dev.projection.regroup(n, dev.list.team)
 
@@ -172,7 +172,7 @@ class Contact(PairContact):
         dev.events = EventLog(scene, self.table) if dev.has_events else None
         if dev.events:
             pair_data.append(dev.events.touched)
-        dev.search = NeighbourSearch(scene, self._listed, linked, self.table, pair_data, team, dev.move)
+        dev.search = NeighbourSearch(scene, self._present_skin, linked, self.table, pair_data, team, dev.move)
         dev.list = dev.search.list
         dev.geometry = DiscGeometry(scene, dev.search, self.push_out, dev.impulse if dev.has_restitution else dev.push)
         if dev.events:
@@ -202,17 +202,17 @@ class Contact(PairContact):
         return self.dev.has_restitution and not self.dev.spins
 
     @ti.func
-    def presses(self, i, e):
+    def is_pressed(self, i, e):
         """Whether particle i and the particle at entry e of its list press on each other."""
         return self.dev.push.field[e] > 0 or self.dev.geometry.push_each_other(i, self.dev.list.neighbour[e], 0)
 
     @ti.func
-    def held_by(self, j):
+    def pressed_particle(self, j):
         """Return the particle that is pressed where an entry of a list is j: for discs, j itself."""
         return j
 
     @ti.func
-    def reached(self, i, e, margin):
+    def touched_sleeper(self, i, e, margin):
         """Return the particle at entry e of the list of i if it sleeps and i is within `margin` [m] of it, else -1.
 
         A driven particle i also reaches a sleeping particle that it touched as the substep began.
@@ -273,12 +273,12 @@ class Contact(PairContact):
                     keeps = ti.max(lesser(1 - alone * each, ti.static(CARRY)), 0)
                     if ti.static(self.dev.has_loads):
                         if first != 0:
-                            known = self.dev.known.given(e, now)
+                            known = self.dev.known.known_push(e, now)
                             push = known
                     if ti.static(self.dev.has_restitution):
                         held = overlap
                         if ti.static(self.dev.has_loads):  # bounce() compares what holds the load: add the known load's overlap
-                            held = ti.max(overlap, 0) + ti.max((1 - keeps) / each, alone) * self.dev.known.given(e, now)
+                            held = ti.max(overlap, 0) + ti.max((1 - keeps) / each, alone) * self.dev.known.known_push(e, now)
                         given, slack, rests = self.dev.restitution.bounce(i, j, n, held, self.dev.slack.field[e], last, first)
                         slack = ti.min(slack, ti.max(overlap, 0))
                         if first != 0:
@@ -301,7 +301,7 @@ class Contact(PairContact):
                             part = ti.zero(part)
                             push -= known
                     if ti.static(self.dev.has_loads):
-                        load = self.dev.known.remember(i, j, e, part, push + part, now)
+                        load = self.dev.known.update_load(i, j, e, part, push + part, now)
                         carried += w * load * self.dev.geometry.direction(i, j)  # the normal as the next substep starts
                     pressed = part + known
                     if ti.static(self.dev.has_restitution):
@@ -315,7 +315,7 @@ class Contact(PairContact):
                         if given > 0:
                             given, left, _approach = self.dev.restitution.collision(i, j, n, overlap)
                     if ti.static(self.dev.spins):
-                        tangential, turned = self.grip(i, j, e, n, reach, pressed + given / shared, given > 0)
+                        tangential, turned = self.spin_friction(i, j, e, n, reach, pressed + given / shared, given > 0)
                         want += tangential
                         if ti.static(self.dev.has_restitution):
                             if given > 0:  # friction of an impact acts from the time of impact on
@@ -336,7 +336,7 @@ class Contact(PairContact):
                             forced += self.dev.forces.share(approach, pressed * alone) * w * (want - part * n)
                     self.dev.push.field[e] = push
             if least == 0:
-                self.dev.splitting.doubt(i)
+                self.dev.splitting.invalidate_bound(i)
         self.dev.move[i] = total
         if ti.static(self.dev.has_loads):
             self.dev.known.carried.field[i] = carried
@@ -357,7 +357,7 @@ class Contact(PairContact):
         return self.table.held(i, j, n, normal, moved)
 
     @ti.func
-    def grip(self, i, j, e, n, reach, pressed, bounces):
+    def spin_friction(self, i, j, e, n, reach, pressed, bounces):
         """Return how far friction between spinning particles pushes i and turns its surface, both per inverse mass [kg m].
 
         pressed: the push along the normal n [kg m]. reach: the distance of the pair [m]. bounces: whether this is an impact.
@@ -379,7 +379,7 @@ class Contact(PairContact):
 
         It is the sum of pushes along the normals at the present places, where they have no moment, and of friction as the passes
         summed it up. The part of known loads that counts as a force already is left out: h^2 / soft of a load, as in
-        KnownLoads.given().
+        KnownLoads.known_push().
         """
         total, w = 0 * self.dev.state.d[i], self.dev.w.of(i)
         if self.dev.splitting.weight[i] > 0:

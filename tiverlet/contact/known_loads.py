@@ -51,7 +51,8 @@ class KnownLoads:
     decides by the overlap of a pair whether it rests; for a known load, the overlap that would hold it is added.
 
     A wall undoes, in the same substep, the displacement into it. For contacts to see that, particles are placed where walls leave
-    them while contacts are solved (`lean`). Walls then start again with the whole displacement into them, which friction needs.
+    them while contacts are solved (`wall_move`). Walls then start again with the whole displacement into them, which friction
+    needs.
 
     Warm starting (Box2D) of a single pass would be unstable: a mode of eigenvalue L has the characteristic polynomial
     z^3 - 3 a z^2 + 3 a z - a, a = 1 - r L, whose roots near 1 grow like (r L)^(1/3) / 2.
@@ -65,7 +66,7 @@ class KnownLoads:
         self.pair_data = [self.load, self.borne, self.earlier]
         n, dim = scene.count, scene.particles.dim
         self.carried = Carried(scene)
-        self.lean = scene.memory.field("Contact.lean", n, width=dim)  # how far walls moved it before contacts were solved [m]
+        self.wall_move = scene.memory.field("Contact.lean", n, width=dim)  # by walls, before contacts were solved [m]
         self.in_state = {"carried": self.carried.field}
 
     def bind(self, pairs: "NeighbourList") -> None:
@@ -99,12 +100,12 @@ class KnownLoads:
         scene.memory.write(self.carried.field, scene.inv_mass[:, None] * np.stack(sums, axis=1))
 
     @ti.func
-    def given(self, e, now):
+    def known_push(self, e, now):
         """Return what the known load of entry e gave in this substep, per inverse mass [kg m]."""
         return self.load.field[e] * self.weights.integrator.h2_effective(now.h, now.fresh)
 
     @ti.func
-    def remember(self, i, j, e, part, push, now):
+    def update_load(self, i, j, e, part, push, now):
         """Update the load of entry e, the pair of i and j, and return it [N].
 
         part: the push that contacts added in this pass [kg m]. push: the whole push of the pair [kg m].

@@ -153,14 +153,14 @@ class MassSplitting:
         if ti.static(not self.has_friction):
             if pairs > 2:
                 split = self.bound[i]
-                if others or split == 0 or self.hurries(i) or (now.span.since + now.s + i) % EVERY == 0:
+                if others or split == 0 or self.has_turning_normals(i) or (now.span.since + now.s + i) % EVERY == 0:
                     split = self.bound_of(i, ti.cast(pairs, self.real))
         split *= self.state.w.of(i)
         rest = ti.static(FADE) * ti.max(self.weight[i] - split, 0)
         self.weight[i] = ti.select(pairs > 0, split + rest, split)
 
     @ti.func
-    def hurries(self, i):
+    def has_turning_normals(self, i):
         """Whether particle i moves so far in a substep that its normals turn, see SLOW."""
         d, slow = self.state.d[i], ti.static(SLOW) * self.geometry.radius.of(i)
         return d.dot(d) > slow * slow
@@ -195,7 +195,7 @@ class MassSplitting:
         return m
 
     @ti.func
-    def doubt(self, i):
+    def invalidate_bound(self, i):
         """Invalidate the bound of particle i, which touches a particle without a push: a new list would not keep that bit."""
         if ti.static(not self.has_friction):
             self.bound[i] = 0

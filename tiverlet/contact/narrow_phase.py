@@ -197,7 +197,7 @@ class DiscGeometry:
             self.shrunk[i] = ti.max(self.shrunk[i] - self.push_out * h / 2, 0)
 
     @ti.func
-    def is_eased(self, i):
+    def is_shrunk(self, i):
         """Whether particle i is smaller than its radius for a while."""
         out = False
         if ti.static(self.shrinks):

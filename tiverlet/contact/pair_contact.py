@@ -42,7 +42,7 @@ class Geometry(Protocol):
     def restore(self, i, h) -> None:
         """Reduce the allowed overlap of particle i after a substep h, at push_out [m/s]."""
 
-    def is_eased(self, i) -> Any:
+    def is_shrunk(self, i) -> Any:
         """Whether particle i is allowed to overlap."""
 
     def worst_overlap(self, i) -> Any:
@@ -75,9 +75,9 @@ class PairContact(Feature):
     - apply_corrections(i, first)
     - finish_substep(i, now), at the end of the substep
 
-    For sleep, presses(i, e) returns whether there is a contact at entry e of the list of particle i. held_by(j) returns the other
-    particle of that contact. reached(i, e, margin) returns the sleeping particle at entry e that the awake particle i touches,
-    or nearly touches, or -1.
+    For sleep, is_pressed(i, e) returns whether there is a contact at entry e of the list of particle i. pressed_particle(j)
+    returns the other particle of that contact. touched_sleeper(i, e, margin) returns the sleeping particle at entry e that
+    the awake particle i touches, or nearly touches, or -1.
     """
 
     friction = Knob(lambda f, v: f._surface("friction", v), "Of all pairs, or by pairs of groups.")
@@ -85,10 +85,10 @@ class PairContact(Feature):
     skin = Knob(lambda f, v: _skin(v), "How far beyond touching pairs are listed [m].", built=True)
     push_out = Knob(lambda f, v: checks.number("Contact", "push_out", v, least=0.0), "[m/s].", built=True)
     compiled_for = ("has_friction", "has_restitution", "turns", "uniform")
-    _finest = _listed = 0.0  # the smallest radius, and the present skin [m]
+    _smallest_radius = _present_skin = 0.0  # the smallest radius, and the present skin [m]
     table: Table  # bound to one world
     bodies: Sequence[np.ndarray] = ()
-    matters = True
+    can_touch = True
     code_size = 3.0
     neighbours_per_particle = 0  # initial list entries per particle, if more than discs need
     detects = False  # whether each pass calls detect() for all particles, before contacts are counted
@@ -198,7 +198,7 @@ class PairContact(Feature):
         Groups that the settings do not name any more stay in the table, so dropping a name does not rebuild the world.
         """
         named = self._pairs.named
-        told = self.table.named if self.scene and self.matters else frozenset()
+        told = self.table.named if self.scene and self.can_touch else frozenset()
         return super().build_values() | {"named": told if named <= told else named}
 
     def upload(self) -> None:
@@ -208,12 +208,12 @@ class PairContact(Feature):
 
     def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Warn if all radii are 0, so that nothing touches."""
-        if not self.matters and particles.count:
+        if not self.can_touch and particles.count:
             warnings.warn(f"{self!r}: all radii are 0, so nothing touches; give tv.Particles a radius.", stacklevel=3)
 
     def check_added(self, particles: Particles, first: int) -> None:
         """Refuse positions too far out for the cells, of all particles after some were added."""
-        if self.matters:
+        if self.can_touch:
             self.check_range(particles.position)
 
     def kept_mask(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -222,7 +222,7 @@ class PairContact(Feature):
 
     def check_range(self, position: np.ndarray) -> None:
         """Raise ValueError if a coordinate is too large for the cells."""
-        cell = 2 * self._finest + self._listed
+        cell = 2 * self._smallest_radius + self._present_skin
         far = np.abs(position) >= FARTHEST * cell
         if far.any():
             i, k = np.unravel_index(int(np.argmax(far)), far.shape)

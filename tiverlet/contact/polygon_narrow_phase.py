@@ -82,26 +82,26 @@ class PolygonGeometry:
             PairData("met", 4, False, is_transferred=False),
             PairData("back", 2, False, is_transferred=False),
         )
-        self.most = PairData(
-            "most", 0, False, is_transferred=False
-        )  # how far the contact alone may be pushed out in this substep [m]
+        # How far the contact alone may be pushed out in this substep [m].
+        self.push_limit = PairData("most", 0, False, is_transferred=False)
         self.impulse = PairData("given", 0, persistent=True, for_reports=True)  # pushes and impacts in the last substep [kg m]
-        self.usual = PairData("usual", 0, persistent=True)  # the depth, averaged over substeps with the latest weighing most [m]
-        self.carried = [self.manifold, self.back, self.most, self.impulse, self.usual]
+        # The depth, averaged over substeps with the latest weighing most [m].
+        self.usual_depth = PairData("usual", 0, persistent=True)
+        self.carried = [self.manifold, self.back, self.push_limit, self.impulse, self.usual_depth]
 
     @staticmethod
     def _stride(outline: Outline) -> float:
         """Return a quarter of the shortest edge [m]."""
         return float(outline.length[outline.body >= 0].min(initial=np.inf)) / 4
 
-    def become(self, outline: Outline) -> None:
+    def set_outline(self, outline: Outline) -> None:
         """Write other bodies, of the present particles, to the device."""
         self.outline, self.step, memory = outline, self._stride(outline), self.scene.memory
         memory.write(self.loop, np.c_[outline.ends, outline.body])
         memory.write(self.longest, outline.longest)
 
     def bind(self, search: NeighbourSearch) -> None:
-        """Store the neighbour list of a search whose pairs `Beside` selects."""
+        """Store the neighbour list of a search whose pairs `EdgePairTable` selects."""
         self.list, self.discs = search.list, DiscGeometry(self.scene, search)
 
     @ti.func
@@ -290,12 +290,12 @@ class PolygonGeometry:
                 if moved != 0:
                     overlap -= self.allowed[ti.min(i, j)]
                 self.manifold.field[e] = ti.Vector([overlap, ti.cast(DISCS, self.real), n[0], n[1]])
-                self.remember(i, j, e, moved)
+                self.update_usual_depth(i, j, e, moved)
             else:
                 overlap, n, t = 0 * self.w.of(i) - 1, 0 * self.state.x[i], 0 * self.w.of(i)
                 front = self.corner(i, j)
                 if self.after(j) >= 0:
-                    overlap, n, t, self.most.field[e] = self.edge(i, j, front, moved)
+                    overlap, n, t, self.push_limit.field[e] = self.edge(i, j, front, moved)
                     if overlap > 0:
                         if self.find(i, self.after(j)) < 0:
                             overlap = -overlap  # the end of a long edge is not on the list of i: momentum would be lost
@@ -311,22 +311,22 @@ class PolygonGeometry:
                         if self.corner(j, i) <= 0:
                             overlap = -overlap
                 self.manifold.field[e] = ti.Vector([overlap, t, n[0], n[1]])
-                self.remember(i, j, e, moved)
+                self.update_usual_depth(i, j, e, moved)
                 if self.after(i) >= 0:
                     self.back.field[e] = ti.cast(ti.Vector([self.find(j, i), self.find(j, self.before(i))]), self.real)
 
     @ti.func
-    def remember(self, i, j, e, moved):
+    def update_usual_depth(self, i, j, e, moved):
         """Update the usual depth of the contact of vertex i with j, at entry e, unless both sleep."""
-        if moved != 0 and (self.state.awake(i) or self.state.awake(self.held_by(j))):
-            depth, usual = self.depth(e), self.usual.field[e]
+        if moved != 0 and (self.state.awake(i) or self.state.awake(self.pressed_particle(j))):
+            depth, usual = self.depth(e), self.usual_depth.field[e]
             if depth <= 0:
                 usual *= 0
             elif usual == 0:
                 usual = depth
             elif moved == 1:
                 usual += ti.static(RATE) * (depth - usual)
-            self.usual.field[e] = usual
+            self.usual_depth.field[e] = usual
 
     @ti.func
     def keeps(self, i, j):
@@ -411,7 +411,7 @@ class PolygonGeometry:
         """Return the depth of the contact at entry `at`, or how far it may be pushed out in this substep, if that is less [m]."""
         depth = self.manifold.field[at][0]
         if self.manifold.field[at][1] > DISCS:
-            depth = ti.min(depth, self.most.field[at])
+            depth = ti.min(depth, self.push_limit.field[at])
         return depth
 
     @ti.func
@@ -429,7 +429,7 @@ class PolygonGeometry:
         alone). Otherwise a load could hold a vertex inside for ever.
         """
         overlap, depth = self.manifold.field[at][0], self.depth(at)
-        shared = self.split_mass(depths, v, a, b, t) / self.usual.field[at]
+        shared = self.split_mass(depths, v, a, b, t) / self.usual_depth.field[at]
         if depth < overlap:
             overlap = ti.min(overlap, depth * shared / self.inverse_mass(v, a, b, t))
         return overlap, shared
@@ -474,7 +474,7 @@ class PolygonGeometry:
         self.allowed[i] = ti.max(self.allowed[i] - self.push_out * h, 0)
 
     @ti.func
-    def is_eased(self, i):
+    def is_shrunk(self, i):
         """Whether particle i is allowed to overlap."""
         return self.allowed[i] > 0
 
@@ -485,7 +485,7 @@ class PolygonGeometry:
             self.manifold.field[e] = ti.Vector([-1, 0, 0, 0], self.real)
 
     @ti.func
-    def held_by(self, j):
+    def pressed_particle(self, j):
         """Return the particle that moves with disc j or the edge from j: j, or the other end if j cannot move."""
         out = j
         if not self.w.positive(j) and self.after(j) >= 0:
@@ -493,11 +493,11 @@ class PolygonGeometry:
         return out
 
     @ti.func
-    def stays(self, i, e):
+    def is_unchanged(self, i, e):
         """Whether the contact of vertex i at entry e of its list is unchanged: i cannot move, and the other particle sleeps."""
         out = False
         if ti.static(bool(self.state.sleepers)):
-            out = not self.w.positive(i) and not self.state.awake(self.held_by(self.list.neighbour[e]))
+            out = not self.w.positive(i) and not self.state.awake(self.pressed_particle(self.list.neighbour[e]))
         return out
 
     @ti.func
@@ -568,7 +568,7 @@ def turns(r, s):
     return r.cross(s) >= -TILT * r.norm() * s.norm()
 
 
-class Beside:
+class EdgePairTable:
     """The table that selects pairs for the neighbour search: vertices near edges of other bodies, and discs."""
 
     uniform = senses = False

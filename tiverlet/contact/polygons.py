@@ -20,7 +20,7 @@ from .exclusions import excluded_pairs
 from .force_share import ForceShare
 from .loops import checked, flat, laid, refuse_deep
 from .pair_contact import PairContact
-from .polygon_narrow_phase import VERTEX, Beside, Outline, PolygonGeometry
+from .polygon_narrow_phase import VERTEX, EdgePairTable, Outline, PolygonGeometry
 from .restitution import SLOW, under_force
 
 SKIN = 0.15  # skin of a vertex, relative to its longer edge
@@ -80,11 +80,11 @@ class Polygons(PairContact):
         self.dev.outline = Outline(*laid(self.loops, x))
         sizes = np.where(self.dev.outline.body >= 0, SKIN * self.dev.outline.length, 0.75 * particles.radius)
         auto = median(sizes[sizes > 0]) if (sizes > 0).any() else 1.0
-        self._listed = auto if self.skin == "auto" else float(self.skin)
-        self._finest = float((particles.radius + self.dev.outline.reach / 2).min(initial=np.inf))
-        matters = particles.count > 0 and bool(self.loops or (particles.radius > 0).any())
-        self._keep(matters=matters, table=self.wanted)
-        if self.matters:
+        self._present_skin = auto if self.skin == "auto" else float(self.skin)
+        self._smallest_radius = float((particles.radius + self.dev.outline.reach / 2).min(initial=np.inf))
+        can_touch = particles.count > 0 and bool(self.loops or (particles.radius > 0).any())
+        self._keep(can_touch=can_touch, table=self.wanted)
+        if self.can_touch:
             self.check_range(x)
 
     def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
@@ -138,7 +138,7 @@ class Polygons(PairContact):
 
         Not in a world with Sleep, or if the groups or the neighbour search would differ.
         """
-        if not self.matters or self.scene.state.sleepers:
+        if not self.can_touch or self.scene.state.sleepers:
             return False
         came, now = change.now.position[change.kept :], change.now
         after: Any = self.copy()
@@ -150,19 +150,21 @@ class Polygons(PairContact):
         after.prepare(start, change.inv_mass.copy())
         self._after = after
         reach = after.dev.outline.reach
-        alike = after.matters and self.table.can_be(change.before.group, now.group)
+        alike = after.can_touch and self.table.can_be(change.before.group, now.group)
         return alike and self.dev.search.can_regroup(change, now.radius, reach)
 
     def regroup(self, change: Regrouping) -> None:
         """Carry out the planned edit. The thread team already has the new number of particles."""
         dev, after = self.dev, self._after
-        self.start, self._listed, self._finest, self._after = after.start, after._listed, after._finest, None
+        self.start, self._present_skin, self._smallest_radius, self._after = (
+            after.start, after._present_skin, after._smallest_radius, None,
+        )  # fmt: skip
         self._hold(after.loops)
         dev.outline = after.dev.outline
-        dev.geometry.become(dev.outline)
-        dev.beside.skin = self._listed
+        dev.geometry.set_outline(dev.outline)
+        dev.edge_pair_table.skin = self._present_skin
         self.table.regroup(self.scene, change.now.group)
-        dev.search.regroup(change, self._listed, change.now.radius, dev.outline.reach)
+        dev.search.regroup(change, self._present_skin, change.now.radius, dev.outline.reach)
 
     def rods(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the edges (k, 2) of all bodies, and their numbers (k,), counted from body to body. Rays meet them."""
@@ -191,8 +193,10 @@ class Polygons(PairContact):
             *([dev.slip] if dev.has_friction else []),
             *([dev.restitution.aim, dev.restitution.last] if dev.has_restitution else []),
         ]
-        dev.beside = Beside(dev.geometry, self.table, scene.memory.number(self._listed, scene.real))
-        dev.search = NeighbourSearch(scene, self._listed, linked, dev.beside, pair_data, team, dev.move, dev.outline.reach)
+        dev.edge_pair_table = EdgePairTable(dev.geometry, self.table, scene.memory.number(self._present_skin, scene.real))
+        dev.search = NeighbourSearch(
+            scene, self._present_skin, linked, dev.edge_pair_table, pair_data, team, dev.move, dev.outline.reach
+        )
         dev.list = dev.search.list
         dev.geometry.bind(dev.search)
         return dev.search
@@ -208,20 +212,20 @@ class Polygons(PairContact):
         if self.dev.state.awake(i):
             if first != 0:
                 for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
-                    if not self.dev.geometry.stays(i, e):
+                    if not self.dev.geometry.is_unchanged(i, e):
                         self.dev.geometry.impulse.field[e] = 0
                         if ti.static(self.dev.has_restitution):
                             self.dev.restitution.aim.field[e] = 0 * self.dev.restitution.aim.field[e]
             self.note_motion(0, self.dev.geometry.too_long(i))
         if ti.static(not self.dev.state.sleepers):
             self.dev.geometry.detect(i, 2 - first)
-        elif self.dev.state.awake(i) or self.is_near(i):
+        elif self.dev.state.awake(i) or self.has_moving_neighbour(i):
             self.dev.geometry.detect(i, 2 - first)
         else:
             self.dev.geometry.forget(i)
 
     @ti.func
-    def is_near(self, i):
+    def has_moving_neighbour(self, i):
         """Whether any particle on the list of i moves."""
         out = False
         for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
@@ -232,17 +236,17 @@ class Polygons(PairContact):
         return out
 
     @ti.func
-    def presses(self, i, e):
+    def is_pressed(self, i, e):
         """Whether particle i, as a vertex, presses on the edge or disc at entry e of its list, by the last detect()."""
         return self.dev.geometry.impulse.field[e] > 0 or self.dev.geometry.manifold.field[e][0] > 0
 
     @ti.func
-    def held_by(self, j):
-        """Return the particle that a vertex presses on where its entry is j, see PolygonGeometry.held_by()."""
-        return self.dev.geometry.held_by(j)
+    def pressed_particle(self, j):
+        """Return the particle that a vertex presses on where its entry is j, see PolygonGeometry.pressed_particle()."""
+        return self.dev.geometry.pressed_particle(j)
 
     @ti.func
-    def reached(self, i, e, margin):
+    def touched_sleeper(self, i, e, margin):
         """Return the sleeping particle at entry e of the list of i that i touches by the last detect(), or -1.
 
         A driven particle i also reaches a sleeping particle that it touched in the substep before. Edges ignore `margin`.
@@ -251,7 +255,7 @@ class Polygons(PairContact):
         for role in range(self.dev.geometry.roles(i)):
             at, v, a, b, t, part = self.dev.geometry.participants(i, e, role)
             if at >= 0:
-                other = j if role != VERTEX else self.dev.geometry.held_by(j)
+                other = j if role != VERTEX else self.dev.geometry.pressed_particle(j)
                 met = self.dev.geometry.manifold.field[at][0] > 0
                 if not self.dev.w.positive(i):
                     met = met or self.dev.geometry.impulse.field[at] > 0
@@ -270,7 +274,7 @@ class Polygons(PairContact):
                         at, _, _, _, _, part = self.dev.geometry.participants(i, e, role)
                         if at >= 0:
                             if self.dev.geometry.manifold.field[at][0] > 0:
-                                depths += abs(part) * self.dev.geometry.usual.field[at]
+                                depths += abs(part) * self.dev.geometry.usual_depth.field[at]
                                 parts += abs(part)
                 self.dev.depths[i] = depths
                 if ti.static(self.dev.has_restitution):
@@ -304,7 +308,7 @@ class Polygons(PairContact):
                                     if role == VERTEX:
                                         self.dev.restitution.aim.field[e] = aim * n
                         if role == VERTEX:
-                            if not self.dev.geometry.stays(i, e):
+                            if not self.dev.geometry.is_unchanged(i, e):
                                 self.dev.geometry.impulse.field[e] = self.dev.geometry.impulse.field[e] + back / shared
                         want = back * n
                         if ti.static(self.dev.has_friction):

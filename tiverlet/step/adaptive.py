@@ -109,8 +109,8 @@ class StepController:
             checkpoint.put_back(world, kept)
             world._runner.begin(dt, tries.substeps, world.iterations)
         self.substeps, self.iterations, self.stuck = n, k, tries.stuck  # so that the next frames do not try in vain
-        self.look_ahead(world.iterations, report, max(figures), tries.verdict, tries.count)
-        return told(report, max(figures), risks, tries.verdict, tries.count)
+        self.plan_next_frame(world.iterations, report, max(figures), tries.verdict, tries.count)
+        return with_verdict(report, max(figures), risks, tries.verdict, tries.count)
 
     def prepare(self, iterations: int, dt: float, tolerance: float | None, budget: float | None) -> None:
         """Choose the substeps and iterations of the first try."""
@@ -131,7 +131,7 @@ class StepController:
         """Update the cost of an iteration [s]: at once if it is lower, since the first frame compiles; gradually if higher."""
         self.cost = min(cost, self.cost + 0.3 * (cost - self.cost)) if self.cost else cost
 
-    def look_ahead(self, iterations: int, report: StepReport, figure: float, verdict: str, tries: int) -> None:
+    def plan_next_frame(self, iterations: int, report: StepReport, figure: float, verdict: str, tries: int) -> None:
         """Choose less effort for the next frame, if this one leaves room for it; if that has just failed, wait longer before the
         next try. figure: the largest of the figures."""
         if verdict != "good" or tries > 1:
@@ -315,7 +315,7 @@ def cheapest(known: dict[tuple[int, int], Figures], stuck: Figures) -> tuple[int
     return next(e for e in fit if stuck[TENSE] <= 1 or e[0] == max(fit)[0])
 
 
-def told(report: StepReport, figure: float, risks: set[str], verdict: str, tries: int) -> StepReport:
+def with_verdict(report: StepReport, figure: float, risks: set[str], verdict: str, tries: int) -> StepReport:
     """Return the report with the flag, the note and the number of tries of the controller."""
     if verdict == "good":
         return replace(report, tries=tries)

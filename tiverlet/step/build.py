@@ -147,7 +147,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     accelerations, walls = of(Acceleration), of(Collider)
     drivers = [f for f in of(Batch) if f.is_kinematic and f.count]
     batches = [f for f in of(Batch) if not f.is_kinematic and (scene.inv_mass[f.indices] > 0).any()]
-    contact = next((c for c in of(PairContact) if c.matters), None)
+    contact = next((c for c in of(PairContact) if c.can_touch), None)
     if contact or walls:
         scene.radius = Radii(memory, particles.radius, scene.count)
     surfaces = [*walls, *([contact] if contact else [])]

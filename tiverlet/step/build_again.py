@@ -19,7 +19,7 @@ from .build import assemble
 class Rebuild:
     """A rebuild of a world with its particles in the mask `some`, added particles and these features, see edit_scene.change().
 
-    came, went: added and removed features; features whose state begins anew are in both. extending: features by which others are
+    new_features, removed_features: features whose state begins anew are in both. extending: features by which others are
     extended. If building fails, the world is left as it was.
     """
 
@@ -28,13 +28,13 @@ class Rebuild:
         extend: Mapping[Feature, Feature],
     ):  # fmt: skip
         self.world, self.some, self.added, self.features, self.before = world, some, added, features, world.features
-        self.came = [f for f in features if f not in self.before or f.needs_new_state]
-        self.went = [f for f in self.before if f not in features or f.needs_new_state]
+        self.new_features = [f for f in features if f not in self.before or f.needs_new_state]
+        self.removed_features = [f for f in self.before if f not in features or f.needs_new_state]
         self.extending = {f: other.copy() for f, other in extend.items()}
         self.number = np.where(some, np.cumsum(some) - 1, -1)
         self.particles = world._particles.regrouped(some, added, world.position[some])
         known = {one: start.regrouped(some, added) for one, start in {id(f.start): f.start for f in self.before}.items()}
-        self.starts: list[Any] = [None if f in self.came else known[id(f.start)] for f in features]
+        self.starts: list[Any] = [None if f in self.new_features else known[id(f.start)] for f in features]
         # The state before, to carry over and to restore after a failure.
         self.checkpoint = checkpoint.keep(world)
         self.attributes = {f: dict(vars(f)) for f in {*self.before, *features}}
@@ -64,7 +64,7 @@ class Rebuild:
         """Store the state. If the forces on remaining particles will change, displacements become velocities first."""
         runner = self.world._runner
         runner.note_displacements()
-        if any(isinstance(f, Collider) for f in self.went):
+        if any(isinstance(f, Collider) for f in self.removed_features):
             self.world._restart_with_reactions()
         elif self.restarts:
             with runner.memory.compiler():
@@ -78,7 +78,11 @@ class Rebuild:
     def restarts(self) -> bool:
         """Whether forces will be others."""
         pulled = (self.added is not None or not self.some.all()) and self.world._runner.step.has_pair_forces  # by others
-        return pulled or self.world._has_new_force or any(map(self._drives, (*self.came, *self.went, *self.extending.values())))
+        return (
+            pulled
+            or self.world._has_new_force
+            or any(map(self._drives, (*self.new_features, *self.removed_features, *self.extending.values())))
+        )
 
     def _drives(self, feature: Feature) -> bool:
         """Whether adding or removing a feature changes the force on particles that remain."""
@@ -88,12 +92,12 @@ class Rebuild:
 
     def _take_apart(self) -> None:
         """Release features, and give them the new indices of their particles."""
-        self.masks = {f: tuple(mask & (f not in self.came) for mask in f.kept_mask(self.number)) for f in self.before}
+        self.masks = {f: tuple(mask & (f not in self.new_features) for mask in f.kept_mask(self.number)) for f in self.before}
         self.rests = {f: np.stack(f.ramp.now())[:, self.masks[f][0]] for f in self.features if f.ramp and f.ramp.has_pending}
         for f in self.before:
             f.release()
             f.remap_indices(self.number, len(self.particles))
-        for f in self.went:
+        for f in self.removed_features:
             f.compiled_so_far = frozenset()
 
     def _assembled(self) -> Any:
@@ -157,13 +161,13 @@ class Rebuild:
         if runner.integrator.decays:
             runner.set_substep(world._clock.h, drag)
         for f in self.features:
-            if f not in self.came:
+            if f not in self.new_features:
                 f.changed, f.moving = self.attributes[f].get("changed", True), self.attributes[f].get("moving", False)
                 f.new_force = self.attributes[f].get("new_force", False)
         for f, values in self.rests.items():
             if f.ramp:  # rest values continue to the assigned ones; those of added constraints begin at their own
                 f.ramp.put([np.append(rows, now[len(rows) :]) for rows, now in zip(values, f.ramp.now(), strict=True)])
-        if any(isinstance(f, PairContact) for f in self.came):
+        if any(isinstance(f, PairContact) for f in self.new_features):
             world._clock.first_moved = 0
 
     def _give_contacts(self, contact: PairContact) -> None:

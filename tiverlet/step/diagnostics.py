@@ -140,7 +140,7 @@ class Diagnostics:
         return change, moved
 
     @ti.func
-    def nothing(self):
+    def empty_figures(self):
         """Return the figures and the bounding box of nothing, from which sums begin."""
         zero, figures = ti.Vector.zero(ti.f64, self.dim), ti.Vector.zero(ti.f64, self.width)
         figures[5] = 2.0**31
@@ -153,7 +153,7 @@ class Diagnostics:
         Figures: energy, residual, overlap, stiffness, contacts, bad, kinetic energy; with pair forces also the two sums of
         pair_stiffness(). begin: 1 before the first substep. bare: 1 to leave out overlap, stiffness, contacts and the box.
         """
-        figures, low, high = self.nothing()
+        figures, low, high = self.empty_figures()
         scale, back = ti.cast(1, ti.f64), ti.cast(0, self.step.real)
         if begin == 0:
             scale, back = 1 / ti.cast(h, ti.f64), ti.cast(0.5, self.step.real)
@@ -246,7 +246,7 @@ class Diagnostics:
         for _ in range(self.team.one(1, thread)):
             for k in range(FIGURES):
                 sheet[k] = 0  # entries that no kernel writes would come back from a GPU with old values
-            total, low, high = self.nothing()
+            total, low, high = self.empty_figures()
             if ti.static(self.alone):
                 for b in range(filled):
                     part, lower, higher = self.block_of(b, h64, t64, state_origin)
@@ -279,7 +279,7 @@ class Diagnostics:
     @ti.func
     def fold(self, begin, step: ti.template(), count):  # type: ignore[valid-type]
         """Return the total of `count` parts, `step` apart, from `begin` on."""
-        total, low, high = self.nothing()
+        total, low, high = self.empty_figures()
         for b in range(count):
             at = begin + b * step
             total, low, high = self.with_part(total, low, high, self.parts[at], self.low[at], self.high[at])

@@ -171,7 +171,7 @@ def renew(world: Any) -> None:
         had = seen[loose]
     elif not clock.d_is_velocity:
         had = runner.memory.view(runner.scene.state.d)[loose] / clock.h
-    if grabbing.soft or not impulse.tells(runner):
+    if grabbing.soft or not impulse.has_enough_digits(runner):
         with runner.memory.compiler():
             runner.restart_between(world.iterations)
     clock.energy = None
@@ -196,9 +196,9 @@ def build_again(
     seen, loose, moved = _seen(world, some, again.number, features, again.restarts)
     again.run()
     walls = np.array([features.index(f) if f in features else -1 for f in before], dtype=np.int64)
-    new = [*(f for f in again.came if f not in before), *again.extending.values()]
+    new = [*(f for f in again.new_features if f not in before), *again.extending.values()]
     tied = _first_off(world, new)
-    _edited(world, some, added, told, seen, loose, moved, walls, bool(again.came or again.went or new), tied)
+    _edited(world, some, added, told, seen, loose, moved, walls, bool(again.new_features or again.removed_features or new), tied)
 
 
 def _first_off(world: Any, new: list[Feature]) -> int | None:
@@ -282,7 +282,7 @@ def _held(runner: Any, velocity: np.ndarray, moved: np.ndarray) -> np.ndarray:
 def _let_go(world: Any, seen: np.ndarray, loose: np.ndarray) -> None:
     """Let the particles in the mask `loose` continue with the velocities `seen`, (n, dim), that they had before the edit."""
     runner, some = world._runner, np.flatnonzero(loose)
-    if runner.clock.d_is_velocity or impulse.tells(runner):
+    if runner.clock.d_is_velocity or impulse.has_enough_digits(runner):
         impulse.let_go(runner, some, seen[some], world.iterations)
     elif len(some):
         world._start_from(seen)

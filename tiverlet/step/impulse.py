@@ -156,7 +156,7 @@ def pulled(runner: Any, worlds: int, read: Callable[[Any], np.ndarray]) -> np.nd
     return out
 
 
-def tells(runner: Any) -> bool:
+def has_enough_digits(runner: Any) -> bool:
     """Whether displacements determine velocities with enough digits, in a world of order 2."""
     return not runner.probe and (runner.clock.drag or FREE)[0] >= WEAK
 
@@ -170,7 +170,7 @@ def steer(
     whether displacements were found that give the new velocities; if not, the caller must take a start.
     """
     some, clock, drag = (change != 0).any(axis=1), runner.clock, np.array([runner.clock.drag or FREE])
-    if clock.d_is_velocity or not tells(runner):
+    if clock.d_is_velocity or not has_enough_digits(runner):
         return False
     first, end, chosen = _movable(runner, some)
     if first < end:
@@ -245,7 +245,7 @@ def give_new(runner: Any, first: int, want: np.ndarray, iterations: int) -> None
 
     def velocity() -> np.ndarray:
         """Return the velocities of the present displacements."""
-        return runner.velocity(iterations, first, came=True)[None]
+        return runner.velocity(iterations, first, just_added=True)[None]
 
     with runner.memory.compiler():  # for orders above 2
         if any(f.may_act_from(first) for f in runner.integrator.forces.velocity_dependent):

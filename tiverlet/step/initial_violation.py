@@ -132,7 +132,7 @@ def remove(
     far, _ = _violation(rows, body, bodies)
     going = far > ENOUGH
     if any(memory.read(b.dev.equation.lam).any() for b in rigid):
-        rows = rows.towards(_borne(scene, rigid, x, going[body], min(1.0, ratio**2)))
+        rows = rows.with_goal(_borne(scene, rigid, x, going[body], min(1.0, ratio**2)))
     going = (np.bincount(body[placed:], minlength=bodies) > 0) & _open(rows, body, bodies)
     if not going.any():
         return None
@@ -297,7 +297,7 @@ def _within(move: np.ndarray, rows: "Rows", body: np.ndarray, bodies: int) -> np
     np.maximum.at(longest, body, np.linalg.norm(move, axis=1))
     size = np.linalg.norm(np.where(high >= low, high - low, 0.0), axis=1)
     out = np.minimum(1.0, np.divide(size, longest, out=np.ones(bodies), where=longest > 0))
-    legs = rows.legs
+    legs = rows.leg_corners
     i, j = rows.who[legs], rows.who[legs + 1]
     change = np.linalg.norm(move[j] - move[i], axis=1)
     leg = np.linalg.norm(between(rows.x[j], rows.x[i], rows.batches[0].periodic), axis=1)
@@ -362,7 +362,7 @@ class Rows:
         """Return the rows that act at positions x."""
         return Rows(self.batches, x, self.w, self.rounding, self.borne, self.sizes, self.weights)
 
-    def towards(self, borne: list[np.ndarray]) -> "Rows":
+    def with_goal(self, borne: list[np.ndarray]) -> "Rows":
         """Return these rows with the violations `borne`, which bear loads, as their goal."""
         return Rows(self.batches, self.x, self.w, self.rounding, borne, self.sizes, self.weights)
 
@@ -377,7 +377,7 @@ class Rows:
         return np.abs(self.C) * self.close > MET + self.rounding * X * slope * self.close
 
     @property
-    def legs(self) -> np.ndarray:
+    def leg_corners(self) -> np.ndarray:
         """The corners of angles from which a leg leads to the next corner."""
         angles = [b.quantity.curved and not b.quantity.collapses for b in self.batches]
         angle = np.repeat(angles, [some.sum() for some in self.corners])

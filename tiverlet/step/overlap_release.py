@@ -23,7 +23,7 @@ from .contact_rows import stored_by
 from .free_bodies import FreeBodies
 from .jacobian import Jacobian
 from .one_sided import Walls, moved, one_sided
-from .projection import Rows, given_back, matters, paid, seen, seen_before
+from .projection import Rows, given_back, seen, seen_before, take_energy, would_vibrate
 from .rails import tethered
 from .rigid_rows import rigid_rows
 from .solids import Solids
@@ -47,12 +47,12 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
     if not (contact or solids.count):
         return False
     energy, overlap = seen_before(runner)
-    if not small and not matters(max(overlap, solids.worst), ratio):
+    if not small and not would_vibrate(max(overlap, solids.worst), ratio):
         return False
     pairs: Candidates = DiscCandidates(np.zeros((0, 2), dtype=np.int64), np.zeros(0), None)
     if contact:
         runner.invalidate()  # so that the result does not depend on when pairs were listed last
-        runner.look()
+        runner.diagnose_state()
         pairs = contact.dev.geometry.candidates(x)
     jacobian = part(runner, pairs, solids, x, ratio)
     if jacobian:
@@ -64,7 +64,7 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
         memory.write(state.d, v)
         due = seen(runner)[0] - energy - given_back(runner, energy, spun)
         if due > 0:
-            v[: len(x)] = paid(jacobian, v[: len(x)], bodies.unturned(now - x), due)
+            v[: len(x)] = take_energy(jacobian, v[: len(x)], bodies.unturned(now - x), due)
             memory.write(state.d, v)
     return True
 
@@ -131,4 +131,4 @@ def bound(runner: Any, x: np.ndarray, ratio: float) -> Rows | None:
     if not some:
         return None
     rows = Rows(some, w, x, runner.scene.periodic)
-    return rows.towards(rows.C - (1 - ratio**2) * rows.undone(runner))
+    return rows.with_goal(rows.C - (1 - ratio**2) * rows.undone(runner))

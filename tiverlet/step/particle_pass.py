@@ -140,7 +140,7 @@ class ParticlePass:
                 for i in range(first, end):
                     weights.store_weight(i, now)
         if ti.static(self.knows_loads and len(self.walls) > 0):
-            self.look_ahead(first, end, now)
+            self.leave_walls_early(first, end, now)
         for c in ti.static(self.contacts):
             stale, fast = 0, 0
             for i in range(first, end):
@@ -152,18 +152,18 @@ class ParticlePass:
             c.note_motion(stale, fast)
 
     @ti.func
-    def look_ahead(self, begin, end, now):
+    def leave_walls_early(self, begin, end, now):
         """If contacts have known loads: before contacts are solved, move particles in contact to where walls will leave them."""
         for c in ti.static(self.contacts):
             for b in range(blocks(begin, end)):
                 low, high = block(b, begin, end)
                 near = self.near_walls(low, high)
                 for i in range(low, high):
-                    lean = ti.zero(self.state.x[i])
+                    wall_move = ti.zero(self.state.x[i])
                     if near != 0:
                         if self.state.moves(i) and c.dev.splitting.weight[i] > 0:
-                            lean = self.leave_walls(i, now)
-                    c.dev.known.lean[i] = lean
+                            wall_move = self.leave_walls(i, now)
+                    c.dev.known.wall_move[i] = wall_move
 
     @ti.func
     def leave_walls(self, i, now):
@@ -178,13 +178,13 @@ class ParticlePass:
         return self.state.d[i] - d
 
     @ti.func
-    def look_back(self, begin, end):
-        """Undo look_ahead(): move particles back to where they were."""
+    def undo_wall_moves(self, begin, end):
+        """Undo leave_walls_early(): move particles back to where they were."""
         for c in ti.static(self.contacts):
             for i in range(begin, end):
-                lean = c.dev.known.lean[i]
-                if (lean != 0).any():
-                    self.state.shift(i, -lean)
+                wall_move = c.dev.known.wall_move[i]
+                if (wall_move != 0).any():
+                    self.state.shift(i, -wall_move)
 
     @ti.func
     def apply_constraints(self, now):
@@ -225,7 +225,7 @@ class ParticlePass:
                 self.gather(i, 0)
         if ti.static(self.knows_loads and len(self.walls) > 0):
             if now.first != 0:
-                self.look_back(begin, end)
+                self.undo_wall_moves(begin, end)
         for c in ti.static(self.contacts):
             if now.it < now.span.iterations:  # further passes have no contacts, see BodyImpacts
                 for b in range(blocks(begin, end)):

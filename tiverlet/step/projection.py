@@ -97,10 +97,10 @@ def project(
         return True
     batches: list[Any] = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
     stays = left_out(runner.batches, w, x)
-    if matters(stays, ratio):
+    if would_vibrate(stays, ratio):
         runner.released = stays
     if slots and slots.system and not slots.system.steps and not runner.clock.softened:  # it holds loads without a violation
-        batches = [b for b in batches if ((slots.rows(b) < 0) & ~b.immovable(w)).any() or matters(_off(b, x), ratio)]
+        batches = [b for b in batches if ((slots.rows(b) < 0) & ~b.immovable(w)).any() or would_vibrate(_off(b, x), ratio)]
     batches += rigid_rows(runner.batches, w, every=contacts is not None)
     if not batches:
         return True
@@ -109,9 +109,9 @@ def project(
     start = Rows(batches, w, x, runner.scene.periodic, rails)
     undone = start.undone(runner)
     frail = start.would_break(undone, h, longest)
-    if not frail and not matters(float(np.abs(undone * start.close).max(initial=0.0)), ratio):
+    if not frail and not would_vibrate(float(np.abs(undone * start.close).max(initial=0.0)), ratio):
         return ratio < FAR
-    rows = start = start.towards(start.C - (1 - ratio**2) * undone)
+    rows = start = start.with_goal(start.C - (1 - ratio**2) * undone)
     kept = memory.read(state.d)
     v = kept.astype(np.float64)
     n = len(x)
@@ -143,7 +143,7 @@ def project(
     due = more - energy - given_back(runner, energy, spun)
     if due > 0:
         moves = bodies.unturned(x - before)
-        v[:n] = paid(start.jacobian, v[:n], moves, due, rows.wall.any(axis=1), None if contacts else bodies)
+        v[:n] = take_energy(start.jacobian, v[:n], moves, due, rows.wall.any(axis=1), None if contacts else bodies)
         memory.write(state.d, v)
     return True
 
@@ -238,7 +238,7 @@ def _newton(rows: "Rows", enough: float, aims: Aims) -> np.ndarray:
     return rows.x
 
 
-def matters(violation: float, ratio: float) -> bool:
+def would_vibrate(violation: float, ratio: float) -> bool:
     """Whether a violation, as a share of its size, would leave so much vibration that it must be removed. ratio: h' / h."""
     return violation * (1 - ratio**2) ** 2 > ENOUGH * ratio**2
 
@@ -262,7 +262,7 @@ def _pace(runner: Any, batch: Any, x: np.ndarray, h: float, dt: float) -> np.nda
 
 def seen(runner: Any) -> tuple[float, float]:
     """Return the energy [J], and the overlap of the worst contact, in radii."""
-    runner.look()
+    runner.diagnose_state()
     report = runner.report()
     return report.energy, report.overlap
 
@@ -420,7 +420,7 @@ class Rows:
         new._measure(x)
         return new
 
-    def towards(self, goal: np.ndarray) -> "Rows":
+    def with_goal(self, goal: np.ndarray) -> "Rows":
         """Return these rows with C measured from `goal`, (m,)."""
         new = copy.copy(self)
         new.goal = goal
@@ -432,7 +432,7 @@ class Rows:
         """Return rows with the same links and goals, and with other contacts, the last of `batches`, whose goal is 0."""
         new = Rows(batches, self.w, self.x, self.box, self.rails)
         new.undone(runner)  # sets theta and weight
-        return new.towards(np.concatenate([self.goal[~self.touches], np.zeros(int(new.touches.sum()))]))
+        return new.with_goal(np.concatenate([self.goal[~self.touches], np.zeros(int(new.touches.sum()))]))
 
     def undone(self, runner: Any) -> np.ndarray:
         """Return Z = theta C_(n+1) + (1 - theta) C_n + damping dC/dt + alpha lam / h^2, to second order, (m,).
@@ -528,7 +528,7 @@ def given_back(runner: Any, energy: float, spun: float) -> float:
     return spun if bound is None or bound == CHANGED else min(spun, max(bound - energy, 0.0))
 
 
-def paid(
+def take_energy(
     jacobian: Jacobian, v: np.ndarray, moves: np.ndarray, energy: float, walls: Any = False, bodies: FreeBodies | None = None
 ) -> np.ndarray:
     """Return velocities from which the energy [J] that moves added is taken, (n, dim).

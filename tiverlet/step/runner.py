@@ -113,7 +113,7 @@ class Runner:
             clock, placed = self.clock, self.clock.first_moved is not None
             if clock.energy is None:
                 clock.forget_bound()
-                self.look(bare=not placed)
+                self.diagnose_state(bare=not placed)
                 if self.sleep:
                     with self.memory.compiler():
                         self.sleep.compile(clock)
@@ -125,7 +125,7 @@ class Runner:
                     if not clock.tick:
                         extent = self._data[EXTENT : EXTENT + self.step.dim]
                         clock.begin_with(report.energy, slack(self.scene.inv_mass, extent, clock.h))
-                    self.looked(report.energy, report.overlap)
+                    self.set_initial_figures(report.energy, report.overlap)
                 else:
                     clock.energy = float(self._data[0])
             self.placed()
@@ -178,12 +178,12 @@ class Runner:
             self.set_substep(h, drag)
         return True
 
-    def looked(self, energy: float, overlap: float) -> None:
+    def set_initial_figures(self, energy: float, overlap: float) -> None:
         """The second half of begin(), with the energy [J] and the overlap of the initial state of the frame."""
         self.clock.energy, self.clock.parting = energy, overlap > 0
         if overlap > 0 and self.clock.first_moved is not None:
             with self.memory.compiler():
-                self.ease(self.clock.first_moved)
+                self.shrink_overlapping(self.clock.first_moved)
 
     def placed(self) -> None:
         """The end of begin(): particles that were placed have been dealt with."""
@@ -194,7 +194,7 @@ class Runner:
 
     def advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
         """Run one frame, after begin()."""
-        self.set_out()
+        self.start_ramps()
         for semi_iteration in self.semi_iterations:
             with self.memory.compiler():
                 semi_iteration.prepare(iterations)
@@ -227,7 +227,7 @@ class Runner:
             for b in self.ramping:
                 b.ramp.jump_to_goals(np.bincount(b.owner, tied[b.indices.ravel()], minlength=b.count) > 0)
 
-    def set_out(self) -> None:
+    def start_ramps(self) -> None:
         """Start the ramps of assigned rest values, which they reach during the coming frame."""
         if self.ramping:
             new = [b.ramp.memory for b in self.ramping if b.ramp.start_moving()]
@@ -236,7 +236,7 @@ class Runner:
                 self.ramps, self.structure = [*self.ramps, *new], None
                 self.renew()
 
-    def arrive(self) -> None:
+    def end_ramps(self) -> None:
         """End the ramps of rest values, after a frame that will not be repeated."""
         for b in self.ramping:
             b.ramp.finish()
@@ -342,14 +342,14 @@ class Runner:
         iterations: int,
         first: int = 0,
         end: int | None = None,
-        came: bool = False,
+        just_added: bool = False,
         links: bool = True,
         touches: bool = True,
     ) -> np.ndarray:
         """Velocities as the user sees them, to the order of the world, of particles `first` to `end` - 1, (end - first, dim).
 
-        came: whether these were just added, and touch nothing yet. links: whether reactions of rigid constraints count. touches:
-        whether reactions of contacts and walls count.
+        just_added: whether these were just added, and touch nothing yet. links: whether reactions of rigid constraints count.
+        touches: whether reactions of contacts and walls count.
         """
         clock = self.clock
         if clock.d_is_velocity:
@@ -357,7 +357,7 @@ class Runner:
         elif self.probe:
             out = high_order.velocity(self.probe, clock, self.memory, iterations)
         else:
-            if not came:
+            if not just_added:
                 self._list_again()
             out = self._velocities(first, end, links, touches)
             for path in self.paths if len(out) == self.n else ():
@@ -494,7 +494,7 @@ class Runner:
         if self.interruptible:
             deferred_signals.raise_pending()
 
-    def look(self, bare: bool = False) -> None:
+    def diagnose_state(self, bare: bool = False) -> None:
         """Diagnose a state that no frame has diagnosed. bare: compute only its energy, in a third of the time."""
         clock = self.clock
         origin = UNSTEPPED if clock.d_is_velocity else STARTED if clock.started else STEPPED
@@ -504,7 +504,7 @@ class Runner:
         """Build the lists, growing them until everything fits."""
         if not self.launched:
             self.invalidate()
-            self.look()  # its kernel is compiled anyway, and builds lists
+            self.diagnose_state()  # its kernel is compiled anyway, and builds lists
             return
         with self.memory.compiler():
             for k, search in enumerate(self.step.searches):
@@ -526,7 +526,7 @@ class Runner:
             else:
                 self.memory.write_some(search.list.stale, 1, some)
 
-    def ease(self, first: int) -> None:
+    def shrink_overlapping(self, first: int) -> None:
         """Let particles from number `first` on that the user placed into others part gently."""
         contact = self.step.contacts[0]
         if not contact.shrinks:

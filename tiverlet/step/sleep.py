@@ -289,7 +289,7 @@ class SleepPass:
         still, most = self.sleepers.still[i] + ti.cast(dt, self.real), self.sleepers.limits[None][0] * ti.cast(h, self.real)
         slow = way < most * most and self.kept_awake[i] == 0
         for c in ti.static(self.contacts):
-            slow = slow and not c.dev.geometry.is_eased(i)
+            slow = slow and not c.dev.geometry.is_shrunk(i)
         self.sleepers.still[i] = ti.select(slow, still, 0 * still)
 
     @ti.func
@@ -320,9 +320,9 @@ class SleepPass:
                 for i in range(self.n):
                     if self.drifts(i):
                         for e in range(c.dev.list.first[i], c.dev.list.first[i] + c.dev.list.number[i]):
-                            j = c.held_by(c.dev.list.neighbour[e])
+                            j = c.pressed_particle(c.dev.list.neighbour[e])
                             if self.drifts(j) and self.sleepers.root(i) != self.sleepers.root(j):
-                                if c.presses(i, e):
+                                if c.is_pressed(i, e):
                                     self.sleepers.join(i, j)
             for k in range(self.links):
                 i, j = self.pairs[k][0], self.pairs[k][1]
@@ -360,7 +360,7 @@ class SleepPass:
             self.sleepers.blocks[b] = stirs
 
     @ti.func
-    def look(self, i, before):
+    def call_touched(self, i, before):
         """Call the sleeping islands that particle i touches; if it is driven, also those that it touched at the substep's start.
 
         before: 1 if constraints are solved before contacts in this pass. Then also call islands that the particle would touch if
@@ -371,7 +371,7 @@ class SleepPass:
         for c in ti.static(self.contacts):
             if drifts or (self.sleepers.awake(i) and d.dot(d) > 0):
                 for e in range(c.dev.list.first[i], c.dev.list.first[i] + c.dev.list.number[i]):
-                    j = c.reached(i, e, margin)
+                    j = c.touched_sleeper(i, e, margin)
                     if j >= 0:
                         self.call(j)
 

@@ -379,7 +379,7 @@ class Step:
                 self.team.wait()
         n = ti.select(self.sleepers.count[None] > 0, self.n, 0)
         for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
-            self.sleep.look(i, self.halves - 1 - now.half % self.halves)
+            self.sleep.call_touched(i, self.halves - 1 - now.half % self.halves)
         self.team.wait()
 
     @ti.func

@@ -232,7 +232,7 @@ class Worlds:
             clocks.parting[unknown] = np.where(placed, overlap > 0, clocks.parting[unknown])
             for k in unknown[(overlap > 0) & placed]:
                 with self._as_world(k), runner.memory.compiler():
-                    runner.ease(int(clocks.first_moved[k]))
+                    runner.shrink_overlapping(int(clocks.first_moved[k]))
         for contact in runner.step.contacts:
             runner.memory.write_some(contact.dev.fast, 1, np.flatnonzero(jumped))
         clocks.first_moved[some], clocks.needs_drag[some] = NONE, False
@@ -282,7 +282,7 @@ class Worlds:
     ) -> WorldsReport:  # fmt: skip
         """Launch frames, again for worlds that waited for a longer list. before: frames already on the track."""
         world, runner, clocks = self._world, self._runner, self._clocks
-        runner.set_out()
+        runner.start_ramps()
         substeps, iterations, stages = world.substeps, world.iterations, runner.integrator.stages
         with runner.memory.compiler():
             for semi_iteration in runner.semi_iterations:
@@ -305,7 +305,7 @@ class Worlds:
         flat = np.zeros(1) if track is None else track.reshape(-1)
         self._launch_worlds(plan, np.arange(len(self)), sheets, dates, figures, flat)
         energy = np.where(clocks.known, clocks.energy, np.nan)
-        runner.arrive()
+        runner.end_ramps()
         clocks.advance(substeps, frames, started)
         with np.errstate(all="ignore"):  # energies may be infinite, which flags report
             self._last = self._report(figures, energy, moved, released, perf_counter() - begun)
