@@ -32,6 +32,8 @@ def restore(runner: Any, placed: int) -> tuple[np.ndarray, float] | None:
     was removed, relative to the size of its cluster or constraint; None if nothing moved.
     """
     scene, w = runner.scene, runner.scene.inv_mass
+    if not any(b.clusters for b in runner.batches):
+        return None
     solids = Solids.rigid(runner.batches, w, placed)
     x = scene.state.get(runner.memory)
     if not solids.count or not np.isfinite(x).all():
