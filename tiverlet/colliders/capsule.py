@@ -7,7 +7,7 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..geometry.intervals import capsule, entry, rounding
-from ..geometry.nearest import nearest_on_segment, surface_normal
+from ..geometry.nearest import closest_segment_point, surface_normal
 from ..particles import Particles
 from .collider import Collider
 from .round_mesh import rounded
@@ -81,7 +81,7 @@ class Capsule(Collider):
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """Return the distance to the axis, less the radius."""
         a, b = self._ends
-        return np.linalg.norm(points - nearest_on_segment(points, a[None], b[None])[0], axis=1) - self.radius
+        return np.linalg.norm(points - closest_segment_point(points, a[None], b[None])[0], axis=1) - self.radius
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the distances into the rod, and the normals there."""
@@ -89,7 +89,7 @@ class Capsule(Collider):
         close = rounding(origin, a, b)
         distance = entry(capsule(origin, direction, a, b, self.radius + radius), close)
         x = origin + np.where(distance < np.inf, distance, np.nan)[:, None] * direction
-        return distance, surface_normal(x, nearest_on_segment(x, a, b)[0], direction, b - a, close)
+        return distance, surface_normal(x, closest_segment_point(x, a, b)[0], direction, b - a, close)
 
     @property
     def _ends(self) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..geometry.bounding_tree import BoundingTree, distance_bound, ray_entry_bound, ray_exit_bound
 from ..geometry.intervals import ROUNDING, dot, entry, rounded, rounding, triangle
-from ..geometry.nearest import nearest_on_facet, surface_normal
+from ..geometry.nearest import closest_facet_point, surface_normal
 
 if TYPE_CHECKING:
     from .facets import Facets
@@ -32,12 +32,12 @@ class FacetSolid:
 
         def distance(q: np.ndarray, f: np.ndarray) -> np.ndarray:
             """Return the distances of points q[i] to facets f[i]."""
-            r = points[q] - nearest_on_facet(points[q], corners[f])[0]
+            r = points[q] - closest_facet_point(points[q], corners[f])[0]
             return np.sqrt(dot(r, r))
 
         length, f = self._tree.find_least(len(points), np.full(len(points), np.inf), distance_bound(points), distance)
         if self._facets.closed and len(points):
-            at, part = nearest_on_facet(points, corners[f])
+            at, part = closest_facet_point(points, corners[f])
             facing = np.where((part < 0)[:, None], self._normals[f], self._facets.facing[self._facets.features[f, part]])
             length = np.where(dot(points - at, facing) < 0, -length, length)
         return length
@@ -56,7 +56,7 @@ class FacetSolid:
             normal[met] = np.where((dot(n, d) > 0)[:, None], -n, n)
         else:
             x = origin[met] + distance[met, None] * d
-            normal[met] = surface_normal(x, nearest_on_facet(x, corners)[0], d, np.zeros_like(d), np.zeros(len(d)))
+            normal[met] = surface_normal(x, closest_facet_point(x, corners)[0], d, np.zeros_like(d), np.zeros(len(d)))
         return distance, normal
 
     def _bare(self, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,7 @@ import numpy as np
 from .intervals import dot
 
 
-def nearest_on_segment(x: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def closest_segment_point(x: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the point of the segment from a to b nearest to x, (m, dim) [m], and its parameter, (m,), 0 at a and 1 at b."""
     axis = b - a
     square = dot(axis, axis)
@@ -13,14 +13,14 @@ def nearest_on_segment(x: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.
     return np.where((t == 1)[:, None], b, a + t[:, None] * axis), t
 
 
-def nearest_on_facet(x: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def closest_facet_point(x: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the point of a facet, corners (m, dim, dim), nearest to x, (m, dim) [m], and the part of the facet, (m,).
 
     Parts: corners are 0, 1 (and 2 in 3D); the edges 01, 12, 20 in 3D are 3, 4, 5; the inside is -1.
     """
     dim = x.shape[1]
     if dim == 2:
-        point, t = nearest_on_segment(x, corners[:, 0], corners[:, 1])
+        point, t = closest_segment_point(x, corners[:, 0], corners[:, 1])
         return point, np.where(t == 0, 0, np.where(t == 1, 1, -1))
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     over = np.ones(len(x), dtype=bool)
@@ -28,7 +28,7 @@ def nearest_on_facet(x: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np
     for k in range(3):
         a, b = corners[:, k], corners[:, (k + 1) % 3]
         over &= dot(np.cross(normal, b - a), x - a) > 0
-        p, t = nearest_on_segment(x, a, b)
+        p, t = closest_segment_point(x, a, b)
         square = dot(x - p, x - p)
         nearer = square < best
         best, point = np.where(nearer, square, best), np.where(nearer[:, None], p, point)

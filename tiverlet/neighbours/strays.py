@@ -95,7 +95,7 @@ class Strays:
         near = self.search.table.reach(self.search.radius, i, j) + ti.static(1 - 2 * STALE) * ti.cast(self.search.skin, self.real)
         r, out = self.state.apart(i, j), 0
         if r.dot(r) < near * near:
-            out = self.search.belongs_on_list(i, j, r)
+            out = self.search.is_list_member(i, j, r)
             for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
                 if self.list.neighbour[e] == j:
                     out = 0

@@ -42,7 +42,7 @@ def scratch() -> tempfile.TemporaryDirectory:
 
 
 @contextlib.contextmanager
-def _exit_on_signals() -> Iterator[None]:
+def _install_exit_signals() -> Iterator[None]:
     """Within this context, SIGTERM or a closing terminal raises SystemExit, so that processes started in it are ended, too."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -80,7 +80,7 @@ def stop(process: subprocess.Popen) -> None:
 
 def show(path: str) -> int:
     """Open the viewer's window and wait until it is closed. Returns its exit status."""
-    with _exit_on_signals(), scratch() as folder:
+    with _install_exit_signals(), scratch() as folder:
         return _wait(launch(folder, "--port", str(free_port()), path))
 
 
@@ -91,7 +91,7 @@ def serve(path: str, port: int) -> int:
     blocks all hosts but this machine.
     """
     data, page = free_port(), free_port()
-    with _exit_on_signals(), scratch() as folder, Pages((LOCAL, port), page, data) as pages:
+    with _install_exit_signals(), scratch() as folder, Pages((LOCAL, port), page, data) as pages:
         process = launch(folder, "--serve-web", "--port", str(data), "--web-viewer-port", str(page), path)
         threading.Thread(target=pages.serve_forever, daemon=True).start()
         print(f"{url_of(port, data)}   (Ctrl-C ends it)", flush=True)
@@ -166,7 +166,7 @@ def picture(path: str, png: str, frames: list[int] | None = None, scene: bool = 
     if missing := [name for name in out if not os.path.isdir(os.path.dirname(name))]:
         raise ValueError(f"The folder of {missing[0]} does not exist.")
     port = free_port()
-    with _exit_on_signals(), tempfile.TemporaryFile() as said, scratch() as folder:
+    with _install_exit_signals(), tempfile.TemporaryFile() as said, scratch() as folder:
         words = ("--headless", "--hide-welcome-screen", "--port", str(port), os.path.abspath(path))
         process = launch(folder, *words, stdout=said, stderr=said)
         try:

@@ -11,7 +11,7 @@ from ...colliders.collider import Collider
 from ...features.feature import Feature
 from ...geometry.bounding_tree import BoundingTree, ray_entry_bound
 from ...geometry.intervals import ball, capsule, entry, rounding
-from ...geometry.nearest import nearest_on_segment, surface_normal
+from ...geometry.nearest import closest_segment_point, surface_normal
 from ...neighbours.queries import between
 from ...particles import in_range
 
@@ -119,7 +119,7 @@ class Rods:
     def normal(self, point: np.ndarray, direction: np.ndarray, which: np.ndarray) -> np.ndarray:
         """Return unit normals (k, dim) at points (k, dim) on the surface of rods, met by rays in these directions."""
         a, b = self._a[which], self._b[which]
-        return surface_normal(point, nearest_on_segment(point, a, b)[0], direction, b - a, rounding(point, a, b))
+        return surface_normal(point, closest_segment_point(point, a, b)[0], direction, b - a, rounding(point, a, b))
 
 
 def _rays(origin: Any, direction: Any, dim: int) -> tuple[bool, np.ndarray, np.ndarray]:

@@ -206,7 +206,7 @@ class Silo:
         return World(start, [Gravity(G), Contact(friction=grip, loads=self.loads), *walls, ground], substeps=SUBSTEPS), walls
 
 
-def load_on_pinned(world: World) -> float:
+def pinned_load(world: World) -> float:
     """Return the downward force of grains on pinned particles, along contact normals [N]."""
     found, pinned = world.contacts, world.particles.pinned
     i, j = found.pairs.T
@@ -232,7 +232,7 @@ def janssen(
             for wall in walls:
                 wall.position = (0.0, rise * (frame + 1) * FRAME)
             world.step(FRAME)
-            loads.append(load_on_pinned(world))
+            loads.append(pinned_load(world))
         p = world.particles
         free = ~p.pinned
         # The height that the column has at the packing fraction of its lower nine tenths.
