@@ -187,8 +187,10 @@ class World:
             watcher.broken_off()
 
     def _find_stiffened(self) -> None:
-        """Before knobs are uploaded: what was a spring and is to be rigid is met as where its particles are placed, by these and
-        all after them. It has to be known before a state is kept, or copied, which has what was uploaded since."""
+        """Treat the particles of springs that become rigid as placed anew, so that the next step first restores their shape.
+
+        Call it before knobs are uploaded, or the state is copied: it compares the knobs with those on the device.
+        """
         waiting, clock = [f for f in self._features if f.changed and isinstance(f, Batch) and f.soft], self._clock
         first = initial_violation.first_stiffened(waiting, self.position) if waiting else None
         if first is not None:

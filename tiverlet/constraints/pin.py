@@ -61,9 +61,7 @@ class Target(Place):
             source, target = ti.cast(self.source[c], ti.f64), ti.cast(self.target[c], ti.f64)
             self.state.bring(i, source + (target - source) * frame_fraction)
         else:
-            d = self.aim(c, frame_fraction) - self.state.place(i)
-            self.state.d[i] = d
-            self.state.advance(i, d)
+            self.state.bring(i, self.aim(c, frame_fraction))
 
     @ti.func
     def offsets(self, c, frame_fraction, first, fresh):

@@ -31,8 +31,7 @@ class Restitution:
         self.geometry, self.list, self.table, self.state = geometry, geometry.list, table, scene.state
         self.struck, self.slack, self.impulse, self.events = struck, slack, impulse, events
         self.has_events = events is not None
-        self.strikes_bodies = False  # whether bodies of linked particles bounce as wholes
-        self.impacts: Any = None  # the BodyImpacts, if they do
+        self.impacts: Any = None  # a BodyImpacts, where bodies of linked particles bounce as wholes
         self.weight = add("Contact.struck", n)  # the split mass of the first pass, 0 without contact
         self.d_change = add("Contact.d_change", n, width=dim)
         self.lift = add("Contact.lift", n, width=dim)  # moves the position only
@@ -44,7 +43,7 @@ class Restitution:
     def bind(self, scene: Scene, impacts: Any) -> None:
         """Leave impacts of linked particles to the extra passes of a BodyImpacts."""
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
-        self.strikes_bodies, self.impacts = True, impacts
+        self.impacts = impacts
         self.normal, self.target_of = add("Contact.normal", n, width=dim), add("Contact.target", n)
 
     @ti.func
@@ -70,9 +69,7 @@ class Restitution:
             if last == 0:
                 slack = ti.max(slack, overlap - ti.max(here, 0))
             # First pass only: later passes include pushes of other pairs.
-            slow = ti.static(SLOW) * (here - a)
-            if e == 1:
-                slow *= ti.static(ELASTIC / SLOW)
+            slow = ti.select(e < 1, ti.static(SLOW) * (here - a), ti.static(ELASTIC) * (here - a))
             if first != 0 and a <= slow:
                 deep = ti.max(deep, given)
             if a > 0:
@@ -110,7 +107,7 @@ class Restitution:
     def choose(self, i):
         """Choose the earliest struck pair of particle i that still approaches, and store its impact on i."""
         first, partner, most, w = -1, -1, 0 * self.weight[i], self.state.w.of(i)
-        if ti.static(self.strikes_bodies):
+        if ti.static(bool(self.impacts)):
             self.impacts.begin_round(i)
         if self.weight[i] > 0:
             for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
@@ -123,7 +120,7 @@ class Restitution:
                         if left > most or (left == most and earlier(i, j, partner)):
                             first, partner, most = e, j, left
                             self.d_change[i] = w / (w + self.state.w.of(j)) * given * n
-                            if ti.static(self.strikes_bodies):
+                            if ti.static(bool(self.impacts)):
                                 self.set_target(i, j, n, given)
                             if self.hit[None] == 0:
                                 self.hit[None] = 1
@@ -137,7 +134,7 @@ class Restitution:
         j = self.partner[i]
         if j >= 0:
             meets = self.partner[j] == i or self.state.w.of(j) == 0
-            if ti.static(self.strikes_bodies):
+            if ti.static(bool(self.impacts)):
                 if meets:
                     meets = not self.impacts.record_pair_impact(i, j, self.normal[i], self.target_of[i])
             if meets:
@@ -155,7 +152,7 @@ class Restitution:
     def is_deferred(self, i, j):
         """Whether extra passes make the impact of particles i and j, see BodyImpacts."""
         out = False
-        if ti.static(self.strikes_bodies):
+        if ti.static(bool(self.impacts)):
             out = self.impacts.has_struck(i, j)
         return out
 

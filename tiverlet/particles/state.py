@@ -226,10 +226,15 @@ class State:
 
     @ti.func
     def bring(self, i, place):
-        """Particle i goes to a place in f64, where positions are sums."""
-        self.d[i] = ti.cast(place - ti.cast(self.x[i], ti.f64) - ti.cast(self.low[i], ti.f64), self.real)
-        self.x[i] = ti.cast(place, self.real)
-        self.low[i] = ti.cast(place - ti.cast(self.x[i], ti.f64), self.real)
+        """Move particle i to `place`, in f64 where positions are sums; d_i is the way there."""
+        if ti.static(self.sums):
+            self.d[i] = ti.cast(place - ti.cast(self.x[i], ti.f64) - ti.cast(self.low[i], ti.f64), self.real)
+            self.x[i] = ti.cast(place, self.real)
+            self.low[i] = ti.cast(place - ti.cast(self.x[i], ti.f64), self.real)
+        else:
+            d = place - self.place(i)
+            self.d[i] = d
+            self.advance(i, d)
 
     @ti.func
     def shift(self, i, move):

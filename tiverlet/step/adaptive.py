@@ -219,13 +219,14 @@ def vibration_error(world: "World", x: np.ndarray, d: np.ndarray) -> float:
     that its speed would reach, |f - f_0| / (omega h), where f is its length now and f_0 before the substep. A spring stiffer than
     the substep, from omega h = 2 on, does not vibrate, and is right to |f - f_0|.
     """
-    runner, h, worst = world._runner, world._clock.h, 0.0
+    runner, h, worst, split = world._runner, world._clock.h, 0.0, None
     for b in runner.batches:
         if not (isinstance(b, Scalar) and b.arity and h):
             continue
         some = (b.compliance > 0) & ~b.broken
         if some.any():
-            squares, split = (b.gradients(x) ** 2).sum(axis=2), runner.memory.read(runner.scene.slots.split)[: len(x)]
+            split = runner.memory.read(runner.scene.slots.split)[: len(x)] if split is None else split
+            squares = (b.gradients(x) ** 2).sum(axis=2)
             w, shared = ((each[b.indices] * squares).sum(axis=1) for each in (runner.scene.inv_mass, split))
             some &= w > 0
             now, before = (b.violation(each) for each in (x, x - d))

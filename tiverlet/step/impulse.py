@@ -27,7 +27,7 @@ DIGITS = 4  # rounding errors of the largest velocity, at which the iteration en
 Write = Callable[[Any, np.ndarray], None]
 
 
-def factor(h: np.ndarray, drag: np.ndarray) -> np.ndarray:
+def factor(h: Any, drag: np.ndarray) -> np.ndarray:
     """Return the change of displacement per change of velocity [s], after a substep h [s], for worlds with `drag`, (worlds, 5).
 
     Where drag leaves almost nothing of a velocity in a substep, d does not matter, and the factor is bounded.
@@ -249,7 +249,7 @@ def give_new(runner: Any, first: int, want: np.ndarray, iterations: int) -> None
 
     with runner.memory.compiler():  # for orders above 2
         if any(f.may_act_from(first) for f in runner.integrator.forces.velocity_dependent):
-            those.give(want, velocity, np.array([_factor(runner)]))
+            those.give(want, velocity, _factor(runner))
         else:
             those.lengthen(_factor(runner) * (want - velocity()))
 
@@ -262,9 +262,9 @@ def _movable(runner: Any, some: np.ndarray) -> tuple[int, int, np.ndarray]:
     return first, end, some[first:end]
 
 
-def _factor(runner: Any) -> float:
-    """Return factor() for a single world (not one of many copies)."""
-    return runner.clock.h / max((runner.clock.drag or FREE)[0], NOTHING)
+def _factor(runner: Any) -> np.ndarray:
+    """Return factor() for a single world (not one of many copies), (1,)."""
+    return factor(runner.clock.h, np.array([runner.clock.drag or FREE]))
 
 
 def _those(runner: Any, first: int, some: np.ndarray) -> Displacements:

@@ -16,7 +16,7 @@ from ..solvers.corners import bodies_of
 from .clock import MET
 from .initial_violation import ROUNDING, Rows
 from .jacobian import Jacobian
-from .one_sided import Walls, moved, one_sided
+from .one_sided import Walls, move_with_walls, one_sided
 from .solids import Solids
 
 ROUNDS = 64  # of Newton's method, at most, each with the walls that stopped particles in the one before
@@ -59,7 +59,7 @@ def restore(runner: Any, placed: int) -> tuple[np.ndarray, float] | None:
         new = begin
         if len(wanted):
             new = solids.fitted(begin + one_sided(jacobian, wanted, np.arange(len(wanted)) < len(walls.who), SOFT))
-        sent, new = moved(runner, best, new)
+        sent, new = move_with_walls(runner, best, new)
         walls.push(new - sent)
         left = _left(solids, rows, new, w)
         waited = 0 if left < BETTER * least else waited + 1

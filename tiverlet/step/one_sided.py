@@ -10,7 +10,7 @@ STEPS, ENOUGH = 32, 1e-6  # of conjugate gradients, at most; the share of r . z 
 TURNS = 8  # at most, until no one-sided row pulls
 
 
-def moved(runner: Any, before: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def move_with_walls(runner: Any, before: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Put particles, which come from `before`, to x. Returns the positions before and after walls stop them, (n, dim) each."""
     state, memory = runner.scene.state, runner.memory
     state.put(memory, x)

@@ -22,7 +22,7 @@ from ..contact.candidates import Candidates, DiscCandidates
 from .contact_rows import stored_by
 from .free_bodies import FreeBodies
 from .jacobian import Jacobian
-from .one_sided import Walls, moved, one_sided
+from .one_sided import Walls, move_with_walls, one_sided
 from .projection import Rows, given_back, seen, seen_before, take_energy, would_vibrate
 from .rails import tethered
 from .rigid_rows import rigid_rows
@@ -88,7 +88,7 @@ def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: f
         return stored + (rows.stored if rows else 0.0), overlap - goal, rows
 
     first = seen_at(x)[0]
-    best = moved(runner, x, solids.fitted(x))[1] if solids.count else x
+    best = move_with_walls(runner, x, solids.fitted(x))[1] if solids.count else x
     least = seen_at(best)[0]
     for _ in range(ROUNDS):
         if least <= LEFT * ratio**2 * first:
@@ -108,7 +108,7 @@ def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: f
         jacobian = Jacobian(len(wanted), np.concatenate(row), np.concatenate(who), w, np.concatenate(J), solids.whole(begin))
         one_way = np.arange(len(wanted)) < m + k
         one_way[:m] = ~known[some]
-        sent, new = moved(runner, best, solids.fitted(begin + one_sided(jacobian, wanted, one_way, soft)))
+        sent, new = move_with_walls(runner, best, solids.fitted(begin + one_sided(jacobian, wanted, one_way, soft)))
         walls.push(new - sent)
         stored, more, _ = seen_at(new)
         if stored < least:

@@ -36,6 +36,7 @@ from .contact_rows import ContactRows
 from .free_bodies import FreeBodies
 from .integrator import h2_effective_of
 from .jacobian import Jacobian
+from .one_sided import move_with_walls
 from .rails import Rails, tethered
 from .rigid_rows import RigidRows, left_out, rigid_rows
 
@@ -155,13 +156,10 @@ def _leaning(runner: "Runner", rows: "Rows", share: float) -> "Rows":
     """
     if not runner.step.walls:
         return rows
-    state, memory = runner.scene.state, runner.memory
-    push = memory.read(runner.step.particles.wall_displacement)[: rows.n].astype(np.float64)
-    state.put(memory, rows.x - push)
-    sent = state.get(memory)
-    runner.stop_at_walls(rows.x)
-    normal = _units(state.get(memory) - sent)
-    state.put(memory, rows.x)
+    push = runner.memory.read(runner.step.particles.wall_displacement)[: rows.n].astype(np.float64)
+    sent, stopped = move_with_walls(runner, rows.x, rows.x - push)
+    normal = _units(stopped - sent)
+    runner.scene.state.put(runner.memory, rows.x)
     along = np.linalg.norm(push - (push * normal).sum(axis=1)[:, None] * normal, axis=1)
     rubs = any(w.has_friction for w in runner.step.walls)
     return rows.leaning(normal, push, share, rubs & (along > GRIP * np.linalg.norm(push, axis=1)))
@@ -172,14 +170,10 @@ def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: Aims) -> tuple["
 
     start: the rows whose stored energy aims.share refers to.
     """
-    state, memory, before = runner.scene.state, runner.memory, rows.x
-    enough = aims.share * start.stored
+    before, enough = rows.x, aims.share * start.stored
     stopped = np.linalg.norm(rows.wall, axis=1) > 0
     for _ in range(TURNS):
-        state.put(memory, _newton(rows, enough, aims))
-        sent = state.get(memory)
-        runner.stop_at_walls(before)
-        x = state.get(memory)
+        sent, x = move_with_walls(runner, before, _newton(rows, enough, aims))
         stopped |= (x != sent).any(axis=1)
         last, rows = rows, rows.at(x)  # other particles lift those that walls stop
         slips = rows.sticks.any() and rows.stored > enough  # friction does not hold two feet against each other

@@ -81,9 +81,7 @@ class OnCurve(Place):
             self.state.bring(i, P)
         else:
             P, T = self.point(low, ti.cast(s - self.begin[low], self.real))
-            d = P - self.state.place(i)
-            self.state.d[i] = d
-            self.state.advance(i, d)
+            self.state.bring(i, P)
 
     @ti.func
     def find_nearest(self, x):
