@@ -443,11 +443,12 @@ class Rows:
         h2_effective = h2_effective_of(runner.clock)
         springs = [b.dev.spring for b in self.batches]
         before = [
-            read(s.last)[: b.count] - b.goal if s.soft else np.zeros(b.count) for b, s in zip(self.batches, springs, strict=True)
+            read(s.last)[: b.count] - b.rest_now if s.soft else np.zeros(b.count)
+            for b, s in zip(self.batches, springs, strict=True)
         ]
         borne = [
-            b.compliance * read(b.dev.equation.lam)[: b.count] / h2_effective if b.compliance.any() else b.compliance
-            for b in self.batches
+            b.compliance * read(b.dev.equation.lam)[: b.count] / h2_effective if s.soft else np.zeros(b.count)
+            for b, s in zip(self.batches, springs, strict=True)
         ]
         return self._bounded(gamma * self.C + (1 - gamma) * self._bounded(self._each(before)) + self._each(borne))
 
