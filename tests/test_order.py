@@ -70,6 +70,21 @@ def test_velocities_have_the_order_too(world):
         assert max(across) < 1e-9 and np.linalg.norm(w.velocity[2]) == pytest.approx(speed, rel=1e-7)
 
 
+def test_springs_follow_a_moving_rest_value(world):
+    # A mass on a spring, omega^2 = 400, whose rest length begins to grow evenly, by u t: its length is
+    # l_0 + u t - u sin(omega t) / omega. Without rigid links no pass is taken, which would move the rest length.
+    spring = tv.Distance([[0, 1]], 1.0, compliance=1 / 400)
+    start, dt, errors = tv.Particles([[0.0, 0], [1.0, 0]], pinned=[0]), 0.1, []
+    w = world(start, [tv.Gravity(0.0), spring], precision="f64", order=4)
+    for w.substeps in (2, 4, 8):
+        w.position, w.velocity, spring.rest = start.position, 0 * start.position, 1.0
+        w.step(dt)
+        spring.rest = 1.3
+        w.step(dt)
+        errors.append(abs(w.position[1, 0] - (1.3 - 3.0 * np.sin(20 * dt) / 20)))
+    assert order(errors) > 3.7 and errors[-1] < 1e-5, errors
+
+
 @pytest.mark.slow
 def test_springs_are_forces(world):
     # A chain of soft and rigid links converges with order 6 to the limit of order 2. A mass below its spring of length l:

@@ -78,7 +78,9 @@ def test_a_pin_that_takes_other_particles_is_as_a_new_one(world, compliance, pre
     other, old = scene()
     assert w.hash() == other.hash()
     for indices in ([2, 3], [2, 0], [1, 3]):
-        pin.indices, pin.target = indices, [(0.2, 0.9), (1.2, 0.8)]
+        mine = np.array(indices, dtype=np.int32)
+        pin.indices, pin.target = mine, [(0.2, 0.9), (1.2, 0.8)]
+        mine[:] = 5  # the pin has a copy
         new = tv.Pin(indices, [(0.2, 0.9), (1.2, 0.8)], compliance=compliance)
         other.remove(features=[old])
         other.add(features=[new])

@@ -14,7 +14,7 @@ from tiverlet.step import checkpoint
 
 from .bad_starts import BadStart
 from .conftest import order, rms, unprojected
-from .rows import OTHERS, ROWS, Row
+from .rows import OTHERS, PATH, ROWS, Row
 
 BLOCKS = ("met", "off", "turned", "held", "stuck", "soft", "free", "swing", "loaded", "weak")
 MASS = np.array([1.0, 2.5, 0.7, 4.0])
@@ -212,6 +212,22 @@ def test_gradients_of_many_are_those_of_each(name):
         np.testing.assert_allclose(change, (found[-1] * move).sum(axis=(1, 2)), atol=3e-7)
     np.testing.assert_array_equal(found[1], np.repeat(found[0], 2000, axis=0))
     assert np.abs(found[0].sum(axis=1)).max() < 1e-8 < 0.1 < np.abs(found[0]).max()
+
+
+def test_cells_and_planets_move_as_what_lies_on_a_table(world):
+    # Lengths times 2^a, masses times 2^b and accelerations times 2^a give the same bits times 2^a, down to cells of 8 um and
+    # 1e-12 kg in f32. There w |grad f|^2 of an angle is 1e22, and a multiplier of a spring 1e-23 kg m, whose squares f32 cannot
+    # hold.
+    x, found = np.concatenate([PATH, PATH + 2.0]), []
+    for length, mass in ((1.0, 1.0), (2.0**-17, 2.0**-40), (2.0**15, 2.0**80)):
+        features = [tv.Bend([[0, 1, 2], [3, 4, 5]]), tv.Distance([[0, 1], [4, 5]]), tv.Pin([0, 4], compliance=1e-2 / mass)]
+        start = tv.Particles(x * length, velocity=length * np.sin(np.arange(18)).reshape(6, 3), mass=mass)
+        w = world(start, [tv.Gravity(9.81 * length), *features], substeps=10, solver=tv.Jacobi())
+        reports = [w.step(1 / 60) for _ in range(10)]
+        assert all(report.clean for report in reports)
+        energies = [[report.residual, report.energy / (mass * length**2)] for report in reports]
+        found.append(np.concatenate([w.position / length, np.reshape(energies, (-1, 1)) + np.zeros(3)]))
+    assert np.array_equal(found[0], found[1]) and np.array_equal(found[0], found[2])
 
 
 def test_the_tables_hold_every_constraint():

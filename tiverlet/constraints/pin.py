@@ -26,7 +26,7 @@ def _targets(pin: "Pin", target):
 
 def _indices(pin: "Pin", indices) -> np.ndarray:
     """Check assigned indices and replace `members` by them. Returns the indices, (m, 1)."""
-    rows = np.asarray(indices)
+    rows = np.array(indices)  # a copy, which its owner cannot change later
     rows = rows[:, 0] if rows.ndim == 2 and rows.shape[1] == 1 else rows  # (m, 1), the shape in which indices are read
     members, own = one_each("Pin", rows, checks.ANY if pin.start is None else pin.start.count), vars(pin)
     before = pin.members.rows

@@ -65,6 +65,14 @@ class ConstraintPass:
         self.scatter_blocks(thread, h, h * h, -1, 0)
 
     @ti.func
+    def move_rest_values(self, thread, fraction):
+        """Set rest values on their way to where they are at this fraction of the frame, for springs that act as forces."""
+        for f in ti.static([f for f in self.batches if f.ramp and f.ramp.is_allocated]):
+            for c in range(self.team.chunk_begin(f.count, thread), self.team.chunk_end(f.count, thread)):
+                f.ramp.update_rest(c, ti.Vector([fraction, fraction]))
+        self.team.wait()
+
+    @ti.func
     def note_turns(self, thread):
         """Record how far springs that act as forces turned."""
         for f in ti.static(self.batches):

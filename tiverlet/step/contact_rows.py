@@ -20,7 +20,7 @@ class ContactRows:
         self.pairs, self.start = pairs, start
         self.count, each = pairs.who.shape
         self.indices, self.owner = pairs.who, np.repeat(np.arange(self.count), each)
-        self.compliance = self.damping = self.goal = np.zeros(self.count)
+        self.compliance = self.damping = self.rest_now = np.zeros(self.count)
         self.broken = np.zeros(self.count, dtype=bool)
         self.dev = SimpleNamespace(spring=SimpleNamespace(soft=False))
 

@@ -26,6 +26,7 @@ from .one_sided import Walls, move_with_walls, one_sided
 from .projection import Rows, given_back, seen, seen_before, take_energy, would_vibrate
 from .rails import tethered
 from .rigid_rows import rigid_rows
+from .sideways_rows import sideways_rows
 from .solids import Solids
 
 SOFT, SOFTEST = 1e-2, 1e-5  # mu of the first round, and the least
@@ -127,6 +128,7 @@ def bound(runner: Any, x: np.ndarray, ratio: float) -> Rows | None:
     w = runner.scene.inv_mass
     scalars = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
     some = [b for b in scalars if (~b.immovable(w) & ~b.broken).any()]
+    some += sideways_rows(some)
     some += rigid_rows([b for b in runner.batches if b.clusters], w)
     if not some:
         return None

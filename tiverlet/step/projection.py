@@ -39,6 +39,7 @@ from .jacobian import Jacobian
 from .one_sided import move_with_walls
 from .rails import Rails, tethered
 from .rigid_rows import RigidRows, left_out, rigid_rows
+from .sideways_rows import SidewaysRows, sideways_rows
 
 if TYPE_CHECKING:
     from .runner import Runner
@@ -102,6 +103,7 @@ def project(
         runner.released = stays
     if slots and slots.system and not slots.system.steps and not runner.clock.softened:  # it holds loads without a violation
         batches = [b for b in batches if ((slots.rows(b) < 0) & ~b.immovable(w)).any() or would_vibrate(_off(b, x), ratio)]
+    batches += sideways_rows(batches)
     batches += rigid_rows(runner.batches, w, every=contacts is not None)
     if not batches:
         return True
@@ -270,7 +272,7 @@ def seen_before(runner: Any) -> tuple[float, float]:
     return energy if runner.clock.energy is None else runner.clock.energy, overlap
 
 
-def sizes(batch: Scalar | RigidRows | ContactRows) -> np.ndarray:
+def sizes(batch: Scalar | RigidRows | SidewaysRows | ContactRows) -> np.ndarray:
     """Return the number of corners of each constraint, (m,)."""
     return np.bincount(batch.owner, minlength=batch.count)
 
@@ -299,7 +301,7 @@ class Rows:
     rails: Any = None  # see Rails
 
     def __init__(
-        self, batches: Sequence[Scalar | RigidRows | ContactRows], w: np.ndarray, x: np.ndarray, box: Any = None,
+        self, batches: Sequence[Scalar | RigidRows | SidewaysRows | ContactRows], w: np.ndarray, x: np.ndarray, box: Any = None,
         rails: Rails | None = None,
     ):  # fmt: skip
         self.rails = rails if rails and len(rails.who) else None
@@ -443,11 +445,12 @@ class Rows:
         h2_effective = h2_effective_of(runner.clock)
         springs = [b.dev.spring for b in self.batches]
         before = [
-            read(s.last)[: b.count] - b.goal if s.soft else np.zeros(b.count) for b, s in zip(self.batches, springs, strict=True)
+            read(s.last)[: b.count] - b.rest_now if s.soft else np.zeros(b.count)
+            for b, s in zip(self.batches, springs, strict=True)
         ]
         borne = [
-            b.compliance * read(b.dev.equation.lam)[: b.count] / h2_effective if b.compliance.any() else b.compliance
-            for b in self.batches
+            b.compliance * read(b.dev.equation.lam)[: b.count] / h2_effective if s.soft else np.zeros(b.count)
+            for b, s in zip(self.batches, springs, strict=True)
         ]
         return self._bounded(gamma * self.C + (1 - gamma) * self._bounded(self._each(before)) + self._each(borne))
 

@@ -28,7 +28,7 @@ class RigidRows:
         who = [(c.who, len(c.basis)) for c in self.clusters]
         self.indices = np.concatenate([*(np.tile(members, m) for members, m in who), np.zeros(0, dtype=np.int64)])
         self.owner = np.repeat(np.arange(self.count), [len(members) for members, m in who for _ in range(m)])
-        self.compliance = self.damping = self.goal = np.zeros(self.count)
+        self.compliance = self.damping = self.rest_now = np.zeros(self.count)
         self.broken = np.zeros(self.count, dtype=bool)
         self.start, self.dev = batch.start, SimpleNamespace(spring=SimpleNamespace(soft=False))
 

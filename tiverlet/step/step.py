@@ -304,6 +304,7 @@ class Step:
     def integrate(self, now):
         """Move every particle by its displacement and forces, and pose moving walls for this substep."""
         if ti.static(self.integrator.springs_pull):
+            self.constraints.move_rest_values(now.thread, now.frame_fraction[0])
             self.constraints.spring_forces(now.thread, now.h)
             if now.s % self.integrator.stages == self.integrator.longest + 1:
                 self.constraints.note_turns(now.thread)

@@ -78,8 +78,8 @@ class AnchorPasses(Passes):
                     self.spring.last[c] = C0
                 B = self.spring.history[c]
             K = A * self.slots.split[self.corners.member(c, 0)] + alpha
-            new = lam - self.slots.relaxation * (A * C + B + alpha * lam) / K
-            size = (new - lam).norm() * K / self.slots.relaxation
+            left = A * C + B + alpha * lam
+            new, size = lam - self.slots.relaxation * left / K, left.norm()
         return lam, new, size
 
     @ti.func
@@ -127,8 +127,8 @@ class AnchorPasses(Passes):
             if alpha > 0:
                 C = self.place.offset_now(c, back)
                 out = ti.cast(C.dot(C) / (2 * alpha), ti.f64)
-                out *= self.spring.bearing_share(self.lam[c].norm() * alpha, h2_effective, residual * self.size.now)
-                force, w = ti.cast(self.lam[c].norm(), ti.f64), self.w.of(self.corners.member(c, 0))
+                force, w = ti.cast(self.lam[c], ti.f64).norm(), self.w.of(self.corners.member(c, 0))
+                out *= self.spring.bearing_share(force * alpha, h2_effective, residual * self.size.now)
                 if h2_effective > 0:
                     force /= h2_effective
                 out = self.spring.energy(c, w, h2_effective, out, force * force * alpha / 2)

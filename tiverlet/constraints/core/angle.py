@@ -12,6 +12,7 @@ from ...geometry.intervals import cross
 from .quantity import Quantity, exact_rest
 
 TURN = 2 * np.pi
+LEAST_SINE = 1e-13  # of unit vectors u and v: |u x v| below which f64 loses their normal in rounding
 SHORT = 1e-24  # [m^2] squared length below which a link has no direction: representable in f32, and far below any in use
 
 
@@ -68,6 +69,10 @@ class PathAngle(Angle):
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return the angles of the paths, (m,)."""
         return path_angles(x[:, 0], x[:, 1], x[:, 2])
+
+    def gradients(self, x: np.ndarray) -> np.ndarray:
+        """Return the gradients of the angles, (m, 3, dim)."""
+        return path_gradients(x[:, 0], x[:, 1], x[:, 2])
 
     @ti.func
     def trust_radius(self, q):
@@ -142,7 +147,7 @@ def shorter_link(q):
 @inline
 def least_sine(state, real):
     """Return |u x v| of unit vectors below which their normal is lost in rounding."""
-    return ti.cast(1e-13 if state.double else 1e-6, real)
+    return ti.cast(LEAST_SINE if state.double else 1e-6, real)
 
 
 def path_angles(i: np.ndarray, j: np.ndarray, k: np.ndarray) -> np.ndarray:
@@ -152,6 +157,31 @@ def path_angles(i: np.ndarray, j: np.ndarray, k: np.ndarray) -> np.ndarray:
     if i.shape[1] == 2:
         return np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], dot)
     return np.arctan2(np.linalg.norm(cross(a, b), axis=1), dot)
+
+
+def path_gradients(i: np.ndarray, j: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """Return the gradients of path_angles() by each corner, (m, 3, dim), as path_angle() does; 0 where corners coincide.
+
+    Differences would be 0 for a straight path in 3D, whose angle grows in all directions alike: it gets those in one plane.
+    """
+    (u, a), (v, b) = directions(j - i), directions(k - j)
+    if i.shape[1] == 2:
+        across = [np.stack([-r[:, 1], r[:, 0]], axis=1) for r in (u, v)]
+    else:
+        axis = np.where(np.abs(u[:, :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+        axis, _ = directions(axis - (axis * u).sum(axis=1)[:, None] * u)
+        e, size = directions(cross(u, v))
+        e = np.where(size > LEAST_SINE, e, axis)
+        across = [cross(e, r) for r in (u, v)]
+    some = (a > SHORT**0.5) & (b > SHORT**0.5)
+    g, h = (np.divide(r, size, out=np.zeros_like(r), where=some) for r, size in zip(across, (a, b), strict=True))
+    return np.stack([g, -(g + h), h], axis=1)
+
+
+def directions(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the unit vectors of vectors r (m, dim), 0 where r is 0; and their lengths, (m, 1)."""
+    size = np.linalg.norm(r, axis=1, keepdims=True)
+    return np.divide(r, size, out=np.zeros_like(r), where=size > 0), size
 
 
 @ti.func

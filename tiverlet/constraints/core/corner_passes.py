@@ -102,7 +102,7 @@ class CornerPasses(Passes):
             both += split * g[k, :].dot(n[k, :])
             here += split * gg
             there += split * n[k, :].dot(n[k, :])
-        turn = self.slots.classify_turn(both, ti.sqrt(here * there))
+        turn = self.slots.classify_turn(both, ti.sqrt(here) * ti.sqrt(there))  # here * there may be out of the range of f32
         lost = turn == FAR
         if self.equation.has_cusp(c):
             lost, turn = True, 0

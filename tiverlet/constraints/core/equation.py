@@ -115,7 +115,7 @@ class Equation:
         if ti.static(self.driven):
             C += ago * self.drive.step[c]
         elif ti.static(self.ramp.is_allocated and not self.quantity.centred):
-            C += ago * self.ramp.step[c]
+            C += self.ramp.step[c] if ti.static(ago == 1) else self.ramp.steps[c]
         return C
 
     @ti.func

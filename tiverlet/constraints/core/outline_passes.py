@@ -62,7 +62,7 @@ class OutlinePasses(Passes):
         sums = ti.Vector.zero(self.real, 8)
         for b in range(self.corners.blocks[c], self.corners.blocks[c + 1]):
             sums += self.sums[b]
-        turn = self.slots.classify_turn(sums[3], ti.sqrt(sums[4] * sums[5]))
+        turn = self.slots.classify_turn(sums[3], ti.sqrt(sums[4]) * ti.sqrt(sums[5]))
         W = sums[3]
         if turn == FAR:
             W = sums[4]

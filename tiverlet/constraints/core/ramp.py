@@ -21,7 +21,8 @@ class Ramp:
 
     batch: the Scalar, whose tracks() list what moves. The fields of a ramp are allocated when rest values are assigned for the
     first time, in a `memory` of their own: until then a ramp costs nothing. under_way: whether rest values move in the coming
-    frame. step: how far the first of the tracks moves in this substep. low: what rounding takes from its present value.
+    frame. step, steps: how far the first of the tracks moves in this substep, and in this and the last one. low: what rounding
+    takes from its present value.
     """
 
     host_only = ("memory", "under_way")
@@ -88,9 +89,22 @@ class Ramp:
         goals = [goal for _, goal, _ in self._batch.tracks()]
         self.put(goals)
         if self.is_allocated:
+            self._refer_to_goals()
             self._write_goals(goals, goals)
             self.memory.write(self.low, np.zeros(self.shape[1]))
         self.under_way = False
+
+    def _refer_to_goals(self) -> None:
+        """Shift the f that springs remember by the last step, so that it refers to the goal, and set the step to 0.
+
+        The step is no part of the state: without the shift, clones would read other velocities.
+        """
+        spring, m = self._batch.dev.spring, self._batch.count
+        if spring.soft and not self._batch.quantity.centred:
+            last = self._memory.read(spring.last)
+            last[..., :m] += self.memory.read(self.step)[..., :m]
+            self._memory.write(spring.last, last)
+        self.memory.write(self.step, np.zeros(self.shape[1]))
 
     def _make(self) -> None:
         """Allocate the fields of the ramp, in a world that exists already."""
@@ -99,6 +113,7 @@ class Ramp:
         self.begin = [self.memory.field(f"{name}.rest_at_begin", m) for _ in self.fields]
         self.goal = [self.memory.field(f"{name}.rest_at_end", m) for _ in self.fields]
         self.step = self.memory.field(f"{name}.step_of_rest", m)
+        self.steps = self.memory.field(f"{name}.steps_of_rest", m)
         self.low = self.memory.field(f"{name}.rest_low", m)
         self.memory.place()
         self.is_allocated = True
@@ -106,11 +121,12 @@ class Ramp:
     def adopt(self, before: "Ramp") -> None:
         """Take over the fields of a ramp of the same batch, made when it had other constraints."""
         self.fields, self.memory, self.is_allocated = before.fields, before.memory, True
-        self.begin, self.goal, self.step, self.low = before.begin, before.goal, before.step, before.low
+        self.begin, self.goal, self.low = before.begin, before.goal, before.low
+        self.step, self.steps = before.step, before.steps
 
     def resize(self) -> None:
         """Resize the fields to one row for each constraint. No rest value is under way."""
-        for field in (*self.begin, *self.goal, self.step, self.low):
+        for field in (*self.begin, *self.goal, self.step, self.steps, self.low):
             self.memory.resize(field, self._batch.count)
         self.finish()
 
@@ -126,6 +142,8 @@ class Ramp:
             way = self.goal[k][c] - self.begin[k][c]
             self.fields[k][c] = self.goal[k][c] - way * (1 - frame_fraction[1])
             if ti.static(k == 0):
-                self.step[c] = way * (frame_fraction[1] - frame_fraction[0])
+                step = way * (frame_fraction[1] - frame_fraction[0])
+                self.steps[c] = self.step[c] + step
+                self.step[c] = step
                 now = ti.cast(self.goal[k][c], ti.f64) - ti.cast(way, ti.f64) * (1 - frame_fraction[1])
                 self.low[c] = ti.cast(now - self.fields[k][c], self.real)

@@ -166,10 +166,14 @@ class Scalar(Batch):
         """The ramp of rest values, while the batch is bound."""
         return self.dev.equation.ramp if "equation" in vars(self.dev) else None
 
+    @property
+    def rest_now(self) -> np.ndarray:
+        """The rest values of the state, (m,): before a ramp, those at which it begins."""
+        return self.ramp.now()[0] if self.ramp and self.ramp.under_way else self.goal
+
     def violation(self, position: np.ndarray) -> np.ndarray:
-        """Return C at the given positions, (m,), with the rest values of the state: during a ramp, those at which it begins."""
-        rest = self.ramp.now()[0] if self.ramp and self.ramp.under_way else self.goal
-        return self.quantity.difference(self.rest_of(position), rest)
+        """Return C at the given positions, (m,), with the rest values of the state."""
+        return self.quantity.difference(self.rest_of(position), self.rest_now)
 
     def gradients(self, position: np.ndarray) -> np.ndarray:
         """Return grad_k f of every constraint at the given positions, (m, arity, dim); for outlines (total, dim)."""
