@@ -10,8 +10,7 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles
-from .core.angle import TURN, Angle, least_sine, path_angle, path_angles, shorter_link, wrap_near, wrap_to_pi
-from .core.quantity import differences
+from .core.angle import TURN, Angle, least_sine, path_angle, path_angles, path_gradients, shorter_link, wrap_near, wrap_to_pi
 from .core.scalar import Scalar
 
 
@@ -28,6 +27,10 @@ class AngleFromMiddle(Angle):
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return the angles of the paths, (m,)."""
         return path_angles(x[:, 0], x[:, 1], x[:, 2])
+
+    def gradients(self, x: np.ndarray) -> np.ndarray:
+        """Return the gradients of the angles by each corner, (m, 3, dim)."""
+        return path_gradients(x[:, 0], x[:, 1], x[:, 2])
 
     def bind(self, scene: Scene, batch: Any, equation: Any) -> "AngleFromMiddle":
         """Return the quantity for kernels, with a field for the middle of each range."""
@@ -112,12 +115,14 @@ class AngleLimit(Scalar):
                 checks.per_item("AngleLimit", f"{name} (in 3D)", value, self.count, least=0.0, most=np.pi)
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """Return how far the angles are from the middle [rad]. x may hold several copies of all corners, one after the other."""
-        return np.abs(wrap_to_pi(super().values(x) - np.tile(self.middle, len(x) // max(1, self.count))))
+        """Return how far the angles of corners x, (m, 3, dim), are from the middle [rad]."""
+        return np.abs(wrap_to_pi(super().values(x) - self.middle))
 
     def gradients(self, position: np.ndarray) -> np.ndarray:
         """Return the gradients of |angle - middle| by each corner, (m, 3, dim)."""
-        return differences(self.values, self.placed(position))
+        x = self.placed(position)
+        below = wrap_to_pi(super().values(x) - self.middle) < 0
+        return np.where(below, -1.0, 1.0)[:, None, None] * self.quantity.gradients(x)
 
     def tracks(self) -> list[tuple[Any, np.ndarray, Callable]]:
         """List what an assignment moves: half of the range, and its middle."""

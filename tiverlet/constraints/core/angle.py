@@ -69,6 +69,10 @@ class PathAngle(Angle):
         """Return the angles of the paths, (m,)."""
         return path_angles(x[:, 0], x[:, 1], x[:, 2])
 
+    def gradients(self, x: np.ndarray) -> np.ndarray:
+        """Return the gradients of the angles by each corner, (m, 3, dim)."""
+        return path_gradients(x[:, 0], x[:, 1], x[:, 2])
+
     @ti.func
     def trust_radius(self, q):
         """Return the length of the shorter link."""
@@ -152,6 +156,28 @@ def path_angles(i: np.ndarray, j: np.ndarray, k: np.ndarray) -> np.ndarray:
     if i.shape[1] == 2:
         return np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], dot)
     return np.arctan2(np.linalg.norm(cross(a, b), axis=1), dot)
+
+
+def path_gradients(i: np.ndarray, j: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """Return the gradients of path_angle() by each corner (m, dim) [m]: (m, 3, dim); 0 where there is no angle or no plane.
+
+    Differences of angles would be about 0 in 3D where a path is bent by less than their step, since the angle is not signed.
+    """
+    (u, a), (v, b) = unit_vectors(j - i), unit_vectors(k - j)
+    if i.shape[1] == 2:
+        g, h = (np.stack([-w[:, 1], w[:, 0]], axis=1) for w in (u, v))
+    else:
+        e, _ = unit_vectors(cross(u, v))
+        g, h = cross(e, u), cross(e, v)
+    there = (a > 0) & (b > 0)
+    g, h = (np.divide(w, size, out=np.zeros_like(w), where=there[:, None]) for w, size in ((g, a[:, None]), (h, b[:, None])))
+    return np.stack([g, -(g + h), h], axis=1)
+
+
+def unit_vectors(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the directions of vectors (m, dim), 0 for vectors of length 0, and the lengths (m,)."""
+    size = np.linalg.norm(r, axis=1)
+    return np.divide(r, size[:, None], out=np.zeros_like(r), where=size[:, None] > 0), size
 
 
 @ti.func

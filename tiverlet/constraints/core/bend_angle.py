@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...device import ti
-from .angle import Angle, least_sine, path_angle, path_angles, shorter_link
+from .angle import Angle, least_sine, path_angle, path_angles, path_gradients, shorter_link
 
 if TYPE_CHECKING:
     from ...features.feature import Scene
@@ -26,6 +26,10 @@ class BendAngle(Angle):
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return the angles of the paths, (m,)."""
         return path_angles(x[:, 0], x[:, 1], x[:, 2])
+
+    def gradients(self, x: np.ndarray) -> np.ndarray:
+        """Return the gradients of the angles by each corner, (m, 3, dim)."""
+        return path_gradients(x[:, 0], x[:, 1], x[:, 2])
 
     def bind(self, scene: "Scene", batch: Any, equation: Any) -> "BendAngle":
         """Return the quantity for kernels; in 3D, with a field for the last normals."""
