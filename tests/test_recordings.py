@@ -492,6 +492,25 @@ def test_what_is_removed_from_a_pile_that_moves_is_recorded(world, tmp_path, rea
     assert tv.replay(tmp_path / "removed.rrd").verify()
 
 
+@pytest.mark.parametrize("rebuilt", [False, True])
+def test_edits_of_a_world_whose_gate_was_just_opened_are_recorded(world, tmp_path, read_here, rebuilt):
+    # The balls lie at rest on the gate and fall from it by g t^2 / 2: in f64 to rounding, whatever is added or removed at once.
+    gate = tv.HalfSpace((0, 1), active=True)
+    start = tv.Particles([(0, 0.1), (0.3, 0.1), (0.6, 0.1)], radius=0.1)
+    w = world(start, [tv.Gravity(9.81), gate, tv.Contact(friction=0.5)], precision="f64")
+    with tv.Recorder(tmp_path / "gate.rrd", w) as recorder:
+        for frame in range(12):
+            if frame == 3:
+                gate.active = False
+                w.remove([2])
+                if rebuilt:
+                    w.add(features=[tv.Ball((0, 9), 1.0)])
+            w.step(1 / 60)
+            recorder.log()
+    np.testing.assert_allclose(w.position[:, 1], 0.1 - 9.81 * (9 / 60) ** 2 / 2, rtol=0, atol=1e-12)
+    assert tv.replay(tmp_path / "gate.rrd").verify()
+
+
 def test_a_recording_begins_while_a_knob_asks_for_other_kernels(world, tmp_path, read_here):
     start = tv.Particles([(0, 0.1), (0.19, 0.1), (0.5, 0.1)], radius=0.1, velocity=(1.0, 0.0), spin=0.0)
     contact, box, link = tv.Contact(), tv.Box((-1, 0), (1, 2)), tv.Distance([[1, 2]])
