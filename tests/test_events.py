@@ -385,6 +385,11 @@ def test_refused(world):
         tv.Contact(groups=[(1, 0)], sensors=[(0, 1)])
     with pytest.raises(TypeError, match="sensors has the key 3, but a pair of groups"):
         tv.Contact(sensors=[3])
+    with pytest.raises(TypeError, match="restitution has the key 0, but a pair of groups"):
+        tv.Contact(restitution={0: 0.5})  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"friction is 0.5 for \(0, 1\) and 0.6 for \(1, 0\), which are the same pair"):
+        tv.Contact(friction={(0, 1): 0.5, (1, 0): 0.6})
+    tv.Contact(friction={(0, 1): 0.5, (1, 0): 0.5})
     with pytest.raises(TypeError, match="events = 1 is a int, but True or False"):
         tv.Contact(events=1)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="HalfSpace: events = 'yes'"):

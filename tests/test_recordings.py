@@ -17,7 +17,7 @@ import tiverlet as tv
 from tiverlet.__main__ import main
 from tiverlet.device import ti
 from tiverlet.device.language import NAME, NAMES
-from tiverlet.recording import journal, messages, reader, recorder, viewer
+from tiverlet.recording import journal, messages, reader, recorder, rrd, viewer
 
 from .conftest import python
 from .forging import Forgery
@@ -490,6 +490,46 @@ def test_what_is_removed_from_a_pile_that_moves_is_recorded(world, tmp_path, rea
             w.step(1 / 60)
             recorder.log()
     assert tv.replay(tmp_path / "removed.rrd").verify()
+
+
+def test_two_edits_between_two_frames_leave_walls_and_frames_in_the_picture(world, tmp_path, read_here):
+    # An outlet removes after log(), and an inlet adds before the next step: a scene ends before a frame of it was drawn. The next
+    # scene has walls from its first frame on, and no later frame begins another.
+    ball = tv.Particles([(0, 0.1)], radius=0.1)
+    w = world(ball, [tv.Gravity(), tv.HalfSpace((0, 1)), tv.Contact()])
+    with tv.Recorder(tmp_path / "edits.rrd", w) as recorder:
+        for frame in range(1, 7):
+            if frame in (2, 3):
+                w.add(tv.Particles([(0.3 * frame, 0.5)], radius=0.1))
+            w.step(1 / 60)
+            recorder.log()
+            if frame == 2:
+                w.remove([1])
+    recording = tv.replay(tmp_path / "edits.rrd")
+    assert recording.frames.tolist() == list(range(7)) and recording.verify()
+    contents = rrd.read(str(tmp_path / "edits.rrd"), rows=True)
+    rows = [(contents.entities[number], frame) for _, _, number, frame, *_ in contents.rows.tolist()]
+    walls = sorted((frame, entity) for entity, frame in rows if "/walls/" in entity)
+    assert walls == [(0, "world/scene/walls/1"), (2, "world/scene/scene1/walls/1"), (3, "world/scene/scene3/walls/1")]
+
+
+@pytest.mark.parametrize("rebuilt", [False, True])
+def test_edits_of_a_world_whose_gate_was_just_opened_are_recorded(world, tmp_path, read_here, rebuilt):
+    # The balls lie at rest on the gate and fall from it by g t^2 / 2: in f64 to rounding, whatever is added or removed at once.
+    gate = tv.HalfSpace((0, 1), active=True)
+    start = tv.Particles([(0, 0.1), (0.3, 0.1), (0.6, 0.1)], radius=0.1)
+    w = world(start, [tv.Gravity(9.81), gate, tv.Contact(friction=0.5)], precision="f64")
+    with tv.Recorder(tmp_path / "gate.rrd", w) as recorder:
+        for frame in range(12):
+            if frame == 3:
+                gate.active = False
+                w.remove([2])
+                if rebuilt:
+                    w.add(features=[tv.Ball((0, 9), 1.0)])
+            w.step(1 / 60)
+            recorder.log()
+    np.testing.assert_allclose(w.position[:, 1], 0.1 - 9.81 * (9 / 60) ** 2 / 2, rtol=0, atol=1e-12)
+    assert tv.replay(tmp_path / "gate.rrd").verify()
 
 
 def test_a_recording_begins_while_a_knob_asks_for_other_kernels(world, tmp_path, read_here):

@@ -211,13 +211,18 @@ class World:
         """Whether a force has changed and the device still has the old one."""
         return any(f.changed and (f.new_force or isinstance(f, Acceleration)) for f in self._features)
 
+    @property
+    def _releases_load(self) -> bool:
+        """Whether a wall was switched off, and the device still has it. It is lost with the wall, also in a copy of the scene."""
+        return any(f.changed and f.has_released_load for f in self._features)
+
     def _restart_for_new_forces(self, steps: bool) -> None:
         """Where a force has changed, turn displacements into velocities by the old force before it is lost.
 
         The old force is lost when it is overwritten, or left out of a copy. steps: see _rebuild_for_knobs().
         """
         changed = [f for f in self._features if f.changed]
-        if any(f.has_released_load for f in changed):
+        if self._releases_load:
             if not steps:
                 self._runner.note_displacements()
             self._restart_with_reactions()

@@ -58,7 +58,7 @@ class Drawing:
         self.bytes = 0
         self.extent, self._overlays = extent, overlays
         self.hues: np.ndarray | None = None  # colours of particles in the coming frame, if they change
-        self.scenes = 0  # how many scenes were begun
+        self.scenes = 0  # the number of the scene that is drawn, from 1 on
         self._in_box = InBox()
         self._touched = self._broke_before = False
 
@@ -69,16 +69,17 @@ class Drawing:
     def _log(self, entity: str, *what: Any) -> None:
         self._stream.log(entity, *what, strict=True)
 
-    def begin(self) -> None:
+    def begin(self, scenes: int) -> None:
         """Log everything that does not change until particles or features are added or removed.
 
-        Then all of it is logged again, under another name.
+        Then all of it is logged again, under another name. scenes: the number of scenes so far, of which some may have ended
+        before a frame of them was drawn.
         """
         world, p = self.world, self.world.particles
-        self._root = f"{SCENE}/scene{self.scenes}" if self.scenes else SCENE
+        self._root = f"{SCENE}/scene{scenes - 1}" if scenes > 1 else SCENE
         if self.scenes:
             self._log(SCENE, self._rr.Clear(recursive=True))
-        self.scenes += 1
+        self.scenes = scenes
         self._contacts = len(p) <= FEW and bool(world._runner.step.contacts)
         self._broken = {k: f.broken for k, f in enumerate(world.features) if isinstance(f, Batch) and f.breaks}
         hues = colors(world)

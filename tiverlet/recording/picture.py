@@ -69,7 +69,7 @@ class Picture:
         """
         if scenes > self.drawing.scenes:
             self.curves.read_masses(self.world)
-            self.drawing.begin()
+            self.drawing.begin(scenes)
         self._frame_all(x)
         self.drawing.frame(x, x32, changed_features, bool(report and report.broken))
         if report:

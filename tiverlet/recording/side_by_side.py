@@ -172,7 +172,7 @@ class _View:
         self._broken = 0
         turn = [upright(upwards(world))] if dim == 3 else []
         self.drawing.static(SCENE, transform(dim, unit(*extent)), *turn)
-        self.drawing.begin()
+        self.drawing.begin(1)
 
     def frame(self, world: World) -> None:
         """Draw the world's present state."""

@@ -64,7 +64,7 @@ class Rebuild:
         """Store the state. If the forces on remaining particles will change, displacements become velocities first."""
         runner = self.world._runner
         runner.note_displacements()
-        if any(isinstance(f, Collider) for f in self.removed_features):
+        if self.world._releases_load or any(isinstance(f, Collider) for f in self.removed_features):
             self.world._restart_with_reactions()
         elif self.restarts:
             with runner.memory.compiler():

@@ -141,6 +141,9 @@ def change(
     if planned is None:
         build_again(world, some, added, features, extend)
         return
+    if world._releases_load:
+        world._runner.note_displacements()
+        world._restart_with_reactions()
     with world._runner.memory.compiler():
         others = (added is not None or not some.all()) and world._runner.step.has_pair_forces
         restarts = world._has_new_force or others or any(more.soft for more in planned.more)
