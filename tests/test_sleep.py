@@ -307,6 +307,16 @@ def test_what_wakes(world):
     assert w.last.asleep == asleep - 1 and (w.position[0] == rest).all() and w.position[6, 0] > pulled + 0.3
 
 
+def test_what_lies_on_a_roller_wakes_as_it_begins_to_turn(world):
+    # A disc between two pinned rollers takes the speed of their surfaces, -omega R / r.
+    rollers = tv.Particles([(-0.13, 0), (0.13, 0), (0, 0.17)], radius=[0.11, 0.11, 0.1], pinned=[0, 1], spin=0)
+    w = world(rollers, [tv.Gravity(), tv.Contact(friction=0.5), tv.Sleep(0.01, 0.2)], precision="f64", substeps=40)
+    until(w, 1)
+    w.spin = [5.0, 5.0, 0.0]
+    w.run(1.0)
+    assert w.spin[2] == pytest.approx(-5.0 * 0.11 / 0.1, rel=1e-3)
+
+
 def tied(world, start, links, time=0.5, speed=0.05, g=9.81, **settings):
     """Return a world of linked particles above a floor: one structure for each solver."""
     floor, contact = tv.HalfSpace((0, 1), -5.0, friction=0.5), tv.Contact(friction=0.5)

@@ -160,6 +160,11 @@ class State:
         """Return x_i as one number per axis."""
         return at(self.x, i) + at(self.low, i) if self.compensated else at(self.x, i)
 
+    @inline
+    def exact(self, i):
+        """Return x_i with all of its digits: in f64 where it has two words."""
+        return ti.cast(at(self.x, i), ti.f64) + ti.cast(at(self.low, i), ti.f64) if self.compensated else at(self.x, i)
+
     @ti.func
     def begin(self, i):
         """Return the position of particle i at the start of the substep, as one number per axis."""
