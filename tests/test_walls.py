@@ -212,6 +212,22 @@ def test_nothing_passes_a_thin_rod(world):
         assert (w.position[:, 1] >= 0.0005 - 1e-9).all()
 
 
+def test_what_lies_on_a_ball_or_a_rod_is_not_thrown_through_it(world):
+    # In f32 a disc on a wall is inside of it by rounding, up to 4 ulp of its coordinates and of its way, 5 m in a substep here.
+    n, middle = 100, np.array([1.3, 1.3])
+    angle = np.arange(n) * 0.0628
+    out = np.concatenate([np.stack([np.cos(angle), np.sin(angle)], axis=1), np.tile([(0, 1), (0, -1)], (n // 2, 1))])
+    foot = np.tile(middle, (2 * n, 1))
+    foot[n:] += np.stack([np.linspace(4.1, 5.9, n), np.zeros(n)], axis=1)
+    walls = [tv.Ball(middle, 0.1), tv.Capsule(middle + [4, 0], middle + [6, 0], 0.1)]
+    w = world(tv.Particles(foot + 0.15 * out, velocity=-out, radius=0.05), walls, substeps=8)
+    w.run(0.1)
+    w.velocity, w.substeps = -300.0 * out, 1
+    for _ in range(2):
+        w.step(1 / 60)
+        np.testing.assert_allclose(((w.position - foot) * out).sum(axis=1), 0.15, atol=1e-5)
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_ball_stops_what_would_fly_through_it(world, dim):
     # v h = 20 diameters of the ball: a point is caught on the side that it came from; with restitution 1 it goes back.

@@ -30,6 +30,7 @@ class State:
         n, dim = particles.count, particles.dim
         self.compensated = compensated
         self.real, self.double = memory.real, memory.real == ti.f64
+        self.two_digits = 2.0**-50 if self.double else 2.0**-21  # the size of the last two binary digits of 1
         self.count, self.dim = n, dim
         self.starts = self.befores = self.keeps_wall_push = self.carries = self.spins = False
         self.images: Any = None  # set in a periodic box, see neighbours/periodic.py
@@ -195,7 +196,12 @@ class State:
         size = ti.abs(x[0])
         for k in ti.static(range(1, self.dim)):
             size = ti.max(size, ti.abs(x[k]))
-        return ti.static(2.0**-50 if self.double else 2.0**-21) * size
+        return ti.static(self.two_digits) * size
+
+    @ti.func
+    def digits_with(self, i, size):
+        """Return the size of the last two binary digits of sums of coordinates of particle i and of others of this size [m]."""
+        return self.digits(i) + ti.static(self.two_digits) * size
 
     @ti.func
     def restart(self, i):
