@@ -212,6 +212,14 @@ def test_nothing_passes_a_thin_rod(world):
         assert (w.position[:, 1] >= 0.0005 - 1e-9).all()
 
 
+def test_discs_far_from_the_origin_lie_on_the_floor(world):
+    # At x = 1e4 m an f32 has steps of 1 mm, the radius, but not the height above the floor: C = y - r = 0 at rest.
+    x = np.array([(1e4, 0.006), (0.0, 0.006)])
+    w = world(tv.Particles(x, radius=1e-3), [tv.Gravity(), tv.HalfSpace((0, 1))], precision="f32-compensated", substeps=20)
+    w.run(0.5)
+    np.testing.assert_allclose(w.position[:, 1], 1e-3, rtol=1e-6)
+
+
 def test_what_lies_on_a_ball_or_a_rod_is_not_thrown_through_it(world):
     # In f32 a disc on a wall is inside of it by rounding, up to 4 ulp of its coordinates and of its way, 5 m in a substep here.
     n, middle = 100, np.array([1.3, 1.3])

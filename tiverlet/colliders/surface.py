@@ -146,7 +146,7 @@ class Surface:
         d = self.state.d[i] - moved
         shift = 0 * d
         leaving = d.dot(n)
-        close = self.state.digits(i)
+        close = self.state.digits_along(i, n, self.radius.of(i))
         if depth > -close:
             depth = ti.max(depth, ti.min(-leaving, close))
         if ti.static(self.has_impacts):

@@ -199,6 +199,18 @@ class State:
         return ti.static(self.two_digits) * size
 
     @ti.func
+    def digits_along(self, i, n, size):
+        """Return the size of the last two binary digits of n . x_i and of lengths of this size, for a unit vector n [m].
+
+        Only compensated positions need it, which may be so far out that digits() exceeds the particle: there, only the
+        coordinates along n count.
+        """
+        close = self.digits(i)
+        if ti.static(self.compensated):
+            close = ti.static(self.two_digits) * (ti.abs(n).dot(ti.abs(self.x[i])) + size)
+        return close
+
+    @ti.func
     def digits_with(self, i, size):
         """Return the size of the last two binary digits of sums of coordinates of particle i and of others of this size [m]."""
         return self.digits(i) + ti.static(self.two_digits) * size
