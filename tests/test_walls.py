@@ -236,6 +236,15 @@ def test_what_lies_on_a_ball_or_a_rod_is_not_thrown_through_it(world):
         np.testing.assert_allclose(((w.position - foot) * out).sum(axis=1), 0.15, atol=1e-5)
 
 
+def test_a_rod_of_no_length_is_a_ball(world):
+    # The ends of the rod meet in this substep. A disc at v h = 1 m, ten times as far as the rod is thick, stops above its middle.
+    rod = tv.Capsule((-1, 0), (1, 0), 0.05)
+    w = world(tv.Particles([(0.0, 0.5)], velocity=(0, -60.0), radius=0.05), [rod], substeps=1)
+    rod.a = rod.b = (0.0, 0.0)
+    w.step(1 / 60)
+    np.testing.assert_allclose(w.position[0], (0, 0.1), atol=1e-6)
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_ball_stops_what_would_fly_through_it(world, dim):
     # v h = 20 diameters of the ball: a point is caught on the side that it came from; with restitution 1 it goes back.

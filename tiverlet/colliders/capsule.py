@@ -14,6 +14,7 @@ from .round_mesh import rounded
 from .surface import TOUCH
 from .track import Track
 
+SHORT = 1e-30  # square of the length of an axis that has no direction, as where both ends have moved to one place [m^2]
 MARCH = 32  # steps along a path; a grazing path is then resolved within 1e-6 of its length
 
 
@@ -120,7 +121,7 @@ class Capsule(Collider):
         t, length, n = self.nearest(x, self.dev.a.at(frame_fraction[0]), self.dev.b.at(frame_fraction[0]))
         axis = b - a
         if 0 < t < 1:
-            n -= axis * (n.dot(axis) / axis.dot(axis))
+            n -= axis * (n.dot(axis) / ti.max(axis.dot(axis), SHORT))
         return a * (1 - t) + b * t + n * (length / ti.max(n.norm(), TOUCH))
 
     @ti.func
