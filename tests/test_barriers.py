@@ -121,6 +121,14 @@ def test_orientation_is_found(world):
     for faces in ([f[::-1] for f in CUBE_FACES], some):
         np.testing.assert_array_equal(tv.Mesh(CUBE, faces).normals, want)
         np.testing.assert_array_equal(tv.Mesh(CUBE, faces, inside=True).normals, -want)
+    # So do two cubes side by side, each in its own orientation. One cube inside of another may be a cavity.
+    n, flipped = len(CUBE), [f[::-1] for f in CUBE_FACES]
+    for shift, size, cavity in ((9.0, 1.0, False), (9.0, 0.5, False), (0.0, 0.5, True)):
+        middle = np.mean(CUBE, axis=0)
+        two = np.concatenate([CUBE, middle + size * (CUBE - middle) + [shift, 0, 0]])
+        for one, other in ((CUBE_FACES, flipped), (flipped, CUBE_FACES)):
+            got = tv.Mesh(two, np.concatenate([one, n + np.array(other)])).normals
+            np.testing.assert_allclose(got, np.concatenate([want, -want if cavity else want]), atol=1e-15)
     assert (tv.Polygon(SQUARE[::-1]).normals.sum(axis=0) == 0).all()
     centers = tv.Polygon(STAR[::-1]).facets.corners.mean(axis=1)
     assert (outside(centers + 1e-6 * tv.Polygon(STAR[::-1]).normals, STAR) > 0).all()

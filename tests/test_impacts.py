@@ -34,7 +34,6 @@ def discs(
     return w
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("dim, precision, limit", [(2, "f64", 1e-12), (3, "f32", 1e-6)])
 def test_head_on_collisions(world, dim, precision, limit):
     # R14: v1 = (m1 u1 + m2 u2 - m2 e (u1 - u2)) / (m1 + m2), mass ratios 1 ... 1000. One pair per row, a group per e.
@@ -330,7 +329,12 @@ def test_friction_between_particles(world):
     # A disc that stays presses on the fixed one with m g cos, though it does not overlap it by then.
     held = w.contacts.impulse[np.isin(w.contacts.pairs[:, 0], [4, 6])]
     np.testing.assert_allclose(held * 1200, 9.81 * np.cos(a), rtol=1e-9)
-    for friction, error in ((-0.1, "at least 0"), (float("nan"), "finite"), ((0.2, 0.5), "must not exceed")):
+    for friction, error in (
+        (-0.1, "at least 0"),
+        (float("nan"), "finite"),
+        ((0.2, 0.5), "must not exceed"),
+        ({(0, 1): 0.5, (1, 0): 0.1}, "two values"),
+    ):
         with pytest.raises(ValueError, match=error):
             tv.Contact(friction=friction)
     for e in (1.5, -0.1):  # row 60

@@ -15,8 +15,8 @@ def test_near_and_nearest_equal_brute_force(world, dim, kind):
     features = [] if kind == "no contacts" else [tv.Contact()]
     w = world(tv.Particles(x, radius=radius), features, precision="f64", path="launched")  # its list has its own kernel
     x = w.position = x + 0.01 * np.sin(7 * x)
-    points = np.concatenate([rng.uniform(-3.5, 3.5, (50, dim)), x[:5], [[40.0] * dim]])
-    for reach in (0.0, 0.3, 2.0, 100.0):
+    points = np.concatenate([rng.uniform(-3.5, 3.5, (50, dim)), x[:5], [[40.0] * dim, [1e10] * dim]])
+    for reach in (0.0, 0.3, 2.0, 1e30):  # the last one has more cells than integers can count
         distance = np.linalg.norm(x[None] - points[:, None], axis=-1)
         np.testing.assert_array_equal(w.near(points, reach), np.argwhere(distance <= reach))
     index, length = w.nearest(points)
@@ -27,6 +27,31 @@ def test_near_and_nearest_equal_brute_force(world, dim, kind):
         w.near(points, -1.0)
     with pytest.raises(ValueError, match="points has shape"):
         w.nearest(np.zeros((3, 5 - dim)))
+
+
+@pytest.mark.parametrize("periodic", [False, True])
+def test_neighbours_ten_million_radii_from_the_origin(world, periodic):
+    # One f32 has steps of a radius there. Positions have two words, so the cells must read both, and points keep their digits.
+    rng = np.random.default_rng(0)
+    corner, radius = 3e5, 0.03
+    box = tv.Periodic((corner, corner), (corner + 1, corner + 1)) if periodic else None
+    x = corner + rng.uniform(0, 1, (300, 2))
+    w = world(tv.Particles(x, radius=radius), [tv.Contact(), *([box] if box else [])], precision="f32-compensated")
+    w._runner.list_neighbours()
+
+    def distances(a, b):
+        r = a[:, None] - b
+        return np.linalg.norm(box.difference(r, 0 * r) if box else r, axis=-1)
+
+    i, j = w._runner.search.list.entries()[0].T
+    listed = np.zeros((len(x), len(x)), dtype=bool)
+    listed[i, j] = True
+    near = distances(w.position, w.position) < 2 * radius + 0.999 * w._runner.search.skin
+    assert (listed >= near & ~np.eye(len(x), dtype=bool)).all()
+    points = corner + rng.uniform(0, 1, (100, 2))
+    distance = distances(points, w.position)
+    np.testing.assert_array_equal(w.near(points, radius), np.argwhere(distance <= radius))
+    np.testing.assert_array_equal(w.nearest(points)[0], distance.argmin(axis=1))
 
 
 def test_contacts_are_arrays(world):
@@ -42,7 +67,6 @@ def test_contacts_are_arrays(world):
     assert len(world(tv.Particles(x, radius=radius)).contacts) == 0
 
 
-@pytest.mark.slow
 def test_contacts_of_a_pinned_particle_that_another_has_left(world):
     # A pair with stored data stays on the list of the moving particle, however far that is; the pinned particle stores nothing.
     start = tv.Particles([(0.0, 0.0), (0.15, 0.0), (0.0, 0.3)], radius=0.1, pinned=[0], velocity=[(0, 0), (400.0, 0), (0, 0)])

@@ -64,7 +64,6 @@ def falls(w, i=0, frames=20):
     return np.linalg.norm(w.position[i] - before) > 0.02
 
 
-@pytest.mark.slow
 def test_a_row_that_was_never_disturbed_is_hit_to_the_bit(world):
     """Without gravity, a world with sleep has the bits of one without: discs at rest have no displacement to skip.
 
@@ -104,7 +103,6 @@ def test_against_a_world_that_never_rested(world):
     assert np.abs(a.velocity[:32]).max() > 0.1
 
 
-@pytest.mark.slow
 def test_bits_of_all_paths(world):
     """One thread, a team and the launched path agree on sleep, waking, spins and all events.
 
@@ -270,7 +268,6 @@ def yard(world):
     return w
 
 
-@pytest.mark.slow
 def test_what_wakes(world):
     """Every change by the user and every driven particle wakes. A force that depends on time wakes only what it begins to pull.
 
@@ -310,6 +307,16 @@ def test_what_wakes(world):
     assert w.last.asleep == asleep - 1 and (w.position[0] == rest).all() and w.position[6, 0] > pulled + 0.3
 
 
+def test_what_lies_on_a_roller_wakes_as_it_begins_to_turn(world):
+    # A disc between two pinned rollers takes the speed of their surfaces, -omega R / r.
+    rollers = tv.Particles([(-0.13, 0), (0.13, 0), (0, 0.17)], radius=[0.11, 0.11, 0.1], pinned=[0, 1], spin=0)
+    w = world(rollers, [tv.Gravity(), tv.Contact(friction=0.5), tv.Sleep(0.01, 0.2)], precision="f64", substeps=40)
+    until(w, 1)
+    w.spin = [5.0, 5.0, 0.0]
+    w.run(1.0)
+    assert w.spin[2] == pytest.approx(-5.0 * 0.11 / 0.1, rel=1e-3)
+
+
 def tied(world, start, links, time=0.5, speed=0.05, g=9.81, **settings):
     """Return a world of linked particles above a floor: one structure for each solver."""
     floor, contact = tv.HalfSpace((0, 1), -5.0, friction=0.5), tv.Contact(friction=0.5)
@@ -335,7 +342,6 @@ def test_what_sleeps_is_as_it_was_and_frames_cost_nothing(world):
     assert w.last.energy == state.energy and w.last.time == w.time == pytest.approx(state.time + 2.0)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("solver", [None, tv.Jacobi(), tv.ConjugateGradient()], ids=["direct", "jacobi", "conjugate"])
 def test_linked_particles(world, solver):
     """A rope at rest sleeps as a whole, with its loads, and wakes as a whole.
@@ -386,7 +392,6 @@ def square(side, center):
     return np.asarray(center) + side / 2 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
 
 
-@pytest.mark.slow
 def test_bodies_of_loops(world):
     """Two squares on each other and one beside them sleep, until a fourth falls on the two after sqrt(2 h / g).
 

@@ -387,7 +387,8 @@ class World:
                 seen = self.velocity
                 if not impulse.steer(runner, seen, seen, change, self._iterations, has):
                     self._restart_with_reactions()
-            runner.wake(np.flatnonzero(others))
+            held = runner.scene.inv_mass == 0  # what turns in place wakes what lies on it, as a wall that moves does
+            runner.wake(None if (others & held).any() else np.flatnonzero(others))
             s = runner.memory.read(spin.s)[: runner.n]
             runner.memory.write(spin.s, has + change if clock.d_is_velocity else s + clock.h * change)
             clock.energy = None

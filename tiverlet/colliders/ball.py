@@ -142,7 +142,8 @@ class Ball(Collider):
             contact_distance = own + radius
             c, b, a = start.dot(start) - contact_distance * contact_distance, start.dot(d), d.dot(d)
             root = b * b - a * c
-            if c > -TOUCH * contact_distance * contact_distance and b < 0 and root > 0:
+            outside = c > -TOUCH * contact_distance * contact_distance
+            if (outside or self.dev.surface.starts_on(i, start_depth, first, depth, n, d.norm())) and b < 0 and root > 0:
                 s = ti.max(c, 0) / (ti.sqrt(root) - b)
                 if s < 1:
                     n = (start + s * d).normalized()

@@ -14,6 +14,7 @@ from .round_mesh import rounded
 from .surface import TOUCH
 from .track import Track
 
+SHORT = 1e-30  # square of the length of an axis that has no direction, as where both ends have moved to one place [m^2]
 MARCH = 32  # steps along a path; a grazing path is then resolved within 1e-6 of its length
 
 
@@ -120,7 +121,7 @@ class Capsule(Collider):
         t, length, n = self.nearest(x, self.dev.a.at(frame_fraction[0]), self.dev.b.at(frame_fraction[0]))
         axis = b - a
         if 0 < t < 1:
-            n -= axis * (n.dot(axis) / axis.dot(axis))
+            n -= axis * (n.dot(axis) / ti.max(axis.dot(axis), SHORT))
         return a * (1 - t) + b * t + n * (length / ti.max(n.norm(), TOUCH))
 
     @ti.func
@@ -137,8 +138,9 @@ class Capsule(Collider):
         if (a_moved != b_moved).any():
             d = x - self.along(x - self.dev.surface.path(i, 0 * x), a, b, frame_fraction)
         way = d.norm()
+        ends = abs(a).sum() + abs(b).sum()
         # Otherwise the path begins further from the rod than it is long, whatever the rounding.
-        if depth + 2 * way > -TOUCH * (abs(a).sum() + abs(b).sum() + abs(x).sum() + contact_distance):
+        if depth + 2 * way > -TOUCH * (ends + abs(x).sum() + contact_distance):
             s, start_depth, k, going = 0 * length, 0 * length, 0, True
             # If the particle was outside, or touched, step along its path, each step no longer than the distance to the surface.
             while going:
@@ -146,7 +148,9 @@ class Capsule(Collider):
                 gap = distance - contact_distance
                 if k == 0:
                     start_depth = -gap
-                    going = not (gap <= -TOUCH * contact_distance or gap >= way)
+                    going = gap > -TOUCH * contact_distance and gap < way
+                    if not going and gap < way:
+                        going = self.dev.surface.starts_on(i, start_depth, m, depth, n, ends + way)
                 if going:
                     further = s
                     if k <= MARCH:

@@ -17,7 +17,8 @@ class Mesh(Moving):
 
     C(x) = dist(x, faces) - (R + r) >= 0, grad C the direction from the nearest point of the mesh (see FacetShape).
 
-    vertices: (m, 3) [m]. faces: (k, 3) vertices of each triangle, either way round: they are reordered to face outwards.
+    vertices: (m, 3) [m]. faces: (k, 3) vertices of each triangle, either way round: they are reordered to face outwards,
+    each connected part by itself. A part inside of another one is turned with it: a cavity if it is given the other way round.
     inside: keep particles in. closed: False for a sheet, a thin wall with two sides. radius: R [m], by which the faces are
     thickened; it must be above 0 for a sheet and points (particles of radius 0). position, rotation: pose of the vertices (see
     Moving); live.
@@ -75,13 +76,9 @@ class Mesh(Moving):
         order = np.argsort(which.ravel(), kind="stable").reshape(-1, 2)
         first, second = owner[order].T
         same = (halves[order[:, 0]] == halves[order[:, 1]]).all(axis=1)  # both run along it the same way: one is turned
-        if same.any():
-            faces = np.where(_turned(len(faces), first, second, same)[:, None], faces[:, ::-1], faces)
-        c = vertices[faces] - vertices.mean(axis=0)
-        volume = float(np.einsum("ij,ij->i", c[:, 0], np.cross(c[:, 1], c[:, 2])).sum()) / 6
-        if abs(volume) <= 1e-12 * np.abs(c).max() ** 3:
-            raise ValueError(f"Mesh: faces enclose a volume of {volume:g} m^3; closed = False makes a sheet of them.")
-        return faces[:, ::-1] if (volume < 0) != self.inside else faces
+        turned, part = _turned(len(faces), first, second, same)
+        faces = np.where(turned[:, None], faces[:, ::-1], faces)
+        return np.where((_inwards(vertices[faces], part) != self.inside)[:, None], faces[:, ::-1], faces)
 
     def _joined(self) -> Facets:
         """Compute corners and edges, the directions in which the faces continue from them, and the mean normals there."""
@@ -134,8 +131,8 @@ class Mesh(Moving):
         return Collider.solid(self, low, high) if self.inside else (self.placed(self.vertices), np.asarray(self.faces))
 
 
-def _turned(count: int, first: np.ndarray, second: np.ndarray, same: np.ndarray) -> np.ndarray:
-    """Return which faces to reverse so that all neighbours agree.
+def _turned(count: int, first: np.ndarray, second: np.ndarray, same: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which faces to reverse so that all neighbours agree, and the number of the connected part that each belongs to.
 
     first, second: pairs of neighbours. same: whether exactly one of each pair has to be reversed.
     """
@@ -143,13 +140,15 @@ def _turned(count: int, first: np.ndarray, second: np.ndarray, same: np.ndarray)
     order = np.argsort(a, kind="stable")
     b, differ = b[order], differ[order]
     begin = np.searchsorted(a[order], np.arange(count + 1))
-    turned = np.full(count, -1)
+    turned, part, parts = np.full(count, -1), np.zeros(count, dtype=int), 0
     for seed in range(count):
         if turned[seed] >= 0:
             continue
         turned[seed], queue = 0, [seed]
+        parts += 1
         while queue:
             f = queue.pop()
+            part[f] = parts - 1
             for k in range(begin[f], begin[f + 1]):
                 want = turned[f] ^ int(differ[k])
                 if turned[b[k]] < 0:
@@ -159,4 +158,39 @@ def _turned(count: int, first: np.ndarray, second: np.ndarray, same: np.ndarray)
                     raise ValueError(
                         f"Mesh: the faces around faces[{f}] have no outside; a Moebius strip or a Klein bottle has none."
                     )
-    return turned == 1
+    return turned == 1, part
+
+
+def _inwards(corners: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Return which faces, corners (k, 3, 3), are in parts whose normals point inwards.
+
+    part: (k,), the connected part of each face. A part inside of another one counts as that one does: it may be a cavity.
+    """
+    solids = np.split(corners[np.argsort(part, kind="stable")], np.cumsum(np.bincount(part))[:-1])
+    boxes = np.array([[c.min(axis=(0, 1)), c.max(axis=(0, 1))] for c in solids])
+    volume = np.array([_volume(c) for c in solids])
+    outer = np.arange(len(solids))
+    for k, (low, high) in enumerate(boxes):
+        around = np.flatnonzero((boxes[:, 0] < low).all(axis=1) & (boxes[:, 1] > high).all(axis=1))
+        around = [m for m in around if abs(_winding(solids[k][0, 0], solids[m])) > 0.5]
+        outer[k] = max(around, key=lambda m: abs(volume[m]), default=k)
+    return (volume < 0)[outer][part]
+
+
+def _volume(corners: np.ndarray) -> float:
+    """Return the volume that faces, corners (k, 3, 3), enclose [m^3], negative if their normals point inwards."""
+    c = corners - corners.mean(axis=(0, 1))
+    volume = float(np.einsum("ij,ij->i", c[:, 0], np.cross(c[:, 1], c[:, 2])).sum()) / 6
+    if abs(volume) <= 1e-12 * np.abs(c).max() ** 3:
+        raise ValueError(f"Mesh: faces enclose a volume of {volume:g} m^3; closed = False makes a sheet of them.")
+    return volume
+
+
+def _winding(point: np.ndarray, corners: np.ndarray) -> float:
+    """Return how often faces, corners (k, 3, 3), go around a point: the sum of solid angles (van Oosterom and Strackee 1983)."""
+    r = corners - point
+    a, b, c = r.transpose(1, 0, 2)
+    p, q, s = np.linalg.norm(r, axis=2).T
+    triple = np.einsum("ij,ij->i", a, np.cross(b, c))
+    ab, bc, ca = (np.einsum("ij,ij->i", u, v) for u, v in ((a, b), (b, c), (c, a)))
+    return float(np.arctan2(triple, p * q * s + ab * s + bc * p + ca * q).sum()) / (2 * np.pi)

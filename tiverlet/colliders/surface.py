@@ -105,6 +105,15 @@ class Surface:
         return out
 
     @ti.func
+    def starts_on(self, i, start_depth, first, depth, n, size):
+        """Whether particle i started on the surface of a convex wall that it may have passed, although it was inside there.
+
+        It was inside by rounding only, with the normal `first`, and is not inside on the same side at the end, at this depth with
+        the normal n. size: of the lengths from which the start is computed [m].
+        """
+        return start_depth < self.state.digits_with(i, size) and (depth <= 0 or n.dot(first) < 0)
+
+    @ti.func
     def lets_through(self, i, n, start_depth, contact_distance):
         """Whether particle i passes a one-way wall.
 
@@ -137,7 +146,7 @@ class Surface:
         d = self.state.d[i] - moved
         shift = 0 * d
         leaving = d.dot(n)
-        close = self.state.digits(i)
+        close = self.state.digits_along(i, n, self.radius.of(i))
         if depth > -close:
             depth = ti.max(depth, ti.min(-leaving, close))
         if ti.static(self.has_impacts):

@@ -113,9 +113,20 @@ class Table:
         rub = [friction_of(who, "friction", v) for v in values]
         values = restitution.values() if isinstance(restitution, Mapping) else [restitution]
         bounce = [restitution_of(who, "restitution", v) for v in values]
+        for name, given, parsed in (("friction", friction, rub), ("restitution", restitution, bounce)):
+            if isinstance(given, Mapping):
+                self._refuse_contradictions(name, {self._pair(name, pair): v for pair, v in zip(given, parsed, strict=True)})
         self.has_restitution = any(v.normal > 0 for v in bounce)
         self.turns = any(v.rolling > 0 or v.twisting > 0 for v in rub) or any(v.tangential > 0 for v in bounce)
         self.has_friction = any(v.static > 0 for v in rub) or self.turns
+
+    def _refuse_contradictions(self, name: str, values: Mapping[tuple[int, int], Any]) -> None:
+        """Raise ValueError if a pair of groups has two values, one in each order."""
+        for (a, b), value in values.items():
+            if values.get((b, a), value) != value:
+                raise ValueError(
+                    f"{self.who}: {name} has {(a, b)} and {(b, a)}, the same groups, with two values; leave one out."
+                )
 
     def pushing(self, group: np.ndarray, pairs: np.ndarray) -> np.ndarray:
         """Return which pairs (m, 2) of particles of these groups push each other, (m,)."""

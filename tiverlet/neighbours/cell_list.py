@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from ..features.feature import Scene
 
 FARTHEST = 1 << 22  # cells from the origin: beyond it, f32 cannot distinguish adjacent cells
+MOST_CELLS = 1 << 30  # cells from the origin in queries: no particle is there
 LEVELS = 14  # at most; the last level holds all smaller particles, down to points
 
 
@@ -171,23 +172,29 @@ class CellList:
     @ti.func
     def cell_of(self, i, m):
         """Return the cell of particle i at level m."""
-        cell = ti.floor(self.state.x[i] * self.scale(m), ti.i32)
+        x = self.state.exact(i)
+        cell = ti.floor(x * self.scale(m), ti.i32)
         for k in ti.static(self.axes):
-            cell[k] = self.images.cell(self.state.x[i], k, 0, self.cells_per_axis[m][k])
+            cell[k] = self.images.cell(x, k, 0, self.cells_per_axis[m][k])
         return cell
 
     @ti.func
     def cell_range(self, point, radius, m, k: ti.template()):  # type: ignore[valid-type]
-        """Return the first cell along periodic axis k that may hold particles within `radius` of a point, and their number.
+        """Return the first cell along axis k that may hold particles within `radius` of a point, and their number.
 
-        One cell is added on each side for rounding. In a sheared box these are all cells along FLOW. The point is in the box.
+        One cell is added on each side for rounding. In a periodic box the point is in the box; in a sheared one these are all
+        cells along FLOW. There are no more cells than buckets, so that each bucket is read once. Before they are clipped, numbers
+        may be too large for integers.
         """
-        count, size = self.cells_per_axis[m][k], self.images.length[None][k]
-        low = ti.floor((point[k] - radius) / size * count, ti.i32) - 1
-        number = ti.floor((point[k] + radius) / size * count, ti.i32) + 2 - low
+        most, per_meter = 1 << self.axis_bits[m][k], self.scale(m)
+        if ti.static(k in self.axes):
+            most = ti.min(most, self.cells_per_axis[m][k])
+            per_meter = ti.cast(self.cells_per_axis[m][k] / self.images.length[None][k], self.real)
+        low = ti.floor((point[k] - radius) * per_meter) - 1
+        number = ti.cast(ti.min(ti.floor((point[k] + radius) * per_meter) + 2 - low, most), ti.i32)
         if ti.static(self.sheared and k == FLOW):
-            number = count
-        return low, ti.min(number, count, 1 << self.axis_bits[m][k])
+            number = most
+        return ti.cast(ti.max(ti.min(low, MOST_CELLS), -MOST_CELLS), ti.i32), number
 
     @ti.func
     def scale(self, m):
@@ -271,7 +278,7 @@ class CellList:
                     if ti.static(self.sheared and k == GRADIENT):
                         turn = way
         if ti.static(self.sheared):
-            at[0] = self.images.cell(self.state.x[i], 0, turn, self.cells_per_axis[m][0])
+            at[0] = self.images.cell(self.state.exact(i), 0, turn, self.cells_per_axis[m][0])
         low, span = at[0] - 1, 1
         at[0] = 0
         if ti.static(0 in self.axes):

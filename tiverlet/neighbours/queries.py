@@ -43,7 +43,7 @@ class PointSearch:
 
     def __init__(self, search: "NeighbourSearch"):
         self.cells, self.state, self.dim, self.levels = search.cells, search.state, search.dim, search.cells.levels
-        self.real = search.real
+        self.real = ti.f64 if self.state.compensated else search.real
 
     @ti.func
     def visit(self, point, radius, row, number, at, out: ti.template(), fill: ti.template()):  # type: ignore[valid-type]
@@ -52,14 +52,10 @@ class PointSearch:
         Pairs are written to `out` from row at + number on.
         """
         for m in range(self.levels):
-            scale = self.cells.scale(m)
-            low = ti.floor((point - radius) * scale, ti.i32) - 1  # one more cell on each side, for rounding
-            count = ti.floor((point + radius) * scale, ti.i32) + 2 - low
-            for k in ti.static(self.cells.axes):
-                low[k], count[k] = self.cells.cell_range(point, radius, m, k)
-            total = 1
+            total, low = 1, ti.Vector.zero(ti.i32, self.dim)
+            count = low
             for k in ti.static(range(self.dim)):
-                count[k] = ti.min(count[k], 1 << self.cells.axis_bits[m][k])  # each bucket of the torus is read once
+                low[k], count[k] = self.cells.cell_range(point, radius, m, k)
                 total *= count[k]
             for c in range(total):
                 cell, rest = low, c
@@ -71,7 +67,7 @@ class PointSearch:
                 b = self.cells.bucket(cell, m)
                 for e in range(self.cells.edge[b + 1], self.cells.edge[b + 2]):
                     i = self.cells.sorted[e]
-                    r = self.state.nearest(self.state.place(i) - point)
+                    r = self.state.nearest(self.state.exact(i) - point)
                     if r.dot(r) <= radius * radius:
                         if ti.static(fill):
                             out[at + number, 0], out[at + number, 1] = row, i

@@ -30,6 +30,7 @@ class State:
         n, dim = particles.count, particles.dim
         self.compensated = compensated
         self.real, self.double = memory.real, memory.real == ti.f64
+        self.two_digits = 2.0**-50 if self.double else 2.0**-21  # the size of the last two binary digits of 1
         self.count, self.dim = n, dim
         self.starts = self.befores = self.keeps_wall_push = self.carries = self.spins = False
         self.images: Any = None  # set in a periodic box, see neighbours/periodic.py
@@ -164,6 +165,11 @@ class State:
         """Return x_i as one number per axis."""
         return at(self.x, i) + at(self.low, i) if self.compensated else at(self.x, i)
 
+    @inline
+    def exact(self, i):
+        """Return x_i with all of its digits: in f64 where it has two words."""
+        return ti.cast(at(self.x, i), ti.f64) + ti.cast(at(self.low, i), ti.f64) if self.compensated else at(self.x, i)
+
     @ti.func
     def begin(self, i):
         """Return the position of particle i at the start of the substep, as one number per axis."""
@@ -194,7 +200,24 @@ class State:
         size = ti.abs(x[0])
         for k in ti.static(range(1, self.dim)):
             size = ti.max(size, ti.abs(x[k]))
-        return ti.static(2.0**-50 if self.double else 2.0**-21) * size
+        return ti.static(self.two_digits) * size
+
+    @ti.func
+    def digits_along(self, i, n, size):
+        """Return the size of the last two binary digits of n . x_i and of lengths of this size, for a unit vector n [m].
+
+        Only compensated positions need it, which may be so far out that digits() exceeds the particle: there, only the
+        coordinates along n count.
+        """
+        close = self.digits(i)
+        if ti.static(self.compensated):
+            close = ti.static(self.two_digits) * (ti.abs(n).dot(ti.abs(self.x[i])) + size)
+        return close
+
+    @ti.func
+    def digits_with(self, i, size):
+        """Return the size of the last two binary digits of sums of coordinates of particle i and of others of this size [m]."""
+        return self.digits(i) + ti.static(self.two_digits) * size
 
     @ti.func
     def restart(self, i):
