@@ -42,7 +42,10 @@ def _short(values: np.ndarray) -> list:
     with np.errstate(over="ignore"):
         short = np.asarray(values, dtype=np.float32).astype(np.float64)
     known = np.isfinite(short)
-    return (short if known.all() else np.where(known, short, None)).tolist()
+    if not known.all():
+        short = short.astype(object)
+        short[~known] = None
+    return short.tolist()
 
 
 def walls(world: "World", extent: tuple[np.ndarray, np.ndarray]) -> str:
