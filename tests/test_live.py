@@ -64,9 +64,9 @@ def rope(world):
     return world(tv.Particles(line.position, radius=0.02, pinned=[0]), [tv.Gravity(9.81), tv.Distance(line.links)], substeps=4)
 
 
-def page(server, **headers):
-    origin = headers.pop("origin", f"http://127.0.0.1:{server.port}")
-    return connect(server.url.replace("http", "ws") + "socket", origin=origin, additional_headers=headers, compression=None)
+def page(server, **options):
+    options = {"origin": f"http://127.0.0.1:{server.port}", "compression": None} | options
+    return connect(server.url.replace("http", "ws") + "socket", **options)
 
 
 def figures(message: bytes) -> tuple[dict, np.ndarray]:
@@ -82,7 +82,6 @@ def hear(server, count: int) -> None:
     assert server.received.qsize() >= count
 
 
-@pytest.mark.slow
 def test_what_pages_ask_for_is_done_recorded_and_replayed(rope, server, tmp_path):
     live = Session(rope, server, title="<rope>", record=tmp_path / "play.rrd")
     start = rope.hash()
@@ -158,6 +157,130 @@ def test_a_page_that_goes_lets_go_and_one_that_is_slow_is_not_waited_for(rope, s
     hear(server, 1)
     live.advance()
     assert live.hand.particle == -1 and not server.viewers
+
+
+def received(there) -> tuple[list[dict], dict, np.ndarray]:
+    """Return the messages of a page up to the next frame, the figures of this frame, and its numbers. The page shows it."""
+    said = []
+    while isinstance(text := there.recv(timeout=10), str):
+        said.append(json.loads(text))
+    there.send('{"do": "shown"}')
+    return said, *figures(text)
+
+
+def test_pages_are_told_what_breaks_moves_comes_and_turns(world, server):
+    # A weight on a thread of 5 N, m g = 9.8 N: the thread breaks at once. The lid moves while the page takes no frame.
+    thread, lid, gravity = tv.Rope([[0, 1]], 1.0, break_at=5.0), tv.Box((-3, -3), (3, 3)), tv.Gravity(0.0)
+    x = np.array([[0.0, 1.0], [0.0, 0.0], [1.0, 0.0]])
+    w = world(tv.Particles(x, radius=0.1, pinned=[0], spin=[0, 0, 2.0], orientation=0), [gravity, thread, lid], substeps=4)
+    live = Session(w, server)
+    with page(server) as there:
+        hear(server, 1)
+        live.advance()
+        said, told, numbers = received(there)
+        assert {m["kind"]: m for m in said}["broken"]["links"] == [] and said[0]["turns"]
+        np.testing.assert_allclose(numbers[6:], w.orientation, atol=1e-6)
+        gravity.g = 9.81
+        live.advance()
+        said, _, _ = received(there)
+        assert [m["kind"] for m in said] == ["broken"] and said[0]["links"] == [0]
+        while server.viewers[0].waiting:  # the page has shown all
+            time.sleep(0.005)
+        for _ in range(session.AHEAD):
+            live.advance()
+        lid.upper = (3, 2)
+        live.advance()  # not sent: the page has two frames to show
+        live.advance()
+        for _ in range(session.AHEAD):
+            said, _, _ = received(there)
+            assert not said
+        while server.viewers[0].waiting:
+            time.sleep(0.005)
+        live.advance()
+        said, _, _ = received(there)
+        assert [m["kind"] for m in said] == ["walls"] and max(p[1] for s in said[0]["walls"][0]["strips"] for p in s) == 2
+        w.add(tv.Particles([[1.0, 2.0]], radius=0.1, spin=[0.0], orientation=[0.0]))
+        live.advance()
+        said, _, numbers = received(there)
+        assert len({m["kind"]: m for m in said}["scene"]["radius"]) == 4 and len(numbers) == 3 * 4
+        there.send('{"do": "restart"}')
+        hear(server, 1)
+        live.advance()
+        said, told, _ = received(there)
+        assert "no way back" in said[0]["text"] and told["time"] > 0.05
+    live.close()
+    assert not w._watchers
+
+
+def test_a_restart_brings_back_knobs_and_what_broke(world, server):
+    gravity, thread, lid = tv.Gravity(9.81), tv.Rope([[0, 1]], 1.0, break_at=5.0), tv.Box((-3, -3), (3, 3))
+    w = world(tv.Particles([[0.0, 1.0], [0.0, 0.0]], pinned=[0]), [gravity, thread, lid], substeps=4)
+    live = Session(w, server)
+    start = w.hash()
+    for _ in range(5):
+        live.advance()
+    then = w.hash()
+    assert thread.broken.all()
+    gravity.g, lid.upper = (1.0, 2.0), (3, 2)
+    live.advance()
+    live._restart()
+    assert w.hash() == start and gravity.g == 9.81 and lid.upper[1] == 3 and not thread.broken.any()
+    for _ in range(5):
+        live.advance()
+    assert w.hash() == then
+    live.close()
+
+
+def test_a_scene_that_diverges_is_still_shown(world, server):
+    w = world(tv.Particles([[0.0, 0.0]], velocity=[[0.0, 1e160]]), [tv.Gravity(9.81)], precision="f64")  # v^2 is infinite
+    live = Session(w, server)
+    live.advance()
+    assert not np.isfinite(w.last.energy)
+    with page(server) as there:
+        hear(server, 1)
+        live.advance()
+
+        def refuse(name):
+            raise AssertionError(f"{name} is no JSON")
+
+        while isinstance(text := there.recv(timeout=10), str):
+            json.loads(text, parse_constant=refuse)
+        told = json.loads(text[4 : 4 + int.from_bytes(text[:4], "little")], parse_constant=refuse)
+        assert told["energy"] is None
+    live.close()
+
+
+def test_only_the_page_that_holds_a_particle_lets_it_go(rope, server):
+    live = Session(rope, server)
+    with page(server) as one, page(server) as other:
+        hear(server, 2)
+        one.send(json.dumps({"do": "grab", "particle": 4, "target": [0, 0]}))
+        hear(server, 3)
+        other.send(json.dumps({"do": "grab", "particle": 5, "target": [0, 0]}))
+        hear(server, 4)
+        one.send(json.dumps({"do": "drop"}))
+        hear(server, 5)
+        live.advance()
+        assert live.hand.particle == 5
+    live.close()
+
+
+def test_a_page_that_does_not_read_holds_up_nobody(server):
+    with page(server, max_size=None, max_queue=1) as there:
+        hear(server, 1)
+        begin = time.monotonic()
+        for _ in range(3):
+            server.viewers[0].send(bytes(8 << 20))  # more than sockets buffer
+        assert time.monotonic() - begin < 1
+        assert [len(there.recv(timeout=10)) for _ in range(3)] == 3 * [8 << 20]
+
+
+def test_play_replaces_recordings_only(rope, server, tmp_path):
+    notes = tmp_path / "notes.txt"
+    notes.write_text("mine")
+    with pytest.raises(ValueError, match="is no recording, and is not replaced"):
+        Session(rope, server, record=notes)
+    assert notes.read_text() == "mine" and not rope._watchers
 
 
 def test_only_who_knows_the_address_gets_in(server):

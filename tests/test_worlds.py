@@ -99,7 +99,6 @@ SCENES = {
 NO_OTHERS = ("Chebyshev", "ConjugateGradient")  # their velocities are computed like those of "Direct"
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # warnings of corners that are off
 @pytest.mark.parametrize("name", SCENES)
 def test_each_has_the_bits_that_it_has_alone(taichi, name):
@@ -167,7 +166,6 @@ def give_room(many, pairs):
     return near
 
 
-@pytest.mark.slow
 def test_a_list_that_is_too_short_in_one_grows_in_all(taichi):
     # There is room for fewer pairs than there will be: some frames stop in the middle while others continue, in one launch.
     alone = [heap(k, 20) for k in range(3)]
@@ -386,6 +384,31 @@ def test_tracks_of_some_frames_go_on_from_launch_to_launch(taichi, monkeypatch):
         np.testing.assert_array_equal(third.position, every.position[:, 2::3])
         np.testing.assert_array_equal(third.time, every.time[:, 2::3])
         assert third.report.residual.tolist() == every.report.residual.tolist()
+
+
+def test_knobs_may_be_numbers_in_some_worlds_and_vectors_in_others(taichi):
+    def made(g):
+        return tv.World(tv.Particles([[0.0, 1.0]], velocity=(1, 0)), [tv.Gravity(g)], substeps=4)
+
+    for given, later in (((1.0, -2.0), False), (9.81, True)):
+        many, alone = tv.Worlds([made(9.81), made(given)]), made((1.0, -2.0))
+        if later:
+            many.set(many.features[0], [1], g=[(1.0, -2.0)])
+        many.run(0.1)
+        alone.run(0.1)
+        assert many.hash(1) == alone.hash() != many.hash(0)
+        many.close()
+
+
+def test_a_reset_that_is_refused_changes_nothing(taichi):
+    many = tv.Worlds(tv.World(tv.Particles([[0.0, 1.0]]), [tv.Gravity()], substeps=4), 2)
+    many.run(0.1)
+    before = many.hash(0)
+    for wrong in ({"position": np.zeros((3, 1, 2))}, {"velocity": [[np.nan, 0.0]]}, {"position": [[1e39, 0.0]]}):
+        with pytest.raises(ValueError):
+            many.reset(**wrong)
+        assert many.hash(0) == before
+    many.close()
 
 
 def test_a_reset_starts_from_places_that_are_given(taichi):

@@ -25,12 +25,11 @@ def add(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Run and record the script; return its exit status."""
     from ..recording import replay
-    from ..recording.sink import is_recording
+    from ..recording.sink import check_replaceable
 
     path = find(args.script)
     out = args.out or f"{path.stem}.rrd"
-    if os.path.isfile(out) and not is_recording(out):
-        raise ValueError(f"{out} is no recording, and is not replaced. Give another --out, or remove it first.")
+    check_replaceable(out)
     with recording(out, args.live) as made:
         status = execute(path, args.arguments)
     if made:

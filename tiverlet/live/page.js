@@ -3,13 +3,19 @@
 
 const canvas = document.getElementById("view");
 const gl = canvas.getContext("webgl2", { antialias: !inSoftware() });
+if (!gl) {
+  document.getElementById("notes").textContent = "This browser draws no WebGL 2. Switch it on, or open the address in another one.";
+  throw new Error("no WebGL 2");
+}
+canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
+canvas.addEventListener("webglcontextrestored", () => location.reload());
 function inSoftware() { // in software, smooth edges of faces cost a fifth of the frames; discs and lines are smooth by themselves
   const probe = document.createElement("canvas").getContext("webgl2");
   const told = probe && probe.getExtension("WEBGL_debug_renderer_info");
   return /swiftshader|llvmpipe|software/i.test(told ? probe.getParameter(told.UNMASKED_RENDERER_WEBGL) : "");
 }
 const $ = (id) => document.getElementById(id);
-let scene = null, walls = [], figures = {}, x = null, held = null, dirty = true, frames = 0, fps = 0;
+let scene = null, walls = [], figures = {}, x = null, turned = null, held = null, dirty = true, frames = 0, fps = 0;
 const show = { strain: false, particles: false };
 
 // Shader programs. All of them are 3D; a 2D scene has z = 0.
@@ -127,7 +133,7 @@ function squares(count) {
 
 // The camera.
 
-const eye = { center: [0, 0, 0], scale: 100, far: 3, turn: 0.5, lift: 0.35 };
+const eye = { center: [0, 0, 0], scale: 100, far: 3, turn: 0.5, lift: 0.35, chosen: false }; // chosen: the user has moved it
 let look = new Float32Array(16), unlook = null, place = [0, 0, 1], pixels = 1;
 const sub = (a, b) => a.map((v, k) => v - b[k]), add = (a, b, s = 1) => a.map((v, k) => v + s * b[k]);
 const dot = (a, b) => a.reduce((t, v, k) => t + v * b[k], 0), unit = (a) => { const l = Math.hypot(...a) || 1; return a.map((v) => v / l); };
@@ -148,7 +154,7 @@ function fit() {
   eye.scale = Math.min(canvas.width / (span[0] || 1), (canvas.height - keys) / (span[1] || 1)) * 0.88 || 100;
   if (scene.dim === 2) eye.center[1] -= keys / 2 / eye.scale;
   eye.far = 1.5 * Math.hypot(...span) || 1;
-  eye.turn = 0.5; eye.lift = 0.3;
+  eye.turn = 0.5; eye.lift = 0.3; eye.chosen = false;
   dirty = true;
 }
 
@@ -202,6 +208,7 @@ function three(flat) { // returns positions with three components
   return out;
 }
 
+const MARK = [24, 26, 32, 255], SPOT = 0.5; // marks that show rotation: their color, and the radius of a spot on a ball, in radii
 const dark = () => matchMedia("(prefers-color-scheme: dark)").matches;
 
 function hue(strain) { // grey at rest, blue shorter, red longer: full at a tenth, as in recordings
@@ -230,10 +237,42 @@ function drawLines(name, ends, colors, wide) {
   squares(ends.length / 6);
 }
 
+function drawDiscs(name, centers, radius, hues) {
+  use(discs);
+  upload(name, fourfold(centers, 3));
+  attribute(1, name, 3);
+  attribute(2, radius, 1);
+  attribute(3, hues, 4, 0, 0, true);
+  squares(centers.length / 3);
+}
+
+function drawMarks(points, n) { // how far particles have turned: a line to the rim of a disc, two spots on a ball, as in recordings
+  const spots = new Float32Array(6 * n), flat = scene.dim === 2;
+  for (let i = 0; i < n; i++) {
+    const r = scene.covered[i] && !scene.pinned[i] ? 0 : scene.radius[i], c = points.subarray(3 * i, 3 * i + 3);
+    if (flat) {
+      spots.set([...c, c[0] + r * Math.cos(turned[i]), c[1] + r * Math.sin(turned[i]), 0], 6 * i);
+    } else { // the first axis, turned by the quaternion
+      const [a, b, d, w] = turned.subarray(4 * i, 4 * i + 4), s = (1.02 - SPOT) * r;
+      const axis = [1 - 2 * (b * b + d * d), 2 * (a * b + d * w), 2 * (a * d - b * w)];
+      for (let k = 0; k < 3; k++) { spots[6 * i + k] = c[k] + s * axis[k]; spots[6 * i + 3 + k] = c[k] - s * axis[k]; }
+    }
+  }
+  if (flat) drawLines("marks", spots, scene.marks, devicePixelRatio);
+  else drawDiscs("marks", spots, "spots", "spots.color");
+}
+
+function crosses(points, a, b) { // whether two particles are nearer to each other across the periodic box
+  return scene.box.some((length, c) => length && Math.abs(points[3 * a + c] - points[3 * b + c]) > length / 2);
+}
+
 function draw() {
   requestAnimationFrame(draw);
   const w = Math.round(canvas.clientWidth * devicePixelRatio), h = Math.round(canvas.clientHeight * devicePixelRatio);
-  if (canvas.width !== w || canvas.height !== h) { canvas.width = w; canvas.height = h; fit(); }
+  if (canvas.width !== w || canvas.height !== h) {
+    canvas.width = w; canvas.height = h; dirty = true;
+    if (!eye.chosen) fit();
+  }
   if (!dirty || !scene || !x) return;
   dirty = false;
   aim();
@@ -274,7 +313,8 @@ function draw() {
     const color = new Uint8Array(ends.length / 6 * 4).map((_, j) => [120, 125, 140, 255][j % 4]);
     drawLines("wall" + k, new Float32Array(ends), color, wall.radius ? -wall.radius : 1.2 * devicePixelRatio);
   }
-  const drawn = show.strain ? scene.links.map((_, k) => k) : scene.loose;
+  let drawn = show.strain ? scene.whole : scene.loose;
+  if (scene.box) drawn = drawn.filter((k) => !crosses(points, ...scene.links[k]));
   const ends = new Float32Array(6 * drawn.length), colors = new Uint8Array(4 * drawn.length);
   drawn.forEach((k, j) => {
     const [a, b] = scene.links[k];
@@ -288,12 +328,8 @@ function draw() {
   });
   drawLines("links", ends, colors, (show.strain ? 1.6 : 1.2) * devicePixelRatio);
 
-  const where = use(discs);
-  upload("centers", fourfold(points, 3));
-  attribute(1, "centers", 3);
-  attribute(2, show.particles ? "radius" : "seen", 1);
-  attribute(3, "hues", 4, 0, 0, true);
-  squares(n);
+  drawDiscs("centers", points, show.particles ? "radius" : "seen", "hues");
+  if (turned) drawMarks(points, n);
   if (figures.target && figures.held < n) {
     gl.disable(gl.DEPTH_TEST);
     const line = new Float32Array([...at(figures.held), ...[...figures.target, 0].slice(0, 3)]);
@@ -305,35 +341,54 @@ function draw() {
 
 const url = new URL("socket", location.href);
 url.protocol = "ws:";
-const socket = new WebSocket(url);
-socket.binaryType = "arraybuffer";
+let socket = null, counted = performance.now();
 const say = (message) => { if (socket.readyState === 1) socket.send(JSON.stringify(message)); };
-let counted = performance.now();
 
-socket.onmessage = ({ data }) => {
+function connect() {
+  socket = new WebSocket(url);
+  socket.binaryType = "arraybuffer";
+  socket.onmessage = hear;
+  socket.onclose = () => {
+    $("notes").textContent = "The world has ended, or cannot be reached. If it was run again, open the new address.";
+    setTimeout(connect, 2000);
+  };
+}
+
+function hear({ data }) {
   if (typeof data !== "string") {
-    const length = new DataView(data).getUint32(0, true);
+    requestAnimationFrame(() => say({ do: "shown" }));
+    const length = new DataView(data).getUint32(0, true), count = scene.dim * scene.radius.length;
     figures = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
-    x = new Float32Array(data, 4 + length);
+    x = new Float32Array(data, 4 + length, count);
+    turned = scene.turns ? new Float32Array(data, 4 + length + 4 * count) : null;
     frames++;
     dirty = true;
-    requestAnimationFrame(() => say({ do: "shown" }));
     tell();
     return;
   }
   const message = JSON.parse(data);
   if (message.kind === "scene") take(message);
   if (message.kind === "walls") { walls = message.walls; dirty = true; }
+  if (message.kind === "broken") { scene.broken = new Set(message.links); sort(); }
   if (message.kind === "told") { $("named").textContent = message.text; $("named").hidden = false; }
-};
-socket.onclose = () => { $("notes").textContent = "The world has ended. Run it again, and open the new address."; };
+}
+connect();
+
+function sort() { // find the links that are drawn: those that are whole, and the ones among them that no surface covers
+  scene.whole = scene.links.map((_, k) => k).filter((k) => !scene.broken.has(k));
+  scene.loose = scene.whole.filter((k) => !(scene.covered[scene.links[k][0]] && scene.covered[scene.links[k][1]]));
+  dirty = true;
+}
 
 function take(message) {
+  const first = !scene;
   scene = message;
+  x = null; // the next frame has the particles of this scene
   scene.up = [...scene.up, 0].slice(0, 3);
+  scene.broken = new Set();
   document.title = scene.title;
   $("title").textContent = scene.title;
-  scene.loose = scene.links.map((_, k) => k).filter((k) => !(scene.covered[scene.links[k][0]] && scene.covered[scene.links[k][1]]));
+  sort();
   const dots = scene.radius.map((r) => r > 0 ? r : -3);
   upload("radius", fourfold(new Float32Array(dots), 1));
   // Particles of a surface have its shade in 2D. In 3D they are hidden, except pinned ones.
@@ -343,7 +398,10 @@ function take(message) {
   upload("color", hues);
   upload("hues", fourfold(hues, 4));
   upload("triangles", new Uint32Array(scene.triangles.flat()), gl.ELEMENT_ARRAY_BUFFER);
-  fit();
+  scene.marks = new Uint8Array(scene.radius.flatMap(() => MARK));
+  upload("spots", fourfold(new Float32Array(scene.radius.flatMap((r, i) => Array(2).fill(under(i) ? 0 : SPOT * r))), 1));
+  upload("spots.color", fourfold(new Uint8Array(scene.radius.flatMap(() => [...MARK, ...MARK])), 4));
+  if (first) fit();
 }
 
 let last = 0;
@@ -352,12 +410,12 @@ function tell() {
   if (now - last < 150) return;
   if (now - counted > 1000) { fps = 1000 * frames / (now - counted); frames = 0; counted = now; }
   last = now;
-  const f = figures, short = (v) => (v === 0 ? "0" : Math.abs(v) >= 0.01 && Math.abs(v) < 1e4 ? v.toFixed(3) : v.toExponential(1));
+  const f = figures, short = (v) => (v === null ? "not finite" : v === 0 ? "0" : Math.abs(v) >= 0.01 && Math.abs(v) < 1e4 ? v.toFixed(3) : v.toExponential(1));
   const rows = [["time", f.time.toFixed(2) + " s"], ["speed", f.paused ? "paused" : (f.rate ? (f.rate / f.slower).toFixed(2) + " x" : "...")]];
   if (f.ms) rows.push(["computing", f.ms.toFixed(1) + " ms"], ["shown", fps.toFixed(0) + " /s"]);
   if (f.substeps) rows.push(["substeps", f.substeps + (f.iterations > 1 ? " x " + f.iterations : "")]);
-  if (f.residual) rows.push(["residual", short(f.residual)]);
-  if (f.overlap) rows.push(["overlap", short(f.overlap) + " r"]);
+  if (f.residual !== 0 && f.residual !== undefined) rows.push(["residual", short(f.residual)]);
+  if (f.overlap !== 0 && f.overlap !== undefined) rows.push(["overlap", short(f.overlap) + " r"]);
   if (f.energy !== undefined) rows.push(["energy", short(f.energy) + " J"]);
   $("list").replaceChildren(...rows.flatMap((row) => row.map((text, k) => {
     const part = document.createElement(k ? "dd" : "dt");
@@ -382,7 +440,7 @@ for (const [key, name, text, act] of KEYS) {
   button.onclick = () => { act(); dirty = true; button.blur(); };
   $("keys").append(button);
 }
-for (const text of ["drag: pull", "click: name", "drag beside: move or turn", "wheel: nearer"]) {
+for (const text of ["drag: pull", "click: name", "drag beside: move or turn", "wheel or two fingers: nearer"]) {
   const hint = document.createElement("span");
   hint.textContent = text;
   hint.style.cssText = "padding: 2px 6px; color: var(--quiet)";
@@ -390,16 +448,28 @@ for (const text of ["drag: pull", "click: name", "drag beside: move or turn", "w
 }
 addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey) return;
+  if (event.key === " " && event.target.closest("button")) return; // presses the button
   const found = KEYS.find(([key]) => key === event.key.toLowerCase() || (key === "+" && event.key === "="));
+  if (found && event.repeat && found[0] !== ".") return;
   if (found) { event.preventDefault(); found[3](); dirty = true; }
 });
 
 const spot = (event) => [event.offsetX * devicePixelRatio, event.offsetY * devicePixelRatio];
 const target = (event) => add(under(...spot(event), held.from), held.offset).slice(0, scene.dim);
 
+// Fingers and buttons that are down. One pulls a particle or moves the view; two fingers move and zoom it.
+const down = new Map();
+const pinch = () => { // returns the middle of two fingers, and their distance
+  const [a, b] = [...down.values()];
+  return [[(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], Math.hypot(...sub(a, b)) || 1];
+};
+
 canvas.onpointerdown = (event) => {
   if (!scene || !x) return;
   canvas.setPointerCapture(event.pointerId);
+  drop();
+  down.set(event.pointerId, spot(event));
+  if (down.size > 1) return;
   const i = event.shiftKey || event.button ? -1 : pick(...spot(event)), from = i < 0 ? eye.center : at(i);
   held = { i, from, offset: [0, 0, 0], at: spot(event), way: 0, shift: event.shiftKey || event.button > 0 };
   if (i >= 0) {
@@ -409,34 +479,56 @@ canvas.onpointerdown = (event) => {
   }
 };
 canvas.onpointermove = (event) => {
+  if (!down.has(event.pointerId)) return;
+  const two = down.size === 2 && pinch(), now = spot(event);
+  down.set(event.pointerId, now);
+  if (two) {
+    const [middle, wide] = pinch();
+    zoom(wide / two[1], ...two[0]);
+    shift(two[0], middle, eye.center);
+  }
   if (!held) return;
-  const now = spot(event), step = sub(now, held.at);
+  const step = sub(now, held.at);
   held.way += Math.hypot(...step);
   if (held.i >= 0) say({ do: "move", target: target(event) });
   else if (scene.dim === 3 && !held.shift) {
     eye.turn -= step[0] * 0.006 / devicePixelRatio;
     eye.lift = Math.min(1.55, Math.max(-1.55, eye.lift + step[1] * 0.006 / devicePixelRatio));
-  } else {
-    eye.center = sub(eye.center, sub(under(...now, held.from), under(...held.at, held.from)));
-  }
+    eye.chosen = true;
+  } else shift(held.at, now, held.from);
   held.at = now;
   dirty = true;
 };
-canvas.onpointerup = canvas.onpointercancel = () => {
-  if (held && held.i >= 0) {
-    say({ do: "drop" });
-    if (held.way < 4 * devicePixelRatio) say({ do: "name", particle: held.i });
-  } else if (held && held.way < 4) $("named").hidden = true;
+canvas.onpointerup = canvas.onpointercancel = (event) => {
+  down.delete(event.pointerId);
+  if (held && held.i < 0 && held.way < 4) $("named").hidden = true;
+  if (held && held.i >= 0 && held.way < 4 * devicePixelRatio) say({ do: "name", particle: held.i });
+  drop();
+};
+canvas.oncontextmenu = (event) => event.preventDefault(); // the right button moves the view
+
+function drop() {
+  if (held && held.i >= 0) say({ do: "drop" });
   canvas.classList.remove("held");
   held = null;
-};
+}
+
+function shift(from, to, through) { // move the view, so that what was at pixels `from` is at pixels `to`
+  aim();
+  eye.center = sub(eye.center, sub(under(...to, through), under(...from, through)));
+  eye.chosen = dirty = true;
+}
+
+function zoom(by, px, py) { // make the scene larger; in 2D the point under these pixels stays there
+  const before = under(px, py, eye.center);
+  eye.scale *= by; eye.far /= by;
+  if (scene.dim === 2) eye.center = add(eye.center, sub(before, under(px, py, eye.center)));
+  eye.chosen = dirty = true;
+}
+
 canvas.addEventListener("wheel", (event) => {
   event.preventDefault();
-  if (!scene) return;
-  const by = Math.exp(-event.deltaY * 0.0015), before = under(...spot(event), eye.center);
-  eye.scale *= by; eye.far /= by;
-  if (scene.dim === 2) eye.center = add(eye.center, sub(before, under(...spot(event), eye.center)));
-  dirty = true;
+  if (scene) zoom(Math.exp(-event.deltaY * 0.0015), ...spot(event));
 }, { passive: false });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { dirty = true; });
 requestAnimationFrame(draw);

@@ -1,6 +1,7 @@
-"""The data that the page gets about a world: once its parts, and in every frame its positions."""
+"""The data that the page gets about a world: its parts when they have changed, and in every frame its positions."""
 
 import json
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,56 +12,69 @@ from ..constraints import Path
 from ..constraints.core.length import is_link
 from ..features.feature import Batch
 from ..forces import Hand
-from ..recording.drawing import bounds, colors, links, upwards
-from ..recording.images import InBox
+from ..recording.drawing import colors, links, upwards
+from ..recording.images import box_of
 from ..recording.surfaces import covered, triangles
 
 if TYPE_CHECKING:
     from ..world import World
 
 
-def scene(world: "World", title: str) -> str:
-    """Return everything that does not change, as JSON."""
+def scene(world: "World", title: str, extent: tuple[np.ndarray, np.ndarray]) -> str:
+    """Return particles, links, surfaces and the view as JSON. extent: the corners of the view [m]."""
     p = world.particles
     found = links(world)
     none = np.zeros((0, 2), dtype=np.int64)
     rest = [np.asarray(f.rest, dtype=np.float64) if is_link(f) else np.zeros(f.count) for _, f in found]
-    low, high = bounds(world)
-    corners = triangles(world)
+    corners, box = triangles(world), box_of(world)
     return json.dumps({
         "kind": "scene", "title": title, "dim": p.dim, "radius": _short(p.radius),
-        "pinned": (p.inv_mass == 0).astype(int).tolist(),
+        "pinned": (p.inv_mass == 0).astype(int).tolist(), "turns": p.orientation is not None,
         "color": colors(world).tolist(), "links": np.concatenate([none, *(f.indices for _, f in found)]).tolist(),
         "rest": _short(np.concatenate([np.zeros(0), *rest])), "triangles": corners.tolist(),
-        "covered": covered(world, corners).astype(int).tolist(), "low": _short(low),
-        "high": _short(high), "up": _short(upwards(world)),
+        "covered": covered(world, corners).astype(int).tolist(), "low": _short(extent[0]),
+        "high": _short(extent[1]), "up": _short(upwards(world)), "box": None if box is None else _short(box.lengths),
     })  # fmt: skip
 
 
 def _short(values: np.ndarray) -> list:
-    return np.asarray(values, dtype=np.float32).astype(np.float64).tolist()
+    """Return numbers as f32 has them; None where they are not finite, which JSON cannot say."""
+    with np.errstate(over="ignore"):
+        short = np.asarray(values, dtype=np.float32).astype(np.float64)
+    known = np.isfinite(short)
+    if not known.all():
+        short = short.astype(object)
+        short[~known] = None
+    return short.tolist()
 
 
-def walls(world: "World", extent: tuple[np.ndarray, np.ndarray]) -> list[dict[str, Any]]:
-    """Return outlines of walls and paths at their present places."""
+def walls(world: "World", extent: tuple[np.ndarray, np.ndarray]) -> str:
+    """Return outlines of walls, paths and a periodic box at their present places, as JSON. extent: see scene()."""
     out = []
     for f in world.features:
         if isinstance(f, (Collider, Path)) and getattr(f, "active", True):
             strips, radius = f.outline(*extent)
             vertices, faces = f.solid(*extent) if isinstance(f, Collider) else (np.zeros((0, 3)), np.zeros((0, 3)))
-            lines = [] if len(faces) else [_short(strip) for strip in strips]
-            out.append({"strips": lines, "radius": float(radius), "vertices": _short(vertices.ravel()), "faces": faces.tolist()})
-    return out
+            out.append(_wall([] if len(faces) else strips, radius, vertices, faces))
+    if box := box_of(world):
+        out.append(_wall(box.outline(*extent), 0.0, np.zeros((0, 3)), np.zeros((0, 3))))
+    return json.dumps({"kind": "walls", "walls": out})
+
+
+def _wall(strips: Any, radius: float, vertices: np.ndarray, faces: np.ndarray) -> dict[str, Any]:
+    lines = [_short(strip) for strip in strips]
+    return {"strips": lines, "radius": float(radius), "vertices": _short(vertices.ravel()), "faces": faces.tolist()}
+
+
+def broken(world: "World") -> str:
+    """Return the numbers of broken links, as JSON."""
+    each = [f.broken if f.breaks else np.zeros(f.count, dtype=bool) for _, f in links(world)]
+    return json.dumps({"kind": "broken", "links": np.flatnonzero(np.concatenate(each)).tolist()})
 
 
 def message(text: str) -> str:
     """Return a message for the user, as JSON."""
     return json.dumps({"kind": "told", "text": text})
-
-
-def placed_walls(outlines: list[dict[str, Any]]) -> str:
-    """Return the result of walls() as JSON."""
-    return json.dumps({"kind": "walls", "walls": outlines})
 
 
 def describe_particle(world: "World", i: int) -> str:
@@ -78,9 +92,15 @@ def describe_particle(world: "World", i: int) -> str:
     return "\n".join(lines + ([f"in {', '.join(dict.fromkeys(acts))}"] if acts else []))
 
 
-def frame(world: "World", figures: dict[str, Any]) -> bytes:
-    """Return a frame as bytes: the length of the JSON figures (u32, little-endian), the figures, and positions in f32."""
-    text = json.dumps(figures).encode()
+def frame(world: "World", figures: dict[str, Any], places: np.ndarray) -> bytes:
+    """Return a frame as bytes: the length of the JSON figures (u32, little-endian), the figures, positions in f32, orientations.
+
+    Figures that are not finite are null. places: where particles are drawn, (n, dim) [m]. Orientations follow in f32 where
+    particles have them: angles in 2D [rad], quaternions (x, y, z, w) in 3D.
+    """
+    known = {name: v if not isinstance(v, float) or math.isfinite(v) else None for name, v in figures.items()}
+    text = json.dumps(known).encode()
     text += b" " * (-len(text) % 4)
-    places = InBox().drawn_positions(world, world.position)
-    return len(text).to_bytes(4, "little") + text + places.astype("<f4").tobytes()
+    turned = b"" if world.particles.orientation is None else world.orientation.astype("<f4").tobytes()
+    with np.errstate(over="ignore"):  # positions of a diverged scene may exceed f32
+        return len(text).to_bytes(4, "little") + text + places.astype("<f4").tobytes() + turned

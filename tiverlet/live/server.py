@@ -27,13 +27,24 @@ class Viewer:
     def __init__(self, connection: Any):
         self.connection = connection
         self.waiting = 0  # frames sent that the page has not shown yet
+        self.known: dict[str, str] = {}  # the last message of each kind, see Parts
+        self._outbox: queue.SimpleQueue[str | bytes | None] = queue.SimpleQueue()
 
     def send(self, message: str | bytes) -> None:
-        """Send a message to the page, if it is still connected."""
+        """Send a message to the page, if it is still connected. It does not wait for a page that does not read."""
+        self._outbox.put(message)
+
+    def deliver(self) -> None:
+        """Pass messages to the connection, in a thread of its own, until leave() is called or the connection ends."""
         from websockets.exceptions import ConnectionClosed
 
         with contextlib.suppress(ConnectionClosed, OSError):
-            self.connection.send(message)
+            while (message := self._outbox.get()) is not None:
+                self.connection.send(message)
+
+    def leave(self) -> None:
+        """End deliver()."""
+        self._outbox.put(None)
 
 
 class Server:
@@ -107,6 +118,7 @@ class Server:
         from websockets.exceptions import ConnectionClosed
 
         viewer = Viewer(connection)
+        threading.Thread(target=viewer.deliver, daemon=True).start()
         with self._lock:
             self._viewers.append(viewer)
         self.received.put((viewer, {"do": "came"}))
@@ -115,6 +127,7 @@ class Server:
                 for text in connection:
                     self._take(viewer, text)
         finally:
+            viewer.leave()
             with self._lock:
                 self._viewers.remove(viewer)
             self.received.put((viewer, {"do": "went"}))

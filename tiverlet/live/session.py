@@ -1,5 +1,6 @@
 """A world that runs in real time while users watch it and move it by mouse."""
 
+import copy
 import os
 import sys
 import time
@@ -10,9 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..constraints import Pin
+from ..contact import Polygons
+from ..features.feature import Batch
 from ..forces import Hand
+from ..recording.scene import knobs, set_knobs
+from ..recording.sink import check_replaceable
 from ..step import checkpoint
 from . import scene
+from .parts import Parts
 from .server import AHEAD, LOCAL, Server, Viewer
 
 if TYPE_CHECKING:
@@ -36,6 +43,8 @@ class Session:
         each_frame: Callable[["World"], None] | None = None,
     ):  # fmt: skip
         self.world, self.server, self.title, self.record, self.each_frame = world, server, title, record, each_frame
+        if record is not None:
+            check_replaceable(record)
         hands = [f for f in world.features if isinstance(f, Hand)]
         if not hands:
             hands = [Hand(np.zeros(world.particles.dim))]
@@ -44,9 +53,10 @@ class Session:
         self.paused, self.slower, self.steps, self.restarts = False, 1, 0, 0
         self._single_frame = False  # whether to compute one frame of a paused scene
         self._start = checkpoint.keep(world), checkpoint.flags(world)
-        self._extent = scene.bounds(world)
+        self._knobs = [copy.deepcopy(knobs(f)) for f in world.features]
+        self._structure = _structure(world)  # at the start
         self._computed: deque[tuple[float, float]] = deque(maxlen=30)  # for each frame: its begin [s] and computing time [ms]
-        self._walls: Any = None
+        self._parts = Parts(world, title)
         self._sent = 0.0
         self._holder: Viewer | None = None
         self._recorder: Recorder | None = None
@@ -57,11 +67,11 @@ class Session:
         if self.record is not None:
             from ..recording import Recorder
 
-            self.close()
             self._recorder = Recorder(self.record, self.world, overwrite=True)
 
     def close(self) -> None:
-        """Finish the file."""
+        """Finish the file, and leave the world."""
+        self._parts.close()
         if self._recorder is not None:
             self._recorder.close()
 
@@ -95,11 +105,20 @@ class Session:
         self._computed.append((clock, 1e3 * (time.perf_counter() - clock)))
 
     def _restart(self) -> None:
-        """Return to the start, and begin the file again."""
+        """Return to the start, with the knobs of then, and begin the file again."""
+        world = self.world
+        if _structure(world) != self._structure:
+            raise ValueError("There is no way back: particles or features were added or removed. Run the scene again.")
         if self._recorder is not None:
             self._recorder.close()
-        checkpoint.undo(self.world, *self._start)
-        self.hand.particle = -1
+        for feature, then in zip(world.features, self._knobs, strict=True):
+            set_knobs(feature, then)
+        if any(f.needs_other_kernels for f in world.features):
+            world._rebuild_for_knobs()
+        checkpoint.install(world, *self._start)
+        if self.hand.particle >= 0:
+            self.hand.particle = -1
+        self._parts.regrouped()
         self._computed.clear()
         self.restarts += 1
         self._recording()
@@ -118,10 +137,7 @@ class Session:
 
     def _process_request(self, viewer: Viewer, message: dict[str, Any]) -> None:
         what = message.get("do")
-        if what == "came":
-            viewer.send(scene.scene(self.world, self.title))
-            viewer.send(scene.placed_walls(self._wall_list()))
-        elif what == "pause":
+        if what == "pause":
             self.paused = not self.paused
         elif what == "frame":
             self.paused = self._single_frame = True
@@ -137,14 +153,11 @@ class Session:
         elif what == "move":
             if self.hand.particle >= 0 and viewer is self._holder:
                 self.hand.target = message["target"]
-        elif what == "drop" or (what == "went" and viewer is self._holder):
-            if self.hand.particle >= 0:
+        elif what in ("drop", "went"):
+            if self.hand.particle >= 0 and viewer is self._holder:
                 self.hand.particle = -1
         elif what == "name":
             viewer.send(scene.message(scene.describe_particle(self.world, message["particle"])))
-
-    def _wall_list(self) -> list[dict[str, Any]]:
-        return scene.walls(self.world, self._extent)
 
     def _figures(self) -> dict[str, Any]:
         """Return the figures of the last frame."""
@@ -166,14 +179,26 @@ class Session:
         ready = [viewer for viewer in self.server.viewers if viewer.waiting < AHEAD]
         if not ready:
             return
-        message, walls = scene.frame(self.world, self._figures()), None
-        if any(f.moving for f in self.world.features):
-            walls = scene.placed_walls(self._wall_list())
+        parts, message = self._parts.current(), scene.frame(self.world, self._figures(), self._parts.drawn_positions())
         for viewer in ready:
+            for kind, part in parts.items():
+                if viewer.known.get(kind) is not part:
+                    viewer.known[kind] = part
+                    viewer.send(part)
             viewer.waiting += 1
-            if walls:
-                viewer.send(walls)
             viewer.send(message)
+
+
+def _structure(world: "World") -> list[Any]:
+    """Return what only adding and removing particles and features changes, to be compared."""
+    p = world.particles
+    out: list[Any] = [world.features, *(values.tobytes() for values in (p.mass, p.radius, p.pinned, p.group))]
+    for f in world.features:
+        if isinstance(f, Polygons):
+            out += [loop.tobytes() for loop in f.loops]
+        elif isinstance(f, Batch) and not isinstance(f, Pin):  # a knob changes the particles of a pin
+            out.append(f.indices.tobytes())
+    return out
 
 
 def play(

@@ -253,6 +253,12 @@ def is_recording(path: str) -> bool:
         return file.read(4) in (b"RRF2", b"")
 
 
+def check_replaceable(path: str | os.PathLike) -> None:
+    """Raise ValueError for an existing file that is no recording, which no command replaces."""
+    if os.path.isfile(path) and not is_recording(os.fspath(path)):
+        raise ValueError(f"{os.fspath(path)} is no recording, and is not replaced. Give another name, or remove it first.")
+
+
 def file_error(error: Exception, what: str, rest: str = "") -> OSError:
     """Return the error of a file with an explanation."""
     if isinstance(error, OSError):

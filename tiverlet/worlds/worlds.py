@@ -419,15 +419,19 @@ class Worlds:
         (some, n, dim) or (n, dim), to replace those of that state.
         """
         chosen = self._chosen("Worlds.reset", some)
+        if position is not None:
+            position = self._in_range(self._per_particle("position", position, len(chosen)))
+        if velocity is not None:
+            velocity = self._per_particle("velocity", velocity, len(chosen))
         with self._open():
             if self._start:
                 self._start.put_back(self, chosen)
             if position is not None:
                 new = self._runner.scene.state.get(self._runner.memory)
-                new[chosen] = self._per_particle("position", position, len(chosen))
+                new[chosen] = position
                 self._place(new, chosen)
             if velocity is not None:
-                self._set_velocities(self._per_particle("velocity", velocity, len(chosen)), chosen)
+                self._set_velocities(velocity, chosen)
 
     def _feature(self, feature: Feature) -> int:
         """Return the number of a feature."""
@@ -516,15 +520,20 @@ class Worlds:
     @position.setter
     def position(self, value) -> None:
         """Move particles of all worlds to (worlds, n, dim), or to (n, dim) in each [m]. Velocities are kept."""
+        value = self._in_range(self._per_particle("position", value, len(self)))
         with self._open():
-            self._place(self._per_particle("position", value, len(self)), np.arange(len(self)))
+            self._place(value, np.arange(len(self)))
 
-    def _place(self, position: np.ndarray, chosen: np.ndarray) -> None:
-        """Move the particles of the chosen worlds. position: (worlds, n, dim)."""
-        rows = position[chosen].reshape(-1, position.shape[2])
+    def _in_range(self, position: np.ndarray) -> np.ndarray:
+        """Return positions (worlds, n, dim) [m], checked."""
+        rows = position.reshape(-1, position.shape[2])
         in_range("Worlds", "position", rows)
         for contact in self._runner.step.contacts:
             contact.check_range(rows)
+        return position
+
+    def _place(self, position: np.ndarray, chosen: np.ndarray) -> None:
+        """Move the particles of the chosen worlds. position: (worlds, n, dim)."""
         bound = any(isinstance(b, Scalar) for b in self._runner.batches)
         for k in chosen if bound else chosen[~self._clocks.d_is_velocity[chosen]]:
             with self._as_world(k) as world, self._runner.memory.compiler():
@@ -607,8 +616,10 @@ class Worlds:
                 runner, moves, lambda field: memory.read(field)[some, :n], lambda field, v: memory.write_some(field, v, some)
             )
             with self._knobs.shown(0):
-                friction = impulse.has_friction(runner)
-                pulled = impulse.pulled(runner, len(some), lambda field: memory.read(field)[some])
+                friction, pulled = (
+                    impulse.has_friction(runner),
+                    impulse.pulled(runner, len(some), lambda field: memory.read(field)[some]),
+                )
             share, found = those.steer(
                 want, change, seen, had, bare, free, pulled, friction, lambda: self._velocities()[some], clocks.h[some], drag
             )
