@@ -104,9 +104,6 @@ class Table:
         for a, b in noting:
             if {(a, b), (b, a)} & {*(self.touching or ())}:
                 raise ValueError(f"{who}: groups has {(a, b)}, which touch, and so has sensors; leave one of them out.")
-        for name, given in (("friction", friction), ("restitution", restitution)):
-            if isinstance(given, Mapping):
-                self._check_keys(name, given)
         single = not isinstance(friction, Mapping) and not isinstance(restitution, Mapping)
         self.uniform = single and touching is None and not self.senses
         values = friction.values() if isinstance(friction, Mapping) else [friction]
@@ -237,15 +234,6 @@ class Table:
         if {*map(type, pairs)} == {tuple} and {*map(len, pairs)} == {2} and {type(k) for pair in pairs for k in pair} == {int}:
             return pairs
         return [self._pair(name, pair) for pair in pairs]
-
-    def _check_keys(self, name: str, given: Mapping) -> None:
-        """Check the keys of a mapping from pairs of groups. A pair may be given both ways round, with equal values."""
-        for pair, value in given.items():
-            a, b = self._pair(name, pair)
-            if given.get((b, a), value) != value:
-                raise ValueError(
-                    f"{self.who}: {name} is {value!r} for {(a, b)} and {given[b, a]!r} for {(b, a)}, which are the same pair."
-                )
 
     def _pair(self, name: str, pair: Any) -> tuple[int, int]:
         return checks.group_pair(self.who, name, pair, "the key ")
