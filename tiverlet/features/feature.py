@@ -97,6 +97,7 @@ class Feature:
     compiled_for: tuple[str, ...] = ()  # properties that decide the code of its kernels
     has_own_compile_time = True  # compile times are reported per class
     does_work = False  # it may add energy unknown to reports; motion that only a knob causes is seen by `changed`
+    conserves = False  # it takes no energy out of the scene, as far as is known
     has_no_particle_data = False  # no data of it, on device or host, depends on which particles exist; see can_regroup()
     code_size = 0.3  # size of its kernel code relative to that of a Distance; see build.LONG
     changed = True
@@ -243,6 +244,11 @@ class Acceleration(Feature):
         """Whether it accelerates particles and has no known potential."""
         return self.accelerates and not self.conservative
 
+    @property
+    def conserves(self) -> bool:
+        """Whether it does not brake particles."""
+        return not (self.decays or self.uses_velocity)
+
     def kernel_values(self) -> dict[str, Any]:
         """Return the numbers and vectors that kernels read as `dev.name[None]`, computed from its knobs."""
         return {}
@@ -307,6 +313,11 @@ class Batch(Feature):
     def does_work(self) -> bool:
         """Whether rest values change by themselves."""
         return self.driven
+
+    @property
+    def conserves(self) -> bool:
+        """Whether it has springs and rigid constraints only, without dashpots or plastic flow, and none can break."""
+        return not (self.driven or self.breaks or any(np.any(getattr(self, name, 0.0)) for name in ("damping", "creep")))
 
     @property
     def indices(self) -> np.ndarray:
