@@ -266,8 +266,8 @@ def test_a_scene_does_not_go_to_and_fro_between_two_substeps(world):
 @pytest.mark.parametrize("contact", [[], [tv.Contact(restitution=1.0)]])
 def test_springs_between_elastic_walls_keep_their_energy(world, contact):
     # Dimers of 1 kg discs in an elastic box. The law of springs takes 2 pi s^5 of its energy from a vibration in each period,
-    # with s = omega h: at one substep a frame, in which no other figure has anything to find, 34 to 12 % were left after 5 s. From
-    # theta > 0.99 on, springs are rigid in impacts, which leaves Newton's law for rigid bodies, right to O(h).
+    # with s = omega h: at one substep a frame, in which no other figure has anything to find, 34 to 12 % were left after 5 s.
+    # From theta > 0.99 on, springs are rigid in impacts, which leaves Newton's law for rigid bodies, right to O(h).
     rng = np.random.default_rng(1)
     center, a = np.stack(np.divmod(np.arange(12.0), 3), axis=1) + 0.5, rng.uniform(0, 2 * np.pi, 12)
     arm = 0.25 * np.stack([np.cos(a), np.sin(a)], axis=1)
@@ -294,8 +294,8 @@ def test_quiet_springs_cost_nothing(world):
 
 def test_a_truss_on_a_roller_settles(world):
     # A king post of links that one pass of Jacobi holds, pinned at one foot; the other runs on a wire. Each joint weighs m g.
-    # Half of what hangs from the top, 2 m g, goes to each foot, so rafters bear sqrt(a^2 + b^2) / b m g, the tie beam a / b m g, and
-    # the post m g. One substep a frame is enough until the sag is there, some 10 frames later. It was tried again at once, for
+    # Half of what hangs from the top, 2 m g, goes to each foot, so rafters bear sqrt(a^2 + b^2) / b m g, the tie beam a / b m g,
+    # and the post m g. One substep a frame is enough until the sag is there, some 10 frames later. It was tried again at once, for
     # good: loads went from 2 to 100 N at the tie beam, and to -188 N at a rafter.
     a, b, m = 2.0, 3.0, 5.0
     links = tv.Distance([[0, 1], [1, 2], [0, 3], [2, 3], [1, 3]])

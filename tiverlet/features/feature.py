@@ -223,6 +223,7 @@ class Acceleration(Feature):
     accelerates: acceleration() adds something (False for a pure drag).
     uniform: the acceleration is the same at every place, so it adds no stiffness. common: it is the same for all particles, and
     computed only once.
+    steady: it changes with its knobs only, not with the time t.
     uses_velocity: acceleration() reads v, which needs one more field for second order.
     conservative: potential() is defined, so the energy report can account for it.
     decays: it has a rate, a linear drag [1/s] that is solved exactly (exponential); several rates add up.
@@ -232,6 +233,7 @@ class Acceleration(Feature):
     accelerates = True
     uniform = False
     common = False
+    steady = False
     uses_velocity = False
     conservative = False
     decays = False
