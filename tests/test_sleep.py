@@ -7,6 +7,7 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.device import ti
+from tiverlet.features.feature import Acceleration
 
 from .test_events import equal, rows
 
@@ -315,6 +316,35 @@ def test_what_lies_on_a_roller_wakes_as_it_begins_to_turn(world):
     w.spin = [5.0, 5.0, 0.0]
     w.run(1.0)
     assert w.spin[2] == pytest.approx(-5.0 * 0.11 / 0.1, rel=1e-3)
+
+
+class Tilt(Acceleration):
+    """A pull of 5 m/s^2 along x on all particles, from 2 s on."""
+
+    uniform = common = True
+
+    def prepare(self, particles, inv_mass):
+        """Do nothing: there are no arguments."""
+
+    def bind(self, scene):
+        """Store the scene."""
+        self.scene, self.changed = scene, False
+
+    @ti.func
+    def acceleration(self, i, x, v, t):
+        """Return the acceleration [m/s^2]."""
+        return ti.Vector([ti.select(t > 2.0, 5.0, 0.0), 0.0])
+
+
+def test_a_uniform_force_that_changes_with_the_time_wakes(world):
+    # A disc on a floor of friction mu slides by (a - mu g) t^2 / 2 once a > mu g pulls. The pull on sleeping particles was
+    # compared only if it could differ from place to place, so the disc slept on.
+    mu, floor = 0.3, tv.HalfSpace((0, 1), friction=0.3)
+    w = world(tv.Particles([(0.0, R)], radius=R), [tv.Gravity(9.81), Tilt(), floor, tv.Sleep(0.05, 0.2)], substeps=8)
+    w.run(2.0)
+    assert w.last.asleep == 1
+    w.run(1.0)
+    assert w.position[0, 0] == pytest.approx((5.0 - mu * 9.81) / 2, rel=0.05)
 
 
 def tied(world, start, links, time=0.5, speed=0.05, g=9.81, **settings):

@@ -94,12 +94,12 @@ class BodyImpacts:
         return self.rigid[i] != 0
 
     @ti.func
-    def mark_linked(self, batch: ti.template(), c):  # type: ignore[valid-type]
-        """In the first pass: mark the particles that constraint c holds, if it is rigid.
+    def mark_linked(self, batch: ti.template(), c, h):  # type: ignore[valid-type]
+        """In the first pass: mark the particles that constraint c holds, if it is rigid for a substep h.
 
-        An impact is too short for springs to act.
+        An impact is too short for other springs to act.
         """
-        holds = batch.dev.spring.is_rigid(c)
+        holds = batch.dev.is_firm(c, h)
         if ti.static(batch.breaks):
             holds = holds and batch.dev.strength.is_intact(c)
         if holds:
@@ -150,9 +150,9 @@ class BodyImpacts:
             self.reached[i] = 1
 
     @ti.func
-    def is_reached(self, batch: ti.template(), c):  # type: ignore[valid-type]
-        """Whether constraint c is rigid, and an impact has reached it."""
-        out = batch.dev.spring.is_rigid(c)
+    def is_reached(self, batch: ti.template(), c, h):  # type: ignore[valid-type]
+        """Whether constraint c is rigid for a substep h, and an impact has reached it."""
+        out = batch.dev.is_firm(c, h)
         if ti.static(self.spreads):
             near = False
             for k in ti.static(range(batch.arity)):

@@ -7,7 +7,7 @@ import numpy as np
 from .. import checks
 from ..device import ti
 from ..features.feature import Feature, Knob, Scene
-from ..features.material import Bounce, as_given, friction_of, restitution_of
+from ..features.material import Bounce, as_given, friction_of, is_elastic, restitution_of
 from ..features.regrouping import Regrouping
 from .surface import Surface
 from .wall_log import WallLog
@@ -86,6 +86,11 @@ class Collider(Feature):
         if length == 0:
             raise ValueError(f"{self!r}: one_way = 0 has no direction; {(0, 1, 0)[:dim]} lets particles pass upwards.")
         return way / length
+
+    @property
+    def conserves(self) -> bool:
+        """Whether particles leave it with the energy that they had."""
+        return is_elastic(self.friction, self.restitution)
 
     @property
     def has_friction(self) -> bool:

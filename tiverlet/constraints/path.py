@@ -120,6 +120,11 @@ class Path(Anchored):
         """Return C at the start, (m, dim)."""
         return position[self.indices[:, 0]] - self.curve.at(self._start)
 
+    def offset(self, position: np.ndarray) -> np.ndarray:
+        """Return the offsets from the nearest points of the curve, (m, dim)."""
+        x = position[self.indices[:, 0]]
+        return x - self.curve.at(self.curve.nearest(x))
+
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """Return points along the curve, for pictures."""
         return self.curve.at(np.linspace(0, self.length * (1 - 1e-12), 4 * len(self.curve.lengths) + 1))[None], 0.0

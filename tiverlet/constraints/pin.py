@@ -176,6 +176,10 @@ class Pin(Anchored):
         if self.is_kinematic:
             inv_mass[rows] = 0.0
 
+    def offset(self, position: np.ndarray) -> np.ndarray:
+        """Return x - target, (m, dim)."""
+        return position[self.indices[:, 0]] - self.scene.memory.read(self.dev.place.source)[: self.count]
+
     def place_of(self, scene: Scene, passes: AnchorPasses) -> "Target":
         """Make the targets at the start and the end of a frame."""
         return Target(scene, passes, self._anchors)

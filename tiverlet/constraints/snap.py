@@ -120,8 +120,16 @@ class Snap(Anchored):
 
     def start_offset(self, position: np.ndarray) -> np.ndarray:
         """Return C at the start, (m, dim)."""
+        return self.offset(position)
+
+    def offset(self, position: np.ndarray) -> np.ndarray:
+        """Return x - node, (m, dim); 0 along free axes."""
         x = position[self.indices[:, 0]]
         return x - self.node(x)
+
+    def across(self, x: np.ndarray) -> np.ndarray:
+        """Return the projectors on the axes of the grid that are not free, (m, dim, dim)."""
+        return np.broadcast_to(np.diag(np.isfinite(self._spacing) * 1.0), (len(x), *2 * x.shape[1:]))
 
     def place_of(self, scene: Scene, passes: AnchorPasses) -> "Nodes":
         """Make the nodes of the particles, on the device."""

@@ -10,7 +10,7 @@ from .. import checks
 from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Knob, Scene
-from ..features.material import refuse_turning
+from ..features.material import is_elastic, refuse_turning
 from ..features.regrouping import Regrouping
 from ..geometry.ordered import median
 from ..neighbours.neighbour_list import PairData
@@ -195,6 +195,11 @@ class Contact(PairContact):
             dev.spinning = Spinning(scene, self.table, dev.splitting.weight, dev.turn)
         dev.projection = VelocityProjection(scene, dev.list, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
         return dev.search
+
+    @property
+    def conserves(self) -> bool:
+        """Whether pairs leave each other with the energy that they had."""
+        return is_elastic(self.friction, self.restitution)
 
     @property
     def strikes_bodies(self) -> bool:

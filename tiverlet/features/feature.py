@@ -97,6 +97,7 @@ class Feature:
     compiled_for: tuple[str, ...] = ()  # properties that decide the code of its kernels
     has_own_compile_time = True  # compile times are reported per class
     does_work = False  # it may add energy unknown to reports; motion that only a knob causes is seen by `changed`
+    conserves = False  # it takes no energy out of the scene, as far as is known
     has_no_particle_data = False  # no data of it, on device or host, depends on which particles exist; see can_regroup()
     code_size = 0.3  # size of its kernel code relative to that of a Distance; see build.LONG
     changed = True
@@ -222,6 +223,7 @@ class Acceleration(Feature):
     accelerates: acceleration() adds something (False for a pure drag).
     uniform: the acceleration is the same at every place, so it adds no stiffness. common: it is the same for all particles, and
     computed only once.
+    steady: it changes with its knobs only, not with the time t.
     uses_velocity: acceleration() reads v, which needs one more field for second order.
     conservative: potential() is defined, so the energy report can account for it.
     decays: it has a rate, a linear drag [1/s] that is solved exactly (exponential); several rates add up.
@@ -231,6 +233,7 @@ class Acceleration(Feature):
     accelerates = True
     uniform = False
     common = False
+    steady = False
     uses_velocity = False
     conservative = False
     decays = False
@@ -242,6 +245,11 @@ class Acceleration(Feature):
     def does_work(self) -> bool:
         """Whether it accelerates particles and has no known potential."""
         return self.accelerates and not self.conservative
+
+    @property
+    def conserves(self) -> bool:
+        """Whether it does not brake particles."""
+        return not (self.decays or self.uses_velocity)
 
     def kernel_values(self) -> dict[str, Any]:
         """Return the numbers and vectors that kernels read as `dev.name[None]`, computed from its knobs."""
@@ -307,6 +315,11 @@ class Batch(Feature):
     def does_work(self) -> bool:
         """Whether rest values change by themselves."""
         return self.driven
+
+    @property
+    def conserves(self) -> bool:
+        """Whether it has springs and rigid constraints only, without dashpots or plastic flow, and none can break."""
+        return not (self.driven or self.breaks or any(np.any(getattr(self, name, 0.0)) for name in ("damping", "creep")))
 
     @property
     def indices(self) -> np.ndarray:

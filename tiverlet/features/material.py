@@ -53,6 +53,12 @@ def restitution_of(who: str, name: str, value: Any) -> Bounce:
     return Bounce(normal, checks.number(who, f"{name} (tangential)", given[1], least=0.0, most=1.0))
 
 
+def is_elastic(friction: Any, restitution: Any) -> bool:
+    """Whether there is no friction, and restitution 1; both as given, or as mappings from pairs of groups."""
+    rubs, bounces = (list(v.values()) if isinstance(v, Mapping) else [v] for v in (friction, restitution))
+    return all(np.max(v) == 0 for v in rubs) and all(np.ravel(v)[0] == 1 for v in bounces) and len(bounces) > 0
+
+
 def as_given(value: Any) -> Any:
     """Return a checked number or tuple of numbers as floats, in the form shown to the user."""
     return tuple(float(v) for v in value) if isinstance(value, (tuple, list)) else float(value)

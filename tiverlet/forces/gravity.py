@@ -25,7 +25,7 @@ class Gravity(Acceleration):
 
     has_no_particle_data = True
     conservative = True
-    uniform = common = True
+    uniform = common = steady = True
     dim = 0
     g = Knob(_vector, "Acceleration [m/s^2]: a number along -y, or a vector.")
 

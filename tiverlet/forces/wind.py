@@ -20,7 +20,7 @@ class Wind(Acceleration):
     velocity = Knob(lambda f, v: checks.vector("Wind", "velocity", v, f.dim or len(np.atleast_1d(v))), "Of the air [m/s].")
     rate = Knob(lambda f, v: checks.number("Wind", "rate", v, least=0.0), "Drag rate [1/s].")
     decays = True
-    uniform = True
+    uniform = steady = True
     dim = 0
 
     def __init__(self, velocity, rate):

@@ -50,6 +50,7 @@ class Periodic(Feature):
     _last_strain_and_offset = 0.0, 0.0
     shear = Knob(lambda f, v: checks.number("Periodic", "shear", v), "Rate of the shear [1/s].")
     code_size = 0.1
+    conserves = True
 
     def __init__(self, low: ArrayLike, high: ArrayLike, axes: Sequence[int] | None = None, *, shear: float = 0.0):
         low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)

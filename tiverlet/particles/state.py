@@ -211,7 +211,7 @@ class State:
         """
         close = self.digits(i)
         if ti.static(self.compensated):
-            close = ti.static(self.two_digits) * (ti.abs(n).dot(ti.abs(self.x[i])) + size)
+            close = ti.static(self.two_digits) * (abs(n).dot(abs(self.x[i])) + size)
         return close
 
     @ti.func

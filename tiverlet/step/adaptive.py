@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import checks
+from ..constraints.core.anchored import Anchored
+from ..constraints.core.corner_passes import FIRM
 from ..constraints.core.scalar import Scalar
 from ..constraints.path import Path
 from ..solvers.slots import TENSEST
@@ -26,17 +28,21 @@ TENSION = 2.0  # (omega h)^2 across a tension: half the limit of stability
 STIFF = 2.0  # omega h from which on a spring is as good as rigid
 FORCE = 0.06  # (omega h)^2 in forces: 25 substeps per period, as in molecular dynamics
 RISKS = {"tunnelling-risk", "stiff-force", "non-finite"}
+LOSS = 2e-3  # share of the largest kinetic energy that springs may lose in a second: a percent in 5 s
 GAIN = 1.4  # factor by which twice the effort must lower a figure; second order lowers it by 4, first order by 2
 FEW = 16  # substeps below which more of them may still help, although two doublings did not
 IDLE = {"substeps": 2, "iterations": 1}  # doublings without a gain after which no more are tried
 ROOM = 6.0  # factor by which all figures must be better than their aims before less effort is tried
-PLENTY = 24.0  # four times that: after a try with half the effort there is still room, so failures are forgotten
-PATIENCE = 64  # most frames between two tries with less effort
+PATIENCE = 1024  # most frames with room before an effort that failed is tried again
+GROWTH = 4  # factor by which each failure makes them more
+ENOUGH = 64  # frames with plenty of room after which failures are forgotten
+OCTAVES = (MOST * PASSES).bit_length()  # of efforts, in substeps times iterations
 
-Figures = tuple[float, ...]  # residual, overlap, tension, motion, stiffness and energy, relative to their aims
-TENSE, ENERGY = 2, 5  # the indices of the tension and of the energy, which is the last, in Figures
-NOTHING: Figures = (1.0,) * 6
-WORST: Figures = (float("inf"),) * 6
+Figures = tuple[float, ...]  # residual, overlap, tension, motion, stiffness, damping and energy, relative to their aims
+TENSE, HOPED = 2, 5  # in Figures: the index of the tension; the first of those that need not be met if no effort meets them
+NOTHING: Figures = (1.0,) * 7
+WORST: Figures = (float("inf"),) * 7
+WELL = 1, 1.0  # the end of the controller's memory where no frame has failed yet
 
 
 class StepController:
@@ -53,12 +59,16 @@ class StepController:
     residual: for the 26 degrees above it is 1e-2. A tolerance also applies to the turns of rigid constraints and of beads on
     curves, and to the vibrations of springs, see vibration_error().
     In the same way, motion in forces that vary in space is too fast by (omega h)^2 / 24; by default (omega h)^2 may be 0.06. A
-    frame whose energy is wrong by more than a fiftieth of the kinetic energy, see energy_bound.missed(), is repeated as long as
-    that helps. If it does not help, the frame counts as good, since the energy before it was computed with longer substeps.
+    frame is also repeated, as long as that helps, if its energy is wrong by more than a fiftieth of the kinetic energy, see
+    energy_bound.missed(), or if springs lose more than they may, see damping(). If it does not help, the frame counts as good,
+    since the energy before it was computed with longer substeps.
 
-    All figures are of the order of h^2. If they leave room for it, the next frame is tried with half the effort. After each
-    failure there must be room in twice as many frames in a row before the next try, in up to 64, until there is room for two
-    halvings. A scene that changed back and forth between two numbers of substeps would lose or gain energy with each change.
+    All figures are of the order of h^2. If they leave room for it, the next frame is tried with half the effort. Each effort has
+    a patience of its own: the number of frames in a row in which there must be room before it is tried. A failure makes it four
+    times what it was, or what that of any lower effort is. It is forgotten once the figures of up to 64 frames have left room for
+    that effort and as much again. A scene that changed back and forth between two numbers of substeps would lose or gain energy
+    with each change, and loads would swing: where passes leave a violation, a sag takes many frames to grow, so a longer substep
+    seems good for a while.
 
     The cost: to repeat a frame, the state at its start is read back to the host before each frame.
     """
@@ -67,21 +77,31 @@ class StepController:
         self.auto = False
         self.substeps, self.iterations = START, 1  # of the next frame
         self.dt = 0.0  # of the last frame [s]
-        self.wait, self.patience = 0, 1  # frames until less effort is tried: now, and after the next failure
+        self.wait = 0  # frames until less effort is tried
+        self.patience = [1] * OCTAVES  # frames with room before an effort is tried, by its octave
+        self.worst = 0.0  # the largest figure since the wait began
         self.stuck = NOTHING  # the figures that no effort improved
         self.cost = 0.0  # measured run time of an iteration [s]
 
     @property
     def memory(self) -> tuple:
         """The values on which the next frames depend."""
-        stuck = NOTHING[:1] if self.stuck == NOTHING else self.stuck
-        return self.substeps, self.iterations, self.dt, self.wait, self.patience, *stuck
+        failed = self.stuck != NOTHING or max(self.patience) > 1
+        return (
+            self.substeps,
+            self.iterations,
+            self.dt,
+            self.wait,
+            *((self.worst, *self.patience, *self.stuck) if failed else WELL),
+        )
 
     @memory.setter
     def memory(self, value: tuple) -> None:
         """Restore the values of another time."""
-        self.substeps, self.iterations, self.dt, self.wait, self.patience, *stuck = value
-        self.stuck = tuple(stuck) if len(stuck) > 1 else NOTHING
+        self.substeps, self.iterations, self.dt, self.wait, self.worst, *rest = value
+        failed = tuple(value[4:]) != WELL
+        self.patience = rest[:OCTAVES] if failed else [1] * OCTAVES
+        self.stuck = tuple(rest[OCTAVES:]) if failed else NOTHING
 
     def advance(self, world: "World", dt: float, tolerance: float | None, budget: float | None) -> StepReport:
         """Run one frame, and repeat it until it is good, nothing helps, or the limit of substeps or the budget is reached."""
@@ -100,7 +120,7 @@ class StepController:
             took = perf_counter() - begun
             self.learn(took / (n * k))
             motion, missed = motion_error(world) if tolerance else 0.0, energy_bound.missed(world, report, energy)
-            figures, risks = judge(report, tolerance, motion, stiffness(world), missed)
+            figures, risks = judge(report, tolerance, motion, stiffness(world), damping(world, n), missed)
             if tries.record(figures, risks, report.energy, world._runner.sheet.item(KINETIC)):
                 break
             if not tries.verdict and perf_counter() + 2 * took > end:
@@ -109,7 +129,7 @@ class StepController:
             checkpoint.put_back(world, kept)
             world._runner.begin(dt, tries.substeps, world.iterations)
         self.substeps, self.iterations, self.stuck = n, k, tries.stuck  # so that the next frames do not try in vain
-        self.plan_next_frame(world.iterations, report, max(figures), tries.verdict, tries.count)
+        self.plan_next_frame(world.iterations, max(figures), tries.verdict, tries.count)
         return with_verdict(report, max(figures), risks, tries.verdict, tries.count)
 
     def prepare(self, iterations: int, dt: float, tolerance: float | None, budget: float | None) -> None:
@@ -131,20 +151,45 @@ class StepController:
         """Update the cost of an iteration [s]: at once if it is lower, since the first frame compiles; gradually if higher."""
         self.cost = min(cost, self.cost + 0.3 * (cost - self.cost)) if self.cost else cost
 
-    def plan_next_frame(self, iterations: int, report: StepReport, figure: float, verdict: str, tries: int) -> None:
+    def plan_next_frame(self, iterations: int, figure: float, verdict: str, tries: int) -> None:
         """Choose less effort for the next frame, if this one leaves room for it; if that has just failed, wait longer before the
         next try. figure: the largest of the figures."""
+        self.worst = max(self.worst, figure)
+        lower = self._octave - 1  # of the effort that failed, or that comes next
         if verdict != "good" or tries > 1:
-            self.patience = min(2 * self.patience, PATIENCE) if tries > 1 else self.patience
-            self.wait = self.patience
+            if tries > 1 and lower >= 0:
+                self.patience[lower] = min(GROWTH * max(self.patience[: lower + 1]), PATIENCE)
+            self._wait()
         elif figure * ROOM > 1:
-            self.wait = self.wait if self.patience == 1 or self.stuck != NOTHING else self.patience
-        elif not self.wait:
-            if self.iterations > iterations:
-                self.iterations //= 2
-            elif self.substeps > 1:
-                self.substeps = (self.substeps + 1) // 2
-            self.patience = 1 if figure * PLENTY <= 1 else self.patience
+            if self.stuck == NOTHING:
+                self._wait()
+        else:
+            if self.patience[lower] - self.wait >= min(self.patience[lower], ENOUGH):
+                self._forget()
+            if not self.wait and self.substeps * self.iterations > iterations:
+                if self.iterations > iterations:
+                    self.iterations //= 2
+                else:
+                    self.substeps = (self.substeps + 1) // 2
+                self._wait()
+
+    @property
+    def _octave(self) -> int:
+        """The octave of the present effort."""
+        return (self.substeps * self.iterations).bit_length() - 1
+
+    def _wait(self) -> None:
+        """Begin to wait until less effort is tried: not at all if that has never failed."""
+        patience = self.patience[max(self._octave - 1, 0)]
+        self.wait, self.worst = patience if patience > 1 else 0, 0.0
+
+    def _forget(self) -> None:
+        """Forget the failures of efforts for which the figures of this wait leave room, and as much again."""
+        for lower in range(self._octave):
+            if self.worst * 4.0 ** (self._octave - lower) * ROOM <= 1:
+                self.patience[lower] = 1
+        if self.patience[self._octave - 1] == 1:
+            self.wait = 0
 
 
 class Tries:
@@ -171,7 +216,7 @@ class Tries:
         self._kinetic = kinetic if self.count == 1 else self._kinetic
         self._made[n, k] = bool(risks), max(figures), n * k
         if self.verdict or not (risks or any(wrong)):
-            self.verdict = self.verdict or ("stuck" if max(figures[:ENERGY]) > 1 else "good")
+            self.verdict = self.verdict or ("stuck" if max(figures[:HOPED]) > 1 else "good")
             return True
         if pumps(self._energies, self._kinetic):
             self.verdict = "stuck"
@@ -186,8 +231,8 @@ class Tries:
             self._idle = 0 if gains else self._idle + 1
             self._best = tuple(map(min, figures, self._best))
             if self._idle >= IDLE[self._kind] and n >= FEW:
-                if self._kind == "iterations" or k >= PASSES or not any(wrong[:ENERGY]):
-                    self.verdict = "stuck" if any(wrong[:ENERGY]) else "good"
+                if self._kind == "iterations" or k >= PASSES or not any(wrong[:HOPED]):
+                    self.verdict = "stuck" if any(wrong[:HOPED]) else "good"
                     self.stuck = tuple(max(s, GAIN * f) if w else s for s, f, w in zip(stuck, figures, wrong, strict=True))
                     self.substeps, self.iterations = cheapest(self._known, self.stuck)
                     return (self.substeps, self.iterations) == (n, k)
@@ -271,6 +316,37 @@ def stiffness(world: "World") -> float:
         return max(probe(clock.h, clock.time), runner.sheet.item(STIFFNESS))
 
 
+def damping(world: "World", substeps: int) -> float:
+    """Return the energy that springs lose by their substep, relative to what they may lose, as a figure of the order of h^2.
+
+    The stiff share theta of the law of springs, see Equation, takes about
+
+        theta u^2 / alpha,    theta = s^4 / (1 + s^4), s = omega h
+
+    from a spring that became longer by u in a substep: 2 pi s^5 of its energy in each period. Springs at rest lose nothing,
+    however stiff. Those with theta > FIRM count as rigid, and are so in impacts, too: what they have lost is gone, and to resolve
+    them would take some 40 times the substeps. Nothing counts where features brake anyway.
+    """
+    runner, clock = world._runner, world._clock
+    springs = [b for b in runner.batches if isinstance(b, (Scalar, Anchored)) and not b.is_kinematic and (b.compliance > 0).any()]
+    if not (springs and clock.h and all(f.conserves for f in world.features)):
+        return 0.0
+    state, memory, lost = runner.scene.state, runner.memory, 0.0
+    x = state.get(memory)
+    d = memory.read(state.d)[: len(x)].astype(np.float64)
+    for b in springs:
+        alpha, w = b.compliance, b.weights(x) * clock.h**2
+        if isinstance(b, Scalar):
+            now, before = (np.maximum(b.side * C, 0) if b.side else C for C in (b.violation(x), b.violation(x - d)))
+            square = (now - before) ** 2
+        else:
+            square = ((b.offset(x) - b.offset(x - d)) ** 2).sum(axis=1)
+        theta = w**2 / (w**2 + alpha**2)
+        some = (alpha > 0) & (theta <= FIRM)
+        lost += float((theta[some] * square[some] / alpha[some]).sum())
+    return (substeps * lost / energy_bound.allowed_loss(world, LOSS)) ** 0.4 if lost else 0.0
+
+
 @np.errstate(all="ignore")  # energies may be infinite
 def pumps(energies: list[float], kinetic: float) -> bool:
     """Whether the last doubling of the effort added more energy than the one before, and led beyond the bound.
@@ -285,10 +361,10 @@ def pumps(energies: list[float], kinetic: float) -> bool:
 
 
 def judge(
-    report: StepReport, tolerance: float | None, motion: float, stiffness: float, missed: float
+    report: StepReport, tolerance: float | None, motion: float, stiffness: float, damping: float, missed: float
 ) -> tuple[Figures, set[str]]:  # fmt: skip
-    """Return residual, overlap, tension, motion, stiffness and energy relative to their aims (1: just met), and the risks that
-    shorter substeps must remove."""
+    """Return residual, overlap, tension, motion, stiffness, damping and energy relative to their aims (1: just met), and the
+    risks that shorter substeps must remove."""
     risks = set(report.flags & RISKS)
     if report.turn:
         risks.add("turned")
@@ -300,6 +376,7 @@ def judge(
         report.tension / TENSION,
         motion / (tolerance or RESIDUAL),
         stiffness / (24 * tolerance if tolerance else FORCE),
+        damping,
         missed,
     )
     return tuple(float(r) if r == r else float("inf") for r in ratios), risks  # NaN is the worst of all

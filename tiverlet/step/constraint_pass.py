@@ -81,18 +81,18 @@ class ConstraintPass:
                     f.dev.note_spring_turn(c)
 
     @ti.func
-    def takes_part(self, f: ti.template(), c, newton):  # type: ignore[valid-type]
+    def takes_part(self, f: ti.template(), c, now):  # type: ignore[valid-type]
         """Whether constraint c of a batch is solved: in later Newton steps, only if the first step left it unmet."""
         out = f.dev.corners.awake(c)
         if ti.static(self.refines):
-            if newton > 0:
+            if now.newton > 0:
                 if ti.static(f in self.in_systems):
                     out = out and f.dev.unmet(c)
                 else:
                     out = False
         for impacts in ti.static(self.impacts):
             if impacts.is_later_extra_pass() and out:
-                out = impacts.is_reached(f, c)
+                out = impacts.is_reached(f, c, now.h)
         return out
 
     @ti.func
@@ -115,8 +115,8 @@ class ConstraintPass:
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                 for impacts in ti.static(self.impacts):
                     if now.first != 0:
-                        impacts.mark_linked(f, c)
-                if self.takes_part(f, c, now.newton):
+                        impacts.mark_linked(f, c, now.h)
+                if self.takes_part(f, c, now):
                     f.dev.relax(c, now.h, h2_effective, now.frame_fraction, now.first, fresh)
         if ti.static(len(self.batches) > 0):
             self.team.wait()
@@ -177,7 +177,7 @@ class ConstraintPass:
                 system.end(now.thread)
         for f in ti.static(self.in_systems):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
-                if self.takes_part(f, c, now.newton):
+                if self.takes_part(f, c, now):
                     f.dev.update_multiplier(c, now.first)
         if ti.static(len(self.in_systems) > 0):
             self.team.wait()

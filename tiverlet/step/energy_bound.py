@@ -21,7 +21,7 @@ from ..features.feature import Acceleration
 from ..forces.gravity import Gravity
 from ..neighbours.periodic import Periodic
 from .clock import CHANGED, DIGITS, PARTED, energy_limit
-from .diagnostics import EXTENT, KINETIC, REACH, STIFFNESS
+from .diagnostics import ENERGY, EXTENT, KINETIC, REACH, STIFFNESS
 from .step_report import StepReport
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 FALL = 1e-3  # share of the energy of a fall through the scene: contacts lift particles that they begin to bear
 MISSED = 0.02  # share of the largest kinetic energy by which the energy may be wrong in a frame with substeps="auto"
+BOUNCED = 0.003  # the same where bodies bounce and nothing takes energy out: impacts follow each other, and errors add up
 SKIN = 1e-5  # share of the largest coordinate: apparent depth of particles that lie on a wall, at most
 ROUNDED = 64  # rounding error of positions, in units in the last place of the largest coordinate
 FLAG = "energy-gain"
@@ -67,27 +68,32 @@ def before(world: "World") -> float | None:
 def missed(world: "World", report: StepReport, energy: float | None) -> float:
     """Return the error of the energy in a frame that began with `energy` [J], relative to the allowed error.
 
-    The error is the spurious gain; if there are only conservative forces, also the loss. No other figure measures events that
-    begin and end within a frame, such as two bodies that fly past each other. The kinetic energy of the common motion of all
-    particles is not counted in the allowed error, since it takes no part in such events.
+    The error is the spurious gain; if there are only conservative forces, or if nothing takes energy out of bodies that bounce,
+    also the loss. No other figure measures events that begin and end within a frame, such as two bodies that fly past each other,
+    or an impact of linked particles, which is right to O(h). The kinetic energy of the common motion of all particles is not
+    counted in the allowed error, since it takes no part in such events.
     """
     if energy is None:
         return 0.0
     clock, sheet = world._clock, world._runner.sheet
-    if all(isinstance(f, Periodic) or (isinstance(f, Acceleration) and not _brakes(f)) for f in world.features):
+    conserved, bounces = all(f.conserves for f in world.features), world._runner.bounces
+    if conserved and (bounces or all(isinstance(f, (Periodic, Acceleration)) for f in world.features)):
         change = abs(report.energy - energy)
     else:
         change = report.energy - (energy if clock.bound is None else max(energy, clock.bound))
     if not change > 0 or works(world):
         return 0.0
     kinetic = max(clock.kinetic, sheet.item(KINETIC))
-    allowed = MISSED * max(0.0, kinetic - _drift(world)) + DIGITS * (abs(report.energy) + kinetic)
+    share = BOUNCED if conserved and bounces else MISSED
+    allowed = share * max(0.0, kinetic - _drift(world)) + DIGITS * (abs(report.energy) + kinetic)
     return float(change / allowed) if allowed else 0.0
 
 
-def _brakes(force: Acceleration) -> bool:
-    """Whether a force may take energy out of the scene."""
-    return force.decays or force.uses_velocity
+def allowed_loss(world: "World", rate: float) -> float:
+    """Return the energy that a frame may lose at a rate [1/s] of the largest kinetic energy, beside rounding [J]."""
+    clock, sheet = world._clock, world._runner.sheet
+    kinetic, energy = max(clock.kinetic, sheet.item(KINETIC)), sheet.item(ENERGY)
+    return rate * clock.frame[1] * kinetic + DIGITS * abs(energy) + rounding(world, sheet.item(REACH))
 
 
 def _drift(world: "World") -> float:
@@ -124,8 +130,13 @@ def blur(world: "World", extent: np.ndarray, reach: Any) -> Any:
 
     extent: edges of the bounding box, (..., dim) [m]. reach: the largest coordinate, (...) [m].
     """
+    return _masses(world).sum() * FALL * extent @ _pull(world) + rounding(world, reach)
+
+
+def rounding(world: "World", reach: Any) -> Any:
+    """Return the energy that the rounding of positions may add [J]. reach: the largest coordinate, (...) [m]."""
     digit = ROUNDED * (2.0**-23 if world._precision != "f64" else 2.0**-52) * reach / world._clock.h
-    return _masses(world).sum() * (FALL * extent @ _pull(world) + digit**2)
+    return _masses(world).sum() * digit**2
 
 
 def _masses(world: "World") -> np.ndarray:

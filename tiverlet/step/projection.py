@@ -30,6 +30,7 @@ from ..constraints.core.scalar import Scalar
 from ..neighbours.queries import between
 from ..particles import LARGEST
 from ..solvers.corners import bodies_of
+from .anchor_rows import AnchorRows, anchor_rows
 from .block_matrix import WIDEST, BlockMatrix, WideRows, summed
 from .clock import CHANGED
 from .contact_rows import ContactRows
@@ -101,9 +102,11 @@ def project(
     stays = left_out(runner.batches, w, x)
     if would_vibrate(stays, ratio):
         runner.released = stays
-    if slots and slots.system and not slots.system.steps and not runner.clock.softened:  # it holds loads without a violation
-        batches = [b for b in batches if ((slots.rows(b) < 0) & ~b.immovable(w)).any() or would_vibrate(_off(b, x), ratio)]
+    system = slots and slots.system
+    if system and not (system.steps or runner.clock.softened or system.count_relaxed_alone(runner.batches)):
+        batches = [b for b in batches if would_vibrate(_off(b, x), ratio)]  # it holds loads without a violation
     batches += sideways_rows(batches)
+    batches += anchor_rows(runner.batches, x)
     batches += rigid_rows(runner.batches, w, every=contacts is not None)
     if not batches:
         return True
@@ -112,9 +115,11 @@ def project(
     start = Rows(batches, w, x, runner.scene.periodic, rails)
     undone = start.undone(runner)
     frail = start.would_break(undone, h, longest)
-    if not frail and not would_vibrate(float(np.abs(undone * start.close).max(initial=0.0)), ratio):
+    off = max(float(np.abs(undone * start.close).max(initial=0.0)), rails.worst / runner.scene.particles.size)
+    if not frail and not would_vibrate(off, ratio):
         return ratio < FAR
-    rows = start = start.with_goal(start.C - (1 - ratio**2) * undone)
+    start = start.with_goal(start.C - (1 - ratio**2) * undone)
+    rows = start.at(rails.drawn(x, 1 - ratio**2)) if rails.worst else start
     kept = memory.read(state.d)
     v = kept.astype(np.float64)
     n = len(x)
@@ -245,6 +250,16 @@ def _off(batch: Scalar, x: np.ndarray) -> float:
     return float((np.abs(C) if batch.side == 0 else C * batch.side).max(initial=0.0))
 
 
+def _remembered(batch: Any, read: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return C at the start of the last substep, and the multiplier, of springs, (m,) each; 0 for rigid batches."""
+    count, spring = batch.count, batch.dev.spring
+    if isinstance(batch, AnchorRows):
+        return batch.along(read(spring.last)), batch.along(read(batch.dev.lam))
+    if not spring.soft:
+        return np.zeros(count), np.zeros(count)
+    return read(spring.last)[:count] - batch.rest_now, read(batch.dev.equation.lam)[:count]
+
+
 def _pace(runner: Any, batch: Any, x: np.ndarray, h: float, dt: float) -> np.ndarray:
     """How fast the rest value of each constraint goes in the coming substep h, of a frame dt, (m,); 0 where it waits at x."""
     if getattr(batch, "driven", False):
@@ -272,7 +287,7 @@ def seen_before(runner: Any) -> tuple[float, float]:
     return energy if runner.clock.energy is None else runner.clock.energy, overlap
 
 
-def sizes(batch: Scalar | RigidRows | SidewaysRows | ContactRows) -> np.ndarray:
+def sizes(batch: Scalar | AnchorRows | SidewaysRows | RigidRows | ContactRows) -> np.ndarray:
     """Return the number of corners of each constraint, (m,)."""
     return np.bincount(batch.owner, minlength=batch.count)
 
@@ -301,8 +316,8 @@ class Rows:
     rails: Any = None  # see Rails
 
     def __init__(
-        self, batches: Sequence[Scalar | RigidRows | SidewaysRows | ContactRows], w: np.ndarray, x: np.ndarray, box: Any = None,
-        rails: Rails | None = None,
+        self, batches: Sequence[Scalar | AnchorRows | SidewaysRows | RigidRows | ContactRows], w: np.ndarray, x: np.ndarray,
+        box: Any = None, rails: Rails | None = None,
     ):  # fmt: skip
         self.rails = rails if rails and len(rails.who) else None
         self.batches, self.w, self.n, self.dim = batches, w, *x.shape
@@ -443,16 +458,8 @@ class Rows:
         self.weight = self._rigid(alpha, shared * h * h)
         gamma = self.theta + damping * alpha / h
         h2_effective = h2_effective_of(runner.clock)
-        springs = [b.dev.spring for b in self.batches]
-        before = [
-            read(s.last)[: b.count] - b.rest_now if s.soft else np.zeros(b.count)
-            for b, s in zip(self.batches, springs, strict=True)
-        ]
-        borne = [
-            b.compliance * read(b.dev.equation.lam)[: b.count] / h2_effective if s.soft else np.zeros(b.count)
-            for b, s in zip(self.batches, springs, strict=True)
-        ]
-        return self._bounded(gamma * self.C + (1 - gamma) * self._bounded(self._each(before)) + self._each(borne))
+        before, lam = (self._each(list(values)) for values in zip(*(_remembered(b, read) for b in self.batches), strict=True))
+        return self._bounded(gamma * self.C + (1 - gamma) * self._bounded(before) + alpha * lam / h2_effective)
 
     def pace(self, runner: Any, h: float, dt: float) -> np.ndarray:
         """How fast rest values go in the coming substep h, of a frame dt."""

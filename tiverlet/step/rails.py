@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 class Rails:
     """The directions along which beads on rigid wires can move at positions x (n, dim). No row of a constraint contains them.
 
-    who: (k,) the beads. along: (k, dim) unit directions.
+    who: (k,) the beads. along: (k, dim) unit directions. off: (k, dim) [m], how far beads are off their wires.
     """
 
     def __init__(self, runner: "Runner", x: np.ndarray):
@@ -22,8 +22,22 @@ class Rails:
         self.who = np.concatenate(
             [np.zeros(0, dtype=np.int64), *(b.indices[some, 0] for b, some in zip(wires, rigid, strict=True))]
         )
-        along = [b.tangents(x[b.indices[:, 0]])[some] for b, some in zip(wires, rigid, strict=True)]
-        self.along = np.concatenate([np.zeros((0, x.shape[1])), *along])
+        along, off = (
+            np.concatenate([np.zeros((0, x.shape[1])), *(of(b)[some] for b, some in zip(wires, rigid, strict=True))])
+            for of in (lambda b: b.tangents(x[b.indices[:, 0]]), lambda b: b.offset(x))
+        )
+        self.along, self.off = along, off - (off * along).sum(axis=1)[:, None] * along  # not beyond the ends of wires
+
+    @property
+    def worst(self) -> float:
+        """How far the worst bead is off its wire [m]."""
+        return float(np.linalg.norm(self.off, axis=1).max(initial=0.0))
+
+    def drawn(self, x: np.ndarray, share: float) -> np.ndarray:
+        """Return positions x, (n, dim), with beads drawn to their wires by this share of their distance."""
+        out = x.copy()
+        out[self.who] -= share * self.off
+        return out
 
     def moves(self, moves: np.ndarray) -> np.ndarray:
         """Return moves, (n, dim), with those of beads projected on their wires."""

@@ -33,7 +33,7 @@ class Sleep(Feature):
 
     - a moving or a driven particle touches it: in that substep, before the contact is solved;
     - the force on one of its particles differs from the force with which it fell asleep: compared at the end of each frame, for
-      forces that are not uniform;
+      forces that may differ from place to place, or with the time;
     - one of its particles is given another velocity or spin (all islands wake if this makes a start of the whole world).
 
     All islands wake before a frame in which a wall is moved, a knob is changed (other than the target of a driven particle), a
@@ -201,7 +201,7 @@ class SleepPass:
         self.step: Any = step
         self.sleepers, self.state, self.n, self.real = sleepers, step.state, step.scene.count, step.real
         self.contacts, self.forces = step.contacts, step.integrator.forces
-        self.watches = any(not f.uniform for f in self.forces.all)
+        self.watches = any(not (f.uniform and f.steady) for f in self.forces.all)
         memory, n = step.scene.memory, step.scene.count
         kept, pairs = linked(step.scene.inv_mass, drivers, batches, step.contacts)
         self.restless = memory.field("Sleep.restless", n, kind=ti.i32)  # 1 for islands that stay awake, while they are found

@@ -87,9 +87,22 @@ class Anchored(Batch):
         """Return C at the start, (m, dim)."""
         return np.zeros((self.count, position.shape[1]))
 
+    def offset(self, position: np.ndarray) -> np.ndarray:
+        """Return C at positions (n, dim), with the places where the coming frame begins, (m, dim)."""
+        raise NotImplementedError
+
     def tangents(self, x: np.ndarray) -> np.ndarray:
         """Return unit vectors along which particles at x (m, dim) can move under rigid constraints; 0 where there is none."""
         return np.zeros_like(x)
+
+    def across(self, x: np.ndarray) -> np.ndarray:
+        """Return the projectors on the directions in which particles at x (m, dim) are held, (m, dim, dim)."""
+        along = self.tangents(x)
+        return np.eye(x.shape[1]) - along[:, :, None] * along[:, None, :]
+
+    def weights(self, position: np.ndarray) -> np.ndarray:
+        """Return the inverse masses of the particles, (m,)."""
+        return self.scene.inv_mass[self.indices[:, 0]]
 
     def place_of(self, scene: Scene, passes: AnchorPasses) -> Place:
         """Make the places of the particles, on the device."""
@@ -110,7 +123,7 @@ class Anchored(Batch):
             raise RuntimeError(f"{self!r}.load: driven particles are taken along whatever it takes; give compliance to measure.")
         if not self.acts:
             return np.zeros((self.count, self.scene.particles.dim))
-        scale = per_newton(self.scene.multipliers_per_newton, self.compliance, lambda: self.scene.inv_mass[self.indices[:, 0]])
+        scale = per_newton(self.scene.multipliers_per_newton, self.compliance, lambda: self.weights(self.start.position))
         return scale[:, None] * self.scene.memory.read(self.dev.lam)[: self.count].astype(np.float64)
 
 

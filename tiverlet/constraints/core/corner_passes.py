@@ -9,10 +9,12 @@ from ...features.feature import FAR, Scene
 from .equation import Equation
 from .known_load import KnownLoad
 from .passes import Passes
+from .spring import stiff
 from .step_limit import TRUST
 
 RESOLVED = 4.0  # alpha' / W: from this ratio on the substep resolves a spring
 LOST = 0.015  # relative violation at the start of a substep, beyond which its direction there would add energy
+FIRM = 0.99  # theta from which on a spring is rigid in an impact
 
 
 class CornerPasses(Passes):
@@ -233,6 +235,18 @@ class CornerPasses(Passes):
             if new == 0 and (W == 0 or ti.static(self.side != 0)):
                 self.known.drop_load(c)
         return step
+
+    @ti.func
+    def is_firm(self, c, h):
+        """Whether a substep h sees constraint c as rigid, or as a spring that vibrates much faster."""
+        out = self.spring.is_rigid(c)
+        if ti.static(self.spring.soft):
+            if not out:
+                g, w = self.quantity.measure(c, self.relative_corners.now_and_start(c)[1])[1], ti.cast(0, self.real)
+                for k in ti.static(range(self.arity)):
+                    w += self.w.of(self.corners.member(c, k)) * g[k, :].dot(g[k, :])
+                out = w > 0 and stiff(self.spring.alpha[c], h, w) > FIRM
+        return out
 
     @ti.func
     def violation_left(self, c, violation, lam):

@@ -59,17 +59,15 @@ class Curve:
         """Return arc lengths of the points of the curve nearest to x (m, dim): the best of 9 on each piece, refined."""
         s = (self.starts[:-1, None] + self.lengths[:, None] * np.linspace(0, 1, 9)).ravel()
         p = self.at(np.minimum(s, self.length * (1 - 1e-15)))
-        out = np.empty(len(x))
-        for i, point in enumerate(x):
-            j = int(np.argmin(((p - point) ** 2).sum(axis=1)))
-            span = self.lengths[min(j // 9, len(self.lengths) - 1)] / 4
-            low, high = s[j] - span, s[j] + span
-            for _ in range(60):  # ternary search
-                one, two = low + (high - low) / 3, high - (high - low) / 3
-                near = ((self.at(np.array([one, two])) - point) ** 2).sum(axis=1)
-                low, high = (low, two) if near[0] < near[1] else (one, high)
-            out[i] = (low + high) / 2
-        return out
+        j = np.array([int(np.argmin(((p - point) ** 2).sum(axis=1))) for point in x], dtype=np.int64)
+        span = self.lengths[np.minimum(j // 9, len(self.lengths) - 1)] / 4
+        low, high = s[j] - span, s[j] + span
+        for _ in range(60):  # ternary search
+            one, two = low + (high - low) / 3, high - (high - low) / 3
+            near = ((self.at(np.stack([one, two])) - x) ** 2).sum(axis=2)
+            less = near[0] < near[1]
+            low, high = np.where(less, low, one), np.where(less, two, high)
+        return (low + high) / 2
 
 
 def _slopes(x: np.ndarray, step: np.ndarray, closed: bool) -> np.ndarray:
