@@ -9,6 +9,7 @@ import signal
 import struct
 import subprocess
 import tempfile
+import time
 
 import numpy as np
 import pytest
@@ -46,6 +47,40 @@ def falling(tmp_path_factory):
 def rewrite(path, to, change, seal=True):
     """Copy a recording with entries changed by change(text) -> text; `seal` renews the checksums."""
     return Forgery(path).journal(lambda entry: json.loads(change(json.dumps(entry))), seal).save(to)
+
+
+def test_a_file_ends_while_a_child_keeps_its_pipe_and_with_a_name_of_any_length(tmp_path, monkeypatch):
+    # A child made by fork holds a copy of the pipe's end for writing, as dup() makes one. 255 bytes are the most of a file name.
+    pipe, kept = os.pipe, []
+
+    def copied():
+        out, into = pipe()
+        kept.append(os.dup(into))
+        return out, into
+
+    monkeypatch.setattr("tiverlet.recording.sink.WAIT", 2.0)
+    path = tmp_path / ("a" * 251 + ".rrd")
+    with tv.World(tv.Particles([[0.0, 0.0]]), [tv.Gravity()], substeps=2) as w:
+        for _ in range(2):
+            with monkeypatch.context() as patch:
+                patch.setattr(os, "pipe", copied)
+                recorder = tv.Recorder(path, w, overwrite=True)
+            w.run(1 / 60, recorder=recorder)
+            begin = time.monotonic()
+            recorder.close()
+            assert time.monotonic() - begin < 2.0
+            assert tv.replay(path).complete
+    assert os.listdir(tmp_path) == [path.name]
+    for end in kept:
+        os.close(end)
+
+
+def test_frames_are_asked_for_by_number(falling):
+    recording = tv.replay(falling)
+    for wrong in ("a", None, 1.5, True, [1]):
+        for ask in (recording.world, recording.position):
+            with pytest.raises(ValueError, match="but the number of a frame is needed"):
+                ask(wrong)
 
 
 def test_what_was_recorded_reads_back(falling, tmp_path):
