@@ -431,6 +431,30 @@ if __name__ == "__main__":
     assert main(["replay", "mine.rrd", "--verify", "--given", "mine.py"]) == 0
     assert main(["run", "nobody"]) == 2 and "no demo of that name" in capsys.readouterr().err
 
+    # Errors of a script have their traceback; it finds the modules beside it. What was recorded before is kept.
+    (tmp_path / "beside.py").write_text("steps = 2")
+    (tmp_path / "fails.py").write_text("""
+import beside
+import tiverlet as tv
+
+with tv.World(tv.Particles([[0.0, 1.0]]), substeps=2) as world:
+    for _ in range(beside.steps):
+        world.step(1 / 60)
+    float("x")
+""")
+    assert main(["run", "fails.py"]) == 1
+    told = capsys.readouterr()
+    assert "fails.rrd: 3 frames" in told.out and 'line 8, in <module>\n    float("x")' in told.err and "runpy" not in told.err
+    for words in (["play", "fails.py"], ["replay", "mine.rrd", "--verify", "--given", "fails.py"]):
+        with pytest.raises(SystemExit) as end:
+            main(words)
+        assert end.value.code == 1 and "could not convert" in capsys.readouterr().err
+    for number in ("-1", "65536", "x"):
+        with pytest.raises(SystemExit) as end:
+            main(["play", "fails.py", "--port", number])
+        assert end.value.code == 2 and "is no number from 0 to 65535" in capsys.readouterr().err
+    assert main(["run", "fails.py", "--out", "none/a.rrd"]) == 2 and "The folder of none/a.rrd" in capsys.readouterr().err
+
 
 def test_entries_that_passed_each_other_are_packed_in_order(falling):
     # Entries with and without bytes are in different messages; messages in another order give the same journal.

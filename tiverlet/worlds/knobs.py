@@ -204,7 +204,7 @@ def _same(one: Any, other: Any) -> bool:
 def _stacked(values: list[Any]) -> Any:
     """Stack the values of all worlds to an array.
 
-    Return a list if they are not numbers or arrays, such as (static, dynamic), or of different shapes, such as g = 9.81 and (0, 1).
+    Return a list if they are not numbers or arrays, such as (static, dynamic), or of different shapes, such as 9.81 and (0, 1).
     """
     listed = any(isinstance(v, (tuple, Mapping)) for v in values) or len({np.shape(v) for v in values}) > 1
     return values if listed else np.array(values)
