@@ -256,6 +256,17 @@ def test_a_plane_is_at_zero_and_particles_may_come(changing, tmp_path):
         assert not (tmp_path / f"a.{kind}").exists()
 
 
+@pytest.mark.parametrize("name", ["10:00.mp4", "-y.mp4"])
+def test_films_may_have_names_that_ffmpeg_would_take_for_something_else(recording, name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert recording.export(name) == [name] and pathlib.Path(name).stat().st_size > 1000
+
+
+def test_the_buffer_of_a_gltf_file_is_named_as_a_uri(recording, tmp_path):
+    recording.export(tmp_path / "100 % #1.gltf")
+    assert json.loads((tmp_path / "100 % #1.gltf").read_text())["buffers"][0]["uri"] == "100 %25 %231.bin"
+
+
 @pytest.mark.parametrize("kind", ["gif", "webp", "mp4"])
 def test_films_show_what_moves(kind, tmp_path, world):
     # A disc moves to the right at 2 m/s between walls: a picture every 40 ms, of the nearest frame. Then a wall is moved.

@@ -31,7 +31,6 @@ def column(path, entity, name):
     return [found[k] for k in sorted(found, key=lambda k: -1 if k is None else k) if found[k] is not None]
 
 
-@pytest.mark.slow
 def test_lines_are_as_wide_as_the_loads_they_show(tmp_path):
     # At rest the k-th contact from the top bears k m g, and lines are as wide as the loads.
     path = tmp_path / "a.rrd"
@@ -69,6 +68,29 @@ def test_quantities_of_ones_own_are_kept_and_shown(tmp_path):
     packed = np.array(column(path, "world/scene/particles", "Points2D:colors")[-1], dtype=np.uint32)
     drawn = np.stack([packed >> 24, packed >> 16 & 255, packed >> 8 & 255], axis=1)
     assert (drawn == overlays.ramp(height[-1], 0.0, 0.8)).all()
+
+
+def test_quantities_may_have_any_printable_name(tmp_path):
+    # rerun escapes most characters in a path. "violation" is how the path of the built-in residuals ends.
+    names = ["height [m]", "arm/angle", "50 %: x*y", "α² → 😀", "é", "नमस्ते", "violation", "a.b-c"]
+    path, world = tmp_path / "a.rrd", stack()
+    with tv.Recorder(path, world) as recorder:
+        for k in range(1, 3):
+            world.step(1 / 60)
+            recorder.log(**{name: k + i for i, name in enumerate(names)}, **{"force [N]": world.position[:, 1]})
+    recording = tv.replay(path)
+    assert recording.verify().kind == "intact"
+    for i, name in enumerate(names):
+        assert recording.curves[name][1].tolist() == [1 + i, 2 + i]
+    assert len(recording.curves["residual"][1]) == 2 and "force [N]" in recording.quantities
+    recording.export(tmp_path / "a.NPZ")
+    with np.load(tmp_path / "a.NPZ") as arrays:
+        assert {f"{name} value" for name in (*names, "force [N]")} <= {*arrays.files}
+    with tv.Recorder(tmp_path / "b.rrd", world) as recorder:
+        for wrong in ("", "/x", "x/", "a//b", "../x", "a\\b", "a\nb"):
+            with pytest.raises(ValueError, match="is no name of a quantity"):
+                recorder.log(**{wrong: 1.0})
+        recorder.log()
 
 
 def test_the_scale_of_colours_goes_from_end_to_end():

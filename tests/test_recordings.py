@@ -9,6 +9,7 @@ import signal
 import struct
 import subprocess
 import tempfile
+import time
 
 import numpy as np
 import pytest
@@ -46,6 +47,40 @@ def falling(tmp_path_factory):
 def rewrite(path, to, change, seal=True):
     """Copy a recording with entries changed by change(text) -> text; `seal` renews the checksums."""
     return Forgery(path).journal(lambda entry: json.loads(change(json.dumps(entry))), seal).save(to)
+
+
+def test_a_file_ends_while_a_child_keeps_its_pipe_and_with_a_name_of_any_length(tmp_path, monkeypatch):
+    # A child made by fork holds a copy of the pipe's end for writing, as dup() makes one. 255 bytes are the most of a file name.
+    pipe, kept = os.pipe, []
+
+    def copied():
+        out, into = pipe()
+        kept.append(os.dup(into))
+        return out, into
+
+    monkeypatch.setattr("tiverlet.recording.sink.WAIT", 2.0)
+    path = tmp_path / ("a" * 251 + ".rrd")
+    with tv.World(tv.Particles([[0.0, 0.0]]), [tv.Gravity()], substeps=2) as w:
+        for _ in range(2):
+            with monkeypatch.context() as patch:
+                patch.setattr(os, "pipe", copied)
+                recorder = tv.Recorder(path, w, overwrite=True)
+            w.run(1 / 60, recorder=recorder)
+            begin = time.monotonic()
+            recorder.close()
+            assert time.monotonic() - begin < 2.0
+            assert tv.replay(path).complete
+    assert os.listdir(tmp_path) == [path.name]
+    for end in kept:
+        os.close(end)
+
+
+def test_frames_are_asked_for_by_number(falling):
+    recording = tv.replay(falling)
+    for wrong in ("a", None, 1.5, True, [1]):
+        for ask in (recording.world, recording.position):
+            with pytest.raises(ValueError, match="but the number of a frame is needed"):
+                ask(wrong)
 
 
 def test_what_was_recorded_reads_back(falling, tmp_path):
@@ -395,6 +430,30 @@ if __name__ == "__main__":
     assert main(["replay", "mine.rrd", "--verify"]) == 2 and "given=[swing]" in capsys.readouterr().err
     assert main(["replay", "mine.rrd", "--verify", "--given", "mine.py"]) == 0
     assert main(["run", "nobody"]) == 2 and "no demo of that name" in capsys.readouterr().err
+
+    # Errors of a script have their traceback; it finds the modules beside it. What was recorded before is kept.
+    (tmp_path / "beside.py").write_text("steps = 2")
+    (tmp_path / "fails.py").write_text("""
+import beside
+import tiverlet as tv
+
+with tv.World(tv.Particles([[0.0, 1.0]]), substeps=2) as world:
+    for _ in range(beside.steps):
+        world.step(1 / 60)
+    float("x")
+""")
+    assert main(["run", "fails.py"]) == 1
+    told = capsys.readouterr()
+    assert "fails.rrd: 3 frames" in told.out and 'line 8, in <module>\n    float("x")' in told.err and "runpy" not in told.err
+    for words in (["play", "fails.py"], ["replay", "mine.rrd", "--verify", "--given", "fails.py"]):
+        with pytest.raises(SystemExit) as end:
+            main(words)
+        assert end.value.code == 1 and "could not convert" in capsys.readouterr().err
+    for number in ("-1", "65536", "x"):
+        with pytest.raises(SystemExit) as end:
+            main(["play", "fails.py", "--port", number])
+        assert end.value.code == 2 and "is no number from 0 to 65535" in capsys.readouterr().err
+    assert main(["run", "fails.py", "--out", "none/a.rrd"]) == 2 and "The folder of none/a.rrd" in capsys.readouterr().err
 
 
 def test_entries_that_passed_each_other_are_packed_in_order(falling):

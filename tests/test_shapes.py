@@ -217,6 +217,21 @@ def test_files_of_others(tmp_path):
     np.testing.assert_array_equal(body.tetrahedra, [[0, 1, 2, 3]])
 
 
+def test_files_may_begin_with_a_mark_and_end_lines_in_any_way(tmp_path):
+    triangle, path = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], tmp_path / "a.obj"
+    path.write_bytes(b"\xef\xbb\xbfv 0 0 0\r\nv 1 0 0\r\nv 0 1 0\r\nf 1 2 \\\r\n 3\r\n")
+    side = S.load(path)
+    assert side.position.tolist() == triangle and side.faces.tolist() == [[0, 1, 2]]
+    text = "ply\ncomment end_header follows\nformat ascii 1.0\nelement vertex 3\n" + XYZ
+    text += "element face 1\nproperty list char int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+    for end in ("\n", "\r\n", "\r"):
+        (tmp_path / "a.ply").write_bytes(text.replace("\n", end).encode())
+        side = S.load(tmp_path / "a.ply")
+        assert side.position.tolist() == triangle and side.faces.tolist() == [[0, 1, 2]]
+    (tmp_path / "a.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\n" + XYZ + "end_header")
+    assert len(S.load(tmp_path / "a.ply")) == 0
+
+
 XYZ = "".join(f"property float {c}\n" for c in "xyz")
 
 
@@ -232,6 +247,8 @@ XYZ = "".join(f"property float {c}\n" for c in "xyz")
         ("a.ply", "ply\nformat zip 1.0\nend_header\n", "format 'zip'"),
         ("a.ply", "ply\nformat ascii 1.0\nelement vertex 2\n" + XYZ + "end_header\n1 2 3\n4",
          "vertex 1 of 2 is incomplete"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement face 1\nproperty list char int vertex_indices\nend_header\n-1 0\n",
+         "face 0 of 1 is incomplete"),
         ("a.ply", "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "no vertices with x, y and z"),
         ("a.stl", "", "ends with '.stl'"),
     ],
@@ -255,6 +272,8 @@ def test_files_that_are_refused(tmp_path, name, text, message):
         (lambda: S.blob([[0, 0], [1, 0], [2, 0]], 0.1), "no area"),
         (lambda: S.blob(MOUTH, 5.0), "make it smaller"),
         (lambda: S.truss((0, 0), (1, -1), 2), r"upper\[1\] = -1"),
+        (lambda: S.truss((0, 0), (1, 1), (1, 2, 3)), r"cells = \(1, 2, 3\), but one number"),
+        (lambda: S.pile((0, 0), (1, 1), (1, 2, 3)), r"radius = \(1, 2, 3\), but a number"),
         (lambda: S.pile((0, 0), (1, 1), 2.0), "no particle of radius 2 fits"),
         (lambda: S.pile((0, 0), (1, 1), (0.2, 0.1)), "smallest comes first"),
         (lambda: S.tree((0, 0), 1.0, levels=0), "levels = 0"),

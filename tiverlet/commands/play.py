@@ -4,6 +4,8 @@ import argparse
 import runpy
 from typing import Any
 
+from .scripts import as_script, port
+
 ABOUT = "run a demo or script live, and take it by hand"
 
 
@@ -11,7 +13,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     """Add the script, and options of the page."""
     parser.add_argument("script", help="a .py file with a function play() or build() that returns a world, or the name of a demo")
     parser.add_argument("--record", metavar="FILE.rrd", help="write what happens, the hand included; replays bit for bit")
-    parser.add_argument("--port", type=int, default=0, help="default: a free one")
+    parser.add_argument("--port", type=port, default=0, help="default: a free one")
     parser.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
 
 
@@ -21,8 +23,9 @@ def main(args: argparse.Namespace) -> int:
     from .run import find
 
     path = find(args.script)
-    world, each_frame = load_world(str(path))
-    play(world, record=args.record, each_frame=each_frame, title=path.stem, port=args.port, browser=args.browser)
+    with as_script(path):
+        world, each_frame = load_world(str(path))
+        play(world, record=args.record, each_frame=each_frame, title=path.stem, port=args.port, browser=args.browser)
     return 0
 
 

@@ -6,6 +6,7 @@ import runpy
 from typing import Any
 
 from ..device.language import is_kernel_function
+from .scripts import as_script, port
 
 ABOUT = "view, verify, picture or export a recording"
 
@@ -30,7 +31,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--shape", metavar="BODY.obj", help="of --export: take its faces, quads and texture coordinates")
     parser.add_argument("--frame", type=int, action="append", help="of --png; several with a %%d in the name; default the last")
     parser.add_argument("--scene", action="store_true", help="of --png: the scene alone, without curves and text")
-    parser.add_argument("--port", type=int, default=9090, help="of --web; default 9090")
+    parser.add_argument("--port", type=port, default=9090, help="of --web; default 9090")
     parser.add_argument("--given", metavar="SCRIPT.py", help="of --verify: where the user's own functions in the scene are")
 
 
@@ -82,7 +83,8 @@ def functions(script: str, names: dict[str, str]) -> dict[str, Any]:
     """
     from ..recording.scene import plain
 
-    found = runpy.run_path(script, run_name="given")
+    with as_script(script):
+        found = runpy.run_path(script, run_name="given")
     out = {name: found[name.partition(" #")[0]] for name in names if name.partition(" #")[0] in found}
     for name, thing in out.items():
         if not is_kernel_function(thing):

@@ -9,6 +9,8 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
+from .scripts import as_script
+
 ABOUT = "run a demo or script, and record it"
 # The folder beside the package in a checkout, or in the installed package.
 DEMOS = next((p / "demos" for p in pathlib.Path(__file__).parents[1:3] if (p / "demos").is_dir()), pathlib.Path("demos"))
@@ -30,6 +32,8 @@ def main(args: argparse.Namespace) -> int:
     path = find(args.script)
     out = args.out or f"{path.stem}.rrd"
     check_replaceable(out)
+    if not os.path.isdir(os.path.dirname(os.path.abspath(out))):
+        raise FileNotFoundError(f"The folder of {out} does not exist.")
     with recording(out, args.live) as made:
         status = execute(path, args.arguments)
     if made:
@@ -41,16 +45,13 @@ def main(args: argparse.Namespace) -> int:
 
 def execute(path: pathlib.Path, arguments: list[str]) -> int:
     """Run a script as Python would; return its exit status."""
-    before = sys.argv, list(sys.path)
-    sys.argv, sys.path[0] = [str(path), *arguments], str(path.parent)
     try:
-        runpy.run_path(str(path), run_name="__main__")
+        with as_script(path, arguments):
+            runpy.run_path(str(path), run_name="__main__")
     except SystemExit as end:
         if isinstance(end.code, str):
             print(end.code, file=sys.stderr)
         return end.code if isinstance(end.code, int) else int(end.code is not None)
-    finally:
-        sys.argv, sys.path[:] = before
     return 0
 
 

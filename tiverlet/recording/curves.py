@@ -1,5 +1,6 @@
 """The figures of each frame as curves."""
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,6 +37,21 @@ SPIN = {
     }),
 }  # fmt: skip
 OWN = "own"  # first part of the paths of the user's quantities
+ESCAPED = re.compile(r"\\u\{([0-9A-F]{1,6})\}|\\(.)")  # a character in such a path
+
+
+def own_path(name: str) -> str:
+    """Return the path of the rows of a quantity of the user's, below "figures". rerun wants most characters in it escaped."""
+    import rerun as rr
+
+    return "/".join([OWN, *(rr.escape_entity_path_part(part) for part in name.split("/"))])
+
+
+def own_name(path: str) -> str | None:
+    """Return the name of the quantity with this path, see own_path(); None for a curve of every recording."""
+    if not path.startswith(f"{OWN}/"):
+        return None
+    return ESCAPED.sub(lambda found: chr(int(found[1], 16)) if found[1] else found[2], path.removeprefix(f"{OWN}/"))
 
 
 def curves_of(world: "World") -> dict[str, tuple[str, dict[str, Any]]]:
@@ -121,8 +137,8 @@ class Curves:
         for name, value in numbers.items():
             if name not in self.own:
                 self.own.append(name)
-                self._stream.log(f"figures/{OWN}/{name}", self._rr.SeriesLines(names=[name]), static=True, strict=True)
-            self._rows.setdefault(f"{OWN}/{name}", []).append((frame, time, [value]))
+                self._stream.log(f"figures/{own_path(name)}", self._rr.SeriesLines(names=[name]), static=True, strict=True)
+            self._rows.setdefault(own_path(name), []).append((frame, time, [value]))
 
     def send(self) -> None:
         """Log all collected figures."""

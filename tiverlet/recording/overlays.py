@@ -63,6 +63,11 @@ def checked_color(value: Any) -> tuple[str, float, float] | None:
     return value[0], low, high
 
 
+def is_name(name: str) -> bool:
+    """Whether a quantity may have this name, which becomes part of a path in recordings and exports."""
+    return name.isprintable() and "\\" not in name and not {"", ".", ".."} & {*name.split("/")}
+
+
 def checked_quantities(given: dict[str, Any], count: int) -> dict[str, Any]:
     """Check the user's quantities; return them as floats and arrays (count,) in f64."""
     taken = {name for _, curves in (CURVES | SPIN).values() for name in curves}
@@ -71,6 +76,10 @@ def checked_quantities(given: dict[str, Any], count: int) -> dict[str, Any]:
         array = np.asarray(value)
         if name in taken:
             raise ValueError(f"Recorder.log: {name} is the name of a curve of every recording; choose another.")
+        if not is_name(name):
+            raise ValueError(
+                f"Recorder.log: {name!r} is no name of a quantity. Write words, or a path of them such as 'arm/angle'."
+            )
         if array.dtype.kind not in "biuf" or array.shape not in ((), (count,)):
             raise ValueError(
                 f"Recorder.log: {name} has the shape {array.shape} and the type {array.dtype}, but a number, or one for each of "

@@ -111,12 +111,12 @@ def layout(
     seen: corners of the visible region [m], and the factor of scale; None for what is known beforehand. own: names of the user's
     quantities that have curves.
     """
-    from .curves import OWN, informative_views
+    from .curves import informative_views, own_path
     from .drawing import bounds, links, upwards
     from .layout import blueprint, unit
 
     (low, high), scale = seen or (bounds(world), unit(*bounds(world)))
-    figures = {name: (f"{OWN}/{name}", [True]) for name in own} | informative_views(world)
+    figures = {name: (own_path(name), [True]) for name in own} | informative_views(world)
     return blueprint(scale * low, scale * high, overlays.title(bool(links(world))), figures, upwards(world))
 
 

@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import numbers
 import os
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -17,7 +18,7 @@ from ..shapes import Shape
 from ..step import checkpoint
 from ..step.clock import Clock
 from . import journal, rrd, scene
-from .curves import CURVES, OWN, SPIN
+from .curves import CURVES, SPIN, own_name
 from .journal import Entry
 from .redraw import Redraw, compare
 from .scene import plain
@@ -106,6 +107,8 @@ class Replay:
         return f"Replay({self.path!r}, {len(self.frames)} frames{'' if self.complete else ', not complete'})"
 
     def _entry(self, frame: int) -> Entry:
+        if isinstance(frame, bool) or not isinstance(frame, numbers.Integral):
+            raise ValueError(f"replay: frame = {frame!r} is a {type(frame).__name__}, but the number of a frame is needed.")
         if frame not in self._frames:
             near = self.frames[np.argmin(np.abs(self.frames - frame))] if len(self.frames) else None
             raise ValueError(f"replay: {self.path} has no frame {frame}; the nearest is {near}. All are in .frames.")
@@ -437,11 +440,11 @@ def _curves(contents: rrd.Contents) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         if name.startswith("figures/"):
             found.setdefault(name[len("figures/") :], {})[frame] = k
     out, known = {}, {end: list(curves) for end, curves in (CURVES | SPIN).values()}
-    found = {end.removeprefix(f"{OWN}/"): rows for end, rows in found.items()}
     for end, rows in found.items():
-        frames = sorted(rows)
+        frames, own = sorted(rows), own_name(end)
         values = np.array([contents.values(rows[frame]) for frame in frames])
-        for name, column in zip(known.get(end, [end]), values.reshape(len(frames), -1).T, strict=False):
+        names = known.get(end, [end]) if own is None else [own]
+        for name, column in zip(names, values.reshape(len(frames), -1).T, strict=False):
             out[name] = np.array(frames), column
     return dict(sorted(out.items()))
 

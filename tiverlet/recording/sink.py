@@ -95,8 +95,8 @@ class Sink:
 
     def _temporary_name(self) -> str:
         """Return a name for a file that will replace the recording's."""
-        folder, name = os.path.split(os.path.realpath(self.path))
-        return os.path.join(folder, f".{name}.{uuid.uuid4().hex[:8]}")
+        folder = os.path.dirname(os.path.realpath(self.path))
+        return os.path.join(folder, f".recording.{uuid.uuid4().hex[:8]}")  # the name of the recording may be too long for more
 
     def _remember_file(self) -> None:
         found = os.fstat(self._file.fileno())
@@ -127,8 +127,8 @@ class Sink:
             self.error = FileNotFoundError(errno.ENOENT, "the file was removed or replaced")
 
     def _copy_messages(self) -> None:
-        """Copy messages until rerun closes the pipe. Reading and writing share one lock, so that flush() waits for both."""
-        while True:
+        """Copy messages until the last one. Reading and writing share one lock, so that flush() waits for both."""
+        while not self._ended:  # rerun then closes its end of the pipe, which a forked child may keep open
             select.select([self._out], [], [])
             with self._busy:
                 piece = os.read(self._out, PIECE)
@@ -153,12 +153,12 @@ class Sink:
             if len(self._partial_message) - at < HEAD.size:
                 break
             kind, length = HEAD.unpack_from(self._partial_message, at)
+            if len(self._partial_message) - at - HEAD.size < length:
+                break
             if kind == END:
                 seal = SEAL + self._sum.digest()
                 self._put(HEAD.pack(END, len(seal)) + seal)
                 self._ended = True
-            elif len(self._partial_message) - at - HEAD.size < length:
-                break
             else:
                 message = bytes(self._partial_message[at + HEAD.size : at + HEAD.size + length])
                 message = smaller(message) if kind == CHUNK else message
@@ -190,7 +190,11 @@ class Sink:
                 data = file.read()
             new, before, taken = self._temporary_name(), (self._file, self._sum, self.bytes), False
             try:
-                self._file, self._sum, self.bytes = open(new, "xb", buffering=0), hashlib.sha256(), 0
+                file = open(new, "xb", buffering=0)
+            except OSError:  # the folder takes no further file
+                return False
+            try:
+                self._file, self._sum, self.bytes = file, hashlib.sha256(), 0
                 os.chmod(new, stat.S_IMODE(os.fstat(before[0].fileno()).st_mode))
                 self._put(data[:HEADER])
                 for kind, message in thinned(split(data), stride):

@@ -1,6 +1,7 @@
 """Reading and writing meshes as OBJ and PLY files. Both formats are short enough to need no library."""
 
 import os
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -94,7 +95,8 @@ def _obj(name: str, data: bytes):
         found = [int(w) for w in words]
         return [i - 1 if i > 0 else count + i if i < 0 else -1 for i in found]
 
-    for number, line in enumerate(data.decode("utf-8", "replace").replace("\\\n", " ").splitlines(), 1):
+    text = re.sub(r"\\\r?\n", " ", data.decode("utf-8-sig", "replace"))  # some programs begin a file with a byte order mark
+    for number, line in enumerate(text.splitlines(), 1):
         words = line.partition("#")[0].split()
         if not words or words[0] not in ("v", "vt", "l", "f"):
             continue
@@ -134,12 +136,11 @@ def _obj(name: str, data: bytes):
 
 def _header(name: str, data: bytes):
     """Return the format, the elements [(name, count, [(property, type, list count type or None)])], and the start of the body."""
-    stop = data.find(b"end_header")
-    if not data.startswith(b"ply") or stop < 0:
+    end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\r|\n|$)", data)
+    if not data.startswith(b"ply") or end is None:
         raise ValueError(f"load: {name} is not a PLY file; it has no header.")
-    begin = data.index(b"\n", stop) + 1
     kind, elements = "", []
-    for line in data[:stop].decode("ascii", "replace").splitlines():
+    for line in data[: end.start()].decode("ascii", "replace").splitlines():
         words = line.split()
         try:
             if words[:1] == ["format"]:
@@ -154,7 +155,7 @@ def _header(name: str, data: bytes):
             raise ValueError(f"load: {name}: {line.strip()!r} in the header cannot be understood.") from None
     if kind not in ("ascii", "binary_little_endian", "binary_big_endian"):
         raise ValueError(f"load: {name}: format {kind!r} is unknown.")
-    return kind, elements, begin
+    return kind, elements, end.end()
 
 
 def _ply(name: str, data: bytes):
@@ -165,6 +166,8 @@ def _ply(name: str, data: bytes):
     def take(form: str, count: int) -> list:
         """Read the next `count` numbers."""
         nonlocal here, at
+        if count < 0:
+            raise ValueError
         if kind == "ascii":
             here += count
             if here > len(words):

@@ -63,7 +63,7 @@ def bridge(start, end, panels: int, height: float) -> Shape:
     return Shape(np.concatenate([deck, (deck[1:] + deck[:-1]) / 2 + up]), np.concatenate(links))
 
 
-def tree(root, height: float, levels: int = 4, branches: int = 2, segments: int = 4, spread: float = 0.6, dim: int = 2) -> Shape:
+def tree(root, height: float, levels: int = 4, branches: int = 2, segments: int = 4, spread: float = 0.6) -> Shape:
     """Make a plant: a stem of `segments` links that splits into `branches` shorter ones, and so on for `levels` levels.
 
     root: (dim,) [m]. height: of the whole plant, upright, roughly [m]. spread: angle between a branch and its stem [rad].

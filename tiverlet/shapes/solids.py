@@ -100,6 +100,8 @@ def truss(lower, upper, cells) -> Shape:
     """
     low = point("truss", "lower", lower)
     high = checks.vector("truss", "upper", upper, len(low))
+    if np.shape(cells) not in ((), (len(low),)):
+        raise ValueError(f"truss: cells = {cells!r}, but one number, or one along each of {len(low)} axes, is needed.")
     counts = np.broadcast_to(np.asarray(cells), (len(low),))
     counts = np.array([checks.integer("truss", f"cells[{k}]", n, least=1) for k, n in enumerate(counts.tolist())])
     if not (high > low).all():
@@ -225,6 +227,8 @@ def pile(lower, upper, radius) -> Shape:
     low = point("pile", "lower", lower)
     high = checks.vector("pile", "upper", upper, len(low))
     ends = np.atleast_1d(np.asarray(radius, dtype=np.float64))
+    if ends.shape not in ((1,), (2,)):
+        raise ValueError(f"pile: radius = {radius!r}, but a number, or the smallest and the largest, is needed.")
     small, large = checks.per_item("pile", "radius", ends if len(ends) == 2 else np.repeat(ends, 2), 2, above=0.0)
     if large < small:
         raise ValueError(f"pile: radius = ({small:g}, {large:g}), but the smallest comes first.")

@@ -1,10 +1,10 @@
 """Export of arrays for numpy."""
 
-import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..overlays import is_name
 from ..scene import plain
 from .stretch import only
 
@@ -17,9 +17,10 @@ def write(recording: "Replay", path: str) -> list[str]:
     stretch = only(recording, path, "array", ".csv")
     more: dict[str, Any] = {name: stretch.column(name) for name in ("mass", "radius")}
     for name, (frames, values) in (recording.curves | recording.quantities).items():
-        if not re.fullmatch(r"\w+(/\w+)*", name):  # the name becomes that of a file in the archive
+        if not is_name(name):  # the name becomes that of a file in the archive
             raise ValueError(f"replay: {recording.path} has a curve with the name {plain(name)!r}; see .verify().")
         more |= {f"{name} frame": frames, f"{name} value": values}
     x = np.array([x for _, _, x in stretch])
-    np.savez_compressed(path, position=x, frame=stretch.frames, time=stretch.times, **more)
+    with open(path, "wb") as file:  # given a name, numpy would append its own ending to .NPZ
+        np.savez_compressed(file, position=x, frame=stretch.frames, time=stretch.times, **more)
     return [path]

@@ -39,7 +39,8 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
     size = "x".join(map(str, first.size))
     words = [video, "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(RATE), "-i", "-"]
     with tempfile.TemporaryFile() as said:
-        process = subprocess.Popen([*words, "-pix_fmt", "yuv420p", path], stdin=subprocess.PIPE, stderr=said)
+        out = os.path.abspath(path)  # ffmpeg would take "-a.mp4" for an option, and "10:00.mp4" for a protocol
+        process = subprocess.Popen([*words, "-pix_fmt", "yuv420p", out], stdin=subprocess.PIPE, stderr=said)
         with process, contextlib.suppress(BrokenPipeError):  # if ffmpeg has ended, its output says why
             assert process.stdin
             for picture in itertools.chain([first], pictures):

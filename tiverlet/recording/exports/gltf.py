@@ -5,7 +5,9 @@ frames. Positions are stored as recorded; a node above them rotates the scene so
 """
 
 import os
+import re
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -236,7 +238,9 @@ class _Scene:
         beside = f"{os.path.splitext(path)[0]}.bin"
         with open(beside, "wb") as out:
             out.writelines(self._blocks)
-        file.buffers[0].uri = os.path.basename(beside)
+        file.buffers[0].uri = re.sub(
+            "[%#?]", lambda found: quote(found[0]), os.path.basename(beside)
+        )  # which end a path in a URI
         with open(path, "w", encoding="utf-8") as out:
             out.write(file.to_json())
         return [path, beside]
