@@ -207,7 +207,8 @@ class State:
         """
         close = self.digits(i)
         if ti.static(self.compensated):
-            close = ti.static(self.two_digits) * (ti.abs(n).dot(ti.abs(self.x[i])) + size)
+            along = ti.abs(n).dot(ti.abs(self.x[i]))  # type: ignore[reportOptionalCall, reportOptionalMemberAccess]
+            close = ti.static(self.two_digits) * (along + size)
         return close
 
     @ti.func
