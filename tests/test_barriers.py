@@ -114,6 +114,20 @@ def test_a_fine_sphere_is_a_ball(world):
     assert errors[1] < 0.01 and errors[1] < errors[0] / 2.5
 
 
+def test_discs_between_a_wall_that_moves_and_turns_and_a_box_are_in_neither(world):
+    # Discs that are thrown into the wedges beside the box, at up to 5 m per substep, while the wall sweeps through them.
+    rng = np.random.default_rng(0)
+    n, r = 1000, 0.01
+    x = np.stack([rng.uniform(-0.9, 0.9, n), 0.5 * rng.choice([-1, 1], n)], axis=1)
+    wall, box = tv.Polygon([(-2, 0), (2, 0)], closed=False, radius=0.001), tv.Box((-1, -1), (1, 1))
+    start = tv.Particles(x, velocity=rng.normal(size=(n, 2)) * 100, radius=r)
+    w = world(start, [wall, box], precision="f64", substeps=1)
+    for k in range(4):
+        wall.position, wall.rotation = (0.1 * np.cos(k), 0.2 * np.sin(2.1 * k)), 0.1 * np.sin(1.7 * k)
+        w.step(1 / 60)
+        assert wall.clearance(w.position).min() >= r - 1e-12 and box.clearance(w.position).min() >= r - 1e-12
+
+
 def test_orientation_is_found(world):
     # Faces in either orientation, or in mixed ones, give the same wall bit for bit.
     some = [f[::-1] if k % 3 else f for k, f in enumerate(CUBE_FACES)]

@@ -11,6 +11,7 @@ from ..particles import Particles
 from .collider import Collider
 from .pose import Pose, rotation_matrix
 from .shape import HostShape
+from .surface import ANY_DEPTH
 
 TOUCHES = 8  # of one particle in one substep; after these it stays at the last place known to be free
 
@@ -150,6 +151,8 @@ class Moving(Collider):
                         shift = self.dev.surface.push(i, depth, start_depth, out, moved, h, mode, slides)
                         a += s * e
                         e += self.dev.pose.inward(1, shift) - s * e
+                        if mode != ANY_DEPTH and depth <= self.dev.state.digits_along(i, out, radius):
+                            e += ti.max(depth, 0) * n  # push() leaves rounding as it is; the way goes on along the surface
         if ti.static(self.dev.shape.may_miss_touches):
             if touched and not self.dev.shape.is_penetrating(first, contact_distance - 8 * close, close):
                 going = going or self.dev.shape.is_penetrating(a + e, contact_distance - 4 * close, close)
