@@ -165,6 +165,13 @@ def test_wrong_angles_are_named():
         tv.Dihedral([[0, 1, 2]])
     with pytest.raises(ValueError, match=r"AngleLimit: triples\[0\] = \(0, 1, 3\), but there are 3 particles"):
         tv.World(tv.Particles(np.eye(3)), [tv.AngleLimit([[0, 1, 3]], 0.0, 1.0)])
+    with pytest.raises(ValueError, match=r"Bend: rest \(in 3D\)\[0\] = -0.5, but it must be at least 0"):
+        tv.World(tv.Particles(np.eye(3)), [tv.Bend([[0, 1, 2]], -0.5)])
+    bend, limit = tv.Bend([[0, 1, 2]], 0.5), tv.AngleLimit([[0, 1, 2]], 0.0, 1.0)
+    with tv.World(tv.Particles(np.eye(3)), [bend, limit]), pytest.raises(ValueError, match="at least 0"):
+        bend.rest = -0.5
+    with pytest.raises(ValueError, match=r"AngleLimit: upper \(in 3D\)\[0\] = 4, but it must be at most 3.14159"):
+        limit.upper = 4.0
     tv.Bend([[0, 1, 2], [1, 2, 0], [2, 0, 1]])
     with pytest.warns(UserWarning, match=r"Bend: 1 of the triples are duplicates, the first of them \(0, 1, 2\)"):
         tv.Bend([[0, 1, 2], [2, 1, 0]])

@@ -127,7 +127,8 @@ class AnchorPasses(Passes):
             if alpha > 0:
                 C = self.place.offset_now(c, back)
                 out = ti.cast(C.dot(C) / (2 * alpha), ti.f64)
-                force, w = ti.cast(self.lam[c], ti.f64).norm(), self.w.of(self.corners.member(c, 0))
+                force = ti.cast(self.lam[c], ti.f64).norm()  # type: ignore[reportOptionalCall]
+                w = self.w.of(self.corners.member(c, 0))
                 out *= self.spring.bearing_share(force * alpha, h2_effective, residual * self.size.now)
                 if h2_effective > 0:
                     force /= h2_effective
