@@ -25,7 +25,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ..constraints.bend import Bend
 from ..constraints.core.scalar import Scalar
 from ..device import ti
 from ..features.feature import Batch, Feature, Scene
@@ -389,7 +388,7 @@ class Rows:
         """Return the least moves that take the linearised C to 0, (n, dim), and bend no straight path across its plane."""
         m, row, who, J = len(self.C), [self.row], [self.who], [self.J * self.scale[self.row, None]]
         for (b, some), W in zip(self.active, self.weights, strict=True):
-            if isinstance(b, Bend) and (straight := some & (W > 0) & b.straight).any():
+            if (straight := some & (W > 0) & b.straight).any():
                 more = SidewaysRows(b, straight)
                 row, who = [*row, m + more.owner], [*who, more.indices.ravel()]
                 J.append((more.gradients(self.x) / np.sqrt(W[straight])[:, None, None]).reshape(-1, self.dim))
