@@ -10,7 +10,18 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles
-from .core.angle import TURN, Angle, least_sine, path_angle, path_angles, path_gradients, shorter_link, wrap_near, wrap_to_pi
+from .core.angle import (
+    TURN,
+    Angle,
+    angles_of_paths,
+    least_sine,
+    path_angle,
+    path_angles,
+    path_gradients,
+    shorter_link,
+    wrap_near,
+    wrap_to_pi,
+)
 from .core.scalar import Scalar
 
 
@@ -88,7 +99,7 @@ class AngleLimit(Scalar):
         self.lower, self.upper = lower, upper
 
     def _bound(self, name: str, value) -> np.ndarray:
-        value = checks.per_item("AngleLimit", name, value, self.count, least=-TURN, most=TURN)
+        value = angles_of_paths(self, name, value)
         low = value if name == "lower" else self.__dict__.get("lower", value)
         high = value if name == "upper" else self.__dict__.get("upper", value)
         for wrong, why in ((low > high, "lower must not exceed upper"), (high - low > TURN, "they are more than a turn apart")):
@@ -111,8 +122,7 @@ class AngleLimit(Scalar):
         """Check the indices, and check the limits against the dimension."""
         checks.indices("AngleLimit", self.index_name, self.indices, particles.count, arity=3)
         for name, value in (("lower", self.lower), ("upper", self.upper)):
-            if particles.dim == 3:
-                checks.per_item("AngleLimit", f"{name} (in 3D)", value, self.count, least=0.0, most=np.pi)
+            angles_of_paths(self, name, value, particles.dim)
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return how far the angles are from the middle [rad]."""

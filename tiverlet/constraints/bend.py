@@ -3,8 +3,9 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..features.feature import Knob
 from ..geometry.intervals import cross
-from .core.angle import REST_ANGLE
+from .core.angle import angles_of_paths
 from .core.bend_angle import BendAngle
 from .core.scalar import Scalar
 
@@ -28,10 +29,15 @@ class Bend(Scalar):
 
     measures = BendAngle
     index_name = "triples"
-    rest = REST_ANGLE
+    rest = Knob(lambda f, v: angles_of_paths(f, "rest", v), "Rest angle [rad].")
 
     def __init__(self, triples, rest=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0, break_at=None):
         self.setup(triples, rest, compliance, damping, break_at)
+
+    def prepare(self, particles, inv_mass: np.ndarray) -> None:
+        """Check the indices, and check the rest angles against the dimension."""
+        super().prepare(particles, inv_mass)
+        angles_of_paths(self, "rest", self.rest, particles.dim)
 
     def violation(self, position: np.ndarray) -> np.ndarray:
         """Return C at the given positions, (m,), with the sign that the angles have on the device."""
@@ -45,7 +51,7 @@ class Bend(Scalar):
     def straight(self) -> np.ndarray:
         """Which paths in 3D are to be straight now, so that they may bend in any direction, (m,). See BendAngle."""
         if self.start.dim == 2:
-            return np.zeros(self.count, dtype=bool)
+            return super().straight
         return self.scene.memory.read(self.dev.equation.rest)[: self.count] == 0
 
     def _sides(self, position: np.ndarray) -> np.ndarray:

@@ -32,6 +32,7 @@ from ..neighbours.queries import between
 from ..solvers.corners import bodies_of, corners_of
 from .clock import MET
 from .jacobian import Jacobian
+from .sideways_rows import SidewaysRows
 
 SEEN = 1e-3  # of its size: a violation from which on the report says that it was removed
 ENOUGH = 0.2  # of its size: a violation after which known loads are reset
@@ -384,14 +385,21 @@ class Rows:
         return np.flatnonzero(angle[:-1] & (self.row[:-1] == self.row[1:]))
 
     def newton(self) -> np.ndarray:
-        """Return the least moves that take the linearised C to 0, (n, dim)."""
-        return self._scaled.solve(-self.C * self.scale, enough=LEFT, steps=STEPS)
+        """Return the least moves that take the linearised C to 0, (n, dim), and bend no straight path across its plane."""
+        m, row, who, J = len(self.C), [self.row], [self.who], [self.J * self.scale[self.row, None]]
+        for (b, some), W in zip(self.active, self.weights, strict=True):
+            if (straight := some & (W > 0) & b.straight).any():
+                more = SidewaysRows(b, straight)
+                row, who = [*row, m + more.owner], [*who, more.indices.ravel()]
+                J.append((more.gradients(self.x) / np.sqrt(W[straight])[:, None, None]).reshape(-1, self.dim))
+                m += more.count
+        right = np.zeros(m)
+        right[: len(self.C)] = -self.C * self.scale
+        return Jacobian(m, np.concatenate(row), np.concatenate(who), self.w, np.concatenate(J)).solve(
+            right, enough=LEFT, steps=STEPS
+        )
 
     def relaxed(self) -> np.ndarray:
         """Return the moves of one pass, -w J^T C / W, (n, dim)."""
-        return self._scaled.moves(-self.C * self.scale)
-
-    @property
-    def _scaled(self) -> Jacobian:
-        """The Jacobian of C / sqrt(W)."""
-        return Jacobian(len(self.C), self.row, self.who, self.w, self.J * self.scale[self.row, None])
+        scaled = Jacobian(len(self.C), self.row, self.who, self.w, self.J * self.scale[self.row, None])
+        return scaled.moves(-self.C * self.scale)

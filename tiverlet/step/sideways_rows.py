@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from ..constraints.bend import Bend
 from ..constraints.core.angle import directions
 from ..geometry.intervals import cross
 
@@ -24,7 +23,7 @@ class SidewaysRows:
 
     side, breaks = 0, False
 
-    def __init__(self, batch: Bend, some: np.ndarray):
+    def __init__(self, batch: Any, some: np.ndarray):
         self.batch, self.some, self.start = batch, some, batch.start
         self.count, self.indices = int(some.sum()), batch.indices[some]
         self.owner = np.repeat(np.arange(self.count), batch.arity)
@@ -52,5 +51,5 @@ class SidewaysRows:
 
 def sideways_rows(batches: list[Any]) -> list[SidewaysRows]:
     """Return the rows of the paths that are to be straight in 3D."""
-    some = [(b, b.straight & ~b.broken) for b in batches if isinstance(b, Bend)]
+    some = [(b, b.straight & ~b.broken) for b in batches]
     return [SidewaysRows(b, straight) for b, straight in some if straight.any()]

@@ -19,6 +19,16 @@ SHORT = 1e-24  # [m^2] squared length below which a link has no direction: repre
 REST_ANGLE = Knob(lambda f, v: checks.per_item(repr(f), f.rest_name, v, f.count, least=-TURN, most=TURN), "Rest angle [rad].")
 
 
+def angles_of_paths(batch: Any, name: str, value: Any, dim: int | None = None) -> np.ndarray:
+    """Return angles of paths as the user gives them, checked, (m,): within a turn, and in 3D in [0, pi], where they have no sign.
+
+    dim: of the world; None for that of the batch, which it has once it is in a world.
+    """
+    if (batch.start.dim if dim is None and batch.start else dim) == 3:
+        return checks.per_item(repr(batch), f"{name} (in 3D)", value, batch.count, least=0.0, most=np.pi)
+    return checks.per_item(repr(batch), name, value, batch.count, least=-TURN, most=TURN)
+
+
 @cache
 def _matrix(rows: int, columns: int, real: Any) -> Any:
     return ti.types.matrix(rows, columns, real)
