@@ -135,6 +135,8 @@ def test_a_restitution_through_an_impact():
 
 def test_what_is_refused():
     last = thrown()
+    with pytest.raises(TypeError, match="make = .* is a World, but a function is needed"):
+        tv.gradient(last, {"speed": 1.0}, landing)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="must be a dict of numbers"):
         tv.gradient(thrown, {}, landing)
     with pytest.raises(TypeError, match="parameters are numbers"):

@@ -193,6 +193,19 @@ def test_kernels_depend_on_no_number_of_particles(world, dim):
         assert written(one) == first
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_kernels_depend_on_no_corner_of_a_wall(world, dim):
+    # Other corners, other numbers of facets, and other cells around them, also for larger particles. The ball lies at height s.
+    with compiled() as names:
+        for s, r in ((1.0, 0.1), (2.0, 0.1), (1.0, 0.5)):
+            wall = tv.Polygon([*(s * SQUARE), *[(-s, 0.0)] * (s > 1)]) if dim == 2 else tv.Mesh(s * CUBE, CUBE_FACES)
+            ball = np.full((1, dim), 0.5 * s) + [0, 0.5 * s + r, 0][:dim]
+            w = world(tv.Particles(ball, radius=r), [tv.Gravity(9.81), wall], substeps=2)
+            w.run(0.1)
+            assert w.position[0, 1] == pytest.approx(s + r, abs=1e-6)
+    assert names.count("fused") == 1
+
+
 def test_what_is_left_out_of_the_writing_is_not_read(world, monkeypatch):
     # Compiled code is a function of what is read. So while kernels are translated, nothing that sharing.KernelInputs leaves out
     # may be read: attributes for the host, and the content of arrays.
@@ -275,7 +288,6 @@ def test_what_functions_of_the_user_know_is_part_of_the_structure(world):
         assert end(strength, table) == pytest.approx(np.cos(np.sqrt(strength * table[1]) * 0.2), abs=1e-5)  # cos(omega t)
 
 
-@pytest.mark.slow
 def test_worlds_of_many_kinds_take_few_trees(world, monkeypatch):
     # When there are many trees, the next tree has all fields that any has: most later worlds fit into it.
     def built(k):

@@ -2,10 +2,12 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from ..device import ti
+from ..device.number import OnDevice
 from ..features.feature import Scene
 from ..particles import Particles
 from .facet_grid import FacetGrid
@@ -83,20 +85,31 @@ class FacetShape(Shape):
     The distance to one facet is convex along a straight path, so Newton's method from its start converges to the time of the
     touch without overshooting. A facet that is touched at a corner or an edge counts only where no neighbour is nearer. That is
     tested with the directions (`wings`) in which the neighbours continue, so that nothing catches on the seams of a flat surface.
+
+    low, high: corners of the box around the facets. shape: cells of the grid along each axis.
     """
+
+    close: Any = OnDevice()  # rounding of the largest coordinate [m]
+    touch: Any = OnDevice()  # distance at which a start counts as on the surface [m]
+    reach: Any = OnDevice()  # distance within which lists are complete [m]
+    cell: Any = OnDevice()  # size of a cell [m]
+    pieces: Any = OnDevice()  # most cells on a way
+    all: Any = OnDevice()  # the bucket that holds all facets, for particles that start deep inside
 
     def __init__(self, facets: Facets, scene: Scene, name: str, radius: float):
         corners, features, wings, facing = facets.corners, facets.features, facets.wings, facets.facing
         self.dim, self.closed, self.columns, self.real = corners.shape[1], facets.closed, features.shape[1], scene.real
-        size = float(np.abs(corners).max())
-        self.close = size * (2.0**-21 if scene.real == ti.f32 else 2.0**-50)
-        self.touch = TOUCH * size
+        size, number, real = float(np.abs(corners).max()), scene.memory.number, scene.real
+        self.close = number(size * (2.0**-21 if scene.real == ti.f32 else 2.0**-50), real)
+        self.touch = number(TOUCH * size, real)
         self.tilt, self.slight = (2.0**-18, 2.0**-20) if scene.real == ti.f32 else (2.0**-40, 2.0**-48)
         buckets = FacetGrid(corners, float(scene.particles.radius.max(initial=0.0)) + radius, self.closed)
-        self.reach, self.cell, self.shape = buckets.reach, buckets.cell, buckets.shape.tolist()
-        self.low, self.high = corners.min(axis=(0, 1)).tolist(), corners.max(axis=(0, 1)).tolist()
-        self.pieces = 4 * int(buckets.shape.sum()) + 64
-        self.all = len(buckets.begin) - 2  # the last bucket holds all facets, for particles that start deep inside
+        self.reach, self.cell = number(buckets.reach, real), number(buckets.cell, real)
+        self.shape = [number(int(cells)) for cells in buckets.shape]
+        self.low, self.high = (
+            [number(float(v), real) for v in end] for end in (corners.min(axis=(0, 1)), corners.max(axis=(0, 1)))
+        )
+        self.pieces, self.all = number(4 * int(buckets.shape.sum()) + 64), number(len(buckets.begin) - 2)
         self.beyond = self.closed and facets.inside
         order = np.argsort(wings[0], kind="stable")
         begin = np.searchsorted(wings[0][order], np.arange(len(facing) + 1))
@@ -156,8 +169,7 @@ class FacetShape(Shape):
     @ti.func
     def around(self, q):
         """Return begin and end of the list of the facets around q, and the distance from q within which there are no others."""
-        low, high = self.constant(self.low), self.constant(self.high)
-        reach, size = ti.cast(self.reach, self.real), ti.cast(self.cell, self.real)
+        low, high, reach, size = self.vector(self.low), self.vector(self.high), self.reach, self.cell
         off = ti.max(low - q, q - high)
         clear = off[0]
         for k in ti.static(range(1, self.dim)):
@@ -167,7 +179,7 @@ class FacetShape(Shape):
             cell = ti.floor((q - low + reach) / size, ti.i32)
             where = 0
             for k in ti.static(range(self.dim - 1, -1, -1)):
-                where = where * self.shape[k] + ti.min(ti.max(cell[k], 0), self.shape[k] - 1)
+                where = where * self.shape[k].now + ti.min(ti.max(cell[k], 0), self.shape[k].now - 1)
             bucket = self.bucket[where]
             clear = reach
             if bucket < 0:
@@ -180,14 +192,14 @@ class FacetShape(Shape):
         return begin, end, clear
 
     @ti.func
-    def constant(self, values: ti.template()):  # type: ignore[valid-type]
-        """Return a vector of numbers that are known when the kernel is compiled."""
-        return ti.Vector([ti.cast(v, self.real) for v in ti.static(values)])
+    def vector(self, numbers: ti.template()):  # type: ignore[valid-type]
+        """Return a vector of Numbers."""
+        return ti.Vector([number.now for number in ti.static(numbers)])
 
     @ti.func
     def rounding(self, q):
         """Return the rounding of the largest coordinate of the corners."""
-        return ti.cast(self.close, self.real)
+        return self.close
 
     @ti.func
     def find_first_touch(self, a, e, contact_distance, close, limit):

@@ -1,5 +1,7 @@
 """Angles between links."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -9,6 +11,11 @@ from .core.angle import angles_of_paths
 from .core.bend_angle import BendAngle
 from .core.scalar import Scalar
 
+if TYPE_CHECKING:
+    from ..particles import Particles
+
+STRAIGHT = 1e-9  # [rad] below which an initial angle in 3D is rounding of positions
+
 
 class Bend(Scalar):
     """Bending springs and rigid corners: the path i - j - k turns by a given angle at j.
@@ -17,7 +24,7 @@ class Bend(Scalar):
 
     triples: (m, 3) particle indices, the corner in the middle.
     rest: rest angle, number or (m,) [rad]; None takes the initial angles. Live. In 2D signed, positive to the left; in 3D in
-    [0, pi], and with rest = 0 the angle keeps its sign while a rod swings through straight.
+    [0, pi], and with rest = 0 the angle keeps its sign while a rod swings through straight; initial angles below 1e-9 count as 0.
     compliance: number or (m,) [rad/(N m)]; 0 is rigid. A beam of stiffness EI [N m^2] cut into links of length l has l / EI.
     damping: of a dashpot parallel to the spring, number or (m,) [N m s/rad].
     break_at: moment at which a corner breaks, number or (m,) [N m].
@@ -34,10 +41,13 @@ class Bend(Scalar):
     def __init__(self, triples, rest=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0, break_at=None):
         self.setup(triples, rest, compliance, damping, break_at)
 
-    def prepare(self, particles, inv_mass: np.ndarray) -> None:
-        """Check the indices, and check the rest angles against the dimension."""
+    def prepare(self, particles: "Particles", inv_mass: np.ndarray) -> None:
+        """Check the indices and the rest angles. Initial angles are exactly 0 where a path in 3D is straight but for rounding."""
+        first = "rest" not in vars(self) and self._rest_given is None
         super().prepare(particles, inv_mass)
         angles_of_paths(self, "rest", self.rest, particles.dim)
+        if first and particles.dim == 3:
+            self.start_from(np.where(self.rest < STRAIGHT, 0.0, self.rest))
 
     def violation(self, position: np.ndarray) -> np.ndarray:
         """Return C at the given positions, (m,), with the sign that the angles have on the device."""

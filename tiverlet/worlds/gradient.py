@@ -57,6 +57,9 @@ def gradient(
     Raises ValueError or TypeError for parameters that are no finite numbers, for steps that are not positive or vanish beside the
     value, for worlds of different structure, and for figures without a row per world.
     """
+    for name, function in (("make", make), ("figure", figure)):
+        if not callable(function):
+            raise TypeError(f"gradient: {name} = {function!r} is a {type(function).__name__}, but a function is needed.")
     if not isinstance(parameters, Mapping) or not parameters:
         raise ValueError(f'gradient: parameters = {parameters!r}, but it must be a dict of numbers, such as {{"mass": 1.0}}.')
     values = {name: _numbers(name, value) for name, value in parameters.items()}

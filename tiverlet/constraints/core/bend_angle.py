@@ -59,6 +59,14 @@ class BendAngle(Angle):
         return self.rest[c] == 0
 
     @ti.func
+    def is_radial(self, c):
+        """Whether the path turns in 3D and its rest shape is straight: it may bend in any plane."""
+        out = False
+        if ti.static(self.state.dim == 3):
+            out = self.mirrored(c)
+        return out
+
+    @ti.func
     def direction_reliable(self, f, f0):
         """Whether the path is bent by more than 0.1 rad; in 2D always True.
 

@@ -117,6 +117,8 @@ class CornerPasses(Passes):
                 resolved = self.spring.alpha[c] >= RESOLVED * here * h2_effective
             if resolved:
                 both = ti.max(both, here / RESOLVED)  # positive, and small compared with alpha'
+                if self.quantity.is_radial(c):
+                    turn = 0
             else:
                 n, both = g, here
         if ti.static(self.equation.driven):
@@ -347,8 +349,11 @@ class CornerPasses(Passes):
 
     @ti.func
     def note_spring_turn(self, c):
-        """Record how far a spring turned. A spring without rest length is left out, since it passes through length 0."""
-        if not self.spring.is_rigid(c) and (ti.static(not self.equation.cusp) or self.equation.rest[c] != 0):
+        """Record how far a spring turned. A spring that passes through 0 is left out: one without rest length, or is_radial()."""
+        passes = self.quantity.is_radial(c)
+        if ti.static(self.equation.cusp):
+            passes = passes or self.equation.rest[c] == 0
+        if not (self.spring.is_rigid(c) or passes):
             f, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
             f0, n = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 1))
             if self.quantity.direction_reliable(f, f0):

@@ -126,6 +126,14 @@ class Quantity:
         """Before the first pass of a substep: store what measure() needs, from corners now and at the start."""
 
     @ti.func
+    def is_radial(self, c):
+        """Whether f - rest of constraint c is like the distance from a point.
+
+        A spring then has a smooth force while it passes close to f = rest, however far its direction turns there.
+        """
+        return False
+
+    @ti.func
     def direction_reliable(self, f, f0):
         """Whether directions at f (now) and f0 (at the start) are defined well enough to detect a turn of 41 degrees."""
         return True
