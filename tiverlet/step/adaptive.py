@@ -324,8 +324,8 @@ def damping(world: "World", substeps: int) -> float:
         theta u^2 / alpha,    theta = s^4 / (1 + s^4), s = omega h
 
     from a spring that became longer by u in a substep: 2 pi s^5 of its energy in each period. Springs at rest lose nothing,
-    however stiff. Those with theta > FIRM count as rigid, and are so in impacts, too: what they have lost is gone, and to resolve
-    them would take some 40 times the substeps. Nothing counts where features brake anyway.
+    however stiff. Nothing counts where features brake anyway. Where bodies bounce, springs with theta > FIRM are rigid, see
+    BodyImpacts, and do not count: an impact would make them vibrate in a substep that is some 40 times shorter.
     """
     runner, clock = world._runner, world._clock
     springs = [b for b in runner.batches if isinstance(b, (Scalar, Anchored)) and not b.is_kinematic and (b.compliance > 0).any()]
@@ -342,7 +342,7 @@ def damping(world: "World", substeps: int) -> float:
         else:
             square = ((b.offset(x) - b.offset(x - d)) ** 2).sum(axis=1)
         theta = w**2 / (w**2 + alpha**2)
-        some = (alpha > 0) & (theta <= FIRM)
+        some = (alpha > 0) & ((theta <= FIRM) | (not runner.bounces))  # broken ones are none: nothing breaks here
         lost += float((theta[some] * square[some] / alpha[some]).sum())
     return (substeps * lost / energy_bound.allowed_loss(world, LOSS)) ** 0.4 if lost else 0.0
 
