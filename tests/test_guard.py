@@ -306,8 +306,8 @@ def test_quiet_springs_cost_nothing(world):
 def test_a_truss_on_a_roller_settles(world):
     # A king post of links that one pass of Jacobi holds, pinned at one foot; the other runs on a wire. Each joint weighs m g.
     # Half of what hangs from the top, 2 m g, goes to each foot, so rafters bear sqrt(a^2 + b^2) / b m g, the tie beam a / b m g,
-    # and the post m g. One substep a frame is enough until the sag is there, some 10 frames later. It was tried again at once, for
-    # good: loads went from 2 to 100 N at the tie beam, and to -188 N at a rafter.
+    # and the post m g. One substep a frame is enough until the sag is there, some 10 frames later. It was tried again at once,
+    # for good: loads went from 2 to 100 N at the tie beam, and to -188 N at a rafter.
     a, b, m = 2.0, 3.0, 5.0
     links = tv.Distance([[0, 1], [1, 2], [0, 3], [2, 3], [1, 3]])
     start = tv.Particles([(0, 0), (a, 0), (2 * a, 0), (a, b)], mass=m, pinned=[0])

@@ -327,8 +327,8 @@ class Tilt(Acceleration):
 
 
 def test_a_uniform_force_that_changes_with_the_time_wakes(world):
-    # A disc on a floor of friction mu slides by (a - mu g) t^2 / 2 once a > mu g pulls. The pull on sleeping particles was compared
-    # only if it could differ from place to place, so the disc slept on.
+    # A disc on a floor of friction mu slides by (a - mu g) t^2 / 2 once a > mu g pulls. The pull on sleeping particles was
+    # compared only if it could differ from place to place, so the disc slept on.
     mu, floor = 0.3, tv.HalfSpace((0, 1), friction=0.3)
     w = world(tv.Particles([(0.0, R)], radius=R), [tv.Gravity(9.81), Tilt(), floor, tv.Sleep(0.05, 0.2)], substeps=8)
     w.run(2.0)
