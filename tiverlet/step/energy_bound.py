@@ -20,7 +20,7 @@ from ..colliders.collider import Collider
 from ..features.feature import Acceleration, Batch
 from ..forces.gravity import Gravity
 from ..neighbours.periodic import Periodic
-from .clock import CHANGED, DIGITS, PARTED, room
+from .clock import CHANGED, DIGITS, PARTED, energy_limit
 from .diagnostics import ENERGY, EXTENT, KINETIC, REACH, STIFFNESS
 from .step_report import StepReport
 
@@ -42,7 +42,7 @@ def checked(world: "World", report: StepReport) -> StepReport:
         clock.bound = None
         return report
     bound: Any = clock.bound
-    gain = report.energy - room(bound, clock.kinetic, report.energy)
+    gain = report.energy - energy_limit(bound, clock.kinetic, report.energy)
     err = blur(world, sheet[EXTENT : EXTENT + world.particles.dim], sheet[REACH]) + sheet[STIFFNESS] / 4 * clock.kinetic
     if not gain > err:
         return report
