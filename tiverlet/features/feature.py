@@ -317,11 +317,6 @@ class Batch(Feature):
         return self.driven
 
     @property
-    def conserves(self) -> bool:
-        """Whether it has springs and rigid constraints only, without dashpots or plastic flow, and none can break."""
-        return not (self.driven or self.breaks or any(np.any(getattr(self, name, 0.0)) for name in ("damping", "creep")))
-
-    @property
     def indices(self) -> np.ndarray:
         """The particles of each constraint, (m, arity); for constraints of any size, all corners in sequence, (total,)."""
         return self.members.indices

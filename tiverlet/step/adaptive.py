@@ -28,6 +28,7 @@ TENSION = 2.0  # (omega h)^2 across a tension: half the limit of stability
 STIFF = 2.0  # omega h from which on a spring is as good as rigid
 FORCE = 0.06  # (omega h)^2 in forces: 25 substeps per period, as in molecular dynamics
 RISKS = {"tunnelling-risk", "stiff-force", "non-finite"}
+FASTEST = 50.0  # omega dt of the fastest springs that substeps="auto" resolves: 8 periods in a frame, some 500 substeps
 LOSS = 2e-3  # share of the largest kinetic energy that springs may lose in a second: a percent in 5 s
 GAIN = 1.4  # factor by which twice the effort must lower a figure; second order lowers it by 4, first order by 2
 FEW = 16  # substeps below which more of them may still help, although two doublings did not
@@ -324,12 +325,13 @@ def damping(world: "World", substeps: int) -> float:
         theta u^2 / alpha,    theta = s^4 / (1 + s^4), s = omega h
 
     from a spring that became longer by u in a substep: 2 pi s^5 of its energy in each period. Springs at rest lose nothing,
-    however stiff. Those with theta > FIRM count as rigid, and are so in impacts, too: what they have lost is gone, and to resolve
-    them would take some 40 times the substeps. Nothing counts where features brake anyway.
+    however stiff. Nothing counts where features brake anyway. Where bodies bounce, springs with theta > FIRM are rigid, see
+    BodyImpacts, and do not count: an impact would make them vibrate in a substep that is some 40 times shorter. Springs of more
+    than FASTEST do not count either: to resolve them would take more time than it is worth.
     """
     runner, clock = world._runner, world._clock
     springs = [b for b in runner.batches if isinstance(b, (Scalar, Anchored)) and not b.is_kinematic and (b.compliance > 0).any()]
-    if not (springs and clock.h and all(f.conserves for f in world.features)):
+    if not (springs and clock.h and energy_bound.keeps_energy(world)):
         return 0.0
     state, memory, lost = runner.scene.state, runner.memory, 0.0
     x = state.get(memory)
@@ -342,7 +344,7 @@ def damping(world: "World", substeps: int) -> float:
         else:
             square = ((b.offset(x) - b.offset(x - d)) ** 2).sum(axis=1)
         theta = w**2 / (w**2 + alpha**2)
-        some = (alpha > 0) & (theta <= FIRM)
+        some = (alpha > 0) & ((theta <= FIRM) | (not runner.bounces)) & (substeps**2 * w <= FASTEST**2 * alpha)
         lost += float((theta[some] * square[some] / alpha[some]).sum())
     return (substeps * lost / energy_bound.allowed_loss(world, LOSS)) ** 0.4 if lost else 0.0
 

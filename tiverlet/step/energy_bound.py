@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..colliders.collider import Collider
-from ..features.feature import Acceleration
+from ..features.feature import Acceleration, Batch
 from ..forces.gravity import Gravity
 from ..neighbours.periodic import Periodic
 from .clock import CHANGED, DIGITS, PARTED, energy_limit
@@ -76,17 +76,25 @@ def missed(world: "World", report: StepReport, energy: float | None) -> float:
     if energy is None:
         return 0.0
     clock, sheet = world._clock, world._runner.sheet
-    conserved, bounces = all(f.conserves for f in world.features), world._runner.bounces
-    if conserved and (bounces or all(isinstance(f, (Periodic, Acceleration)) for f in world.features)):
+    conserves, bounces = keeps_energy(world), world._runner.bounces
+    if conserves and (bounces or all(isinstance(f, (Periodic, Acceleration)) for f in world.features)):
         change = abs(report.energy - energy)
     else:
         change = report.energy - (energy if clock.bound is None else max(energy, clock.bound))
     if not change > 0 or works(world):
         return 0.0
     kinetic = max(clock.kinetic, sheet.item(KINETIC))
-    share = BOUNCED if conserved and bounces else MISSED
+    share = BOUNCED if conserves and bounces else MISSED
     allowed = share * max(0.0, kinetic - _drift(world)) + DIGITS * (abs(report.energy) + kinetic)
     return float(change / allowed) if allowed else 0.0
+
+
+def keeps_energy(world: "World") -> bool:
+    """Whether nothing takes energy out of the scene, as far as is known: no force, contact, dashpot, plastic flow or break."""
+    springs = [f for f in world.features if isinstance(f, Batch)]
+    if not all(f.conserves for f in world.features if not isinstance(f, Batch)):
+        return False
+    return not any(f.driven or f.breaks or np.any(getattr(f, name, 0.0)) for f in springs for name in ("damping", "creep"))
 
 
 def allowed_loss(world: "World", rate: float) -> float:

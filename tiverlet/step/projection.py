@@ -11,7 +11,8 @@ particles at rest. Springs that the substep resolves stay as they are. Positions
 that an impact left overlapping.
 
 Where contacts are in the way, they are rows, too (ContactRows). Moves may lead into further contacts, which become rows in a few
-rounds. Beads stay on their wires (Rails), and free bodies keep their angular momentum (FreeBodies).
+rounds. Springs that hold particles at places are rows (AnchorRows). Beads are first drawn to their wires, and then stay on them
+(Rails), and free bodies keep their angular momentum (FreeBodies).
 
 Where moves lift particles, the motion pays for the energy as far as it can. A taut net has no direction to sag in, so its fall
 does not show in velocities; lifting it back at the end of each fall would pump energy in. The energy gained is taken from the
