@@ -106,7 +106,7 @@ class ConstraintPass:
         for f in ti.static(self.batches):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                 for impacts in ti.static(self.impacts):
-                    if now.first != 0:
+                    if now.s == 0 and now.first != 0:
                         impacts.mark_linked(f, c)
                 if self.takes_part(f, c, now.newton):
                     f.dev.relax(c, now.h, h2_effective, now.frame_fraction, now.first, fresh)
