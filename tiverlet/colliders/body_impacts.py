@@ -74,11 +74,12 @@ class BodyImpacts:
     other.
     """
 
-    def __init__(self, scene: "Scene", batches: "list[Batch]", pairs: bool):
+    def __init__(self, scene: "Scene", batches: "list[Batch]", touches: bool, pairs: bool):
         system = scene.slots.system
         self.passes = FEW if system and not pairs else MANY
         self.spreads = not system  # from link to link; a system solves all links at once
         self.exact = is_exact(scene, batches)
+        self.leaves = touches or not self.exact  # regular passes leave violations: by contacts, or because they do not converge
         self.stops = stops_bodies(scene, batches)
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.state = scene.state

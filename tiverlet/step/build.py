@@ -168,7 +168,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     if can_have_impacts(scene, batches):
         pairs = bool(contact and contact.strikes_bodies)
         if pairs or any(w.has_restitution for w in walls) or (walls and stops_bodies(scene, batches)):
-            scene.impacts = BodyImpacts(scene, batches, pairs)
+            scene.impacts = BodyImpacts(scene, batches, bool(contact), pairs)
         if contact and pairs:
             contact.dev.restitution.bind(scene, scene.impacts)
     state.remember(

@@ -50,7 +50,7 @@ class CornerPasses(Passes):
             self.step = add(f"{name}.step", m)
         self.known = KnownLoad(scene, name, batch)
         self.impacts: Any = scene.impacts
-        self.stores_left = bool(self.impacts) and not self.impacts.exact  # extra passes leave what the regular ones left
+        self.stores_left = bool(self.impacts) and self.impacts.leaves  # extra passes leave what the regular ones left
         if self.stores_left:
             self.left = add(f"{name}.left", m)  # the violation that the regular passes of the substep left
 
