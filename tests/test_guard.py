@@ -546,7 +546,7 @@ def test_what_cannot_be_paid_or_said_in_numbers(world):
 
 
 def test_what_an_impact_left_of_a_link_is_no_spring_where_a_wall_holds_it(world):
-    # Three masses, one above the other, fall on the lowest one in frames of one substep. Walls leave impacts to links where Jacobi
+    # Three masses, one above another, fall on the lowest one in frames of one substep. Walls leave impacts to links where Jacobi
     # solves several of a particle, and these are then off by C = 0.39 L. Substeps that are 64 times shorter would turn that into
     # some m (C / h)^2 / 4, 5e4 J. So the violation is projected first; the lowest one cannot go down, and the others are lifted
     # by no more than C and 2 C.
