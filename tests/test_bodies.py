@@ -186,6 +186,7 @@ def test_meshes_and_loops_that_are_refused():
         tv.ShapeMatch([[0, 1]], creep=1.0)
 
 
+@pytest.mark.slow
 def test_bodies_have_the_same_bits_on_both_paths(world):
     # Clones also continue bit for bit, with the history of soft constraints and of shapes that creep.
     rng = np.random.default_rng(1)

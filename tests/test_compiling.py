@@ -35,6 +35,7 @@ def reports():
 """
 
 
+@pytest.mark.slow
 def test_the_bits_do_not_depend_on_the_patches():
     # Taichi without patches, in another process (as for versions other than 1.7.4): the same hashes and the same reports.
     space: dict = {}
@@ -47,6 +48,7 @@ def test_the_bits_do_not_depend_on_the_patches():
     assert sum(r.contacts for r in made[1][0]) > 100 and len(re.findall("StepReport", alone)) == 48
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (ARCH == "cpu" and sys.platform == "linux"), reason="LLVM's switches are found there")
 def test_loops_are_copied_for_the_user_alone():
     # LLVM reports which loops it unrolls. It leaves our loops whose length is known only at run time as they are. In the same
@@ -320,6 +322,7 @@ def arm():
     return particles, [tv.Gravity(), tv.Distance([[0, 1], [1, 2], [2, 3], [3, 4]]), *angles]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene, precision", [(squares, "f32"), (arm, "f64")])
 def test_functions_that_kernels_call_change_no_bit(monkeypatch, scene, precision):
     # Kernels that call long functions, and kernels into which these are copied.

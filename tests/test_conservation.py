@@ -20,6 +20,7 @@ def touching(world, start, links, g=9.81, floor=-2.0, **settings):
     return world(start, [tv.Gravity(g), links, tv.Contact(), tv.HalfSpace(up, floor)], **settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision, limit", [("f64", 1e-12), ("f32", 1e-6)])
 def test_momentum_is_conserved_for_ten_thousand_steps(world, precision, limit):
     # Masses 1 ... 100, links from rigid to soft, contacts: internal forces are equal and opposite. What is left is the rounding
@@ -45,6 +46,7 @@ def test_momentum_is_conserved_for_ten_thousand_steps(world, precision, limit):
     assert worst <= limit * size and mass.max() / mass.min() == pytest.approx(100, rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["shapes in 3D", "contacts"])
 def test_velocities_have_the_momentum_of_the_motion(world, what):
     # Sum m v = sum m d / h. Where the forces in v act along their directions at x_n, also sum m x x v = sum m x x d / h. Both
@@ -76,6 +78,7 @@ def test_velocities_have_the_momentum_of_the_motion(world, what):
         assert (touched > 0) == (what == "contacts")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loads", [False, True])
 def test_discs_that_lie_on_each_other_do_not_turn_by_themselves(world, loads):
     # Seven discs without friction, attracted to a point by central forces. Pushes p act along the line of centers at the start
@@ -95,6 +98,7 @@ def test_discs_that_lie_on_each_other_do_not_turn_by_themselves(world, loads):
     assert w.last.energy == pytest.approx(energy, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_what_slides_over_a_disc_is_second_order(world):
     # An inverted pendulum, while the disc presses: theta'^2 = w^2 + 2 g / l (1 - cos theta), so the time to reach theta is the
     # integral of 1 / theta'. The disc would leave at cos theta = (2 + w^2 l / g) / 3, after 0.56 s.

@@ -66,6 +66,7 @@ def test_pay_finds_that_features_only_add(printed):
     assert "bytes per particle" in printed("pay", settings=[("N", 900)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, arguments, words",
     [

@@ -19,6 +19,7 @@ PASS = "solve_constraints apply_corrections"
 DEMOS = pathlib.Path(__file__).parent.parent / "demos"
 
 
+@pytest.mark.slow
 def test_what_a_gpu_sums_up_is_the_same(world, monkeypatch):
     # A GPU sums by 64^2 blocks and then 64, a CPU by 64: the same figures, up to the rounding of a sum of n numbers. The scene
     # is one of those below, whose kernels it shares.
@@ -65,6 +66,7 @@ def results(path):
     assert len(made) == 3 and len(made[0]) == 64 and len(set(made)) == 1
 
 
+@pytest.mark.slow
 def test_every_solver_has_the_same_bits_on_1_and_8_threads():
     # Sums over all constraints, as conjugate gradients compute them beside contacts, and systems that several threads solve:
     # cloth that falls on a ball, with hail on it, and ropes. On one thread they run phase by phase, as on a GPU. Jacobi is
@@ -98,6 +100,7 @@ def results(path):
     assert len(made) == 6 and len(set(made[:3])) == 3 and made[:3] == made[3:]
 
 
+@pytest.mark.slow
 def test_a_large_pile_has_the_same_bits_on_all_paths_and_where_a_team_breaks_up(world, monkeypatch):
     # From 1000 particles on, blocks of particles are tested for any contact. If every wait of a team is a long one, the first
     # thread continues alone after a few waits, and the others come back 32 frames later. One path is compiled as large worlds
@@ -130,6 +133,7 @@ def apart(r):
     return 0.02 * r * (0.04 - r.dot(r))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("acting", [True, False], ids=["forces and contacts", "constraints"])
 def test_all_paths_have_the_same_bits(world, acting):
     # Two scenes, since compile time grows faster than the number of features. Three dimensions are tested by the fuzzer; spins,
@@ -257,6 +261,7 @@ def test_the_host_asks_once_in_a_frame(world):
     assert count.answers == count["measure"] + count["build_list"]
 
 
+@pytest.mark.slow
 def test_unused_files_change_no_bit(tmp_path):
     # The same scene with the files of other features deleted from the package, and their names from its lists.
     import shutil

@@ -23,6 +23,7 @@ def blocks(page: pathlib.Path) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```$", (ROOT / page).read_text(), re.S | re.M)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", [p for p in PAGES if blocks(p)], ids=str)
 def test_code_runs(page, tmp_path, monkeypatch, capsys, briefly):
     # In reading order, each page in a file of its own, since Taichi reads the source of functions.

@@ -169,6 +169,7 @@ def edited(scene, anew: bool) -> tuple[list, int]:
     return seen, sum(taken)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", [discs, grains, beside_a_rope, beside_a_net, crowd, charges, asleep])
 def test_in_place_is_to_the_bit_as_built_anew(scene, briefly):
     seen, count = edited(scene, anew=False)
@@ -297,6 +298,7 @@ SOLVED = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", SOLVED)
 def test_constraints_in_place_are_to_the_bit_as_built_anew(scene):
     for k, (a, b) in enumerate(zip(grown(SOLVED[scene], False), grown(SOLVED[scene], True), strict=True)):

@@ -68,6 +68,7 @@ def extended(w: tv.World, kind, k: int) -> None:
     w.add(placed(kind, [k]), extend=dict(zip(w.features, kind([k]), strict=False)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [ropes, bodies])
 def test_a_world_that_was_extended_is_the_one_that_has_all(kind, tmp_path):
     whole, w = world_of(kind, 3), world_of(kind, 1)

@@ -33,6 +33,7 @@ def quick(read_here, built_once):
     """Read in this process and compile a scene once; these tests check neither."""
 
 
+@pytest.mark.slow
 def test_forgeries_are_named(original, quick, tmp_path):
     assert tv.replay(original).verify()
     passed = {}

@@ -27,6 +27,7 @@ def test_other_engines_are_asked():
     assert rolls[0][1] / rolls[1][1] == pytest.approx(2, rel=0.05)
 
 
+@pytest.mark.slow
 def test_heaps_of_what_resists_rolling_are_steeper():
     # Discs that roll freely form heaps of 10 to 20 degrees, +- 5 for a heap this small; rolling resistance makes heaps steeper.
     # 1e-9 means none, with the same kernels as 0.3.
@@ -34,6 +35,7 @@ def test_heaps_of_what_resists_rolling_are_steeper():
     assert 5 < free < 25 and held > free + 10
 
 
+@pytest.mark.slow
 def test_a_silo_bears_its_grains():
     # Janssen 1895: without friction at the walls the floor bears the weight (1e-9 means none, with the same kernels as 0.5). In
     # half a second that is off by dv / (g 0.5 s) for velocities of dv, 2 cm/s as the walls rise. With friction the floor bears

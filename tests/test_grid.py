@@ -42,6 +42,7 @@ class Bench:
             sort(self.list, 1, count, runs)
 
 
+@pytest.mark.slow
 def test_running_sums():
     rng = np.random.default_rng(0)
     for launched in (False, True)[ARCH != "cpu" :]:  # on a GPU launched only: a driver may stop such a long loop on one thread
@@ -102,6 +103,7 @@ def shuffle(w, rng) -> None:
     w._runner.memory.write(cells.sorted_position, place[order])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim, sizes", [(3, "one"), (2, "several"), (3, "several")])  # (2, "one"): test_pairs.py
 @pytest.mark.filterwarnings("ignore:.*near pairs per particle")
 def test_lists_of_a_gpu_are_those_of_one_thread(world, dim, sizes):
@@ -143,6 +145,7 @@ def test_lists_of_a_gpu_are_those_of_one_thread(world, dim, sizes):
             np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_what_pairs_carry_goes_with_them(world):
     # A pile of many sizes with friction, which stores data for each pair, starting with lists that are too small.
     rng = np.random.default_rng(3)
@@ -161,6 +164,7 @@ def test_what_pairs_carry_goes_with_them(world):
     assert made[0] == made[1]
 
 
+@pytest.mark.slow
 def test_a_few_that_fly_far_have_no_list_built_until_they_meet_something(world):
     # 1056 discs lie still without touching. Others fly over them, towards each other and into them, by 0.3 m a substep, while a
     # list with a skin of 0.375 m covers 0.18 m. All pairs within 2 % of the skin are listed, and all bits are those of lists

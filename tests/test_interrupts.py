@@ -48,6 +48,7 @@ def w(piled):
     piled.substeps, piled.iterations, piled._runner.passes_at_once = 4, 3, passes
 
 
+@pytest.mark.slow
 def test_a_signal_waits_for_the_end_of_the_frame(w, tmp_path):
     w.substeps = "auto"
     pin = w.features[-1]
@@ -104,6 +105,7 @@ def test_long_frames_in_several_launches_have_the_same_bits(w, passes):
     assert whole == parted
 
 
+@pytest.mark.slow
 def test_long_frames_of_a_team_and_of_high_order():
     # For a team, the code between two passes is the same whatever features there are; discs and a rope stand for all.
     chain = [tv.Gravity(), tv.Distance([(0, 1)])]

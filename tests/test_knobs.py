@@ -284,6 +284,7 @@ def test_friction_may_name_other_groups(world, friction):
     assert np.abs(ends[0] - ends[1]).max() < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", GROUPED)
 def test_every_setting_is_live(world, group):
     rows = {name: ROWS3[name] for name in GROUPED[group]}

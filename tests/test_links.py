@@ -44,6 +44,7 @@ def test_kernels_agree_with_the_prototype(world, dim, iterations):
     np.testing.assert_array_equal(made.position[:2], x[:2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, efforts",
     [("N10_alpha1e-3", ((20, 4), (20, 16), (50, 4))), ("N100_alpha1e-5", ((50, 40),))],

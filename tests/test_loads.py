@@ -51,6 +51,7 @@ def overlap(w):
     return np.maximum(w.contacts.overlap, 0.0).mean() / (2 * R)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings, most",
     [({}, 1e-6), ({"dim": 3, "n": 3}, 1e-6), ({"precision": "f32"}, 1e-6), ({"substeps": 2}, 1e-5),

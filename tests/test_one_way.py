@@ -19,6 +19,7 @@ SPEED = np.array([0.0, 5.0, np.sqrt(2 * G * 0.8), 0.0, -80.0, 80.0])
 STAYS = np.array([True, True, False, False, True, False])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "precision"), [("Capsule", "f32"), ("Polygon", "f64"), ("line", "f32"), ("line", "f64")])
 def test_what_comes_from_below_passes_and_what_comes_from_above_lands(world, name, precision):
     # Particles that pass move as without the wall: y0 + v t - g t^2 / 2, to rounding, for any number of substeps.

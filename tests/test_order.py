@@ -43,6 +43,7 @@ def test_orders_and_the_error_of_a_good_peer(world, high):
         w.close()
 
 
+@pytest.mark.slow
 def test_velocities_have_the_order_too(world):
     # A Kepler ellipse, e = 0.5, from its pericentre: it returns after T = 2 pi with the velocity (0, sqrt(3)). And a conical
     # pendulum, whose rod has to remove the velocity along it: v stays at right angles to the rod, and as fast as at the start.
@@ -69,6 +70,7 @@ def test_velocities_have_the_order_too(world):
         assert max(across) < 1e-9 and np.linalg.norm(w.velocity[2]) == pytest.approx(speed, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_springs_are_forces(world):
     # A chain of soft and rigid links converges with order 6 to the limit of order 2. A mass below its spring of length l:
     # l = 1 + g / k + (1 - g / k) cos(omega t), with omega^2 = k = 400.

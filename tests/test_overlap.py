@@ -4,6 +4,7 @@ from types import SimpleNamespace as Some
 from typing import Any
 
 import numpy as np
+import pytest
 
 import tiverlet as tv
 from tiverlet.contact.initial_overlap import overlapping
@@ -44,6 +45,7 @@ def test_what_rounding_makes_overlap_is_known_too(world):
     assert "Contact.shrunk" not in wide.fields
 
 
+@pytest.mark.slow
 def test_only_scenes_that_start_with_overlap_have_the_field_for_it(world):
     x = np.array([[0.0, 0.0], [0.19, 0.0], [0.5, 0.0], [0.75, 0.0]])
     for features, start, want in (

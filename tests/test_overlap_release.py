@@ -51,6 +51,7 @@ def pile(world, x, friction, restitution, substeps, **settings):
     return w
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim, friction, restitution", [(2, 0.0, 0.0), (3, 0.5, 0.0), (2, 0.3, 0.5)])
 def test_a_pile_gains_no_energy_however_the_substep_changes(world, dim, friction, restitution):
     # With gravity and contacts only, kinetic plus potential energy never exceeds that of the start.
@@ -69,6 +70,7 @@ def test_a_pile_gains_no_energy_however_the_substep_changes(world, dim, friction
         assert most <= start * (1 + 1e-3), turns
 
 
+@pytest.mark.slow
 def test_ropes_in_a_heap_gain_none_either(world):
     # Rigid links keep their lengths while discs are moved apart, so they pull nothing back.
     ropes = S.join(*[S.rope((0, 0.1 + 0.11 * k), (1, 0.12 + 0.11 * k), 12) for k in range(6)])[0]
@@ -108,6 +110,7 @@ def stack(n=4):
     return np.concatenate([*x, [(-2, -1), (2, -1), (2, 0), (-2, 0)]]), np.arange(4 * n + 4).reshape(-1, 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hold", ["links", "shapes"])
 def test_a_stack_of_bodies_gains_no_energy(world, hold):
     # Each contact bears the squares above it: it overlaps by some h^2 F. In a substep h' this is a spring with (h / h')^2 of that
@@ -133,6 +136,7 @@ def test_a_stack_of_bodies_gains_no_energy(world, hold):
             assert w.last.energy == pytest.approx(G * (x[: n - 4, 1] - 0.01 * (1 + np.arange(16) // 4)).sum(), rel=5e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compliance", [0.0, 1e-6])
 def test_a_cluster_on_a_floor_gains_none(world, compliance):
     # A floor leaves a corner where it is, off the shape of its cluster. If that sprang back, it would bring 33 times the energy
@@ -276,6 +280,7 @@ def test_a_bridge_under_a_cart_gains_no_energy(world):
     assert most > 8
 
 
+@pytest.mark.slow
 def test_slow_motion_brings_no_energy_into_soft_bodies(world):
     # Three balloons rest on each other; then frames get ten times shorter. Links and contacts move together here, too, not only
     # where there are more substeps. Otherwise 0.4 J come from nowhere, and 4400 J at 1/100 of the frame with ten times the

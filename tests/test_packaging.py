@@ -52,6 +52,7 @@ def test_every_extra_is_told_of():
     assert not [name for name in extras if f"[{name}]" not in text and f"`{name}`" not in text]
 
 
+@pytest.mark.slow
 def test_type_checkers_accept_what_the_pages_show(tmp_path):
     # Every call on the pages, and the calls in documented_calls.py; the demos are checked with the package.
     assert (ROOT / "tiverlet/py.typed").is_file()

@@ -132,6 +132,7 @@ def test_energy_stays_and_lists_grow():
     assert np.abs(world.position - x - h * h / 2 * a).max() < 1e-13
 
 
+@pytest.mark.slow
 def test_bits_are_the_same_after_a_replay(world, tmp_path):
     """Contacts have their own list beside it; recorded, replayed, cloned. For paths see test_determinism.py."""
     rng = np.random.default_rng(2)
@@ -148,6 +149,7 @@ def test_bits_are_the_same_after_a_replay(world, tmp_path):
     assert tv.replay(tmp_path / "pairs.rrd", given=[short]).verify()
 
 
+@pytest.mark.slow
 def test_hashes_know_nothing_of_who_is_listed(world, tmp_path):
     # A listed pair that is too far apart to act must leave 0, as an unlisted pair does, not -0. With -0, worlds that continue
     # from a frame in the middle of a recording have other hashes and are refused.

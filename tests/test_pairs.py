@@ -68,6 +68,7 @@ LEFT_OUT = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*near pairs per particle")
 @pytest.mark.parametrize(
     "path, name, radius, several", [(path, *c) for path, left_out in LEFT_OUT.items() for c in clouds() if c[0] not in left_out]
@@ -104,6 +105,7 @@ def test_pairs_equal_brute_force(world, path, name, radius, several):
         assert touching.overlap == pytest.approx((depth / small).max(initial=0.0), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_many_particles(world, monkeypatch, briefly):
     monkeypatch.setattr(build, "CROSSOVER", CROSSOVER)
     rng = np.random.default_rng(8)
@@ -121,6 +123,7 @@ def test_many_particles(world, monkeypatch, briefly):
     np.testing.assert_array_equal(got, tv.measure.overlapping(position, radius, 0.05)[0])
 
 
+@pytest.mark.slow
 def test_neither_room_nor_skin_nor_path_changes_a_bit(world):
     # Row 35: the hash with room for one entry of the list equals the hash with room for all, and no contact is missing. Nor does
     # it matter when lists are built: the smallest skin rebuilds them in nearly all substeps. For the launched path see
@@ -144,6 +147,7 @@ def test_neither_room_nor_skin_nor_path_changes_a_bit(world):
     assert len(hashes) == 1
 
 
+@pytest.mark.slow
 def test_the_skin_changes_no_bit_of_what_rubs_and_bounces(world):
     # A pair that begins to overlap at the end of a substep is listed only if the skin is wide: its slip begins in the next
     # substep. Without friction and restitution the skin changes no bit either: a world rebuilt for another skin keeps kernels

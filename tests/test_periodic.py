@@ -66,6 +66,7 @@ BOXES = {  # lengths, axes, shear, radii; several sizes of cells wherever that m
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*BOXES])
 def test_no_pair_is_missed_whichever_image_is_near(world, name):
     length, axes, shear, radii = BOXES[name]
@@ -131,6 +132,7 @@ def crowd(shift, moved, contact, shear=0.0, n=30, **settings):
     return tv.Particles(x + shift + boxes * length, velocity=v, radius=0.15), features, settings | {"precision": "f64"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["contact", "pair force"])
 def test_where_the_box_begins_and_which_image_is_followed_changes_nothing(world, kind):
     def run(shift, moved):

@@ -57,6 +57,7 @@ def test_loads_that_passes_bear_stay(world):
     assert sag > 5e-3 and np.abs(w.position - hung).max() < 0.05 * sag and "moved" not in report.flags
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Direct()], ids=str)
 def test_links_that_come_later_bring_no_energy(world, solver):
     # A tie that is a fifth too short is added to a hanging rope: the rope bulges there and is lifted, and nothing flies off. In a
@@ -113,6 +114,7 @@ def softly_held(world, **settings):
     return world(tv.Particles(x, pinned=held), [*features, *others], **({"precision": "f64"} | settings))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("substeps", [2, 20, 200])
 def test_springs_that_become_rigid_bring_no_energy(world, substeps):
     # What a spring of 0.01 m/N has given way by under 9.81 N is 0.1 m, which a pass would take out in one substep: up to 4e6 J,
@@ -138,6 +140,7 @@ def test_springs_that_become_rigid_bring_no_energy(world, substeps):
     assert np.abs(w.velocity).max() < 0.01 + G * h / 8
 
 
+@pytest.mark.slow
 def test_each_of_many_worlds_meets_what_becomes_rigid_in_it(world):
     w = softly_held(world, substeps=20)
     w.run(0.5)

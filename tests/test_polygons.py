@@ -165,6 +165,7 @@ def test_collisions_conserve_momentum_and_angular_momentum(world):
     assert tv.measure.kinetic_energy(w) <= 0.5 * (mass * (v**2).sum(axis=1)).sum()
 
 
+@pytest.mark.slow
 def test_a_pile_settles_without_overlap_and_alike_on_both_paths(world):
     # Convex and concave bodies and discs of mixed sizes. After settling no vertex is deeper inside of another body than 1 % of an
     # edge, and no disc deeper than 2 % of its radius. Kinetic energy is below 1e-2 m g r per particle.
@@ -216,6 +217,7 @@ def test_corners_of_one_width_carry_each_other(world):
         np.testing.assert_allclose(sunk, [[0, 0, 10, 10], [10, 10, 16, 16], [16, 16, 18, 18]], rtol=2e-3, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_bodies_of_links_that_lie_edge_to_edge_fall_asleep(world):
     # A wall of triangles, upright and upside down in turn, whose corners meet. They slide past each other as their links sway, so
     # contacts come and go. The contacts that bear the load must not change with that, or the wall never rests.

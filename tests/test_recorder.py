@@ -35,6 +35,7 @@ def read(path, entity: str, column: str):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 def test_every_frame_reads_back(world, tmp_path, dim):
     x = tv.golden(np.arange(30), dim=dim) * 0.9 + 0.05
@@ -166,6 +167,7 @@ def test_a_rope_is_one_strip_and_a_sheet_is_one_mesh(world):
     assert not len(four) and not used.any()  # six links, but not flat
 
 
+@pytest.mark.slow
 def test_bytes_of_positions_take_most_of_the_file(world, tmp_path):
     # Positions take n * dim * 4 bytes of a frame; lines, meshes and colours 0.4 of that; a message of rows 1.5 kB, a row 100.
     rng = np.random.default_rng(1)

@@ -25,6 +25,7 @@ def discrete(n: int, values: dict) -> np.ndarray:
     return 10.0 / n * np.stack([np.ones(n), slope], axis=1) / np.sqrt(1 + slope**2)[:, None]
 
 
+@pytest.mark.slow
 def test_ropes_hang_as_catenaries(world):
     # R10b, rigid: 1e-4 with 16 passes. S07, elastic: 1e-4 with 4 passes or more. All five ropes are in one world. Then the rigid
     # ropes and one of a hundred links with the default solver, which is direct: 1e-8 with one pass.
@@ -166,6 +167,7 @@ def test_a_net_sags_under_its_weight(world):
             np.testing.assert_allclose(x[k[2, 2]], values[key]["quarter_xyz"], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_beam_bends_under_its_load(world):
     # S06: k_b theta_i = F (x_N - x_i), k_b = EI / l: a clamped strip of ten rigid links with a force at its tip.
     n = 10

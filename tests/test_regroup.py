@@ -132,6 +132,7 @@ def test_what_comes_starts_as_in_a_world_of_its_own(world, last):
     np.testing.assert_allclose(w.velocity[new][0], alone.velocity[0], atol=1e-11)
 
 
+@pytest.mark.slow
 def test_forces_and_constraints_come_and_go(world):
     # A straight line, then a parabola, then a straight line again: exact, because forces change between a velocity and the next
     # substep. Besides, links take their rest lengths from the present positions; and a disc that is put into another parts from

@@ -165,6 +165,7 @@ def test_every_feature_is_built_again_from_its_description():
     assert seen == set(scene.PUBLIC)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build, precision", [(swing, "f64"), (race, "f32-compensated")])
 def test_round_trip(build, precision, tmp_path, built_once):
     path = tmp_path / "a.rrd"

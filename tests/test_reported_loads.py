@@ -76,6 +76,7 @@ def all_kinds(dim):
     return bodies
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 def test_what_is_at_rest_bears_its_weight_however_the_substep_changes(world, dim):
     # A constraint moves a body at rest by h^2 g in a substep. In the first substep after one of another length h_old,
@@ -122,6 +123,7 @@ BREAKING = [  # corners, the feature that holds them, its load, the number of pi
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ["fused", "parallel", "launched", "many"])
 def test_only_what_is_too_weak_breaks_where_the_substep_changes(world, path):
     # Two of each kind: one can bear a thousandth more than it has to, the other a thousandth less. None: velocities are given.
@@ -147,6 +149,7 @@ def broken(w):
     return [f.broken.tolist() for f in w.features[1:-1]]
 
 
+@pytest.mark.slow
 def test_rounding_breaks_nothing_and_holds_nothing(world):
     # f32 places are known to 4e-6 m at 30 m, and loads in substeps of 13 us to m 4e-6 m / h^2 = 45 kN. What they sum up to over
     # N substeps is known to m 4e-6 m, so a body of 20 N on strengths of 30 N and 2 N is told from it by MARGIN times that
@@ -226,6 +229,7 @@ def test_what_sags_holds_where_the_substep_gets_shorter(world):
         assert not angles.broken.any()
 
 
+@pytest.mark.slow
 def test_what_is_moved_steadily_bears_its_weight_in_f32(world):
     # What is lifted without acceleration bears m g, whatever lifts it: a winch, rest lengths, pins or paths. Coordinates of 3 m
     # end at e = 2^-22 m in f32: where a rest value or a place is rounded to that it jerks, by m e / h^2 = 17 N here. Angles

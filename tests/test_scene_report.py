@@ -18,6 +18,7 @@ def rope(world, **settings):
     return world(tv.Particles(shape.position, pinned=[0]), [tv.Gravity(9.81), tv.Distance(shape.links)], **settings)
 
 
+@pytest.mark.slow
 def test_a_world_reports_on_itself(world):
     w = rope(world, solver=tv.Direct())
     w.run(0.1)

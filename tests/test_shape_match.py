@@ -16,6 +16,7 @@ def angular(w, m, steps):
     return np.cross(np.pad(x - d, pad), np.pad(m[:, None] * d, pad)).sum(axis=0) * steps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_tennis_racket(world, precision):
     # S05: a rigid cluster that spins about its middle axis turns over after half a period, again and again.
@@ -64,6 +65,7 @@ def test_a_rigid_pendulum(world):
     assert 1.9 <= order(errors) <= 2.1 and errors[-1] < 1e-5 and np.abs(w.position[0]).max() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 def test_soft_shapes(world, dim):
     # Swelling by 1 % rings at 1 / sqrt(alpha M). A spinning, badly deformed body keeps energy, momentum and angular momentum.
@@ -91,6 +93,7 @@ def test_soft_shapes(world, dim):
     np.testing.assert_allclose(angular(w, m, 600), spin, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim, precision, limit", [(2, "f64", 1e-12), (3, "f32", 5e-6)])
 def test_shapes_without_extent(world, dim, precision, limit):
     # Rows 23, 57: general, flat, on a line, in one place, tiny, mirrored; and one of a single particle. All start with random

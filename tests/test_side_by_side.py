@@ -20,6 +20,7 @@ def scene(k: int) -> tv.World:
     return tv.World(tv.Particles(x, radius=radius, pinned=[n]), features, substeps=6, solver=tv.Jacobi())  # compiles fastest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("overlays", [{}, {"forces": True, "velocities": True, "strain": False}], ids=str)
 def test_each_view_is_the_picture_of_that_world(taichi, tmp_path, overlays):
     alone = [scene(k) for k in range(4)]

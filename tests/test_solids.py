@@ -30,6 +30,7 @@ def round_room(p):
     return 1 - p.norm()
 
 
+@pytest.mark.slow
 def test_what_is_far_away_changes_no_bits(world):
     # Row 85: discs rest in a round room, beads slide down a wire and discs pile up. The bits are the same with another particle
     # at 1e2 m, and with one near by and one that is added later at 1e5 m.
@@ -53,11 +54,13 @@ def test_what_is_far_away_changes_no_bits(world):
 FEW = [(-0.5, 0.2), (0.0, 0.1), (0.5, 0.3), (0.1, 0.4), (2.017036, -0.207938), (2.5, -1.0)]
 
 
+@pytest.mark.slow
 def test_nothing_gets_out_of_a_function(world):
     room = [tv.Sdf(round_room, friction=0.3, restitution=0.8)]
     keeps(world, room, lambda x, w: 1 - np.linalg.norm(x, axis=1), lambda s: {}, room)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["f64", "f32"])
 def test_what_slides_in_a_hollow_keeps_its_energy(world, precision):
     # A point released at the rim of a bowl of 1 m, with g = 10 m/s^2, has v^2 / 2 = 10 sin(a) when it has come down by the angle

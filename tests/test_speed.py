@@ -93,6 +93,7 @@ def report(kept, forked):
     return replace(whole, absent=rope.absent)
 
 
+@pytest.mark.slow
 def test_figures_are_positive_and_belong_together(report):
     (r,) = report.runs
     assert (r.scene, r.particles, r.threads) == ("pile", 41, 1)
@@ -303,6 +304,7 @@ def batch(kept):
         return worlds.worlds(threads=(1,), quick=True, peers=False)
 
 
+@pytest.mark.slow
 def test_worlds_are_measured_or_left_out(batch):
     assert not batch.missing
     assert {note for note in batch.notes if note.startswith("Left out")} == {
@@ -327,6 +329,7 @@ def test_worlds_are_measured_or_left_out(batch):
     assert "Double pendulums" in str(batch) and "| pendulum |" in batch.markdown() and "tables" in json.loads(batch.json())
 
 
+@pytest.mark.slow
 def test_reference_of_double_pendulums():
     # The reference has the energy of its start, and half the step changes nothing.
     times = np.arange(1, 46) / 15

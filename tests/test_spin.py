@@ -121,6 +121,7 @@ def law(x, v, omega, m, r, k, e, mu, beta):
     return t, V[:, :dim], W[:, 3 - axes :], size <= mu * normal
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 def test_two_that_collide_obey_the_law_of_impacts_to_rounding(world, dim):
     # Momentum, angular momentum about any point and, for a super ball, energy are constant to rounding.
@@ -262,6 +263,7 @@ def test_twisting_resistance_stops_a_top(world):
     assert w.spin[0, 1] == pytest.approx(now, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_a_turning_wall_takes_a_ball_along(world):
     # In a turning drum, a disc that resists rolling turns as the drum does, at 0.6 rad/s, as if glued to it. A disc between two
     # pinned, spinning ones takes the speed of their surfaces, -5 rad/s times R / r.
@@ -309,6 +311,7 @@ def scene(dim: int):
     return start, features
 
 
+@pytest.mark.slow
 def test_spins_are_the_same_on_all_ways(world, tmp_path, read_here):
     # Clones, copies, recordings, and particles that are added and removed. In space, which has everything that the plane has. For
     # all paths see test_sleep.py, for the plane and many worlds the recordings below.

@@ -51,6 +51,7 @@ def scene(name, damped):
     return tv.Particles(x.reshape(-1, dim), velocity=np.tile(v, (m, 1)), mass=np.tile(MASS[:k], m)), made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*ROWS, *PLACES])
 def test_velocities_written_back_change_nothing(world, name):
     # Without gravity a block has the energy of its start. Velocities that are read and written back after each frame may neither
@@ -138,6 +139,7 @@ def test_forces_that_come_change_no_velocity_before_they_act(world, what):
     np.testing.assert_allclose(w.position[1:5], begin + seen[1:] * t - [0, g * t**2 / 2], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["f64", "f32", "f32-compensated"])
 def test_what_keeps_its_velocity_goes_on_to_the_bit(world, precision):
     # A swinging chain, spinning discs that roll and touch, and one disc far away that is steered by velocity and spin: an impulse
@@ -189,6 +191,7 @@ def test_piles_come_to_rest_and_sleep_while_one_steers(world):
     assert w.last.asleep == 30 and w.velocity[5, 1] == pytest.approx(2 - 9.81 / 60)  # a disc that leaves another wakes no others
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["velocity", "spin", "both", "many", "sleep"])
 @pytest.mark.parametrize("precision", ["f64", "f32", "f32-compensated"])
 def test_a_pile_goes_on_to_the_bit_beside_what_is_driven_on_a_rough_floor(world, precision, how):

@@ -196,6 +196,7 @@ def test_blows_do_not_count_as_forces(world):
     assert (w.velocity**2).sum(axis=1).mean() == pytest.approx(1, rel=0.15)
 
 
+@pytest.mark.slow
 def test_slight_blows_between_particles_do_not_either(world):
     # 20 balls graze each other in a magnet. If their blows counted as forces that go on, 0.95 J would become 41 J at 8 substeps.
     x = np.stack([np.linspace(0, 1, 20), np.zeros(20)], axis=1)
@@ -271,6 +272,7 @@ def scene():
     return tv.Particles(x, velocity=np.sin(7 * x), radius=0.05), features
 
 
+@pytest.mark.slow
 def test_the_same_bits_in_copies(world):
     # For paths see test_determinism.py.
     w = world(*scene(), substeps=3)

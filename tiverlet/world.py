@@ -331,7 +331,7 @@ class World:
         on a taut rope, and in orders above 2, all particles start from the assigned velocities (a start is the first substep
         after velocities were set). Writing back the velocities that were read changes nothing.
         """
-        out = self._clock.parted
+        out = self._clock.velocity_override
         if out is None:
             self._runner.memory.check()
             with deferred_signals, self._runner.memory.compiler():
@@ -378,7 +378,7 @@ class World:
             change = np.where(others[:, None], spin.from_rates(value) - has, 0.0)
             if not change.any():
                 return
-            if impulse.rubs(runner) or runner.probe:  # the change alters friction
+            if impulse.has_friction(runner) or runner.probe:  # the change alters friction
                 seen = self.velocity
                 if not impulse.steer(runner, seen, seen, change, self._iterations, has):
                     self._restart_with_reactions()

@@ -11,6 +11,7 @@ from .twins import WAYS
 HARD = {"error", "nan", "bits", "overlap", "residual", "momentum", "spin", "twin", "wall"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("begin", (0, 4))
 def test_random_scenes_keep_their_promises(taichi, begin):
     # Energy of passive scenes, brute force, momentum, walls, equal bits: see trials.py. The scenes are the same in every run;

@@ -322,7 +322,7 @@ class BodyImpacts:
         off, push = False, 0 * self.target[i]
         if self.struck[i] != 0 and not self.by_wall(i):
             j, n, w = self.partner[i], self.normal[i], self.state.w.of(i)
-            off, push = self.missing_push(i, self.state.slid(self.state.d[i] - self.state.d[j], i, j).dot(n))
+            off, push = self.missing_push(i, self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n))
             self.change[i] = w / (w + self.state.w.of(j)) * push * n
         return off, push
 

@@ -55,7 +55,7 @@ class WallLog:
             self.when[i][1] = substep
 
     @ti.func
-    def note(self, i, depth, n, push, approach):
+    def record(self, i, depth, n, push, approach):
         """Record that particle i is `depth` [m] inside of the wall with the normal n.
 
         push: change of its displacement along n [m]. approach: its displacement towards the wall [m].
@@ -82,13 +82,13 @@ class WallLog:
         self.touching[i] = ti.cast(self.when[i][1] == self.substep[None], ti.i32)
 
     @property
-    def made(self) -> Any:
+    def counter(self) -> Any:
         """The field that is 0 where there are no events to report."""
         return self.substep
 
     def forget(self) -> None:
         """Discard the events: the state does not come from the last frame."""
-        self._scene.memory.write(self.made, 0)
+        self._scene.memory.write(self.counter, 0)
 
     def read(self, number: int, h: float, time: float) -> Touches:
         """Return the events of the last frame, which ended at `time` [s].

@@ -173,5 +173,5 @@ class Loops(Quantity):
     def slope(self, e, back):
         """Return half the vector from the previous corner to the next one, turned by -90 degrees."""
         i, j = self.sides[e]
-        r = self.state.apart(j, i) - back * (self.state.d[j] - self.state.d[i])
+        r = self.state.separation(j, i) - back * (self.state.d[j] - self.state.d[i])
         return ti.Vector([r[1], -r[0]]) / 2

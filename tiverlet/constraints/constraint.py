@@ -65,7 +65,7 @@ class RelativeCorners:
         self.corners, self.state, self.real, self.arity, self.origin = corners, corners.state, corners.real, corners.arity, origin
 
     @ti.func
-    def apart(self, c, back):
+    def relative_positions(self, c, back):
         """Return the corners of constraint c at x - back d."""
         q = ti.Matrix.zero(self.real, self.arity, self.state.dim)
         for k in ti.static(range(self.arity)):
@@ -78,7 +78,7 @@ class RelativeCorners:
                     r += self.state.low[i]
             else:
                 j = self.corners.member(c, 0)
-                r += self.state.apart(i, j) + back * self.state.d[j]
+                r += self.state.separation(i, j) + back * self.state.d[j]
             for a in ti.static(range(self.state.dim)):
                 q[k, a] = r[a]
         return q
@@ -86,7 +86,7 @@ class RelativeCorners:
     @ti.func
     def now_and_start(self, c):
         """Return the corners of constraint c now and at the start of the substep."""
-        return self.apart(c, 0), self.apart(c, 1)
+        return self.relative_positions(c, 0), self.relative_positions(c, 1)
 
 
 class Constraint(Scalar):

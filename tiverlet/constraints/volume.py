@@ -198,8 +198,8 @@ class Surfaces(Quantity):
         total = 0 * self.state.d[i]
         for k in range(self.starts[e], self.starts[e + 1]):
             j, m = self.ring[k]
-            b = self.state.apart(j, i) - back * (self.state.d[j] - self.state.d[i])
-            c = self.state.apart(m, i) - back * (self.state.d[m] - self.state.d[i])
+            b = self.state.separation(j, i) - back * (self.state.d[j] - self.state.d[i])
+            c = self.state.separation(m, i) - back * (self.state.d[m] - self.state.d[i])
             total += b.cross(c)
         return total / 6
 

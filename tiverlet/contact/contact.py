@@ -127,7 +127,7 @@ class Contact(PairContact):
         dev, now = self.dev, change.now
         if not self.can_touch:
             return not bool((now.radius > 0).any())
-        alike = self.table.can_be(change.before.group, now.group)
+        alike = self.table.has_same_rows(change.before.group, now.group)
         splits = dev.splitting.can_regroup(dev.list.team.piece_of(now.count))
         return alike and splits and bool((now.radius > 0).any()) and dev.search.can_regroup(change, now.radius)
 
@@ -221,7 +221,7 @@ class Contact(PairContact):
         if not self.dev.state.awake(j):
             met = self.dev.geometry.push_each_other(i, j, margin)
             if not self.dev.w.positive(i):
-                r, distance = self.dev.state.apart(i, j) - self.dev.state.d[i], self.dev.geometry.contact_distance(i, j)
+                r, distance = self.dev.state.separation(i, j) - self.dev.state.d[i], self.dev.geometry.contact_distance(i, j)
                 met = met or r.dot(r) < distance * distance
             out = ti.select(met, j, -1)
         return out
@@ -307,7 +307,7 @@ class Contact(PairContact):
                     if ti.static(self.dev.has_restitution):
                         self.dev.impulse.field[e] = self.dev.impulse.field[e] + pressed
                     if ti.static(self.dev.reports):
-                        self.dev.events.note(i, j, e, n, pressed, final)
+                        self.dev.events.record(i, j, e, n, pressed, final)
                     push += part
                     least = lesser(push, least)
                     want = part * n
@@ -323,7 +323,7 @@ class Contact(PairContact):
                         spin_change += w * turned
                         if final != 0:
                             before = self.dev.forces.before[i] - self.dev.forces.before[j]
-                            approach = -self.dev.state.slid(before, i, j).dot(n)
+                            approach = -self.dev.state.relative_displacement(before, i, j).dot(n)
                             share = self.dev.forces.share(approach, pressed * alone) * w
                             forced += share * tangential
                             spin_forced += share * turned
@@ -332,7 +332,9 @@ class Contact(PairContact):
                     total += w * want
                     if ti.static(self.dev.has_friction and not self.dev.spins):
                         if final != 0:
-                            approach = -self.dev.state.slid(self.dev.forces.before[i] - self.dev.forces.before[j], i, j).dot(n)
+                            approach = -self.dev.state.relative_displacement(
+                                self.dev.forces.before[i] - self.dev.forces.before[j], i, j
+                            ).dot(n)
                             forced += self.dev.forces.share(approach, pressed * alone) * w * (want - part * n)
                     self.dev.push.field[e] = push
             if least == 0:
@@ -353,7 +355,7 @@ class Contact(PairContact):
     @ti.func
     def held(self, i, j, n, normal, slip):
         """Return the part of a pair's slip [m], this substep included, that friction takes back for a normal displacement."""
-        moved = self.dev.state.slid(slip + self.dev.state.d[i] - self.dev.state.d[j], i, j)
+        moved = self.dev.state.relative_displacement(slip + self.dev.state.d[i] - self.dev.state.d[j], i, j)
         return self.table.held(i, j, n, normal, moved)
 
     @ti.func
@@ -389,11 +391,13 @@ class Contact(PairContact):
                     e = self.dev.list.entry(i, word, bits)
                     bits &= bits - ti.u32(1)
                     j, push = self.dev.list.neighbour[e], self.dev.push.field[e]
-                    r = self.dev.state.apart(i, j)
+                    r = self.dev.state.separation(i, j)
                     length = r.norm()
                     if push > 0 and length > 0:
                         n = r / length
-                        approach = -self.dev.state.slid(self.dev.forces.before[i] - self.dev.forces.before[j], i, j).dot(n)
+                        approach = -self.dev.state.relative_displacement(
+                            self.dev.forces.before[i] - self.dev.forces.before[j], i, j
+                        ).dot(n)
                         share = self.dev.forces.share(approach, push * (w + self.dev.w.of(j)))
                         if ti.static(self.dev.has_loads):
                             push -= self.dev.known.load.field[e] * h * h / soft

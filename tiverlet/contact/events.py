@@ -90,7 +90,7 @@ class EventLog:
         self.speed.field[row] = 0
 
     @ti.func
-    def note(self, i, j, e, n, impulse, final):
+    def record(self, i, j, e, n, impulse, final):
         """Record that entry e of particle i, with j, touches in this pass.
 
         Both particles of a pair call it, unless one cannot move. Only one of them writes.
@@ -108,7 +108,7 @@ class EventLog:
             self.place(row, i, j, n)
         began, last = self.when.field[row][0], self.when.field[row][1]
         if last < now - 1:
-            approach = -self.state.slid(self.state.d[i] - self.state.d[j], i, j).dot(n)
+            approach = -self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n)
             self.speed.field[row] = ti.max(self.speed.field[row], approach)
         if final != 0 and began == BEFORE:
             self.place(row, i, j, n)
@@ -119,7 +119,7 @@ class EventLog:
     def place(self, row, i, j, n):
         """Write the normal and the point where the pair touches: in the middle between the two surfaces along n."""
         self.normal.field[row] = n
-        way = (self.radius.of(j) - self.radius.of(i)) * n - self.state.apart(i, j)
+        way = (self.radius.of(j) - self.radius.of(i)) * n - self.state.separation(i, j)
         self.point.field[row] = self.state.place(i) + way / 2
 
     @ti.func
@@ -173,7 +173,7 @@ class EventLog:
                     if self.sleeps(i, j):
                         last = self.substep[None]
                         self.when.field[row][1] = last
-                    r = self.state.apart(i, j)
+                    r = self.state.separation(i, j)
                     length = r.norm()
                     if length > 0:
                         self.place(row, i, j, r / length)
@@ -182,13 +182,13 @@ class EventLog:
                 self.touched.field[e] = ti.cast(last == self.substep[None], ti.i32)
 
     @property
-    def made(self) -> Any:
+    def counter(self) -> Any:
         """The field that is 0 if there are no events to report."""
         return self.rows
 
     def forget(self) -> None:
         """Empty the table, because the state is not the end of a frame that was just computed."""
-        self.list.memory.write(self.made, 0)
+        self.list.memory.write(self.counter, 0)
 
     def read(self, h: float, time: float) -> ContactEvents:
         """Return the events of the last frame, which had substeps h [s] and ended at `time` [s]."""

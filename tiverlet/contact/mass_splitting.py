@@ -64,7 +64,7 @@ class MassSplitting:
         out, begin = ti.u32(0), self.list.first[i] + word * WORD
         for k in range(ti.min(self.list.number[i] - word * WORD, WORD)):
             j = self.list.neighbour[begin + k]
-            r, contact_distance = self.state.apart(i, j), self.geometry.contact_distance(i, j)
+            r, contact_distance = self.state.separation(i, j), self.geometry.contact_distance(i, j)
             one = ti.cast(r.dot(r) < contact_distance * contact_distance, ti.u32)  # no branch: it would be mispredicted
             if ti.static(self.has_loads):
                 one |= ti.cast(self.known.load.field[begin + k] > 0, ti.u32)
@@ -93,7 +93,7 @@ class MassSplitting:
         Fast path: a block without contact in the last pass is tested only for any contact. Small worlds leave this code out, to
         compile faster.
         """
-        some = self.state.stirs(begin, end)
+        some = self.state.any_awake(begin, end)
         if ti.static(not self.few):
             if some != 0:
                 some = 0
@@ -127,7 +127,7 @@ class MassSplitting:
         gap, begin = ti.cast(ti.math.inf, self.real), self.list.first[i]
         for e in range(begin, begin + self.list.number[i]):
             j = self.list.neighbour[e]
-            r = self.state.apart(i, j)
+            r = self.state.separation(i, j)
             rr = r.dot(r)
             if ti.static(not same):
                 rr -= self.geometry.contact_distance(i, j) * self.geometry.contact_distance(i, j)
@@ -184,7 +184,7 @@ class MassSplitting:
             while bits != 0:
                 j = self.list.neighbour[self.list.entry(i, word, bits)]
                 bits &= bits - ti.u32(1)
-                r, contact_distance = self.state.apart(i, j), self.geometry.contact_distance(i, j)
+                r, contact_distance = self.state.separation(i, j), self.geometry.contact_distance(i, j)
                 scale = 1 / (contact_distance * contact_distance)
                 tensor += scale * r.outer_product(r)
                 deepest = lesser(r.dot(r) * scale, deepest)
@@ -209,7 +209,7 @@ class MassSplitting:
             while bits != 0:
                 j = self.list.neighbour[self.list.entry(i, word, bits)]
                 bits &= bits - ti.u32(1)
-                r, contact_distance = self.state.apart(i, j), self.geometry.contact_distance(i, j)
+                r, contact_distance = self.state.separation(i, j), self.geometry.contact_distance(i, j)
                 rr = r.dot(r)
                 if rr > contact_distance * contact_distance * ti.static(SAME_PLACE):
                     tensor += r.outer_product(r) / rr

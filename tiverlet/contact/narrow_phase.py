@@ -56,7 +56,7 @@ class DiscGeometry:
     @ti.func
     def depth(self, i, j, contact_distance):
         """Return the overlap of a pair that touches at `contact_distance` [m], without the normal; negative where apart."""
-        r = self.state.apart(i, j)
+        r = self.state.separation(i, j)
         rr = r.dot(r)
         overlap = 0 * contact_distance - 1
         if rr < contact_distance * contact_distance:
@@ -68,7 +68,7 @@ class DiscGeometry:
     @ti.func
     def overlap(self, i, j, contact_distance):
         """Return the overlap [m] of a pair that touches at `contact_distance` [m], negative where apart, and its normal."""
-        r = self.state.apart(i, j)
+        r = self.state.separation(i, j)
         rr = r.dot(r)
         overlap, n = 0 * contact_distance - 1, 0 * r
         if rr < contact_distance * contact_distance:
@@ -82,14 +82,14 @@ class DiscGeometry:
     @ti.func
     def gap(self, i, j):
         """Return the (negative) overlap of a pair that is apart [m], and its normal."""
-        r = self.state.apart(i, j)
+        r = self.state.separation(i, j)
         length = r.norm()
         return self.contact_distance(i, j) - length, r / length
 
     @ti.func
     def direction(self, i, j):
         """Return the normal of a pair that may be apart, 0 in the same place."""
-        r = self.state.apart(i, j)
+        r = self.state.separation(i, j)
         length = r.norm()
         n = 0 * r
         if length > 0:
@@ -112,8 +112,8 @@ class DiscGeometry:
         sliding particles: seven discs drawn to a point would double their angular momentum in 20 s at 20 substeps. A particle
         that slides on a straight path ends a little above the other one, so a pair that bears a load counts as touching, too.
         """
-        r = self.state.apart(i, j)
-        d = self.state.slid(self.state.d[i] - self.state.d[j], i, j)
+        r = self.state.separation(i, j)
+        d = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j)
         start, rr = r - d, r.dot(r)
         before, near = start.dot(start), contact_distance * contact_distance * ti.static(SAME_PLACE)
         c = before - contact_distance * contact_distance
@@ -207,7 +207,7 @@ class DiscGeometry:
     @ti.func
     def push_each_other(self, i, j, margin):
         """Whether particles i and j push each other, and are less than `margin` [m] from overlapping."""
-        r, distance = self.state.apart(i, j), self.contact_distance(i, j) + margin
+        r, distance = self.state.separation(i, j), self.contact_distance(i, j) + margin
         return r.dot(r) < distance * distance and self.pushes(i, j) != 0
 
     @ti.func
@@ -220,7 +220,7 @@ class DiscGeometry:
             j = self.list.neighbour[last - k]
             if j < i:  # the list is sorted: so are the rest
                 break
-            a, b, r = self.radius.of(i), self.radius.of(j), self.state.apart(i, j)
+            a, b, r = self.radius.of(i), self.radius.of(j), self.state.separation(i, j)
             small = ti.select(ti.min(a, b) > 0, ti.min(a, b), ti.max(a, b))
             overlap = ((a + b) * self.pushes(i, j) - ti.sqrt(r.dot(r))) / small
             # No branch: half of the listed pairs are apart.

@@ -122,7 +122,11 @@ class PolygonGeometry:
         """
         out = 1
         if self.after(a) >= 0:
-            r, u, w = self.state.apart(v, a), self.state.apart(self.after(a), a), self.state.apart(self.before(a), a)
+            r, u, w = (
+                self.state.separation(v, a),
+                self.state.separation(self.after(a), a),
+                self.state.separation(self.before(a), a),
+            )
             if r.dot(u) > 0 or r.dot(w) > 0:
                 out = 0
             elif u.cross(w) < 0:
@@ -140,7 +144,7 @@ class PolygonGeometry:
         returned. moved: as in detect().
         """
         b = self.after(a)
-        r, u = self.state.apart(v, a), self.state.apart(b, a)
+        r, u = self.state.separation(v, a), self.state.separation(b, a)
         uu, t = u.dot(u), 0 * r[0]
         overlap, n, most = t - 1, 0 * r, ti.cast(ti.math.inf, self.real)
         if uu > 0:
@@ -202,9 +206,9 @@ class PolygonGeometry:
         """
         out = 0
         if self.after(v) >= 0 and self.after(c) >= 0:
-            r = self.state.apart(v, c)
-            p, q = self.state.apart(self.after(v), v), self.state.apart(self.before(v), v)
-            a, b = self.state.apart(self.after(c), c), self.state.apart(self.before(c), c)
+            r = self.state.separation(v, c)
+            p, q = self.state.separation(self.after(v), v), self.state.separation(self.before(v), v)
+            a, b = self.state.separation(self.after(c), c), self.state.separation(self.before(c), c)
             # Heights times edge lengths: of v over the edges of c, and of c over the edges of v.
             over_a, over_b, over_p, over_q = r.cross(a), b.cross(r), p.cross(r), r.cross(q)
             if p.cross(q) > 0 and a.cross(b) > 0 and over_a * over_b < 0 and over_p * over_q < 0:
@@ -238,7 +242,7 @@ class PolygonGeometry:
         going = True
         while going:
             k = self.after(k)
-            s = self.state.apart(k, a) - p
+            s = self.state.separation(k, a) - p
             up = s[1] > 0
             if (r[1] > 0) != up and (r.cross(s) > 0) == up:
                 out = not out
@@ -250,7 +254,7 @@ class PolygonGeometry:
         """Return a vector from an outer corner v into its own body; 0 at inner corners and without a body."""
         out = 0 * self.state.x[v]
         if self.after(v) >= 0:
-            u, w = self.state.apart(self.after(v), v), self.state.apart(self.before(v), v)
+            u, w = self.state.separation(self.after(v), v), self.state.separation(self.before(v), v)
             if u.cross(w) > 0:
                 out = u * w.norm() + w * u.norm()
         return out
@@ -265,7 +269,7 @@ class PolygonGeometry:
         for e in range(self.list.first[v], self.list.first[v] + self.list.number[v]):
             j = self.list.neighbour[e]
             if j != a and j != shared and self.loop[j][2] == self.loop[a][2]:
-                r, u = self.state.apart(v, j), self.state.apart(self.after(j), j)
+                r, u = self.state.separation(v, j), self.state.separation(self.after(j), j)
                 uu, faces = u.dot(u), u[1] * back[0] - u[0] * back[1] >= 0
                 if uu > 0:
                     r -= ti.min(ti.max(r.dot(u) / uu, 0), 1) * u
@@ -439,7 +443,7 @@ class PolygonGeometry:
         """Return 1 if the edge that begins at particle i is too long for the list."""
         after, out = self.after(i), 0
         if after >= 0:
-            u = self.state.apart(after, i)
+            u = self.state.separation(after, i)
             if u.dot(u) > self.longest[i] ** 2:
                 out = 1
         return out
@@ -513,7 +517,7 @@ class PolygonGeometry:
             if found[0] > 0 and (found[1] > DISCS or self.keeps(i, j)):
                 size = ti.min(self.radius.of(i), self.radius.of(j))
                 if found[1] > DISCS:
-                    size = self.state.apart(self.after(j), j).norm() / 2
+                    size = self.state.separation(self.after(j), j).norm() / 2
                 elif size == 0:
                     size = ti.max(self.radius.of(i), self.radius.of(j))
                 worst = ti.max(worst, found[0] / size)
@@ -579,7 +583,7 @@ class EdgePairTable:
         self.loop, self.longest, self.radius, self.state = geometry.loop, geometry.longest, geometry.radius, geometry.state
 
     @ti.func
-    def reach(self, radius: ti.template(), i, j):  # type: ignore[valid-type]
+    def cutoff(self, radius: ti.template(), i, j):  # type: ignore[valid-type]
         """Return the distance up to which particles i and j may take part in a contact [m]."""
         return radius.of(i) + radius.of(j) + ti.static(REACH) * ti.max(self.longest[i], self.longest[j])
 
@@ -597,10 +601,10 @@ class EdgePairTable:
         """Whether v is near an edge of c: within the skin in front of it, or behind it by up to half its length and the skin."""
         out = False
         if self.loop[c][2] >= 0:
-            r, reach = self.state.apart(v, c), self.radius.of(v) + self.skin
+            r, reach = self.state.separation(v, c), self.radius.of(v) + self.skin
             for k in ti.static(range(2)):
                 other = self.loop[c][k]
-                u, size = self.state.apart(other, c), reach + ti.max(self.radius.of(c), self.radius.of(other))
+                u, size = self.state.separation(other, c), reach + ti.max(self.radius.of(c), self.radius.of(other))
                 length = u.norm()
                 t, height = r.dot(u), r.cross(u) * (1 - 2 * k)
                 if height >= -(length / 2 + size) * length and height <= size * length:

@@ -88,8 +88,8 @@ class Restitution:
 
         Also return how far the pair approaches in this substep, and how far it would without forces [m].
         """
-        a = -self.state.slid(self.state.before[i] - self.state.before[j], i, j).dot(n)
-        here = -self.state.slid(self.state.d[i] - self.state.d[j], i, j).dot(n)
+        a = -self.state.relative_displacement(self.state.before[i] - self.state.before[j], i, j).dot(n)
+        here = -self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n)
         return here + self.table.of(i, j)[2] * ti.max(a, 0), here, a
 
     @ti.func
@@ -160,7 +160,7 @@ class Restitution:
     def set_target(self, i, j, n, given):
         """Store the displacement along n with which particle i is to leave particle j."""
         self.normal[i] = n
-        self.target_of[i] = given + self.state.slid(self.state.d[i] - self.state.d[j], i, j).dot(n)
+        self.target_of[i] = given + self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n)
 
     @ti.func
     def push_body(self, i):

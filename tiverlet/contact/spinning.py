@@ -41,13 +41,13 @@ class Spinning:
     def arm(self, i, j, n):
         """Return the arm m after the pass: from the start of the substep, or along n if the pair did not touch there."""
         distance = self.radius.of(i) + self.radius.of(j)
-        r = self.state.apart(i, j) - self.state.slid(self.state.d[i] - self.state.d[j], i, j)
+        r = self.state.separation(i, j) - self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j)
         return ti.select(r.dot(r) > distance * distance, n, r / distance)
 
     @ti.func
     def slip(self, i, j, m):
         """Return how far the surfaces slide past each other in this substep [m]. m: the arm."""
-        moved = self.state.slid(self.state.d[i] - self.state.d[j], i, j)
+        moved = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j)
         return moved - self.spin.surface(self.spin.s[i] + self.spin.s[j], m)
 
     @ti.func

@@ -75,7 +75,7 @@ class VelocityProjection:
                     bits &= bits - ti.u32(1)
                     if self.bears(i, e):
                         j = self.list.neighbour[e]
-                        r = self.state.apart(i, j)
+                        r = self.state.separation(i, j)
                         rr = r.dot(r)
                         if rr > 0:
                             shared = self.weight[i] + self.weight[j]
@@ -102,8 +102,8 @@ class VelocityProjection:
         want, first = 0 * self.state.d[i], self.list.first[i]
         for e in range(first, first + self.number[i]):
             j = self.list.old_neighbour[e]
-            r = self.state.apart(i, j)
-            want -= self.push.old[e] * self.state.slid(self.state.d[i] - self.state.d[j], i, j).dot(r) * r
+            r = self.state.separation(i, j)
+            want -= self.push.old[e] * self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(r) * r
         if ti.static(self.state.keeps_wall_push):
             wall_push = self.state.wall_push[i]
             size = wall_push.dot(wall_push)

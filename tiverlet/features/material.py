@@ -177,12 +177,12 @@ class Table:
             self.width = 7 if self.turns else 4  # columns on the device
             self.entries = scene.memory.field("Contact.table", len(rows), width=self.width, values=rows[:, : self.width])
 
-    def can_be(self, before: np.ndarray, now: np.ndarray) -> bool:
+    def has_same_rows(self, before: np.ndarray, now: np.ndarray) -> bool:
         """Whether particles of the groups `now` have the same table as those of the groups `before`."""
         return self.uniform or np.array_equal(self.rows(before)[1], self.rows(now)[1])
 
     def regroup(self, scene: "Scene", group: np.ndarray) -> None:
-        """Write the groups of the present particles, for which can_be() is true."""
+        """Write the groups of the present particles, for which has_same_rows() is true."""
         if not self.uniform:
             scene.memory.write(self.rank, self.rows(group)[0])
 
@@ -214,7 +214,7 @@ class Table:
         return limit_length(s, row[0] * normal, row[1] * normal)
 
     @inline
-    def reach(self, radius, i, j):
+    def cutoff(self, radius, i, j):
         """Return the distance up to which particles i and j touch [m]."""
         return radius.of(i) + radius.of(j)
 

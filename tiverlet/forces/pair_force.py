@@ -28,7 +28,7 @@ class Cutoff:
         self.radius = scene.memory.number(radius, scene.real)
 
     @inline
-    def reach(self, radius, i, j):
+    def cutoff(self, radius, i, j):
         """Return the distance up to which particles i and j act on each other [m]."""
         return self.radius
 
@@ -170,11 +170,11 @@ class PairForce(Acceleration):
             if ti.static(self.listed):
                 for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
                     j = self.dev.list.neighbour[e]
-                    total += self.pull(i, j, self.dev.state.apart(i, j))
+                    total += self.pull(i, j, self.dev.state.separation(i, j))
             else:
                 for j in range(self.dev.n.now):
                     if j != i:
-                        total += self.pull(i, j, self.dev.state.apart(i, j))
+                        total += self.pull(i, j, self.dev.state.separation(i, j))
         self.dev.now[i] = w * total
 
     @ti.func
@@ -185,7 +185,10 @@ class PairForce(Acceleration):
     @ti.func
     def stiffness_between(self, i, j):
         """Return omega^2 of a pair [1/s^2], (w_i + w_j) |F(r) - F(r - u)| / |u|, where r changed by u in the last substep."""
-        r, u = self.dev.state.apart(i, j), self.dev.state.slid(self.dev.state.d[i] - self.dev.state.d[j], i, j)
+        r, u = (
+            self.dev.state.separation(i, j),
+            self.dev.state.relative_displacement(self.dev.state.d[i] - self.dev.state.d[j], i, j),
+        )
         out, uu = 0 * r[0], u.norm_sqr()
         if uu > 0:
             out = (self.dev.w.of(i) + self.dev.w.of(j)) * (self.pull(i, j, r) - self.pull(i, j, r - u)).norm() / ti.sqrt(uu)
@@ -207,8 +210,8 @@ class PairForce(Acceleration):
     @ti.func
     def energy_between(self, i, j, back):
         """Return the share of particle i in the energy of a pair at x - back d, in f64 [J]: half, or all if j cannot move."""
-        shift = back * self.dev.state.slid(self.dev.state.d[i] - self.dev.state.d[j], i, j)
-        r = self.dev.state.apart(i, j) - shift
+        shift = back * self.dev.state.relative_displacement(self.dev.state.d[i] - self.dev.state.d[j], i, j)
+        r = self.dev.state.separation(i, j) - shift
         out = ti.cast(0, ti.f64)
         if self.near(r):
             low, high = ti.min(i, j), ti.max(i, j)

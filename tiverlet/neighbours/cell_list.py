@@ -237,8 +237,8 @@ class CellList:
         self.team.wait()
 
     @ti.func
-    def apart(self, i, k):
-        """Return the vector from the k-th sorted particle to particle i [m], as State.apart() does for two particle indices."""
+    def separation(self, i, k):
+        """Return the vector from the k-th sorted particle to particle i [m], like State.separation() for two indices."""
         r = self.state.x[i] - self.sorted_position[k]
         if ti.static(self.state.compensated and len(self.axes) > 0):
             far = ti.cast(self.state.x[i], ti.f64) - ti.cast(self.sorted_position[k], ti.f64)

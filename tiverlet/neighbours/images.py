@@ -67,7 +67,7 @@ class Images:
         return middle + self.nearest(x - middle)
 
     @ti.func
-    def slid(self, moved, r):
+    def relative_displacement(self, moved, r):
         """Return the relative displacement of the nearest images of two particles in a substep [m].
 
         moved: their relative displacement [m]. r: the vector between them [m].

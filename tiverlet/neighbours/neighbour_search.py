@@ -309,7 +309,7 @@ class NeighbourSearch:
                     b = base + self.cells.position_in_row(low + part, m)
                     for e in range(self.cells.edge[b + 1], self.cells.edge[b + span + 1]):
                         j = self.cells.sorted[e]
-                        listed = self.is_list_member(i, j, self.cells.apart(i, e))
+                        listed = self.is_list_member(i, j, self.cells.separation(i, e))
                         if ti.static(not self.counts_first):
                             # No branch, which the CPU could not predict. The next entry overwrites one that is not listed.
                             self.list.neighbour[start + ti.min(used, self.list.capacity)] = j
@@ -327,7 +327,7 @@ class NeighbourSearch:
                         used += listed
         for old in range(self.list.old_first[i], self.list.old_first[i] + self.list.old_number[i]):
             j = self.list.old_neighbour[old]
-            if self.is_list_member(i, j, self.state.apart(i, j)) == 0:
+            if self.is_list_member(i, j, self.state.separation(i, j)) == 0:
                 if ti.static(not self.counts_first):
                     self.list.neighbour[start + ti.min(used, self.list.capacity)] = j
                 elif what != COUNT:
@@ -341,7 +341,7 @@ class NeighbourSearch:
     @ti.func
     def is_list_member(self, i, j, r):
         """Return 1 if a pair with difference r [m] belongs on the list: near, movable, not excluded."""
-        far = self.table.reach(self.radius, i, j) + ti.cast(self.skin, self.real)
+        far = self.table.cutoff(self.radius, i, j) + ti.cast(self.skin, self.real)
         yes = ti.cast(r.dot(r) < far * far, ti.i32) & ti.cast(i != j, ti.i32)
         if ti.static(self.has_static):
             if yes != 0:

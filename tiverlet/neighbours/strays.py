@@ -92,8 +92,10 @@ class Strays:
     @ti.func
     def is_unlisted(self, i, j):
         """Return 1 if a pair belongs on the list, is nearer than any unlisted pair of a valid list can be, and is not listed."""
-        near = self.search.table.reach(self.search.radius, i, j) + ti.static(1 - 2 * STALE) * ti.cast(self.search.skin, self.real)
-        r, out = self.state.apart(i, j), 0
+        near = self.search.table.cutoff(self.search.radius, i, j) + ti.static(1 - 2 * STALE) * ti.cast(
+            self.search.skin, self.real
+        )
+        r, out = self.state.separation(i, j), 0
         if r.dot(r) < near * near:
             out = self.search.is_list_member(i, j, r)
             for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):

@@ -24,29 +24,29 @@ class PerParticle:
         if not self.uniform:
             self.field = memory.field(name, number, values=values)
 
-    def can_be(self, values: np.ndarray) -> bool:
+    def can_assign(self, values: np.ndarray) -> bool:
         """Whether these values need the same kernels as the present ones."""
         uniform = bool(len(values) == 0 or (values == values[0]).all())
         return uniform == self.uniform and (uniform and bool(len(values) and values[0] > 0)) == self.all_positive
 
-    def become(self, memory: "Memory", values: np.ndarray) -> None:
-        """Write other values, for which can_be() is true."""
+    def assign(self, memory: "Memory", values: np.ndarray) -> None:
+        """Write other values, for which can_assign() is true."""
         if self.uniform:
             self.constant = float(values[0]) if len(values) else 0.0
         else:
             memory.write(self.field, values)
 
     def can_change(self, values: np.ndarray, some: np.ndarray) -> bool:
-        """Return can_be() for values that differ from the present ones only at `some`.
+        """Return can_assign() for values that differ from the present ones only at `some`.
 
         If the values at `some` differ from each other, the others need no comparison.
         """
-        return (not self.uniform and len({*values[some].tolist()}) > 1) or self.can_be(values)
+        return (not self.uniform and len({*values[some].tolist()}) > 1) or self.can_assign(values)
 
     def change(self, memory: "Memory", values: np.ndarray, some: np.ndarray) -> None:
         """Write the values at `some`, for which can_change() is true, in an elastic memory."""
         if self.uniform:
-            self.become(memory, values)
+            self.assign(memory, values)
         else:
             memory.view(self.field)[some] = values[some]
 
@@ -78,13 +78,13 @@ class Radii:
         positive = radius[radius > 0]
         return float(positive.min()) if len(positive) else 0.0, bool((radius == 0).any()), bool(len(positive))
 
-    def can_be(self, values: np.ndarray) -> bool:
+    def can_assign(self, values: np.ndarray) -> bool:
         """Whether these radii need the same kernels as the present ones."""
-        return self.each.can_be(values) and self._kinds(values)[1:] == (self.points, self.discs)
+        return self.each.can_assign(values) and self._kinds(values)[1:] == (self.points, self.discs)
 
-    def become(self, memory: "Memory", values: np.ndarray) -> None:
-        """Write other radii, for which can_be() is true."""
-        self.each.become(memory, values)
+    def assign(self, memory: "Memory", values: np.ndarray) -> None:
+        """Write other radii, for which can_assign() is true."""
+        self.each.assign(memory, values)
         self.least = self._kinds(values)[0]
 
     @inline

@@ -41,29 +41,29 @@ class Spin:
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether particles can be added and removed in place."""
         now = change.now
-        if (now.orientation is not None) != self.orients or not self.inverse_inertia.can_be(
+        if (now.orientation is not None) != self.orients or not self.inverse_inertia.can_assign(
             inverse_inertias(now, change.inv_mass)
         ):
             return False
-        return not self.orients or self.inverse_radius.can_be(inverse(now.radius))
+        return not self.orients or self.inverse_radius.can_assign(inverse(now.radius))
 
     def regroup(self, memory: Memory, change: Regrouping) -> None:
         """Set spin and orientation of added particles, see State.regroup()."""
         now, first = change.now, change.kept
         self.radius = now.radius
-        self.inverse_inertia.become(memory, inverse_inertias(now, change.inv_mass))
+        self.inverse_inertia.assign(memory, inverse_inertias(now, change.inv_mass))
         memory.write_from(self.s, first, self.from_rates(now.spin)[first:])
         if self.orients:
-            self.inverse_radius.become(memory, inverse(now.radius))
+            self.inverse_radius.assign(memory, inverse(now.radius))
             memory.write_from(self.orientation, first, np.asarray(now.orientation).reshape(now.count, -1)[first:])
 
-    def can_weigh(self, particles: Particles, inv_mass: np.ndarray) -> bool:
+    def can_set_inverse_mass(self, particles: Particles, inv_mass: np.ndarray) -> bool:
         """Whether other inverse masses of the same particles can be written in place."""
-        return self.inverse_inertia.can_be(inverse_inertias(particles, inv_mass))
+        return self.inverse_inertia.can_assign(inverse_inertias(particles, inv_mass))
 
-    def weigh(self, memory: Memory, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Write other inverse masses, for which can_weigh() is true."""
-        self.inverse_inertia.become(memory, inverse_inertias(particles, inv_mass))
+    def set_inverse_mass(self, memory: Memory, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Write other inverse masses, for which can_set_inverse_mass() is true."""
+        self.inverse_inertia.assign(memory, inverse_inertias(particles, inv_mass))
 
     def from_rates(self, rates: Any) -> np.ndarray:
         """Convert angular velocities [rad/s] to r omega [m/s], (n, axes)."""

@@ -56,12 +56,12 @@ class State:
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether particles can be added and removed in place."""
         spins = change.now.spins == self.spins and (not self.spins or self.spin.can_regroup(change))
-        return spins and self.w.can_be(change.inv_mass)
+        return spins and self.w.can_assign(change.inv_mass)
 
     def regroup(self, memory: "Memory", change: Regrouping) -> None:
         """Set position and velocity of added particles. `memory` already holds only the rows of the remaining ones."""
         self.count, first = change.now.count, change.kept
-        self.w.become(memory, change.inv_mass)
+        self.w.assign(memory, change.inv_mass)
         x = change.now.position[first:]
         memory.write_from(self.x, first, x)
         memory.write_from(self.d, first, change.now.velocity[first:])
@@ -70,15 +70,15 @@ class State:
         if self.spins:
             self.spin.regroup(memory, change)
 
-    def can_weigh(self, particles: "Particles", inv_mass: np.ndarray, some: np.ndarray) -> bool:
+    def can_set_inverse_mass(self, particles: "Particles", inv_mass: np.ndarray, some: np.ndarray) -> bool:
         """Whether other inverse masses can be written in place. some: the particles whose inverse mass may differ."""
-        return self.w.can_change(inv_mass, some) and (not self.spins or self.spin.can_weigh(particles, inv_mass))
+        return self.w.can_change(inv_mass, some) and (not self.spins or self.spin.can_set_inverse_mass(particles, inv_mass))
 
-    def weigh(self, memory: "Memory", particles: "Particles", inv_mass: np.ndarray, some: np.ndarray) -> None:
-        """Write other inverse masses, for which can_weigh() is true."""
+    def set_inverse_mass(self, memory: "Memory", particles: "Particles", inv_mass: np.ndarray, some: np.ndarray) -> None:
+        """Write other inverse masses, for which can_set_inverse_mass() is true."""
         self.w.change(memory, inv_mass, some)
         if self.spins:
-            self.spin.weigh(memory, particles, inv_mass)
+            self.spin.set_inverse_mass(memory, particles, inv_mass)
 
     def get(self, memory: "Memory") -> np.ndarray:
         """Return a copy of the positions, low words added in f64."""
@@ -115,12 +115,12 @@ class State:
         return ti.select(self.sleepers.awake(i), self.w.of(i), ti.cast(0, self.real)) > 0
 
     @inline
-    def stirs(self, begin, end):
+    def any_awake(self, begin, end):
         """Return 0 if all blocks of particles from `begin` up to `end` sleep, else 1."""
-        return self.sleepers.stirs(begin, end) if self.sleepers else 1
+        return self.sleepers.any_awake(begin, end) if self.sleepers else 1
 
     @inline
-    def apart(self, i, j):
+    def separation(self, i, j):
         """Return x_i - x_j, with any low words; in a periodic box the difference of the nearest images."""
         if self.images and self.compensated:  # f32 cannot resolve the difference of particles many boxes apart
             return ti.cast(self.between(i, j), self.real)
@@ -151,9 +151,13 @@ class State:
         return self.images.inside(x) if self.images else x
 
     @inline
-    def slid(self, moved, i, j):
+    def relative_displacement(self, moved, i, j):
         """Return how much further particle i moved than particle j, as images of a periodic box that may be sheared."""
-        return self.images.slid(moved, at(self.x, i) - at(self.x, j)) if self.images and self.images.sheared else moved
+        return (
+            self.images.relative_displacement(moved, at(self.x, i) - at(self.x, j))
+            if self.images and self.images.sheared
+            else moved
+        )
 
     @inline
     def place(self, i):

@@ -77,7 +77,7 @@ class Curves:
 
         self._rr, self._stream = rr, stream
         self._curves = curves_of(world)
-        self.weigh(world)
+        self.read_masses(world)
         self._rows: dict[str, list[tuple[int, float, list[float]]]] = {}
         self._begun = False
         self.own: list[str] = []  # names of the user's quantities
@@ -87,7 +87,7 @@ class Curves:
             lines = rr.SeriesLines(names=titles, colors=colors, visible_series=those)
             stream.log(f"figures/{end}", lines, static=True, strict=True)
 
-    def weigh(self, world: "World") -> None:
+    def read_masses(self, world: "World") -> None:
         """Read the masses again; they change when particles are added or removed."""
         p = world.particles
         self._mass = np.where(p.inv_mass > 0, p.mass, 0.0)

@@ -79,7 +79,7 @@ class Journal:
         kept, world = checkpoint.keep(self.world), self.world
         more = {"flags": checkpoint.flags(world), "reach": world._runner.scene.multipliers_per_newton}
         more["once"] = [sorted(f.compiled_so_far) for f in world.features]
-        parted = kept.clock.parted
+        parted = kept.clock.velocity_override
         arrays = kept.values if parted is None else kept.values | {PARTED: np.asarray(parted)}
         return self.put(kind, {"clock": kept.clock.named() | {"_parted": None}, **more}, arrays)
 

@@ -68,7 +68,7 @@ class Picture:
         frame. scenes: the number of scenes so far. changed_features: features whose knobs were set since the last frame.
         """
         if scenes > self.drawing.scenes:
-            self.curves.weigh(self.world)
+            self.curves.read_masses(self.world)
             self.drawing.begin()
         self._frame_all(x)
         self.drawing.frame(x, x32, changed_features, bool(report and report.broken))

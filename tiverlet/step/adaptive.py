@@ -11,7 +11,7 @@ from ..constraints.core.scalar import Scalar
 from ..constraints.path import Path
 from ..solvers.slots import TENSEST
 from . import checkpoint, energy_bound
-from .clock import room
+from .clock import energy_limit
 from .diagnostics import KINETIC, STIFFNESS
 from .step_report import StepReport
 
@@ -101,7 +101,7 @@ class StepController:
             self.learn(took / (n * k))
             motion, missed = motion_error(world) if tolerance else 0.0, energy_bound.missed(world, report, energy)
             figures, risks = judge(report, tolerance, motion, stiffness(world), missed)
-            if tries.note(figures, risks, report.energy, world._runner.sheet.item(KINETIC)):
+            if tries.record(figures, risks, report.energy, world._runner.sheet.item(KINETIC)):
                 break
             if not tries.verdict and perf_counter() + 2 * took > end:
                 tries.verdict = "substeps-capped"
@@ -162,7 +162,7 @@ class Tries:
         self._made: dict[tuple[int, int], tuple] = {}  # of all tries: a key by which the best one is the least
         self._energies, self._kinetic = [energy], 0.0
 
-    def note(self, figures: Figures, risks: set[str], energy: float, kinetic: float) -> bool:
+    def record(self, figures: Figures, risks: set[str], energy: float, kinetic: float) -> bool:
         """Record a try, with its energies [J]. Returns whether it is the last one; else the next one has been chosen."""
         n, k, stuck = self.substeps, self.iterations, self.stuck
         wrong = [f > max(1.0, s) for f, s in zip(figures, stuck, strict=True)]
@@ -275,13 +275,13 @@ def stiffness(world: "World") -> float:
 def pumps(energies: list[float], kinetic: float) -> bool:
     """Whether the last doubling of the effort added more energy than the one before, and led beyond the bound.
 
-    energies: before the frame, then after each try [J]. The bound follows from all but the last two of them, see room().
+    energies: before the frame, then after each try [J]. The bound follows from all but the last two of them, see energy_limit().
     Violations that could not be removed first act as springs, which a shorter substep makes stiffer, see projection.py.
     """
     if len(energies) < 4:
         return False
     first, second = np.diff(energies[-3:]).tolist()
-    return second > GAIN * first and energies[-1] > room(max(energies[:-2]), kinetic, energies[-1])
+    return second > GAIN * first and energies[-1] > energy_limit(max(energies[:-2]), kinetic, energies[-1])
 
 
 def judge(

@@ -144,7 +144,7 @@ class Rebuild:
         world, last = self.world, self.world._runner
         contact = next((c for c in last.step.contacts if c in self.features), None)
         multipliers, left = last.scene.multipliers_per_newton, last.left
-        world._clock.parted = None
+        world._clock.velocity_override = None
         world._install(world._particles.regrouped(self.some, self.added), self.features, parts)
         runner = world._runner
         runner.memory.compiler.times.add(last.memory.compiler.times)

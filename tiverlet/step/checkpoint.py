@@ -151,7 +151,7 @@ def check(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
     if len({len(value) for name, value in kept.values.items() if name in pieces or name == PAIRS}) > 1:
         raise ValueError("The state is not one of this scene: pairs in contact carry other numbers of values.")
     right = len(flagged) == len(world.features) and all(type(b) is bool for pair in flagged for b in pair)
-    if not right or not kept.clock.sound(len(world.particles), world.particles.dim):
+    if not right or not kept.clock.is_valid(len(world.particles), world.particles.dim):
         raise ValueError("The state is not one of this scene: its clock is none.")
 
 

@@ -8,9 +8,9 @@ import numpy as np
 # Names in recordings.
 NAMES = {
     "_time": "time", "_tick": "tick", "_since": "since", "_h": "h", "_fresh": "d_is_velocity", "_longest": "longest",
-    "_frame": "frame", "_drag": "drag", "_started": "started", "_owed": "owed", "_lacked": "lacked", "_parted": "parted",
-    "_placed": "first_moved", "_energy": "energy", "_softened": "softened", "_bound": "bound", "_kinetic": "kinetic",
-    "_parting": "parting",
+    "_frame": "frame", "_drag": "drag", "_started": "started", "_owed": "owed", "_lacked": "lacked",
+    "_parted": "velocity_override", "_placed": "first_moved", "_energy": "energy", "_softened": "softened", "_bound": "bound",
+    "_kinetic": "kinetic", "_parting": "parting",
 }  # fmt: skip
 
 SHARE = 0.1  # of the largest kinetic energy: the gain that is allowed
@@ -21,12 +21,12 @@ MET = 1e-6  # relative violation that counts as rounding
 PARTED = 0.01  # overlap [radii] down to which particles placed into each other push themselves apart
 
 
-def room(bound: Any, kinetic: Any, energy: Any) -> Any:
+def energy_limit(bound: Any, kinetic: Any, energy: Any) -> Any:
     """The most energy that a passive scene can have [J], see energy_bound.py. Numbers or arrays."""
     return bound + SHARE * kinetic + DIGITS * abs(energy)
 
 
-def slack(inv_mass: np.ndarray, extent: np.ndarray, h: Any) -> Any:
+def initial_margin(inv_mass: np.ndarray, extent: np.ndarray, h: Any) -> Any:
     """The kinetic energy that initial violations may become [J]: initial_violation.py leaves up to MET of the extent (..., dim)
     [m], and a substep of h [s] removes it. Numbers or arrays."""
     return (MET * np.linalg.norm(extent, axis=-1) / h) ** 2 * (1 / inv_mass[inv_mass > 0]).sum() / 2
@@ -41,10 +41,10 @@ class Clock:
     was a start. longest: the longest substep since violations were last removed [s], see projection.py. frame: when frames of the
     present length began [s], their length [s], their number. drag: its factors for h, see integrator.decay(). owed: the kick by
     rigid constraints that velocities before a start lack, as a time [s]. lacked: `owed` of the last substep if it was a start,
-    else 0. parted: velocities, valid until the next step, after constraints that contribute to them were removed or velocities
-    were assigned; a start before the next step takes these. first_moved: the first particle that the user placed since the last
-    frame; None if there is none. energy: at the end of the last frame [J]; None if unknown. softened: whether violations held
-    loads that had no direction in the last frame. bound, kinetic, parting: the energy that must not be exceeded [J], None if
+    else 0. velocity_override: velocities, valid until the next step, after constraints that contribute to them were removed or
+    velocities were assigned; a start before the next step takes these. first_moved: the first particle that the user placed since
+    the last frame; None if there is none. energy: at the end of the last frame [J]; None if unknown. softened: whether violations
+    held loads that had no direction in the last frame. bound, kinetic, parting: the energy that must not be exceeded [J], None if
     unknown; the largest kinetic energy since then [J]; whether particles that were placed into each other still part; see
     energy_bound.py.
     """
@@ -60,7 +60,7 @@ class Clock:
     drag: list[float] | None = None
     owed: float = 0.0
     lacked: float = 0.0
-    parted: np.ndarray | None = None
+    velocity_override: np.ndarray | None = None
     first_moved: int | None = 0
     energy: float | None = None
     softened: bool = False
@@ -107,9 +107,9 @@ class Clock:
         self.kinetic = max(self.kinetic, kinetic)
         if self.parting:
             self.bound, self.parting = max(self.bound, energy), overlap > PARTED
-        return energy > room(self.bound, self.kinetic, energy)
+        return energy > energy_limit(self.bound, self.kinetic, energy)
 
-    def counted(self, dt: float) -> tuple[float, float, int]:
+    def next_frame(self, dt: float) -> tuple[float, float, int]:
         """When frames of this length began, their length, and their number with the coming one. Counting frames of equal length,
         instead of summing dt, adds no rounding errors."""
         since, length, count = self.frame
@@ -118,7 +118,7 @@ class Clock:
     def advance(self, substeps: int, frame: tuple[float, float, int], started: bool) -> None:
         """Advance by so many substeps, which made one frame."""
         self.tick, self.since = (self.tick + substeps) % 2**31, (self.since + substeps) % 2**31
-        self.started, self.d_is_velocity, self.parted = started, False, None
+        self.started, self.d_is_velocity, self.velocity_override = started, False, None
         self.lacked = self.owed if started else 0.0
         self.frame, self.time = frame, frame[0] + frame[1] * frame[2]
 
@@ -127,12 +127,14 @@ class Clock:
         """The values that the next frames depend on, for the hash."""
         later: list[Any] = [self.longest] if self.longest > self.h else []  # matters when h changes
         later += ["softened"] if self.softened else []
-        later += [] if self.parted is None else [np.asarray(self.parted, dtype=np.float64).tobytes()]
+        later += [] if self.velocity_override is None else [np.asarray(self.velocity_override, dtype=np.float64).tobytes()]
         return [self.time, self.tick, self.since, self.h, self.d_is_velocity, *later]
 
-    def sound(self, particles: int, dim: int) -> bool:
+    def is_valid(self, particles: int, dim: int) -> bool:
         """Whether these values are valid for a world of so many particles."""
-        if self.parted is not None and (np.shape(self.parted) != (particles, dim) or not np.isfinite(self.parted).all()):
+        if self.velocity_override is not None and (
+            np.shape(self.velocity_override) != (particles, dim) or not np.isfinite(self.velocity_override).all()
+        ):
             return False
         right = [type(k) is int and 0 <= k < 2**31 for k in (self.tick, self.since)]
         right += [type(some) is bool for some in (self.d_is_velocity, self.started, self.softened, self.parting)]

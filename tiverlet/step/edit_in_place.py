@@ -81,7 +81,7 @@ def planned(
         work += sum(more.count for more in bound.more.values())
     if not world._scale.holds(Scale(count, work)):
         return None
-    if not (scene.state.can_regroup(change) and (scene.radius is None or scene.radius.can_be(now.radius))):
+    if not (scene.state.can_regroup(change) and (scene.radius is None or scene.radius.can_assign(now.radius))):
         return None
     if not all(f.can_regroup(change) for f in world.features if not (bound and f in bound.kept)):
         return None
@@ -104,7 +104,7 @@ def regroup(world: Any, edit: Edit, added: Particles | None) -> None:
     scene.particles, scene.inv_mass = change.now, change.inv_mass
     scene.state.regroup(memory, change)
     if scene.radius:
-        scene.radius.become(memory, change.now.radius)
+        scene.radius.assign(memory, change.now.radius)
     if scene.slots and not bound:
         scene.slots.regroup(memory, change)
     runner.team.regroup(count)
@@ -162,7 +162,9 @@ def grabbing(world: Any) -> Grab | None:
         inv_mass, some = inv_mass.copy(), _joined([before, after])
         inv_mass[before] = world._particles.inv_mass[before]
         inv_mass[after] = 0.0
-        if not scene.state.can_weigh(world._particles, inv_mass, some) or (runner.search and not runner.search.has_static):
+        if not scene.state.can_set_inverse_mass(world._particles, inv_mass, some) or (
+            runner.search and not runner.search.has_static
+        ):
             return None
         if any((inv_mass[b.indices] != scene.inv_mass[b.indices]).any() for b in runner.batches):
             return None
@@ -180,7 +182,7 @@ def grab(world: Any, change: Grab) -> None:
     if len(change.some):
         free = min(np.count_nonzero(inv_mass) for inv_mass in (scene.inv_mass, change.inv_mass))
         scene.inv_mass = change.inv_mass
-        scene.state.weigh(memory, particles, change.inv_mass, change.some)
+        scene.state.set_inverse_mass(memory, particles, change.inv_mass, change.some)
         if free < len(change.inv_mass) - 1:  # lists lack pairs in which neither particle can move
             runner.invalidate()
     if change.soft:

@@ -147,7 +147,7 @@ def change(
         told, (seen, loose, moved) = world._all_events(), _seen(world, some, number, features, restarts)
         if restarts:
             world._runner.restart_between(world.iterations)
-        world._clock.parted = None
+        world._clock.velocity_override = None
         edit_in_place.regroup(world, planned, added)
         world._runner.pass_on(world._runner.left, some)
         world._runner.wake()
@@ -165,7 +165,7 @@ def renew(world: Any) -> None:
     told = world._all_events() if runner.logs else world._events
     loose = grabbing.some[runner.scene.inv_mass[grabbing.some] == 0]
     loose = np.unique(loose) if len(loose) > 1 else loose
-    seen, moved = clock.parted, runner.scene.inv_mass > 0
+    seen, moved = clock.velocity_override, runner.scene.inv_mass > 0
     had = None
     if seen is not None:
         had = seen[loose]
@@ -180,8 +180,8 @@ def renew(world: Any) -> None:
     world._events = told
     if had is not None:
         impulse.let_go(runner, loose, had, world.iterations)
-    if clock.parted is not None:
-        clock.parted = _held(runner, clock.parted, moved)
+    if clock.velocity_override is not None:
+        clock.velocity_override = _held(runner, clock.velocity_override, moved)
     for watcher in world._watchers:
         watcher.regrouped()
 
@@ -219,7 +219,7 @@ def _seen(
     it removes. Driven particles cannot move. restarts: whether displacements are about to become velocities.
     """
     loose, clock = np.zeros(len(some), dtype=bool), world._clock
-    loses = clock.parted is not None or (restarts and any(_holds(f) for f in world.features))
+    loses = clock.velocity_override is not None or (restarts and any(_holds(f) for f in world.features))
     for f in world.features:
         if isinstance(f, Pin) and f in features and f.needs_new_state:  # a pin that takes other particles
             if f.is_kinematic:
@@ -232,7 +232,7 @@ def _seen(
                     batch: Any = f
                     goes = ~np.broadcast_to(stays, f.count) & (batch.compliance == 0)
                     loose[f.indices.ravel()[goes[f.owner]]] = True
-    seen = clock.parted if clock.d_is_velocity or not loses else world.velocity
+    seen = clock.velocity_override if clock.d_is_velocity or not loses else world.velocity
     return seen, loose, world._runner.scene.inv_mass > 0
 
 
@@ -268,7 +268,7 @@ def _edited(
     if seen is not None:  # removed constraints contributed to the velocities of particles that remain
         seen = seen[some] if added is None else np.concatenate([seen[some], added.velocity])
         _let_go(world, seen, np.concatenate([loose[some], np.zeros(m, dtype=bool)]))
-        clock.parted = _held(world._runner, seen, np.concatenate([moved[some], np.ones(m, dtype=bool)]))
+        clock.velocity_override = _held(world._runner, seen, np.concatenate([moved[some], np.ones(m, dtype=bool)]))
     for watcher in world._watchers:
         watcher.regrouped()
 

@@ -20,7 +20,7 @@ from ..colliders.collider import Collider
 from ..features.feature import Acceleration
 from ..forces.gravity import Gravity
 from ..neighbours.periodic import Periodic
-from .clock import CHANGED, DIGITS, PARTED, room
+from .clock import CHANGED, DIGITS, PARTED, energy_limit
 from .diagnostics import EXTENT, KINETIC, REACH, STIFFNESS
 from .step_report import StepReport
 
@@ -41,7 +41,7 @@ def checked(world: "World", report: StepReport) -> StepReport:
         clock.bound = None
         return report
     bound: Any = clock.bound
-    gain = report.energy - room(bound, clock.kinetic, report.energy)
+    gain = report.energy - energy_limit(bound, clock.kinetic, report.energy)
     err = blur(world, sheet[EXTENT : EXTENT + world.particles.dim], sheet[REACH]) + sheet[STIFFNESS] / 4 * clock.kinetic
     if not gain > err:
         return report

@@ -98,18 +98,18 @@ class Displacements:
 
     def steer(
         self, want: np.ndarray, change: np.ndarray, seen: np.ndarray, had: np.ndarray, bare: np.ndarray, free: np.ndarray,
-        pulled: np.ndarray, rubs: bool, velocity: Callable[[], np.ndarray], h: Any, drag: np.ndarray,
+        pulled: np.ndarray, friction: bool, velocity: Callable[[], np.ndarray], h: Any, drag: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
         """Set velocities `want` as give() does, and end the reactions that the `change` of velocities or spins ends.
 
         Returns the share of each particle's contact reaction that ends, (worlds, n, 1), and in which worlds this succeeded,
         (worlds,). Velocities are (worlds, n, dim) [m/s]. seen: those that the user read last. had: those of the displacements,
         which differ from `seen` where a reaction has ended before. bare: without reactions. free: without the reactions of
-        contacts and walls. pulled: mask of particles that links which may go slack hold. rubs: whether there is friction. h,
+        contacts and walls. pulled: mask of particles that links which may go slack hold. friction: whether there is friction. h,
         drag: of each world.
         """
         leaning = had - free
-        over = _ratio(((had - seen) * leaning).sum(axis=2), leaning) + _ended(change, had - bare, rubs)
+        over = _ratio(((had - seen) * leaning).sum(axis=2), leaning) + _ended(change, had - bare, friction)
         share = np.where(self.some, np.clip(over, 0, 1)[..., None], 0.0)
         more = np.where(self.some, share * leaning, 0.0)
         r = (h * drag[:, 1] / drag[:, 3]).reshape(-1, 1, 1) * more
@@ -119,13 +119,13 @@ class Displacements:
         return share, found & self.give(want + more, velocity, factor(h, drag), had)
 
 
-def _ended(change: np.ndarray, leaning: np.ndarray, rubs: bool) -> np.ndarray:
+def _ended(change: np.ndarray, leaning: np.ndarray, friction: bool) -> np.ndarray:
     """Return the share of each particle's reaction that a change of velocity ends, (worlds, n). It may exceed 1.
 
     A change of LEANS of the reaction's velocity or more ends all of it: a change along the reaction or, with friction, in any
     direction. leaning: the velocity that reactions give in half a substep, (worlds, n, dim) [m/s].
     """
-    if rubs:
+    if friction:
         part = np.sqrt((change**2).sum(axis=2) * (leaning**2).sum(axis=2))
     else:
         part = np.abs((change * leaning).sum(axis=2))
@@ -138,7 +138,7 @@ def _ratio(part: np.ndarray, leaning: np.ndarray) -> np.ndarray:
     return np.divide(part, square, out=np.zeros_like(square), where=square != 0)
 
 
-def rubs(runner: Any) -> bool:
+def has_friction(runner: Any) -> bool:
     """Whether contacts or walls have friction."""
     return any(c.has_friction for c in runner.step.contacts) or any(wall.has_friction for wall in runner.step.walls)
 
@@ -176,23 +176,23 @@ def steer(
     if first < end:
         rows, those = slice(first, end), _those(runner, first, chosen)
         with runner.memory.compiler():
-            had = seen if clock.parted is None else runner.velocity(iterations)
+            had = seen if clock.velocity_override is None else runner.velocity(iterations)
             free = runner.velocity(iterations, first, end, touches=False)[None]
             bare = runner.velocity(iterations, first, end, links=False, touches=False)[None] if runner.batches else free
             share, found = those.steer(
                 want[None, rows], change[None, rows], seen[None, rows], had[None, rows], bare, free,
-                pulled(runner, 1, lambda field: runner.memory.read(field)[None])[:, rows], rubs(runner),
+                pulled(runner, 1, lambda field: runner.memory.read(field)[None])[:, rows], has_friction(runner),
                 lambda: runner.velocity(iterations, first, end)[None], clock.h, drag,
             )  # fmt: skip
         if not found[0]:
             return False
-        turn_on(runner, first, share[0], spun)
+        restore_turn(runner, first, share[0], spun)
     runner.wake(np.flatnonzero(some))
-    clock.energy, clock.parted = None, want.copy()
+    clock.energy, clock.velocity_override = None, want.copy()
     return True
 
 
-def turn_on(runner: Any, first: int, share: np.ndarray, spun: np.ndarray | None = None) -> None:
+def restore_turn(runner: Any, first: int, share: np.ndarray, spun: np.ndarray | None = None) -> None:
     """Give particles from `first` on back the part of friction's turn in half a substep that has ended. share: (m, 1).
 
     spun: the result of Runner.spin(), if it is known.

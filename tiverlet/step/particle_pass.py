@@ -106,7 +106,7 @@ class ParticlePass:
         """Integrate all particles."""
         for k in range(self.tile_count(now.thread)):
             first, end = self.tile_of(k, now.thread)
-            if self.state.stirs(first, end) != 0:
+            if self.state.any_awake(first, end) != 0:
                 self.advance(first, end, now)
 
     @ti.func
@@ -172,12 +172,12 @@ class ParticlePass:
     def leave_walls(self, i, now):
         """Move particle i out of the walls, without friction and bounces. Returns the move [m]."""
         d = self.state.d[i]
-        before, wall_push = self.traces(i)
+        before, wall_push = self.wall_values(i)
         moving = True
         for _ in range(SWEEPS):
             if moving:
                 moving = not self.touch_all(i, now.h, now.frame_fraction, BEFORE_CONTACTS)
-        self.leave_traces(i, before, wall_push)
+        self.restore_wall_values(i, before, wall_push)
         return self.state.d[i] - d
 
     @ti.func
@@ -216,7 +216,7 @@ class ParticlePass:
         if ti.static(self.acts):
             for k in range(self.tile_count(now.thread)):
                 begin, end = self.tile_of(k, now.thread)
-                if self.state.stirs(begin, end) != 0:
+                if self.state.any_awake(begin, end) != 0:
                     self.move(begin, end, now)
         self.team.wait()
 
@@ -324,7 +324,7 @@ class ParticlePass:
                 for k in range(SWEEPS + ROUNDS + 1):
                     if moving:
                         if k == SWEEPS + ROUNDS:
-                            self.stay(i)
+                            self.cancel_move(i)
                         settled = self.touch_all(i, h, frame_fraction, mode)
                         # A round with friction or bounces may return to where it began, although the particle is in a wall there.
                         moving = not (settled and (mode == FRICTIONLESS or ti.static(not self.rough)))
@@ -341,7 +341,7 @@ class ParticlePass:
         return (self.state.d[i] == d).all() and (self.state.x[i] == x).all()
 
     @ti.func
-    def traces(self, i):
+    def wall_values(self, i):
         """Return the values of particle i that walls change, besides its position and displacement."""
         before = wall_push = ti.zero(self.state.d[i])
         if ti.static(self.state.befores):
@@ -351,8 +351,8 @@ class ParticlePass:
         return before, wall_push
 
     @ti.func
-    def leave_traces(self, i, before, wall_push):
-        """Restore the values of particle i that traces() returned."""
+    def restore_wall_values(self, i, before, wall_push):
+        """Restore the values of particle i that wall_values() returned."""
         if ti.static(self.state.befores):
             self.state.before[i] = before
         if ti.static(self.state.keeps_wall_push):
@@ -374,21 +374,21 @@ class ParticlePass:
         d_low = ti.zero(d)
         if ti.static(self.state.carries):
             d_low = self.state.d_low[i]
-        before, wall_push = self.traces(i)
+        before, wall_push = self.wall_values(i)
         self.state.d[i] = move
         moving = True
         for k in range(ROUNDS + 1):
             if moving:
                 if k == ROUNDS:
-                    self.stay(i)
+                    self.cancel_move(i)
                 moving = not self.touch_all(i, 0 * d[0], ti.Vector([0, 0], self.real), FRICTIONLESS)
         self.state.d[i] = d
         if ti.static(self.state.carries):
             self.state.d_low[i] = d_low
-        self.leave_traces(i, before, wall_push)
+        self.restore_wall_values(i, before, wall_push)
 
     @ti.func
-    def stay(self, i):
+    def cancel_move(self, i):
         """Move particle i back to where it was at the start of the substep, at rest."""
         if ti.static(self.state.starts):
             if ti.static(self.state.befores):

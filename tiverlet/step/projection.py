@@ -161,8 +161,8 @@ def _leaning(runner: "Runner", rows: "Rows", share: float) -> "Rows":
     normal = _units(stopped - sent)
     runner.scene.state.put(runner.memory, rows.x)
     along = np.linalg.norm(push - (push * normal).sum(axis=1)[:, None] * normal, axis=1)
-    rubs = any(w.has_friction for w in runner.step.walls)
-    return rows.leaning(normal, push, share, rubs & (along > GRIP * np.linalg.norm(push, axis=1)))
+    friction = any(w.has_friction for w in runner.step.walls)
+    return rows.leaning(normal, push, share, friction & (along > GRIP * np.linalg.norm(push, axis=1)))
 
 
 def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: Aims) -> tuple["Rows", np.ndarray]:

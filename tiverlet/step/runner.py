@@ -12,7 +12,7 @@ from ..device.interrupts import deferred_signals
 from ..device.patches.compiler import CachedLaunch
 from ..particles.spin import moments_of_inertia
 from . import high_order, initial_shape, initial_violation
-from .clock import Clock, slack
+from .clock import Clock, initial_margin
 from .contact_rows import ContactRows
 from .diagnostics import BARE, EXTENT, STARTED, STEPPED, UNSTEPPED
 from .frames import Frames
@@ -124,7 +124,7 @@ class Runner:
                     report = self.report()
                     if not clock.tick:
                         extent = self._data[EXTENT : EXTENT + self.step.dim]
-                        clock.begin_with(report.energy, slack(self.scene.inv_mass, extent, clock.h))
+                        clock.begin_with(report.energy, initial_margin(self.scene.inv_mass, extent, clock.h))
                     self.set_initial_figures(report.energy, report.overlap)
                 else:
                     clock.energy = float(self._data[0])
@@ -199,7 +199,7 @@ class Runner:
             with self.memory.compiler():
                 semi_iteration.prepare(iterations)
         clock = self.clock
-        span, started = clock.counted(dt), clock.d_is_velocity and substeps * self.integrator.stages == 1
+        span, started = clock.next_frame(dt), clock.d_is_velocity and substeps * self.integrator.stages == 1
         if not (self.sleep and self.sleep.rests):
             self.run(substeps if self.n else 0, iterations, span[0] + span[1] * span[2], STARTED if started else STEPPED)
         clock.advance(substeps, span, started)
@@ -293,8 +293,8 @@ class Runner:
         """
         clock = self.clock
         if not clock.d_is_velocity:
-            if clock.parted is not None or self.bounces:
-                held, seen = (self.scene.inv_mass == 0)[:, None], clock.parted
+            if clock.velocity_override is not None or self.bounces:
+                held, seen = (self.scene.inv_mass == 0)[:, None], clock.velocity_override
                 seen = self.velocity(iterations) if seen is None else seen
                 self.start(np.where(held, self.memory.read(self.scene.state.d)[: self.n] / clock.h, seen))
             elif self.probe:
@@ -303,7 +303,7 @@ class Runner:
                 self._turned[:] = clock.h, clock.time
                 self._to_velocity()
                 clock.owed = (clock.drag or FREE)[3] * clock.h
-            clock.d_is_velocity, clock.parted = True, None
+            clock.d_is_velocity, clock.velocity_override = True, None
 
     def start(self, velocity: np.ndarray) -> None:
         """Make the next substep a start from these velocities, (n, dim), and the present spins; with memory.compiler()."""
@@ -311,7 +311,7 @@ class Runner:
         if state.spins and not clock.d_is_velocity:
             self.memory.write(state.spin.s, self.spin())
         state.start(self.memory, velocity)
-        clock.d_is_velocity, clock.owed, clock.parted = True, 0.0, None
+        clock.d_is_velocity, clock.owed, clock.velocity_override = True, 0.0, None
 
     def restart_between(self, iterations: int) -> None:
         """Call restart() between frames, and keep the data from which residuals of the last substep are computed."""

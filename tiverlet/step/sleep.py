@@ -118,7 +118,7 @@ class Sleepers:
         return at(self.asleep, i) == 0
 
     @ti.func
-    def stirs(self, begin, end):
+    def any_awake(self, begin, end):
         """Return 1 if any block of particles from `begin` up to `end` contains an awake particle, else 0."""
         out = 0
         for b in range(begin // BLOCK, (end + (BLOCK - 1)) // BLOCK):
@@ -354,10 +354,10 @@ class SleepPass:
     def note_blocks(self):
         """Mark the blocks with an awake particle."""
         for b in range((self.n + (BLOCK - 1)) // BLOCK):
-            stirs = 0
+            awake = 0
             for i in range(b * BLOCK, ti.min((b + 1) * BLOCK, self.n)):
-                stirs |= ti.cast(self.sleepers.awake(i), ti.i32)
-            self.sleepers.blocks[b] = stirs
+                awake |= ti.cast(self.sleepers.awake(i), ti.i32)
+            self.sleepers.blocks[b] = awake
 
     @ti.func
     def call_touched(self, i, before):

@@ -29,7 +29,9 @@ class Clocks:
         # Lists, since these values rarely differ from world to world.
         self.drag = [clock.drag for clock in clocks]
         self.needs_drag = np.zeros(self.count, dtype=bool)
-        self.parted = {k: clock.parted for k, clock in enumerate(clocks) if clock.parted is not None}
+        self.velocity_override = {
+            k: clock.velocity_override for k, clock in enumerate(clocks) if clock.velocity_override is not None
+        }
 
     time: np.ndarray
     tick: np.ndarray
@@ -48,7 +50,7 @@ class Clocks:
         """Return the clock of world k."""
         out = Clock(**{name: getattr(self, name)[k].item() for name in PLAIN})
         since, length, count = self.frame[k].tolist()
-        out.frame, out.drag, out.parted = (since, length, int(count)), self.drag[k], self.parted.get(k)
+        out.frame, out.drag, out.velocity_override = (since, length, int(count)), self.drag[k], self.velocity_override.get(k)
         out.energy = float(self.energy[k]) if self.known[k] else None
         out.bound = None if np.isnan(self.bound[k]) else float(self.bound[k])
         out.first_moved = None if self.first_moved[k] == NONE else int(self.first_moved[k])
@@ -68,10 +70,10 @@ class Clocks:
         self.energy[k] = np.nan if clock.energy is None else clock.energy
         self.bound[k] = np.nan if clock.bound is None else clock.bound
         self.first_moved[k] = NONE if clock.first_moved is None else clock.first_moved
-        if clock.parted is None:
-            self.parted.pop(k, None)
+        if clock.velocity_override is None:
+            self.velocity_override.pop(k, None)
         else:
-            self.parted[k] = clock.parted
+            self.velocity_override[k] = clock.velocity_override
 
     def copy(self) -> "Clocks":
         """Return a copy, for return_to()."""
@@ -84,12 +86,12 @@ class Clocks:
         for k in map(int, some):
             self.needs_drag[k] |= self.drag[k] != other.drag[k]
             self.drag[k] = other.drag[k]
-            self.parted.pop(k, None)
-            if k in other.parted:
-                self.parted[k] = other.parted[k]
+            self.velocity_override.pop(k, None)
+            if k in other.velocity_override:
+                self.velocity_override[k] = other.velocity_override[k]
 
     def count_frame(self, dt: float, some: np.ndarray) -> None:
-        """Begin frames of length dt [s] in the worlds in the mask `some`, see Clock.counted(); the first of them is number 1."""
+        """Begin frames of length dt [s] in the worlds in the mask `some`, see Clock.next_frame(); the first is number 1."""
         new = some & (self.frame[:, 1] != dt)
         self.frame[new, 0], self.frame[new, 1], self.frame[new, 2] = self.time[new], dt, 0
 
@@ -102,4 +104,4 @@ class Clocks:
         self.started = started & (frames == 1)
         self.lacked = np.where(self.started, self.owed, 0.0)
         self.d_is_velocity = np.zeros(self.count, dtype=bool)
-        self.parted.clear()
+        self.velocity_override.clear()

@@ -19,7 +19,7 @@ from ..features.read_only import assign_whole_advice, read_only
 from ..particles import in_range
 from ..step import checkpoint, energy_bound, impulse
 from ..step import frames as kernel
-from ..step.clock import CHANGED, PARTED, SQUEEZED, room, slack
+from ..step.clock import CHANGED, PARTED, SQUEEZED, energy_limit, initial_margin
 from ..step.diagnostics import ENERGY, EXTENT, KINETIC, OVERLAP, REACH, STARTED, STEPPED, STIFFNESS, TURNS, UNSTEPPED, risks
 from ..step.integrator import shares_of
 from ..world import World
@@ -225,7 +225,7 @@ class Worlds:
             clocks.energy[unknown], clocks.known[unknown] = energy, True
             placed = clocks.first_moved[unknown] != NONE
             first = placed & (clocks.tick[unknown] == 0)
-            more = slack(runner.scene.inv_mass, figures[:, EXTENT : EXTENT + world.particles.dim], h)
+            more = initial_margin(runner.scene.inv_mass, figures[:, EXTENT : EXTENT + world.particles.dim], h)
             works = clocks.bound[unknown] == CHANGED  # something does work in the coming frame
             clocks.bound[unknown] = np.where(works, CHANGED, np.where(first, energy + more, np.nan))
             clocks.kinetic[unknown] = np.where(first, 0.0, clocks.kinetic[unknown])
@@ -385,7 +385,7 @@ class Worlds:
             clocks.kinetic = np.maximum(np.where(unknown | changed, 0.0, clocks.kinetic), kinetic[:, k])
             clocks.bound = np.where(clocks.parting, np.maximum(clocks.bound, energy[:, k]), clocks.bound)
             clocks.parting = clocks.parting & (overlap[:, k] > PARTED)
-            gain[:, k] = energy[:, k] - room(clocks.bound, clocks.kinetic, energy[:, k])
+            gain[:, k] = energy[:, k] - energy_limit(clocks.bound, clocks.kinetic, energy[:, k])
         out = gain > 0
         for k in np.flatnonzero(out.any(1)):
             with self._as_world(k) as world:
@@ -549,10 +549,10 @@ class Worlds:
         out = runner.memory.read(runner.scene.state.d)[:, : runner.n].astype(np.float64)
         saved = runner.memory.read(runner.search.list.old_saved)[:, 0] if runner.search else np.zeros(len(self))
         alone = ~clocks.d_is_velocity & ((saved != 0) | bool(runner.probe))
-        for k, known in clocks.parted.items():
+        for k, known in clocks.velocity_override.items():
             out[k] = known
         there = clocks.d_is_velocity.copy()
-        there[list(clocks.parted)] = True
+        there[list(clocks.velocity_override)] = True
         alone &= ~there
         some = np.flatnonzero(~there & ~alone).astype(np.int32)
         if len(some):
@@ -597,7 +597,7 @@ class Worlds:
         if steered.any():
             some, memory, n = chosen[steered], runner.memory, runner.n
             for k in some:
-                clocks.parted.pop(int(k), None)
+                clocks.velocity_override.pop(int(k), None)
             want, seen, change, drag = velocity[steered], seen[steered], change[steered], drag[steered]
             inv_mass = [self._sources[k].inv_mass for k in some] if self._sources else runner.scene.inv_mass
             moves = change.any(axis=2) & (np.asarray(inv_mass) > 0)
@@ -607,16 +607,17 @@ class Worlds:
                 runner, moves, lambda field: memory.read(field)[some, :n], lambda field, v: memory.write_some(field, v, some)
             )
             with self._knobs.shown(0):
-                rubs, pulled = impulse.rubs(runner), impulse.pulled(runner, len(some), lambda field: memory.read(field)[some])
+                friction = impulse.has_friction(runner)
+                pulled = impulse.pulled(runner, len(some), lambda field: memory.read(field)[some])
             share, found = those.steer(
-                want, change, seen, had, bare, free, pulled, rubs, lambda: self._velocities()[some], clocks.h[some], drag
+                want, change, seen, had, bare, free, pulled, friction, lambda: self._velocities()[some], clocks.h[some], drag
             )
             for k, parts in zip(some[found], share[found], strict=True) if runner.scene.state.spins else ():
                 with self._as_world(k):
-                    impulse.turn_on(runner, 0, parts)
+                    impulse.restore_turn(runner, 0, parts)
             steered[steered] = found
             clocks.known[some] = False
-            clocks.parted.update((int(k), want[i]) for i, k in enumerate(some) if found[i])
+            clocks.velocity_override.update((int(k), want[i]) for i, k in enumerate(some) if found[i])
         fresh = moved & ~steered
         self._start_from(velocity[fresh], chosen[fresh])
 
@@ -631,7 +632,7 @@ class Worlds:
             memory.write_some(state.d_low, 0.0, chosen)
         clocks.d_is_velocity[chosen], clocks.known[chosen], clocks.owed[chosen] = True, False, 0.0
         for k in chosen:
-            clocks.parted.pop(int(k), None)
+            clocks.velocity_override.pop(int(k), None)
 
     @property
     def substeps(self) -> int:
@@ -738,7 +739,7 @@ class _Start:
                     with worlds._as_world(k):
                         runner.search.list.restore(*pairs)
         for log in runner.logs:
-            runner.memory.write_some(log.made, 0, chosen)
+            runner.memory.write_some(log.counter, 0, chosen)
         runner.invalidate(chosen)
         worlds._clocks.return_to(self.clocks, chosen)
         if runner.drags:

@@ -78,7 +78,7 @@ class ClusterPasses(Passes):
         """
         i = self.corners.members[e]
         move = ti.cast(self.state.d[i], ti.f64) - ti.cast(self.state.d[i0], ti.f64)
-        return ti.cast(self.state.apart(i, i0), ti.f64) - back * move
+        return ti.cast(self.state.separation(i, i0), ti.f64) - back * move
 
     @ti.func
     def law(self, c, h, h2_effective, fresh):

@@ -148,7 +148,7 @@ class CornerPasses(Passes):
         for k in ti.static(range(self.arity)):
             i = self.corners.member(c, k)
             j, split = self.corners.member(c, 0), self.slots.split[i]
-            move = self.state.slid(self.state.d[i] - self.state.d[j], i, j)
+            move = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j)
             if together != 0:
                 split = self.w.of(i) * (self.slots.begin[i + 1] - self.slots.begin[i])
             u += n[k, :].dot(move)
@@ -165,7 +165,10 @@ class CornerPasses(Passes):
         far = False
         if self.spring.is_rigid(c):
             u, W, longest, fastest = self.motion(c, n, together)
-            trust_radius, size = self.quantity.trust_radius(self.relative_corners.apart(c, 0)), self.equation.residual_scale(c)
+            trust_radius, size = (
+                self.quantity.trust_radius(self.relative_corners.relative_positions(c, 0)),
+                self.equation.residual_scale(c),
+            )
             new, far = self.limit.limit(c, lam, new, u, W, longest, fastest, trust_radius, size, share)
         return new, far
 
@@ -189,7 +192,7 @@ class CornerPasses(Passes):
             if split > 0 and self.spring.is_rigid(c):
                 spare = 2 * (violation - moved) ** 2 / split
                 if ti.static(self.limit.acts):
-                    most = TRUST * self.quantity.trust_radius(self.relative_corners.apart(c, 0)) / longest
+                    most = TRUST * self.quantity.trust_radius(self.relative_corners.relative_positions(c, 0)) / longest
             self.slots.system.limit_row(row, u, spare, most, lam - new)
         for k in ti.static(range(self.arity)):
             self.slots.system.set_gradient(self.corners.places[c][k], self.corners.member(c, k), g[k, :])
@@ -208,7 +211,9 @@ class CornerPasses(Passes):
             for k in ti.static(range(self.arity)):
                 w = self.w.of(self.corners.member(c, k))
                 move += w * w * n[k, :].dot(n[k, :])
-            new = self.limit.limit_collapse(lam, new, self.equation.rest[c], self.relative_corners.apart(c, 0).norm_sqr(), move)
+            new = self.limit.limit_collapse(
+                lam, new, self.equation.rest[c], self.relative_corners.relative_positions(c, 0).norm_sqr(), move
+            )
         step = new - lam
         if ti.static(self.semi_iterates):
             last, wanted = self.step[c], new
@@ -288,7 +293,7 @@ class CornerPasses(Passes):
     @ti.func
     def weigh_load(self, c):
         """At the end of a window: call KnownLoad.record_body_load()."""
-        _, g = self.quantity.remeasure(c, self.relative_corners.apart(c, 0))
+        _, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
         _, _, most, _ = self.motion(c, g, 0)
         own = ti.cast(0, self.real)
         for k in ti.static(range(self.arity)):
@@ -298,7 +303,7 @@ class CornerPasses(Passes):
     @ti.func
     def learn_load(self, c, h):
         """After weigh_load(): call KnownLoad.learn()."""
-        _, g = self.quantity.remeasure(c, self.relative_corners.apart(c, 0))
+        _, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
         _, W, _, fastest = self.motion(c, g, 0)
         self.known.learn(c, h * h * W, self.equation.residual_scale(c), ti.sqrt(fastest))
 
@@ -341,11 +346,11 @@ class CornerPasses(Passes):
 
         Rigid links get their force in the next substep, except for the load that they know.
         """
-        f, g = self.quantity.remeasure(c, self.relative_corners.apart(c, 0))
+        f, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
         f = self.quantity.unwrap(f, self.equation.rest[c])
         f0, w = f, ti.cast(0, self.real)
         if ti.static(self.spring.damped):
-            f0, _ = self.quantity.remeasure(c, self.relative_corners.apart(c, 1))
+            f0, _ = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 1))
         for k in ti.static(range(self.arity)):
             w += self.w.of(self.corners.member(c, k)) * g[k, :].dot(g[k, :])
         force = self.equation.spring_force(c, f, self.quantity.unwrap(f0, f), w, h)
@@ -359,15 +364,15 @@ class CornerPasses(Passes):
     def note_spring_turn(self, c):
         """Record how far a spring turned. A spring without rest length is left out, since it passes through length 0."""
         if not self.spring.is_rigid(c) and (ti.static(not self.equation.cusp) or self.equation.rest[c] != 0):
-            f, g = self.quantity.remeasure(c, self.relative_corners.apart(c, 0))
-            f0, n = self.quantity.remeasure(c, self.relative_corners.apart(c, 1))
+            f, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
+            f0, n = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 1))
             if self.quantity.direction_reliable(f, f0):
                 self.slots.record_turn(self.slots.classify_turn((g * n).sum(), g.norm() * n.norm()))
 
     @ti.func
     def push_reaction(self, c, h, firm, soft):
         """Push h^2 w_j F grad_j C, with F of Equation.reaction(); nothing if the multiplier contains an impact, which is over."""
-        f, g = self.quantity.remeasure(c, self.relative_corners.apart(c, 0))
+        f, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
         w, W = ti.cast(0, self.real), ti.cast(0, self.real)
         if ti.static(self.spring.soft):
             f = self.quantity.unwrap(f, self.equation.rest[c])
@@ -403,7 +408,7 @@ class CornerPasses(Passes):
             past, unsure = self.strength.add_excess(c, c, lam, per_newton), 0 * lam
             if past > 0:
                 if ti.static(not (self.quantity.precise and self.state.carries)):
-                    _, g = self.quantity.remeasure(c, self.relative_corners.apart(c, 0))
+                    _, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
                     for k in ti.static(range(self.arity)):
                         if g[k, :].norm() > 0:
                             rounding = self.strength.rounding(c, self.corners.member(c, k), self.corners.member(c, 0))
@@ -418,7 +423,7 @@ class CornerPasses(Passes):
         W is computed from the current gradients alone: it cancels, unless the multiplier is bounded. Without gradients no pass
         reduces the violation, so all of it is left; a spring correctly exerts no force there.
         """
-        f, g = self.quantity.remeasure(c, self.relative_corners.apart(c, 0))
+        f, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
         f = self.quantity.unwrap(f, self.equation.rest[c])
         w, W, free = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
         for k in ti.static(range(self.arity)):
@@ -439,14 +444,14 @@ class CornerPasses(Passes):
         out = ti.cast(0, ti.f64)
         if ti.static(self.spring.soft):
             if self.equation.stores_energy(c):
-                f, _ = self.quantity.remeasure(c, self.relative_corners.apart(c, back))
+                f, _ = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, back))
                 out = self.equation.energy(c, f, self.weight(c), h2_effective, residual)
         return out
 
     @ti.func
     def weight(self, c):
         """Return sum_j w_j |grad_j f|^2 at the present positions."""
-        _, g = self.quantity.remeasure(c, self.relative_corners.apart(c, 0))
+        _, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
         w = ti.cast(0, self.real)
         for k in ti.static(range(self.arity)):
             w += self.w.of(self.corners.member(c, k)) * g[k, :].dot(g[k, :])

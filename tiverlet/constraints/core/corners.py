@@ -50,13 +50,13 @@ class FixedCorners:
             self.slots.move[place] = move
 
     @ti.func
-    def apart(self, c, back):
+    def relative_positions(self, c, back):
         """Return the corners of constraint c relative to the first, at x - back d: near the origin, where f32 loses no digits."""
         i = self.member(c, 0)
         q = ti.Matrix.zero(self.real, self.arity, self.state.dim)
         for k in ti.static(range(1, self.arity)):
             j = self.member(c, k)
-            r = self.state.apart(j, i) - back * self.state.slid(self.state.d[j] - self.state.d[i], j, i)
+            r = self.state.separation(j, i) - back * self.state.relative_displacement(self.state.d[j] - self.state.d[i], j, i)
             for a in ti.static(range(self.state.dim)):
                 q[k, a] = r[a]
         return q
@@ -69,7 +69,7 @@ class FixedCorners:
         start = now
         for k in ti.static(range(1, self.arity)):
             j = self.member(c, k)
-            r, moved = self.state.apart(j, i), self.state.slid(self.state.d[j] - self.state.d[i], j, i)
+            r, moved = self.state.separation(j, i), self.state.relative_displacement(self.state.d[j] - self.state.d[i], j, i)
             for a in ti.static(range(self.state.dim)):
                 now[k, a], start[k, a] = r[a] - 0 * moved[a], r[a] - moved[a]
         return now, start
@@ -138,4 +138,4 @@ class VariableCorners:
     def relative_position(self, e, i0, back):
         """Return corner e relative to particle i0, at x - back d."""
         i = self.members[e]
-        return self.state.apart(i, i0) - back * (self.state.d[i] - self.state.d[i0])
+        return self.state.separation(i, i0) - back * (self.state.d[i] - self.state.d[i0])

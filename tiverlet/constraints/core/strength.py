@@ -98,7 +98,7 @@ class Strength:
         particle from which positions are measured."""
         x = self.state.x[i]
         if ti.static(self.state.compensated):
-            x = self.state.apart(i, j)
+            x = self.state.separation(i, j)
         return self.rounding_scale[c] * x.norm()
 
     @ti.func
