@@ -65,7 +65,7 @@ def meeting(x, y, v, reach: float) -> tuple[int, int, np.ndarray]:
     return int(i), int(j), (r[i, j] + time[i, j] * v) / reach
 
 
-@pytest.mark.parametrize("e", [1e-9, 0.4, 1.0])
+@pytest.mark.parametrize("e", [0.0, 0.4, 1.0])
 @pytest.mark.parametrize("shape", [BAR, TRIANGLE, TETRAHEDRON], ids=["bar", "triangle", "tetrahedron"])
 def test_rigid_bodies_leave_by_newtons_law(world, shape, e):
     # Without forces, velocities before and after the impact are constant. The only error is the turn during a substep, omega h.
@@ -89,7 +89,57 @@ def test_rigid_bodies_leave_by_newtons_law(world, shape, e):
         w.close()
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+@pytest.mark.parametrize(
+    "wall", [tv.HalfSpace((0, 1)), tv.Polygon([(-4, -1), (4, -1), (4, 0), (-4, 0)])], ids=["plane", "polygon"]
+)
+def test_what_lands_upright_without_restitution_stays_down(world, wall, precision):
+    # A rod left the floor at 1/4 of its speed and a chain of ten links at 0.6, at any number of substeps: 0.7 and 1.7 m/s here.
+    # What is left is the sag of the links under the load, up to 2 g h (N - 1) / 2 for N particles.
+    for x, pairs in ((BAR, links(BAR)), (np.stack([np.zeros(11), 0.1 * np.arange(11)], axis=1), [(i, i + 1) for i in range(10)])):
+        for substeps in (8, 200):
+            w = world(
+                tv.Particles(x + (0, 0.32), velocity=(0.0, -2.0), radius=0.02), [tv.Gravity(9.81), tv.Distance(pairs), wall],
+                substeps=substeps, precision=precision,
+            )  # fmt: skip
+            speeds = [w.step(1 / 60) and w.velocity[:, 1].mean() for _ in range(30)]
+            assert max(speeds) < 9.81 * (len(x) - 1) / (60 * substeps) + 1e-5
+            assert w.velocity == pytest.approx(0, abs=1e-4) and w.position[0, 1] == pytest.approx(0.02, abs=1e-6)
+            w.close()
+
+
+def test_what_strikes_a_polygon_slides_on_as_on_a_plane(world):
+    # A struck particle that waits for its push in a polygon had lost what was left of its way along it: 0.75 m/s instead of 0.99.
+    walls = tv.HalfSpace((0, 1)), tv.Polygon([(-4, -1), (4, -1), (4, 0), (-4, 0)])
+    speeds = []
+    for wall in walls:
+        x = turned(BAR, 0.4)
+        w = world(
+            tv.Particles(x + (0, 0.32 - x[:, 1].min()), velocity=(0.0, -2.0), radius=0.02),
+            [tv.Gravity(9.81), tv.Distance(links(BAR)), wall], substeps=20, precision="f64",
+        )  # fmt: skip
+        w.run(0.2)
+        speeds.append(w.velocity)
+    assert speeds[0] == pytest.approx(speeds[1], abs=1e-9)
+
+
+@pytest.mark.parametrize("e", [0.0, 0.7])
+def test_chains_that_rub_and_strike_gain_no_energy(world, e):
+    # With the secant of one push, friction among several made chains gain 2.4 times their energy in a frame at e = 0.7; without
+    # restitution they gained 0.7 % of it, since links gave back what walls had stopped.
+    k, links_of_one = 8, np.stack([np.arange(7), np.arange(1, 8)], axis=1)
+    x = np.concatenate([turned(np.stack([np.zeros(k), 0.1 * np.arange(k)], axis=1), j) + (0.8 + 0.9 * j, 1.5) for j in range(6)])
+    v = np.repeat(np.random.default_rng(0).normal(0, 3, (6, 2)), k, axis=0)
+    features = [tv.Gravity(9.81), tv.Distance(np.concatenate([links_of_one + k * j for j in range(6)]))]
+    w = world(
+        tv.Particles(x, velocity=v, radius=0.02),
+        [*features, tv.Box((0, 0), (6.5, 4), restitution=e, friction=0.3)],
+        precision="f64",
+    )
+    energy = np.array([w.step(1 / 60).energy for _ in range(240)])
+    assert np.diff(energy).max() < 1e-3 * energy[0]
+
+
 @pytest.mark.parametrize("shape", [BAR, TRIANGLE, TETRAHEDRON], ids=["bar", "triangle", "tetrahedron"])
 def test_bodies_leave_each_other_by_newtons_law(world, shape):
     # The same of two bodies: J = (1 + e) times the speed at which they meet, over what 1 N s gives to both. At e = 1 the end of
@@ -136,7 +186,6 @@ def test_elastic_bodies_in_a_box_keep_their_energy_and_heaps_of_them_gain_none(w
         assert energy[-1] > 0.9 * energy[0] if e == 1 else (np.diff(energy) < 1e-3 * energy[0]).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("solver", [None, tv.Jacobi(), tv.ConjugateGradient(20)], ids=repr)
 def test_elastic_bodies_keep_their_energy_and_gain_none(world, solver):
     # Ten seconds in a box: exact solvers keep the energy, up to O(h) per impact; inexact ones may lose some.
@@ -163,11 +212,7 @@ def test_friction_takes_its_share_of_the_blow(world, e):
         [tv.Distance([(0, 1), (1, 2), (2, 0)]), tv.HalfSpace((0, 1), restitution=e, friction=mu)], substeps=100, precision="f64",
     )  # fmt: skip
     w.run(0.3)
-    after = w.velocity.mean(axis=0)
-    if e:
-        assert after == pytest.approx((v[0] + mu * (1 + e) * v[1], -e * v[1]), abs=0.02)
-    else:
-        assert after[0] == pytest.approx(v[0] + mu * v[1], abs=0.1)  # without restitution, the links take it in many substeps
+    assert w.velocity.mean(axis=0) == pytest.approx((v[0] + mu * (1 + e) * v[1], -e * v[1]), abs=0.02)
 
 
 def test_velocities_have_no_part_of_a_blow(world):
@@ -183,11 +228,11 @@ def test_velocities_have_no_part_of_a_blow(world):
     assert w.velocity[0, 1] > 1  # it has hit the floor
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    "solver, e", [(tv.Direct(), 0.0), (tv.Direct(), 0.7), (tv.Jacobi(), 0.7), (tv.ConjugateGradient(5), 0.0)], ids=repr
-)
-def test_all_paths_have_the_same_bits(world, solver, e):
+    "solver, e, on_walls",
+    [(tv.Direct(), 0.0, 0.0), (tv.Direct(), 0.7, 0.8), (tv.Jacobi(), 0.7, 0.8), (tv.ConjugateGradient(5), 0.0, 0.8)], ids=repr,
+)  # fmt: skip
+def test_all_paths_have_the_same_bits(world, solver, e, on_walls):
     x, pairs = row(5)
     bodies = np.concatenate([turned(x, 0.3 * k) + (0.5 + 0.7 * k, 0.6) for k in range(3)])
     pairs = np.concatenate([pairs + 5 * k for k in range(3)])
@@ -198,7 +243,7 @@ def test_all_paths_have_the_same_bits(world, solver, e):
     def run(path):
         w = world(
             tv.Particles(bodies, velocity=(1.0, -3.0), radius=0.04),
-            [tv.Gravity(), tv.Distance(pairs), contact(), tv.Box((0, 0), (3, 2), restitution=0.8, friction=0.3)],
+            [tv.Gravity(), tv.Distance(pairs), contact(), tv.Box((0, 0), (3, 2), restitution=on_walls, friction=0.3)],
             substeps=8, path=path, solver=solver,
         )  # fmt: skip
         w.run(1.0)
@@ -239,21 +284,21 @@ def test_what_is_struck_is_never_inside(world):
         assert (w.position >= -1e-12).all() and (w.position <= 2 + 1e-12).all()
 
 
-def test_the_impulse_of_an_impact_is_that_of_the_body(world):
+@pytest.mark.parametrize("e", [0.0, 0.5])
+def test_the_impulse_of_an_impact_is_that_of_the_body(world, e):
     # M (1 + e) v for a body of three particles that lands flat on two of them.
     w = world(
         tv.Particles([[0.0, 0.3], [0.4, 0.3], [0.2, 0.5]], velocity=(0.0, -1.5)),
-        [tv.Distance([(0, 1), (1, 2), (2, 0)]), tv.HalfSpace((0, 1), restitution=0.5, events=True)], substeps=20,
+        [tv.Distance([(0, 1), (1, 2), (2, 0)]), tv.HalfSpace((0, 1), restitution=e, events=True)], substeps=20,
         precision="f64",
     )  # fmt: skip
     total = 0.0
     for _ in range(30):
         w.step(1 / 60)
         total += w.wall_events().touches.impulse.sum()
-    assert total == pytest.approx(3 * 1.5 * 1.5, rel=0.01)
+    assert total == pytest.approx(3 * 1.5 * (1 + e), rel=0.01)
 
 
-@pytest.mark.slow
 def test_the_impulse_of_bodies_that_meet_is_told(world):
     # Two bars of two discs of 1 kg that meet head on at 2 m/s: 1 kg is their reduced mass, which gets (1 + e) 2 m/s.
     w = world(

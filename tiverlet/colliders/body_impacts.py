@@ -8,11 +8,10 @@ if TYPE_CHECKING:
     from ..features.feature import Batch, Scene
 
 # Passes over the constraints, at most, beside the regular ones of every substep: FEW where a system solves them, MANY where
-# impulses propagate from link to link. Most of the latter have little to do.
+# impulses propagate from link to link. One or two do where a system solves them exactly, and most of MANY have little to do.
 FEW, MANY = 8, 32
 MET = 2.0**-9  # of the first push: a smaller error of the normal displacement counts as met
-LIGHTEST = 2.0**-7  # the least share that a particle may have in the mass that its impact stops
-CAREFUL = 0.55  # the same if impacts of pairs may change each other: projections converge with steps of less than 1 / 0.5
+CAREFUL = 0.55  # the least secant of a pair. Impacts may change each other: projections converge with steps of less than 1 / 0.5
 FELT = 2.0**-20  # of a squared displacement: a smaller change is no impact
 STRUCK_NOW, STRUCK_BEFORE = 1, 2  # a particle is struck: in the pass in which it meets the wall or particle, and in later passes
 
@@ -28,40 +27,60 @@ def can_have_impacts(scene: "Scene", batches: "list[Batch]") -> bool:
     return bool(batches) and noted and scene.order == 2 and not scene.slots.semi_iteration
 
 
+def is_exact(scene: "Scene", batches: "list[Batch]") -> bool:
+    """Whether a pass satisfies all constraints up to rounding."""
+    system = scene.slots.system
+    return bool(scene.slots.exact and (not system or system.count_relaxed_alone(batches) == 0))
+
+
+def stops_bodies(scene: "Scene", batches: "list[Batch]") -> bool:
+    """Whether walls without restitution stop bodies as wholes: where one pass more does it, and anything is rigid."""
+    return is_exact(scene, batches) and any(b.rigid for b in batches)
+
+
 class BodyImpacts:
     """A linked particle that strikes a wall leaves it with -e times its normal velocity, and takes its body along.
 
-    Links take back part of the velocity that the wall gives to a single particle. So in a substep with such an impact there are
-    more passes, at most FEW or MANY, until two conditions hold. Constraints are met, as far as a pass meets them, and the struck
-    particle has the normal displacement t = -e d_n, with d_n that before the substep. So the impact is at the start of the
-    substep, and positions agree with displacements. In each pass the sum p >= 0 of all pushes on the particle is corrected,
+    A wall alone would stop the particle and not its body. The links would find that one substep later, take half of it back, and
+    so on: with y the height of the upper end of an upright rod above where the rod is unstrained, and d its displacement,
 
-        p' = max(p + (t - d.n) / s, 0),    s = (miss_last - miss) / push_last,    miss = t - d.n
+        y' = (y + d) / 2,    d' = (d - y) / 2,    eigenvalues (1 +- i) / 2.
 
-    where constraints are solved exactly: s is the part of the last push that they left, the secant of the particle's part of the
-    mass, and two or three passes suffice. Otherwise s = 1, since the violation that a pass leaves is still propagating; what the
-    last pass leaves is lost. All impacts of a substep together are Newton's law for a rigid body. At e = 1 it neither removes nor
-    adds energy; energy is conserved to O(h) in an impact, since a body turns in a substep. Friction holds the tangential
-    displacement by up to its coefficient times p.
+    This is a vibration with a period of eight substeps, whatever their length, and after a quarter of it the rod takes off, at a
+    quarter of its speed. So in a substep with such an impact there are more passes, at most FEW or MANY, until two conditions
+    hold. Constraints are met, as far as a pass meets them, and the struck particle has the normal displacement t = -e d_n, with
+    d_n that before the substep. So the impact is at the start of the substep, and positions agree with displacements. For e = 0,
+    t is that with which the particle ends the substep on the wall. After each pass the sum p >= 0 of all pushes on the particle
+    is corrected, p' = max(p + t - d.n, 0).
 
-    The first of these passes only records the violations that the regular passes left. The later passes leave these violations:
-    removed all at once, they would become speed. Contacts wait for the next substep. A particle that approaches by no more than
-    SLOW substeps of forces and links add does not bounce, see Surface.
+    Constraints take into account that the wall will do that: while p > 0, they have their gradients at the particle, and so its
+    part in the matrix, without the direction of the normal. So one pass suffices where they are solved exactly, for any body and
+    any number of struck particles; there is another one if a particle was struck by it or came free, and for e > 0, until what is
+    left of second order is small. What the last pass leaves is lost. All impacts of a substep together are Newton's law for a
+    rigid body. At e = 1 it neither removes nor adds energy; energy is conserved to O(h) in an impact, since a body turns in a
+    substep. Friction holds the tangential displacement by up to its coefficient times p.
+
+    These passes leave the violations that the regular passes left, and those of springs: removed all at once, they would become
+    speed. Contacts wait for the next substep. A particle that approaches by no more than SLOW substeps of forces and links add
+    does not take part, see Surface.
 
     Two particles that strike each other, at least one of them linked, obey the same law with the displacement of one relative to
     the other, along their normal; each takes its share of the push by mass. Both sides compute the same push before either
-    moves. A particle has one impact of this kind in a substep, on a wall or on a particle; in others it bounces alone.
+    moves. Constraints do not take it into account, so where they are solved exactly, the push is divided by the part s of the
+    last push that they left, the secant s = (miss_last - miss) / push_last with miss = t - d.n. A particle has one impact of this
+    kind in a substep, on a wall or on a particle; in others it bounces alone.
 
     open: for each pass beyond the regular ones of every substep, whether it is needed. pairs: whether particles strike each
     other.
     """
 
-    def __init__(self, scene: "Scene", batches: "list[Batch]", pairs: bool):
+    def __init__(self, scene: "Scene", batches: "list[Batch]", touches: bool, pairs: bool):
         system = scene.slots.system
         self.passes = FEW if system and not pairs else MANY
-        self.lightest = CAREFUL if pairs else LIGHTEST
         self.spreads = not system  # from link to link; a system solves all links at once
-        self.exact = bool(scene.slots.exact and (not system or system.count_relaxed_alone(batches) == 0))
+        self.exact = is_exact(scene, batches)
+        self.leaves = touches or not self.exact  # regular passes leave violations: by contacts, or because they do not converge
+        self.stops = stops_bodies(scene, batches)
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.state = scene.state
         self.rigid = add("impacts.rigid", n, kind=ti.i32)  # whether a rigid constraint holds it
@@ -69,7 +88,6 @@ class BodyImpacts:
         self.normal, self.moved = add("impacts.normal", n, width=dim), add("impacts.wall_moved", n, width=dim)
         self.coefficients = add("impacts.friction", n, width=2)
         self.target, self.pushed, self.first_push = (add(f"impacts.{k}", n) for k in ("target", "pushed", "first_push"))
-        self.last_push, self.last_miss = add("impacts.last_push", n), add("impacts.last_miss", n)
         self.held = add("impacts.held", n, width=dim)  # by friction
         self.logs: list[Any] = []  # of walls that report events
         self.log = add("impacts.log", n, kind=ti.i32)  # of the wall, by its number, or -1
@@ -80,6 +98,7 @@ class BodyImpacts:
             self.partner = add("impacts.partner", n, kind=ti.i32)  # the particle that was struck; -1 for a wall
             self.ready = add("impacts.ready", n, kind=ti.i32)  # whether it had struck nothing when the round of bounces began
             self.change = add("impacts.change", n, width=dim)
+            self.last_push, self.last_miss = add("impacts.last_push", n), add("impacts.last_miss", n)
 
     def add_log(self, log: Any) -> int:
         """Return the number of a log; -1 for None."""
@@ -95,7 +114,7 @@ class BodyImpacts:
 
     @ti.func
     def mark_linked(self, batch: ti.template(), c, h):  # type: ignore[valid-type]
-        """In the first pass: mark the particles that constraint c holds, if it is rigid for a substep h.
+        """At the start of a frame: mark the particles that constraint c holds, if it is rigid for a substep h.
 
         An impact is too short for other springs to act.
         """
@@ -114,7 +133,7 @@ class BodyImpacts:
     @ti.func
     def clear(self, i):
         """At the start of a substep: clear the marks of particle i."""
-        self.struck[i] = self.reached[i] = self.rigid[i] = 0
+        self.struck[i] = self.reached[i] = 0
 
     @ti.func
     def clear_requests(self):
@@ -134,13 +153,18 @@ class BodyImpacts:
         return self.open[now.it - now.span.iterations] != 0
 
     @ti.func
+    def is_extra_pass(self):
+        """Whether constraints are solved in an extra pass."""
+        return self.open[0] != 0
+
+    @ti.func
     def is_first_extra_pass(self):
-        """Whether this is the first extra pass, which only records the violations that constraints leave."""
+        """Whether constraints are solved in the first extra pass, which records the violations that the regular ones left."""
         return self.open[0] != 0 and self.open[1] == 0
 
     @ti.func
     def is_later_extra_pass(self):
-        """Whether this is a later extra pass."""
+        """Whether constraints are solved in a later extra pass."""
         return self.open[1] != 0
 
     @ti.func
@@ -150,19 +174,39 @@ class BodyImpacts:
             self.reached[i] = 1
 
     @ti.func
-    def is_reached(self, batch: ti.template(), c, h):  # type: ignore[valid-type]
-        """Whether constraint c is rigid for a substep h, and an impact has reached it."""
-        out = batch.dev.is_firm(c, h)
+    def is_reached(self, batch: ti.template(), c):  # type: ignore[valid-type]
+        """Whether an impact has reached constraint c."""
+        out = True
         if ti.static(self.spreads):
-            near = False
+            out = False
             for k in ti.static(range(batch.arity)):
-                near = near or self.reached[batch.dev.corners.member(c, k)] != 0
-            out = out and near
+                out = out or self.reached[batch.dev.corners.member(c, k)] != 0
         return out
 
     @ti.func
-    def record_impact(self, i, n, moved, target, static, dynamic, log):
-        """Record that a wall is to give particle i the normal displacement `target`, relative to the wall.
+    def is_held(self, i):
+        """Whether a wall holds the normal displacement of particle i, whatever constraints do."""
+        return self.struck[i] == STRUCK_BEFORE and self.by_wall(i) and self.pushed[i] > 0
+
+    @ti.func
+    def held_part(self, i, g):
+        """Return the part of the gradient g, of particle i, along which a wall holds the particle."""
+        out = 0 * g
+        if self.is_held(i):
+            out = g.dot(self.normal[i]) * self.normal[i]
+        return out
+
+    @ti.func
+    def wall_change(self, i):
+        """Return how far a wall that it struck has changed the displacement of particle i."""
+        out = 0 * self.normal[i]
+        if self.is_held(i):
+            out = self.pushed[i] * self.normal[i] - self.held[i]
+        return out
+
+    @ti.func
+    def record_impact(self, i, n, moved, target, leaving, static, dynamic, log):
+        """Record that a wall is to give particle i the normal displacement `target` instead of `leaving`, relative to the wall.
 
         n: normal of the wall. moved: motion of the wall. log: number of the log for the impulse. Returns whether a later pass
         does that. It does not if particle i has struck a wall before in this substep, nor in the last pass.
@@ -173,7 +217,7 @@ class BodyImpacts:
             if ti.static(self.pairs):
                 self.partner[i] = -1
             self.normal[i], self.moved[i], self.target[i] = n, moved, target
-            self.pushed[i] = self.last_push[i] = 0 * target
+            self.pushed[i], self.first_push[i] = 0 * target, target - leaving
             self.coefficients[i] = [static, dynamic]
             self.held[i] = ti.zero(n)
             self.log[i] = log
@@ -190,13 +234,22 @@ class BodyImpacts:
 
     @ti.func
     def correct_push(self, i):
-        """Push particle i, which struck a wall, towards its target, or correct the push. Returns whether its displacement was
-        off."""
+        """Push particle i, which struck a wall, to its target, or correct the push. Returns whether constraints have to follow.
+
+        Where they are solved exactly, they have taken into account that the wall holds it, if the wall held it before.
+        """
         off = False
         if self.struck[i] != 0 and self.by_wall(i):
-            n, d = self.normal[i], self.state.d[i] - self.moved[i]
-            off, push = self.missing_push(i, d.dot(n))
-            change, pushed = push * n, self.pushed[i]
+            n, d, last = self.normal[i], self.state.d[i] - self.moved[i], self.pushed[i]
+            miss = self.target[i] - d.dot(n)
+            pushed, change = ti.max(last + miss, 0), ti.max(miss, -last) * n
+            if self.struck[i] == STRUCK_NOW:  # another wall may have pushed it meanwhile
+                pushed, change = self.first_push[i], miss * n
+            self.struck[i] = STRUCK_BEFORE
+            self.pushed[i] = pushed
+            off = (pushed > 0) != (last > 0)
+            if ti.static(not self.exact) or self.target[i] > 0:
+                off = off or ti.abs(miss) > ti.static(MET) * self.first_push[i]
             for k in ti.static(range(len(self.logs))):
                 if self.log[i] == k:
                     self.logs[k].add(i, change)
@@ -214,7 +267,7 @@ class BodyImpacts:
 
     @ti.func
     def missing_push(self, i, has):
-        """Return whether the normal displacement `has` of particle i is off, and the push that it needs in this pass."""
+        """Return whether the normal displacement `has` of particle i, which struck another, is off, and the push it needs."""
         miss = self.target[i] - has
         if self.struck[i] == STRUCK_NOW:
             self.first_push[i] = miss
@@ -222,7 +275,7 @@ class BodyImpacts:
         part = 1 + 0 * miss
         if ti.static(self.exact):
             if self.last_push[i] != 0:
-                part = ti.max(ti.static(self.lightest), ti.min((self.last_miss[i] - miss) / self.last_push[i], 1))
+                part = ti.max(ti.static(CAREFUL), ti.min((self.last_miss[i] - miss) / self.last_push[i], 1))
         pushed = ti.max(self.pushed[i] + miss / part, 0)
         push = pushed - self.pushed[i]
         self.last_push[i], self.last_miss[i], self.pushed[i] = push, miss, pushed

@@ -127,13 +127,13 @@ class Moving(Collider):
         moved = self.dev.pose.place[2] + self.dev.pose.outward(2, first)
         e = self.dev.pose.inward(1, self.dev.state.d[i] - moved)
         close, lifted = ti.max(self.dev.state.digits(i), self.dev.shape.rounding(first)), False
-        if ti.static(self.dev.state.befores):
+        if ti.static(self.dev.state.lifts):
             # A particle that bounced in this substep is not where its displacement says.
             high, lift = self.dev.surface.bounced(i)
             lifted = high
             if high:
                 e += self.dev.pose.inward(1, lift)
-        a, going, touched = first, True, False
+        a, going, touched, deferred = first, True, False, False
         for k in range(TOUCHES + 1):
             if going:
                 s, depth, n = self.dev.shape.find_first_touch(a, e, contact_distance, close, self.push_out * h)
@@ -153,8 +153,10 @@ class Moving(Collider):
                         e += self.dev.pose.inward(1, shift) - s * e
                         if mode != ANY_DEPTH and depth <= self.dev.state.digits_along(i, out, radius):
                             e += ti.max(depth, 0) * n  # push() leaves rounding as it is; the way goes on along the surface
+                        if self.dev.surface.is_deferred(i):
+                            going, deferred = False, True
         if ti.static(self.dev.shape.may_miss_touches):
-            if touched and not self.dev.shape.is_penetrating(first, contact_distance - 8 * close, close):
+            if touched and not deferred and not self.dev.shape.is_penetrating(first, contact_distance - 8 * close, close):
                 going = going or self.dev.shape.is_penetrating(a + e, contact_distance - 4 * close, close)
                 if going and self.dev.shape.is_penetrating(a, contact_distance, close):
                     a = first

@@ -40,7 +40,8 @@ class Surface:
         self.has_friction, self.has_restitution = friction is not None, restitution is not None
         self.impacts: Any = scene.impacts
         # A particle with spin and friction bounces alone, since the extra passes do not change its spin.
-        self.has_impacts = self.has_restitution and scene.impacts is not None and not (scene.state.spins and friction)
+        self.has_impacts = bool(scene.impacts) and not (scene.state.spins and friction)
+        self.has_impacts = self.has_impacts and (self.has_restitution or scene.impacts.stops)
         self.log_number = self.impacts.add_log(log) if self.has_impacts else -1
         self.poses: list[Any] = []
         self.spins, self.turns, self.radius = scene.state.spins and self.has_friction, turns, scene.radius
@@ -90,7 +91,7 @@ class Surface:
     def bounced(self, i):
         """Whether particle i is not where its displacement says, because it bounced in this substep; and the offset [m]."""
         lift = 0 * self.state.d[i]
-        if ti.static(self.state.befores):
+        if ti.static(self.state.lifts):
             lift = self.state.place(i) - self.state.begin(i) - self.state.d[i]
         return lift.norm() > 4 * self.state.digits(i), lift
 
@@ -98,7 +99,7 @@ class Surface:
     def path(self, i, moved):
         """Return the path of particle i since the start of the substep, relative to a wall that moved by `moved`."""
         out = self.state.d[i] - moved
-        if ti.static(self.state.befores):
+        if ti.static(self.state.lifts):
             high, lift = self.bounced(i)
             if high:
                 out += lift
@@ -149,9 +150,8 @@ class Surface:
         close = self.state.digits_along(i, n, self.radius.of(i))
         if depth > -close:
             depth = ti.max(depth, ti.min(-leaving, close))
-        if ti.static(self.has_impacts):
-            if self.impacts.is_struck_now(i):
-                depth = ti.min(depth, 0)
+        if self.is_deferred(i):
+            depth = ti.min(depth, 0)
         if depth > ti.select(mode == ANY_DEPTH, 0, close):
             move = ti.max(depth - ti.max(start_depth - self.push_out * h, 0), 0)
             # Normal displacement after the substep. A particle that bounced may be moved further than its displacement changes.
@@ -159,16 +159,15 @@ class Surface:
             if not slides:
                 after = ti.min(after, ti.max(ti.abs(leaving), self.push_out * h))
             rise, left = 0 * depth, 1 + 0 * depth
-            if ti.static(self.has_restitution):
+            if ti.static(self.has_restitution or self.has_impacts):
                 # After an earlier bounce in this substep, the straight path to the present position begins at the height `gap`.
                 gap = -depth - leaving
                 if gap >= 0 and leaving < 0 and mode != FRICTIONLESS:
                     before = (self.state.before[i] - moved).dot(n)
                     if self.is_linked(i):
-                        bounces = self.restitution[None] > 0 and -before > ti.static(SLOW) * ti.abs(before - leaving)
-                        if self.defer_impact(i, n, moved, -self.restitution[None] * before, bounces, mode):
+                        if self.defer_impact(i, n, moved, leaving, before, after, mode):
                             move, after = 0 * depth, leaving
-                    else:
+                    elif ti.static(self.has_restitution):
                         rise, after, left = self.bounce(gap, leaving, before, after)
                 if mode == BEFORE_CONTACTS and rise > 0:  # a particle that bounces in this substep is not supported by the wall
                     move, rise, after = 0 * depth, 0 * depth, leaving
@@ -199,7 +198,7 @@ class Surface:
                     change -= slip
                     shift -= slip
             self.state.d[i] = self.state.d[i] + change
-            if ti.static(self.state.befores):
+            if ti.static(self.state.lifts):
                 impact = change  # an impact is no acceleration
                 if rise == 0:
                     impact -= (after - leaving) * n
@@ -220,13 +219,27 @@ class Surface:
         return out
 
     @ti.func
-    def defer_impact(self, i, n, moved, target, bounces, mode):
-        """Whether linked particle i is left where it is in this pass.
+    def is_deferred(self, i):
+        """Whether particle i is left inside of the wall until BodyImpacts pushes it."""
+        out = False
+        if ti.static(self.has_impacts):
+            out = self.impacts.is_struck_now(i)
+        return out
 
-        If it bounces, later passes give it the normal displacement `target`.
+    @ti.func
+    def defer_impact(self, i, n, moved, leaving, before, after, mode):
+        """Whether linked particle i is left where it is in this pass, since it strikes the wall, and BodyImpacts pushes it.
+
+        It is to leave with the restitution times its normal displacement before the substep. Without restitution it is to have
+        the normal displacement `after`, with which it stays on the wall.
         """
         out = False
         if ti.static(self.has_impacts):
+            bounces, target = ti.static(self.impacts.stops), after
+            if ti.static(self.has_restitution):
+                if self.restitution[None] > 0:
+                    bounces, target = True, -self.restitution[None] * before
+            bounces = bounces and -before > ti.static(SLOW) * ti.abs(before - leaving)
             static = dynamic = 0 * target
             if ti.static(self.has_friction):
                 static, dynamic = self.static(), self.dynamic()
@@ -235,7 +248,7 @@ class Surface:
             else:
                 self.impacts.cancel_bounce(i, n)
                 if bounces:
-                    out = self.impacts.record_impact(i, n, moved, target, static, dynamic, self.log_number)
+                    out = self.impacts.record_impact(i, n, moved, target, leaving, static, dynamic, self.log_number)
         return out
 
     @ti.func

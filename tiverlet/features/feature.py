@@ -297,6 +297,7 @@ class Batch(Feature):
 
     arity = 0  # 0: each constraint has any number, see VariableSize
     needs_reduce_block = False  # residual_of() needs reduce_block()
+    rigid = True  # whether any constraint is rigid
     soft = False  # has springs, which act at a start (the first substep after velocities were set)
     breaks = False  # has constraints that a load can break
     clusters = False  # preserves shapes, see members_of() and shape_of()

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from ..colliders.body_impacts import BodyImpacts, can_have_impacts
+from ..colliders.body_impacts import BodyImpacts, can_have_impacts, stops_bodies
 from ..colliders.collider import Collider
 from ..constraints.core.anchored import refuse_held_twice
 from ..contact.pair_contact import PairContact
@@ -162,21 +162,22 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
             state.carry(memory, particles)
         if scene.order > 2:
             high_order.check_solved(batches, scene, solver)
-    state.remember(
-        memory,
-        has_friction or any(w.needs_start_position for w in walls) or (bounces and bool(walls)),
-        bounces,
-        bool(contact and walls),
-    )
     size = size_of(path, scale.work)
     team = Team(memory, size, len(particles), path == "parallel" and size == 1, pieces=PIECES if contact else size)
     search = contact.make_search(scene, batches, team) if contact else None
     if can_have_impacts(scene, batches):
         pairs = bool(contact and contact.strikes_bodies)
-        if pairs or any(w.has_restitution for w in walls):
-            scene.impacts = BodyImpacts(scene, batches, pairs)
+        if pairs or any(w.has_restitution for w in walls) or (walls and stops_bodies(scene, batches)):
+            scene.impacts = BodyImpacts(scene, batches, bool(contact), pairs)
         if contact and pairs:
             contact.dev.restitution.bind(scene, scene.impacts)
+    state.remember(
+        memory,
+        has_friction or any(w.needs_start_position for w in walls) or (bounces and bool(walls)),
+        bounces or bool(scene.impacts),
+        bounces,
+        bool(contact and walls),
+    )
     for feature in of(Batch):
         feature.scene = scene  # also for those that do nothing, because all of their particles are held
     for feature in [*accelerations, *drivers, *batches, *walls]:

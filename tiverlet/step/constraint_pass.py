@@ -92,7 +92,7 @@ class ConstraintPass:
                     out = False
         for impacts in ti.static(self.impacts):
             if impacts.is_later_extra_pass() and out:
-                out = impacts.is_reached(f, c, now.h)
+                out = impacts.is_reached(f, c)
         return out
 
     @ti.func
@@ -114,7 +114,7 @@ class ConstraintPass:
         for f in ti.static(self.batches):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                 for impacts in ti.static(self.impacts):
-                    if now.first != 0:
+                    if now.s == 0 and now.first != 0:
                         impacts.mark_linked(f, c, now.h)
                 if self.takes_part(f, c, now):
                     f.dev.relax(c, now.h, h2_effective, now.frame_fraction, now.first, fresh)

@@ -159,7 +159,7 @@ class Launcher:
 
     def needs_newton_step(self, now: Moment) -> bool:
         """Whether there is only one pass. The host reads no result; if all systems are met, a second Newton step does nothing."""
-        return now.span.iterations == 1
+        return now.span.iterations == 1 and now.it == 0
 
     def solve_contacts(self, now: Moment) -> None:
         """Add the phase solve_contacts, if there are contacts."""

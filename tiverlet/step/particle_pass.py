@@ -134,6 +134,9 @@ class ParticlePass:
         for impacts in ti.static(self.impacts):
             for i in range(first, end):
                 impacts.clear(i)
+            if now.s == 0:
+                for i in range(first, end):
+                    impacts.rigid[i] = 0
         self.integrator.advance(first, end, now)
         for weights in ti.static(self.weights):
             if now.damps != 0:
@@ -190,22 +193,22 @@ class ParticlePass:
     def apply_constraints(self, now):
         """Apply the corrections of constraints to particles before contacts are solved, and check the neighbour list."""
         for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
-            self.gather(i, now.newton)
+            self.gather(i, now)
             for c in ti.static(self.contacts):
                 c.note_motion(self.search.moved_too_far(i), c.overshoots(i))
         self.team.wait()
 
     @ti.func
-    def gather(self, i, newton):
+    def gather(self, i, now):
         """Apply the corrections of constraints to particle i."""
         if self.state.awake(i):
             for impacts in ti.static(self.impacts):
                 d = self.state.d[i]
-                self.slots.gather(i, newton)
-                if impacts.is_later_extra_pass():
+                self.slots.gather(i, now.newton)
+                if now.it >= now.span.iterations:
                     impacts.mark_reached(i, self.state.d[i] - d)
             if ti.static(len(self.impacts) == 0):
-                self.slots.gather(i, newton)
+                self.slots.gather(i, now.newton)
 
     @ti.func
     def apply_corrections(self, now):
@@ -222,7 +225,7 @@ class ParticlePass:
         """Apply corrections to a tile of particles."""
         if ti.static(self.gathers):
             for i in range(begin, end):
-                self.gather(i, 0)
+                self.gather(i, now)
         if ti.static(self.knows_loads and len(self.walls) > 0):
             if now.first != 0:
                 self.undo_wall_moves(begin, end)
@@ -259,6 +262,8 @@ class ParticlePass:
         for impacts in ti.static(self.impacts):
             for i in range(begin, end):
                 if impacts.is_struck_now(i):
+                    if now.it + 1 >= now.span.iterations:
+                        impacts.correct_push(i)
                     impacts.request_pass(now)
         for c in ti.static(self.contacts):
             if now.checks_list != 0:

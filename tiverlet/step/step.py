@@ -56,7 +56,7 @@ def substep(do, now):
             this_pass = do.pass_of(now, half)
             if half % do.halves == 0:
                 for k in range(do.newton_steps):
-                    if k == 0 or do.needs_newton_step(now):
+                    if k == 0 or do.needs_newton_step(this_pass):
                         do.solve_constraints(this_pass.newton_step(k))
                         do.solve_systems(this_pass.newton_step(k))
                         do.update_multipliers(this_pass.newton_step(k))
@@ -439,10 +439,13 @@ class Step:
 
     @ti.func
     def needs_newton_step(self, now):
-        """Whether any system needs a second Newton step. With several iterations it does not: every pass is a Newton step."""
+        """Whether any system needs a second Newton step.
+
+        With several iterations it does not: every pass is a Newton step. In the extra passes of BodyImpacts walls come first.
+        """
         out = False
         if ti.static(self.newton_steps > 1):
-            out = now.span.iterations == 1 and self.slots.system.any_unmet[None] != 0
+            out = now.span.iterations == 1 and now.it == 0 and self.slots.system.any_unmet[None] != 0
         return out
 
     @ti.func

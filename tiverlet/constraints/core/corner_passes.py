@@ -13,6 +13,7 @@ from .spring import stiff
 from .step_limit import TRUST
 
 RESOLVED = 4.0  # alpha' / W: from this ratio on the substep resolves a spring
+HELD = 1 / 64  # of its weight: if walls leave less to a constraint in an impact, it does not take into account that they hold it
 LOST = 0.015  # relative violation at the start of a substep, beyond which its direction there would add energy
 FIRM = 0.99  # theta from which on a spring is rigid in an impact
 
@@ -51,7 +52,7 @@ class CornerPasses(Passes):
             self.step = add(f"{name}.step", m)
         self.known = KnownLoad(scene, name, batch)
         self.impacts: Any = scene.impacts
-        self.stores_left = bool(self.impacts) and not self.impacts.exact  # violations are left to the next substep
+        self.stores_left = bool(self.impacts) and self.impacts.leaves  # extra passes leave what the regular ones left
         if self.stores_left:
             self.left = add(f"{name}.left", m)  # the violation that the regular passes of the substep left
 
@@ -67,8 +68,10 @@ class CornerPasses(Passes):
         share = frame_fraction[1] - frame_fraction[0]
         violation, A, alpha, lam, W, n, g, turn, moved = self.linearise(c, h, h2_effective, share, first, fresh)
         step = ti.cast(1, self.real)
-        if ti.static(self.stores_left):
-            violation -= self.violation_left(c, violation, lam)
+        if ti.static(bool(self.impacts)):
+            if self.impacts.is_extra_pass():
+                violation -= self.violation_left(c, violation, lam, g, h)
+                W, g = self.held_by_walls(c, W, n, g)
         if ti.static(self.in_system):
             if self.row[c] >= 0:
                 self.fill_row(c, violation, A, alpha, lam, W, n, g, turn, moved, share)
@@ -251,17 +254,43 @@ class CornerPasses(Passes):
         return out
 
     @ti.func
-    def violation_left(self, c, violation, lam):
-        """Return the violation that the regular passes left.
+    def violation_left(self, c, violation, lam, g, h):
+        """Return the violation that an extra pass leaves: that which the regular passes left, and all of that of a spring.
 
-        It is 0 outside of the extra passes after impacts on walls, see BodyImpacts.
+        In the first extra pass, walls have already pushed what struck them.
         """
-        out = 0 * violation
-        if self.impacts.is_first_extra_pass():
-            self.left[c] = ti.select(ti.static(self.side == 0) or self.side * violation > 0 or lam != 0, violation, out)
-        if self.impacts.is_first_extra_pass() or self.impacts.is_later_extra_pass():
-            out = self.left[c]
+        out = violation
+        if self.is_firm(c, h):
+            out = 0 * violation
+            if ti.static(self.stores_left):
+                if self.impacts.is_first_extra_pass():
+                    if ti.static(self.side == 0) or self.side * violation > 0 or lam != 0:
+                        out = violation
+                        for k in ti.static(range(self.arity)):
+                            out -= g[k, :].dot(self.impacts.wall_change(self.corners.member(c, k)))
+                    self.left[c] = out
+                out = self.left[c]
         return out
+
+    @ti.func
+    def held_by_walls(self, c, W, n, g):
+        """Return the weight W and the gradients g without the directions in which walls hold corners that struck them.
+
+        A constraint whose corners cannot move otherwise keeps both.
+        """
+        free, held, all_of_it = g, 0 * W, 0 * W
+        for k in ti.static(range(self.arity)):
+            i = self.corners.member(c, k)
+            part = self.impacts.held_part(i, g[k, :])
+            held += self.slots.split[i] * part.dot(n[k, :])
+            all_of_it += self.slots.split[i] * g[k, :].dot(n[k, :])
+            for a in ti.static(range(self.state.dim)):
+                free[k, a] -= part[a]
+        if all_of_it - held > ti.static(HELD) * all_of_it:
+            W *= 1 - held / all_of_it
+        else:
+            free = g
+        return W, free
 
     @ti.func
     def known_violation(self, c, start, W, h, h2_effective):

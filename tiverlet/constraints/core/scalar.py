@@ -43,7 +43,7 @@ class Scalar(Batch):
     compliance = Knob(lambda f, v: checks.per_item(repr(f), "compliance", v, f.count, least=0.0), "Of springs.", force=True)
     damping = Knob(lambda f, v: checks.per_item(repr(f), "damping", v, f.count, least=0.0), "Of the dashpot.", force=True)
     break_at = Knob(strength_of, "Load beyond which a constraint breaks, (m,); None for never.")
-    compiled_for = ("soft", "damped", "breaks", "limited", "cusp", "capped")
+    compiled_for = ("soft", "rigid", "damped", "breaks", "limited", "cusp", "capped")
 
     each = ("rest", "compliance", "damping", "break_at")
     uploads_all = True
@@ -247,6 +247,11 @@ class Scalar(Batch):
         return bool((self.compliance > 0).any()) or "soft" in self.compiled_so_far
 
     @property
+    def rigid(self) -> bool:
+        """Whether any constraint of the batch has no compliance, or had none when kernels were compiled."""
+        return bool((self.compliance == 0).any()) or "rigid" in self.compiled_so_far
+
+    @property
     def damped(self) -> bool:
         """Whether any constraint has a dashpot, or had when kernels were compiled."""
         return self.soft and bool((self.damping > 0).any()) or "damped" in self.compiled_so_far
@@ -364,12 +369,10 @@ class Scalar(Batch):
             raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")
         if not self.acts:
             return np.zeros(self.count)
-        memory, missing = self.scene.memory, self.sagging
+        memory, missing, factors = self.scene.memory, self.sagging, self.scene.multipliers_per_newton
         known = memory.read(self.dev.equation.lam)[: self.count] - missing  # velocities contain it, as a spring force
-        scale = per_newton(self.scene.multipliers_per_newton, self.compliance, lambda: self.weights(self.scene.state.get(memory)))
-        return -scale * missing - np.divide(
-            known, self.scene.multipliers_per_newton[1], out=np.zeros(self.count), where=known != 0
-        )
+        scale = per_newton(factors, self.compliance, lambda: self.weights(self.scene.state.get(memory)))
+        return -scale * missing - np.divide(known, factors[1], out=np.zeros(self.count), where=known != 0)
 
     @property
     def _learns(self) -> bool:
