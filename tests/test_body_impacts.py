@@ -140,6 +140,7 @@ def test_chains_that_rub_and_strike_gain_no_energy(world, e):
     assert np.diff(energy).max() < 1e-3 * energy[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [BAR, TRIANGLE, TETRAHEDRON], ids=["bar", "triangle", "tetrahedron"])
 def test_bodies_leave_each_other_by_newtons_law(world, shape):
     # The same of two bodies: J = (1 + e) times the speed at which they meet, over what 1 N s gives to both. At e = 1 the end of
@@ -186,6 +187,7 @@ def test_elastic_bodies_in_a_box_keep_their_energy_and_heaps_of_them_gain_none(w
         assert energy[-1] > 0.9 * energy[0] if e == 1 else (np.diff(energy) < 1e-3 * energy[0]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [None, tv.Jacobi(), tv.ConjugateGradient(20)], ids=repr)
 def test_elastic_bodies_keep_their_energy_and_gain_none(world, solver):
     # Ten seconds in a box: exact solvers keep the energy, up to O(h) per impact; inexact ones may lose some.
@@ -228,6 +230,7 @@ def test_velocities_have_no_part_of_a_blow(world):
     assert w.velocity[0, 1] > 1  # it has hit the floor
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver, e, on_walls",
     [(tv.Direct(), 0.0, 0.0), (tv.Direct(), 0.7, 0.8), (tv.Jacobi(), 0.7, 0.8), (tv.ConjugateGradient(5), 0.0, 0.8)], ids=repr,
@@ -299,6 +302,7 @@ def test_the_impulse_of_an_impact_is_that_of_the_body(world, e):
     assert total == pytest.approx(3 * 1.5 * (1 + e), rel=0.01)
 
 
+@pytest.mark.slow
 def test_the_impulse_of_bodies_that_meet_is_told(world):
     # Two bars of two discs of 1 kg that meet head on at 2 m/s: 1 kg is their reduced mass, which gets (1 + e) 2 m/s.
     w = world(

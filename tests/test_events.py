@@ -42,6 +42,7 @@ def balls(x, v=0.0, m=1.0):
     )
 
 
+@pytest.mark.slow
 def test_a_bouncing_ball(world):
     # Dropped from H onto a static ball, and onto a floor: after k bounces v_k = e^k sqrt(2 g H), at
     # t_k = t_0 (1 + 2 (e + ... + e^k)). A bounce takes less than two substeps, so each begins and ends in the same frame. The
@@ -203,6 +204,7 @@ def staged(world, start, walls, g=5.0, wide=1.0, events=False, sensors=(), group
     return world(start, features, **({"substeps": 5, "precision": "f32-compensated"} | settings))
 
 
+@pytest.mark.slow
 def test_sensors_note_what_overlaps_and_touch_nothing(world):
     # The same bits as with groups that do not touch and without events. Sensors report the pairs that overlap at the current
     # positions, also without events of contacts.
@@ -259,6 +261,7 @@ def test_a_heap_leans_on_what_is_below(world):
     np.testing.assert_allclose(total, [m * g / 2, 3 * m * g / 2], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_recorded_cloned_edited(world, tmp_path, monkeypatch):
     path = tmp_path / "events.rrd"
     w, count = stage(world), 0

@@ -554,6 +554,7 @@ def test_stiffness_of_forces_is_that_of_the_stiffest(world, forces):
     assert abs(found / exact - 1) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_bodies_that_collide_or_fly_by_keep_their_energy(world, precision):
     # E(t) = E(0) up to what frames may miss. Only the stiffness of forces reveals these errors. Without it "auto" goes down to

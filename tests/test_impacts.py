@@ -34,6 +34,7 @@ def discs(
     return w
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim, precision, limit", [(2, "f64", 1e-12), (3, "f32", 1e-6)])
 def test_head_on_collisions(world, dim, precision, limit):
     # R14: v1 = (m1 u1 + m2 u2 - m2 e (u1 - u2)) / (m1 + m2), mass ratios 1 ... 1000. One pair per row, a group per e.

@@ -82,6 +82,7 @@ def hear(server, count: int) -> None:
     assert server.received.qsize() >= count
 
 
+@pytest.mark.slow
 def test_what_pages_ask_for_is_done_recorded_and_replayed(rope, server, tmp_path):
     live = Session(rope, server, title="<rope>", record=tmp_path / "play.rrd")
     start = rope.hash()

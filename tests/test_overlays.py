@@ -31,6 +31,7 @@ def column(path, entity, name):
     return [found[k] for k in sorted(found, key=lambda k: -1 if k is None else k) if found[k] is not None]
 
 
+@pytest.mark.slow
 def test_lines_are_as_wide_as_the_loads_they_show(tmp_path):
     # At rest the k-th contact from the top bears k m g, and lines are as wide as the loads.
     path = tmp_path / "a.rrd"

@@ -120,6 +120,7 @@ def moments(m: np.ndarray, x: np.ndarray, d: np.ndarray) -> list[float]:
     return [*(m @ d), *turn]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROWS)
 def test_a_constraint_does_what_all_constraints_do(world, name):
     row = ROWS[name]
@@ -242,6 +243,7 @@ def test_the_tables_hold_every_constraint():
     assert {name for name, row in ROWS.items() if not fields(row) <= plain} == {*OWN}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["Bend 3D", *OTHERS])
 def test_a_batch_is_its_constraints_and_a_clone_is_its_world(world, name):
     # Two constraints in one batch, the second one of a Row soft. Then each alone, among the particles of both: in a batch of its
@@ -296,6 +298,7 @@ def degenerate(row: Row) -> np.ndarray:
     return np.stack(cases + [row.points * s for s in (1e-30, 1e-20, 1e-13, 1e-11, 1e-6, 1e6, 1e14) if s < row.largest])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROWS)
 def test_nothing_explodes_where_a_constraint_has_no_direction(world, name):
     # Rows 15, 17, 54, 56: no NaN, and no particle moves further than its corners are apart, or than the constraint demands.
@@ -320,6 +323,7 @@ def test_nothing_explodes_where_a_constraint_has_no_direction(world, name):
             assert (moved <= 5 * size).all(), (np.argmax(moved / (size + 1e-300)), np.c_[moved, size])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("dim", "solver"),
     [(2, tv.Chebyshev()), (2, tv.ConjugateGradient()), (3, tv.Direct())],

@@ -67,6 +67,7 @@ def test_contacts_are_arrays(world):
     assert len(world(tv.Particles(x, radius=radius)).contacts) == 0
 
 
+@pytest.mark.slow
 def test_contacts_of_a_pinned_particle_that_another_has_left(world):
     # A pair with stored data stays on the list of the moving particle, however far that is; the pinned particle stores nothing.
     start = tv.Particles([(0.0, 0.0), (0.15, 0.0), (0.0, 0.3)], radius=0.1, pinned=[0], velocity=[(0, 0), (400.0, 0), (0, 0)])

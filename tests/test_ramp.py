@@ -14,6 +14,7 @@ def pendulum(world, *features, **options):
     return world(tv.Particles([[0.0, 0], [L, 0]], mass=M, pinned=[0]), [tv.Gravity(0.0), *features], **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Direct()], ids=str)
 def test_a_link_is_drawn_in_at_the_speed_of_the_frame(world, solver):
     # The rest length goes from L to 0.9 L in a frame, so the particle moves at u = 0.1 L / dt and has m u^2 / 2, for any number
@@ -103,6 +104,7 @@ def crowd(first=0):
     return tv.Particles(x, mass=0.1), features, turn
 
 
+@pytest.mark.slow
 def test_what_a_ramp_brings_in_does_not_depend_on_the_substep(world):
     # m (C / dt)^2 / 2 for each constraint. As jumps it would be m (C / h)^2 / 2, 64 times as much at 8 times the substeps.
     particles, features, turn = crowd()

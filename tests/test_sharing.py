@@ -288,6 +288,7 @@ def test_what_functions_of_the_user_know_is_part_of_the_structure(world):
         assert end(strength, table) == pytest.approx(np.cos(np.sqrt(strength * table[1]) * 0.2), abs=1e-5)  # cos(omega t)
 
 
+@pytest.mark.slow
 def test_worlds_of_many_kinds_take_few_trees(world, monkeypatch):
     # When there are many trees, the next tree has all fields that any has: most later worlds fit into it.
     def built(k):

@@ -65,6 +65,7 @@ def falls(w, i=0, frames=20):
     return np.linalg.norm(w.position[i] - before) > 0.02
 
 
+@pytest.mark.slow
 def test_a_row_that_was_never_disturbed_is_hit_to_the_bit(world):
     """Without gravity, a world with sleep has the bits of one without: discs at rest have no displacement to skip.
 
@@ -104,6 +105,7 @@ def test_against_a_world_that_never_rested(world):
     assert np.abs(a.velocity[:32]).max() > 0.1
 
 
+@pytest.mark.slow
 def test_bits_of_all_paths(world):
     """One thread, a team and the launched path agree on sleep, waking, spins and all events.
 
@@ -269,6 +271,7 @@ def yard(world):
     return w
 
 
+@pytest.mark.slow
 def test_what_wakes(world):
     """Every change by the user and every driven particle wakes. A force that depends on time wakes only what it begins to pull.
 
@@ -372,6 +375,7 @@ def test_what_sleeps_is_as_it_was_and_frames_cost_nothing(world):
     assert w.last.energy == state.energy and w.last.time == w.time == pytest.approx(state.time + 2.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [None, tv.Jacobi(), tv.ConjugateGradient()], ids=["direct", "jacobi", "conjugate"])
 def test_linked_particles(world, solver):
     """A rope at rest sleeps as a whole, with its loads, and wakes as a whole.
@@ -422,6 +426,7 @@ def square(side, center):
     return np.asarray(center) + side / 2 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
 
 
+@pytest.mark.slow
 def test_bodies_of_loops(world):
     """Two squares on each other and one beside them sleep, until a fourth falls on the two after sqrt(2 h / g).
 

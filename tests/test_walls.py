@@ -53,6 +53,7 @@ LEFT_OUT = {(name, dim, 0.7 if dim == 2 else 0.0) for name in ("box", "plane", "
 LEFT_OUT |= {("sdf", 2, 0.0), ("sdf", 3, 0.7), ("hollow", 2, 0.7)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", scenes(2))
 @pytest.mark.parametrize("dim", [2, 3])
 def test_no_particle_is_ever_inside(world, name, dim):
@@ -125,6 +126,7 @@ TIGHT = {
 TURNS = ("box", "corner", "wedge", "bowl")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TIGHT)
 def test_nothing_gets_out_whatever_takes_it_there(world, name):
     make, outside, moves = TIGHT[name]
@@ -371,6 +373,7 @@ def test_a_conveyor_takes_along_what_lies_on_it(world):
     assert w.position[0, 0] == pytest.approx(1.5 - slip / 2, abs=2e-3) and w.velocity[0, 0] == pytest.approx(1.0, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", scenes(2))
 @pytest.mark.parametrize("dim", [2, 3])
 def test_what_is_moved_between_substeps_stays_outside_too(world, name, dim):

@@ -99,6 +99,7 @@ SCENES = {
 NO_OTHERS = ("Chebyshev", "ConjugateGradient")  # their velocities are computed like those of "Direct"
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # warnings of corners that are off
 @pytest.mark.parametrize("name", SCENES)
 def test_each_has_the_bits_that_it_has_alone(taichi, name):
@@ -166,6 +167,7 @@ def give_room(many, pairs):
     return near
 
 
+@pytest.mark.slow
 def test_a_list_that_is_too_short_in_one_grows_in_all(taichi):
     # There is room for fewer pairs than there will be: some frames stop in the middle while others continue, in one launch.
     alone = [heap(k, 20) for k in range(3)]

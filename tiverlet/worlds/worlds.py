@@ -616,10 +616,8 @@ class Worlds:
                 runner, moves, lambda field: memory.read(field)[some, :n], lambda field, v: memory.write_some(field, v, some)
             )
             with self._knobs.shown(0):
-                friction, pulled = (
-                    impulse.has_friction(runner),
-                    impulse.pulled(runner, len(some), lambda field: memory.read(field)[some]),
-                )
+                friction = impulse.has_friction(runner)
+                pulled = impulse.pulled(runner, len(some), lambda field: memory.read(field)[some])
             share, found = those.steer(
                 want, change, seen, had, bare, free, pulled, friction, lambda: self._velocities()[some], clocks.h[some], drag
             )
