@@ -89,14 +89,6 @@ def refuse_deep(loops: list[np.ndarray], x: np.ndarray, first: int) -> None:
                 )
 
 
-def area_of(loop: np.ndarray) -> float:
-    """Return the area that a loop (k, 2) [m] encloses, positive if it is counterclockwise [m^2]."""
-    after = np.roll(loop, -1, axis=0)
-    v = loop - loop.mean(axis=0)
-    w = after - loop.mean(axis=0)
-    return float((v[:, 0] * w[:, 1] - v[:, 1] * w[:, 0]).sum()) / 2
-
-
 def depth_of(point: np.ndarray, loop: np.ndarray) -> tuple[float, float]:
     """Return how deep a point is inside of a loop [m], 0 outside, and the length of the nearest edge [m]."""
     a, b = loop, np.roll(loop, -1, axis=0)
