@@ -231,11 +231,8 @@ def test_velocities_have_no_part_of_a_blow(world):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "solver, e, on_walls",
-    [(tv.Direct(), 0.0, 0.0), (tv.Direct(), 0.7, 0.8), (tv.Jacobi(), 0.7, 0.8), (tv.ConjugateGradient(5), 0.0, 0.8)], ids=repr,
-)  # fmt: skip
-def test_all_paths_have_the_same_bits(world, solver, e, on_walls):
+@pytest.mark.parametrize("solver, e", [(tv.Direct(), 0.7), (tv.Jacobi(), 0.7), (tv.ConjugateGradient(5), 0.0)], ids=repr)
+def test_all_paths_have_the_same_bits(world, solver, e):
     x, pairs = row(5)
     bodies = np.concatenate([turned(x, 0.3 * k) + (0.5 + 0.7 * k, 0.6) for k in range(3)])
     pairs = np.concatenate([pairs + 5 * k for k in range(3)])
@@ -246,7 +243,7 @@ def test_all_paths_have_the_same_bits(world, solver, e, on_walls):
     def run(path):
         w = world(
             tv.Particles(bodies, velocity=(1.0, -3.0), radius=0.04),
-            [tv.Gravity(), tv.Distance(pairs), contact(), tv.Box((0, 0), (3, 2), restitution=on_walls, friction=0.3)],
+            [tv.Gravity(), tv.Distance(pairs), contact(), tv.Box((0, 0), (3, 2), restitution=0.8, friction=0.3)],
             substeps=8, path=path, solver=solver,
         )  # fmt: skip
         w.run(1.0)

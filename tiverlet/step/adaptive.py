@@ -87,14 +87,9 @@ class StepController:
     @property
     def memory(self) -> tuple:
         """The values on which the next frames depend."""
+        now = self.substeps, self.iterations, self.dt, self.wait
         failed = self.stuck != NOTHING or max(self.patience) > 1
-        return (
-            self.substeps,
-            self.iterations,
-            self.dt,
-            self.wait,
-            *((self.worst, *self.patience, *self.stuck) if failed else WELL),
-        )
+        return (*now, self.worst, *self.patience, *self.stuck) if failed else (*now, *WELL)
 
     @memory.setter
     def memory(self, value: tuple) -> None:
