@@ -24,8 +24,11 @@ PATH = np.array([[-0.4, 0.3, 0.1], [0.1, -0.2, 0.0], [0.6, 0.4, 0.3]])
 WINGS = np.array([[0.0, -0.1, 0.0], [0.9, 0.1, 0.1], [0.3, 0.8, 0.2], [0.5, -0.6, 0.4]])
 SPRING, SPRINGS = {"compliance": 1e-2, "damping": 1.0, "break_at": 1e6}, {"compliance": 3e-2, "damping": 3.0, "break_at": 1e5}
 SOFT, SOFTER, RIGID = ({"compliance": a, "damping": b} for a, b in ((1e-2, 1.0), (1e-3, 3.0), (0.0, 0.0)))
-SURFACE = {"friction": 0.5, "restitution": 0.5, "push_out": 1.0, "active": True, "events": False}
-SURFACES = {"friction": (0.2, 0.1), "restitution": 0.9, "push_out": 3.0, "active": False, "events": True}
+SURFACE2 = {"friction": 0.5, "restitution": 0.5, "push_out": 1.0, "active": True, "events": False, "surface_velocity": (0.0, 0.0)}
+SURFACES2 = {
+    "friction": (0.2, 0.1), "restitution": 0.9, "push_out": 3.0, "active": False, "events": True, "surface_velocity": (2.0, 0.0),
+}  # fmt: skip
+SURFACE, SURFACES = SURFACE2 | {"surface_velocity": (0.0, 0.0, 0.0)}, SURFACES2 | {"surface_velocity": (0.0, 0.0, 2.0)}
 BLOCK = np.array([6.0, 0.0, 0.0])  # from the particles of one row to those of the next
 LOCAL = ("center", "a", "b", "position", "target")  # settings that are positions, relative to the block
 
@@ -160,8 +163,8 @@ ROWS3 = {
 ROWS2 = {
     "Polygon": (
         lambda i, x, **k: tv.Polygon(SQUARE, **k), [[0, 1.12], [0.2, -0.95]],
-        {"radius": 0.01, "position": (0, 0), "rotation": 0.0} | SURFACE,
-        {"radius": 0.02, "position": (0, 0.03), "rotation": 0.05} | SURFACES,
+        {"radius": 0.01, "position": (0, 0), "rotation": 0.0} | SURFACE2,
+        {"radius": 0.02, "position": (0, 0.03), "rotation": 0.05} | SURFACES2,
     ),
     "Area, loops": (lambda i, x, **k: tv.Area([i], **k), LOOP, AREA | SPRING, {"rest": 0.4, "pressure": 1.3} | SPRINGS),
     "Polygons": (

@@ -57,7 +57,8 @@ def flat(precision="f32", **settings):
         tv.Pin([0], compliance=1e-4), tv.Pin([n + 4], (-0.8, 0.3)), tv.Path([n + 5], [(-1, 0.3), (0, 0.4), (1, 0.3)], at=0.4),
         tv.Path([n + 6], [(-0.5, 0.3), (0.5, 0.2)], smooth=False), tv.Snap([n + 7], 0.1, compliance=0.01),
         tv.Constraint(spacing, [(n + 2, n + 3)], rest=0.2), tv.Contact(friction={(0, 1): 0.3}, groups=[(0, 1), (0, 0)]),
-        tv.Box((-2, 0), (2, np.inf), friction=(0.4, 0.3)), tv.HalfSpace((0.1, 1), -0.5), tv.Ball((0.5, -0.2), 0.3),
+        tv.Box((-2, 0), (2, np.inf), friction=(0.4, 0.3)), tv.Ball((0.5, -0.2), 0.3),
+        tv.HalfSpace((0.1, 1), -0.5, friction=0.3, surface_velocity=(0.5, 0)),
         tv.Capsule((1.5, 0.1), (1.8, 0.3), 0.05, one_way=(0, 1)),
         tv.Polygon([(-2, -1), (2, -1), (2, 4), (-2, 4)], inside=True), tv.Sdf(bowl),
     ]  # fmt: skip

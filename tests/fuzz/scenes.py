@@ -418,6 +418,8 @@ def walls(draw, s: Stage) -> Call | None:
     up = np.eye(s.dim)[1]
     if kind in ("Capsule", "Polygon", "Mesh") and pick(draw, False, False, True):
         more["one_way"] = pick(draw, up, -up, up + 0.3)
+    if "friction" in more and pick(draw, False, False, True):
+        more["surface_velocity"] = pick(draw, np.zeros(s.dim), 2.0 * s.size * np.eye(s.dim)[0])
     if kind == "Box":
         return Call(kind, {"lower": low, "upper": high} | more)
     if kind == "HalfSpace":

@@ -22,7 +22,7 @@ class Ball(Collider):
 
     center: (dim,) [m], live: assign to it between frames, and the ball moves there during the next frame. radius: R [m], live: it
     changes at once, and particles that are then inside move out at push_out. inside: keep particles in. friction, restitution,
-    push_out, active, events: see Collider.
+    push_out, active, events, surface_velocity: see Collider.
 
     A particle that passes through in one substep is caught on the way in: the time when it met the surface is solved for, as for
     pairs. Nothing passes at any speed, and no force can pull a particle through.
@@ -38,12 +38,12 @@ class Ball(Collider):
 
     def __init__(
         self, center, radius, inside: bool = False, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float =
-        1.0, active: bool | None = None, events: bool = False,
+        1.0, active: bool | None = None, events: bool = False, surface_velocity=None,
     ):  # fmt: skip
         self.center = center
         self.inside = bool(inside)
         self.radius = radius
-        self.set_surface(friction, restitution, push_out, active, events)
+        self.set_surface(friction, restitution, push_out, active, events, surface_velocity=surface_velocity)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the dimension, and that particles fit in."""

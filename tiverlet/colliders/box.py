@@ -38,8 +38,8 @@ class Box(Collider):
     C(x) = x_k - lower_k - radius >= 0 and upper_k - x_k - radius >= 0, with unit gradients along axis k.
 
     lower, upper: (dim,) [m]; -inf and inf leave a side open. Live: assign to .lower or .upper between frames, and the walls move
-    there during the next frame (to or from an open side they jump). friction, restitution, push_out, active, events: see
-    Collider.
+    there during the next frame (to or from an open side they jump). friction, restitution, push_out, active, events,
+    surface_velocity: see Collider.
 
     One-sided: a particle cannot leave at any speed, and no force can pull it out.
     """
@@ -51,11 +51,11 @@ class Box(Collider):
 
     def __init__(
         self, lower, upper, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
-        None = None, events: bool = False,
+        None = None, events: bool = False, surface_velocity=None,
     ):  # fmt: skip
         self.lower = lower
         self.upper = upper
-        self.set_surface(friction, restitution, push_out, active, events)
+        self.set_surface(friction, restitution, push_out, active, events, surface_velocity=surface_velocity)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the corners against the dimension and the widest particle."""

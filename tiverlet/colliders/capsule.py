@@ -28,7 +28,7 @@ class Capsule(Collider):
     C(x) = |x - q| - (R + r) >= 0 with q the nearest point of the segment; grad C = (x - q) / |x - q|.
 
     a, b: (dim,) [m], live: the ends move to assigned places during the next frame. radius: R [m], above 0,
-    live: it changes at once. friction, restitution, push_out, active, events, one_way: see Collider.
+    live: it changes at once. friction, restitution, push_out, active, events, surface_velocity, one_way: see Collider.
 
     A particle that passes through in one substep is caught on the way in, however thin the rod. Its path relative to the rod is
     followed to where it meets the surface (sphere tracing, Hart 1996). No force can pull a particle through either.
@@ -40,11 +40,11 @@ class Capsule(Collider):
 
     def __init__(
         self, a, b, radius, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
-        None = None, events: bool = False, one_way=None,
+        None = None, events: bool = False, surface_velocity=None, one_way=None,
     ):  # fmt: skip
         self.a, self.b = a, b
         self.radius = radius
-        self.set_surface(friction, restitution, push_out, active, events, one_way, len(self.a))
+        self.set_surface(friction, restitution, push_out, active, events, one_way, len(self.a), surface_velocity=surface_velocity)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the dimension."""

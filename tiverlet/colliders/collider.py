@@ -51,7 +51,9 @@ class Collider(Feature):
     start of the substep, for whatever reason, is let through until it is free. Fixed, and turned with the wall. Only the position
     of a particle decides; nothing else is remembered. Capsule, Polygon and Mesh take it; None is a wall for both sides.
 
-    A conveyor is a long Capsule or Polygon with friction that is moved along itself: its place is assigned before each frame.
+    surface_velocity: (dim,) [m/s], of the surface relative to the wall, for conveyor belts: the wall stays where it is, and
+    friction carries along what lies on it. In the axes of the world; the part along the normal is left out. Live; 0 is a belt at
+    rest. It needs friction. Nothing falls asleep while a surface moves.
     """
 
     friction = Knob(lambda f, v: _friction(f, v), "A number, or (static, dynamic, rolling, twisting).")
@@ -59,7 +61,8 @@ class Collider(Feature):
     active = Knob(lambda f, v: checks.flag(repr(f), "active", v), "Whether it is there.")
     push_out = Knob(lambda f, v: checks.number(repr(f), "push_out", v, least=0.0), "[m/s].", compiled=True)
     events = Knob(lambda f, v: checks.flag(repr(f), "events", v), "Whether World.wall_events() tells of it.", compiled=True)
-    compiled_for = ("has_friction", "has_restitution", "has_switch", "turns")
+    surface_velocity = Knob(lambda f, v: _surface_velocity(f, v), "Of the surface relative to the wall, (dim,) [m/s].")
+    compiled_for = ("has_friction", "has_restitution", "has_switch", "has_surface_velocity", "turns")
     host_only = ("widest",)
     one_way: Any = None  # unit vector along which particles pass
     _switch = False  # whether `active` was given
@@ -71,10 +74,11 @@ class Collider(Feature):
 
     def set_surface(
         self, friction: Any, restitution: Any, push_out: float, active: bool | None, events: bool = False, one_way: Any = None,
-        dim: int = 0,
+        dim: int = 0, surface_velocity: Any = None,
     ) -> None:  # fmt: skip
         """Check and store the arguments that all walls have; one_way in dim axes."""
         self.friction, self.restitution, self.push_out, self.events = friction, restitution, push_out, events
+        self.surface_velocity = surface_velocity
         if one_way is not None:
             self.one_way = self._direction(one_way, dim)
         self._switch, self.active = active is not None, True if active is None else active
@@ -111,6 +115,16 @@ class Collider(Feature):
         return max(rub.rolling, rub.twisting, self._bounce.tangential) > 0 or "turns" in self.compiled_so_far
 
     @property
+    def has_surface_velocity(self) -> bool:
+        """Whether the surface has a velocity, if only 0, or had when kernels were compiled."""
+        return self.surface_velocity is not None or "has_surface_velocity" in self.compiled_so_far
+
+    @property
+    def does_work(self) -> bool:
+        """Whether the surface moves, by which friction may add energy."""
+        return self.surface_velocity is not None and bool(self.surface_velocity.any())
+
+    @property
     def _bounce(self) -> Bounce:
         return restitution_of(repr(self), "restitution", self.restitution)
 
@@ -137,13 +151,24 @@ class Collider(Feature):
         both = friction_of(repr(self), "friction", self.friction) if self.has_friction else None
         restitution, active = self._bounce if self.has_restitution else None, self.active if self.has_switch else None
         self.dev.log = WallLog(scene, repr(self)) if self.events else None
+        velocity = self._velocity(scene.particles.dim) if self.has_surface_velocity else None
+        if velocity is not None and both is None:
+            raise ValueError(f"{self!r}: surface_velocity moves nothing without friction. Give friction above 0 too.")
         self.dev.surface = Surface(
-            scene, repr(self), both, restitution, self.push_out, active, self.turns, self.dev.log, self.one_way
+            scene, repr(self), both, restitution, self.push_out, active, self.turns, self.dev.log, self.one_way, velocity
         )
 
+    def _velocity(self, dim: int) -> np.ndarray:
+        """Return the velocity of the surface, (dim,) [m/s]."""
+        given = self.surface_velocity
+        return np.zeros(dim) if given is None else checks.vector(repr(self), "surface_velocity", given, dim)
+
     def upload(self) -> None:
-        """Write friction, restitution and `active` to the device."""
-        self.dev.surface.upload(friction_of(repr(self), "friction", self.friction), self._bounce, self.active)
+        """Write friction, restitution, `active` and the velocity of the surface to the device."""
+        self.dev.surface.upload(
+            friction_of(repr(self), "friction", self.friction), self._bounce, self.active,
+            self._velocity(self.scene.particles.dim),
+        )  # fmt: skip
 
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether the widest particle, for which the wall was checked and built, is as wide as before."""
@@ -195,6 +220,11 @@ class Collider(Feature):
 def _friction(wall: Collider, value: Any) -> Any:
     friction_of(repr(wall), "friction", value)
     return as_given(value)
+
+
+def _surface_velocity(wall: Collider, value: Any) -> Any:
+    dim = wall.dim or (2 if value is None else np.size(value))
+    return None if value is None else checks.vector(repr(wall), "surface_velocity", value, dim)
 
 
 def _restitution(wall: Collider, value: Any) -> Any:

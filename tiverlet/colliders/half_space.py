@@ -17,7 +17,8 @@ class HalfSpace(Collider):
     C(x) = n . x - offset - radius >= 0, grad C = n.
 
     normal: (dim,), any length above 0; offset: [m] along the unit normal, from the origin. offset is live: assign to it between
-    frames, and the plane moves there during the next frame. friction, restitution, push_out, active, events: see Collider.
+    frames, and the plane moves there during the next frame. friction, restitution, push_out, active, events, surface_velocity:
+    see Collider.
 
     One-sided: a particle cannot pass at any speed, and no force can pull it through.
     """
@@ -26,7 +27,7 @@ class HalfSpace(Collider):
 
     def __init__(
         self, normal, offset: ArrayLike = 0.0, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0,
-        active: bool | None = None, events: bool = False,
+        active: bool | None = None, events: bool = False, surface_velocity=None,
     ):  # fmt: skip
         normal = np.asarray(normal, dtype=np.float64)
         normal = checks.vector("HalfSpace", "normal", normal, normal.size)
@@ -36,7 +37,7 @@ class HalfSpace(Collider):
         self.normal = normal / length
         self.normal.flags.writeable = False
         self.offset = offset
-        self.set_surface(friction, restitution, push_out, active, events)
+        self.set_surface(friction, restitution, push_out, active, events, surface_velocity=surface_velocity)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the dimension of the normal."""

@@ -22,7 +22,7 @@ class Mesh(Moving):
     inside: keep particles in. closed: False for a sheet, a thin wall with two sides. radius: R [m], by which the faces are
     thickened; it must be above 0 for a sheet and points (particles of radius 0). position, rotation: pose of the vertices (see
     Moving); live.
-    friction, restitution, push_out, active, events, one_way: see Collider.
+    friction, restitution, push_out, active, events, surface_velocity, one_way: see Collider.
 
     Nothing passes, at any speed of the particle or of the wall. The cost for a particle grows with the number of faces around it,
     not with the size of the mesh. Raises ValueError for faces of no area, and for a closed mesh with an edge that does not have
@@ -34,7 +34,7 @@ class Mesh(Moving):
     def __init__(
         self, vertices, faces, inside: bool = False, *, closed: bool = True, radius: float = 0.0, position: ArrayLike = 0.0,
         rotation: ArrayLike = 0.0, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
-        None = None, events: bool = False, one_way=None,
+        None = None, events: bool = False, surface_velocity=None, one_way=None,
     ):  # fmt: skip
         vertices = checks.points("Mesh", "vertices", vertices, dim=3)
         faces = checks.indices("Mesh", "faces", faces, len(vertices), arity=3).astype(int)
@@ -57,7 +57,7 @@ class Mesh(Moving):
         for array in (vertices, faces):
             array.flags.writeable = False
         self.place(position, rotation)
-        self.set_surface(friction, restitution, push_out, active, events, one_way, 3)
+        self.set_surface(friction, restitution, push_out, active, events, one_way, 3, surface_velocity=surface_velocity)
         self.facets = self._joined()
 
     def _outward(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ class Polygon(Moving):
     vertices: (m, 2) [m], in order, either way round; outlines may be concave. inside: keep particles in. closed: False for a
     line from the first vertex to the last, a thin wall with two sides. radius: R [m], by which the outline is thickened; it must
     be above 0 for a line and points (particles of radius 0). position, rotation: pose of the vertices (see Moving); live.
-    friction, restitution, push_out, active, events, one_way: see Collider.
+    friction, restitution, push_out, active, events, surface_velocity, one_way: see Collider.
 
     Nothing passes, at any speed of the particle or of the wall. Raises ValueError for edges of no length, and for a closed
     outline that has no area or intersects itself.
@@ -30,7 +30,7 @@ class Polygon(Moving):
     def __init__(
         self, vertices, inside: bool = False, *, closed: bool = True, radius: float = 0.0, position: ArrayLike = 0.0, rotation:
         ArrayLike = 0.0, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
-        None = None, events: bool = False, one_way=None,
+        None = None, events: bool = False, surface_velocity=None, one_way=None,
     ):  # fmt: skip
         vertices = checks.points("Polygon", "vertices", vertices, dim=2)
         self.closed, self.inside = bool(closed), bool(inside)
@@ -59,7 +59,7 @@ class Polygon(Moving):
         self.vertices = vertices
         self.vertices.flags.writeable = False
         self.place(position, rotation)
-        self.set_surface(friction, restitution, push_out, active, events, one_way, 2)
+        self.set_surface(friction, restitution, push_out, active, events, one_way, 2, surface_velocity=surface_velocity)
         along = vertices[j] - vertices[i]
         along /= np.linalg.norm(along, axis=1)[:, None]
         features = np.stack([i, j], axis=1)

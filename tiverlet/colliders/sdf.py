@@ -37,7 +37,7 @@ class Sdf(Moving):
     function: a ti.func that takes a position [m] and returns the signed distance to the surface [m], negative inside of the
     solid. Its literals have the world's precision. gradient: a ti.func of the position that returns the gradient; None for
     central differences. radius: R [m], by which the shape is thickened. position, rotation: pose of the shape (see Moving); live.
-    friction, restitution, push_out, active, events: see Collider.
+    friction, restitution, push_out, active, events, surface_velocity: see Collider.
 
         @ti.func
         def torus(p):
@@ -56,13 +56,13 @@ class Sdf(Moving):
     def __init__(
         self, function, gradient=None, *, radius: float = 0.0, position: ArrayLike = 0.0, rotation: ArrayLike = 0.0, friction:
         ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
-        None = None, events: bool = False,
+        None = None, events: bool = False, surface_velocity=None,
     ):  # fmt: skip
         self.function: Any = _checked_function("function", function)
         self.gradient: Any = gradient and _checked_function("gradient", gradient)
         self.radius = radius
         self.place(position, rotation)
-        self.set_surface(friction, restitution, push_out, active, events)
+        self.set_surface(friction, restitution, push_out, active, events, surface_velocity=surface_velocity)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the dimension, and that the function is finite and a distance around the particles."""

@@ -27,12 +27,12 @@ class Surface:
     friction: coefficients, or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s]. active: whether the wall
     is present, or None for a wall without a switch. turns: whether it resists rolling, or bounces across the normal. poses: the
     Pose of a wall that may turn; else none. log: of events, or None. one_way: unit vector along which the wall lets particles
-    pass, or None.
+    pass, or None. velocity: of the surface relative to the wall [m/s], or None.
     """
 
     def __init__(
         self, scene: "Scene", name: str, friction: "Coefficients | None", restitution: "Bounce | None", push_out: float, active:
-        bool | None, turns: bool, log: "WallLog | None", one_way: Any,
+        bool | None, turns: bool, log: "WallLog | None", one_way: Any, velocity: Any,
     ):  # fmt: skip
         self.log: Any = log
         self.has_log = log is not None
@@ -58,10 +58,13 @@ class Surface:
         self.has_switch, self.is_one_way = active is not None, one_way is not None
         if self.is_one_way:
             self.one_way = scene.memory.field(f"{name}.one_way", None, width=len(one_way), values=one_way)
+        self.has_velocity = velocity is not None
+        if self.has_velocity:
+            self.velocity = scene.memory.field(f"{name}.surface_velocity", None, width=len(velocity), values=velocity)
         if self.has_switch:
             self.active = scene.memory.field(f"{name}.active", None, kind=ti.i32, values=float(active or 0))
 
-    def upload(self, friction: "Coefficients", restitution: "Bounce", active: bool) -> None:
+    def upload(self, friction: "Coefficients", restitution: "Bounce", active: bool, velocity: Any) -> None:
         """Write these values to the device, as far as kernels read them."""
         if self.has_friction:
             self._memory.write(self.friction, friction[:2])
@@ -71,6 +74,8 @@ class Surface:
             self._memory.write(self.rolling, (friction.rolling, friction.twisting, restitution.tangential))
         if self.has_switch:
             self._memory.write(self.active, float(active))
+        if self.has_velocity:
+            self._memory.write(self.velocity, velocity)
 
     @property
     def was_active(self) -> bool:
@@ -144,6 +149,9 @@ class Surface:
         A particle within rounding of the surface touches it, so that it does not sink, or slip, by the last digits of its
         position. Returns the shift of the position.
         """
+        if ti.static(self.has_velocity):
+            velocity = self.velocity[None]
+            moved += h * (velocity - velocity.dot(n) * n)
         d = self.state.d[i] - moved
         shift = 0 * d
         leaving = d.dot(n)

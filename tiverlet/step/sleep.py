@@ -38,8 +38,8 @@ class Sleep(Feature):
 
     All islands wake before a frame in which a wall is moved, a knob is changed (other than the target of a driven particle), a
     particle that cannot move is given another spin, positions are assigned, particles or features are added or removed, or the
-    length of substeps changes. Compared with a world without Sleep, a sleeping particle is off by less than speed times time,
-    since it would have crept by less.
+    length of substeps changes. No island falls asleep while the surface of any wall moves. Compared with a world without Sleep, a
+    sleeping particle is off by less than speed times time, since it would have crept by less.
 
     Sleep depends on the state alone: it is the same bit for bit on all paths, in clones and in replays. Pinned particles do not
     join two islands. Particles of motors and winches, and particles that are linked to driven ones, never sleep.
@@ -251,6 +251,8 @@ class SleepPass:
         if called:
             self.wake_called(clock.h, clock.time, 0, 0, 0, 1, 1, 1, 0)
         part = self.sleepers.time / TRIES
+        if any(wall.does_work for wall in self.step.walls):  # what a slow belt carries along is no slower than its speed
+            ready = 0
         if ready and clock.time // part > (clock.time - dt) // part:
             self.fall_asleep(clock.time)
         return awake == 0 and not called and not self.goes_on
