@@ -35,7 +35,10 @@ def with_equal_kernels(worlds: "list[World]") -> "list[World]":
 
 def check_structure(worlds: "Sequence[World]") -> None:
     """Raise ValueError for a world that does not fit the kernels of the first."""
-    rule = "They may differ in numbers only, not in how many particles and constraints there are, in what acts, or on what."
+    rule = (
+        "They may differ in numbers only, not in how many particles and constraints there are, in what acts, on what, or in the "
+        "vertices of a Polygon or a Mesh."
+    )
     first = _structure(worlds[0])
     for k, world in enumerate(worlds[1:], 1):
         now = _structure(world)
@@ -67,7 +70,7 @@ def _structure(world: "World") -> dict[str, Any]:
     out: dict[str, Any] = {
         "settings": [(name, "=", repr(value)) for name, value in world.settings.items()],
         "features": built,
-        "fields": [("a field", e.name, "of shape", e.shape) for e in world._runner.memory.entries],
+        "fields": [("an array", e.name, "of shape", e.shape) for e in world._runner.memory.entries],
         "indices": [f.indices.tobytes() for f in world.features if isinstance(f, Batch)],
         "kernels": None,
     }
