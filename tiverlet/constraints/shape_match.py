@@ -84,11 +84,24 @@ class ShapeMatch(Batch):
         """Write new stiffnesses, rates and strengths to the device."""
         if self.acts:
             write = self.scene.memory.write
+            self._forget_springs()
             self.dev.spring.upload(self.compliance, self.damping)
             if self.dev.plastic:
                 write(self.dev.creep, self.creep)
                 write(self.dev.yield_size, self.yield_strain * self._radius)
             self.dev.strength.upload(self.break_at)
+
+    def _forget_springs(self) -> None:
+        """Before new stiffnesses are written: let clusters that become rigid forget what their springs bore.
+
+        What they have given way by then is no deformation that passes leave under loads, so they are put into shape, however soft
+        they were.
+        """
+        spring, read = self.dev.spring, self.scene.memory.read
+        if spring.soft and (stiffened := (read(spring.alpha)[: self.count] > 0) & (self.compliance == 0)).any():
+            pull = read(self.dev.pull)
+            pull[: len(self.owner)][stiffened[self.owner]] = 0.0
+            self.scene.memory.write(self.dev.pull, pull)
 
     @property
     def soft(self) -> bool:

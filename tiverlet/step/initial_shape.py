@@ -49,6 +49,7 @@ def restore(runner: Any, placed: int) -> tuple[np.ndarray, float] | None:
     solids = clusters.joined()
     copies = solids.copies
     best, least, walls, waited = x, np.inf, Walls(x), 0
+    met = max(MET, ROUNDING[scene.real] * float(np.abs(x).max() / max(solids.radius.min(), np.finfo(float).tiny)))
     for _ in range(ROUNDS):
         begin = solids.fitted(copies.lift(best))
         middle = copies.mean(begin)
@@ -77,7 +78,7 @@ def restore(runner: Any, placed: int) -> tuple[np.ndarray, float] | None:
         waited = 0 if left < BETTER * least else waited + 1
         if left < least:
             least, best = left, new
-        if least <= MET or waited == PATIENCE:
+        if least <= met or waited == PATIENCE:
             break
     if clusters.copies.shared:
         best = _relaxed(runner, clusters, best)
