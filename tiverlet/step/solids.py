@@ -9,7 +9,7 @@ from ..solvers.corners import bodies_of, corners_of
 from .block_matrix import summed
 from .integrator import h2_effective_of
 from .joined_clusters import Copies, joined
-from .rigid_rows import HEAVY
+from .cluster_rows import HEAVY
 
 SEEN, BORNE = 1e-3, 4.0  # of the radius: out of shape by more, and by so many times what loads do to a cluster
 
@@ -40,17 +40,19 @@ class Solids:
         self.radius = np.sqrt(np.bincount(self.owner, self.m * (self.shape**2).sum(axis=1)) / self.total)[self.owner]
 
     @staticmethod
-    def loaded(runner: Any, x: np.ndarray, ratio: float) -> "Solids":
+    def loaded(runner: Any, x: np.ndarray, ratio: float, apart: bool = True) -> "Solids":
         """Return the clusters with the shapes that they have at x, (n, dim), without a part of their residual deformation.
 
-        The residual Z of passes is that of projection.py; ratio^2 of it stays.
+        The residual Z of passes is that of projection.py; ratio^2 of it stays. apart: only clusters that share no particle.
         """
         w, h, h2_effective = runner.scene.inv_mass, runner.clock.h, h2_effective_of(runner.clock)
-        found = [(b, some & apart) for b, some, apart in _movable(runner.batches, w) if (some & apart).any()]
+        found = [(b, some & (alone | (not apart))) for b, some, alone in _movable(runner.batches, w)]
+        found = [(b, some) for b, some in found if some.any()]
         columns = [(b.indices, b.owner, *_state(b, w, h, h2_effective)) for b, _ in found]
         parts = [_of(b, some, rows) for (b, some), rows in zip(found, columns, strict=True)]
         out = Solids(w, parts)
         if out.count:
+            x = out.copies.lift(x)
             last, pull, now, give = (np.concatenate([part[k] for part in parts]) for k in range(3, 7))
             off, turn = x[out.who] - out._placed(x), out.turn[out.owner]
             off, pull = np.einsum("kba,kb->ka", turn, off), np.einsum("kba,kb->ka", turn, pull)
