@@ -154,7 +154,8 @@ def complement(a: np.ndarray) -> np.ndarray:
 
 
 def cluster_rows(batches: list, w: np.ndarray, every: bool = False) -> list[ClusterRows]:
-    """Return rows of the clusters that share particles with other constraints and, with `every`, of the other rigid clusters.
+    """Return rows of the rigid clusters that share particles with other constraints, or, with `every`, of all rigid clusters; and
+    of the soft ones that share particles with other clusters.
 
     Passes leave clusters that share particles violated. Large clusters get no rows, see WIDEST.
     """
@@ -178,12 +179,16 @@ def left_out(batches: list, w: np.ndarray, x: np.ndarray, h: float) -> float:
 
 
 def _coupled(batches: list, w: np.ndarray, every: bool = False) -> Iterator[tuple[Any, np.ndarray]]:
-    """Yield each batch and the mask of its clusters that share particles with other constraints; with `every`, of rigid ones too."""
-    degree = np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in batches)]), minlength=len(w))
-    for b in batches:
-        if b.clusters and b.count:
-            shares = np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) > 1
-            yield b, (shares | (every & (b.compliance == 0))) & ~b.broken & ~b.immovable(w)
+    """Yield each batch and the mask of its rigid clusters that share particles with other constraints, with `every` of all rigid
+    ones, and of its soft clusters that share particles with other clusters."""
+    clusters = [b for b in batches if b.clusters and b.count]
+    degrees = [
+        np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in some)]), minlength=len(w))
+        for some in (batches, clusters)
+    ]
+    for b in clusters:
+        with_any, with_clusters = (np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) > 1 for degree in degrees)
+        yield b, np.where(b.compliance == 0, every | with_any, with_clusters) & ~b.broken & ~b.immovable(w)
 
 
 def _wide(batch: Any) -> np.ndarray:

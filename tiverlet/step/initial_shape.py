@@ -49,7 +49,7 @@ def restore(runner: Any, placed: int) -> tuple[np.ndarray, float] | None:
     solids = clusters.joined()
     copies = solids.copies
     best, least, walls, waited = x, np.inf, Walls(x), 0
-    met = max(MET, ROUNDING[scene.real] * float(np.abs(x).max() / max(solids.radius.min(), np.finfo(float).tiny)))
+    met = max(MET, ROUNDING[scene.real] * float(np.abs(x).max()) / float(solids.radius.max() or np.inf))
     for _ in range(ROUNDS):
         begin = solids.fitted(copies.lift(best))
         middle = copies.mean(begin)
