@@ -185,7 +185,7 @@ def lattice(dim, size, step):
 )
 def test_lattices_that_become_rigid_gain_no_energy(world, dim, step, substeps):
     # All clusters of a lattice together are one rigid body, or, if they share corners only, bodies on hinges. Soft ones that hang
-    # from a corner and turn about it store 1/2 sum k x^2, and rigid ones none: the energy falls to that of the rigid shape. Passes
+    # from a corner and turn about it store 1/2 sum k x^2, and rigid ones nothing: energy falls to that of the rigid shape. Passes
     # from cluster to cluster would make up to 4e5 J of 87. Clusters keep the shape of their cube: its sides and diagonals.
     x, clusters = lattice(dim, (5, 3, 3)[:dim], step)
     shapes, corner = tv.ShapeMatch(clusters, compliance=2e-4, damping=0.2), len(x) - 1

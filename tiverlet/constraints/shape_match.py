@@ -32,9 +32,9 @@ class ShapeMatch(Batch):
     the law of Spring, with deformations compared in the body frame. Damping acts on the deformation only, not on the rigid
     motion.
 
-    clusters: a sequence of index sequences, or (m, k), or one sequence. They may overlap: then every pass moves a particle to the
-    mean of its places in them, so a rigid lattice of n clusters in a row gives way under loads, by about n^2 g h^2. A cluster may be flat, on a line, in
-    one place or inside out; it is rotated, never reflected.
+    clusters: a sequence of index sequences, or (m, k), or one sequence. They may overlap: each pass then moves a particle to the
+    mean of its places in them, so rigid lattices give way under loads, as rigid links do under Jacobi. A cluster may be flat, on
+    a line, in one place or inside out; it is rotated, never reflected.
     rest: (n, dim) [m], the rest shape of all particles; None takes the initial positions.
     compliance: number or (m,) [m/N]; the stiffnesses of a cluster's springs add up to 1 / compliance. 0 is rigid.
     damping: number or (m,) [N s/m], the sum of the dashpots parallel to the springs.

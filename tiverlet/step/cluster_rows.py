@@ -20,7 +20,7 @@ class ClusterRows:
     and grad_i C_r = m_i R B_ri. gradients() adds what they do: else rows of clusters that share particles, deformed differently,
     would hold these against any turn of the whole.
 
-    Since sum_r C_r^2 = sum_i m_i |D_i|^2, a cluster of mass M and compliance alpha stores the energy of rows of compliance alpha M.
+    Since sum_r C_r^2 = sum_i m_i |D_i|^2, a cluster of mass M and compliance alpha has rows of compliance alpha M.
     """
 
     side, breaks = 0, False
@@ -113,7 +113,7 @@ class Cluster:
     def gradients(self, x: np.ndarray) -> np.ndarray:
         """Return the gradients of the rows at positions x, (rows, k, dim).
 
-        R follows x so that sum_i m_i G_k q_i . P_i = 0 with P_i = q_i + D_i. So it turns by G_l M_lk^-1 sum_i m_i G_k q_i . R^T dx_i
+        R follows x so that sum_i m_i G_k q_i . P_i = 0, P_i = q_i + D_i. So it turns by G_l M_lk^-1 sum_i m_i G_k q_i . R^T dx_i
         with M_kl = sum_i m_i G_k q_i . G_l P_i, and C_r loses sum_i m_i B_ri . G_l D_i of that.
         """
         R, D = self.strain(x)

@@ -111,7 +111,7 @@ def _calm(runner: Any, solids: Solids, x: np.ndarray) -> None:
     """
     copies, state = solids.copies, runner.scene.state
     begin = solids.fitted(copies.lift(x))
-    whole = solids.whole(begin)
+    whole: Any = solids.whole(begin)
     v = runner.memory.read(state.d).astype(np.float64)
     new = whole(copies.lift(v[: copies.n]))
     if copies.shared:
@@ -134,7 +134,6 @@ def _left(solids: Solids, rows: Rows | None, x: np.ndarray, w: np.ndarray) -> fl
 def _tied(solids: Solids, rows: Rows, w: np.ndarray) -> np.ndarray:
     """Which rows hang together with a cluster, (rows,)."""
     m = len(rows.C)
-    label, _ = bodies_of(
-        m + solids.count, np.concatenate([rows.row, m + solids.owner]), np.concatenate([rows.who, solids.copies.particle[solids.who]]), w
-    )
+    who = np.concatenate([rows.who, solids.copies.particle[solids.who]])
+    label, _ = bodies_of(m + solids.count, np.concatenate([rows.row, m + solids.owner]), who, w)
     return np.isin(label[:m], label[m:])

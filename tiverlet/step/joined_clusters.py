@@ -1,9 +1,9 @@
-"""Rigid clusters that share particles: those that can only move together, as one body, and copies of the particles between bodies.
+"""Rigid clusters that share particles: those that can only move together as one body, and copies of what bodies share.
 
 Two clusters that share so many particles that none can turn without the other are one rigid body, as all clusters of a lattice
 are. Bodies that share fewer particles hang on each other as by hinges: each gets a copy of what they share, with its part of the
-mass, and rows that hold copies together (initial_shape.py). So a lattice of any size gets into shape in one fit, where passes from
-cluster to cluster would take as many rounds as the square of its length.
+mass, and rows that hold copies together (initial_shape.py). So a lattice of any size gets into shape in one fit, where passes
+from cluster to cluster would take as many rounds as the square of its length.
 """
 
 from collections.abc import Iterator
@@ -56,7 +56,7 @@ class Copies:
         return row[corner], copy, J[corner] / count[corner][:, None]
 
     def joints(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the rows, copies and gradients of corners, and the violations, of rows that hold copies at x, (N, dim), together."""
+        """Return the rows that hold copies together: row, copy and gradient of their corners, and violations at x, (N, dim)."""
         further = self.n + np.flatnonzero(self.w[self.n :] > 0)
         pair, axes = np.stack([further, self.particle[further]], axis=1), np.eye(x.shape[1])
         row = np.repeat(np.arange(len(pair) * len(axes)), 2)
@@ -87,7 +87,7 @@ def joined(who: np.ndarray, owner: np.ndarray, q: np.ndarray) -> tuple[np.ndarra
 def _grown(
     c: int, members: list[slice], of: list[list[int]], free: np.ndarray, who: np.ndarray, q: np.ndarray
 ) -> Iterator[tuple[int, np.ndarray]]:  # fmt: skip
-    """Yield the particles of the body that cluster c belongs to, with their places in its shape, and mark its clusters as taken."""
+    """Yield the particles of the body of cluster c, with their places in its shape, and mark its clusters as taken."""
     place: dict[int, np.ndarray] = {}
     waiting = {c: None}  # in order, so that results do not depend on how sets are stored
     while waiting:

@@ -19,13 +19,13 @@ import numpy as np
 
 from ..constraints.core.scalar import Scalar
 from ..contact.candidates import Candidates, DiscCandidates
+from .cluster_rows import cluster_rows
 from .contact_rows import stored_by
 from .free_bodies import FreeBodies
 from .jacobian import Jacobian
 from .one_sided import Walls, move_with_walls, one_sided
 from .projection import Rows, given_back, seen, seen_before, take_energy, would_vibrate
 from .rails import tethered
-from .cluster_rows import cluster_rows
 from .sideways_rows import sideways_rows
 from .solids import Solids
 

@@ -34,13 +34,13 @@ from ..solvers.corners import bodies_of
 from .anchor_rows import AnchorRows, anchor_rows
 from .block_matrix import WIDEST, BlockMatrix, WideRows, summed
 from .clock import CHANGED
+from .cluster_rows import ClusterRows, cluster_rows, left_out
 from .contact_rows import ContactRows
 from .free_bodies import FreeBodies
 from .integrator import h2_effective_of
 from .jacobian import Jacobian
 from .one_sided import move_with_walls
 from .rails import Rails, tethered
-from .cluster_rows import ClusterRows, left_out, cluster_rows
 from .sideways_rows import SidewaysRows, sideways_rows
 from .solids import Solids
 
@@ -466,7 +466,8 @@ class Rows:
         self.weight = self._rigid(alpha, shared * h * h)
         gamma = self.theta + damping * alpha / h
         h2_effective = h2_effective_of(runner.clock)
-        before, lam = (self._each(list(values)) for values in zip(*(_remembered(b, read, self.x) for b in self.batches), strict=True))
+        known = (_remembered(b, read, self.x) for b in self.batches)
+        before, lam = (self._each(list(values)) for values in zip(*known, strict=True))
         return self._bounded(gamma * self.C + (1 - gamma) * self._bounded(before) + alpha * lam / h2_effective)
 
     def pace(self, runner: Any, h: float, dt: float) -> np.ndarray:

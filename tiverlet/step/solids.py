@@ -7,9 +7,9 @@ import numpy as np
 
 from ..solvers.corners import bodies_of, corners_of
 from .block_matrix import summed
+from .cluster_rows import HEAVY
 from .integrator import h2_effective_of
 from .joined_clusters import Copies, joined
-from .cluster_rows import HEAVY
 
 SEEN, BORNE = 1e-3, 4.0  # of the radius: out of shape by more, and by so many times what loads do to a cluster
 
@@ -176,7 +176,8 @@ def _reached(batches: list[Any], some: list[np.ndarray], w: np.ndarray, first: i
     if not first:
         return some
     owner, who = corners_of(batches)
-    label, _ = bodies_of(len(np.concatenate(some)), *(corner[np.concatenate(some)[owner]] for corner in (owner, who)), w)
+    corners = np.concatenate(some)[owner]
+    label, _ = bodies_of(sum(map(len, some)), owner[corners], who[corners], w)
     here = np.bincount(label[owner], who >= first, minlength=len(label)) > 0
     cuts = np.cumsum([b.count for b in batches])[:-1]
     return [mask & reached for mask, reached in zip(some, np.split(here[label], cuts), strict=True)]
