@@ -173,7 +173,7 @@ def _movable(batches: list[Any], w: np.ndarray) -> list[tuple[Any, np.ndarray, n
 
 def _reached(batches: list[Any], some: list[np.ndarray], w: np.ndarray, first: int) -> list[np.ndarray]:
     """Return masks of the clusters in the masks `some`, (m,), that movable particles connect to a particle from `first` on."""
-    if not first:
+    if not (first and batches):
         return some
     owner, who = corners_of(batches)
     corners = np.concatenate(some)[owner]
