@@ -256,7 +256,11 @@ class BodyImpacts:
         Where they are solved exactly, they have taken into account that the wall holds it, if the wall held it before.
         """
         off = False
-        if self.struck[i] != 0 and self.by_wall(i) and not self.in_cluster(i):
+        if self.in_cluster(i):
+            if self.struck[i] == STRUCK_BEFORE and self.by_wall(i):  # it turns in a substep: second order is left
+                miss = self.target[i] - (self.state.d[i] - self.moved[i]).dot(self.normal[i])
+                off = (miss > 0 or self.pushed[i] > 0) and ti.abs(miss) > ti.static(MET) * self.first_push[i]
+        elif self.struck[i] != 0 and self.by_wall(i):
             n, d, last = self.normal[i], self.state.d[i] - self.moved[i], self.pushed[i]
             miss = self.target[i] - d.dot(n)
             pushed, change = ti.max(last + miss, 0), ti.max(miss, -last) * n

@@ -50,15 +50,17 @@ class ClusterImpact:
     def move_as_body(self, c, begin, end):
         """Push the particles of cluster c that struck walls, and write the moves of all of its corners."""
         i0, M, center = self.corners.reference_particle(c), ti.cast(0, ti.f64), self.cluster.zero_vector()
+        start = self.cluster.zero_vector()
         S = center.outer_product(center)
         for e in range(begin, end):
-            m, r = self.cluster.mass_in_fit(e, c), self.cluster.relative_position(e, i0, 0)
+            m, r = self.cluster.mass_in_fit(e, c), self.cluster.relative_position(e, i0, 1)
             M += m
-            center += m * r
+            start += m * r
+            center += m * self.cluster.relative_position(e, i0, 0)
             S += m * r.outer_product(r)
             self.count_push(e, -1)
-        center /= M
-        S -= M * center.outer_product(center)
+        start, center = start / M, center / M
+        S -= M * start.outer_product(start)
         V = 0 * center
         W, off = 0 * rotation.axial(S), True
         for _ in range(SWEEPS):
@@ -67,10 +69,10 @@ class ClusterImpact:
                 for e in range(begin, end):
                     i = self.corners.members[e]
                     if self.is_struck(i):
-                        r = self.cluster.relative_position(e, i0, 0) - center
-                        push, change = self.corrected_push(i, r, V, W, M, S, self.cluster.mass_in_fit(e, c))
+                        r, s = self.cluster.relative_position(e, i0, 0) - center, self.cluster.relative_position(e, i0, 1) - start
+                        push, change = self.corrected_push(i, r, s, V, W, M, S, self.cluster.mass_in_fit(e, c))
                         V += push / M
-                        W += rotation.turn_rate(S, rotation.axial(push.outer_product(r)))
+                        W += rotation.turn_rate(S, rotation.axial(push.outer_product(s)))
                         off = off or change > ti.static(MET) * self.impacts.first_push[i]
         T = rotation.cayley(W, S)
         for e in range(begin, end):
@@ -83,18 +85,18 @@ class ClusterImpact:
         self.cluster.write_matrix(self.cluster.pose, c, T @ self.cluster.read_matrix(self.cluster.pose, c))
 
     @ti.func
-    def corrected_push(self, i, r, V, W, M, S, m):
+    def corrected_push(self, i, r, s, V, W, M, S, m):
         """Correct the push of particle i. Returns the change of its impulse, times the substep, and how much the push changed."""
         n, p = self.wide(self.impacts.normal[i]), self.impacts.pushed[i]
         d = self.wide(self.state.d[i] - self.impacts.moved[i]) + V + rotation.skew(W, S) @ r
         miss = self.wide(self.impacts.target[i]) - d.dot(n)
-        self.impacts.pushed[i] = ti.max(p + ti.cast(miss / (m * self.give(r, n, M, S)), self.real), 0)
+        self.impacts.pushed[i] = ti.max(p + ti.cast(miss / (m * self.give(s, n, M, S)), self.real), 0)
         push = self.wide(self.impacts.pushed[i] - p) * n
         across = d - d.dot(n) * n
         slip = across.norm()
         if self.impacts.coefficients[i][0] > 0 and slip > 0:
             last = self.wide(self.impacts.held[i])
-            held = last + across / (m * self.give(r, across / slip, M, S))
+            held = last + across / (m * self.give(s, across / slip, M, S))
             size, most = held.norm(), self.wide(self.impacts.coefficients[i] * self.impacts.pushed[i])
             if size > most[0]:
                 held *= most[1] / size
