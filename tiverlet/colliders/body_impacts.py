@@ -73,6 +73,8 @@ class BodyImpacts:
     speed. Contacts wait for the next substep. A particle that approaches by no more than SLOW substeps of forces and links add
     does not take part, see Surface.
 
+    A rigid cluster that shares none of its particles moves as a rigid body in these passes, see ClusterImpact.
+
     Two particles that strike each other, at least one of them linked, obey the same law with the displacement of one relative to
     the other, along their normal; each takes its share of the push by mass. Both sides compute the same push before either
     moves. Constraints do not take it into account, so where they are solved exactly, the push is divided by the part s of the
