@@ -359,8 +359,8 @@ def test_clusters_on_walls_have_the_same_bits_on_all_paths(world):
 
 def test_a_blow_on_a_wall_breaks_a_cluster(world):
     # The floor gives each of its two lower particles the momentum 2 m v, of which they pass m v = 1.1 N s on to the upper ones:
-    # in one substep of 1/600 s with 660 N, or here, where the first one takes it to the floor, with 177 N and 487 N. Gravity alone
-    # would be 10 N.
+    # in one substep of 1/600 s with 660 N, or here, where the first one takes it to the floor, with 177 N and 487 N. The weight
+    # is 10 N.
     x = 0.2 * np.array([(0, 0), (1, 0), (0, 1), (1, 1)]) + (0, 0.03)
     for strength, holds in ((400.0, False), (700.0, True)):
         shape = tv.ShapeMatch([[0, 1, 2, 3]], break_at=strength)

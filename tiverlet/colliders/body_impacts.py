@@ -89,7 +89,7 @@ class BodyImpacts:
         system = scene.slots.system
         self.passes = FEW if (system or all(b.clusters for b in batches)) and not pairs else MANY
         self.spreads = not system  # from link to link; a system solves all links at once
-        self.exact = is_exact(scene, batches)
+        self.exact = is_exact(scene, [b for b in batches if not b.clusters])
         self.leaves = touches or not self.exact  # regular passes leave violations: by contacts, or because they do not converge
         self.stops = stops_bodies(scene, batches)
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field

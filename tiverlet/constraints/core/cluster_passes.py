@@ -188,7 +188,7 @@ class ClusterPasses(Passes):
 
     @ti.func
     def is_firm(self, c, h):
-        """Whether a substep h sees cluster c as rigid, and it shares no particle and none is fixed, so that it moves as a body."""
+        """Whether cluster c moves as a body in impacts: it is rigid for a substep h, shares no particle, and none is fixed."""
         out = self.mass[c] > 0
         for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
             i = self.corners.members[e]
