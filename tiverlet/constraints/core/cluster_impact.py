@@ -21,13 +21,8 @@ class ClusterImpact:
     """
 
     def __init__(self, cluster: Any, impacts: Any):
-        self.cluster, self.corners, self.impacts, self.state, self.real = (
-            cluster,
-            cluster.corners,
-            impacts,
-            cluster.state,
-            cluster.real,
-        )
+        self.cluster, self.corners, self.impacts = cluster, cluster.corners, impacts
+        self.state, self.real = cluster.state, cluster.real
 
     @ti.func
     def is_struck(self, i):
