@@ -2,6 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ..device import ti
 
 if TYPE_CHECKING:
@@ -13,6 +15,7 @@ FEW, MANY = 8, 32
 MET = 2.0**-9  # of the first push: a smaller error of the normal displacement counts as met
 CAREFUL = 0.55  # the least secant of a pair. Impacts may change each other: projections converge with steps of less than 1 / 0.5
 FELT = 2.0**-20  # of a squared displacement: a smaller change is no impact
+LINKED, IN_CLUSTER = 1, 2  # what holds a particle: links, or a rigid cluster that shares no particle
 STRUCK_NOW, STRUCK_BEFORE = 1, 2  # a particle is struck: in the pass in which it meets the wall or particle, and in later passes
 
 
@@ -20,10 +23,15 @@ def can_have_impacts(scene: "Scene", batches: "list[Batch]") -> bool:
     """Whether there can be passes beside the regular ones of every substep.
 
     Particles bounce alone in three cases: in stages of higher orders; where passes are steps of a semi-iteration, whose number is
-    fixed; and beside clusters, outlines and places, whose violations are not recorded. If contacts leave such violations and they
-    are removed all at once, heaps shake for ever.
+    fixed; and beside outlines, places, and clusters that share particles with links, whose violations are not recorded. If
+    contacts leave such violations and they are removed all at once, heaps shake for ever.
     """
-    noted = all(b.arity > 1 for b in batches)
+    links = [b for b in batches if not b.clusters]
+    held, linked = (
+        np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in batches if b.clusters == kind)])
+        for kind in (True, False)
+    )
+    noted = all(b.arity > 1 for b in links) and not np.isin(held, linked).any()
     return bool(batches) and noted and scene.order == 2 and not scene.slots.semi_iteration
 
 
@@ -35,7 +43,8 @@ def is_exact(scene: "Scene", batches: "list[Batch]") -> bool:
 
 def stops_bodies(scene: "Scene", batches: "list[Batch]") -> bool:
     """Whether walls without restitution stop bodies as wholes: where one pass more does it, and anything is rigid."""
-    return is_exact(scene, batches) and any(b.rigid for b in batches)
+    links = [b for b in batches if not b.clusters]
+    return (not links or is_exact(scene, links)) and any(b.rigid for b in batches)
 
 
 class BodyImpacts:
@@ -64,6 +73,8 @@ class BodyImpacts:
     speed. Contacts wait for the next substep. A particle that approaches by no more than SLOW substeps of forces and links add
     does not take part, see Surface.
 
+    A rigid cluster that shares none of its particles moves as a rigid body in these passes, see ClusterImpact.
+
     Two particles that strike each other, at least one of them linked, obey the same law with the displacement of one relative to
     the other, along their normal; each takes its share of the push by mass. Both sides compute the same push before either
     moves. Constraints do not take it into account, so where they are solved exactly, the push is divided by the part s of the
@@ -76,14 +87,14 @@ class BodyImpacts:
 
     def __init__(self, scene: "Scene", batches: "list[Batch]", touches: bool, pairs: bool):
         system = scene.slots.system
-        self.passes = FEW if system and not pairs else MANY
+        self.passes = FEW if (system or all(b.clusters for b in batches)) and not pairs else MANY
         self.spreads = not system  # from link to link; a system solves all links at once
-        self.exact = is_exact(scene, batches)
+        self.exact = is_exact(scene, [b for b in batches if not b.clusters])
         self.leaves = touches or not self.exact  # regular passes leave violations: by contacts, or because they do not converge
         self.stops = stops_bodies(scene, batches)
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.state = scene.state
-        self.rigid = add("impacts.rigid", n, kind=ti.i32)  # whether a rigid constraint holds it
+        self.rigid = add("impacts.rigid", n, kind=ti.i32)  # LINKED, IN_CLUSTER, or 0
         self.struck = add("impacts.struck", n, kind=ti.i32)  # STRUCK_NOW, STRUCK_BEFORE, or 0
         self.normal, self.moved = add("impacts.normal", n, width=dim), add("impacts.wall_moved", n, width=dim)
         self.coefficients = add("impacts.friction", n, width=2)
@@ -113,6 +124,11 @@ class BodyImpacts:
         return self.rigid[i] != 0
 
     @ti.func
+    def in_cluster(self, i):
+        """Whether a rigid cluster holds particle i, and nothing else."""
+        return self.rigid[i] == IN_CLUSTER
+
+    @ti.func
     def mark_linked(self, batch: ti.template(), c, h):  # type: ignore[valid-type]
         """At the start of a frame: mark the particles that constraint c holds, if it is rigid for a substep h.
 
@@ -122,8 +138,11 @@ class BodyImpacts:
         if ti.static(batch.breaks):
             holds = holds and batch.dev.strength.is_intact(c)
         if holds:
+            if ti.static(batch.clusters):
+                for e in range(batch.dev.corners.starts[c], batch.dev.corners.starts[c + 1]):
+                    self.rigid[batch.dev.corners.members[e]] = IN_CLUSTER
             for k in ti.static(range(batch.arity)):
-                self.rigid[batch.dev.corners.member(c, k)] = 1
+                self.rigid[batch.dev.corners.member(c, k)] = LINKED
 
     @ti.func
     def is_struck_now(self, i):
@@ -177,7 +196,7 @@ class BodyImpacts:
     def is_reached(self, batch: ti.template(), c):  # type: ignore[valid-type]
         """Whether an impact has reached constraint c."""
         out = True
-        if ti.static(self.spreads):
+        if ti.static(self.spreads and not batch.clusters):
             out = False
             for k in ti.static(range(batch.arity)):
                 out = out or self.reached[batch.dev.corners.member(c, k)] != 0
@@ -239,7 +258,11 @@ class BodyImpacts:
         Where they are solved exactly, they have taken into account that the wall holds it, if the wall held it before.
         """
         off = False
-        if self.struck[i] != 0 and self.by_wall(i):
+        if self.in_cluster(i):
+            if self.struck[i] == STRUCK_BEFORE and self.by_wall(i):  # it turns in a substep: second order is left
+                miss = self.target[i] - (self.state.d[i] - self.moved[i]).dot(self.normal[i])
+                off = (miss > 0 or self.pushed[i] > 0) and ti.abs(miss) > ti.static(MET) * self.first_push[i]
+        elif self.struck[i] != 0 and self.by_wall(i):
             n, d, last = self.normal[i], self.state.d[i] - self.moved[i], self.pushed[i]
             miss = self.target[i] - d.dot(n)
             pushed, change = ti.max(last + miss, 0), ti.max(miss, -last) * n
@@ -250,9 +273,7 @@ class BodyImpacts:
             off = (pushed > 0) != (last > 0)
             if ti.static(not self.exact) or self.target[i] > 0:
                 off = off or ti.abs(miss) > ti.static(MET) * self.first_push[i]
-            for k in ti.static(range(len(self.logs))):
-                if self.log[i] == k:
-                    self.logs[k].add(i, change)
+            self.log_push(i, change)
             held = self.held[i] + d - d.dot(n) * n
             size = held.norm()
             if size > self.coefficients[i][0] * pushed:
@@ -264,6 +285,20 @@ class BodyImpacts:
             if ti.static(self.state.keeps_wall_push):
                 self.state.wall_push[i] = self.state.wall_push[i] + change
         return off
+
+    @ti.func
+    def log_push(self, i, change):
+        """Add what a wall, which particle i struck, changed of its displacement to the events of that wall."""
+        for k in ti.static(range(len(self.logs))):
+            if self.log[i] == k:
+                self.logs[k].add(i, change)
+
+    @ti.func
+    def mark_struck_in_cluster(self, i):
+        """Mark particle i of a cluster that an impact has moved."""
+        self.reached[i] = 1
+        if self.struck[i] == STRUCK_NOW:
+            self.struck[i] = STRUCK_BEFORE
 
     @ti.func
     def missing_push(self, i, has):
@@ -305,7 +340,8 @@ class BodyImpacts:
 
         It is called for both particles in the same round. Returns whether a later pass does that, as record_impact() does.
         """
-        out = (self.is_linked(i) or self.is_linked(j)) and self.ready[i] != 0 and self.ready[j] != 0
+        linked = (self.is_linked(i) and not self.in_cluster(i)) or (self.is_linked(j) and not self.in_cluster(j))
+        out = linked and self.ready[i] != 0 and self.ready[j] != 0
         if out and self.state.w.positive(i):
             self.struck[i] = STRUCK_NOW
             self.partner[i] = j

@@ -33,10 +33,12 @@ class Collider(Feature):
     restitution: 0 ... 1. The time of impact within the substep is solved for, with the acceleration during the substep. The
     particle leaves at restitution times its velocity at that time, and is placed where it would be at the end of the substep. A
     particle that rigid links hold takes its body along, see BodyImpacts, unless 8 substeps of forces and links account for its
-    speed. On springs, beside ShapeMatch, Area of loops, Path or Snap, and where it spins and has friction, a particle bounces
-    alone. With 0, the default, bodies stop by the same law where Direct solves all constraints, or no two share a particle.
-    Elsewhere links find in later substeps that an end was stopped: an upright rod leaves a floor at 1/4 of its speed, a chain of
-    ten links at 0.6, at any number of substeps. There, 1e-9 stops bodies, as far as passes of the solver converge.
+    speed. So does one of a rigid ShapeMatch cluster all of whose particles can move and have no other constraint. On springs,
+    in other clusters, on links that share particles with clusters, beside Area of loops, Path or Snap, and where it spins and has
+    friction, a particle bounces alone. With 0, the default, bodies of links stop by the same law where Direct solves all links,
+    or no two share a particle, and clusters there and in worlds without links. Elsewhere links find in later substeps that an
+    end was stopped: an upright rod leaves a floor at 1/4 of its speed, a chain of ten links at 0.6, at any number of substeps.
+    There, 1e-9 stops bodies, as far as passes of the solver converge.
     For particles that spin, the displacement of the contact point is removed. Then friction = (static, dynamic, rolling,
     twisting) also resists rolling, by a moment of up to rolling * radius times the normal force, and spinning about the normal,
     by up to twisting * radius times it; a particle that these moments hold does not roll. With restitution = (normal, tangential)

@@ -32,8 +32,9 @@ class ShapeMatch(Batch):
     the law of Spring, with deformations compared in the body frame. Damping acts on the deformation only, not on the rigid
     motion.
 
-    clusters: a sequence of index sequences, or (m, k), or one sequence. They may overlap. A cluster may be flat, on a line, in
-    one place or inside out; it is rotated, never reflected.
+    clusters: a sequence of index sequences, or (m, k), or one sequence. They may overlap: each pass then moves a particle to the
+    mean of its places in them, so rigid lattices give way under loads, as rigid links do under Jacobi. A cluster may be flat, on
+    a line, in one place or inside out; it is rotated, never reflected.
     rest: (n, dim) [m], the rest shape of all particles; None takes the initial positions.
     compliance: number or (m,) [m/N]; the stiffnesses of a cluster's springs add up to 1 / compliance. 0 is rigid.
     damping: number or (m,) [N s/m], the sum of the dashpots parallel to the springs.
@@ -84,11 +85,24 @@ class ShapeMatch(Batch):
         """Write new stiffnesses, rates and strengths to the device."""
         if self.acts:
             write = self.scene.memory.write
+            self._forget_springs()
             self.dev.spring.upload(self.compliance, self.damping)
             if self.dev.plastic:
                 write(self.dev.creep, self.creep)
                 write(self.dev.yield_size, self.yield_strain * self._radius)
             self.dev.strength.upload(self.break_at)
+
+    def _forget_springs(self) -> None:
+        """Before new stiffnesses are written: let clusters that become rigid forget what their springs bore.
+
+        What they have given way by then is no deformation that passes leave under loads, so they are put into shape, however soft
+        they were.
+        """
+        spring, read = self.dev.spring, self.scene.memory.read
+        if spring.soft and (stiffened := (read(spring.alpha)[: self.count] > 0) & (self.compliance == 0)).any():
+            pull = read(self.dev.pull)
+            pull[: len(self.owner)][stiffened[self.owner]] = 0.0
+            self.scene.memory.write(self.dev.pull, pull)
 
     @property
     def soft(self) -> bool:

@@ -8,8 +8,8 @@ import numpy as np
 
 from .. import checks
 from ..constraints.core.anchored import Anchored
-from ..constraints.core.corner_passes import FIRM
 from ..constraints.core.scalar import Scalar
+from ..constraints.core.spring import FIRM
 from ..constraints.path import Path
 from ..solvers.slots import TENSEST
 from . import checkpoint, energy_bound

@@ -19,11 +19,11 @@ def move_with_walls(runner: Any, before: np.ndarray, x: np.ndarray) -> tuple[np.
     return sent, state.get(memory)
 
 
-def one_sided(jacobian: Jacobian, right: np.ndarray, one_way: np.ndarray, soft: float) -> np.ndarray:
-    """Return the least moves, (n, dim), without rows in the mask `one_way` that would pull."""
+def one_sided(jacobian: Jacobian, right: np.ndarray, one_way: np.ndarray, soft: float, steps: int = STEPS) -> np.ndarray:
+    """Return the least moves, (n, dim), without rows in the mask `one_way` that would pull. steps: at most."""
     some = np.ones(len(right))
     for _ in range(TURNS):
-        lam = jacobian.multipliers(right * some, some, ENOUGH, STEPS, soft)
+        lam = jacobian.multipliers(right * some, some, ENOUGH, steps, soft)
         pulls = one_way & (lam < 0)
         if not pulls.any():
             break

@@ -19,13 +19,13 @@ import numpy as np
 
 from ..constraints.core.scalar import Scalar
 from ..contact.candidates import Candidates, DiscCandidates
+from .cluster_rows import cluster_rows
 from .contact_rows import stored_by
 from .free_bodies import FreeBodies
 from .jacobian import Jacobian
 from .one_sided import Walls, move_with_walls, one_sided
 from .projection import Rows, given_back, seen, seen_before, take_energy, would_vibrate
 from .rails import tethered
-from .rigid_rows import rigid_rows
 from .sideways_rows import sideways_rows
 from .solids import Solids
 
@@ -129,7 +129,7 @@ def bound(runner: Any, x: np.ndarray, ratio: float) -> Rows | None:
     scalars = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
     some = [b for b in scalars if (~b.immovable(w) & ~b.broken).any()]
     some += sideways_rows(some)
-    some += rigid_rows([b for b in runner.batches if b.clusters], w)
+    some += cluster_rows([b for b in runner.batches if b.clusters], w)
     if not some:
         return None
     rows = Rows(some, w, x, runner.scene.periodic)

@@ -34,14 +34,15 @@ from ..solvers.corners import bodies_of
 from .anchor_rows import AnchorRows, anchor_rows
 from .block_matrix import WIDEST, BlockMatrix, WideRows, summed
 from .clock import CHANGED
+from .cluster_rows import ClusterRows, cluster_rows, left_out
 from .contact_rows import ContactRows
 from .free_bodies import FreeBodies
 from .integrator import h2_effective_of
 from .jacobian import Jacobian
 from .one_sided import move_with_walls
 from .rails import Rails, tethered
-from .rigid_rows import RigidRows, left_out, rigid_rows
 from .sideways_rows import SidewaysRows, sideways_rows
+from .solids import Solids
 
 if TYPE_CHECKING:
     from .runner import Runner
@@ -100,7 +101,7 @@ def project(
     if not (np.abs(x) < LARGEST).all():  # or NaN
         return True
     batches: list[Any] = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
-    stays = left_out(runner.batches, w, x)
+    stays = left_out(runner.batches, w, x, runner.clock.h)
     if would_vibrate(stays, ratio):
         runner.released = stays
     system = slots and slots.system
@@ -108,7 +109,11 @@ def project(
         batches = [b for b in batches if would_vibrate(_off(b, x), ratio)]  # it holds loads without a violation
     batches += sideways_rows(batches)
     batches += anchor_rows(runner.batches, x)
-    batches += rigid_rows(runner.batches, w, every=contacts is not None)
+    clusters = Solids.loaded(runner, x, 1.0, apart=False)  # a fast test
+    if batches or contacts or would_vibrate(clusters.worst, ratio):
+        batches += cluster_rows(runner.batches, w, every=contacts is not None)
+    elif clusters.count and clusters.copies.shared:
+        return ratio < FAR
     if not batches:
         return True
     batches += [contacts] if contacts else []
@@ -251,9 +256,11 @@ def _off(batch: Scalar, x: np.ndarray) -> float:
     return float((np.abs(C) if batch.side == 0 else C * batch.side).max(initial=0.0))
 
 
-def _remembered(batch: Any, read: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return C at the start of the last substep, and the multiplier, of springs, (m,) each; 0 for rigid batches."""
+def _remembered(batch: Any, read: Any, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return C at the start of the last substep, and the multiplier, of springs, (m,) each; 0 for rigid batches. x: positions."""
     count, spring = batch.count, batch.dev.spring
+    if isinstance(batch, ClusterRows):
+        return batch.remembered(x)
     if isinstance(batch, AnchorRows):
         return batch.along(read(spring.last)), batch.along(read(batch.dev.lam))
     if not spring.soft:
@@ -288,7 +295,7 @@ def seen_before(runner: Any) -> tuple[float, float]:
     return energy if runner.clock.energy is None else runner.clock.energy, overlap
 
 
-def sizes(batch: Scalar | AnchorRows | SidewaysRows | RigidRows | ContactRows) -> np.ndarray:
+def sizes(batch: Scalar | AnchorRows | SidewaysRows | ClusterRows | ContactRows) -> np.ndarray:
     """Return the number of corners of each constraint, (m,)."""
     return np.bincount(batch.owner, minlength=batch.count)
 
@@ -317,7 +324,7 @@ class Rows:
     rails: Any = None  # see Rails
 
     def __init__(
-        self, batches: Sequence[Scalar | AnchorRows | SidewaysRows | RigidRows | ContactRows], w: np.ndarray, x: np.ndarray,
+        self, batches: Sequence[Scalar | AnchorRows | SidewaysRows | ClusterRows | ContactRows], w: np.ndarray, x: np.ndarray,
         box: Any = None, rails: Rails | None = None,
     ):  # fmt: skip
         self.rails = rails if rails and len(rails.who) else None
@@ -459,7 +466,8 @@ class Rows:
         self.weight = self._rigid(alpha, shared * h * h)
         gamma = self.theta + damping * alpha / h
         h2_effective = h2_effective_of(runner.clock)
-        before, lam = (self._each(list(values)) for values in zip(*(_remembered(b, read) for b in self.batches), strict=True))
+        known = (_remembered(b, read, self.x) for b in self.batches)
+        before, lam = (self._each(list(values)) for values in zip(*known, strict=True))
         return self._bounded(gamma * self.C + (1 - gamma) * self._bounded(before) + alpha * lam / h2_effective)
 
     def pace(self, runner: Any, h: float, dt: float) -> np.ndarray:

@@ -142,6 +142,12 @@ class Runner:
             if h != clock.h or drag != clock.drag:
                 clock.longest = max(clock.longest, clock.h if clock.first_moved is None else 0.0)
                 self.restart(iterations)
+            self.moved, first = 0.0, clock.first_moved if self.scene.slots else None
+            if first is not None:
+                for b in self.driven:
+                    b.start_at(self.scene.state.get(self.memory), first)
+                self._note_moved(initial_shape.restore(self, first))  # before its deformation passes for what passes have left
+            if h != clock.h or drag != clock.drag:
                 if h < clock.longest and not self.probe:
                     released = release(self, h, clock.longest)
                     projected = project(self, h, dt, clock.longest)
@@ -154,22 +160,10 @@ class Runner:
                         clock.longest = h
             if clock.d_is_velocity:
                 clock.since = 0
-            self.moved = 0.0
-            if clock.first_moved is not None and self.scene.slots:
-                for b in self.driven:
-                    b.start_at(self.scene.state.get(self.memory), clock.first_moved)
+            if first is not None:
                 ratio = h / (clock.h or h)
-                for removed in (
-                    initial_shape.restore(self, clock.first_moved),
-                    initial_violation.remove(self.scene, self.batches, clock.first_moved, ratio, self.stop_at_walls),
-                ):
-                    if removed is not None:
-                        way, share = removed
-                        seen = float(way.max()) if share > initial_violation.SEEN else 0.0
-                        self.moved = max(self.moved, seen)
-                        self.jumped = self.jumped or (bool((way > self.scene.particles.radius).any()) and seen > 0)
-                        self.invalidate()
-                bare = clock.first_moved < self.n and not any((b.indices >= clock.first_moved).any() for b in self.batches)
+                self._note_moved(initial_violation.remove(self.scene, self.batches, first, ratio, self.stop_at_walls))
+                bare = first < self.n and not any((b.indices >= first).any() for b in self.batches)
                 if self.scene.slots.system and not bare:  # particles added without constraints do not concern it
                     system, x = self.scene.slots.system, self.scene.state.get(self.memory)
                     left = initial_violation.left(self.batches, x) if system.steps else []
@@ -177,6 +171,15 @@ class Runner:
                     system.forget(left)
             self.set_substep(h, drag)
         return True
+
+    def _note_moved(self, removed: tuple[np.ndarray, float] | None) -> None:
+        """Note how far particles were moved to meet their constraints, (n,) [m], and the violation that was removed, if any."""
+        if removed is not None:
+            way, share = removed
+            seen = float(way.max()) if share > initial_violation.SEEN else 0.0
+            self.moved = max(self.moved, seen)
+            self.jumped = self.jumped or (bool((way > self.scene.particles.radius).any()) and seen > 0)
+            self.invalidate()
 
     def set_initial_figures(self, energy: float, overlap: float) -> None:
         """The second half of begin(), with the energy [J] and the overlap of the initial state of the frame."""

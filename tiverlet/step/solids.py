@@ -5,27 +5,33 @@ from typing import Any
 
 import numpy as np
 
+from ..solvers.corners import bodies_of, corners_of
 from .block_matrix import summed
+from .cluster_rows import HEAVY
 from .integrator import h2_effective_of
-from .rigid_rows import HEAVY
+from .joined_clusters import Copies, joined
 
 SEEN, BORNE = 1e-3, 4.0  # of the radius: out of shape by more, and by so many times what loads do to a cluster
 
 
 class Solids:
-    """Clusters that share no particle with another one, with the shapes that they have at rest or under their loads.
+    """Clusters, or bodies of several ones, with the shapes that they have at rest or under their loads.
 
-    Corner k belongs to cluster owner[k] and is particle who[k], of mass m[k]. worst: the largest deformation that passes have
-    left in a cluster, as a share of its radius.
+    Each has its own copy of the particles that several of them share, and all positions and moves are those of copies. Corner k
+    belongs to cluster owner[k] and is copy who[k], of mass m[k]. worst: the largest deformation that passes have left in a
+    cluster, as a share of its radius.
     """
 
     def __init__(self, w: np.ndarray, parts: list[tuple[np.ndarray, ...]]):
         """Declare bodies. w: (n,) inverse masses. parts: for each batch the particle, cluster and rest shape of each corner."""
-        self.count, self.free, self.worst = sum(1 + int(owner.max()) for _, owner, *_ in parts), (w > 0)[:, None], 0.0
+        self.count, self.inverse, self.worst = sum(1 + int(owner.max()) for _, owner, *_ in parts), w, 0.0
         if not self.count:
             return
         first = np.cumsum([0, *(1 + int(owner.max()) for _, owner, *_ in parts)])
-        self.who, q = (np.concatenate([part[k] for part in parts]) for k in (0, 2))
+        who, q = (np.concatenate([part[k] for part in parts]) for k in (0, 2))
+        self.copies = Copies(who, w)
+        self.who, w = self.copies.who, self.copies.w
+        self.free = (w > 0)[:, None]
         self.owner = np.concatenate([owner + k for (_, owner, *_), k in zip(parts, first, strict=False)])
         m = np.divide(1, w[self.who], out=np.zeros(len(self.who)), where=w[self.who] > 0)
         self.m = np.where(m > 0, m, HEAVY * np.bincount(self.owner, m)[self.owner])
@@ -34,17 +40,19 @@ class Solids:
         self.radius = np.sqrt(np.bincount(self.owner, self.m * (self.shape**2).sum(axis=1)) / self.total)[self.owner]
 
     @staticmethod
-    def loaded(runner: Any, x: np.ndarray, ratio: float) -> "Solids":
+    def loaded(runner: Any, x: np.ndarray, ratio: float, apart: bool = True) -> "Solids":
         """Return the clusters with the shapes that they have at x, (n, dim), without a part of their residual deformation.
 
-        The residual Z of passes is that of projection.py; ratio^2 of it stays.
+        The residual Z of passes is that of projection.py; ratio^2 of it stays. apart: only clusters that share no particle.
         """
         w, h, h2_effective = runner.scene.inv_mass, runner.clock.h, h2_effective_of(runner.clock)
-        found = [(b, some) for b, some in _apart(runner.batches, w) if some.any()]
+        found = [(b, some & (alone | (not apart))) for b, some, alone in _movable(runner.batches, w)]
+        found = [(b, some) for b, some in found if some.any()]
         columns = [(b.indices, b.owner, *_state(b, w, h, h2_effective)) for b, _ in found]
         parts = [_of(b, some, rows) for (b, some), rows in zip(found, columns, strict=True)]
         out = Solids(w, parts)
         if out.count:
+            x = out.copies.lift(x)
             last, pull, now, give = (np.concatenate([part[k] for part in parts]) for k in range(3, 7))
             off, turn = x[out.who] - out._placed(x), out.turn[out.owner]
             off, pull = np.einsum("kba,kb->ka", turn, off), np.einsum("kba,kb->ka", turn, pull)
@@ -55,18 +63,29 @@ class Solids:
 
     @staticmethod
     def rigid(batches: list[Any], w: np.ndarray, first: int = 0) -> "Solids":
-        """Return the rigid clusters with any particle from `first` on, with their rest shapes. worst: deformation by loads."""
+        """Return the rigid clusters with any particle from `first` on, and those that share particles with them, at rest.
+
+        worst: deformation by loads.
+        """
+        found = [(b, some & (b.compliance == 0)) for b, some, _ in _movable(batches, w)]
+        found = [(b, some) for b, some in found if some.any()]
         parts = []
-        for b, some in _apart(batches, w):
-            some &= (b.compliance == 0) & (np.maximum.reduceat(b.indices, b.members.starts[:-1]) >= first)
-            if some.any():
+        for (b, some), reached in zip(found, _reached([b for b, _ in found], [some for _, some in found], w, first), strict=True):
+            if reached.any():
                 read, corners = b.scene.memory.read, len(b.owner)
                 columns = b.indices, b.owner, read(b.dev.shape)[:corners], read(b.dev.pull)[:corners].astype(np.float64)
-                parts.append(_of(b, some, columns))
+                parts.append(_of(b, reached, columns))
         out = Solids(w, parts)
-        if out.count:  # passes undo in each substep the deformation that loads have caused
-            out.worst = float(out._shares(np.concatenate([part[3] for part in parts])).max())
+        if out.count:  # passes undo in each substep the deformation that loads have caused; clusters with a particle share that
+            pull = np.concatenate([part[3] for part in parts])
+            out.worst = float(out._shares(pull * out.copies.count[out.copies.particle[out.who]][:, None]).max())
         return out
+
+    def joined(self) -> "Solids":
+        """Return the bodies of clusters that can only move together."""
+        if not self.copies.shared:
+            return self
+        return Solids(self.inverse, [joined(self.copies.particle[self.who], self.owner, self.shape)])
 
     def _shares(self, way: np.ndarray) -> np.ndarray:
         """Return the lengths of vectors of corners, as shares of the radius of their cluster, (corners,)."""
@@ -137,16 +156,31 @@ class Solids:
 def first_off(batches: list[Any], w: np.ndarray, x: np.ndarray) -> int | None:
     """The first particle of rigid clusters that are out of shape at x, (n, dim); None where none is."""
     solids = Solids.rigid(batches, w)
-    return min(solids.who[solids.far(x) > solids.borne].tolist(), default=None) if solids.count else None
+    if not solids.count:
+        return None
+    off = solids.far(solids.copies.lift(x)) > solids.borne
+    return min(solids.copies.particle[solids.who[off]].tolist(), default=None)
 
 
-def _apart(batches: list[Any], w: np.ndarray) -> list[tuple[Any, np.ndarray]]:
-    """Return each batch of clusters, and a mask, (m,), of those that share no particle, are not broken, and can move."""
+def _movable(batches: list[Any], w: np.ndarray) -> list[tuple[Any, np.ndarray, np.ndarray]]:
+    """Return each batch of clusters, and masks, (m,), of those that are not broken and can move, and that share no particle."""
     clusters = [b for b in batches if b.clusters and b.count]
     degree = np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices for b in clusters)]), minlength=len(w))
     return [
-        (b, (np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) == 1) & ~b.immovable(w) & ~b.broken) for b in clusters
+        (b, ~b.immovable(w) & ~b.broken, np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) == 1) for b in clusters
     ]
+
+
+def _reached(batches: list[Any], some: list[np.ndarray], w: np.ndarray, first: int) -> list[np.ndarray]:
+    """Return masks of the clusters in the masks `some`, (m,), that movable particles connect to a particle from `first` on."""
+    if not (first and batches):
+        return some
+    owner, who = corners_of(batches)
+    corners = np.concatenate(some)[owner]
+    label, _ = bodies_of(sum(map(len, some)), owner[corners], who[corners], w)
+    here = np.bincount(label[owner], who >= first, minlength=len(label)) > 0
+    cuts = np.cumsum([b.count for b in batches])[:-1]
+    return [mask & reached for mask, reached in zip(some, np.split(here[label], cuts), strict=True)]
 
 
 def _of(batch: Any, some: np.ndarray, columns: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:

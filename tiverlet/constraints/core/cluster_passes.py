@@ -6,8 +6,9 @@ import numpy as np
 
 from ...device import ti
 from . import rotation
+from .cluster_impact import ClusterImpact
 from .passes import Passes
-from .spring import Spring, stiff
+from .spring import FIRM, Spring, stiff
 from .strength import Strength
 
 if TYPE_CHECKING:
@@ -61,6 +62,8 @@ class ClusterPasses(Passes):
             self.fit = add(f"{name}.fit", m, width=dim * dim, kind=ti.f64, state=for_reports)
             self.middle = add(f"{name}.middle", m, width=dim, kind=ti.f64)
             self.mean = add(f"{name}.mean", m, width=dim, kind=ti.f64, state=for_reports)
+        self.impacts: Any = scene.impacts
+        self.impact: Any = ClusterImpact(self, scene.impacts) if scene.impacts else None
         if self.plastic:
             self.creep = add(f"{name}.creep", m, values=batch.creep)
             self.yield_size = add(f"{name}.yield", m, values=batch.yield_strain * radius)
@@ -184,7 +187,31 @@ class ClusterPasses(Passes):
         return ti.Matrix([[field[c][dim * j + k] for k in ti.static(range(dim))] for j in ti.static(range(dim))])
 
     @ti.func
+    def is_firm(self, c, h):
+        """Whether cluster c moves as a body in impacts: it is rigid for a substep h, shares no particle, and none is fixed."""
+        out = self.mass[c] > 0
+        for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+            i = self.corners.members[e]
+            w = self.w.of(i)
+            out = out and w > 0 and self.slots.split[i] < 2 * w
+        if ti.static(self.spring.soft):
+            if out and self.spring.alpha[c] > 0:
+                out = stiff(self.spring.alpha[c], h, 1 / self.mass[c]) > FIRM
+        return out
+
+    @ti.func
     def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
+        """Compute the position and rotation of the cluster; in an extra pass, let it leave walls that it struck."""
+        if ti.static(bool(self.impacts)):
+            if self.impacts.is_extra_pass():
+                self.impact.strike(c)
+            else:
+                self.find_place(c, h, h2_effective, first, fresh)
+        else:
+            self.find_place(c, h, h2_effective, first, fresh)
+
+    @ti.func
+    def find_place(self, c, h, h2_effective, first, fresh):
         """Compute the position and rotation of the cluster."""
         if self.mass[c] > 0:
             total, p, q, s, K, X = self.moments(c)
@@ -273,6 +300,9 @@ class ClusterPasses(Passes):
         if ti.static(self.strength.breaks):
             if not self.strength.is_intact(c):
                 move = 0 * move
+        if ti.static(bool(self.impacts)):
+            if self.impacts.reached[self.corners.members[e]] != 0:  # a blow is over
+                move = 0 * move
         return move
 
     @ti.func
@@ -304,6 +334,15 @@ class ClusterPasses(Passes):
 
     @ti.func
     def scatter_corner(self, e, h, h2_effective, first, fresh):
+        """Move corner e towards its place; in an extra pass, relax() has written its move."""
+        if ti.static(bool(self.impacts)):
+            if first < 0 or not self.impacts.is_extra_pass():
+                self.move_to_place(e, h, h2_effective, first, fresh)
+        else:
+            self.move_to_place(e, h, h2_effective, first, fresh)
+
+    @ti.func
+    def move_to_place(self, e, h, h2_effective, first, fresh):
         """Move corner e towards its place."""
         c, i = self.corners.owner[e], self.corners.members[e]
         w, relaxation = self.w.of(i), self.slots.relaxation

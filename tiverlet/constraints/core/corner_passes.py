@@ -9,13 +9,12 @@ from ...features.feature import FAR, Scene
 from .equation import Equation
 from .known_load import KnownLoad
 from .passes import Passes
-from .spring import stiff
+from .spring import FIRM, stiff
 from .step_limit import TRUST
 
 RESOLVED = 4.0  # alpha' / W: from this ratio on the substep resolves a spring
 HELD = 1 / 64  # of its weight: if walls leave less to a constraint in an impact, it does not take into account that they hold it
 LOST = 0.015  # relative violation at the start of a substep, beyond which its direction there would add energy
-FIRM = 0.99  # theta from which on a spring is rigid in an impact
 
 
 class CornerPasses(Passes):

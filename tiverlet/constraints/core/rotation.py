@@ -78,15 +78,44 @@ def solve_3x3(H, r):
 @ti.func
 def rigid_rotation(S, X):
     """Return the rotation, as a matrix, of a body whose parts move by y: S = sum m r r^T, X = sum m r y^T, about its centre."""
-    gap, out, size = axial(X.transpose()), 0 * S, S.trace()
+    return skew(turn_rate(S, axial(X.transpose())), S)
+
+
+@ti.func
+def turn_rate(S, moment):
+    """Return how fast a body turns with an angular momentum about its center: I^-1 L, for S = sum m r r^T."""
+    out, size = 0 * moment, S.trace()
     if size > 0:
         if ti.static(S.n == 2):
-            out[1, 0] = gap[0] / size
-            out[0, 1] = -out[1, 0]
+            out = moment / size
         else:
             # The rotation about a line of particles is arbitrary. As a literal, 1 + 2^-46 would be 1 in f32.
-            x, _ = solve_3x3(diagonal(size + ti.static(2.0**-46) * size, S) - S, gap)
-            out = ti.Matrix([[0 * size, -x[2], x[1]], [x[2], 0 * size, -x[0]], [-x[1], x[0], 0 * size]])
+            out, _ = solve_3x3(diagonal(size + ti.static(2.0**-46) * size, S) - S, moment)
+    return out
+
+
+@ti.func
+def skew(x, like):
+    """Return the matrix B with B r = x x r: one number x in 2D, three in 3D."""
+    out = 0 * like
+    if ti.static(like.n == 2):
+        out[1, 0] = x[0]
+        out[0, 1] = -x[0]
+    else:
+        out = ti.Matrix([[0 * x[0], -x[2], x[1]], [x[2], 0 * x[0], -x[0]], [-x[1], x[0], 0 * x[0]]])
+    return out
+
+
+@ti.func
+def cayley(x, like):
+    """Return the matrix of the rotation about x by 2 arctan(|x| / 2), which is |x| to second order."""
+    out = 0 * like
+    if ti.static(like.n == 2):
+        q = x[0] / 2
+        out = matrix(ti.Vector([1 - q * q, 2 * q]) / (1 + q * q))
+    else:
+        q = quaternion(x)
+        out = matrix(q / q.norm())
     return out
 
 

@@ -10,6 +10,8 @@ from ...device import ti
 if TYPE_CHECKING:
     from ...features.feature import Scene
 
+FIRM = 0.99  # theta from which on a spring is rigid in an impact
+
 
 @ti.pyfunc
 def stiff_at(ratio):

@@ -1,0 +1,126 @@
+"""Impacts of rigid clusters on walls: the cluster leaves them as a rigid body, by Newton's law, see BodyImpacts."""
+
+from typing import Any
+
+from ...device import ti
+from . import rotation
+
+SWEEPS = 64  # over the particles that were struck, at most
+MET = 2.0**-12  # of the first push: a smaller change ends the sweeps
+
+
+class ClusterImpact:
+    """In extra passes: pushes the particles of a cluster that struck walls to their targets, and moves it as a rigid body.
+
+    A push p along n [m] of a particle of mass m at r from the center moves the body by V += m p n / M, and turns it by
+    W += I^-1 (r x m p n). So it adds k p to the normal displacement there, k = m (1 / M + (r x n) . I^-1 (r x n)). Particles take
+    turns, p' = max(p + miss / k, 0), and their friction likewise across n, until all have what they are to have. The cluster
+    keeps the deformation that contacts and loads have left in it.
+
+    cluster: the ClusterPasses. impacts: the BodyImpacts.
+    """
+
+    def __init__(self, cluster: Any, impacts: Any):
+        self.cluster, self.corners, self.impacts = cluster, cluster.corners, impacts
+        self.state, self.real = cluster.state, cluster.real
+
+    @ti.func
+    def is_struck(self, i):
+        """Whether particle i, of a cluster, struck a wall."""
+        return self.impacts.struck[i] != 0 and self.impacts.by_wall(i)
+
+    @ti.func
+    def wide(self, v):
+        """Return a vector in f64."""
+        return ti.cast(v, ti.f64)
+
+    @ti.func
+    def strike(self, c):
+        """Write the moves of the corners of cluster c."""
+        begin, end, hit = self.corners.starts[c], self.corners.starts[c + 1], False
+        for e in range(begin, end):
+            i = self.corners.members[e]
+            hit = hit or (self.impacts.in_cluster(i) and self.is_struck(i))
+        if hit:
+            self.move_as_body(c, begin, end)
+        else:
+            for e in range(begin, end):
+                self.corners.write_move(e, ti.cast(self.cluster.zero_vector(), self.real))
+
+    @ti.func
+    def move_as_body(self, c, begin, end):
+        """Push the particles of cluster c that struck walls, and write the moves of all of its corners."""
+        i0, M, center = self.corners.reference_particle(c), ti.cast(0, ti.f64), self.cluster.zero_vector()
+        start = self.cluster.zero_vector()
+        S = center.outer_product(center)
+        for e in range(begin, end):
+            m, r = self.cluster.mass_in_fit(e, c), self.cluster.relative_position(e, i0, 1)
+            M += m
+            start += m * r
+            center += m * self.cluster.relative_position(e, i0, 0)
+            S += m * r.outer_product(r)
+            self.count_push(e, -1)
+        start, center = start / M, center / M
+        S -= M * start.outer_product(start)
+        V = 0 * center
+        W, off = 0 * rotation.axial(S), True
+        for _ in range(SWEEPS):
+            if off:
+                off = False
+                for e in range(begin, end):
+                    i = self.corners.members[e]
+                    if self.is_struck(i):
+                        r, s = self.cluster.relative_position(e, i0, 0) - center, self.cluster.relative_position(e, i0, 1) - start
+                        push, change = self.corrected_push(i, r, s, V, W, M, S, self.cluster.mass_in_fit(e, c))
+                        V += push / M
+                        W += rotation.turn_rate(S, rotation.axial(push.outer_product(s)))
+                        off = off or change > ti.static(MET) * self.impacts.first_push[i]
+        T = rotation.cayley(W, S)
+        for e in range(begin, end):
+            i, r = self.corners.members[e], self.cluster.relative_position(e, i0, 0) - center
+            move = ti.cast(V + T @ r - r, self.real)
+            self.cluster.pull[e] = self.cluster.pull[e] + move
+            self.count_push(e, 1)
+            self.impacts.mark_struck_in_cluster(i)
+            self.corners.write_move(e, move)
+        self.cluster.write_matrix(self.cluster.pose, c, T @ self.cluster.read_matrix(self.cluster.pose, c))
+
+    @ti.func
+    def corrected_push(self, i, r, s, V, W, M, S, m):
+        """Correct the push of particle i. Returns the change of its impulse, times the substep, and how much the push changed."""
+        n, p = self.wide(self.impacts.normal[i]), self.impacts.pushed[i]
+        d = self.wide(self.state.d[i] - self.impacts.moved[i]) + V + rotation.skew(W, S) @ r
+        miss = self.wide(self.impacts.target[i]) - d.dot(n)
+        self.impacts.pushed[i] = ti.max(p + ti.cast(miss / (m * self.give(s, n, M, S)), self.real), 0)
+        push = self.wide(self.impacts.pushed[i] - p) * n
+        across = d - d.dot(n) * n
+        slip = across.norm()
+        if self.impacts.coefficients[i][0] > 0 and slip > 0:
+            last = self.wide(self.impacts.held[i])
+            held = last + across / (m * self.give(s, across / slip, M, S))
+            size, most = held.norm(), self.wide(self.impacts.coefficients[i] * self.impacts.pushed[i])
+            if size > most[0]:
+                held *= most[1] / size
+            self.impacts.held[i] = ti.cast(held, self.real)
+            push -= held - last
+        return m * push, ti.abs(self.impacts.pushed[i] - p)
+
+    @ti.func
+    def give(self, r, n, M, S):
+        """Return the displacement along n, at r from the center, for an impulse times the substep of 1 there: k / m."""
+        arm = rotation.axial(n.outer_product(r))
+        return 1 / M + arm.dot(rotation.turn_rate(S, arm))
+
+    @ti.func
+    def count_push(self, e, sign):
+        """Add the push of the particle of corner e, or with sign = -1 subtract it, where pushes of walls are summed up.
+
+        It is no load of the cluster.
+        """
+        i = self.corners.members[e]
+        if self.is_struck(i):
+            push = sign * (self.impacts.pushed[i] * self.impacts.normal[i] - self.impacts.held[i])
+            self.cluster.pull[e] = self.cluster.pull[e] - push
+            self.impacts.log_push(i, push)
+            if ti.static(self.state.keeps_wall_push):
+                self.state.wall_push[i] = self.state.wall_push[i] + push
