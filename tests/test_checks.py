@@ -191,6 +191,61 @@ def test_a_force_is_a_vector_of_the_world(world, function, words):
             w.step(0.1)
 
 
+@ti.func
+def silent(x):
+    y = 2 * x  # noqa: F841
+
+
+@ti.func
+def branching(x):
+    if x[0] > 0:
+        return x
+    return -x
+
+
+def one_vector(a, b):
+    return a - b
+
+
+def distance(a, b):
+    return (a - b).norm()
+
+
+@ti.func
+def misordered(x, t):
+    return x * t
+
+
+LINK = [[0, 1]]
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: tv.Force(silent), "Force: silent returns nothing"),
+        (lambda: tv.PairForce(deep, potential=deep), "takes .'x', 'v'., but it must take 1 or 3 of .r, i, j.,"),
+        (lambda: tv.PairForce(silent, potential=flat), "silent returns nothing"),
+        (lambda: tv.Sdf(silent), "Sdf: silent returns nothing, but it must return one number"),
+        (lambda: tv.Sdf(flat, gradient=flat), "Sdf: flat returns a number, but in 2D a gradient has 2 components"),
+        (lambda: tv.Constraint(one_vector, LINK), r"Constraint\(one_vector\): one_vector returns 2 components"),
+        (lambda: tv.Constraint(distance, LINK, gradient=one_vector), "one_vector must return 2 vectors, the gradient by each"),
+        (lambda: tv.Force(misordered), "takes .'x', 't'.*: its t would get v"),
+    ],
+)
+def test_what_functions_of_users_take_and_return(make, words):
+    # A vector in place of the value of an Sdf ended the process; a matrix or a vector elsewhere gave an error inside of Taichi.
+    with pytest.raises(TypeError, match=words):
+        tv.World(tv.Particles([[1.0, 1.0], [2.0, 1.0]]), [make()]).step(0.1)
+
+
+def test_errors_in_functions_of_users_name_their_line(world):
+    with pytest.raises(Exception) as caught:
+        world(tv.Particles([[0.0, 1.0]]), [tv.Force(branching)]).step(0.1)
+    said = str(caught.value)
+    assert said.startswith("branching cannot be compiled:\nFile") and "test_checks.py" in said and "return x\n" in said
+    assert "integrator.py" not in said and "A Taichi function returns once, at its end" in said
+
+
 def test_what_taichi_says_of_a_start_is_said_in_our_words():
     typed = (
         f"import {COMPILER} as ti\nimport tiverlet as tv\n"
