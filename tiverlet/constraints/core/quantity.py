@@ -62,7 +62,7 @@ class Quantity:
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return f, (m,), of corners x (m, arity, dim) [m]; for outlines, of all positions (n, dim)."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__}.values() is missing.")
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
         """Return the gradients of f by each corner, (m, arity, dim); for outlines (total, dim)."""
