@@ -1,5 +1,6 @@
 """Errors for invalid arguments: they say what is wrong, with index and value, before Taichi is called."""
 
+import copy
 import pickle
 
 import numpy as np
@@ -100,6 +101,7 @@ def scene(*features, **kwargs):
         # rows 28, 63, 66: world
         (lambda: tv.World(tv.Particles([[0.0, 0]]), tv.Gravity()), TypeError, r"features = Gravity is a Gravity; write a list"),
         (lambda: tv.Recorder(tv.World(tv.Particles([[0.0, 0]])), "x.rrd"), TypeError, r"write tv.Recorder\(path, world\)"),
+        (lambda: tv.Particles(np.ma.array([[0.0, 1.0]], mask=[[True, False]])), ValueError, "position has masked values"),
         (lambda: pickle.dumps(tv.World(tv.Particles([[0.0, 0]]))), TypeError, r"Use world.clone\(\)"),
         (lambda: tv.World(tv.Particles([[0.0, 0]])).run(1, recorder=3), TypeError, r"recorder = 3 is a int, but a path or a "),
         (lambda: tv.World(tv.Particles([[0, 0], [1e6, 0]], radius=0.05), [tv.Contact()]), ValueError, r"position\[1, 0\] = 1e"),
@@ -162,6 +164,17 @@ def test_structure_is_fixed_and_says_so(world):
         w.substeps = 0
     with pytest.raises(TypeError, match="gravity cannot be changed"):
         w.clone(gravity=1)
+
+
+def test_features_of_a_world_are_pickled_and_copied_without_it(world):
+    start, pairs = tv.Particles([[0.0, 0.0], [1.0, 0.0]], radius=0.1), [[0, 1]]
+    features = [tv.Gravity(3.0), tv.Distance(pairs, 2.0, compliance=0.1), tv.Contact(friction=0.2), tv.HalfSpace((0, 1))]
+    w = world(start, features)
+    w.step(0.1)
+    for others in (pickle.loads(pickle.dumps(features)), copy.deepcopy(features)):
+        again = world(start, others)
+        again.step(0.1)
+        assert again.hash() == w.hash() and all(a is not b for a, b in zip(features, others, strict=True))
 
 
 def test_what_does_nothing_is_said(world):

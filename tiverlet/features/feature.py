@@ -172,6 +172,10 @@ class Feature:
         new.compiled_so_far = frozenset()
         return new
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what pickle and copy.deepcopy() store: the feature without its world, like copy()."""
+        return vars(self.copy())
+
     def copy_with_kernels(self) -> "Feature":
         """Return a copy for a world of the same state, with the same kernels."""
         new = self.copy()
