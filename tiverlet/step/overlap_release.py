@@ -11,6 +11,9 @@ Constraints move to the violations that the same loads need, as in projection.py
 other again. Clusters move as rigid bodies, and lose the deformation that contacts and walls have left (Solids). Particles do not
 move into walls that stopped them, and walls only push. mu falls while the stored energy, the sum of C^2 / D, falls, and rises
 otherwise (Levenberg and Marquardt). Motion pays for lifted particles, as in projection.py.
+
+In large piles, and in much shorter substeps, overlaps remain that would store more energy than before. These discs shrink to fit,
+and grow back in the course of many substeps (DiscGeometry.shrink). So they are pushed apart as slowly, whatever h' is.
 """
 
 from typing import Any
@@ -32,6 +35,7 @@ from .solids import Solids
 SOFT, SOFTEST = 1e-2, 1e-5  # mu of the first round, and the least
 ROUNDS = 16  # of moves, at most, each with the contacts into which the last one led
 LEFT = 0.01  # of the energy that overlaps store: what may be left of it in the shorter substep
+GROWTH = 64  # of the longest substeps: in so many, discs that shrank grow back
 
 
 def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
@@ -55,7 +59,7 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
         runner.invalidate()  # so that the result does not depend on when pairs were listed last
         runner.diagnose_state()
         pairs = contact.dev.geometry.candidates(x)
-    jacobian = part(runner, pairs, solids, x, ratio)
+    jacobian, deep = part(runner, pairs, solids, x, ratio)
     if jacobian:
         v, now = memory.read(state.d).astype(np.float64), state.get(memory)
         stopped = tethered(runner)
@@ -67,16 +71,20 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
         if due > 0:
             v[: len(x)] = take_energy(jacobian, v[: len(x)], bodies.unturned(now - x), due)
             memory.write(state.d, v)
+    if deep > 0 and contact.late:
+        runner.list_neighbours()
+        runner.shrink_overlapping(0, deep / (GROWTH * longest))
     return True
 
 
-def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: float) -> Jacobian | None:
+def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: float) -> tuple[Jacobian | None, float]:
     """Move particles from x, (n, dim), until overlaps store about ratio^4 of their energy, or as near to that as possible.
 
-    Returns the Jacobian of the last round; None if there was none.
+    Returns the Jacobian of the last round, None if there was none; and the deepest overlap [m] if overlaps would store more energy
+    in the shorter substep than they did, else 0.
     """
     state, memory, w, jacobian = runner.scene.state, runner.memory, runner.scene.inv_mass, None
-    overlap = pairs.at(x)[0]
+    overlap, normal = pairs.at(x)
     known = active = overlap > 0
     goal = ratio**2 * np.maximum(overlap, 0.0)
     soft, tied, walls = SOFT, bound(runner, x, ratio), Walls(x)
@@ -117,7 +125,9 @@ def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: f
         else:
             soft, active = 10 * soft, active | (more > 0)
     state.put(memory, best)
-    return jacobian
+    deeper, gradient = pairs.at(best)
+    left, had = stored_by(deeper - goal, gradient, w[pairs.who]), stored_by(overlap, normal, w[pairs.who])
+    return jacobian, float(deeper.max(initial=0.0)) if left > ratio**2 * had else 0.0
 
 
 def bound(runner: Any, x: np.ndarray, ratio: float) -> Rows | None:

@@ -529,8 +529,8 @@ class Runner:
             else:
                 self.memory.write_some(search.list.stale, 1, some)
 
-    def shrink_overlapping(self, first: int) -> None:
-        """Let particles from number `first` on that the user placed into others part gently."""
+    def shrink_overlapping(self, first: int, speed: float = np.inf) -> None:
+        """Let particles from number `first` on that the user placed into others part gently, at up to `speed` [m/s]."""
         contact = self.step.contacts[0]
         if not contact.shrinks:
             x = self.scene.state.get(self.memory) if first else None
@@ -538,7 +538,7 @@ class Runner:
                 return  # overlap under a load is no error of placing
             contact.enable_shrink()
             self.renew()
-        self.step.shrink_overlapping(first)
+        self.step.shrink_overlapping(first, speed)
 
     def report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
         """The StepReport of the last diagnostics."""

@@ -71,7 +71,7 @@ class Scalar(Batch):
 
     def hold(self, quantity: Quantity) -> None:
         """Use this f, and act on its particles."""
-        kind, wanted = type(quantity), "measure" if quantity.members.arity else "slope"
+        kind, wanted = type(quantity), "measure" if getattr(quantity.members, "arity", 0) else "slope"
         if getattr(kind, wanted) is getattr(Quantity, wanted):
             raise TypeError(f"{self!r}: {kind.__name__}.{wanted}() is missing, see Quantity in constraints/core/quantity.py.")
         self._keep(quantity=quantity, members=quantity.members, arity=getattr(quantity.members, "arity", 0))
