@@ -59,7 +59,9 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
         runner.invalidate()  # so that the result does not depend on when pairs were listed last
         runner.diagnose_state()
         pairs = contact.dev.geometry.candidates(x)
-    jacobian, deep = part(runner, pairs, solids, x, ratio)
+    overlaps, gradient = pairs.at(x)
+    runner.pressed = stored_by(overlaps, gradient, runner.scene.inv_mass[pairs.who])
+    jacobian = part(runner, pairs, solids, x, ratio)
     if jacobian:
         v, now = memory.read(state.d).astype(np.float64), state.get(memory)
         stopped = tethered(runner)
@@ -71,20 +73,29 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
         if due > 0:
             v[: len(x)] = take_energy(jacobian, v[: len(x)], bodies.unturned(now - x), due)
             memory.write(state.d, v)
-    if deep > 0 and contact.late:
-        runner.list_neighbours()
-        runner.shrink_overlapping(0, deep / (GROWTH * longest))
     return True
 
 
-def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: float) -> tuple[Jacobian | None, float]:
+def shrink_left(runner: Any, h: float, longest: float) -> None:
+    """After release() and projections: shrink discs if overlaps would store more energy in the substep h than they did."""
+    contact = next(iter(runner.step.contacts), None)
+    if not (contact and contact.late and runner.pressed):
+        return
+    runner.list_neighbours()
+    x = runner.scene.state.get(runner.memory)
+    pairs = contact.dev.geometry.candidates(x)
+    overlap, gradient = pairs.at(x)
+    if stored_by(overlap, gradient, runner.scene.inv_mass[pairs.who]) > (h / longest) ** 2 * runner.pressed:
+        runner.shrink_overlapping(0, float(overlap.max()) / (GROWTH * longest))
+
+
+def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: float) -> Jacobian | None:
     """Move particles from x, (n, dim), until overlaps store about ratio^4 of their energy, or as near to that as possible.
 
-    Returns the Jacobian of the last round, None if there was none; and the deepest overlap [m] if overlaps would store more energy
-    in the shorter substep than they did, else 0.
+    Returns the Jacobian of the last round; None if there was none.
     """
     state, memory, w, jacobian = runner.scene.state, runner.memory, runner.scene.inv_mass, None
-    overlap, normal = pairs.at(x)
+    overlap = pairs.at(x)[0]
     known = active = overlap > 0
     goal = ratio**2 * np.maximum(overlap, 0.0)
     soft, tied, walls = SOFT, bound(runner, x, ratio), Walls(x)
@@ -125,9 +136,7 @@ def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: f
         else:
             soft, active = 10 * soft, active | (more > 0)
     state.put(memory, best)
-    deeper, gradient = pairs.at(best)
-    left, had = stored_by(deeper - goal, gradient, w[pairs.who]), stored_by(overlap, normal, w[pairs.who])
-    return jacobian, float(deeper.max(initial=0.0)) if left > ratio**2 * had else 0.0
+    return jacobian
 
 
 def bound(runner: Any, x: np.ndarray, ratio: float) -> Rows | None:

@@ -18,7 +18,7 @@ from .diagnostics import BARE, EXTENT, STARTED, STEPPED, UNSTEPPED
 from .frames import Frames
 from .integrator import FREE, decay, h2_effective_of, h2_rigid_of, shares_of
 from .launcher import Launcher
-from .overlap_release import release
+from .overlap_release import release, shrink_left
 from .projection import project
 from .span import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Span
 from .step import frame
@@ -50,6 +50,7 @@ class Runner:
         self.jumped = False  # whether any such move was longer than the radius of its particle
         self.sleepers, self.sleep = parts.scene.state.sleepers, parts.step.sleep
         self.released = 0.0  # the violation that a shorter substep would turn into energy, relative to the constraint's size
+        self.pressed = 0.0  # the energy of overlaps before they were released, up to the factor of stored_by()
         self.ramping: list[Any] = []  # batches whose rest values change in the coming frame
         self.ramps: list[Any] = []  # the memories of ramps
         self.structure: Any = None  # a digest of all that kernels can read of constraints, once computed
@@ -143,6 +144,7 @@ class Runner:
                 clock.longest = max(clock.longest, clock.h if clock.first_moved is None else 0.0)
                 self.restart(iterations)
                 if h < clock.longest and not self.probe:
+                    self.pressed = 0.0
                     released = release(self, h, clock.longest)
                     projected = project(self, h, dt, clock.longest)
                     # Links and contacts must move together. With frames of slightly uneven length, stacks would creep sideways.
@@ -150,6 +152,7 @@ class Runner:
                         projected = project(self, h, dt, clock.longest, ContactRows.of(self))
                     if projected is None and not released:
                         released = release(self, h, clock.longest, small=True)
+                    shrink_left(self, h, clock.longest)
                     if projected or projected is None or released:
                         clock.longest = h
             if clock.d_is_velocity:
