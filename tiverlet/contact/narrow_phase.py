@@ -24,7 +24,8 @@ class DiscGeometry:
     """The geometry of pairs of discs or spheres: C(x) = |x_i - x_j| - (r_i + r_j), normal n = (x_i - x_j) / |x_i - x_j|.
 
     The normal points from j to i. Particles that the user put into each other shrink for a while, and grow back at push_out
-    [m/s], or more slowly where that is asked for. search: the NeighbourSearch that lists the pairs. impulse: the pushes of listed pairs in the last substep [kg m].
+    [m/s], or more slowly after overlap_release.shrink_left(). search: the NeighbourSearch that lists the pairs. impulse: the
+    pushes of listed pairs in the last substep [kg m].
     """
 
     push_out: Any = OnDevice()
@@ -186,7 +187,8 @@ class DiscGeometry:
 
         Pairs then part at `speed` [m/s], or at push_out if that is less.
         """
-        less = ti.select(first > 0, self.shrunk[i], ti.cast(0, self.real))
+        before = ti.select(first > 0, self.shrunk[i], ti.cast(0, self.real))
+        less = before
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             j = self.list.neighbour[e]
             if ti.max(i, j) >= first and self.pushes(i, j) != 0:
@@ -194,7 +196,10 @@ class DiscGeometry:
                 overlap, _ = self.overlap(i, j, contact_distance)
                 less = ti.max(less, overlap * self.radius.of(i) / contact_distance)
         self.shrunk[i] = less
-        self.slower[i] = ti.select(less > 0, ti.max(self.push_out - speed, 0), 0)
+        if less > before:
+            self.slower[i] = ti.max(self.push_out - speed, 0)
+        elif less == 0:
+            self.slower[i] = 0
 
     @ti.func
     def restore(self, i, h):

@@ -1,7 +1,5 @@
 """The user's own force."""
 
-from typing import Any
-
 import numpy as np
 
 from ..device import inline, ti

@@ -141,7 +141,7 @@ class Runner:
         with self.memory.compiler():
             self._jump()
             if h != clock.h or drag != clock.drag:
-                clock.longest = max(clock.longest, clock.h if clock.first_moved is None else 0.0)
+                clock.longest = max(clock.longest, clock.h if clock.first_moved != 0 else 0.0)
                 self.restart(iterations)
                 if h < clock.longest and not self.probe:
                     self.pressed = 0.0

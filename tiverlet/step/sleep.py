@@ -36,11 +36,11 @@ class Sleep(Feature):
       forces that may differ from place to place, or with the time;
     - one of its particles is given another velocity or spin (all islands wake if this makes a start of the whole world).
 
-    All islands wake before a frame in which a wall is moved, a knob is changed (other than the target of a driven particle), a
-    particle that cannot move is given another spin, positions are assigned, particles or features are added or removed, or the
-    length of substeps changes. What a Constraint or an Sdf of your own reads from a Taichi field is not noticed: after writing the
-    field, assign world.position = world.position. Compared with a world without Sleep, a sleeping particle is off by less than
-    speed times time, since it would have crept by less.
+    All islands wake before a frame in which a wall is moved, a knob is changed (other than the target of a driven particle),
+    a particle that cannot move is given another spin, positions are assigned, particles or features are added or removed, or
+    the length of substeps changes. What a Constraint or an Sdf of your own reads from a Taichi field is not noticed: after
+    writing the field, assign world.position = world.position. Compared with a world without Sleep, a sleeping particle is off
+    by less than speed times time, since it would have crept by less.
 
     Sleep depends on the state alone: it is the same bit for bit on all paths, in clones and in replays. Pinned particles do not
     join two islands. Particles of motors and winches, and particles that are linked to driven ones, never sleep.

@@ -82,7 +82,9 @@ class NumericGradient:
         who, name = f"Constraint({undecorated(self.function).__name__})", undecorated(self.given).__name__
         several = self.arity > 1
         if several and (isinstance(value, Expression) or len(value) != self.arity):
-            refuse(TypeError(f"{who}: {name} must return {self.arity} vectors, the gradient by each corner: return g_0, g_1, ..."))
+            refuse(
+                TypeError(f"{who}: {name} must return {self.arity} vectors, the gradient by each corner: return g_0, g_1, ...")
+            )
         for one in value if several else [value]:
             check_vector(who, name, one, self.dim, "the gradient by a corner", "")
         return value

@@ -53,7 +53,9 @@ class Scalar(Batch):
     def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
         """Store the arguments of __init__; prepare() checks what depends on the particles."""
         if not hasattr(type(self), "rest"):
-            raise TypeError(f"{self!r}: the class has no knob `rest`. Write rest = Knob(check, text) in it, as in core/length.py.")
+            raise TypeError(
+                f"{self!r}: the class has no knob `rest`. Write rest = Knob(check, text) in it, as in core/length.py."
+            )
         self.set_listing(indices)
         self._warn_duplicates()
         if rest is not None:
