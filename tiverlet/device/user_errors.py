@@ -10,7 +10,7 @@ TRACE = "Traceback (most recent call last):"
 REMEDIES = {
     r"Return inside non-static": "A Taichi function returns once, at its end. Assign to a variable in each branch, return that.",
     r'Name "(\w+)" is not defined': "Define it above the function; if an if or for defines it, above that: {0} = 0.0",
-    r"ufunc|numpy array": "NumPy does not run in kernels. Use ti.sqrt and its like, v.norm(), ti.Vector([...]), ti.Matrix([...]).",
+    r"ufunc|numpy array": "NumPy does not run in kernels. Use ti.sqrt and its like, v.norm(), or ti.Vector([...]).",
     r"Cannot loop over the object <class '(?:list|tuple)'>": "Write for ... in ti.static(...): the loop is unrolled then.",
     r"only one of them is a tensor type": "A vector stands for a number. Arguments are passed by order, not by name.",
 }

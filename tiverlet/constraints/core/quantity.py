@@ -139,6 +139,16 @@ class Quantity:
         return True
 
 
+def checked(batch: Any, quantity: Quantity) -> Quantity:
+    """Return the quantity of a constraint. Raise TypeError if the class of either lacks a part without a default."""
+    if not hasattr(type(batch), "rest"):
+        raise TypeError(f"{batch!r}: the class has no knob `rest`. Write rest = Knob(check, text) in it, as in core/length.py.")
+    kind, wanted = type(quantity), "measure" if getattr(quantity.members, "arity", 0) else "slope"
+    if getattr(kind, wanted) is getattr(Quantity, wanted):
+        raise TypeError(f"{batch!r}: {kind.__name__}.{wanted}() is missing, see Quantity in constraints/core/quantity.py.")
+    return quantity
+
+
 @ti.func
 def exact_rest(quantity: ti.template(), c):  # type: ignore[valid-type]
     """Return the rest value of constraint c in f64. In f32, a moving rest value would jerk by rounding / h^2."""

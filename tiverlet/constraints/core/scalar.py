@@ -16,7 +16,7 @@ from .drive import Drive
 from .equation import SMALLEST
 from .members import FixedSize
 from .outline_passes import OutlinePasses
-from .quantity import Quantity
+from .quantity import Quantity, checked
 from .ramp import Ramp
 from .spring import per_newton
 from .strength import strength_of
@@ -52,10 +52,6 @@ class Scalar(Batch):
 
     def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
         """Store the arguments of __init__; prepare() checks what depends on the particles."""
-        if not hasattr(type(self), "rest"):
-            raise TypeError(
-                f"{self!r}: the class has no knob `rest`. Write rest = Knob(check, text) in it, as in core/length.py."
-            )
         self.set_listing(indices)
         self._warn_duplicates()
         if rest is not None:
@@ -73,10 +69,7 @@ class Scalar(Batch):
 
     def hold(self, quantity: Quantity) -> None:
         """Use this f, and act on its particles."""
-        kind, wanted = type(quantity), "measure" if getattr(quantity.members, "arity", 0) else "slope"
-        if getattr(kind, wanted) is getattr(Quantity, wanted):
-            raise TypeError(f"{self!r}: {kind.__name__}.{wanted}() is missing, see Quantity in constraints/core/quantity.py.")
-        self._keep(quantity=quantity, members=quantity.members, arity=getattr(quantity.members, "arity", 0))
+        self._keep(quantity=checked(self, quantity), members=quantity.members, arity=getattr(quantity.members, "arity", 0))
 
     def check_indices(self, particles: "Particles") -> None:
         """Raise ValueError where a constraint names a particle that does not exist."""
