@@ -81,9 +81,9 @@ def keep(thing: Any, **values: Any) -> None:
         object.__setattr__(thing, name, as_read_only(value, structure_advice(type(thing).__name__, name)))
 
 
-def state_alone(thing: Any) -> dict[str, Any]:
+def state_alone(self: Any) -> dict[str, Any]:
     """The __getstate__ of features, for pickle and copy.deepcopy(): a feature without its world, like copy()."""
-    return vars(thing.copy())
+    return vars(self.copy())
 
 
 def refuse_deletion(thing: Any, name: str) -> None:
