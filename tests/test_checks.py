@@ -1,5 +1,6 @@
 """Errors for invalid arguments: they say what is wrong, with index and value, before Taichi is called."""
 
+import copy
 import pickle
 
 import numpy as np
@@ -100,6 +101,7 @@ def scene(*features, **kwargs):
         # rows 28, 63, 66: world
         (lambda: tv.World(tv.Particles([[0.0, 0]]), tv.Gravity()), TypeError, r"features = Gravity is a Gravity; write a list"),
         (lambda: tv.Recorder(tv.World(tv.Particles([[0.0, 0]])), "x.rrd"), TypeError, r"write tv.Recorder\(path, world\)"),
+        (lambda: tv.Particles(np.ma.array([[0.0, 1.0]], mask=[[True, False]])), ValueError, "position has masked values"),
         (lambda: pickle.dumps(tv.World(tv.Particles([[0.0, 0]]))), TypeError, r"Use world.clone\(\)"),
         (lambda: tv.World(tv.Particles([[0.0, 0]])).run(1, recorder=3), TypeError, r"recorder = 3 is a int, but a path or a "),
         (lambda: tv.World(tv.Particles([[0, 0], [1e6, 0]], radius=0.05), [tv.Contact()]), ValueError, r"position\[1, 0\] = 1e"),
@@ -164,6 +166,17 @@ def test_structure_is_fixed_and_says_so(world):
         w.clone(gravity=1)
 
 
+def test_features_of_a_world_are_pickled_and_copied_without_it(world):
+    start, pairs = tv.Particles([[0.0, 0.0], [1.0, 0.0]], radius=0.1), [[0, 1]]
+    features = [tv.Gravity(3.0), tv.Distance(pairs, 2.0, compliance=0.1), tv.Contact(friction=0.2), tv.HalfSpace((0, 1))]
+    w = world(start, features)
+    w.step(0.1)
+    for others in (pickle.loads(pickle.dumps(features)), copy.deepcopy(features)):
+        again = world(start, others)
+        again.step(0.1)
+        assert again.hash() == w.hash() and all(a is not b for a, b in zip(features, others, strict=True))
+
+
 def test_what_does_nothing_is_said(world):
     start = tv.Particles([[0.0, 0], [1, 0], [3.5, 0]])
     with pytest.warns(UserWarning, match="all radii are 0, so nothing touches"):
@@ -189,6 +202,61 @@ def test_a_force_is_a_vector_of_the_world(world, function, words):
     for _ in range(2):  # every step raises the error
         with pytest.raises(TypeError, match=f"{words}, but in 2D a force has 2 components"):
             w.step(0.1)
+
+
+@ti.func
+def silent(x):
+    y = 2 * x  # noqa: F841
+
+
+@ti.func
+def branching(x):
+    if x[0] > 0:
+        return x
+    return -x
+
+
+def one_vector(a, b):
+    return a - b
+
+
+def distance(a, b):
+    return (a - b).norm()
+
+
+@ti.func
+def misordered(x, t):
+    return x * t
+
+
+LINK = [[0, 1]]
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: tv.Force(silent), "Force: silent returns nothing"),
+        (lambda: tv.PairForce(deep, potential=deep), "takes .'x', 'v'., but it must take 1 or 3 of .r, i, j.,"),
+        (lambda: tv.PairForce(silent, potential=flat), "silent returns nothing"),
+        (lambda: tv.Sdf(silent), "Sdf: silent returns nothing, but it must return one number"),
+        (lambda: tv.Sdf(flat, gradient=flat), "Sdf: flat returns a number, but in 2D a gradient has 2 components"),
+        (lambda: tv.Constraint(one_vector, LINK), r"Constraint\(one_vector\): one_vector returns 2 components"),
+        (lambda: tv.Constraint(distance, LINK, gradient=one_vector), "one_vector must return 2 vectors, the gradient by each"),
+        (lambda: tv.Force(misordered), "takes .'x', 't'.*: its t would get v"),
+    ],
+)
+def test_what_functions_of_users_take_and_return(make, words):
+    # A vector in place of the value of an Sdf ended the process; a matrix or a vector elsewhere gave an error inside of Taichi.
+    with pytest.raises(TypeError, match=words):
+        tv.World(tv.Particles([[1.0, 1.0], [2.0, 1.0]]), [make()]).step(0.1)
+
+
+def test_errors_in_functions_of_users_name_their_line(world):
+    with pytest.raises(Exception) as caught:
+        world(tv.Particles([[0.0, 1.0]]), [tv.Force(branching)]).step(0.1)
+    said = str(caught.value)
+    assert said.startswith("branching cannot be compiled:\nFile") and "test_checks.py" in said and "return x\n" in said
+    assert "integrator.py" not in said and "A Taichi function returns once, at its end" in said
 
 
 def test_what_taichi_says_of_a_start_is_said_in_our_words():

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
+from tiverlet.constraints.core.length import REST_LENGTH, Length
+from tiverlet.constraints.core.quantity import Quantity
+from tiverlet.constraints.core.scalar import Scalar
 from tiverlet.device import ti
 
 from .conftest import case, order, rerun, rms
@@ -109,3 +112,23 @@ def test_what_is_wrong_is_named(world):
         tv.Constraint(length, [[0, 1]], side=2)
     with pytest.raises(ValueError, match=r"indices\[0\] = \(0, 3\)"):
         world(start, [tv.Constraint(length, [[0, 3]])])
+
+
+class Half(Quantity):
+    """A quantity without measure(), whose default is 0 with its corners as gradients."""
+
+    arity = 2
+
+    def values(self, x):
+        return x[:, 0, 0]
+
+
+def test_a_constraint_without_its_parts_is_refused():
+    def made(quantity, **more):
+        new = type("New", (Scalar,), {"measures": quantity, "__init__": lambda self, i: self.setup(i, None, 0.0, 0.0), **more})
+        return lambda: new([[0, 1]])
+
+    with pytest.raises(TypeError, match="New: the class has no knob `rest`"):
+        made(Length)()
+    with pytest.raises(TypeError, match=r"New: Half.measure\(\) is missing"):
+        made(Half, rest=REST_LENGTH)()

@@ -336,7 +336,11 @@ def test_a_column_that_is_too_heavy_for_the_substep_is_flagged(world):
         w.position, w.velocity, w.substeps = x, 0 * x, substeps
         report = w.run(1.0)
         assert report.flags == ({"compressed"} if substeps == 2 else set())
-        assert "substeps" in " ".join(report.notes) or report.clean
+        assert "Use up to " in " ".join(report.notes) or report.clean
+    # At 1e5 m f32 tells places 8 mm apart, which no substep makes less.
+    near = tv.Particles([[1e5 + 0.1, 0.1], [1e5 + 0.126, 0.1]], radius=0.02)
+    report = smooth(world, near, (1e5 + 1, 20), precision="f32", push_out=0.0).step(1 / 60)
+    assert report.flags == {"compressed"} and "are rounded to 0.0078 m in f32" in report.notes[0]
 
 
 def test_a_point_in_the_middle_of_a_disc_that_is_to_stay_there(world):

@@ -202,12 +202,21 @@ def test_wrong_arguments_are_refused():
     def two(r, i):
         return r
 
+    @ti.func
+    def vector(r):
+        return r
+
     for make, kind, text in (
         (lambda: tv.PairForce(lambda r: r), TypeError, "PairForce: function = .* is not a Taichi function"),
         (lambda: tv.PairForce(two), TypeError, "it must take 1 or 3 of \\(r, i, j\\)"),
         (lambda: tv.PairForce(newton, -1.0), ValueError, "PairForce: radius"),
         (lambda: tv.PairForce(newton, potential=3), TypeError, "PairForce: potential"),
         (lambda: tv.World(particles, [tv.PairForce(number)]).step(0.1), TypeError, "number returns a number, but in 2D"),
+        (
+            lambda: tv.World(particles, [tv.PairForce(vector, potential=vector)]).step(0.1),
+            TypeError,
+            "vector returns 2 components, but it must return one number",
+        ),
     ):
         with pytest.raises(kind, match=text):
             make()

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
+from tiverlet.device import ti
 
 from .test_references import line
 
@@ -211,3 +212,19 @@ def test_clusters_that_contradict_each_other_say_so_and_stay_passive(world):
     assert "moved" in reports[0].flags and all("unconverged" in r.flags for r in reports) and shapes[0].residual.min() > 0.08
     assert max(r.energy for r in reports) < 1e-4
     np.testing.assert_allclose(np.ptp(w.position, axis=0), 1.1 * np.ptp(x, axis=0), rtol=0.01)
+
+
+def direction(x):
+    """Return the angle of a place, whose gradient 1 / |x| falls so fast that one Newton step from afar goes past the goal."""
+    return ti.atan2(x.x, 1.0)
+
+
+def test_bodies_without_extent_are_moved_without_velocity(world):
+    # A bead of a user's constraint at x = 20: a step of -atan(20) (1 + 20^2) went to -590 m, and the next ones to 1e14 m.
+    bead = world(tv.Particles([[20.0, 0.4]]), [tv.Constraint(direction, [0], rest=0.0)])
+    # Three particles in one place, with two links and a straight angle, left it at 6 m/s.
+    chain = world(tv.Particles([[0.0, 1.0]] * 3), [tv.Distance([[0, 1], [1, 2]], rest=1.0), tv.Bend([[0, 1, 2]], rest=0.0)])
+    for w, place in ((bead, [[0.0, 0.4]]), (chain, [[1.0, 1.0], [0.0, 1.0], [-1.0, 1.0]])):
+        assert w.step(1 / 60).flags == {"moved"}
+        np.testing.assert_allclose(w.position, place, atol=1e-6)
+        assert np.abs(w.velocity).max() < 1e-5

@@ -18,7 +18,7 @@ import tiverlet as tv
 from tiverlet.__main__ import main
 from tiverlet.device import ti
 from tiverlet.device.language import NAME, NAMES
-from tiverlet.recording import journal, messages, reader, recorder, rrd, viewer
+from tiverlet.recording import journal, messages, reader, recorder, rrd, sink, viewer
 
 from .conftest import python
 from .forging import Forgery
@@ -59,6 +59,7 @@ def test_a_file_ends_while_a_child_keeps_its_pipe_and_with_a_name_of_any_length(
         return out, into
 
     monkeypatch.setattr("tiverlet.recording.sink.WAIT", 2.0)
+    monkeypatch.setattr("tiverlet.recording.sink.REST", 0.1)
     path = tmp_path / ("a" * 251 + ".rrd")
     with tv.World(tv.Particles([[0.0, 0.0]]), [tv.Gravity()], substeps=2) as w:
         for _ in range(2):
@@ -73,6 +74,29 @@ def test_a_file_ends_while_a_child_keeps_its_pipe_and_with_a_name_of_any_length(
     assert os.listdir(tmp_path) == [path.name]
     for end in kept:
         os.close(end)
+
+
+def test_what_rerun_writes_after_the_last_message_is_read(tmp_path, monkeypatch):
+    # Without a reader, rerun reports a broken pipe on the console.
+    pipe, ends = os.pipe, []
+
+    def noted():
+        ends.append(pipe())
+        return ends[0]
+
+    with open(tmp_path / "a", "xb", buffering=0) as file, monkeypatch.context() as patch:
+        patch.setattr(sink.Sink, "_open", lambda *_: ends.append(os.dup(ends[0][1])))
+        patch.setattr(os, "pipe", noted)
+        patch.setattr(sink.Sink, "_create", lambda *_: file)
+        copying = sink.Sink(str(tmp_path / "a"), "a", None, "a")
+        os.write(ends[1], b"h" * messages.HEADER + messages.HEAD.pack(messages.END, 0))
+        while not copying._ended:
+            time.sleep(0.001)
+        time.sleep(0.02)
+        assert os.write(ends[1], b"footer") == 6
+        os.close(ends[1])
+        copying._copy.join(5.0)
+        assert not copying._copy.is_alive()
 
 
 def test_frames_are_asked_for_by_number(falling):

@@ -1,15 +1,15 @@
 """A wall given by a function."""
 
-import inspect
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..device import runtime, ti
-from ..device.language import is_kernel_function, undecorated
+from ..device import inline, runtime, ti
+from ..device.language import undecorated
 from ..device.patches.compiler import Compiler
 from ..features.feature import Scene
+from ..features.user_function import check_function, check_number, check_vector
 from ..particles import Particles
 from ..tools import golden
 from .moving import Moving
@@ -58,8 +58,11 @@ class Sdf(Moving):
         ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
         None = None, events: bool = False, surface_velocity=None,
     ):  # fmt: skip
-        self.function: Any = _checked_function("function", function)
-        self.gradient: Any = gradient and _checked_function("gradient", gradient)
+        check_function("Sdf", "function", function, ("p",), (1,))
+        if gradient is not None:
+            check_function("Sdf", "gradient", gradient, ("p",), (1,))
+        self.function: Any = function
+        self.gradient: Any = gradient
         self.radius = radius
         self.place(position, rotation)
         self.set_surface(friction, restitution, push_out, active, events, surface_velocity=surface_velocity)
@@ -79,6 +82,8 @@ class Sdf(Moving):
         """Evaluate and check the function at the particles and around them."""
         x = particles.position
         if not len(x):
+            for probe in (self.dev.probe.clearance, self.dev.probe.gradient)[: 2 if self.gradient else 1]:
+                probe(np.zeros((1, self.dim)))  # checks only what kind of thing is returned
             return
         low, high = x.min(axis=0), x.max(axis=0)
         reach = float((high - low).max()) or float(particles.radius.max()) or 1.0
@@ -322,6 +327,16 @@ class _Probe:
             self._gradient(np.ascontiguousarray(points, dtype=np.float64), out)
         return out
 
+    @inline
+    def number(self, value):
+        """Return the value of the function if it is a number, else refuse it."""
+        return check_number("Sdf", undecorated(self.wall.function).__name__, value)
+
+    @inline
+    def vector(self, value):
+        """Return the value of the gradient if it is a vector, else refuse it."""
+        return check_vector("Sdf", undecorated(self.wall.gradient).__name__, value, self.dim, "a gradient", "")
+
     @ti.func
     def _point(self, points: ti.template(), i):  # type: ignore[valid-type]
         return ti.Vector([points[i, k] for k in ti.static(range(self.dim))])
@@ -329,7 +344,7 @@ class _Probe:
     @ti.kernel
     def _value(self, points: ti.types.ndarray(ti.f64, 2), out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         for i in range(points.shape[0]):
-            out[i] = self.wall.function(self._point(points, i))
+            out[i] = self.number(self.wall.function(self._point(points, i)))
 
     @ti.kernel
     def _cast(
@@ -375,7 +390,7 @@ class _Probe:
     @ti.kernel
     def _gradient(self, points: ti.types.ndarray(ti.f64, 2), out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
         for i in range(points.shape[0]):
-            g = self.wall.gradient(self._point(points, i))
+            g = self.vector(self.wall.gradient(self._point(points, i)))
             for k in ti.static(range(self.dim)):
                 out[i, k] = g[k]
 
@@ -398,19 +413,6 @@ def contour(grid: np.ndarray, value: np.ndarray) -> np.ndarray:
             ends.append(x[rows, odd] + weight[:, None] * (x[rows, other] - x[rows, odd]))
         out.append(np.stack(ends, axis=1))
     return np.concatenate(out)
-
-
-def _checked_function(name: str, function):
-    """Check that a function is a ti.func of one argument, and return it."""
-    if not is_kernel_function(function):
-        raise TypeError(
-            f"Sdf: {name} = {function!r} is not a Taichi function. Put the decorator @ti.func above its def "
-            "(import taichi as ti), in a file: Taichi reads its source."
-        )
-    names = list(inspect.signature(undecorated(function)).parameters)
-    if len(names) != 1:
-        raise TypeError(f"Sdf: {name} takes {names}, but it must take one position.")
-    return function
 
 
 def _at(point: np.ndarray) -> str:

@@ -96,7 +96,7 @@ class Constraint(Scalar):
     constraint, to read parameters from Taichi fields. It returns one number. It is in Taichi's language: arithmetic, ti.sqrt and
     its like, v.norm(), a.cross(b), if and for; decorated with @ti.func or not. Python numbers that it reads are compiled as
     constants.
-    indices: (m, arity) particle indices, or (m,) for constraints on one particle each.
+    indices: (m, arity) particle indices, or (m,) for constraints on one particle each: [[0, 1]] is a pair, [0, 1] are two.
     rest: number or (m,); None takes the initial values of function. Live.
     gradient: takes the arguments of function, returns its gradient by each corner, as many vectors. None: central differences.
     side: 0 for C = 0; 1 for function at most rest; -1 for function at least rest.
@@ -219,6 +219,14 @@ class Constraint(Scalar):
         """Return the corners that function takes, (m, arity, dim)."""
         q = position[self.indices]
         return q - (q[:, :1] if self.origin is None else self.origin)
+
+    def inverse_size(self, position: np.ndarray) -> np.ndarray:
+        """Return what Scalar does. One corner has no extent; its distance from the origin, or the rest value, stands for it."""
+        if self.arity > 1:
+            return super().inverse_size(position)
+        size = np.linalg.norm(self._corners(position)[:, 0], axis=1) * np.linalg.norm(self.gradients(position)[:, 0], axis=1)
+        size = np.maximum(size, np.abs(self.goal))
+        return np.divide(1, size, out=np.zeros(self.count), where=size > 0)
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """Return the values of function, (m,)."""

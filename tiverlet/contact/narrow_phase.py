@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ..neighbours.neighbour_search import NeighbourSearch
 
 SHRUNK = "Contact.shrunk"  # the field of how much smaller each particle is than its radius [m]
+SLOWER = "Contact.slower"  # the field of how much slower than at push_out pairs of each shrunk particle part [m/s]
 SAME_PLACE = 2.0**-80  # (distance / contact distance)^2 below which two particles count as in the same place
 
 
@@ -23,11 +24,12 @@ class DiscGeometry:
     """The geometry of pairs of discs or spheres: C(x) = |x_i - x_j| - (r_i + r_j), normal n = (x_i - x_j) / |x_i - x_j|.
 
     The normal points from j to i. Particles that the user put into each other shrink for a while, and grow back at push_out
-    [m/s]. search: the NeighbourSearch that lists the pairs. impulse: the pushes of listed pairs in the last substep [kg m].
+    [m/s], or more slowly after overlap_release.shrink_left(). search: the NeighbourSearch that lists the pairs. impulse: the
+    pushes of listed pairs in the last substep [kg m].
     """
 
     push_out: Any = OnDevice()
-    late = (SHRUNK,)
+    late = (SHRUNK, SLOWER)
 
     def __init__(
         self, scene: Scene, search: "NeighbourSearch", push_out: float = 0.0, impulse: PairData | None = None,
@@ -171,17 +173,22 @@ class DiscGeometry:
         return ti.select(d.dot(d) <= limit * limit, 0, 1)
 
     def enable_shrink(self) -> None:
-        """Prepare for shrink(): declare the field of shrunk radii, which exists only once it is needed."""
+        """Prepare for shrink(): declare the fields of shrunk radii, which exist only once they are needed."""
         if not self.shrinks:
             self.store = self.scene.memory.make_companion()
             self.shrunk = self.store.field(SHRUNK, self.scene.count, state=True)
+            self.slower = self.store.field(SLOWER, self.scene.count, state=True)
             self.store.place()
             self.shrinks = True
 
     @ti.func
-    def shrink(self, i, first):
-        """Shrink particle i to remove its overlap with particles of index `first` or more, shared in proportion to the radii."""
-        less = ti.select(first > 0, self.shrunk[i], ti.cast(0, self.real))
+    def shrink(self, i, first, speed):
+        """Shrink particle i to remove its overlap with particles of index `first` or more, shared in proportion to the radii.
+
+        Pairs then part at `speed` [m/s], or at push_out if that is less.
+        """
+        before = ti.select(first > 0, self.shrunk[i], ti.cast(0, self.real))
+        less = before
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             j = self.list.neighbour[e]
             if ti.max(i, j) >= first and self.pushes(i, j) != 0:
@@ -189,12 +196,18 @@ class DiscGeometry:
                 overlap, _ = self.overlap(i, j, contact_distance)
                 less = ti.max(less, overlap * self.radius.of(i) / contact_distance)
         self.shrunk[i] = less
+        if less > before:
+            self.slower[i] = ti.max(self.push_out - speed, 0)
+        elif less == 0:
+            self.slower[i] = 0
 
     @ti.func
     def restore(self, i, h):
-        """Let particle i grow back for a substep h [s], at push_out / 2: both particles of a pair grow."""
+        """Let particle i grow back for a substep h [s], at push_out / 2 or more slowly: both particles of a pair grow."""
         if ti.static(self.shrinks):
-            self.shrunk[i] = ti.max(self.shrunk[i] - self.push_out * h / 2, 0)
+            self.shrunk[i] = ti.max(self.shrunk[i] - (self.push_out - self.slower[i]) * h / 2, 0)
+            if self.shrunk[i] == 0:
+                self.slower[i] = 0
 
     @ti.func
     def is_shrunk(self, i):

@@ -27,8 +27,8 @@ class Geometry(Protocol):
     """
 
     shrinks: bool  # whether particles may shrink for a while, or are allowed to overlap
-    store: Any  # the Memory of a field that is declared only when it is needed, or None
-    late: tuple[str, ...]  # the name of that field in the state
+    store: Any  # the Memory of fields that are declared only when they are needed, or None
+    late: tuple[str, ...]  # the names of its fields in the state
 
     def overshoots(self, i) -> Any:
         """Return 1 if particle i moves so far in one substep that a contact may be missed."""
@@ -36,8 +36,8 @@ class Geometry(Protocol):
     def enable_shrink(self) -> None:
         """Prepare for shrink(): from now on overlap may be allowed for a while."""
 
-    def shrink(self, i, first) -> None:
-        """Allow the overlap that particle i has with particles of index `first` or more."""
+    def shrink(self, i, first, speed) -> None:
+        """Allow the overlap that particle i has with particles of index `first` or more; pairs part at up to `speed` [m/s]."""
 
     def restore(self, i, h) -> None:
         """Reduce the allowed overlap of particle i after a substep h, at push_out [m/s]."""
@@ -255,9 +255,9 @@ class PairContact(Feature):
                 self.dev.fast[None] = 1
 
     @ti.func
-    def shrink(self, i, first):
+    def shrink(self, i, first, speed):
         """Allow the overlap that particle i has with particles of index `first` or more."""
-        self.dev.geometry.shrink(i, first)
+        self.dev.geometry.shrink(i, first, speed)
 
     @ti.func
     def restore(self, i, h):

@@ -460,8 +460,11 @@ class PolygonGeometry:
         """Do nothing: the field of allowed overlaps exists from the start."""
 
     @ti.func
-    def shrink(self, i, first):
-        """Allow particle i the overlap that it has as a vertex in contacts with particles of index `first` or more."""
+    def shrink(self, i, first, speed):
+        """Allow particle i the overlap that it has as a vertex in contacts with particles of index `first` or more.
+
+        Bodies then part at push_out, whatever `speed` is.
+        """
         self.detect(i, 0)
         allowed = ti.select(first > 0, self.allowed[i], 0 * self.w.of(i))
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):

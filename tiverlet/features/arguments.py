@@ -81,6 +81,11 @@ def keep(thing: Any, **values: Any) -> None:
         object.__setattr__(thing, name, as_read_only(value, structure_advice(type(thing).__name__, name)))
 
 
+def state_alone(self: Any) -> dict[str, Any]:
+    """The __getstate__ of features, for pickle and copy.deepcopy(): a feature without its world, like copy()."""
+    return vars(self.copy())
+
+
 def refuse_deletion(thing: Any, name: str) -> None:
     """The __delattr__ of classes that record arguments."""
     raise AttributeError(f"{thing!r}.{name} cannot be deleted.")

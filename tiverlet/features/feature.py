@@ -33,7 +33,7 @@ from ..device import ti
 from ..device.language import inside_kernel
 from ..device.number import Number
 from .arguments import Knob as Knob
-from .arguments import keep, knobs_of, record_arguments, refuse_deletion, set_attribute
+from .arguments import keep, knobs_of, record_arguments, refuse_deletion, set_attribute, state_alone
 from .read_only import as_read_only, assign_whole_advice
 
 if TYPE_CHECKING:
@@ -110,6 +110,7 @@ class Feature:
     start: Any = None  # Particles as they were when it was added; used whenever it is bound again
 
     __setattr__, __delattr__, _keep = set_attribute, refuse_deletion, keep
+    __getstate__ = state_alone
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)

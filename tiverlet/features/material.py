@@ -123,6 +123,10 @@ class Table:
         self.turns = any(v.rolling > 0 or v.twisting > 0 for v in rub) or any(v.tangential > 0 for v in bounce)
         self.has_friction = any(v.static > 0 for v in rub) or self.turns
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what pickle stores: all but the fields of bind()."""
+        return {name: value for name, value in vars(self).items() if name not in ("rank", "entries")}
+
     def _refuse_contradictions(self, name: str, values: Mapping[tuple[int, int], Any]) -> None:
         """Raise ValueError if a pair of groups has two values, one in each order."""
         for (a, b), value in values.items():

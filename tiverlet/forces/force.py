@@ -1,14 +1,11 @@
 """The user's own force."""
 
-import inspect
-from typing import Any
-
 import numpy as np
 
 from ..device import inline, ti
-from ..device.language import Expression, is_kernel_function, undecorated
-from ..device.patches.compiler import readable, refuse
+from ..device.language import undecorated
 from ..features.feature import Acceleration, Scene
+from ..features.user_function import check_function, check_vector
 from ..particles import Particles
 
 
@@ -50,7 +47,7 @@ class Force(Acceleration):
 
     @inline
     def force(self, value):
-        """Return the value of the function if it is a vector. A number would be added to all components."""
+        """Return the value of the function if it is a vector, else refuse it."""
         return check_vector("Force", undecorated(self.function).__name__, value, self.dev.dim)
 
     @ti.func
@@ -66,33 +63,3 @@ class Force(Acceleration):
         else:
             out = self.force(self.function(x, v, t, i))
         return self.dev.w.of(i) * out
-
-
-def check_function(who: str, name: str, function: Any, takes: tuple[str, ...], counts: tuple[int, ...]) -> int:
-    """Return how many of the arguments in `takes` a ti.func of the user takes. It must be one of `counts`."""
-    if not is_kernel_function(function):
-        raise TypeError(
-            f"{who}: {name} = {function!r} is not a Taichi function. Put the decorator @ti.func above its def "
-            "(import taichi as ti), in a file: Taichi reads its source."
-        )
-    plain = undecorated(function)
-    if not readable(plain):
-        raise ValueError(
-            f"{who}: the source of {plain.__name__} cannot be read, and Taichi compiles the source. Write it in a file or "
-            "in a notebook; what is typed in a console is not kept."
-        )
-    names = list(inspect.signature(plain).parameters)
-    if len(names) not in counts:
-        some = f"{counts[0]} to {counts[-1]}" if len(counts) == counts[-1] else " or ".join(map(str, counts))
-        raise TypeError(f"{who}: {name} takes {names}, but it must take {some} of ({', '.join(takes)}), in this order.")
-    return len(names)
-
-
-def check_vector(who: str, name: str, value: Any, dim: int) -> Any:
-    """Return the value of a function if it is a vector, else refuse it. A number would be added to all components."""
-    known = isinstance(value, Expression)
-    shape = (tuple(value.get_shape()) if value.is_tensor() else ()) if known else np.shape(value)
-    if shape != (dim,):
-        what = f"{shape[0]} components" if len(shape) == 1 else f"a matrix of shape {shape}" if shape else "a number"
-        refuse(TypeError(f"{who}: {name} returns {what}, but in {dim}D a force has {dim} components [N]: ti.Vector([...])."))
-    return value

@@ -10,9 +10,9 @@ from ..device.language import undecorated
 from ..device.number import OnDevice
 from ..features.feature import Acceleration, Scene
 from ..features.regrouping import Regrouping
+from ..features.user_function import check_function, check_number, check_vector
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
-from .force import check_function, check_vector
 
 ROOM = (8, 40)  # initial room for listed neighbours per particle, in 2D and 3D; lists grow
 SKIN = 0.15  # skin of the neighbour list, relative to the radius
@@ -127,6 +127,11 @@ class PairForce(Acceleration):
         """Return the value of the function if it is a vector, else refuse it."""
         return check_vector("PairForce", undecorated(self.function).__name__, value, self.dev.dim)
 
+    @inline
+    def checked_energy(self, value):
+        """Return the value of the potential if it is a number, else refuse it."""
+        return check_number("PairForce", undecorated(self.potential_of).__name__, value)
+
     @ti.func
     def between(self, i, j, r):
         """Return the force of the function on particle i by particle j [N], for i < j and r = x_i - x_j."""
@@ -217,9 +222,9 @@ class PairForce(Acceleration):
             low, high = ti.min(i, j), ti.max(i, j)
             way = ti.select(i < j, r, -r)
             if ti.static(self.potential_arity == 1):
-                out = ti.cast(self.potential_of(way), ti.f64)
+                out = ti.cast(self.checked_energy(self.potential_of(way)), ti.f64)
             else:
-                out = ti.cast(self.potential_of(way, low, high), ti.f64)
+                out = ti.cast(self.checked_energy(self.potential_of(way, low, high)), ti.f64)
             if self.dev.w.positive(j):
                 out *= 0.5
         return out

@@ -14,6 +14,7 @@ from .messages import BATCH, CHUNK, END, HEAD, HEADER, smaller, split, thinned
 from .reader import SEAL
 
 WAIT = 10.0  # [s] longest wait for a flush
+REST = 1.0  # [s] without a byte after the last message, after which a child process must hold the other end of the pipe
 PIECE = 1 << 20  # bytes read at a time
 CHECK_INTERVAL = 0.2  # [s] between checks that the file still exists
 BACKLOG = 32 << 20  # most bytes waiting to be written
@@ -127,9 +128,12 @@ class Sink:
             self.error = FileNotFoundError(errno.ENOENT, "the file was removed or replaced")
 
     def _copy_messages(self) -> None:
-        """Copy messages until the last one. Reading and writing share one lock, so that flush() waits for both."""
-        while not self._ended:  # rerun then closes its end of the pipe, which a forked child may keep open
-            select.select([self._out], [], [])
+        """Copy messages until the last one. Reading and writing share one lock, so that flush() waits for both.
+
+        After it rerun may write a footer, and prints an error if nobody reads it. Then it closes its end of the pipe, which a
+        forked child may keep open.
+        """
+        while select.select([self._out], [], [], REST if self._ended else None)[0]:
             with self._busy:
                 piece = os.read(self._out, PIECE)
                 if not piece:

@@ -176,7 +176,8 @@ class Rebuild:
             contact.enable_shrink()
             less: Any = contact.store
             values = less.state()
-            values["Contact.shrunk"][: self.some.sum()] = self.old["Contact.shrunk"][self.some]
+            for name in contact.late:
+                values[name][: self.some.sum()] = self.old[name][self.some]
             less.restore(values)
         search, pairs = self.world._runner.search, self.number[self.old["Contact.pairs"]]
         assert search

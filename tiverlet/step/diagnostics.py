@@ -27,6 +27,7 @@ STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges; velocities that forces 
 
 # The origin of a state: an ordinary substep; a substep that was a start (the first after velocities were set); no substep yet.
 STEPPED, STARTED, UNSTEPPED = range(3)
+ROUGH = 0.25  # of an overlap: the rounding of coordinates from which on it is the cause
 BARE = 3  # added to one of these if only the energy is needed
 # Indices on the sheet: energy, overlap, (omega h)^2 of forces, largest coordinate, kinetic energy, edges of the bounding box.
 ENERGY, OVERLAP, STIFFNESS, REACH, KINETIC, EXTENT = 0, 2, 3, 7, 11, 12
@@ -406,20 +407,35 @@ class Reporter:
             f"loses energy and angular momentum. Use about {need:.7g} substeps, or more steps of the solver.",
         )
 
+    def _less_overlap(self, reach: float, overlap: float, substeps: int) -> str:
+        """Return what to do about an overlap, relative to a radius."""
+        radius = self.scene.particles.radius
+        single = self.scene.real == ti.f32 and not self.scene.state.compensated
+        rounding = float(np.spacing(np.float32(reach))) if single else 0.0
+        if rounding > ROUGH * overlap * radius[radius > 0].min(initial=np.inf):
+            return (
+                f"Coordinates of {reach:g} m are rounded to {rounding:.2g} m in f32: shift the scene towards the origin, or use "
+                'precision="f32-compensated".'
+            )
+        need = np.ceil(substeps * overlap / UNCONVERGED)  # of order h after impacts, h^2 under loads
+        speed = max(c.push_out for c in self._step.contacts)
+        return f"Use up to {need:.7g} substeps, or more iterations; what was placed so parts at push_out = {speed:g} m/s."
+
     def _note(self, flag, first, reach, overlap, moved, tension, stiff, released, residual, substeps) -> str:
         """Return the note of a flag: its meaning and a remedy, with the figures of this frame."""
         if flag == "non-finite":
-            return f"The state of particle {first} is not finite (the first of them); go back and use a smaller step."
+            return (
+                f"The state of particle {first} is not finite (the first of them). tv.report.autopsy(world, seconds) names the "
+                "cause, such as a function of yours that divides by 0; else go back and use a smaller step."
+            )
         if flag == "out-of-range":
             return f"A coordinate is out of range: it reached {reach:g} m, and beyond {self.farthest:g} m the precision fails."
         if flag == "tunnelling-risk":
             return "A particle moved by more than its own size in one substep and may have passed another; use more substeps."
         if flag == "compressed":
-            need = np.ceil(substeps * overlap / UNCONVERGED)  # of order h after impacts, h^2 under loads
             return (
                 f"Contacts are pressed or thrown together by more than they hold: the worst overlaps by {100 * overlap:.3g} % "
-                f"of the radius of the smaller particle. Use up to {need:.7g} substeps, or more iterations; what was placed so "
-                "parts at push_out."
+                f"of the radius of the smaller particle. {self._less_overlap(reach, overlap, substeps)}"
             )
         if flag == "turned":
             return (

@@ -212,7 +212,7 @@ def _newton(rows: "Rows", body: np.ndarray, going: np.ndarray) -> "Rows":
         tried = going.copy()
         while tried.any():
             x = np.where(tried[body][:, None], rows.x + far[body][:, None] * move, x)
-            tried &= _violation(rows.at(x), body, bodies)[1] > BETTER * size
+            tried &= ~(_violation(rows.at(x), body, bodies)[1] <= BETTER * size)  # a function may be NaN there
             far[tried] /= 2
             stuck = tried & (far < LEAST)
             x = np.where(stuck[body][:, None], rows.x, x)
@@ -290,14 +290,17 @@ def _bulged(rows: "Rows", body: np.ndarray, pushed: np.ndarray, strain: np.ndarr
 
 
 def _within(move: np.ndarray, rows: "Rows", body: np.ndarray, bodies: int) -> np.ndarray:
-    """Return the factor of each move, (n,), with which no particle moves further than its body's size, nor a leg by half."""
+    """Return the factor of each move, (n,), with which no particle moves further than its body's size, nor a leg by half.
+
+    A body whose particles are all in one place, such as a single bead, has no size: its moves are only as short as `far` says.
+    """
     of, x = _of(rows, body, bodies)[rows.row], rows.x[rows.who]
     low, high, longest = np.full((bodies, rows.dim), np.inf), np.full((bodies, rows.dim), -np.inf), np.zeros(bodies)
     np.minimum.at(low, of, x)
     np.maximum.at(high, of, x)
     np.maximum.at(longest, body, np.linalg.norm(move, axis=1))
     size = np.linalg.norm(np.where(high >= low, high - low, 0.0), axis=1)
-    out = np.minimum(1.0, np.divide(size, longest, out=np.ones(bodies), where=longest > 0))
+    out = np.minimum(1.0, np.divide(size, longest, out=np.ones(bodies), where=(longest > 0) & (size > 0)))
     legs = rows.leg_corners
     i, j = rows.who[legs], rows.who[legs + 1]
     change = np.linalg.norm(move[j] - move[i], axis=1)

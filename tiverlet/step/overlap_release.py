@@ -11,6 +11,9 @@ Constraints move to the violations that the same loads need, as in projection.py
 other again. Clusters move as rigid bodies, and lose the deformation that contacts and walls have left (Solids). Particles do not
 move into walls that stopped them, and walls only push. mu falls while the stored energy, the sum of C^2 / D, falls, and rises
 otherwise (Levenberg and Marquardt). Motion pays for lifted particles, as in projection.py.
+
+In large piles, and in much shorter substeps, overlaps remain that would store more energy than before. These discs shrink to fit,
+and grow back in the course of many substeps (DiscGeometry.shrink). So they are pushed apart as slowly, whatever h' is.
 """
 
 from typing import Any
@@ -32,6 +35,7 @@ from .solids import Solids
 SOFT, SOFTEST = 1e-2, 1e-5  # mu of the first round, and the least
 ROUNDS = 16  # of moves, at most, each with the contacts into which the last one led
 LEFT = 0.01  # of the energy that overlaps store: what may be left of it in the shorter substep
+GROWTH = 64  # of the longest substeps: in so many, discs that shrank grow back
 
 
 def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
@@ -55,6 +59,8 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
         runner.invalidate()  # so that the result does not depend on when pairs were listed last
         runner.diagnose_state()
         pairs = contact.dev.geometry.candidates(x)
+    overlaps, gradient = pairs.at(x)
+    runner.pressed = stored_by(overlaps, gradient, runner.scene.inv_mass[pairs.who])
     jacobian = part(runner, pairs, solids, x, ratio)
     if jacobian:
         v, now = memory.read(state.d).astype(np.float64), state.get(memory)
@@ -68,6 +74,19 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
             v[: len(x)] = take_energy(jacobian, v[: len(x)], bodies.unturned(now - x), due)
             memory.write(state.d, v)
     return True
+
+
+def shrink_left(runner: Any, h: float, longest: float) -> None:
+    """After release() and projections: shrink discs if overlaps would store more energy in the substep h than they did."""
+    contact = next(iter(runner.step.contacts), None)
+    if not (contact and contact.late and runner.pressed):
+        return
+    runner.list_neighbours()
+    x = runner.scene.state.get(runner.memory)
+    pairs = contact.dev.geometry.candidates(x)
+    overlap, gradient = pairs.at(x)
+    if stored_by(overlap, gradient, runner.scene.inv_mass[pairs.who]) > (h / longest) ** 2 * runner.pressed:
+        runner.shrink_overlapping(0, float(overlap.max()) / (GROWTH * longest))
 
 
 def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: float) -> Jacobian | None:

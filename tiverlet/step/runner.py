@@ -18,7 +18,7 @@ from .diagnostics import BARE, EXTENT, STARTED, STEPPED, UNSTEPPED
 from .frames import Frames
 from .integrator import FREE, decay, h2_effective_of, h2_rigid_of, shares_of
 from .launcher import Launcher
-from .overlap_release import release
+from .overlap_release import release, shrink_left
 from .projection import project
 from .span import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Span
 from .step import frame
@@ -50,6 +50,7 @@ class Runner:
         self.jumped = False  # whether any such move was longer than the radius of its particle
         self.sleepers, self.sleep = parts.scene.state.sleepers, parts.step.sleep
         self.released = 0.0  # the violation that a shorter substep would turn into energy, relative to the constraint's size
+        self.pressed = 0.0  # the energy of overlaps before they were released, up to the factor of stored_by()
         self.ramping: list[Any] = []  # batches whose rest values change in the coming frame
         self.ramps: list[Any] = []  # the memories of ramps
         self.structure: Any = None  # a digest of all that kernels can read of constraints, once computed
@@ -140,7 +141,7 @@ class Runner:
         with self.memory.compiler():
             self._jump()
             if h != clock.h or drag != clock.drag:
-                clock.longest = max(clock.longest, clock.h if clock.first_moved is None else 0.0)
+                clock.longest = max(clock.longest, clock.h if clock.first_moved != 0 else 0.0)
                 self.restart(iterations)
             self.moved, first = 0.0, clock.first_moved if self.scene.slots else None
             if first is not None:
@@ -149,6 +150,7 @@ class Runner:
                 self._note_moved(initial_shape.restore(self, first))  # before its deformation passes for what passes have left
             if h != clock.h or drag != clock.drag:
                 if h < clock.longest and not self.probe:
+                    self.pressed = 0.0
                     released = release(self, h, clock.longest)
                     projected = project(self, h, dt, clock.longest)
                     # Links and contacts must move together. With frames of slightly uneven length, stacks would creep sideways.
@@ -156,6 +158,7 @@ class Runner:
                         projected = project(self, h, dt, clock.longest, ContactRows.of(self))
                     if projected is None and not released:
                         released = release(self, h, clock.longest, small=True)
+                    shrink_left(self, h, clock.longest)
                     if projected or projected is None or released:
                         clock.longest = h
             if clock.d_is_velocity:
@@ -532,8 +535,8 @@ class Runner:
             else:
                 self.memory.write_some(search.list.stale, 1, some)
 
-    def shrink_overlapping(self, first: int) -> None:
-        """Let particles from number `first` on that the user placed into others part gently."""
+    def shrink_overlapping(self, first: int, speed: float = np.inf) -> None:
+        """Let particles from number `first` on that the user placed into others part gently, at up to `speed` [m/s]."""
         contact = self.step.contacts[0]
         if not contact.shrinks:
             x = self.scene.state.get(self.memory) if first else None
@@ -541,7 +544,7 @@ class Runner:
                 return  # overlap under a load is no error of placing
             contact.enable_shrink()
             self.renew()
-        self.step.shrink_overlapping(first)
+        self.step.shrink_overlapping(first, speed)
 
     def report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
         """The StepReport of the last diagnostics."""

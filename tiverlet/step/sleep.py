@@ -38,8 +38,9 @@ class Sleep(Feature):
 
     All islands wake before a frame in which a wall is moved, a knob is changed (other than the target of a driven particle), a
     particle that cannot move is given another spin, positions are assigned, particles or features are added or removed, or the
-    length of substeps changes. No island falls asleep while the surface of any wall moves. Compared with a world without Sleep, a
-    sleeping particle is off by less than speed times time, since it would have crept by less.
+    length of substeps changes. What a Constraint or an Sdf of your own reads from a Taichi field is not noticed: after writing
+    the field, assign world.position = world.position. No island falls asleep while the surface of any wall moves. Compared with
+    a world without Sleep, a sleeping particle is off by less than speed times time, since it would have crept by less.
 
     Sleep depends on the state alone: it is the same bit for bit on all paths, in clones and in replays. Pinned particles do not
     join two islands. Particles of motors and winches, and particles that are linked to driven ones, never sleep.

@@ -5,7 +5,9 @@ from typing import Any
 import numpy as np
 
 from ...device import inline, runtime, ti
-from ...device.patches.compiler import Compiler
+from ...device.language import Expression, undecorated
+from ...device.patches.compiler import Compiler, refuse
+from ...features.user_function import check_number, check_vector
 
 STEP = 2.0**-20  # of central differences, relative to the distance between corners
 
@@ -66,7 +68,26 @@ class NumericGradient:
             ti.Vector([q[k, a] + sign * ti.cast((j + 1) // 2 == self.number[k][a], ti.f64) for a in ti.static(range(self.dim))])
             for k in ti.static(range(self.arity))
         ]
-        return self.function(*self.arguments(corners, c, self.counts))
+        return self.checked(self.function(*self.arguments(corners, c, self.counts)))
+
+    @inline
+    def checked(self, value):
+        """Return the value of the function if it is a number, else refuse it."""
+        name = undecorated(self.function).__name__
+        return check_number(f"Constraint({name})", name, value)
+
+    @inline
+    def checked_vectors(self, value):
+        """Return the given gradient if it is a vector for each corner, else refuse it."""
+        who, name = f"Constraint({undecorated(self.function).__name__})", undecorated(self.given).__name__
+        several = self.arity > 1
+        if several and (isinstance(value, Expression) or len(value) != self.arity):
+            refuse(
+                TypeError(f"{who}: {name} must return {self.arity} vectors, the gradient by each corner: return g_0, g_1, ...")
+            )
+        for one in value if several else [value]:
+            check_vector(who, name, one, self.dim, "the gradient by a corner", "")
+        return value
 
     @inline
     def arguments(self, corners, c, counts):
@@ -77,7 +98,7 @@ class NumericGradient:
     def slope(self, c, q):
         """Return the given gradient."""
         corners = [q[k, :] for k in ti.static(range(self.arity))]
-        return self.rows(self.given(*self.arguments(corners, c, self.gradient_counts)))
+        return self.rows(self.checked_vectors(self.given(*self.arguments(corners, c, self.gradient_counts))))
 
     @ti.func
     def rows(self, vectors: ti.template()):  # type: ignore[valid-type]

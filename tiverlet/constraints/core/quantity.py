@@ -62,7 +62,7 @@ class Quantity:
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return f, (m,), of corners x (m, arity, dim) [m]; for outlines, of all positions (n, dim)."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__}.values() is missing.")
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
         """Return the gradients of f by each corner, (m, arity, dim); for outlines (total, dim)."""
@@ -137,6 +137,16 @@ class Quantity:
     def direction_reliable(self, f, f0):
         """Whether directions at f (now) and f0 (at the start) are defined well enough to detect a turn of 41 degrees."""
         return True
+
+
+def checked(batch: Any, quantity: Quantity) -> Quantity:
+    """Return the quantity of a constraint. Raise TypeError if the class of either lacks a part without a default."""
+    if not hasattr(type(batch), "rest"):
+        raise TypeError(f"{batch!r}: the class has no knob `rest`. Write rest = Knob(check, text) in it, as in core/length.py.")
+    kind, wanted = type(quantity), "measure" if getattr(quantity.members, "arity", 0) else "slope"
+    if getattr(kind, wanted) is getattr(Quantity, wanted):
+        raise TypeError(f"{batch!r}: {kind.__name__}.{wanted}() is missing, see Quantity in constraints/core/quantity.py.")
+    return quantity
 
 
 @ti.func

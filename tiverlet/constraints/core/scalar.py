@@ -16,7 +16,7 @@ from .drive import Drive
 from .equation import SMALLEST
 from .members import FixedSize
 from .outline_passes import OutlinePasses
-from .quantity import Quantity
+from .quantity import Quantity, checked
 from .ramp import Ramp
 from .spring import per_newton
 from .strength import strength_of
@@ -69,7 +69,7 @@ class Scalar(Batch):
 
     def hold(self, quantity: Quantity) -> None:
         """Use this f, and act on its particles."""
-        self._keep(quantity=quantity, members=quantity.members, arity=getattr(quantity.members, "arity", 0))
+        self._keep(quantity=checked(self, quantity), members=quantity.members, arity=getattr(quantity.members, "arity", 0))
 
     def check_indices(self, particles: "Particles") -> None:
         """Raise ValueError where a constraint names a particle that does not exist."""

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from ..language import active, impl, sources
+from ..user_errors import shortened
 from . import lean, patched
 from .unrolling import disable_unrolling, restore_switches
 
@@ -119,10 +120,10 @@ class Compiler:
             gc.disable()  # trees are many small objects, none of them garbage
             try:
                 yield
-            except Exception:
-                if self.refused is None:
+            except Exception as e:
+                error, self.refused = self.refused or shortened(e), None
+                if error is None:
                     raise
-                error, self.refused = self.refused, None
                 raise error from None
             finally:
                 active.pop()
