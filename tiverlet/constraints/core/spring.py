@@ -10,6 +10,8 @@ from ...device import ti
 if TYPE_CHECKING:
     from ...features.feature import Scene
 
+SOFTEST = 1e24  # the largest compliance, of a spring that does nothing: beyond it, compliance / h^2 may overflow in f32
+
 
 @ti.pyfunc
 def stiff_at(ratio):
