@@ -173,7 +173,7 @@ class Surface:
                     move, rise, after = 0 * depth, 0 * depth, leaving
             if ti.static(self.has_log):
                 if mode != BEFORE_CONTACTS:
-                    self.log.record(i, depth, n, after - leaving, -leaving)
+                    self.log.record(i, depth, n, after - leaving, -leaving, moved, h, rise > 0)
             change = (after - leaving) * n
             if ti.static(self.state.keeps_wall_push):
                 self.state.wall_push[i] = self.state.wall_push[i] + change
