@@ -144,13 +144,16 @@ def conserves(world: "World") -> bool:
 
 
 def loss_error(world: "World", extent: np.ndarray, reach: Any) -> float:
-    """Return by how much the energy of a scene that conserves energy may seem to fall [J]. extent, reach: see blur().
+    """Return by how much the energy of a scene that conserves energy may fall [J]. extent, reach: see blur().
 
-    The energy in the middle of a substep is (omega h)^2 / 4 of the stored energy less where a spring begins to relax than where
-    it is at rest. Rounding stretches springs, which costs energy the stiffer they are.
+    A load that begins to act makes stiff springs sag, and they lose the vibration about that: it does not count up to FALL of the
+    energy of a fall as far as the scene is wide. The energy in the middle of a substep is (omega h)^2 / 4 of the stored energy
+    less where a spring begins to relax than where it is at rest. Rounding stretches springs, which costs energy the stiffer they
+    are.
     """
     h, inv_mass, x = world._clock.h, world._runner.scene.inv_mass, world.position
-    out = blur(world, extent, reach) + initial_margin(inv_mass, extent, h)
+    sag = FALL * _masses(world).sum() * np.linalg.norm(extent) * np.linalg.norm(_pull(world))
+    out = sag + rounding(world, reach) + initial_margin(inv_mass, extent, h)
     for f, some in _springs(world):
         alpha, w = f.compliance[some], f.weights(x)[some]
         s2 = w * h**2 / alpha
