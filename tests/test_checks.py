@@ -73,6 +73,9 @@ def scene(*features, **kwargs):
         (lambda: tv.Distance([[0.5, 1]]), TypeError, "integers"),
         (lambda: tv.Distance([[0, 1]], compliance=-1e-3), ValueError, r"compliance\[0\] = -0.001"),
         (lambda: tv.Distance([[0, 1]], compliance=NAN), ValueError, r"compliance\[0\] = nan"),
+        (lambda: tv.Distance([[0, 1]], compliance=1e39), ValueError, r"compliance\[0\] = 1e\+39, but it must be at most 1e\+24"),
+        (lambda: tv.Pin([0], compliance=1e39), ValueError, r"compliance\[0\] = 1e\+39"),
+        (lambda: tv.ShapeMatch([[0, 1, 2]], compliance=1e39), ValueError, r"compliance\[0\] = 1e\+39"),
         (lambda: tv.Distance([[0, 1]], damping=[-1.0]), ValueError, r"damping\[0\] = -1"),
         (lambda: tv.Distance([[0, 1], [1, 2]], rest=[1, -2]), ValueError, r"rest\[1\] = -2"),
         (lambda: tv.Distance([[0, 1]], rest=NAN), ValueError, r"Distance: rest\[0\] = nan"),
@@ -118,6 +121,8 @@ def scene(*features, **kwargs):
         (lambda: tv.Jacobi(relaxation=0), ValueError, "above 0"),
         (lambda: tv.init(arch="gpu"), ValueError, "arch = 'gpu', but it must be one of 'cpu'"),
         (lambda: tv.init(threads=0), ValueError, "threads = 0"),
+        (lambda: tv.init(threads=np.float64(2)), ValueError, "but it must be an integer of at least 1"),
+        (lambda: tv.measure.center_of_mass(tv.World(tv.Particles([[0.0, 0]], pinned=[0]))), ValueError, "no particle can move"),
         (lambda: tv.shapes.rope((0, 0), (1, 0), points=1), ValueError, "points = 1"),
         (lambda: tv.shapes.cloth((0, 0), (1, 0), (0, 1), 10), ValueError, r"points = 10, .*: \(10, 10\)"),
     ],
@@ -125,6 +130,22 @@ def scene(*features, **kwargs):
 def test_bad_input_is_named(make, error, words):
     with pytest.raises(error, match=words):
         make()
+
+
+@pytest.mark.parametrize("size", [1e200, 1e-200])  # whose squares are infinite, or 0
+def test_a_direction_has_any_length(size):
+    np.testing.assert_array_equal(tv.HalfSpace((size, 0)).normal, [1, 0])
+    np.testing.assert_array_equal(tv.Capsule((0, 0), (1, 0), 0.1, one_way=(0, -size)).one_way, [0, -1])
+
+
+def test_the_softest_spring_does_nothing(world):
+    # x = v t + g t^2 / 2. compliance / h^2 is finite in f32, and h^2 F is 0, for h of a microsecond.
+    link, x = tv.Distance([[0, 1]], 0.5, compliance=1e24), np.array([[0.0, 0.0], [1.0, 0.0]])
+    w = world(tv.Particles(x, velocity=(1.0, 0.0)), [tv.Gravity(9.81), link], substeps=1)
+    for _ in range(3):
+        report = w.step(1e-6)
+    np.testing.assert_allclose(w.position, x + [3e-6, 0], rtol=0, atol=1e-7)
+    assert np.isfinite(report.energy) and report.clean and np.abs(link.load).max() < 1e-20
 
 
 @pytest.mark.parametrize("dt", [0.0, -1.0, NAN, INF, "1", None, True])

@@ -513,3 +513,13 @@ def test_a_dense_gas_gains_no_energy_in_several_passes(world):
         w.velocity, w.position, w.iterations = v, x, passes
         energy = [w.step(1 / 60).energy for _ in range(100)]
         assert np.diff(energy).max() < 1e-9 * energy[0]
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64", "f32-compensated"])
+def test_what_starts_on_a_wall_bounces(world, precision):
+    # v' = -e v, whether rounding puts the start on the wall or 1e-17 m inside, where half of the balls did not bounce.
+    r = np.random.default_rng(0).uniform(0.05, 0.4, 64)
+    start = tv.Particles(np.stack([np.arange(64.0), 1.7 + r], axis=1), radius=r, velocity=(0.0, -3.0))
+    w = world(start, [tv.HalfSpace((0, 1), 1.7, restitution=0.5)], substeps=7, precision=precision)
+    w.step(1 / 60)
+    np.testing.assert_allclose(w.velocity[:, 1], 1.5, rtol=1e-3)

@@ -30,6 +30,24 @@ def test_driven_pins_follow_their_targets(world):
     assert w.last.residual < 1e-3 and np.abs(w.position - [10.0, 0]).max() <= 1.1
 
 
+@pytest.mark.parametrize("substeps", [1, 4])
+def test_what_a_driven_pin_drags_bears_the_impulse_of_a_frame_in_its_first_substep(world, substeps):
+    # x = -a t^2 / 2 at the ends of frames, about: the speed grows by a dt where frames meet, and F h = 3 m a dt for three links. In
+    # frames of one substep, F = 3 m a.
+    a, dt, x = 2.0, 1 / 60, np.stack([np.arange(4.0), np.zeros(4)], axis=1)
+    for share in (0.999, 1.001):
+        pin = tv.Pin([0])
+        links = tv.Distance([[0, 1], [1, 2], [2, 3]], break_at=share * 3 * a * substeps)
+        w = world(tv.Particles(x, velocity=(-a * dt / 2, 0.0)), [pin, links], substeps=substeps, precision="f64")
+        for k in range(1, 6):
+            pin.target = [[-a * (k * dt) * ((k + 1) * dt) / 2, 0.0]]
+            w.step(dt)
+            if share > 1:
+                want = a * np.array([3.0, 2.0, 1.0]) if substeps == 1 else 0.0
+                assert k == 1 or links.load == pytest.approx(want, abs=1e-9)
+        assert links.broken.tolist() == [share < 1, False, False]
+
+
 def test_soft_pins_are_springs(world):
     # m x'' = -k (x - target): an oscillator along both axes; and under gravity the particle rests at the static distance.
     k = 100.0

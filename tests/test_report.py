@@ -178,11 +178,16 @@ def test_the_certificate_tells_what_holds_and_what_does_not(monkeypatch, tmp_pat
         tv.report.stress(rows=[99])
 
 
-def test_commands(capsys):
+def test_commands(tmp_path, capsys):
     assert main(["info"]) == 0 and "taichi" in capsys.readouterr().out
     assert main(["report", "--list"]) == 0 and "S05_tennis_racket" in capsys.readouterr().out
     assert main(["report", "nonsense", "--workers", "1"]) == 2 and "fits no case" in capsys.readouterr().err
     assert main(["stress", "--workers", "0"]) == 2
+    for name, words in ((str(tmp_path / "none" / "x"), "does not exist"), (str(tmp_path), "is a folder")):
+        for command in ("stress", "report"):
+            with pytest.raises(SystemExit):
+                main([command, "--json", name])
+            assert words in capsys.readouterr().err
 
 
 PLANTS = {

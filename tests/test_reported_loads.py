@@ -203,15 +203,35 @@ def test_a_pendulum_breaks_at_its_strength_under_auto(world, angle):
 
 
 def test_walls_give_as_much_as_gravity_takes_away(world):
-    # The impulse of a wall is a change of momentum: all that gravity gave to the particle on it, up to the middle of the last
-    # substep, where the displacement gives the velocity. So nothing is lost or counted twice where the substep changes.
+    # The impulse of a wall is a change of momentum: all that gravity gave to the particle on it, m g dt in each frame. Where the
+    # substep changes, it is counted from the middle of the substep before to the middle of the last one, where the displacement
+    # gives the velocity, so nothing is lost or counted twice.
     floor = tv.HalfSpace((0, 1), -2.0, events=True)
     w = world(tv.Particles([[0.0, -2.0]], mass=MASS), [tv.Gravity(G), floor], substeps=4, precision="f64")
     given = 0.0
     for dt in (4 * H, 4 * H, 40 * H, 4 * H, 0.4 * H, 8 * H, H, 3 * H):
         w.step(dt)
         given += w.wall_events().touches.impulse.sum()
-        assert given == pytest.approx(WEIGHT * (w.time - dt / 8), rel=1e-9)
+        assert given == pytest.approx(WEIGHT * (w.time - dt / 8 + H / 2), rel=1e-9)
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.5])
+def test_a_start_gives_the_impulse_of_a_whole_frame(world, restitution):
+    # sum J = m g t + m (v - v_0), from the first frame on, for what rests and for what strikes: the blow counts once. The substep
+    # of a start moves by h^2 / 2 times the load only.
+    start = tv.Particles([[0.0, 0.1], [1.0, 0.1]], radius=0.1, mass=MASS, velocity=[[0, 0], [0, -3.0]])
+    floor = tv.HalfSpace((0, 1), events=True, restitution=restitution)
+    w = world(start, [tv.Gravity(G), floor], substeps=2, precision="f64")
+    for _ in range(2):
+        given, begin = np.zeros(2), w.time
+        for _ in range(8):
+            w.step(0.02)
+            touches = w.wall_events().touches
+            np.add.at(given, touches.pairs[:, 0], touches.impulse)
+        gained = MASS * (w.velocity - start.velocity)[:, 1]
+        np.testing.assert_allclose(given - gained, WEIGHT * (w.time - begin), rtol=1e-9)
+        assert given[0] == pytest.approx(WEIGHT * 8 * 0.02, rel=1e-9)
+        w.position, w.velocity = start.position, start.velocity  # another start
 
 
 def test_what_sags_holds_where_the_substep_gets_shorter(world):

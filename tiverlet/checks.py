@@ -88,6 +88,12 @@ def vector(who: str, name: str, value, dim: int, *, infinite=False) -> np.ndarra
     return array
 
 
+def direction(array: np.ndarray) -> np.ndarray:
+    """Return a vector of finite numbers as a unit vector; 0 where it is 0. Its square may be too large or too small for a float."""
+    scaled = np.ldexp(array, -np.frexp(np.abs(array).max(initial=0.0))[1])  # exact
+    return scaled / (np.linalg.norm(scaled) or 1.0)
+
+
 def finite(who: str, name: str, array: np.ndarray) -> None:
     """Raise ValueError for the first element that is NaN or infinite."""
     sound = np.isfinite(array)

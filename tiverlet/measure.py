@@ -44,8 +44,13 @@ def torque(world: "World") -> np.ndarray:
 
 
 def center_of_mass(world: "World") -> np.ndarray:
-    """Return the center of mass of the particles that can move [m], (dim,)."""
+    """Return the center of mass of the particles that can move [m], (dim,). Raises ValueError if there are none.
+
+    Particles that the scene holds (pinned, of infinite mass) have no weight beside others.
+    """
     m = _mass(world)
+    if not m.any():
+        raise ValueError("measure.center_of_mass: no particle can move. The mean position is world.position.mean(axis=0).")
     return m @ world.position / m.sum()
 
 

@@ -44,8 +44,9 @@ class World:
 
     particles: Particles. features: forces, constraints, contacts and walls, in any order; at most one Contact. A feature that is
     not in the list costs nothing.
-    substeps: substeps per frame, or "auto" for as many as each frame needs (see StepController). iterations: passes over the
-    constraints in each substep. Both may change at any time, without compiling.
+    substeps: substeps per frame, or "auto" for as many as each frame needs (see StepController); springs of omega dt > 50, dt the
+    frame, are not resolved, and lose what they vibrate with (flag "energy-loss"). iterations: passes over the constraints in each
+    substep. Both may change at any time, without compiling.
     solver: how constraints are solved: Direct for chains, trees and loops; Jacobi, Chebyshev or ConjugateGradient for cloth. None
     chooses ConjugateGradient(5) where elimination would leave many stiff links to Jacobi, as in cloth; else Direct where
     constraints are connected like chains or beams; else Jacobi. explain() reports the choice and its reason.
@@ -171,6 +172,8 @@ class World:
             self._runner.end_ramps()
             if self._clock.exceeds(report.energy, self._runner.sheet.item(KINETIC), report.overlap):
                 report = energy_bound.checked(self, report)
+            elif self._clock.falls_short(report.energy):
+                report = energy_bound.checked_for_loss(self, report)
             report.__dict__["seconds"] = perf_counter() - clock  # the report is frozen; this field is not compared
             self._last, self._clock.energy, self._undo, self._events = report, report.energy, None, None
             for watcher in self._watchers:

@@ -87,11 +87,10 @@ class Collider(Feature):
 
     def _direction(self, one_way: Any, dim: int) -> np.ndarray:
         """Return one_way, checked, as a unit vector."""
-        way = checks.vector(repr(self), "one_way", one_way, dim)
-        length = float(np.linalg.norm(way))
-        if length == 0:
+        way = checks.direction(checks.vector(repr(self), "one_way", one_way, dim))
+        if not way.any():
             raise ValueError(f"{self!r}: one_way = 0 has no direction; {(0, 1, 0)[:dim]} lets particles pass upwards.")
-        return way / length
+        return way
 
     @property
     def conserves(self) -> bool:

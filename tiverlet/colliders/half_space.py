@@ -31,10 +31,9 @@ class HalfSpace(Collider):
     ):  # fmt: skip
         normal = np.asarray(normal, dtype=np.float64)
         normal = checks.vector("HalfSpace", "normal", normal, normal.size)
-        length = float(np.linalg.norm(normal))
-        if length == 0:
+        self.normal = checks.direction(normal)
+        if not self.normal.any():
             raise ValueError("HalfSpace: normal = 0 has no direction; (0, 1) is a floor.")
-        self.normal = normal / length
         self.normal.flags.writeable = False
         self.offset = offset
         self.set_surface(friction, restitution, push_out, active, events, surface_velocity=surface_velocity)

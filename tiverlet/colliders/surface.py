@@ -169,9 +169,11 @@ class Surface:
             rise, left = 0 * depth, 1 + 0 * depth
             if ti.static(self.has_restitution or self.has_impacts):
                 # After an earlier bounce in this substep, the straight path to the present position begins at the height `gap`.
-                gap = -depth - leaving
+                # What strikes a wall on which it starts may be inside of it by rounding; what rests there has no approach of its own.
+                gap, before = -depth - leaving, (self.state.before[i] - moved).dot(n)
+                if gap < 0 and gap >= -close and -before > ti.abs(before - leaving):
+                    gap = 0 * gap
                 if gap >= 0 and leaving < 0 and mode != FRICTIONLESS:
-                    before = (self.state.before[i] - moved).dot(n)
                     if self.is_linked(i):
                         if self.defer_impact(i, n, moved, leaving, before, after, mode):
                             move, after = 0 * depth, leaving
@@ -181,7 +183,7 @@ class Surface:
                     move, rise, after = 0 * depth, 0 * depth, leaving
             if ti.static(self.has_log):
                 if mode != BEFORE_CONTACTS:
-                    self.log.record(i, depth, n, after - leaving, -leaving)
+                    self.log.record(i, depth, n, after - leaving, -leaving, moved, h, rise > 0)
             change = (after - leaving) * n
             if ti.static(self.state.keeps_wall_push):
                 self.state.wall_push[i] = self.state.wall_push[i] + change

@@ -20,6 +20,9 @@ class WallLog:
     of the frame, from 1 on, in which it was first pressed and last pressed, or BEFORE or NEVER. impulse: the sum of the changes
     of its displacement along normals [m]; there are several normals in corners and in hollows. normal: the first of them. speed:
     its approach in the substep in which it met the wall [m].
+
+    A start from given velocities moves particles by h^2 / 2 times what presses them, h^2 in other substeps. So there, what a wall
+    gives counts `late` times more, as far as it is not the blow of the velocity `given`, as whose impulse it is whole.
     """
 
     per_particle = True
@@ -30,6 +33,7 @@ class WallLog:
         self.touching = add(f"events.{name}.touching", n, kind=ti.i32, state=True, for_reports=True)
         self.when = add(f"events.{name}.when", n, width=2, kind=ti.i32)
         self.impulse, self.speed = add(f"events.{name}.impulse", n, width=dim), add(f"events.{name}.speed", n)
+        self.given, self.late = add(f"events.{name}.given", n, width=dim), add(f"events.{name}.late", None)
         sleeps = bool(scene.state.sleepers)  # sleeping particles are not tested again, so their points are state
         self.normal, self.point = (
             add(f"events.{name}.{what}", n, width=dim, state=sleeps, for_reports=sleeps) for what in ("normal", "point")
@@ -38,8 +42,18 @@ class WallLog:
         self.in_state = {"touching": self.touching} | ({"normal": self.normal, "point": self.point} if sleeps else {})
 
     @ti.func
+    def begin(self, substep, late):
+        """Begin a substep, numbered from 1 on. late: see above, 0 but for starts from given velocities. One thread calls it."""
+        self.substep[None] = substep
+        self.late[None] = late
+
+    @ti.func
     def open(self, i):
-        """At the start of a frame: clear the events of particle i. Whether it touched before is kept."""
+        """At the start of a frame: clear the events of particle i, and note its velocity, which d_i is if the frame is a start.
+
+        Whether it touched before is kept.
+        """
+        self.given[i] = self.state.d[i]
         began = ti.select(self.touching[i] != 0, BEFORE, NEVER)
         self.when[i] = [began, began]
         self.impulse[i] = ti.zero(self.state.x[i])
@@ -55,10 +69,11 @@ class WallLog:
             self.when[i][1] = substep
 
     @ti.func
-    def record(self, i, depth, n, push, approach):
+    def record(self, i, depth, n, push, approach, moved, h, bounces):
         """Record that particle i is `depth` [m] inside of the wall with the normal n.
 
-        push: change of its displacement along n [m]. approach: its displacement towards the wall [m].
+        push: change of its displacement along n [m]. approach: its displacement towards the wall, which moved by `moved` in this
+        substep of h [s] itself [m]. bounces: whether it leaves the wall.
         """
         began, last, now = self.when[i][0], self.when[i][1], self.substep[None]
         if last < now - 1:
@@ -67,6 +82,9 @@ class WallLog:
             self.normal[i] = n
             self.point[i] = self.state.place(i) - (self.radius.of(i) - depth) * n
         self.when[i] = [ti.select(began == NEVER, now, began), now]
+        if self.late[None] > 0 and not bounces:
+            blow = ti.min(ti.max(approach, 0), ti.max((moved - h * self.given[i]).dot(n), 0))
+            push += self.late[None] * (push - ti.min(blow, push))
         self.add(i, push * n)
 
     @ti.func

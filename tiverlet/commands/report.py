@@ -2,6 +2,7 @@
 
 import argparse
 
+from .output import output
 from .pool import add_workers, workers
 
 ABOUT = "error against run time on scenes with known answers"
@@ -13,10 +14,10 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--list", action="store_true", help="list the cases")
     parser.add_argument("--quick", action="store_true", help="a few substeps and one timed run of each")
     parser.add_argument("--wide", action="store_true", help="print all columns, for screens of 200 characters")
-    parser.add_argument("--json", metavar="FILE", help="write all points, for machines")
-    parser.add_argument("--markdown", metavar="FILE", help="write the table, and one of all points for each case")
+    parser.add_argument("--json", type=output, metavar="FILE", help="write all points, for machines")
+    parser.add_argument("--markdown", type=output, metavar="FILE", help="write the table, and one of all points for each case")
     parser.add_argument("--plot", metavar="FOLDER", help="write a log-log plot of each case (needs matplotlib)")
-    parser.add_argument("--record", metavar="FILE", help="write the curves for the rerun viewer")
+    parser.add_argument("--record", type=output, metavar="FILE", help="write the curves for the rerun viewer")
     add_workers(parser)
 
 

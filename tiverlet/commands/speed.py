@@ -2,6 +2,8 @@
 
 import argparse
 
+from .output import output
+
 ABOUT = "speed, memory and starts; beside a pile in C, and other engines"
 
 
@@ -19,8 +21,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     for name, what in parts.items():
         parser.add_argument(f"--no-{name}", dest=name, action="store_false", help=f"without {what}")
     parser.add_argument("--compilers", action="store_true", help="Taichi beside Quadrants, and nothing else")
-    parser.add_argument("--json", metavar="FILE", help="write everything, for machines")
-    parser.add_argument("--markdown", metavar="FILE", help="write the tables")
+    parser.add_argument("--json", type=output, metavar="FILE", help="write everything, for machines")
+    parser.add_argument("--markdown", type=output, metavar="FILE", help="write the tables")
     parser.add_argument("--plot", metavar="FOLDER", help="write plots (needs matplotlib)")
 
 

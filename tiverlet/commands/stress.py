@@ -2,6 +2,7 @@
 
 import argparse
 
+from .output import output
 from .pool import add_workers, workers
 
 ABOUT = "stiff and extreme cases, with a verdict on each"
@@ -10,7 +11,7 @@ ABOUT = "stiff and extreme cases, with a verdict on each"
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("rows", nargs="*", type=int, help="numbers of rows; all without any")
-    parser.add_argument("--json", metavar="FILE", help="write the certificate, for machines")
+    parser.add_argument("--json", type=output, metavar="FILE", help="write the certificate, for machines")
     add_workers(parser)
 
 

@@ -24,7 +24,9 @@ class Path(Anchored):
     and the report has a flag. Particles stop at the ends of an open curve.
 
     indices: (m,) particles. points: (k, dim) [m], along the curve. closed: the last point is connected to the first.
-    smooth: a cubic spline through the points, with continuous curvature; otherwise a polyline, with corners.
+    smooth: a cubic spline through the points, with continuous curvature; otherwise a polyline, with corners. At a corner of angle
+    phi a free particle changes its speed by a factor between cos(phi) and 1 / cos(phi), by where in the substep it passes: energy
+    is not conserved there, however short the substep (flag "energy-gain" once it adds up). Take smooth=True, or small angles.
     speed: number or (m,) [m/s]; driven at this speed, positive in the order of the points. Live.
     at: number or (m,) [m]; driven to this arc length, evenly during each frame in which it changes. Live. Not with `speed`.
     compliance: number or (m,) [m/N], of a soft wire; damping: number or (m,) [N s/m], across it. Free particles only.

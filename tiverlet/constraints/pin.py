@@ -95,6 +95,10 @@ class Pin(Anchored):
 
     `load` is the force of each spring on its particle [N]. It raises where particles are driven, since nothing computes the force
     that holds them: give a small compliance.
+
+    Within a frame the speed is constant, and changes where frames meet. So what hangs on a driven Pin of acceleration a bears all
+    of the impulse m a dt of a frame in the first substep, with m a dt / h, where `break_at` compares it, and nothing in the last
+    one, which `load` tells of. Where loads matter, step frames of one substep, with a target for each: they bear m a.
     """
 
     each = ("compliance", "damping", "target")

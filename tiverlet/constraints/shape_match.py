@@ -11,7 +11,7 @@ from ..geometry.ordered import distinct
 from ..particles import Particles
 from .core.cluster_passes import ClusterPasses
 from .core.members import VariableSize, rows
-from .core.spring import per_newton
+from .core.spring import SOFTEST, per_newton
 from .core.strength import strength_of
 
 
@@ -71,7 +71,8 @@ class ShapeMatch(Batch):
         self.break_at = break_at
 
     def _setting(self, name: str, value) -> np.ndarray:
-        value = checks.per_item(repr(self), name, value, self.count, least=0.0)
+        most = SOFTEST if name == "compliance" else None
+        value = checks.per_item(repr(self), name, value, self.count, least=0.0, most=most)
         now = {"compliance": 1.0, "creep": 0.0} | vars(self) | {name: value}
         rigid = (now["creep"] > 0) & (now["compliance"] == 0) & np.ones(self.count, dtype=bool)
         if rigid.any():

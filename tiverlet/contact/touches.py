@@ -22,7 +22,9 @@ class Touches:
     impulse: (m,) [N s] along the normal, without friction, summed over all substeps of the frame (World.contacts has that of the
     last substep only). i got impulse * normal, and j the opposite. It is 0 for sensors and sleeping particles. The impulse of a
     substep acts from the middle of the substep before to its own middle. So a frame of substeps h after substeps h_old has
-    (h_old - h) / 2 of a steady force more, and sums over frames miss no more than half a substep.
+    (h_old - h) / 2 of a steady force more, and sums over frames miss no more than half a substep. Walls give the impulse of a
+    whole frame, m g dt for what rests, in the first frame and after velocities were given, too; contacts of particles give half a
+    substep less there.
     speed: (m,) [m/s], the highest speed of approach at which the pair met in this frame, before the impact; 0 if it did not meet.
     began: (m,) [s], when the pair first met in this frame; NaN if it touched before. ended: (m,) [s], when it was apart again;
     NaN if it still touches. Times are those of the ends of substeps.

@@ -62,7 +62,8 @@ class StepController:
     In the same way, motion in forces that vary in space is too fast by (omega h)^2 / 24; by default (omega h)^2 may be 0.06. A
     frame is also repeated, as long as that helps, if its energy is wrong by more than a fiftieth of the kinetic energy, see
     energy_bound.missed(), or if springs lose more than they may, see damping(). If it does not help, the frame counts as good,
-    since the energy before it was computed with longer substeps.
+    since the energy before it was computed with longer substeps. Springs of omega dt > FASTEST are left unresolved, and what they
+    vibrate with is lost; once that is a tenth of the largest kinetic energy, the flag "energy-loss" says so.
 
     All figures are of the order of h^2. If they leave room for it, the next frame is tried with half the effort. Each effort has
     a patience of its own: the number of frames in a row in which there must be room before it is tried. A failure makes it four

@@ -158,7 +158,10 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     if batches:
         with memory.owned("slots"):
             scene.slots = Slots(scene, batches, solver)
-        if not state.double and (state.compensated or (scene.slots.exact and sums_exactly())):
+        # Rounding errors are carried along where they are all that constraints leave, and where rest values move by themselves,
+        # whose steady loads would otherwise tremble by m ulp(x) / h^2.
+        carries = sums_exactly() and (scene.slots.exact or any(b.driven for b in batches))
+        if not state.double and (state.compensated or carries):
             state.carry(memory, particles)
         if scene.order > 2:
             high_order.check_solved(batches, scene, solver)

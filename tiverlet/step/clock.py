@@ -13,8 +13,8 @@ NAMES = {
     "_kinetic": "kinetic", "_parting": "parting",
 }  # fmt: skip
 
-SHARE = 0.1  # of the largest kinetic energy: the gain that is allowed
-DIGITS = 1e-5  # of the energy: the gain that rounding may cause
+SHARE = 0.1  # of the largest kinetic energy: the gain, or the loss, that is allowed
+DIGITS = 1e-5  # of the energy: the gain, or the loss, that rounding may cause
 CHANGED = -np.inf  # the bound while work is done on the scene in the coming frame: earlier energies do not count
 SQUEEZED = 0.1  # overlap [radii] from which particles that were pressed together may push themselves apart
 MET = 1e-6  # relative violation that counts as rounding
@@ -24,6 +24,11 @@ PARTED = 0.01  # overlap [radii] down to which particles placed into each other 
 def energy_limit(bound: Any, kinetic: Any, energy: Any) -> Any:
     """The most energy that a passive scene can have [J], see energy_bound.py. Numbers or arrays."""
     return bound + SHARE * kinetic + DIGITS * abs(energy)
+
+
+def energy_floor(bound: Any, kinetic: Any, energy: Any) -> Any:
+    """The least energy of a scene that conserves energy [J], see energy_bound.py. Numbers or arrays."""
+    return bound - SHARE * kinetic - DIGITS * abs(energy)
 
 
 def initial_margin(inv_mass: np.ndarray, extent: np.ndarray, h: Any) -> Any:
@@ -46,7 +51,8 @@ class Clock:
     the last frame; None if there is none. energy: at the end of the last frame [J]; None if unknown. softened: whether violations
     held loads that had no direction in the last frame. bound, kinetic, parting: the energy that must not be exceeded [J], None if
     unknown; the largest kinetic energy since then [J]; whether particles that were placed into each other still part; see
-    energy_bound.py.
+    energy_bound.py. conserves: whether the scene conserves energy, see energy_bound.conserves(); None if unknown. It follows from
+    the features, and is not recorded.
     """
 
     time: float = 0.0
@@ -67,6 +73,7 @@ class Clock:
     bound: float | None = None
     kinetic: float = 0.0
     parting: bool = False
+    conserves: bool | None = None
 
     def copy(self) -> "Clock":
         """A clock with the same values."""
@@ -96,18 +103,25 @@ class Clock:
     def begin_with(self, energy: float, more: float) -> None:
         """Set the bound to the initial energy plus `more` [J], unless work is done on the scene in the coming frame."""
         if self.bound != CHANGED:
-            self.bound, self.kinetic = float(energy + more), 0.0
+            self.bound, self.kinetic, self.conserves = float(energy + more), 0.0, None
 
     def exceeds(self, energy: float, kinetic: float, overlap: float) -> bool:
         """Record total and kinetic energy [J] and overlap [radii] after a frame. Returns whether the energy exceeds its bound."""
         if self.bound is None:
             self.bound, self.kinetic = energy if self.energy is None else max(self.energy, energy), 0.0
+            self.conserves = None
         elif self.bound == CHANGED:
             self.bound, self.kinetic, self.parting = energy, 0.0, self.parting or overlap > SQUEEZED
+            self.conserves = None
         self.kinetic = max(self.kinetic, kinetic)
         if self.parting:
             self.bound, self.parting = max(self.bound, energy), overlap > PARTED
         return energy > energy_limit(self.bound, self.kinetic, energy)
+
+    def falls_short(self, energy: float) -> bool:
+        """Whether the energy [J] is below that of a scene that conserves it, as this one does as far as is known. Call it after
+        exceeds()."""
+        return self.conserves is not False and not self.parting and energy < energy_floor(self.bound, self.kinetic, energy)
 
     def next_frame(self, dt: float) -> tuple[float, float, int]:
         """When frames of this length began, their length, and their number with the coming one. Counting frames of equal length,

@@ -1,4 +1,4 @@
-"""Spurious energy: an upper bound on the energy of a scene on which nothing does work.
+"""Spurious gains and losses: bounds on the energy of a scene on which nothing does work.
 
 A passive scene, of gravity, springs, dashpots, contacts and fixed walls, loses or conserves energy,
 
@@ -9,6 +9,14 @@ particles placed, features edited, a knob changed, a pin or a wall moved. The ch
 kinetic energy since then, plus the error of forces that are hardly resolved, (omega h)^2 / 4 of that energy. A larger gain means
 that substeps are too long for some motion that no other figure of the report measures. Clock.exceeds() checks this after each
 frame; this file has the further checks for frames where it returns true.
+
+A scene of springs, uniform gravity, and walls and contacts without friction that return what strikes them also has a lower bound,
+
+    E(t) >= E(0) - O(h^2),
+
+since nothing in it is known to take energy out. But springs that the substep does not resolve are damped by it: a vibration loses
+2 pi s^5 of its energy in each period, s = omega h, see adaptive.damping(). A loss of more than a tenth of the largest kinetic
+energy is flagged. Clock.falls_short() finds the frames for checked_for_loss(), see conserves() for the scenes.
 """
 
 from dataclasses import replace
@@ -17,10 +25,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..colliders.collider import Collider
+from ..constraints.core.anchored import Anchored
+from ..constraints.core.scalar import Scalar
 from ..features.feature import Acceleration, Batch
 from ..forces.gravity import Gravity
 from ..neighbours.periodic import Periodic
-from .clock import CHANGED, DIGITS, PARTED, energy_limit
+from .clock import CHANGED, DIGITS, PARTED, energy_floor, energy_limit, initial_margin
 from .diagnostics import ENERGY, EXTENT, KINETIC, REACH, STIFFNESS
 from .step_report import StepReport
 
@@ -32,7 +42,8 @@ MISSED = 0.02  # share of the largest kinetic energy by which the energy may be 
 BOUNCED = 0.003  # the same where bodies bounce and nothing takes energy out: impacts follow each other, and errors add up
 SKIN = 1e-5  # share of the largest coordinate: apparent depth of particles that lie on a wall, at most
 ROUNDED = 64  # rounding error of positions, in units in the last place of the largest coordinate
-FLAG = "energy-gain"
+RESOLVED = 0.1  # omega h up to which a spring loses less than 1e-4 of its energy in a period
+FLAG, LOST = "energy-gain", "energy-loss"
 
 
 def checked(world: "World", report: StepReport) -> StepReport:
@@ -56,6 +67,26 @@ def checked(world: "World", report: StepReport) -> StepReport:
         f"{clock.kinetic:.3g} J at most. Use more substeps, at first {2 * report.substeps}, or soften what is stiff and heavy."
     )
     return replace(report, flags=report.flags | {FLAG}, notes=(*report.notes, note))
+
+
+def checked_for_loss(world: "World", report: StepReport) -> StepReport:
+    """Return the report of a frame after which Clock.falls_short() is true, with the flag "energy-loss" if the loss is spurious."""
+    clock, sheet = world._clock, world._runner.sheet
+    if clock.conserves is None:
+        clock.conserves = conserves(world) and not works(world)
+    bound: Any = clock.bound
+    loss = energy_floor(bound, clock.kinetic, report.energy) - report.energy
+    if not (clock.conserves and loss > loss_error(world, sheet[EXTENT : EXTENT + world.particles.dim], sheet[REACH])):
+        return report
+    omega = fastest_spring(world)
+    need = np.ceil(report.substeps * omega * clock.h / RESOLVED)
+    note = (
+        f"Nothing is said to take energy out of the scene, but it has {bound - report.energy:.3g} J less than it had; its kinetic "
+        f"energy was {clock.kinetic:.3g} J at most. Springs that a substep does not resolve are damped by it: the fastest has "
+        f"omega h = {omega * clock.h:.3g}. About {need:.7g} substeps resolve it. Otherwise say that energy is lost: give springs "
+        "damping, or make rigid what is too stiff (compliance 0)."
+    )
+    return replace(report, flags=report.flags | {LOST}, notes=(*report.notes, note))
 
 
 def before(world: "World") -> float | None:
@@ -95,6 +126,59 @@ def keeps_energy(world: "World") -> bool:
     if not all(f.conserves for f in world.features if not isinstance(f, Batch)):
         return False
     return not any(f.driven or f.breaks or np.any(getattr(f, name, 0.0)) for f in springs for name in ("damping", "creep"))
+
+
+def conserves(world: "World") -> bool:
+    """Whether the scene has springs, and nothing that may take energy out of it or that errs by an unknown amount.
+
+    False for what dissipates, see keeps_energy(); for rigid constraints, since a link that becomes taut is an inelastic impact,
+    and violations are removed without a return; for forces that vary in space; and for constraints of unknown kinds.
+    """
+    if not keeps_energy(world) or not all(f.uniform for f in world.features if isinstance(f, Acceleration)):
+        return False
+    batches, inv_mass = [f for f in world.features if isinstance(f, Batch)], world._runner.scene.inv_mass
+    if not all(isinstance(f, (Scalar, Anchored)) for f in batches):
+        return False
+    rigid = any(((f.compliance == 0) & ~f.immovable(inv_mass)).any() for f in batches)
+    return not rigid and any((f.compliance > 0).any() for f in batches)
+
+
+def loss_error(world: "World", extent: np.ndarray, reach: Any) -> float:
+    """Return by how much the energy of a scene that conserves energy may fall [J]. extent, reach: see blur().
+
+    A load that begins to act makes stiff springs sag, and they lose the vibration about that: it does not count up to FALL of the
+    energy of a fall as far as the scene is wide. The energy in the middle of a substep is (omega h)^2 / 4 of the stored energy
+    less where a spring begins to relax than where it is at rest. Rounding stretches springs, which costs energy the stiffer they
+    are.
+    """
+    h, inv_mass, x = world._clock.h, world._runner.scene.inv_mass, world.position
+    sag = FALL * _masses(world).sum() * np.linalg.norm(extent) * np.linalg.norm(_pull(world))
+    out = sag + rounding(world, reach) + initial_margin(inv_mass, extent, h)
+    for f, some in _springs(world):
+        alpha, w = f.compliance[some], f.weights(x)[some]
+        s2 = w * h**2 / alpha
+        if isinstance(f, Scalar):
+            C = f.violation(x)
+            square = (np.maximum(f.side * C, 0) if f.side else C)[some] ** 2
+        else:
+            square = (f.offset(x)[some] ** 2).sum(axis=1)
+        stretch = w / inv_mass[inv_mass > 0].min() * _digit(world, reach) ** 2  # at least |grad f|^2 times that of the digit
+        out += float(((np.where(s2 < 1, s2 / 4, 0) * square + stretch) / (2 * alpha)).sum())
+    return float(out)
+
+
+def fastest_spring(world: "World") -> float:
+    """Return the angular frequency of the fastest spring [rad/s]."""
+    x = world.position
+    return float(np.sqrt(max([(f.weights(x)[some] / f.compliance[some]).max() for f, some in _springs(world)], default=0.0)))
+
+
+def _springs(world: "World") -> list[tuple[Any, np.ndarray]]:
+    """Return the batches of springs, and the mask of those constraints in each that can move something."""
+    inv_mass = world._runner.scene.inv_mass
+    batches = [f for f in world.features if isinstance(f, (Scalar, Anchored))]
+    each = [(f, (f.compliance > 0) & ~f.immovable(inv_mass)) for f in batches]
+    return [(f, some) for f, some in each if some.any()]
 
 
 def allowed_loss(world: "World", rate: float) -> float:
@@ -143,8 +227,12 @@ def blur(world: "World", extent: np.ndarray, reach: Any) -> Any:
 
 def rounding(world: "World", reach: Any) -> Any:
     """Return the energy that the rounding of positions may add [J]. reach: the largest coordinate, (...) [m]."""
-    digit = ROUNDED * (2.0**-23 if world._precision != "f64" else 2.0**-52) * reach / world._clock.h
-    return _masses(world).sum() * digit**2
+    return _masses(world).sum() * (_digit(world, reach) / world._clock.h) ** 2
+
+
+def _digit(world: "World", reach: Any) -> Any:
+    """Return the rounding error of positions [m]. reach: the largest coordinate, (...) [m]."""
+    return ROUNDED * (2.0**-23 if world._precision != "f64" else 2.0**-52) * reach
 
 
 def _masses(world: "World") -> np.ndarray:

@@ -315,7 +315,8 @@ class Step:
         for log in ti.static(self.wall_logs):
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, now.thread)):
-                log.substep[None] = now.s + 1
+                whole, start = self.integrator.h2_effective(now.h, 0), self.integrator.h2_effective(now.h, now.fresh)
+                log.begin(now.s + 1, ti.select(now.span.owed > 0, 0 * now.h, whole / start - 1))
             n = self.n * ti.cast(now.s == 0, ti.i32)
             for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
                 log.open(i)

@@ -29,6 +29,10 @@ class StepReport:
         "stiff-force"       a force changes too fast for the substep (omega h > 2): one that depends on position makes energy
                             grow; one that depends on velocity turns motion far too little
         "energy-gain"       the scene gained more than a tenth of its largest kinetic energy, though nothing does work on it
+        "energy-loss"       a scene of springs, uniform gravity, and walls and contacts without friction and with restitution 1
+                            lost more than a tenth of its largest kinetic energy: springs that the substep does not resolve are
+                            damped by it. Never where anything may take energy out (damping, drag, friction, rigid constraints,
+                            which lose in impacts, sleep), nor with forces that vary in space
         "softened"          a solver let constraints give way, because their tension is too large for the substep
         "unconverged"       the residual is above 0.1: a link is off by a tenth of its length, an angle by a tenth of a radian
                             (or large clusters that share particles gained energy, because a substep became shorter)

@@ -8,13 +8,14 @@ from ..step.integrator import FREE
 # Attributes with the same name and meaning in Clock.
 PLAIN = "time", "tick", "since", "h", "d_is_velocity", "started", "longest", "owed", "lacked", "softened", "kinetic", "parting"
 NONE = -1  # first_moved where no particle was placed
+NO, YES, UNKNOWN = range(3)  # whether a world conserves energy
 
 
 class Clocks:
     """The values of a Clock for each of many worlds, as arrays; see Clock for their meaning.
 
     energy, bound: NaN where unknown. first_moved: NONE where no particle was placed. frame: (worlds, 3). needs_drag: whether
-    knobs may need drag factors other than those in the clock and on the device.
+    knobs may need drag factors other than those in the clock and on the device. conserves: NO, YES or UNKNOWN.
     """
 
     def __init__(self, clocks: list[Clock]):
@@ -29,6 +30,7 @@ class Clocks:
         # Lists, since these values rarely differ from world to world.
         self.drag = [clock.drag for clock in clocks]
         self.needs_drag = np.zeros(self.count, dtype=bool)
+        self.conserves = np.full(self.count, UNKNOWN)
         self.velocity_override = {
             k: clock.velocity_override for k, clock in enumerate(clocks) if clock.velocity_override is not None
         }

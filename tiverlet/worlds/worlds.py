@@ -19,11 +19,11 @@ from ..features.read_only import assign_whole_advice, read_only
 from ..particles import in_range
 from ..step import checkpoint, energy_bound, impulse
 from ..step import frames as kernel
-from ..step.clock import CHANGED, PARTED, SQUEEZED, energy_limit, initial_margin
+from ..step.clock import CHANGED, PARTED, SQUEEZED, energy_floor, energy_limit, initial_margin
 from ..step.diagnostics import ENERGY, EXTENT, KINETIC, OVERLAP, REACH, STARTED, STEPPED, STIFFNESS, TURNS, UNSTEPPED, risks
 from ..step.integrator import shares_of
 from ..world import World
-from .clocks import NONE, Clocks
+from .clocks import NO, NONE, UNKNOWN, YES, Clocks
 from .knobs import Knobs
 from .report import WorldsReport
 from .structure import check_structure, with_equal_kernels
@@ -229,6 +229,7 @@ class Worlds:
             works = clocks.bound[unknown] == CHANGED  # something does work in the coming frame
             clocks.bound[unknown] = np.where(works, CHANGED, np.where(first, energy + more, np.nan))
             clocks.kinetic[unknown] = np.where(first, 0.0, clocks.kinetic[unknown])
+            clocks.conserves[unknown] = UNKNOWN
             clocks.parting[unknown] = np.where(placed, overlap > 0, clocks.parting[unknown])
             for k in unknown[(overlap > 0) & placed]:
                 with self._as_world(k), runner.memory.compiler():
@@ -352,6 +353,7 @@ class Worlds:
             np.where(first, released[:, None], 0.0), residual,
         )  # fmt: skip
         every[energy_bound.FLAG] = self._gains(before, figures)
+        every[energy_bound.LOST] = self._losses(figures[:, -1])[:, None]
         clocks.softened = every["softened"][:, -1].copy()
         wrong = bad < n
         report = WorldsReport(
@@ -383,6 +385,7 @@ class Worlds:
             clocks.bound = np.where(unknown, np.fmax(before, energy[:, k]), np.where(changed, energy[:, k], clocks.bound))
             clocks.parting |= changed & (overlap[:, k] > SQUEEZED)
             clocks.kinetic = np.maximum(np.where(unknown | changed, 0.0, clocks.kinetic), kinetic[:, k])
+            clocks.conserves[unknown | changed] = UNKNOWN
             clocks.bound = np.where(clocks.parting, np.maximum(clocks.bound, energy[:, k]), clocks.bound)
             clocks.parting = clocks.parting & (overlap[:, k] > PARTED)
             gain[:, k] = energy[:, k] - energy_limit(clocks.bound, clocks.kinetic, energy[:, k])
@@ -396,6 +399,23 @@ class Worlds:
                     if (gain[k] > err).any() and energy_bound.inside(world, reach[k].max()):
                         world._clock.bound, err = energy[k].max(), np.inf
                     out[k] = gain[k] > err + energy_bound.let_out(world)
+        return out
+
+    def _losses(self, figures: np.ndarray) -> np.ndarray:
+        """Return which worlds have lost energy by the last frame that nothing took, (worlds,). Call it after _gains().
+
+        Does what Clock.falls_short() and energy_bound.checked_for_loss() do. figures: of the last frame, (worlds, FIGURES).
+        """
+        clocks, out = self._clocks, np.zeros(len(self), dtype=bool)
+        floor = energy_floor(clocks.bound, clocks.kinetic, figures[:, ENERGY])
+        short = (figures[:, ENERGY] < floor) & ~clocks.parting & (clocks.conserves != NO)
+        for k in np.flatnonzero(short):
+            with self._as_world(k) as world:
+                if clocks.conserves[k] == UNKNOWN:
+                    clocks.conserves[k] = YES if energy_bound.conserves(world) and not energy_bound.works(world) else NO
+                if clocks.conserves[k] == YES:
+                    extent = figures[k, EXTENT : EXTENT + world.particles.dim]
+                    out[k] = floor[k] - figures[k, ENERGY] > energy_bound.loss_error(world, extent, figures[k, REACH])
         return out
 
     # Knobs and states of chosen worlds.

@@ -10,7 +10,7 @@ from ...features.feature import Batch, Feature, Knob, Scene
 from ...features.regrouping import Regrouping
 from .anchor_passes import AnchorPasses, Place
 from .members import FixedSize
-from .spring import per_newton
+from .spring import SOFTEST, per_newton
 
 if TYPE_CHECKING:
     from ...particles import Particles
@@ -46,7 +46,7 @@ class Anchored(Batch):
         self.compliance, self.damping = compliance, damping
 
     def _compliance(self, value) -> np.ndarray:
-        return checks.per_item(repr(self), "compliance", value, self.count, least=0.0)
+        return checks.per_item(repr(self), "compliance", value, self.count, least=0.0, most=SOFTEST)
 
     @property
     def listing(self) -> np.ndarray:

@@ -18,7 +18,7 @@ from .members import FixedSize
 from .outline_passes import OutlinePasses
 from .quantity import Quantity, checked
 from .ramp import Ramp
-from .spring import per_newton
+from .spring import SOFTEST, per_newton
 from .strength import strength_of
 
 if TYPE_CHECKING:
@@ -40,7 +40,9 @@ class Scalar(Batch):
     quantity: Quantity  # f of the batch's constraints
     side = 0  # 0: C = 0;  1: C <= 0, pulls when f > rest;  -1: C >= 0, pushes when f < rest
     rest: Any  # a Knob in each constraint: (m,) array
-    compliance = Knob(lambda f, v: checks.per_item(repr(f), "compliance", v, f.count, least=0.0), "Of springs.", force=True)
+    compliance = Knob(
+        lambda f, v: checks.per_item(repr(f), "compliance", v, f.count, least=0.0, most=SOFTEST), "Of springs.", force=True
+    )
     damping = Knob(lambda f, v: checks.per_item(repr(f), "damping", v, f.count, least=0.0), "Of the dashpot.", force=True)
     break_at = Knob(strength_of, "Load beyond which a constraint breaks, (m,); None for never.")
     compiled_for = ("soft", "rigid", "damped", "breaks", "limited", "cusp", "capped")

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from ...features.feature import Scene
 
 FIRM = 0.99  # theta from which on a spring is rigid in an impact
+SOFTEST = 1e24  # the largest compliance, of a spring that does nothing: beyond it, compliance / h^2 may overflow in f32
 
 
 @ti.pyfunc

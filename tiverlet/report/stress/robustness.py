@@ -194,7 +194,7 @@ def sorted_notes(report: "StepReport") -> list[str]:
     """Return a note for each flag of a report, in the order of the flags' names; the flag itself if it has no note."""
     order = (
         "non-finite", "out-of-range", "tunnelling-risk", "compressed", "turned", "softened", "stiff-force", "unconverged",
-        "energy-gain",
+        "energy-gain", "energy-loss",
     )  # fmt: skip
     told = dict(zip([f for f in order if f in report.flags], report.notes, strict=False))
     return [told.get(flag, flag) for flag in sorted(report.flags)]
