@@ -31,9 +31,9 @@ def test_driven_pins_follow_their_targets(world):
 
 
 @pytest.mark.parametrize("substeps", [1, 4])
-def test_what_a_driven_pin_drags_bears_the_impulse_of_a_frame_in_its_first_substep(world, substeps):
-    # x = -a t^2 / 2 at the ends of frames, about: the speed grows by a dt where frames meet, and F h = 3 m a dt for three links. In
-    # frames of one substep, F = 3 m a.
+def test_what_a_pin_drags_bears_the_impulse_of_a_frame_in_its_first_substep(world, substeps):
+    # x = -a t^2 / 2 at the ends of frames, about: the speed grows by a dt where frames meet, and F h = 3 m a dt for three links.
+    # In frames of one substep, F = 3 m a.
     a, dt, x = 2.0, 1 / 60, np.stack([np.arange(4.0), np.zeros(4)], axis=1)
     for share in (0.999, 1.001):
         pin = tv.Pin([0])

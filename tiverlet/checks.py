@@ -89,7 +89,7 @@ def vector(who: str, name: str, value, dim: int, *, infinite=False) -> np.ndarra
 
 
 def direction(array: np.ndarray) -> np.ndarray:
-    """Return a vector of finite numbers as a unit vector; 0 where it is 0. Its square may be too large or too small for a float."""
+    """Return a vector of finite numbers as a unit vector; 0 where it is 0. Its square need not be a finite float above 0."""
     scaled = np.ldexp(array, -np.frexp(np.abs(array).max(initial=0.0))[1])  # exact
     return scaled / (np.linalg.norm(scaled) or 1.0)
 

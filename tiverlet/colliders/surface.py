@@ -169,7 +169,7 @@ class Surface:
             rise, left = 0 * depth, 1 + 0 * depth
             if ti.static(self.has_restitution or self.has_impacts):
                 # After an earlier bounce in this substep, the straight path to the present position begins at the height `gap`.
-                # What strikes a wall on which it starts may be inside of it by rounding; what rests there has no approach of its own.
+                # What strikes a wall on which it starts may be inside of it by rounding; what rests there does not approach it.
                 gap, before = -depth - leaving, (self.state.before[i] - moved).dot(n)
                 if gap < 0 and gap >= -close and -before > ti.abs(before - leaving):
                     gap = 0 * gap

@@ -5,7 +5,7 @@ import pathlib
 
 
 def output(name: str) -> str:
-    """Return the name of a file that can be written, as the `type` of an argument: the command fails before it measures, not after."""
+    """Return the name of a file that can be written: the `type` of an argument, so that a command fails before it measures."""
     path = pathlib.Path(name)
     if path.is_dir():
         raise argparse.ArgumentTypeError(f"{name} is a folder, but the name of a file is needed.")

@@ -48,7 +48,7 @@ def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, see
         raise ValueError(f"init: arch = {arch!r}, but it must be one of {', '.join(map(repr, ARCHITECTURES))}.")
     if threads is not None and (isinstance(threads, bool) or not isinstance(threads, numbers.Integral) or threads < 1):
         raise ValueError(f"init: threads = {threads!r}, but it must be an integer of at least 1, or None for all cores.")
-    threads, seed = (int(v) if isinstance(v, numbers.Integral) else v for v in (threads, seed))  # Taichi refuses those of NumPy
+    threads, seed = None if threads is None else int(threads), int(seed)  # Taichi refuses integers of NumPy
     wanted = {"arch": arch, "threads": threads, "debug": debug, "seed": seed}
     if ti.cfg is not None:
         if _started.get("runtime") is language.current() and wanted == _started["wanted"]:

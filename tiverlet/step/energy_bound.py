@@ -70,7 +70,7 @@ def checked(world: "World", report: StepReport) -> StepReport:
 
 
 def checked_for_loss(world: "World", report: StepReport) -> StepReport:
-    """Return the report of a frame after which Clock.falls_short() is true, with the flag "energy-loss" if the loss is spurious."""
+    """Return the report of a frame after which Clock.falls_short() is true, with "energy-loss" if the loss is spurious."""
     clock, sheet = world._clock, world._runner.sheet
     if clock.conserves is None:
         clock.conserves = conserves(world) and not works(world)
@@ -81,10 +81,10 @@ def checked_for_loss(world: "World", report: StepReport) -> StepReport:
     omega = fastest_spring(world)
     need = np.ceil(report.substeps * omega * clock.h / RESOLVED)
     note = (
-        f"Nothing is said to take energy out of the scene, but it has {bound - report.energy:.3g} J less than it had; its kinetic "
-        f"energy was {clock.kinetic:.3g} J at most. Springs that a substep does not resolve are damped by it: the fastest has "
-        f"omega h = {omega * clock.h:.3g}. About {need:.7g} substeps resolve it. Otherwise say that energy is lost: give springs "
-        "damping, or make rigid what is too stiff (compliance 0)."
+        f"Nothing is said to take energy out of the scene, but it has {bound - report.energy:.3g} J less than it had; its "
+        f"kinetic energy was {clock.kinetic:.3g} J at most. Springs that a substep does not resolve are damped by it: the "
+        f"fastest has omega h = {omega * clock.h:.3g}. About {need:.7g} substeps resolve it. Otherwise say that energy is lost: "
+        "give springs damping, or make rigid what is too stiff (compliance 0)."
     )
     return replace(report, flags=report.flags | {LOST}, notes=(*report.notes, note))
 
@@ -137,10 +137,9 @@ def conserves(world: "World") -> bool:
     if not keeps_energy(world) or not all(f.uniform for f in world.features if isinstance(f, Acceleration)):
         return False
     batches, inv_mass = [f for f in world.features if isinstance(f, Batch)], world._runner.scene.inv_mass
-    if not all(isinstance(f, (Scalar, Anchored)) for f in batches):
-        return False
-    rigid = any(((f.compliance == 0) & ~f.immovable(inv_mass)).any() for f in batches)
-    return not rigid and any((f.compliance > 0).any() for f in batches)
+    springs = [f for f in batches if isinstance(f, (Scalar, Anchored))]
+    rigid = any(((f.compliance == 0) & ~f.immovable(inv_mass)).any() for f in springs)
+    return len(springs) == len(batches) and not rigid and any((f.compliance > 0).any() for f in springs)
 
 
 def loss_error(world: "World", extent: np.ndarray, reach: Any) -> float:
