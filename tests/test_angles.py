@@ -191,6 +191,7 @@ def test_wrong_angles_are_named():
         tv.Bend([[0, 1, 2], [2, 1, 0]])
 
 
+@pytest.mark.slow
 def test_a_bent_corner_between_pins_stays_near_them(world):
     # The corner is straight only between the pins, L = 0.42 m apart. From a distance r the pins subtend L / r, so the gradient
     # falls as L / r^2, and a step of C = pi over the gradient would throw the corner to pi r^2 / L. A corner that starts so is
@@ -259,6 +260,7 @@ def test_gradients_of_paths_are_exact_where_they_are_almost_straight():
     np.testing.assert_allclose(flat.gradients(x[:, :2]), differences(flat.values, x[flat.indices][..., :2]), atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [tv.Direct(), tv.ConjugateGradient(20)], ids=str)
 def test_chains_that_start_straight_but_for_rounding_keep_their_energy(world, solver):
     # Points on a line along (1, 2, 3) are off it by 1e-16 m. Where a path is almost straight, its plane turns far in a substep.

@@ -88,6 +88,7 @@ def icosphere(levels: int):
     return v, f
 
 
+@pytest.mark.slow
 def test_a_fine_sphere_is_a_ball(world):
     # The faces of an icosphere are at most s = 1 - cos(a) inside the sphere, where a is half the angle of an edge; so are the
     # particles. After half a second of sliding, they differ from those on a ball by at most the angle of the faces.

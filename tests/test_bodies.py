@@ -24,6 +24,7 @@ def around(n, first=0):
     return np.stack([first + k, first + (k + 1) % n], axis=1)
 
 
+@pytest.mark.slow
 def test_areas_of_polygons(world):
     # R25: the area n/2 sin(2 pi / n) is kept by soft rims that fall on the ground; every second loop is given clockwise.
     sizes = (3, 6, 12, 64)
@@ -57,6 +58,7 @@ def test_straight_outlines_enclose_nothing():
         assert (area.indices == order).all()
 
 
+@pytest.mark.slow
 def test_volumes_of_solids(world):
     # R25b: a tetrahedron, a cube with faces in mixed orientations, an icosahedron; squeezed on the ground, and inflated.
     g = (1 + 5**0.5) / 2

@@ -65,6 +65,7 @@ def meeting(x, y, v, reach: float) -> tuple[int, int, np.ndarray]:
     return int(i), int(j), (r[i, j] + time[i, j] * v) / reach
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("e", [0.0, 0.4, 1.0])
 @pytest.mark.parametrize("shape", [BAR, TRIANGLE, TETRAHEDRON], ids=["bar", "triangle", "tetrahedron"])
 def test_rigid_bodies_leave_by_newtons_law(world, shape, e):
@@ -89,6 +90,7 @@ def test_rigid_bodies_leave_by_newtons_law(world, shape, e):
         w.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 @pytest.mark.parametrize(
     "wall", [tv.HalfSpace((0, 1)), tv.Polygon([(-4, -1), (4, -1), (4, 0), (-4, 0)])], ids=["plane", "polygon"]
@@ -169,6 +171,7 @@ def test_bodies_leave_each_other_by_newtons_law(world, shape):
         w.close()
 
 
+@pytest.mark.slow
 def test_elastic_bodies_in_a_box_keep_their_energy_and_heaps_of_them_gain_none(world):
     # In free flight one impact after the other is Newton's law, to O(h); what strikes two others at once may lose some. They kept
     # 0.2 of it. In a heap all of them strike at once: with the secant of one impact it gained 1e4 times its energy.

@@ -9,6 +9,7 @@ from .chains import Scene, hung, links
 from .conftest import case, order, pendulums, rerun, rms
 
 
+@pytest.mark.slow
 def test_every_case_reaches_the_figures_of_the_prototypes(world):
     scene = Scene()
     features = [tv.Gravity(9.81), tv.Distance(scene.pairs)]
@@ -50,6 +51,7 @@ def test_every_case_reaches_the_figures_of_the_prototypes(world):
     assert far.max() <= 5e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["f32", "f32-compensated"])
 def test_shorter_substeps_never_make_it_worse(world, precision):
     # If the rounding errors of d, x and C were dropped, a double pendulum would be off by 6.5e-6 m at 20 substeps a frame and

@@ -39,6 +39,7 @@ def test_a_heap_comes_to_rest_without_overlap(world):
     assert x[:, 1].max() < 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*near pairs per particle")
 @pytest.mark.parametrize("dim", [2, 3])
 def test_coincident_particles_part_gently(world, dim):

@@ -44,6 +44,7 @@ def printed(tmp_path, monkeypatch, capsys):
     return run
 
 
+@pytest.mark.slow
 def test_article_runs_and_checks_itself(printed, tmp_path):
     text = printed("article", settings=[("SECONDS", 4.0)])
     assert "frames" in text and "240" in text and "worst overlap" in text
@@ -62,6 +63,7 @@ def test_the_article_gains_no_energy_under_auto(taichi):
     assert energies[-1] < 0.4 * energies[0]
 
 
+@pytest.mark.slow
 def test_pay_finds_that_features_only_add(printed):
     assert "bytes per particle" in printed("pay", settings=[("N", 900)])
 

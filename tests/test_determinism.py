@@ -43,6 +43,7 @@ def hashes(code: str, runs: str) -> list[str]:
     return python(code + loop + "    for sha in results(path):\n        print(sha)\n    ti.reset()\n").stdout.split()
 
 
+@pytest.mark.slow
 def test_the_articles_scene_has_the_same_bits_on_1_and_8_threads():
     # Also twice in a row. The discs are so few that none overlap at the start, in which case all kernels would be compiled
     # twice, and that the team has two of the eight threads.
@@ -211,6 +212,7 @@ def test_what_is_absent_has_no_field_and_no_kernel(world):
     assert "Contact.shrunk" not in mixed.fields
 
 
+@pytest.mark.slow
 def test_launches_count_what_the_scene_needs(world):
     # Kernel launches of a frame, counted at Taichi's entry point: one on a CPU; otherwise one per pass of a substep.
     for features, path, expected in (

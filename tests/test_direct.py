@@ -76,6 +76,7 @@ def test_elimination_equals_a_dense_solution(world, dim):
     assert made.last.residual < 1e-4 and "relaxed as by Jacobi" not in made.explain()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ["fused", "parallel", "launched"])
 def test_a_long_step_is_followed_by_another(world, path):
     # |r + u| = l + |u|^2 / (2 l) for a link that moves by u across itself: one Newton step leaves the second term, a second
@@ -240,6 +241,7 @@ def test_redundant_links_are_left_to_the_others(world):
         assert tv.measure.angular_momentum(w) == pytest.approx(spin, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_direct_has_the_same_bits_on_both_paths(world):
     rng = np.random.default_rng(0)
     pairs = np.vstack([links(20), some_tree(rng, 30) + 21, loop(20) + 51])
@@ -356,6 +358,7 @@ def test_what_is_beside_a_cloth_leaves_its_solver_alone(world):
     assert stretch[2] > 4 * stretch[0]
 
 
+@pytest.mark.slow
 def test_ropes_that_touch_are_solved_and_come_to_rest(world):
     # Elimination and contacts take turns in f32: ropes fall into a box, keep their length, and come to rest. Before they touch
     # the walls, they conserve momentum: m g t per particle. If thrown a little harder, they pile up differently; about one pile

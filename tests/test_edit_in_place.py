@@ -355,6 +355,7 @@ def test_memory_that_stays_for_what_went_is_shown_and_given_back():
     w.close()
 
 
+@pytest.mark.slow
 def test_a_pin_takes_a_disc_in_place():
     # Bit for bit as a Pin made for that particle, among other held particles, whose pairs the list leaves out. test_pins.py has
     # the same in f64.
@@ -423,6 +424,7 @@ def test_springs_of_a_pin_take_others_in_place(monkeypatch, tmp_path):
     other.close()
 
 
+@pytest.mark.slow
 def test_worlds_one_after_the_other_take_no_more_memory():
     # Taichi allows 512 trees of fields at most, and fields cannot grow: worlds share trees and give their memory back.
     def peak() -> int:
@@ -444,6 +446,7 @@ def test_worlds_one_after_the_other_take_no_more_memory():
     assert runtime.trees == trees and peak() - before < 4 << 10  # KiB; a world with its own tree would take 100
 
 
+@pytest.mark.slow
 def test_residuals_stay_those_of_the_last_substep_until_the_next_one():
     # Converting the state for other forces must not change residuals. In that state displacements are velocities, 600 times as
     # large, and clusters have summed up their springs only.

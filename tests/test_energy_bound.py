@@ -110,6 +110,7 @@ def test_a_potential_that_is_wrong_is_found(world, place):
                 assert flags[FLAG].tolist() == [True, True, False] if wrong else not flags
 
 
+@pytest.mark.slow
 def test_what_works_is_no_fault(world):
     # Work is done on particles by lifting, throwing, turning or wind, by stronger gravity, a moving wall or pin, or particles
     # added with a velocity. None of it is flagged.

@@ -43,6 +43,7 @@ def swing(world, contact: bool, ball: float, bead: float, **settings):
     return world(tv.Particles(rope.position, radius=radius, mass=mass, pinned=[0]), features, **settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ball", "bead"), [(0.3, 0.04), (0.3, 0.15)])
 def test_a_ball_on_a_rope_swings_as_without_contacts(world, ball, bead):
     # The ball covers the end of the rope, and beads of radius above 1/7 m overlap the next but one. No contact could part them.

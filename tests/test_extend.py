@@ -113,6 +113,7 @@ def machines(some: list[int]) -> list:
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_drives_grids_and_surfaces_take_more_as_links_do(tmp_path):
     def made(some):
         x = np.concatenate([MACHINE + [20.0 * k, 0, 0] for k in some])

@@ -17,6 +17,7 @@ DOORS = (10, 13, 19, 20, 28, 38, 59, 60, 63, 65, 66)
 MOTION = (4, 6, 7, 11, 18, 29, 37, 50, 51, 52, 61, 62, 67)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", DOORS + MOTION)
 def test_rows_pass(number, briefly):
     # All rows take minutes: python -m tiverlet stress. Other tests cover further rows by name: 2 test_chains.py, 15 and 17

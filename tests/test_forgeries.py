@@ -131,6 +131,7 @@ def test_what_a_file_asks_for_is_bounded(original, tmp_path):
         material.Table("Contact", {(k, k): 0.3 for k in range(n)}, 0.0, None).rows(np.arange(n))
 
 
+@pytest.mark.slow
 def test_the_page_for_browsers_talks_to_this_machine_only_and_ends_when_told(original):
     port = viewer.free_port()
     words = [sys.executable, "-m", "tiverlet", "replay", str(original), "--web", "--port", str(port)]

@@ -5,6 +5,7 @@ import pytest
 from tiverlet.report.accuracy import granular
 
 
+@pytest.mark.slow
 def test_gas_of_discs():
     # R23: Z = PV / NkT = (1 + phi^2 / 8) / (1 - phi)^2 within 3 %; R24: <v^4> / <v^2>^2 = 2 within 2 %.
     figures = granular.gas(980, 2, 0.5, 0.01, 60.0)
@@ -12,6 +13,7 @@ def test_gas_of_discs():
     assert figures["moment"] == pytest.approx(1, abs=0.02)
 
 
+@pytest.mark.slow
 def test_gas_of_spheres():
     # R23: Z = (1 + phi + phi^2 - phi^3) / (1 - phi)^3; R24: 5/3.
     figures = granular.gas(980, 3, 0.3, 0.01, 60.0)

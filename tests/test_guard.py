@@ -46,6 +46,7 @@ def test_it_finds_the_moment_that_needs_more(world):
     assert scene.error(w, name, 0.75) < 5e-2 and total < 450
 
 
+@pytest.mark.slow
 def test_undoing_a_frame_leaves_no_trace(world):
     # A frame that was made three times equals, bit for bit, one with the final number of substeps. Moving targets, contacts
     # that stick, springs and particles that still separate are included.
@@ -281,6 +282,7 @@ def test_a_scene_does_not_go_to_and_fro_between_two_substeps(world):
     assert set(substeps) == {4, 8} and np.count_nonzero(np.diff(substeps)) < 30  # 150 changes if every frame allowed were a try
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("contact", [[], [tv.Contact(restitution=1.0)]])
 def test_springs_between_elastic_walls_keep_their_energy(world, contact):
     # Dimers of 1 kg discs in an elastic box. The law of springs takes 2 pi s^5 of its energy from a vibration in each period,

@@ -61,6 +61,7 @@ def imported(name: str) -> list[str]:
     return [m for m in dict.fromkeys(out) if m != name]
 
 
+@pytest.mark.slow
 def test_imports_go_in_no_circle():
     done: set[str] = set()
 
@@ -177,6 +178,7 @@ def test_the_root_of_the_package_can_be_taken_in_at_a_glance():
     assert len(entries) <= 25, sorted(entries)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(ARCH != "cpu" or not patched, reason="launches go through other files there")
 def test_a_frame_goes_through_few_files(world):
     # Host files only, with links and discs. These and the kernel's are the files to read for what a frame does.

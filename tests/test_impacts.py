@@ -409,6 +409,7 @@ def slope(world, friction, dim):
     return float(3 * height / (np.median(across) / (1 - np.sqrt(0.5))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 def test_heaps_are_steeper_with_friction_and_flat_without(world, dim):
     assert dim == 3 or slope(world, 0.0, dim) <= 0.01

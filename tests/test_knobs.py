@@ -270,6 +270,7 @@ def test_the_rows_have_every_feature():
     assert knobs_of(tv.Force) == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [{(0, 0): 0.3}, {(0, 0): 0.3, (1, 2): 0.6, (2, 2): 0.1}, {(2, 1): 0.5}, 0.4], ids=repr)
 def test_friction_may_name_other_groups(world, friction):
     # Fewer, more or other groups than before must act as in a world that had them from the start: tables then have other rows.
@@ -406,6 +407,7 @@ def falling(world, features, **settings):
     return world(tv.Particles(x, velocity=speed, radius=0.25), [tv.Gravity(), *features], precision="f64", **settings)
 
 
+@pytest.mark.slow
 def test_what_was_absent_is_compiled_when_it_is_first_asked_for(world):
     # From smooth to rough: as in a world built rough. Then a clone, which continues bit for bit.
     surfaces, rough = ([tv.HalfSpace((0, 1), **k), tv.Contact(**k)] for k in ({}, {"friction": 0.3, "restitution": 0.5}))
@@ -460,6 +462,7 @@ def test_what_was_turned_and_turned_back_leaves_no_trace(world):
         assert w.position.tobytes() == fresh.position.tobytes()
 
 
+@pytest.mark.slow
 def test_what_is_turned_stays_in_edited_worlds_and_in_recordings(world, tmp_path):
     link, floor = tv.Distance([[0, 1]]), tv.HalfSpace((0, 1), friction=0.5)
     w = falling(world, [link, floor])

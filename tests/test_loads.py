@@ -351,6 +351,7 @@ def test_a_start_finds_the_loads_that_links_know(world):
     assert forgotten[9] == 0.0 and (forgotten[:9] == known[:9]).all() and (known > 0).all()
 
 
+@pytest.mark.slow
 def test_loads_of_links_are_of_the_state(world):
     # All paths, clones and Worlds have the same bits; added particles leave known loads as they are.
     particles, pairs = hung()

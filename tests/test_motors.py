@@ -26,6 +26,7 @@ def turned(w, since=0.0):
     return (np.arctan2(x[1], x[0]) - since + np.pi) % (2 * np.pi) - np.pi
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Direct()], ids=str)
 def test_a_limited_torque_accelerates_and_the_speed_is_then_met(world, solver):
     # I w' = T until w = speed: the angle is T t^2 / 2 I, then speed (t - t1 / 2) with t1 = I speed / T. Second order.
@@ -290,6 +291,7 @@ def machine(**settings):
     return tv.World(tv.Particles(x, mass=1 + np.arange(5) % 2, pinned=[0, 1]), features, substeps=7, **settings)
 
 
+@pytest.mark.slow
 def test_drives_have_the_same_bits_on_every_path_and_survive_edits():
     def drive(world):
         motor, winch = world.features[:2]

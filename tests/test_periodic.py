@@ -152,6 +152,7 @@ def test_where_the_box_begins_and_which_image_is_followed_changes_nothing(world,
     assert np.abs(d).max() > 0.1
 
 
+@pytest.mark.slow
 def test_a_collision_across_the_boundary_is_that_with_the_image(world):
     # Two discs, one at the top and one at the bottom of the box. The other world has no box, and the second disc is its own image
     # there, a box higher: faster by shear times that height, and farther by the strain so far. They meet after about 0.25 s.
@@ -245,6 +246,7 @@ def test_forces_between_images_keep_energy_and_are_those_of_brute_force(world):
     np.testing.assert_allclose(measure.momentum(w), momentum, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_shear_is_live_and_survives_whatever_happens_to_the_world(world, tmp_path):
     particles, features, settings = crowd(np.zeros(2), False, tv.Contact(friction=0.2, restitution=0.1))
     w = world(particles, features, **settings)

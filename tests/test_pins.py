@@ -82,6 +82,7 @@ def hung(world, pin, gate, precision):
     return world(tv.Particles(x, radius=0.1), features, precision=precision, substeps=5, solver=solver)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not patched or ARCH != "cpu", reason="every world has kernels of its own there")
 @pytest.mark.parametrize(("compliance", "precision"), KINDS)
 def test_a_pin_that_takes_other_particles_is_as_a_new_one(world, compliance, precision):

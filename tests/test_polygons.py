@@ -59,6 +59,7 @@ def dropped(columns, rows, size=1.0):
     return x, loops
 
 
+@pytest.mark.slow
 def test_boxes_stand_on_each_other_and_on_slopes(world):
     # Three boxes of exactly the same width, corners on corners, are at rest. The lower ones carry more and give way more: a
     # Jacobi pass gives links the compliance D h^2, while contacts of corners are resolved. On slopes of 20 and 30 degrees, pinned

@@ -162,6 +162,7 @@ def test_an_angle_goes_the_shorter_way(world):
     assert bend.rest_of(w.position) == pytest.approx(-3.0, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_copies_edits_and_recordings_know_where_a_ramp_begins(world, tmp_path):
     particles, features, turn = crowd()
     w = world(particles, features, solver=tv.Jacobi())

@@ -596,6 +596,7 @@ def test_two_edits_between_two_frames_leave_walls_and_frames_in_the_picture(worl
     assert walls == [(0, "world/scene/walls/1"), (2, "world/scene/scene1/walls/1"), (3, "world/scene/scene3/walls/1")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rebuilt", [False, True])
 def test_edits_of_a_world_whose_gate_was_just_opened_are_recorded(world, tmp_path, read_here, rebuilt):
     # The balls lie at rest on the gate and fall from it by g t^2 / 2: in f64 to rounding, whatever is added or removed at once.
@@ -615,6 +616,7 @@ def test_edits_of_a_world_whose_gate_was_just_opened_are_recorded(world, tmp_pat
     assert tv.replay(tmp_path / "gate.rrd").verify()
 
 
+@pytest.mark.slow
 def test_a_recording_begins_while_a_knob_asks_for_other_kernels(world, tmp_path, read_here):
     start = tv.Particles([(0, 0.1), (0.19, 0.1), (0.5, 0.1)], radius=0.1, velocity=(1.0, 0.0), spin=0.0)
     contact, box, link = tv.Contact(), tv.Box((-1, 0), (1, 2)), tv.Distance([[1, 2]])

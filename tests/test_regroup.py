@@ -47,6 +47,7 @@ def everything():
     return tv.Particles(x, radius=np.tile(np.where(np.arange(n) < 17, 0.01, 0.1), 2), mass=0.3), features
 
 
+@pytest.mark.slow
 def test_what_stays_goes_on_to_the_bit(world):
     start, features = everything()
     n = len(start) // 2

@@ -76,6 +76,7 @@ def report():
     return tv.report.error_vs_time(["D01", "S04"], efforts=(10, 20, 40, 80), runs=1)
 
 
+@pytest.mark.slow
 def test_a_sweep_finds_second_order_and_first(report):
     assert not report.failures and not report.missing
     for case in report.cases:
@@ -229,6 +230,7 @@ PLANTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("defect", PLANTS)
 def test_a_planted_defect_is_caught(defect, tmp_path):
     # A copy of the package with the defect. Without it the same reports pass, see above and `python -m tiverlet stress`.

@@ -92,6 +92,7 @@ def test_worlds_of_higher_order_compile_nothing_more(world):
         assert sprung(9, 1e-3) == shared
 
 
+@pytest.mark.slow
 def test_a_world_that_grows_compiles_nothing(world):
     # From 30 discs to 47 and back, with a list that is too short at first: the same bits as when everything is compiled again.
     def grown(compiles):
@@ -206,6 +207,7 @@ def test_kernels_depend_on_no_corner_of_a_wall(world, dim):
     assert names.count("fused") == 1
 
 
+@pytest.mark.slow
 def test_what_is_left_out_of_the_writing_is_not_read(world, monkeypatch):
     # Compiled code is a function of what is read. So while kernels are translated, nothing that sharing.KernelInputs leaves out
     # may be read: attributes for the host, and the content of arrays.

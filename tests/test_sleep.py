@@ -194,6 +194,7 @@ def test_nothing_begins_where_all_sleep(world):
             assert not events.touches.impulse.any() and not events.touches.speed.any()
 
 
+@pytest.mark.slow
 def test_a_sensor_that_sleeps_and_a_stack_that_wakes(world):
     """Overlaps of a sleeping sensor begin and end as if it were awake.
 
@@ -356,6 +357,7 @@ def tied(world, start, links, time=0.5, speed=0.05, g=9.81, **settings):
     return world(start, [tv.Gravity(g), floor, contact, tv.Distance(links), tv.Sleep(speed, time)], precision="f64", **settings)
 
 
+@pytest.mark.slow
 def test_what_sleeps_is_as_it_was_and_frames_cost_nothing(world):
     """Only the clock changes while all sleep; loads stay, too."""
     rope = tv.shapes.rope((0, 0), (3.0, 0), 16)

@@ -215,6 +215,7 @@ def stage(request, taichi):
         world.close()
 
 
+@pytest.mark.slow
 def test_the_top_of_a_box_is_a_plane(stage, world):
     # Falling, bouncing, rubbing: on the seam of two triangles, near corners and in the middle, the top is the half space y > 1.
     # The last bounce before rest, (g h)^2 / 2 g high, may be there or not; friction changes less than that.
@@ -332,6 +333,7 @@ def test_a_paddle_strikes_with_the_speed_of_its_blade(world):
     assert np.linalg.norm(w.velocity[0]) == pytest.approx(2 * 3.0 * 0.8, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_solids_have_the_same_bits_on_both_paths(world):
     rng = np.random.default_rng(6)
     x, v = rng.uniform(-1.4, 1.4, (200, 3)), rng.normal(size=(200, 3))

@@ -203,6 +203,7 @@ def test_64_chebyshev_refuses_what_is_unstable(world):
         tv.World(tv.Particles(x), solver=tv.Direct)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [tv.Chebyshev, tv.ConjugateGradient])
 def test_a_solver_has_the_same_bits_in_one_kernel_and_for_a_team(world, make):
     # A team has the bits of the launched path, see test_every_solver_has_the_same_bits_on_1_and_8_threads.
@@ -247,6 +248,7 @@ def test_constraints_that_are_not_met_are_flagged_with_what_helps(world, solver,
     assert ("unconverged" in better.flags) == (better.residual > 0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver, precision, pins",
     [

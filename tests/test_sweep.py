@@ -97,6 +97,7 @@ def test_the_order_of_parts_does_not_matter(here):
     assert same(here, tv.sweep(pendulum, STARTS, ends, Backwards(), at_once=2))
 
 
+@pytest.mark.slow
 def test_dask_has_the_same_bits_and_survives_a_worker_that_dies(here, tmp_path):
     dask, distributed = map(importlib.import_module, ("dask.config", "distributed"))  # here, otherwise every worker imports them
     with (

@@ -233,6 +233,7 @@ def ways(world, substeps, friction=0.0):
     return w
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", [1, 1000])
 @pytest.mark.parametrize("substeps", [1, 5, 20])
 def test_what_leans_and_is_sent_off_flies(world, substeps, parts):

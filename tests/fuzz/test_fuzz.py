@@ -21,6 +21,7 @@ def test_random_scenes_keep_their_promises(taichi, begin):
         assert not searcher.found, searcher.says()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FINDS)
 def test_finds_stay_mended(taichi, name):
     trial = Trial(FINDS[name][0])
