@@ -208,6 +208,7 @@ def _newton(rows: "Rows", body: np.ndarray, going: np.ndarray) -> "Rows":
         if not going.any():
             break
         move = rows.newton()
+        move[~np.isfinite(move)] = 0.0  # a function that is NaN here says nothing of where to go
         move *= _within(move, rows, body, bodies)[:, None]
         tried = going.copy()
         while tried.any():
