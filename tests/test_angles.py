@@ -17,6 +17,7 @@ def triples(n: int) -> np.ndarray:
     return np.stack([k, k + 1, k + 2], axis=1)
 
 
+@pytest.mark.slow
 def test_rods_swing_through_straight_and_every_compliance_is_stable(world):
     # Row 56: an unsigned angle has a kink at straight. With the remembered side, a free rod moves in 3D as in 2D, without a
     # flag.
@@ -58,6 +59,7 @@ def test_rods_swing_through_straight_and_every_compliance_is_stable(world):
     np.testing.assert_array_equal(*ends)
 
 
+@pytest.mark.slow
 def test_a_crooked_rod_is_straightened_without_velocity_in_3d_as_in_2d(world):
     # Rods of rigid angles that start crooked by 0.2 rad are moved to where they are straight, at rest. If Newton's method may
     # bend a path across its plane at will, it ends at 5e-3 rad, and passes make 0.06 m/s of the rest.
@@ -214,6 +216,7 @@ def test_a_bent_corner_between_pins_stays_near_them(world):
             assert bend.rest_of(w.position) == pytest.approx(2.0, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [tv.Jacobi(), tv.ConjugateGradient(10)], ids=str)
 def test_limits_know_no_less_than_straight(world, solver):
     # In 3D an angle is at least 0: straight limbs in any position meet limits of 0 to 2 rad, also in f32, where the sign of

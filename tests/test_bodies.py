@@ -128,6 +128,7 @@ def test_pressure_against_tension(world):
     assert rim.load[0] == pytest.approx(k * edge * (r - 1), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_elements_without_extent(world):
     # Row 54: an element without extent has no gradient; it yields no NaN and a residual of at least 1. Row 55: an inverted
     # element returns to the positive side.

@@ -125,6 +125,7 @@ def test_what_strikes_a_polygon_slides_on_as_on_a_plane(world):
     assert speeds[0] == pytest.approx(speeds[1], abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("e", [0.0, 0.7])
 def test_chains_that_rub_and_strike_gain_no_energy(world, e):
     # With the secant of one push, friction among several made chains gain 2.4 times their energy in a frame at e = 0.7; without
@@ -208,6 +209,7 @@ def test_elastic_bodies_keep_their_energy_and_gain_none(world, solver):
             assert energy[-1] > 0.96 * energy[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("e", [0.0, 0.5, 1.0])
 def test_friction_takes_its_share_of_the_blow(world, e):
     # A body lands flat and slides on: both lower particles are stopped alike, and Coulomb's law takes mu (1 + e) |v_y| from v_x.

@@ -108,6 +108,7 @@ def test_fifty_links_with_50_000_to_1(world):
     assert np.abs(np.diff(np.linalg.norm(ends, axis=1))).max() < 1e-5
 
 
+@pytest.mark.slow
 def test_ten_thousand_links_carry_their_load_in_one_pass(world, briefly):
     # Row 39: at rest the k-th link from the top carries (N - k) m g after a single substep; relaxation needs N^2 passes.
     n, m = 10_000, 0.01

@@ -33,6 +33,7 @@ def height(x, c):
     return x[1] - 0.5 * x[0] * x[0] * (c + 1)
 
 
+@pytest.mark.slow
 def test_a_length_of_ones_own_is_a_distance(world):
     # The double pendulum D01: by Distance, by the user's function with a gradient, and by the function with finite differences.
     p = case("D01_double_pendulum")["params"]
@@ -50,6 +51,7 @@ def test_a_length_of_ones_own_is_a_distance(world):
         np.testing.assert_allclose(load, made[0][1], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_what_has_no_direction_says_how_far_it_is_off(world):
     # Central differences of |a - b| at a = b are 0: a rigid link of L m cannot open there, and its residual is all of L. A spring
     # has no force there, as F = -C grad C / alpha says, and no residual. Constraints between fixed particles have no residual.

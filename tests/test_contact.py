@@ -105,6 +105,7 @@ def test_a_column_obeys_the_overlap_law(world):
     np.testing.assert_allclose(overlap, 2 * k * 9.81 * h**2 * phi, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_settled_piles_are_quiet(world):
     # No jitter: the kinetic energy of a settled pile falls below 1e-6 m g r per particle, also with friction or restitution.
     k = np.arange(300)

@@ -119,6 +119,7 @@ def test_a_long_step_is_followed_by_another(world, path):
     assert taken == [False, True, True, False]
 
 
+@pytest.mark.slow
 def test_a_rope_that_whips_keeps_its_energy(world):
     # Free of drag, in f32, the rope keeps cracking, with 185 J of motion at most. Its energy may swing by the error of Verlet,
     # about 2 J, but not rise: with one Newton step only, it rises by 20 to 70 J in two minutes at 12 substeps, by 4 J at 20.
@@ -133,6 +134,7 @@ def test_a_rope_that_whips_keeps_its_energy(world):
             assert abs(energy[-600:].mean() - energy[:600].mean()) < 1.0
 
 
+@pytest.mark.slow
 def test_many_passes_agree_with_relaxation(world):
     # From rigid to soft, with dashpots, unequal masses, loops, free ends: a few passes reach the limit of many Jacobi passes.
     rng = np.random.default_rng(1)
@@ -340,6 +342,7 @@ def test_a_ring_that_bends_keeps_its_energy(world):
     assert w.run(2.0).energy == pytest.approx(start, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_what_is_beside_a_cloth_leaves_its_solver_alone(world):
     # Other features must not change how far a cloth stretches: the solver is chosen by the constraints that it would leave to
     # Jacobi, which stretches the cloth four times as much.
@@ -390,6 +393,7 @@ def test_ropes_that_touch_are_solved_and_come_to_rest(world):
     assert np.median(kinetic) < 1e-6 and max(kinetic) < 1e-3 and np.median(left) < 5e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("link", "precision"), [(tv.Distance, "f32"), (tv.Rope, "f32"), (tv.Rope, "f64")])
 def test_straight_ropes_between_pins_stay_where_they_are(world, link, precision):
     # Rows 71 and 72. No tension along a straight rope bears its weight, and to first order any number is a solution. Energy may

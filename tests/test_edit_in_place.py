@@ -389,6 +389,7 @@ def test_a_pin_takes_a_disc_in_place():
     other.close()
 
 
+@pytest.mark.slow
 def test_springs_of_a_pin_take_others_in_place(monkeypatch, tmp_path):
     # Bit for bit as in a world that is rebuilt for it; with links, whose slots stand among those of the pin, and knobs of both.
     def scene():
@@ -470,6 +471,7 @@ def test_residuals_stay_those_of_the_last_substep_until_the_next_one():
                 assert f.residual.tobytes() == one.residual.tobytes() == kept.tobytes()
 
 
+@pytest.mark.slow
 def test_constraints_come_and_go_in_place_where_rest_values_were_assigned():
     # The rest length of the second link is assigned. Kernels edited in place then have code for that, and rebuilt ones do not.
     def of(anew: bool) -> list:

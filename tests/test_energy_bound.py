@@ -90,6 +90,7 @@ def test_what_a_first_frame_brings_in_is_told(world):
         assert wrong or report.energy == pytest.approx((76.6**2 + 2.7**2) / 4, rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["alone", "one of many"])
 def test_a_potential_that_is_wrong_is_found(world, place):
     # E = K - F (|r| - 1) is conserved. With a potential of 0, E = K = F (|r| - 1) grows from the first frame on.

@@ -56,6 +56,7 @@ def test_a_ball_on_a_rope_swings_as_without_contacts(world, ball, bead):
         assert np.array_equal(there.position, without.position)
 
 
+@pytest.mark.slow
 def test_other_contacts_stay(world):
     # Beads that start in one place have no lengths yet, and spacers get longer: contacts of these pairs act and part them.
     x = np.array([[0.0, 0.0], [0.02, 0.0], [0.0, 0.02]])
@@ -75,6 +76,7 @@ def test_what_can_give_way_holds_nothing_inside(world):
         assert ([0, 2] in w._runner.search._excluded_pairs.tolist()) is (not more)  # pairs not listed; swing() shows the effect
 
 
+@pytest.mark.slow
 def test_edits_and_copies_leave_out_the_same(world):
     # A rope gets longer, and a thick one is added and cut in place. A clone, which is rebuilt, continues bit for bit.
     w = swing(world, True, 0.3, 0.04)

@@ -267,6 +267,7 @@ def test_the_buffer_of_a_gltf_file_is_named_as_a_uri(recording, tmp_path):
     assert json.loads((tmp_path / "100 % #1.gltf").read_text())["buffers"][0]["uri"] == "100 %25 %231.bin"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["gif", "webp", "mp4"])
 def test_films_show_what_moves(kind, tmp_path, world):
     # A disc moves to the right at 2 m/s between walls: a picture every 40 ms, of the nearest frame. Then a wall is moved.

@@ -138,6 +138,7 @@ def test_drives_grids_and_surfaces_take_more_as_links_do(tmp_path):
     whole.close()
 
 
+@pytest.mark.slow
 def test_what_comes_moves_as_under_a_feature_of_its_own():
     # One more link of a swinging rope, and a link to an existing particle, which starts at its current length.
     def scene():

@@ -91,6 +91,7 @@ def test_a_file_calls_nothing_in_a_script(original, tmp_path, monkeypatch, capsy
     assert victim.read_text() == "precious"
 
 
+@pytest.mark.slow
 def test_what_a_file_asks_for_is_bounded(original, tmp_path):
     def told(change):
         def entry(e):

@@ -49,6 +49,7 @@ def test_a_silo_bears_its_grains():
         assert height > 20 * SIZE and least <= load / weight <= most
 
 
+@pytest.mark.slow
 def test_flow_out_of_a_silo_obeys_beverloo():
     # W = C rho sqrt(g) (D - k d)^1.5 with k between 1 and 2 in 2D, so W(8.5) / W(5.5) is between 2.15 and 2.53; +- 20 % here.
     rates = []

@@ -30,11 +30,13 @@ def test_energy_of_a_gas(dim, fraction):
     assert exact == pytest.approx(0, abs=1e-5) and rough == pytest.approx([0, 0, 0], abs=0.01)
 
 
+@pytest.mark.slow
 def test_discs_jam_where_they_should():
     # R22: frictionless discs, half of them 1.4 times as large, jam at 0.842; the target is 0.835 to 0.850.
     assert 0.835 <= granular.packing(600, 2, 0.1)["fraction"] <= 0.850
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_fallen_pile_hardly_overlaps(dim):
     # 120 frames at 20 substeps: 0.2 % of the diameter on average.

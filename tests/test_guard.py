@@ -665,6 +665,7 @@ def test_what_an_impact_left_of_a_link_is_no_spring_where_a_wall_holds_it(world)
     assert report.residual < 1e-3 and report.energy < before.energy + 3 * m * g * L * before.residual
 
 
+@pytest.mark.slow
 def test_motors_and_muscles_go_on_where_the_substep_gets_shorter(world):
     # A crank that a motor turns at 6 rad/s pushes a slider, and a muscle between two braced squares gets shorter by 0.5 m/s. They
     # do so at any substep: links lag by some (6 h)^2 and muscles by what the mass that they draw needs, and that goes. With
@@ -745,6 +746,7 @@ def test_a_cloth_that_hangs_over_a_ball_goes_where_its_links_are_met(world):
         assert max(w.step(1 / 60).energy for _ in range(13)) < start
 
 
+@pytest.mark.slow
 def test_a_sheet_that_sags_takes_few_steps_to_put_right(world, monkeypatch):
     # Threads and soft braces fall from two corners and contradict each other: the violation left there is no fault. If it
     # counted, each of five reductions of the substep would take all 40 Newton steps, 30 s for a sheet of 40 x 40.

@@ -126,6 +126,7 @@ def depth(kind: tuple[str, str], ground: tuple[str, ...] = CONTRACTS) -> int:
     return 0 if kind[1] in ground else max((1 + depth(b, ground) for b in bases()[kind]), default=0)
 
 
+@pytest.mark.slow
 def test_classes_are_at_most_two_below_a_contract():
     # No chain of classes is longer than CHAIN, contracts included.
     by = {kind[1]: kind for kind in kinds()}

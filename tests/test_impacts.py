@@ -202,6 +202,7 @@ def test_what_bounces_on_pinned_particles_keeps_its_energy(world, kind, limit):
         assert w.position[[low, high], 1].mean() == pytest.approx(0.65 + 1.5 * t - g * t * t / 2, rel=10 * limit)
 
 
+@pytest.mark.slow
 def test_what_springs_draw_to_a_pinned_disc_keeps_its_energy_to_second_order(world):
     # A ball on a spring of 5 N/m, 1 m long at rest, and on a disc below, e = 1: E = v^2 / 2 + g y + k (l - 1)^2 / 2.
     start = tv.Particles([(0.0, 0.0), (0.0, 1.3), (0.0, 2.5)], radius=[0.5, 0.5, 0.0], pinned=[0, 2])
@@ -486,6 +487,7 @@ def test_what_bounces_is_the_same_with_a_new_list(world):
             assert again.hash() == w.hash()
 
 
+@pytest.mark.slow
 def test_bodies_of_discs_that_bounce_come_to_rest(world):
     # 16 squares of 4 discs: a corner is pressed in between its body and the floor or disc below, so one impact gives back what
     # the previous one took. A pair must not bounce if it approaches no faster than two substeps of forces make it; otherwise 45

@@ -443,6 +443,7 @@ def test_a_link_whose_rest_length_becomes_zero(world):
     assert np.hypot(*r) < 1e-3 and np.hypot(*v) < 0.1  # both particles are one, and fall as one
 
 
+@pytest.mark.slow
 def test_what_was_turned_and_turned_back_leaves_no_trace(world):
     # Links of length 0 are relaxed alone. With a length again, they are solved with the others, with the bits of a new world.
     def hang(rest):

@@ -184,6 +184,7 @@ def test_the_floor_bears_the_weight(world):
     assert left == pytest.approx(right, abs=36 * G * 1e-4)
 
 
+@pytest.mark.slow
 def test_loads_are_gone_with_what_bore_them(world):
     # When the ground goes, all discs fall. The discs above get the loads of at most one more substep, k g h. Rows of five and
     # four lie in each other's gaps, where they are stable. Of heaps from a square lattice without friction, one in fifty keeps

@@ -109,6 +109,7 @@ def test_a_brake_is_dry_friction(world):
     assert w.run(0.5).energy == pytest.approx(1.0, abs=1e-5)  # (h v / r)^2 = 3e-6: the error of the link
 
 
+@pytest.mark.slow
 def test_a_motor_gives_no_momentum(world):
     # Momentum and angular momentum are constant: gradients sum to 0, and so do their moments. To rounding, over a second, in 2D
     # and 3D.
@@ -148,6 +149,7 @@ def test_hinges_in_space_turn_for_ever(world):
     assert (turn + 5.0 + np.pi) % (2 * np.pi) == pytest.approx(np.pi, abs=1e-6) and abs(motor.load[0]) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_servo_goes_to_its_angle_and_stays(world):
     # A servo takes the shorter way, through pi. Under a load, one pass lags by at most the violation that bears it,
     # 2 w m g r h^2.

@@ -277,6 +277,7 @@ def test_what_is_lifted_does_not_end_inside_of_what_was_far(world):
     assert told[0].energy - low > 100 and told[1].energy == pytest.approx(told[0].energy, abs=3)
 
 
+@pytest.mark.slow
 def test_a_bridge_under_a_cart_gains_no_energy(world):
     # Under "auto" a cart falls onto a truss whose links Jacobi holds. Removing the violation of links pushes the truss into the
     # wheels, so links and contacts have to move together. Otherwise the frame after next has twice the energy of the first,

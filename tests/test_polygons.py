@@ -308,6 +308,7 @@ def test_stacks_that_bounce_come_to_rest(world):
     assert np.abs(w.velocity).max() < 0.01
 
 
+@pytest.mark.slow
 def test_discs_among_boxes_come_to_rest(world):
     # A body that is squeezed from both sides has the eigenvalue 1 of a pass where masses are split by the usual depth of
     # contacts. Split by the depth of this substep it is 2, and half of the bodies oscillate from substep to substep at 0.1 m/s.
@@ -327,6 +328,7 @@ def test_discs_among_boxes_come_to_rest(world):
     assert np.abs(w.velocity).max() < 0.01 > w.contacts.overlap.max() / 0.15
 
 
+@pytest.mark.slow
 def test_edges_that_are_too_long_keep_momentum(world):
     # Loops that hold nothing together, pulled apart to many times their size: one end of an edge may be too far for the list.
     # Then a vertex must not push the other end alone.

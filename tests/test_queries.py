@@ -6,6 +6,7 @@ import pytest
 import tiverlet as tv
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind, dim", [("one size", 3), ("many sizes", 2), ("no contacts", 2), ("no contacts", 3)])
 def test_near_and_nearest_equal_brute_force(world, dim, kind):
     # For particles of one size in 2D see the nearest image in test_periodic.py.
@@ -29,6 +30,7 @@ def test_near_and_nearest_equal_brute_force(world, dim, kind):
         w.nearest(np.zeros((3, 5 - dim)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("periodic", [False, True])
 def test_neighbours_ten_million_radii_from_the_origin(world, periodic):
     # One f32 has steps of a radius there. Positions have two words, so the cells must read both, and points keep their digits.

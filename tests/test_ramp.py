@@ -119,6 +119,7 @@ def test_what_a_ramp_brings_in_does_not_depend_on_the_substep(world):
     assert energies[0] > 0.01 and energies[1] == pytest.approx(energies[0], rel=0.03)
 
 
+@pytest.mark.slow
 def test_springs_follow_a_moving_rest_value_to_second_order(world):
     # Weights on springs with dashpots, whose rest lengths grow by 0.5 m in a frame: beside 1024 substeps, 8 are off by a few
     # thousandths of the way. If C two substeps ago counts a step of the rest length too many, dashpots pull back by it, and the

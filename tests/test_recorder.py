@@ -188,6 +188,7 @@ def test_bytes_of_positions_take_most_of_the_file(world, tmp_path):
         assert raw < sum(map(len, of)) < 1.4 * raw + 1500 * len(of) + 100 * 121
 
 
+@pytest.mark.slow
 def test_a_small_recording_takes_little_beside_its_positions(world, tmp_path):
     # 40 points in 2D: 320 bytes of f32 in a frame. Everything else (layout, curves, hashes) takes at most 1.5 times as much.
     rope = tv.shapes.rope((0, 2), (1, 2), points=40)

@@ -229,6 +229,7 @@ def test_tampering_is_found(falling, tmp_path, read_here):
     assert (verdict.kind, verdict.frame, verdict.particle) == ("changed", 8, 1) and "picture" in str(verdict)
 
 
+@pytest.mark.slow
 def test_a_killed_process_leaves_what_was_flushed(tmp_path, read_here):
     code = f"""
 import os, signal, sys
@@ -331,6 +332,7 @@ def test_a_file_that_is_gone_is_noticed(world, tmp_path, monkeypatch, how):
     assert not w._watchers
 
 
+@pytest.mark.slow
 def test_what_ends_other_programs_is_an_error(tmp_path):
     # Without HOME Taichi ends the process; in a forked child it hangs at the end; ti.reset destroys the fields.
     code = f"""
@@ -369,6 +371,7 @@ recorder.close()
     assert list(tv.replay(tmp_path / "f.rrd").frames) == [0, 1]
 
 
+@pytest.mark.slow
 def test_a_budget_is_kept_and_said(world, tmp_path, read_here):
     w = world(tv.Particles(np.random.default_rng(0).uniform(0, 1, (500, 2))), [tv.Gravity()], substeps=1)
     with pytest.raises(ValueError, match="Give at least"):
@@ -420,6 +423,7 @@ def test_frames_are_taken_out_so_that_the_rest_shows_the_same(stride):
         assert len(rest) <= 40 // stride + 3 or len(frames) < 10
 
 
+@pytest.mark.slow
 def test_command_line(falling, tmp_path, monkeypatch, capsys, read_here):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "a.rrd"

@@ -228,6 +228,7 @@ def test_after_an_error_the_world_is_as_before(world, monkeypatch):
     assert w.add() is not None and w.time == pytest.approx(0.2)
 
 
+@pytest.mark.slow
 def test_a_recording_begins_after_what_came_and_went(world, tmp_path):
     # A rebuilt world is recorded as it is now, with features that were added when particles had left their first positions.
     x = np.array([[0.0, 0], [1, 0], [2, 0], [3, 0], [4, 0], [5, 0]])
@@ -245,6 +246,7 @@ def test_a_recording_begins_after_what_came_and_went(world, tmp_path):
     assert tv.replay(tmp_path / "later.rrd").verify()
 
 
+@pytest.mark.slow
 def test_a_clone_parts_what_came_into_others_as_the_world_does(world):
     # Not stepped since: overlap depends on where particles are, not on where they were when the world began.
     x = np.stack(np.meshgrid(np.arange(4.0), np.arange(4.0)), axis=-1).reshape(-1, 2) * 1.05 + [0.6, 3.0]

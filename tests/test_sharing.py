@@ -32,6 +32,7 @@ def hung(world, mass, compliance, g, rest, points):
 NUMBERS = [(0.01, 1e-3, 9.81, 0.3, 12), (0.5, 1e-5, 1.6, 0.6, 9), (2.0, 0.1, -3.0, 0.2, 17)]
 
 
+@pytest.mark.slow
 def test_worlds_with_other_numbers_and_counts_and_clones_compile_nothing(world):
     # Shared worlds have the bits that they have alone, where each world compiles its own kernels.
     first = hung(world, *NUMBERS[0])
@@ -318,6 +319,7 @@ def test_worlds_of_many_kinds_take_few_trees(world, monkeypatch):
     assert runtime.trees - trees == made
 
 
+@pytest.mark.slow
 def test_many_worlds_one_after_the_other_take_no_more_than_a_few():
     # Whether they are closed or garbage-collected; more than the 511 trees that Taichi has would end the process.
     point = tv.Particles([[0.0, 0.0]])

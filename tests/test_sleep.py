@@ -312,6 +312,7 @@ def test_what_wakes(world):
     assert w.last.asleep == asleep - 1 and (w.position[0] == rest).all() and w.position[6, 0] > pulled + 0.3
 
 
+@pytest.mark.slow
 def test_what_lies_on_a_roller_wakes_as_it_begins_to_turn(world):
     # A disc between two pinned rollers takes the speed of their surfaces, -omega R / r.
     rollers = tv.Particles([(-0.13, 0), (0.13, 0), (0, 0.17)], radius=[0.11, 0.11, 0.1], pinned=[0, 1], spin=0)

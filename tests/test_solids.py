@@ -100,6 +100,7 @@ def test_friction_in_a_hollow_has_its_closed_form(world):
         assert angle > 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["f64", "f32"])
 @pytest.mark.parametrize("restitution", [0.0, 0.8])
 def test_nothing_passes_a_shell(world, precision, restitution, briefly):

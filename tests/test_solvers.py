@@ -69,6 +69,7 @@ def hung(world, solver, n=10, **settings):
     return world(start, [tv.Gravity(9.81), tv.Distance(pairs)], solver=solver, **{"precision": "f64", **settings})
 
 
+@pytest.mark.slow
 def test_conjugate_gradients_reach_the_direct_solution(world):
     # Two Newton steps, each with the same linear system. Enough steps of conjugate gradients give the direct solution; before
     # that, each comes nearer.
@@ -225,6 +226,7 @@ def test_elimination_leaves_less_than_a_pass_of_relaxation():
     assert all_.residual < 1e-3 * one.residual and not all_.flags
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver, advised", [(tv.Jacobi(), tv.ConjugateGradient()), (tv.ConjugateGradient(3), tv.ConjugateGradient(6))]
 )

@@ -391,6 +391,7 @@ def test_none_and_some_that_spin(world):
     np.testing.assert_allclose(w.spin, [3], atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 def test_recordings_show_angular_momentum(world, dim, tmp_path, read_here):
     # Two spinning particles collide: the curve is that of measure, but for half a substep, and constant to rounding in f64.

@@ -143,6 +143,7 @@ def test_what_a_pool_loses_is_done_by_other_processes(tmp_path, monkeypatch):
             tv.sweep(ball, {"speed": SPEEDS}, height, executor)
 
 
+@pytest.mark.slow
 def test_parameters_that_end_every_worker_are_named():
     make = functools.partial(ball, marker="any", always=True)
     told = r"parameters 2, make\(speed=2.0\) could not be done, because its worker died 3 times: .*exit code 3"
@@ -278,6 +279,7 @@ def test_mpi_has_the_same_bits(here, tmp_path):
     assert end == here["end"].tobytes().hex() and len(processes) == 2
 
 
+@pytest.mark.slow
 def test_the_page_runs_as_a_script():
     # Its processes import it, here one of them. test_docs.py runs the code above `if __name__`.
     _, section = (ROOT / "tiverlet/worlds/README.md").read_text().split("## A sweep over machines")

@@ -116,6 +116,7 @@ def test_what_is_let_go_flies_on_to_second_order(world, what):
     assert 1.9 <= order(errors) <= 2.1 and errors[0] <= 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["spring", "force", "particle"])
 def test_forces_that_come_change_no_velocity_before_they_act(world, what):
     # A swinging chain, and a spring, a wind or a particle that comes, of which nothing is felt: what is read is of now. It lacked
@@ -251,6 +252,7 @@ def test_what_leans_and_is_sent_off_flies(world, substeps, parts):
     np.testing.assert_allclose(w.velocity[some], [v[0] - (0, 9.81 * 0.2)] * len(some), rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_what_is_borne_by_loads_that_are_known_flies(world):
     # Where loads are known to the last digit, contacts and ropes add nothing, and particles seem to rest on nothing.
     x = [(0, 0.1), (0, 0.3), (0, 0.5), (2, 3), (2, 2), (2, 1)]
@@ -288,6 +290,7 @@ def test_braking_a_chain_feeds_nothing(world):
         w.velocity = 0.99 * w.velocity
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("substeps", [5, 20])
 def test_what_rubs_and_is_pushed_slides(world, substeps):
     # x + v t - mu g t^2 / 2 from rest; and a disc that is spun up in place moves off at mu g t. There was no friction before.
@@ -328,6 +331,7 @@ def test_spins_and_throws_survive_what_comes_next(world):
     assert w.velocity[0] == pytest.approx([3, 4 - fallen]) and w.velocity[1] == pytest.approx([0, 0])
 
 
+@pytest.mark.slow
 def test_what_breaks_flies_on_with_the_velocity_that_is_read(world):
     # x + v t - g t^2 / 2, to rounding, also from the substep in which it breaks: half a kick of what broke is not to come.
     # A rigid link, a spring, an area and a cluster, each held by pinned particles.

@@ -219,6 +219,7 @@ def pendulum(length=1.0, mass=1.0, g=9.81, **settings):
     return tv.World(start, features, precision="f64", **({"solver": tv.Jacobi()} | settings))
 
 
+@pytest.mark.slow
 def test_knobs_are_for_one_some_or_all(taichi):
     # A force and a target are set between frames, and compared with single worlds that have the same assignments. The last is for
     # all.
@@ -348,6 +349,7 @@ def test_one_that_is_taken_out_has_the_knobs_that_wait(taichi):
         assert many.hash(1) == alone.hash() == one.hash() == twin.hash() and many.hash(0) == many.hash(2) != many.hash(1)
 
 
+@pytest.mark.slow
 def test_knobs_that_wait_for_other_kernels_are_there(taichi):
     # A rest length of 0 is assigned, and no step follows yet: it has no direction, so its constraint leaves the system.
     world, alone = pendulum(solver=tv.Direct()), pendulum(solver=tv.Direct())
