@@ -103,11 +103,9 @@ class Cluster:
         return 1 / (self.radius * np.sqrt(self.mass[self.free].min())) if self.radius > 0 else 0.0
 
     def strain(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return R, and D (k, dim), at positions x (Kabsch 1976)."""
+        """Return R, and D (k, dim), at positions x."""
         p = x[self.who] - self.mass @ x[self.who] / self.mass.sum()
-        u, _, vt = np.linalg.svd((self.mass[:, None] * p).T @ self.shape)
-        u[:, -1] *= np.sign(np.linalg.det(u @ vt)) or 1.0
-        R = u @ vt
+        R = best_rotation((self.mass[:, None] * p).T @ self.shape)
         return R, p @ R - self.shape
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
@@ -121,6 +119,13 @@ class Cluster:
         M = np.einsum("kia,lia->kl", weighted, turns(self.shape + D))
         lost = np.einsum("ria,lia->rl", self.basis, turns(D)) @ np.linalg.pinv(M)
         return (self.basis - np.einsum("rk,kia->ria", lost, weighted)) @ R.T
+
+
+def best_rotation(A: np.ndarray) -> np.ndarray:
+    """Return the R that fits R q_i best to p_i, from A = sum_i m_i p_i q_i^T, or those of a stack (Kabsch 1976)."""
+    u, _, vt = np.linalg.svd(A)
+    u[..., -1] *= np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)[..., None]
+    return u @ vt
 
 
 def turns(q: np.ndarray) -> np.ndarray:

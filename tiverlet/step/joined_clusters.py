@@ -10,6 +10,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from .cluster_rows import best_rotation
+
 FLAT = 1e-6  # of the largest singular value: below, points do not extend along an axis
 ALIKE = 1e-3  # of the radius: clusters whose shared particles differ by more contradict each other, and stay apart
 
@@ -114,9 +116,7 @@ def _placed(shape: np.ndarray, shared: np.ndarray, goal: np.ndarray) -> np.ndarr
     begin, end = own.mean(axis=0), goal.mean(axis=0)
     if _rank(own) < min(shape.shape[1] - 1, _rank(shape)):
         return None
-    u, _, vt = np.linalg.svd((goal - end).T @ (own - begin))
-    u[:, -1] *= np.sign(np.linalg.det(u @ vt)) or 1.0
-    out = end + (shape - begin) @ (u @ vt).T
+    out = end + (shape - begin) @ best_rotation((goal - end).T @ (own - begin)).T
     off, size = np.linalg.norm(out[shared] - goal, axis=1).max(), np.linalg.norm(shape - shape.mean(axis=0), axis=1).max()
     return out if off <= ALIKE * size else None
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..solvers.corners import bodies_of, corners_of
 from .block_matrix import summed
-from .cluster_rows import HEAVY
+from .cluster_rows import HEAVY, best_rotation
 from .integrator import h2_effective_of
 from .joined_clusters import Copies, joined
 
@@ -105,12 +105,10 @@ class Solids:
         return np.stack([np.bincount(self.owner, self.m * v) / self.total for v in values.T], axis=1)[self.owner]
 
     def _placed(self, x: np.ndarray) -> np.ndarray:
-        """Return the positions of the shapes where they fit best to positions x (Kabsch 1976)."""
+        """Return the positions of the shapes where they fit best to positions x."""
         center = self._means(x[self.who])
         moment = self._summed((x[self.who] - center)[:, :, None] * self.shape[:, None, :])
-        u, _, vt = np.linalg.svd(moment)
-        u[:, :, -1] *= np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)[:, None]
-        self.turn = u @ vt
+        self.turn = best_rotation(moment)
         return center + np.einsum("kab,kb->ka", self.turn[self.owner], self.shape)
 
     def _summed(self, values: np.ndarray) -> np.ndarray:
