@@ -201,6 +201,18 @@ class Contact(PairContact):
         dev.projection = VelocityProjection(scene, dev.list, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
         return dev.search
 
+    def keep_stiffness(self, ratio: float) -> bool:
+        """Push as hard as before where the next substep is `ratio` times as long as the last one. Returns whether it can.
+
+        A pair is a spring of stiffness r / (M h^2), with the split masses M. So M is divided by ratio^2, and what pairs pushed in
+        a substep, which is proportional to h^2, is multiplied by it. M goes back by itself, see MassSplitting.split().
+        """
+        dev = self.dev
+        self.scene.memory.write(dev.splitting.weight, self.scene.memory.read(dev.splitting.weight) / ratio**2)
+        for piece in (dev.push, *([dev.known.borne] if dev.known else [])):
+            dev.list.scale(piece, ratio**2)
+        return True
+
     @property
     def conserves(self) -> bool:
         """Whether pairs leave each other with the energy that they had."""
@@ -258,9 +270,9 @@ class Contact(PairContact):
             if first != 0:
                 self.dev.restitution.clear(i, self.dev.splitting.weight[i])
         # Factors 1 or 0, faster than a branch in the loop: whether pairs continue from their push in this substep (again), or
-        # from the push of the last substep (carries).
+        # from the push of the last substep (carries). After a start it does, too, where only the substep has another length.
         again = ti.cast(ti.select(first == 0, 1, 0), self.scene.real)
-        carries = ti.cast(ti.select(first != 0 and fresh == 0, 1, 0), self.scene.real)
+        carries = ti.cast(ti.select(first != 0 and (fresh == 0 or now.span.since > 0), 1, 0), self.scene.real)
         own, least = self.dev.splitting.weight[i], ti.cast(1, self.scene.real)  # least: the smallest push of i
         if own > 0:
             for word in range(self.dev.list.word_count(i)):

@@ -112,7 +112,7 @@ class KnownLoads:
         """
         load, borne = self.load.field[e], self.borne.field[e] + part
         if now.first != 0:
-            if now.fresh != 0:
+            if now.fresh != 0 and now.span.since == 0:
                 borne = part  # a start (velocities were set): forces were different before it
             if (now.span.since + now.s) % WINDOW == 0:
                 load = self.learn(i, j, e, load, (borne - part) / (WINDOW * now.h * now.h))

@@ -240,6 +240,12 @@ class MassSplitting:
         return ti.select(now.span.iterations == 1, self.list.touching_bits(i, word), self.list.all_bits(i, word))
 
 
+def still_soft(h: float, longest: float, passes: int) -> float:
+    """Return the substep [s] of the stiffness that contacts have after so many passes of substeps h, if they had that of
+    substeps `longest` before: the excess of m has decayed."""
+    return h * (1 + ((longest / h) ** 2 - 1) * FADE**passes) ** 0.5
+
+
 @ti.func
 def lesser(a, b):
     """Return the lesser of two numbers. ti.min would also test for NaN, which takes longer."""

@@ -235,6 +235,10 @@ class PairContact(Feature):
         """Prepare for shrink(): from now on particles may be smaller than their radius."""
         self.dev.geometry.enable_shrink()
 
+    def keep_stiffness(self, ratio: float) -> bool:
+        """Push as hard as before where the next substep is `ratio` times as long as the last one. Returns whether it can."""
+        return False
+
     def found(self, x: np.ndarray, h: float) -> Contacts:
         """Return the contacts of particles at x (n, dim) [m] after a substep h [s], for world.contacts."""
         return self.dev.geometry.found(x, h)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..constraints.path import Path
 from ..contact.initial_overlap import overlapping
+from ..contact.mass_splitting import still_soft
 from ..device.interrupts import deferred_signals
 from ..device.patches.compiler import CachedLaunch
 from ..particles.spin import moments_of_inertia
@@ -25,6 +26,7 @@ from .step import frame
 from .step_report import StepReport
 
 KEPT = 100_000  # particles up to which the array for velocities is kept; above, allocating it costs next to nothing
+SLIGHTLY = 0.4  # of the substep: contacts that are still as soft as those of longer substeps may gain energy as they stiffen
 LONG = 10_000_000  # (particles + constraints) x passes in one launch at most: it takes about a second
 
 
@@ -138,6 +140,7 @@ class Runner:
         if h == clock.h and drag == clock.drag and not clock.d_is_velocity and clock.first_moved is None:
             return clock.energy is None
         self.wake()
+        keeps = self._is_slightly_uneven(h, dt) and self._keep_stiffness(h / clock.h)
         with self.memory.compiler():
             self._jump()
             if h != clock.h or drag != clock.drag:
@@ -151,17 +154,18 @@ class Runner:
             if h != clock.h or drag != clock.drag:
                 if h < clock.longest and not self.probe:
                     self.pressed = 0.0
-                    released = release(self, h, clock.longest)
+                    released = keeps or release(self, h, clock.longest)
                     projected = project(self, h, dt, clock.longest)
                     # Links and contacts must move together. With frames of slightly uneven length, stacks would creep sideways.
                     if projected is None and (dt == clock.frame[1] or 2 * h <= clock.longest):
                         projected = project(self, h, dt, clock.longest, ContactRows.of(self))
                     if projected is None and not released:
                         released = release(self, h, clock.longest, small=True)
-                    shrink_left(self, h, clock.longest)
+                    if not keeps:
+                        shrink_left(self, h, clock.longest)
                     if projected or projected is None or released:
-                        clock.longest = h
-            if clock.d_is_velocity:
+                        clock.longest = still_soft(h, clock.longest, substeps * iterations) if keeps else h
+            if clock.d_is_velocity and not keeps:
                 clock.since = 0
             if first is not None:
                 ratio = h / (clock.h or h)
@@ -174,6 +178,18 @@ class Runner:
                     system.forget(left)
             self.set_substep(h, drag)
         return True
+
+    def _is_slightly_uneven(self, h: float, dt: float) -> bool:
+        """Whether the coming frame of dt [s], with substeps h [s], goes on from the last one and is only a little longer or
+        shorter, as where a loop measures dt; and no constraint has to move together with contacts."""
+        clock = self.clock
+        goes_on = not (clock.d_is_velocity or clock.first_moved == 0 or self.probe or any(b.count for b in self.batches))
+        longest = max(clock.h, clock.longest)
+        return goes_on and dt != clock.frame[1] and SLIGHTLY * longest <= h <= clock.h / SLIGHTLY
+
+    def _keep_stiffness(self, ratio: float) -> bool:
+        """Let contacts push as hard as before in a substep of `ratio` times the length. Returns whether they do."""
+        return any([contact.keep_stiffness(ratio) for contact in self.step.contacts])
 
     def _note_moved(self, removed: tuple[np.ndarray, float] | None) -> None:
         """Note how far particles were moved to meet their constraints, (n,) [m], and the violation that was removed, if any."""
