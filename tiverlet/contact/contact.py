@@ -109,7 +109,7 @@ class Contact(PairContact):
     loads = Knob(lambda f, v: checks.flag("Contact", "loads", v), "Whether pairs know what they bear.", compiled=True)
     sensors: Any = Knob(lambda f, v: f._surface("sensors", v), "The pairs of groups of which the second senses.", built=True)
     groups: Any = Knob(lambda f, v: f._surface("groups", v), "The pairs of groups that touch; None for all.", built=True)
-    projects = True
+    projects = can_keep_stiffness = True
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Choose the skin, and refuse positions too far out for the cells."""
@@ -201,8 +201,8 @@ class Contact(PairContact):
         dev.projection = VelocityProjection(scene, dev.list, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
         return dev.search
 
-    def keep_stiffness(self, ratio: float) -> bool:
-        """Push as hard as before where the next substep is `ratio` times as long as the last one. Returns whether it can.
+    def keep_stiffness(self, ratio: float) -> None:
+        """Push as hard as before where the next substep is `ratio` times as long as the last one.
 
         A pair is a spring of stiffness r / (M h^2), with the split masses M. So M is divided by ratio^2, and what pairs pushed in
         a substep, which is proportional to h^2, is multiplied by it. M goes back by itself, see MassSplitting.split().
@@ -211,7 +211,6 @@ class Contact(PairContact):
         self.scene.memory.write(dev.splitting.weight, self.scene.memory.read(dev.splitting.weight) / ratio**2)
         for piece in (dev.push, *([dev.known.borne] if dev.known else [])):
             dev.list.scale(piece, ratio**2)
-        return True
 
     @property
     def conserves(self) -> bool:
@@ -271,8 +270,11 @@ class Contact(PairContact):
                 self.dev.restitution.clear(i, self.dev.splitting.weight[i])
         # Factors 1 or 0, faster than a branch in the loop: whether pairs continue from their push in this substep (again), or
         # from the push of the last substep (carries). After a start it does, too, where only the substep has another length.
+        # Worlds with restitution start from the velocities that users read, and need half of the push first, as C gives it alone.
         again = ti.cast(ti.select(first == 0, 1, 0), self.scene.real)
-        carries = ti.cast(ti.select(first != 0 and (fresh == 0 or now.span.since > 0), 1, 0), self.scene.real)
+        carries = ti.cast(ti.select(first != 0 and fresh == 0, 1, 0), self.scene.real)
+        if ti.static(not self.dev.has_restitution):
+            carries = ti.cast(ti.select(first != 0 and (fresh == 0 or now.span.since > 0), 1, 0), self.scene.real)
         own, least = self.dev.splitting.weight[i], ti.cast(1, self.scene.real)  # least: the smallest push of i
         if own > 0:
             for word in range(self.dev.list.word_count(i)):

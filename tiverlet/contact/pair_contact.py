@@ -92,6 +92,7 @@ class PairContact(Feature):
     code_size = 3.0
     neighbours_per_particle = 0  # initial list entries per particle, if more than discs need
     detects = False  # whether each pass calls detect() for all particles, before contacts are counted
+    can_keep_stiffness = False  # whether keep_stiffness() works
     projects = False  # whether it has a velocity projection of loaded pairs, see velocity_projection.py
 
     def _surface(self, name: str, value):
@@ -235,9 +236,8 @@ class PairContact(Feature):
         """Prepare for shrink(): from now on particles may be smaller than their radius."""
         self.dev.geometry.enable_shrink()
 
-    def keep_stiffness(self, ratio: float) -> bool:
-        """Push as hard as before where the next substep is `ratio` times as long as the last one. Returns whether it can."""
-        return False
+    def keep_stiffness(self, ratio: float) -> None:
+        """Push as hard as before where the next substep is `ratio` times as long as the last one, if can_keep_stiffness."""
 
     def found(self, x: np.ndarray, h: float) -> Contacts:
         """Return the contacts of particles at x (n, dim) [m] after a substep h [s], for world.contacts."""

@@ -140,7 +140,7 @@ class Runner:
         if h == clock.h and drag == clock.drag and not clock.d_is_velocity and clock.first_moved is None:
             return clock.energy is None
         self.wake()
-        keeps = self._is_slightly_uneven(h, dt) and self._keep_stiffness(h / clock.h)
+        keeps = self._is_slightly_uneven(h, dt)
         with self.memory.compiler():
             self._jump()
             if h != clock.h or drag != clock.drag:
@@ -153,18 +153,9 @@ class Runner:
                 self._note_moved(initial_shape.restore(self, first))  # before its deformation passes for what passes have left
             if h != clock.h or drag != clock.drag:
                 if h < clock.longest and not self.probe:
-                    self.pressed = 0.0
-                    released = keeps or release(self, h, clock.longest)
-                    projected = project(self, h, dt, clock.longest)
-                    # Links and contacts must move together. With frames of slightly uneven length, stacks would creep sideways.
-                    if projected is None and (dt == clock.frame[1] or 2 * h <= clock.longest):
-                        projected = project(self, h, dt, clock.longest, ContactRows.of(self))
-                    if projected is None and not released:
-                        released = release(self, h, clock.longest, small=True)
-                    if not keeps:
-                        shrink_left(self, h, clock.longest)
-                    if projected or projected is None or released:
-                        clock.longest = still_soft(h, clock.longest, substeps * iterations) if keeps else h
+                    keeps = self._project(h, dt, substeps * iterations, keeps)
+                for contact in self.step.contacts if keeps else []:
+                    contact.keep_stiffness(h / clock.h)
             if clock.d_is_velocity and not keeps:
                 clock.since = 0
             if first is not None:
@@ -181,15 +172,37 @@ class Runner:
 
     def _is_slightly_uneven(self, h: float, dt: float) -> bool:
         """Whether the coming frame of dt [s], with substeps h [s], goes on from the last one and is only a little longer or
-        shorter, as where a loop measures dt; and no constraint has to move together with contacts."""
+        shorter, as where a loop measures dt."""
         clock = self.clock
-        goes_on = not (clock.d_is_velocity or clock.first_moved == 0 or self.probe or any(b.count for b in self.batches))
+        keep = any(contact.can_keep_stiffness for contact in self.step.contacts)
+        goes_on = keep and not (clock.d_is_velocity or clock.first_moved == 0 or self.probe)
         longest = max(clock.h, clock.longest)
         return goes_on and dt != clock.frame[1] and SLIGHTLY * longest <= h <= clock.h / SLIGHTLY
 
-    def _keep_stiffness(self, ratio: float) -> bool:
-        """Let contacts push as hard as before in a substep of `ratio` times the length. Returns whether they do."""
-        return any([contact.keep_stiffness(ratio) for contact in self.step.contacts])
+    def _project(self, h: float, dt: float, passes: int, keeps: bool) -> bool:
+        """Remove the energy that violations and overlaps would store in a shorter substep h [s], of a frame dt [s].
+
+        keeps: whether contacts may keep their stiffness instead, which they do unless links press on them. passes: in the frame.
+        Returns whether they do.
+        """
+        clock, longest = self.clock, self.clock.longest
+        projected = project(self, h, dt, longest) if keeps else None
+        if keeps and projected is not None:
+            linked = any(b.count for b in self.batches)
+            clock.longest = h if linked else still_soft(h, longest, passes)
+            return True
+        self.pressed = 0.0
+        released = release(self, h, longest)
+        projected = project(self, h, dt, longest)
+        # Links and contacts must move together. With frames of slightly uneven length, stacks would creep sideways.
+        if projected is None and (dt == clock.frame[1] or 2 * h <= longest):
+            projected = project(self, h, dt, longest, ContactRows.of(self))
+        if projected is None and not released:
+            released = release(self, h, longest, small=True)
+        shrink_left(self, h, longest)
+        if projected or projected is None or released:
+            clock.longest = h
+        return False
 
     def _note_moved(self, removed: tuple[np.ndarray, float] | None) -> None:
         """Note how far particles were moved to meet their constraints, (n,) [m], and the violation that was removed, if any."""
