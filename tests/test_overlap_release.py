@@ -123,8 +123,8 @@ def test_ropes_in_a_heap_gain_none_either(world):
         w.substeps = (2, 8)[frame // 10 % 2]
         most = max(most, w.step(1 / 60).energy)
     assert most <= start * (1 + 1e-3)
-    # Nor does the heap, at rest by friction, creep down where a loop measures dt: it loses a tenth of its energy within 300 frames
-    # if discs are moved apart whenever a frame is shorter.
+    # Nor does the heap, at rest by friction, creep down where a loop measures dt. If discs were moved apart whenever a frame is
+    # shorter, it would lose a tenth of its energy within 300 frames.
     w.substeps, rng = 4, np.random.default_rng(0)
     rest = w.run(4.0).energy
     for _ in range(300):
