@@ -143,8 +143,8 @@ class World:
 
         Raises ValueError for dt, tolerance or budget that is not finite and above 0. When the substep length changes,
         displacements are turned into velocities first and back after (time-corrected Verlet), so the step stays second order. But
-        piles that stand by friction creep where frames differ in length: use one dt, and take as many steps of it as the clock
-        asks for.
+        piles that stand by friction creep where a frame is less than 0.4 or more than 2.5 times as long as the last one: use one
+        dt, and take as many steps of it as the clock asks for.
         A signal such as Ctrl-C is handled after the frame. A frame that takes seconds is undone at once if the handler raises.
         """
         self._runner.memory.check()

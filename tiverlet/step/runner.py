@@ -140,7 +140,7 @@ class Runner:
         if h == clock.h and drag == clock.drag and not clock.d_is_velocity and clock.first_moved is None:
             return clock.energy is None
         self.wake()
-        keeps = self._is_slightly_uneven(h, dt)
+        keeps, goes_on = self._is_slightly_uneven(h, dt), not clock.d_is_velocity
         with self.memory.compiler():
             self._jump()
             if h != clock.h or drag != clock.drag:
@@ -156,7 +156,7 @@ class Runner:
                     keeps = self._project(h, dt, substeps * iterations, keeps)
                 for contact in self.step.contacts if keeps else []:
                     contact.keep_stiffness(h / clock.h)
-            if clock.d_is_velocity and not keeps:
+            if clock.d_is_velocity and not (keeps and goes_on):
                 clock.since = 0
             if first is not None:
                 ratio = h / (clock.h or h)
@@ -171,13 +171,11 @@ class Runner:
         return True
 
     def _is_slightly_uneven(self, h: float, dt: float) -> bool:
-        """Whether the coming frame of dt [s], with substeps h [s], goes on from the last one and is only a little longer or
-        shorter, as where a loop measures dt."""
+        """Whether the coming frame of dt [s], with substeps h [s], is only a little longer or shorter than the last one, as where
+        a loop measures dt, and contacts can keep their stiffness."""
         clock = self.clock
-        keep = any(contact.can_keep_stiffness for contact in self.step.contacts)
-        goes_on = keep and not (clock.d_is_velocity or clock.first_moved == 0 or self.probe)
-        longest = max(clock.h, clock.longest)
-        return goes_on and dt != clock.frame[1] and SLIGHTLY * longest <= h <= clock.h / SLIGHTLY
+        can = clock.first_moved != 0 and not self.probe and any(contact.can_keep_stiffness for contact in self.step.contacts)
+        return can and dt != clock.frame[1] and SLIGHTLY * max(clock.h, clock.longest) <= h <= clock.h / SLIGHTLY
 
     def _project(self, h: float, dt: float, passes: int, keeps: bool) -> bool:
         """Remove the energy that violations and overlaps would store in a shorter substep h [s], of a frame dt [s].
