@@ -481,6 +481,32 @@ def test_a_surface_and_a_cluster(world):
         assert w.hash() == other.hash()
 
 
+def test_frames_that_a_loop_measures_wake_nothing(world):
+    """A heap sleeps where it lies while frames get up to a tenth longer and shorter, and stays there when it wakes.
+
+    Its weight is in what its contacts push in a substep, which is proportional to h^2. If a sleeping heap kept that of
+    another h, it would jump or fall where it wakes.
+    """
+    x = np.vstack([heap(6, 3), [[3.0, 300.0]]])  # and a disc that falls all the time, so that frames are computed
+    box, rng = (6 * 2.05 * R + 0.02, 999), np.random.default_rng(0)
+    features = [tv.Gravity(9.81), tv.Box((0, 0), box, friction=0.5), tv.Contact(friction=0.5), tv.Sleep(0.05)]
+    w = world(tv.Particles(x, radius=R), features, substeps=10, precision="f64")
+    while w.time < 2.0:
+        w.step(rng.uniform(0.9, 1.1) / 60)
+    asleep, at, v = w.last.asleep, w.position[:18], w.velocity[:18]
+    assert asleep == 18
+    while w.time < 2.3:
+        assert w.step(rng.uniform(0.9, 1.1) / 60).asleep == asleep
+    assert (w.position[:18] == at).all()
+    np.testing.assert_allclose(w.velocity[:18], v, rtol=0.25, atol=1e-6)  # d / h + a h / 2: d / h stays, h changes by a fifth
+    energy = w.last.energy
+    w.features[2].friction = 0.4  # wakes all
+    for _ in range(30):
+        report = w.step(rng.uniform(0.9, 1.1) / 60)
+        assert report.clean and report.energy < energy * (1 + 1e-4)
+    assert np.abs(w.velocity[:18]).max() < 0.2 and np.abs(w.position[:18] - at).max() < 0.02 * R
+
+
 def test_energy_never_grows(world):
     """The energy of a pile that falls asleep, and is woken again and again by its knobs, grows by no more than creep."""
     w = pile(world, height=0)

@@ -139,8 +139,10 @@ class Runner:
         drag = decay(sum(f.rate for f in self.drags), h) if self.drags else None
         if h == clock.h and drag == clock.drag and not clock.d_is_velocity and clock.first_moved is None:
             return clock.energy is None
-        self.wake()
         keeps, goes_on = self._is_slightly_uneven(h, dt), not clock.d_is_velocity
+        asleep = self._sleeping() if keeps and goes_on and clock.first_moved is None else None
+        if asleep is None:
+            self.wake()
         with self.memory.compiler():
             self._jump()
             if h != clock.h or drag != clock.drag:
@@ -156,6 +158,10 @@ class Runner:
                     keeps = self._project(h, dt, substeps * iterations, keeps)
                 for contact in self.step.contacts if keeps else []:
                     contact.keep_stiffness(h / clock.h)
+                if asleep is not None and keeps:
+                    self._sleep_on(*asleep, h / clock.h)
+                elif asleep is not None:
+                    self.wake()
             if clock.d_is_velocity and not (keeps and goes_on):
                 clock.since = 0
             if first is not None:
@@ -176,6 +182,24 @@ class Runner:
         clock = self.clock
         can = clock.first_moved != 0 and not self.probe and any(contact.can_keep_stiffness for contact in self.step.contacts)
         return can and dt != clock.frame[1] and SLIGHTLY * max(clock.h, clock.longest) <= h <= clock.h / SLIGHTLY
+
+    def _sleeping(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the particles that sleep, and their displacements; None if they have to wake where substeps change, since these
+        are not all of their state."""
+        if not self.sleep or self.scene.state.spins or any(b.count for b in self.batches):
+            return None
+        who = np.flatnonzero(self.memory.read(self.sleepers.asleep))
+        return who, self.memory.read(self.scene.state.d)[who]
+
+    def _sleep_on(self, who: np.ndarray, d: np.ndarray, ratio: float) -> None:
+        """Scale what the last substep has left of the sleeping particles `who`, with displacements d, to one of `ratio` times the
+        length. For them the coming frame is no start."""
+        memory, forces = self.memory, [contact.dev.forces for contact in self.step.contacts]
+        memory.write_rows(self.scene.state.d, who, d * ratio)
+        left = [(f.before, ratio) for f in forces] + [(f.sum, ratio**2) for f in forces if "sum" in f.in_state]
+        left += [(self.step.particles.wall_displacement, ratio**2)] if self.step.walls else []
+        for field, factor in left:
+            memory.write_rows(field, who, memory.read(field)[who] * factor)
 
     def _project(self, h: float, dt: float, passes: int, keeps: bool) -> bool:
         """Remove the energy that violations and overlaps would store in a shorter substep h [s], of a frame dt [s].
