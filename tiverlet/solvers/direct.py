@@ -1,5 +1,6 @@
 """Elimination of chains, trees and loops: exact for any length, mass ratio and compliance."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,6 +33,11 @@ UNKNOWN, UNMET, ENDED = range(3)  # whether a system takes it: decided by the mo
 # gradient of a convex energy, sum lam |r|. Up to 1, it adds at most lam times the shortening of the links.
 SOFTENED_TO = 1.0
 LEAST_SOFTNESS = 2e-12  # of the largest diagonal: the least softness, so that no pivot vanishes
+# A system that was softened for a longer substep becomes stiffer, which takes energy: it has what it lost when a longer substep
+# made it softer, REGAIN of its softness in a substep. At rest, where violations change by less than STILL in one of the longer
+# substeps, it recovers for nothing, by RECOVERY in this time; violations then change half as fast as they may.
+REGAIN, RECOVERY, STILL = 2.0**-4, 2.0**-14, 2.0**-12
+SOFTENED = "system.softened"  # a field, by its name in recordings
 
 # Stages of solve(). ROUGH: directions at the start of the substep, violations in f32. FORWARD: the same directions, accurate
 # violations. COMPARE: directions at the end. AGAIN: as FORWARD, once both agree. GIVE_WAY: directions at the end, softened.
@@ -63,7 +69,8 @@ class Direct(Solver):
     at the start of the substep: an arbitrary number, which adds energy. Such a system is detected by a pivot that is a small part
     of its diagonal, while solutions with directions at the start and at the end disagree about the tension. It is solved with
     directions at the end, and softened until (omega h)^2 <= 1; so is a system with a transverse (omega h)^2 > 4. It gives way and
-    loses energy, and the flag "softened" says so.
+    loses energy, and the flag "softened" says so. Where the substep gets shorter, such a system remains as soft as it is, and
+    becomes stiffer slowly, at rest: its tension, and with it the energy that is stored, would grow with 1 / h^2.
     """
 
     converges = True
@@ -100,7 +107,8 @@ class Direct(Solver):
 class Elimination(System):
     """The systems of one world on the device. Rows are constraints in the order of elimination."""
 
-    host_only = ("plan",)
+    host_only = ("plan", "late")
+    late = (SOFTENED,)
     parts: Any = OnDevice()  # number of systems
     entries: Any = OnDevice()  # number of couplings of two rows
 
@@ -110,6 +118,9 @@ class Elimination(System):
     ):  # fmt: skip
         super().__init__(scene, batches, slots, scalars, found.rows)
         self.plan, self.parts, self.entries = found, self.memory.number(found.parts), self.memory.number(len(found.column))
+        # Of each part that gave way in the last substep: (h' / h)^2 for the substep h' that it is softened for, the sum of its
+        # violations, and what it lost to longer substeps, in energy h^2 / tension for h' = h. Else 0.
+        self.softened = scene.memory.field(SOFTENED, found.parts, width=3, kind=ti.f64, state=True)
         product = found.product.copy()
         product[:, 1:] = slot[product[:, 1:]]
         side = np.repeat([b.side for b in scalars], [b.count for b in scalars])[found.rows]
@@ -149,6 +160,29 @@ class Elimination(System):
             self.batch, self.number = ints("batch", batch), ints("number", number)
         if self.one_sided:
             self.side, self.active, self.remaining = ints("side", side), ints("active", 0 * side), reals("left")
+
+    def keep_softness(self, ratio: float) -> None:
+        """Keep parts that give way as soft as they are, where the next substep is `ratio` times as long as the last one."""
+        soft, off, lost = self.memory.read(self.softened).T
+        if soft.any():
+            kept = np.where(soft > 0, np.maximum(soft / ratio**2, 1.0), 0.0)
+            lost = (lost + off * (_over(soft) - _over(kept * ratio**2))) * ratio**2
+            self.memory.write(self.softened, np.stack([kept, off, np.maximum(lost, 0.0)], axis=1))
+
+    @property
+    def keeps_softness_of_longer(self) -> bool:
+        """Whether a part is softened for a longer substep than the present one, so that shorter ones do not help."""
+        return bool((self.memory.read(self.softened)[:, 0] > 1).any())
+
+    def gives_way(self, batch: Batch) -> np.ndarray:
+        """Return a mask of the constraints of a batch in parts that give way, (m,)."""
+        parts = np.repeat(self.memory.read(self.softened)[:, 0] > 0, np.diff(self.plan.part_begin))
+        row = self.row(batch)
+        return parts[row] & (row >= 0)
+
+    def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
+        """Forget which parts give way."""
+        self.memory.write(self.softened, 0.0)
 
     @ti.func
     def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):
@@ -331,15 +365,16 @@ class Elimination(System):
         return out
 
     @ti.func
-    def tensions(self, begin, end, at_end):
+    def tensions(self, begin, end, at_end, longer):
         """Return (omega h)^2 of transverse vibrations under the multipliers found: the largest, and the signed sum.
 
-        Also returned are the ratio of violations to steps, which is the mean stiffness of the system, and the largest diagonal.
+        longer: the square of the substep for which they are computed, relative to the present one. Also returned are the ratio of
+        violations to steps, which is the mean stiffness of the system, and the largest diagonal.
         """
         worst, total = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         size, steps, most = ti.cast(0, ti.f64), ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         for r in range(begin, end):
-            step, geometric_stiffness = self.step[r], self.geometric_stiffness[r]
+            step, geometric_stiffness = self.step[r], longer * self.geometric_stiffness[r]
             if at_end != 0:
                 geometric_stiffness /= self.relative_length(r)
             worst = ti.max(worst, geometric_stiffness * ti.abs(self.lam[r] + step))
@@ -377,11 +412,27 @@ class Elimination(System):
                         self.violation[r] -= b.dev.limit.postponed[self.number[r]]
 
     @ti.func
-    def limit_tensions(self, begin, end):
-        """Limit each multiplier to the tension with (omega h)^2 = SOFTENED_TO."""
+    def softness(self, b, begin, end):
+        """Return (h' / h)^2 for the substep h' that part b is softened for, after it has recovered a little."""
+        soft, off, lost = ti.max(self.softened[b][0], ti.cast(1, ti.f64)), ti.cast(0, ti.f64), self.softened[b][2]
+        if self.softened[b][0] > 0 and begin < end and self.earlier_tension(begin, end) == 0:
+            for r in range(begin, end):
+                off += ti.abs(self.violation[r])
+            if soft > 1 and off > 0:
+                new = ti.max(soft * (1 - REGAIN), 1 / (1 / soft + lost / off), 1 + 0 * soft)
+                lost -= off * (1 / new - 1 / soft)
+                if ti.abs(off - self.softened[b][1]) * ti.sqrt(soft) < STILL * off:
+                    new = ti.max(new - 2 * RECOVERY * ti.sqrt(new), 1 + 0 * soft)
+                soft = new
+            self.softened[b] = ti.Vector([soft, off, ti.max(lost, 0 * lost)])
+        return soft
+
+    @ti.func
+    def limit_tensions(self, begin, end, longer):
+        """Limit each multiplier to the tension with (omega h)^2 = SOFTENED_TO. longer: see tensions()."""
         for r in range(begin, end):
             if self.geometric_stiffness[r] > 0:
-                most = SOFTENED_TO * self.relative_length(r) / self.geometric_stiffness[r]
+                most = SOFTENED_TO * self.relative_length(r) / (longer * self.geometric_stiffness[r])
                 self.step[r] = ti.max(-most, ti.min(most, self.lam[r] + self.step[r])) - self.lam[r]
 
     @ti.func
@@ -421,8 +472,8 @@ class Elimination(System):
                     self.any_unmet[None] = 1
 
     @ti.func
-    def solve(self, b):
-        """Find the steps of all multipliers in system b.
+    def solve(self, b, kick):
+        """Find the steps of all multipliers in system b. kick: how many kicks they supply: 1, except at a start.
 
         Particles under tension vibrate transversely. If the substep is too long for that, or the tension is undetermined (see
         Direct), the system is solved with directions at the end of the substep. It is softened until its tension is small enough:
@@ -435,19 +486,23 @@ class Elimination(System):
                 end = begin
         zero = ti.cast(0, ti.f64)
         softness, least, inverse, tension_at_start, total_at_start = zero, zero, zero, zero, zero
-        stage, k, bound = FORWARD, 0, True
+        stage, k, bound, soft, longer = FORWARD, 0, True, self.softness(b, begin, end), 1 + zero
+        if self.softened[b][0] > 0:
+            longer = soft / kick
         if ti.static(len(self.precise) > 0):
             stage = ROUGH
+        if begin == end:
+            stage = DONE
         while stage != DONE:
             hard = self.solve_active_set(begin, end, softness, ti.cast(stage >= COMPARE, ti.i32))
-            tension, total, stiffness, most = self.tensions(begin, end, ti.cast(stage >= COMPARE, ti.i32))
+            tension, total, stiffness, most = self.tensions(begin, end, ti.cast(stage >= COMPARE, ti.i32), longer)
             if ti.static(self.limits_steps):
                 if stage <= FORWARD and self.limit_steps(begin, end) != 0:
                     continue
             if stage <= AGAIN:
                 if (hard == 0 and tension <= TENSEST) or stage == AGAIN:
-                    ti.atomic_max(self.tension[None], tension)
-                    stage = DONE
+                    ti.atomic_max(self.tension[None], tension / longer)
+                    self.softened[b], stage = ti.Vector([zero, zero, zero]), DONE
                     if tension > CALM_TENSION:
                         self.end_newton(b)
                 elif stage == ROUGH:
@@ -466,17 +521,19 @@ class Elimination(System):
                     stage = AGAIN
                 else:
                     # A load that more substeps do not help to bear is reported as just unstable, TENSEST.
-                    ti.atomic_max(self.tension[None], ti.select(bound, tension_at_start, ti.min(tension, TENSEST)))
+                    reported = ti.select(bound, tension_at_start, ti.min(tension, TENSEST))
+                    ti.atomic_max(self.tension[None], ti.select(longer > 1, ti.min(reported, TENSEST), reported))
                     softness, stage = LEAST_SOFTNESS * most, GIVE_WAY
                     self.end_newton(b)
-                    if self.earlier_tension(begin, end) > SOFTENED_TO:
+                    if longer * self.earlier_tension(begin, end) > SOFTENED_TO:
                         self.clear_steps(begin, end)
                         stage = DONE
             else:
                 k += 1
                 if k == ROUNDS or (tension <= SOFTENED_TO and (k == 1 or k > 3 or tension > 0.8 * SOFTENED_TO)):
                     self.use_end_directions(begin, end)
-                    self.limit_tensions(begin, end)
+                    self.limit_tensions(begin, end, longer)
+                    self.softened[b][0] = ti.select(k > 1, soft, zero)
                     stage = DONE
                 else:
                     new = softness + stiffness * (tension / SOFTENED_TO - 1)
@@ -486,3 +543,8 @@ class Elimination(System):
                         least, inverse = softness, 1 / tension
                         new = ti.max(new, 1.1 * softness)
                     softness = new
+
+
+def _over(a: np.ndarray) -> np.ndarray:
+    """Return 1 / a; 0 where a is 0."""
+    return np.divide(1.0, a, out=np.zeros_like(a), where=a > 0)

@@ -35,6 +35,8 @@ class System:
     parts: Any = 1  # number of independent systems
     steps = 0  # iterations of a pass, by start(), iterate() and end(); 0 for a solution by solve()
     refines = False  # whether parts may take a second Newton step in a pass, see takes_step() and is_unmet()
+    keeps_softness_of_longer: Any = False  # whether a part is softened for a longer substep, so that shorter ones do not help
+    late: tuple[str, ...] = ()  # the names of fields in the state that are not hashed where they are 0
     team: Any  # the threads that share the loops of start(), iterate() and end(); set when kernels are built
     stride: int  # iterations of such a loop for each block of rows
 
@@ -113,6 +115,13 @@ class System:
         off: for some batches, (m,), the violations of rigid constraints that cannot be removed at the new positions.
         """
 
+    def gives_way(self, batch: "Batch") -> np.ndarray:
+        """Return a mask of the constraints of a batch in parts that give way, and stay so in a shorter substep, (m,)."""
+        return np.zeros(batch.count, dtype=bool)
+
+    def keep_softness(self, ratio: float) -> None:
+        """Keep parts that give way as soft as they are, where the next substep is `ratio` times as long as the last one."""
+
     @ti.func
     def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):
         """Set the data of row r for this pass, except gradients.
@@ -152,8 +161,8 @@ class System:
         """Record that particle i, with slots from `begin` up to `end`, has moved by `move` [m]. Called where `refines`."""
 
     @ti.func
-    def solve(self, b):
-        """Find the steps of all multipliers in part b."""
+    def solve(self, b, kick):
+        """Find the steps of all multipliers in part b. kick: how many kicks they supply: 1, except at a start."""
 
     @ti.func
     def start(self, thread):

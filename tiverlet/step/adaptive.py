@@ -117,7 +117,7 @@ class StepController:
             took = perf_counter() - begun
             self.learn(took / (n * k))
             motion, missed = motion_error(world) if tolerance else 0.0, energy_bound.missed(world, report, energy)
-            figures, risks = judge(report, tolerance, motion, stiffness(world), damping(world, n), missed)
+            figures, risks = judge(report, tolerance, tension(world, report), motion, stiffness(world), damping(world, n), missed)
             if tries.record(figures, risks, report.energy, world._runner.sheet.item(KINETIC)):
                 break
             if not tries.verdict and perf_counter() + 2 * took > end:
@@ -303,6 +303,12 @@ def turned(world: "World", x: np.ndarray, d: np.ndarray) -> float:
     return worst**0.5
 
 
+def tension(world: "World", report: StepReport) -> float:
+    """Return (omega h)^2 of the fastest vibration across a tension; 0 where systems stay as soft as in a longer substep."""
+    slots = world._runner.scene.slots
+    return 0.0 if "softened" in report.flags and slots.system and slots.system.keeps_softness_of_longer else report.tension
+
+
 def stiffness(world: "World") -> float:
     """Return (omega h)^2 of the fastest motion in forces that vary in space."""
     runner, clock = world._runner, world._clock
@@ -359,7 +365,7 @@ def pumps(energies: list[float], kinetic: float) -> bool:
 
 
 def judge(
-    report: StepReport, tolerance: float | None, motion: float, stiffness: float, damping: float, missed: float
+    report: StepReport, tolerance: float | None, tension: float, motion: float, stiffness: float, damping: float, missed: float
 ) -> tuple[Figures, set[str]]:  # fmt: skip
     """Return residual, overlap, tension, motion, stiffness, damping and energy relative to their aims (1: just met), and the
     risks that shorter substeps must remove."""
@@ -371,7 +377,7 @@ def judge(
     ratios = (
         report.residual / (tolerance or RESIDUAL),
         report.overlap / (tolerance or OVERLAP),
-        report.tension / TENSION,
+        tension / TENSION,
         motion / (tolerance or RESIDUAL),
         stiffness / (24 * tolerance if tolerance else FORCE),
         damping,
@@ -384,11 +390,12 @@ def cheapest(known: dict[tuple[int, int], Figures], stuck: Figures) -> tuple[int
     """Return the least effort with which all figures are as good as they have to be, or as good as with the most effort.
 
     If constraints have hardly a direction in which to bear a load, return the most substeps: the sag that bears the load falls
-    with h^2, and would spring back if the number of substeps had to rise later.
+    with h^2, and once it is there, shorter substeps keep it.
     """
     enough = [max(1.0, s) for s in stuck]
     fit = [effort for effort, figures in known.items() if all(f <= e for f, e in zip(figures, enough, strict=True))]
-    return next(e for e in fit if stuck[TENSE] <= 1 or e[0] == max(fit)[0])
+    tense = any(known[e][TENSE] > 1 for e in fit)
+    return next(e for e in fit if not tense or e[0] == max(fit)[0])
 
 
 def with_verdict(report: StepReport, figure: float, risks: set[str], verdict: str, tries: int) -> StepReport:

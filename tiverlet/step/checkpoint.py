@@ -83,7 +83,9 @@ def _hashed(world: "World", values: dict[str, np.ndarray]) -> dict[str, np.ndarr
 
 def _late(world: "World") -> set[str]:
     """Return the names of fields that are allocated when first needed, and count as 0 before."""
-    return {name for contact in world._runner.step.contacts for name in contact.late}
+    slots = world._runner.scene.slots
+    parts = [*world._runner.step.contacts, *([slots.system] if slots and slots.system else [])]
+    return {name for part in parts for name in part.late}
 
 
 def _pieces(world: "World") -> dict[str, Any]:

@@ -144,8 +144,8 @@ class ConstraintPass:
                         f.dev.learn_load(c, now.h)
 
     @ti.func
-    def solve_systems(self, thread, newton):
-        """Compute the steps of the multipliers of each system."""
+    def solve_systems(self, thread, newton, kick):
+        """Compute the steps of the multipliers of each system. kick: how many kicks they supply: 1, except at a start."""
         for system in ti.static(self.systems):
             if ti.static(system.steps > 0):
                 system.start(thread)
@@ -154,7 +154,7 @@ class ConstraintPass:
             else:
                 for b in range(self.team.chunk_begin(system.parts, thread), self.team.chunk_end(system.parts, thread)):
                     if system.takes_step(b, newton):
-                        system.solve(b)
+                        system.solve(b, kick)
                 self.team.wait()
 
     @ti.func

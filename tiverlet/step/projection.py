@@ -105,8 +105,9 @@ def project(
     if would_vibrate(stays, ratio):
         runner.released = stays
     system = slots and slots.system
-    if system and not (system.steps or runner.clock.softened or system.count_relaxed_alone(runner.batches)):
-        batches = [b for b in batches if would_vibrate(_off(b, x), ratio)]  # it holds loads without a violation
+    if system and not (system.steps or system.count_relaxed_alone(runner.batches)):
+        # It holds loads without a violation, or gives way, and remains as soft as it is.
+        batches = [b for b in batches if would_vibrate(_off(b, x, ~system.gives_way(b)), ratio)]
     batches += sideways_rows(batches)
     batches += anchor_rows(runner.batches, x)
     clusters = Solids.loaded(runner, x, 1.0, apart=False)  # a fast test
@@ -250,9 +251,10 @@ def would_vibrate(violation: float, ratio: float) -> bool:
     return violation * (1 - ratio**2) ** 2 > ENOUGH * ratio**2
 
 
-def _off(batch: Scalar, x: np.ndarray) -> float:
-    """Return the worst violation of rigid constraints, as a share of their size, as Newton's method leaves after an impact."""
-    C = batch.violation(x) * batch.inverse_size(batch.start.position) * (batch.compliance == 0) * ~batch.broken
+def _off(batch: Scalar, x: np.ndarray, some: np.ndarray) -> float:
+    """Return the worst violation of rigid constraints in the mask `some`, as a share of their size, as Newton's method leaves
+    after an impact."""
+    C = batch.violation(x) * batch.inverse_size(batch.start.position) * (batch.compliance == 0) * ~batch.broken * some
     return float((np.abs(C) if batch.side == 0 else C * batch.side).max(initial=0.0))
 
 

@@ -409,13 +409,17 @@ class Step:
     def solve_systems(self, now):
         """Solve systems of coupled constraints: chains, cloth."""
         if ti.static(len(self.constraints.systems) > 0):
-            self.solve_each(now.thread, now.newton)
+            kick = ti.cast(1, self.real)
+            if ti.static(self.integrator.half_kick):
+                if now.fresh != 0:
+                    kick = self.integrator.h2_rigid(now.h, now.fresh, ti.cast(now.span.owed, self.real)) / (now.h * now.h)
+            self.solve_each(now.thread, now.newton, kick)
 
     @called
     @ti.func
-    def solve_each(self, thread: ti.i32, newton: ti.i32):
-        """Solve each system, in the Newton step `newton`."""
-        self.constraints.solve_systems(thread, newton)
+    def solve_each(self, thread: ti.i32, newton: ti.i32, kick: ti.f32):
+        """Solve each system, in the Newton step `newton`. kick: how many kicks rigid constraints supply: 1, except at a start."""
+        self.constraints.solve_systems(thread, newton, kick)
 
     @ti.func
     def start_systems(self, now):
