@@ -203,10 +203,11 @@ def works(world: "World") -> bool:
 
 
 def inside(world: "World", reach: float) -> bool:
-    """Whether any particle is inside of a wall, which pushes it out at push_out. reach: the largest coordinate [m]."""
-    x, radius = world.position, world.particles.radius
+    """Whether any particle that can move is inside of a wall, which pushes it out at push_out. reach: the largest coordinate
+    [m]."""
+    x, radius, moves = world.position, world.particles.radius, world._runner.scene.inv_mass > 0
     deep = PARTED * radius + SKIN * reach
-    return any(bool((wall.clearance(x) - radius < -deep).any()) for wall in _walls(world))
+    return any(bool((moves & (wall.clearance(x) - radius < -deep)).any()) for wall in _walls(world))
 
 
 def let_out(world: "World") -> float:

@@ -48,11 +48,16 @@ if TYPE_CHECKING:
     from .runner import Runner
 
 ENOUGH = 1e-3  # of its size: a violation that matters, divided by (r - 1)^2 / r, r = (h / h')^2: what one jump leaves to vibrate
+# The same where a loop measures dt, for substeps of at least UNEVEN of the longest one, unless the scene would have more energy
+# than ever. As much is lost where frames get longer.
+LOOSE, UNEVEN = 0.2, 0.3
+SAFE = 0.9  # of break_at: what a load may become there
 FRAIL = 0.01  # of break_at: the extra load that a violation may cause in a shorter substep
 FIRM = 0.9  # theta from which on velocities must not change a constraint
 FAR = 0.75  # of the longest substep: below, violations that are small now are settled
 NEWTON = 40  # steps, at most
 PRODUCTS = 1e9  # multiplications, at most: some seconds, after which the remaining violations stay
+QUICK = 1 / 32  # of these where a loop measures dt: a wait would make the next frame still longer
 SHARED = PRODUCTS / 8  # the limit where contacts move, too: that is tried after links alone, several times
 BEGIN, HARDEST, LEAST = 1e-3, 10.0, 1e-9  # mu of the first and of the last try; the least mu
 FINE, STALLED = 1e-5, 0.05  # mu from which on a step must remove this share of the stored energy, or violations are left
@@ -85,33 +90,35 @@ class Aims(NamedTuple):
 
 
 def project(
-    runner: "Runner", h: float, dt: float, longest: float, contacts: ContactRows | None = None
+    runner: "Runner", h: float, dt: float, longest: float, contacts: ContactRows | None = None, measured: bool = False
 ) -> bool | None:  # fmt: skip
     """Remove the energy that violations would store in a shorter substep; d holds velocities.
 
     Nothing happens if violations are small, or if the moves would make contacts overlap more. h: the coming substep [s], of a
     frame dt [s]. longest: the longest substep since the last projection [s]. contacts: contacts that move together with links.
+    measured: whether a loop measures dt; then more violation counts as small.
     Returns whether positions are settled for h; None where contacts are in the way and the energy is more than a hundredth of the
     kinetic energy.
     """
     ratio = h / longest
-    slots = runner.scene.slots
+    uneven = measured and ratio >= UNEVEN
+    slots, enough = runner.scene.slots, LOOSE if uneven else ENOUGH
     w, state, memory = runner.scene.inv_mass, runner.scene.state, runner.memory
     x = before = state.get(memory)
     if not (np.abs(x) < LARGEST).all():  # or NaN
         return True
     batches: list[Any] = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
     stays = left_out(runner.batches, w, x, runner.clock.h)
-    if would_vibrate(stays, ratio):
+    if would_vibrate(stays, ratio, enough):
         runner.released = stays
     system = slots and slots.system
     if system and not (system.steps or system.count_relaxed_alone(runner.batches)):
         # It holds loads without a violation, or gives way, and remains as soft as it is.
-        batches = [b for b in batches if would_vibrate(_off(b, x, ~system.gives_way(b)), ratio)]
+        batches = [b for b in batches if would_vibrate(_off(b, x, ~system.gives_way(b)), ratio, enough)]
     batches += sideways_rows(batches)
     batches += anchor_rows(runner.batches, x)
     clusters = Solids.loaded(runner, x, 1.0, apart=False)  # a fast test
-    if batches or contacts or would_vibrate(clusters.worst, ratio):
+    if batches or contacts or would_vibrate(clusters.worst, ratio, enough):
         batches += cluster_rows(runner.batches, w, every=contacts is not None)
     elif clusters.count and clusters.copies.shared:
         return ratio < FAR
@@ -121,10 +128,12 @@ def project(
     rails = Rails(runner, x)
     start = Rows(batches, w, x, runner.scene.periodic, rails)
     undone = start.undone(runner)
-    frail = start.would_break(undone, h, longest)
+    uneven = uneven and start.is_slight(runner, undone, ratio)
+    enough = enough if uneven else ENOUGH
+    frail = start.would_break(undone, h, longest, uneven)
     off = max(float(np.abs(undone * start.close).max(initial=0.0)), rails.worst / runner.scene.particles.size)
-    if not frail and not would_vibrate(off, ratio):
-        return ratio < FAR
+    if not frail and not would_vibrate(off, ratio, enough):
+        return uneven or ratio < FAR
     start = start.with_goal(start.C - (1 - ratio**2) * undone)
     rows = start.at(rails.drawn(x, 1 - ratio**2)) if rails.worst else start
     kept = memory.read(state.d)
@@ -137,7 +146,8 @@ def project(
     v[:n] += rows.jacobian.solve((rows.pace(runner, h, dt) - rows.jacobian.rates(v[:n])) * still, still)
     energy, overlap = seen_before(runner)
     finest = ratio**4 if frail else ratio**2  # by loads, or by energies
-    aims = Aims(LEFT * finest, steps, 0.0 if frail else slight, SHARED if contacts else PRODUCTS, DONE[frail])
+    products = (SHARED if contacts else PRODUCTS) * (QUICK if measured else 1.0)
+    aims = Aims(LEFT * finest, steps, 0.0 if frail else slight, products, DONE[frail])
     rows, stopped = _moved(runner, start, _leaning(runner, rows, 1 - ratio**2), aims)
     left = 0.0
     if contacts:
@@ -246,9 +256,9 @@ def _newton(rows: "Rows", enough: float, aims: Aims) -> np.ndarray:
     return rows.x
 
 
-def would_vibrate(violation: float, ratio: float) -> bool:
+def would_vibrate(violation: float, ratio: float, enough: float = ENOUGH) -> bool:
     """Whether a violation, as a share of its size, would leave so much vibration that it must be removed. ratio: h' / h."""
-    return violation * (1 - ratio**2) ** 2 > ENOUGH * ratio**2
+    return violation * (1 - ratio**2) ** 2 > enough * ratio**2
 
 
 def _off(batch: Scalar, x: np.ndarray, some: np.ndarray) -> float:
@@ -476,13 +486,29 @@ class Rows:
         """How fast rest values go in the coming substep h, of a frame dt."""
         return self._each([_pace(runner, b, self.x, h, dt) for b in self.batches])
 
-    def would_break(self, undone: np.ndarray, h: float, longest: float) -> bool:
-        """Whether a violation would pull so much harder in a substep h that the change counts beside break_at of its row."""
+    def is_slight(self, runner: Any, undone: np.ndarray, ratio: float) -> bool:
+        """Whether the scene would not have more energy than ever if what violations store, lam Z / (2 h^2), grew by
+        1 / ratio^2."""
+        clock, read = runner.clock, runner.memory.read
+        if clock.energy is None or clock.bound is None or clock.bound == CHANGED:
+            return True
+        alone = self.weight * _over(np.abs(undone), self.diagonal)  # multipliers of rows that are relaxed alone
+        told = [read(b.dev.equation.lam)[: b.count] if isinstance(b, Scalar) else np.zeros(b.count) for b in self.batches]
+        lam = np.maximum(np.abs(self._each(told)), alone)
+        stored = float((lam * np.abs(undone)).sum()) / (2 * h2_effective_of(clock))
+        return clock.energy + stored / ratio**2 <= clock.bound + SLIGHT * clock.kinetic
+
+    def would_break(self, undone: np.ndarray, h: float, longest: float, uneven: bool) -> bool:
+        """Whether a violation would pull so much harder in a substep h that the change counts beside break_at of its row.
+
+        uneven: whether loads may grow, and swing, as long as they remain below break_at.
+        """
         if not any(b.breaks for b in self.batches):
             return False
         each: list[Any] = [getattr(b, "break_at", None) for b in self.batches]
         strength = self._each([np.full(b.count, np.inf if s is None else s) for b, s in zip(self.batches, each, strict=True)])
-        return bool((np.abs(undone) * (1 / h**2 - 1 / longest**2) > FRAIL * strength * self.diagonal).any())
+        factor, share = (2 / h**2 - 1 / longest**2, SAFE) if uneven else (1 / h**2 - 1 / longest**2, FRAIL)
+        return bool((np.abs(undone) * factor > share * strength * self.diagonal).any())
 
     def _rigid(self, alpha: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """Return theta. reach: (m,) the move by a force of 1 N in a substep [m]."""

@@ -207,20 +207,21 @@ class Runner:
         """Remove the energy that violations and overlaps would store in a shorter substep h [s], of a frame dt [s].
 
         keeps: whether contacts may keep their stiffness instead, which they do unless links press on them. passes: in the frame.
-        Returns whether they do.
+        Returns whether they do. Where a loop measures dt, it must not wait long.
         """
         clock, longest = self.clock, self.clock.longest
-        projected = project(self, h, dt, longest) if keeps else None
+        measured = dt != clock.frame[1] and clock.first_moved != 0
+        projected = project(self, h, dt, longest, measured=measured) if keeps else None
         if keeps and projected is not None:
             linked = any(b.count for b in self.batches)
             clock.longest = h if linked else still_soft(h, longest, passes)
             return True
         self.pressed = 0.0
         released = release(self, h, longest)
-        projected = project(self, h, dt, longest)
+        projected = project(self, h, dt, longest, measured=measured)
         # Links and contacts must move together. With frames of slightly uneven length, stacks would creep sideways.
         if projected is None and (dt == clock.frame[1] or 2 * h <= longest):
-            projected = project(self, h, dt, longest, ContactRows.of(self))
+            projected = project(self, h, dt, longest, ContactRows.of(self), measured=measured)
         if projected is None and not released:
             released = release(self, h, longest, small=True)
         shrink_left(self, h, longest)
