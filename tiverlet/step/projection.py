@@ -492,10 +492,10 @@ class Rows:
         clock, read = runner.clock, runner.memory.read
         if clock.energy is None or clock.bound is None or clock.bound == CHANGED:
             return True
-        alone = self.weight * _over(np.abs(undone), self.diagonal)  # multipliers of rows that are relaxed alone
-        told = [read(b.dev.equation.lam)[: b.count] if isinstance(b, Scalar) else np.zeros(b.count) for b in self.batches]
-        lam = np.maximum(np.abs(self._each(told)), alone)
-        stored = float((lam * np.abs(undone)).sum()) / (2 * h2_effective_of(clock))
+        each = self.weight * _over(undone, self.diagonal)  # at most, for rows without a multiplier
+        known = [read(b.dev.equation.lam)[: b.count] if isinstance(b, Scalar) else np.full(b.count, np.nan) for b in self.batches]
+        lam = self._each(known)
+        stored = float(np.abs(np.where(np.isnan(lam), each, lam) * undone).sum()) / (2 * h2_effective_of(clock))
         return clock.energy + stored / ratio**2 <= clock.bound + SLIGHT * clock.kinetic
 
     def would_break(self, undone: np.ndarray, h: float, longest: float, uneven: bool) -> bool:
