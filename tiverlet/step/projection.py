@@ -130,7 +130,7 @@ def project(
     undone = start.undone(runner)
     uneven = uneven and start.is_slight(runner, undone, ratio)
     enough = enough if uneven else ENOUGH
-    frail = start.would_break(undone, h, longest, uneven)
+    frail = start.would_break(runner, undone, h, longest, uneven)
     off = max(float(np.abs(undone * start.close).max(initial=0.0)), rails.worst / runner.scene.particles.size)
     if not frail and not would_vibrate(off, ratio, enough):
         return uneven or ratio < FAR
@@ -486,29 +486,35 @@ class Rows:
         """How fast rest values go in the coming substep h, of a frame dt."""
         return self._each([_pace(runner, b, self.x, h, dt) for b in self.batches])
 
+    def multipliers(self, runner: Any, undone: np.ndarray) -> np.ndarray:
+        """Return the multipliers of the last substep, (m,); for rows without any those of a single pass, which are larger."""
+        read = runner.memory.read
+        known = [read(b.dev.equation.lam)[: b.count] if isinstance(b, Scalar) else np.full(b.count, np.nan) for b in self.batches]
+        lam = self._each(known)
+        return np.where(np.isnan(lam), self.weight * _over(undone, self.diagonal), lam)
+
     def is_slight(self, runner: Any, undone: np.ndarray, ratio: float) -> bool:
         """Whether the scene would not have more energy than ever if what violations store, lam Z / (2 h^2), grew by
         1 / ratio^2."""
-        clock, read = runner.clock, runner.memory.read
+        clock = runner.clock
         if clock.energy is None or clock.bound is None or clock.bound == CHANGED:
             return True
-        each = self.weight * _over(undone, self.diagonal)  # at most, for rows without a multiplier
-        known = [read(b.dev.equation.lam)[: b.count] if isinstance(b, Scalar) else np.full(b.count, np.nan) for b in self.batches]
-        lam = self._each(known)
-        stored = float(np.abs(np.where(np.isnan(lam), each, lam) * undone).sum()) / (2 * h2_effective_of(clock))
+        stored = float(np.abs(self.multipliers(runner, undone) * undone).sum()) / (2 * h2_effective_of(clock))
         return clock.energy + stored / ratio**2 <= clock.bound + SLIGHT * clock.kinetic
 
-    def would_break(self, undone: np.ndarray, h: float, longest: float, uneven: bool) -> bool:
+    def would_break(self, runner: Any, undone: np.ndarray, h: float, longest: float, uneven: bool) -> bool:
         """Whether a violation would pull so much harder in a substep h that the change counts beside break_at of its row.
 
-        uneven: whether loads may grow, and swing, as long as they remain below break_at.
+        uneven: whether loads may grow, and swing about their new value, as long as they remain below break_at.
         """
         if not any(b.breaks for b in self.batches):
             return False
         each: list[Any] = [getattr(b, "break_at", None) for b in self.batches]
         strength = self._each([np.full(b.count, np.inf if s is None else s) for b, s in zip(self.batches, each, strict=True)])
-        factor, share = (2 / h**2 - 1 / longest**2, SAFE) if uneven else (1 / h**2 - 1 / longest**2, FRAIL)
-        return bool((np.abs(undone) * factor > share * strength * self.diagonal).any())
+        if uneven:
+            load = np.abs(self.multipliers(runner, undone)) / h2_effective_of(runner.clock)
+            return bool((load * (2 * (longest / h) ** 2 - 1) > SAFE * strength).any())
+        return bool((np.abs(undone) * (1 / h**2 - 1 / longest**2) > FRAIL * strength * self.diagonal).any())
 
     def _rigid(self, alpha: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """Return theta. reach: (m,) the move by a force of 1 N in a substep [m]."""
