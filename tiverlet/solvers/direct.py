@@ -37,6 +37,7 @@ LEAST_SOFTNESS = 2e-12  # of the largest diagonal: the least softness, so that n
 # made it softer, REGAIN of its softness in a substep. At rest, where violations change by less than STILL in one of the longer
 # substeps, it recovers for nothing, by RECOVERY in this time; violations then change half as fast as they may.
 REGAIN, RECOVERY, STILL = 2.0**-4, 2.0**-14, 2.0**-12
+GONE = 0.1  # of its violations: what may be left of them a substep after they seem to have been removed
 SOFTENED = "system.softened"  # a field, by its name in recordings
 
 # Stages of solve(). ROUGH: directions at the start of the substep, violations in f32. FORWARD: the same directions, accurate
@@ -119,7 +120,8 @@ class Elimination(System):
         super().__init__(scene, batches, slots, scalars, found.rows)
         self.plan, self.parts, self.entries = found, self.memory.number(found.parts), self.memory.number(len(found.column))
         # Of each part that gave way in the last substep: (h' / h)^2 for the substep h' that it is softened for, the sum of its
-        # violations, and what it lost to longer substeps, in energy h^2 / tension for h' = h. Else 0.
+        # violations, and what it lost to longer substeps, in energy h^2 / tension for h' = h. Else 0. The first number is below
+        # 0 where the part seems to have borne its load, until its violations are seen to be gone.
         self.softened = scene.memory.field(SOFTENED, found.parts, width=3, kind=ti.f64, state=True)
         product = found.product.copy()
         product[:, 1:] = slot[product[:, 1:]]
@@ -165,18 +167,18 @@ class Elimination(System):
         """Keep parts that give way as soft as they are, where the next substep is `ratio` times as long as the last one."""
         soft, off, lost = self.memory.read(self.softened).T
         if soft.any():
-            kept = np.where(soft > 0, np.maximum(soft / ratio**2, 1.0), 0.0)
-            lost = (lost + off * (_over(soft) - _over(kept * ratio**2))) * ratio**2
-            self.memory.write(self.softened, np.stack([kept, off, np.maximum(lost, 0.0)], axis=1))
+            kept = np.where(soft != 0, np.maximum(np.abs(soft) / ratio**2, 1.0), 0.0)
+            lost = (lost + off * (_over(np.abs(soft)) - _over(kept * ratio**2))) * ratio**2
+            self.memory.write(self.softened, np.stack([np.copysign(kept, soft), off, np.maximum(lost, 0.0)], axis=1))
 
     @property
     def keeps_softness_of_longer(self) -> bool:
         """Whether a part is softened for a longer substep than the present one, so that shorter ones do not help."""
-        return bool((self.memory.read(self.softened)[:, 0] > 1).any())
+        return bool((np.abs(self.memory.read(self.softened)[:, 0]) > 1).any())
 
     def gives_way(self, batch: Batch) -> np.ndarray:
         """Return a mask of the constraints of a batch in parts that give way, (m,)."""
-        parts = np.repeat(self.memory.read(self.softened)[:, 0] > 0, np.diff(self.plan.part_begin))
+        parts = np.repeat(self.memory.read(self.softened)[:, 0] != 0, np.diff(self.plan.part_begin))
         row = self.row(batch)
         return parts[row] & (row >= 0)
 
@@ -413,12 +415,14 @@ class Elimination(System):
 
     @ti.func
     def softness(self, b, begin, end):
-        """Return (h' / h)^2 for the substep h' that part b is softened for, after it has recovered a little."""
-        soft, off, lost = ti.max(self.softened[b][0], ti.cast(1, ti.f64)), ti.cast(0, ti.f64), self.softened[b][2]
-        if self.softened[b][0] > 0 and begin < end and self.earlier_tension(begin, end) == 0:
+        """Return (h' / h)^2 for the substep h' that part b is softened for, after it has recovered a little; 0 if it is not."""
+        soft, off, lost = ti.abs(self.softened[b][0]), ti.cast(0, ti.f64), self.softened[b][2]
+        if soft > 0 and begin < end and self.earlier_tension(begin, end) == 0:
             for r in range(begin, end):
                 off += ti.abs(self.violation[r])
-            if soft > 1 and off > 0:
+            if self.softened[b][0] < 0 and off <= GONE * self.softened[b][1]:
+                soft, off, lost = 0 * soft, 0 * off, 0 * lost
+            elif soft > 1 and off > 0:
                 new = ti.max(soft * (1 - REGAIN), 1 / (1 / soft + lost / off), 1 + 0 * soft)
                 lost -= off * (1 / new - 1 / soft)
                 if ti.abs(off - self.softened[b][1]) * ti.sqrt(soft) < STILL * off:
@@ -426,6 +430,16 @@ class Elimination(System):
                 soft = new
             self.softened[b] = ti.Vector([soft, off, ti.max(lost, 0 * lost)])
         return soft
+
+    @ti.func
+    def record_softness(self, b, soft, gives_way):
+        """Record whether part b, which had this softness(), gives way."""
+        if gives_way:
+            self.softened[b][0] = ti.max(soft, 1 + 0 * soft)
+        elif soft > 1:
+            self.softened[b][0] = -soft
+        else:
+            self.softened[b] = ti.Vector.zero(ti.f64, 3)
 
     @ti.func
     def limit_tensions(self, begin, end, longer):
@@ -487,7 +501,7 @@ class Elimination(System):
         zero = ti.cast(0, ti.f64)
         softness, least, inverse, tension_at_start, total_at_start = zero, zero, zero, zero, zero
         stage, k, bound, soft, longer = FORWARD, 0, True, self.softness(b, begin, end), 1 + zero
-        if self.softened[b][0] > 0:
+        if soft > 0:
             longer = soft / kick
         if ti.static(len(self.precise) > 0):
             stage = ROUGH
@@ -502,7 +516,8 @@ class Elimination(System):
             if stage <= AGAIN:
                 if (hard == 0 and tension <= TENSEST) or stage == AGAIN:
                     ti.atomic_max(self.tension[None], tension / longer)
-                    self.softened[b], stage = ti.Vector([zero, zero, zero]), DONE
+                    self.record_softness(b, soft, False)
+                    stage = DONE
                     if tension > CALM_TENSION:
                         self.end_newton(b)
                 elif stage == ROUGH:
@@ -533,7 +548,7 @@ class Elimination(System):
                 if k == ROUNDS or (tension <= SOFTENED_TO and (k == 1 or k > 3 or tension > 0.8 * SOFTENED_TO)):
                     self.use_end_directions(begin, end)
                     self.limit_tensions(begin, end, longer)
-                    self.softened[b][0] = ti.select(k > 1, soft, zero)
+                    self.record_softness(b, soft, k > 1)
                     stage = DONE
                 else:
                     new = softness + stiffness * (tension / SOFTENED_TO - 1)

@@ -55,7 +55,7 @@ class StepController:
     doubling the substeps, 16 or more, brings no gain, the iterations are doubled. If that brings no gain either, the frame is
     "stuck": among the tries that are as good, the one with the least effort is kept, and the next frames no longer aim at the
     figures that stay wrong. If each try adds more energy than the one before, violations could not be removed first, and the
-    best of the tries is kept.
+    best of the earlier tries is kept.
     A body that turns by phi in a substep turns too fast or too slowly by phi^2 / 24 of that. This is a relative error like the
     residual: for the 26 degrees above it is 1e-2. A tolerance also applies to the turns of rigid constraints and of beads on
     curves, and to the vibrations of springs, see vibration_error().
@@ -217,6 +217,7 @@ class Tries:
             return True
         if pumps(self._energies, self._kinetic):
             self.verdict = "stuck"
+            del self._made[n, k]
             self.substeps, self.iterations = to = min(self._made, key=self._made.__getitem__)
             self.stuck = tuple(max(s, GAIN * f) for s, f in zip(stuck, self._known.get(to, NOTHING), strict=True))
             return False

@@ -45,6 +45,7 @@ from .sideways_rows import SidewaysRows, sideways_rows
 from .solids import Solids
 
 if TYPE_CHECKING:
+    from .clock import Clock
     from .runner import Runner
 
 ENOUGH = 1e-3  # of its size: a violation that matters, divided by (r - 1)^2 / r, r = (h / h')^2: what one jump leaves to vibrate
@@ -128,7 +129,8 @@ def project(
     rails = Rails(runner, x)
     start = Rows(batches, w, x, runner.scene.periodic, rails)
     undone = start.undone(runner)
-    uneven = uneven and start.is_slight(runner, undone, ratio)
+    stored = float(np.abs(start.multipliers(runner, undone) * undone).sum()) / (2 * h2_effective_of(runner.clock))
+    uneven = uneven and is_slight(runner.clock, stored, ratio)
     enough = enough if uneven else ENOUGH
     frail = start.would_break(runner, undone, h, longest, uneven)
     off = max(float(np.abs(undone * start.close).max(initial=0.0)), rails.worst / runner.scene.particles.size)
@@ -162,7 +164,7 @@ def project(
     if fails:
         state.put(memory, before)
         memory.write(state.d, kept)
-        stake = _over(start.weight * undone**2, start.diagonal).sum() / (2 * h * h)
+        stake = max(_over(start.weight * undone**2, start.diagonal).sum() / (2 * h * h), stored / ratio**2)
         kinetic = (start.mass[:, None] * kept[:n].astype(np.float64) ** 2).sum() / 2
         return None if contacts or stake > SLIGHT * kinetic else True
     due = more - energy - given_back(runner, energy, spun)
@@ -493,15 +495,6 @@ class Rows:
         lam = self._each(known)
         return np.where(np.isnan(lam), self.weight * _over(undone, self.diagonal), lam)
 
-    def is_slight(self, runner: Any, undone: np.ndarray, ratio: float) -> bool:
-        """Whether the scene would not have more energy than ever if what violations store, lam Z / (2 h^2), grew by
-        1 / ratio^2."""
-        clock = runner.clock
-        if clock.energy is None or clock.bound is None or clock.bound == CHANGED:
-            return True
-        stored = float(np.abs(self.multipliers(runner, undone) * undone).sum()) / (2 * h2_effective_of(clock))
-        return clock.energy + stored / ratio**2 <= clock.bound + SLIGHT * clock.kinetic
-
     def would_break(self, runner: Any, undone: np.ndarray, h: float, longest: float, uneven: bool) -> bool:
         """Whether a violation would pull so much harder in a substep h that the change counts beside break_at of its row.
 
@@ -567,6 +560,13 @@ class Rows:
         wide = WideRows(len(self.inside), self.row[some], self.number[self.who[some]], self.J[some], stiff) if len(some) else None
         out[self.inside] = self.matrix.solve(blocks, -right[self.inside], wide)
         return self.rails.moves(out) if self.rails else out
+
+
+def is_slight(clock: "Clock", stored: float, ratio: float) -> bool:
+    """Whether the scene would not have more energy than ever if that which violations store [J] grew by 1 / ratio^2."""
+    if clock.energy is None or clock.bound is None or clock.bound == CHANGED:
+        return True
+    return clock.energy + stored / ratio**2 <= clock.bound + SLIGHT * clock.kinetic
 
 
 def given_back(runner: Any, energy: float, spun: float) -> float:

@@ -154,7 +154,7 @@ class Runner:
                     b.start_at(self.scene.state.get(self.memory), first)
                 self._note_moved(initial_shape.restore(self, first))  # before its deformation passes for what passes have left
             if h != clock.h or drag != clock.drag:
-                if clock.softened and self.scene.slots and self.scene.slots.system and clock.h:
+                if self.scene.slots and self.scene.slots.system and clock.h:
                     self.scene.slots.system.keep_softness(h / clock.h)
                 if h < clock.longest and not self.probe:
                     keeps = self._project(h, dt, substeps * iterations, keeps)
