@@ -12,6 +12,7 @@ from ..features.extending import extended
 from ..features.feature import Acceleration, Batch, Feature
 from ..neighbours.periodic import Periodic
 from ..particles import Particles
+from ..solvers.direct import SOFTENED
 from . import checkpoint
 from .build import assemble
 
@@ -122,6 +123,8 @@ class Rebuild:
                 per_particle = getattr(vars(feature.dev)[key[0]], "per_particle", False)  # not decided by the number of rows
                 moves.append((pair[0][key], pair[1][key], (self.some,) if per_particle else self.masks[feature]))
         shared = (set(names[0].values()) - owned[0]) & (set(names[1].values()) - owned[1])
+        if SOFTENED in shared and (self.extending or len(self.old[SOFTENED]) != len(new[SOFTENED])):  # there are other parts
+            shared.remove(SOFTENED)
         moves += [(name, name, (self.some,)) for name in shared]
         for before, after, choices in moves:
             rows = self.old[before]

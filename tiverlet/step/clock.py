@@ -9,7 +9,7 @@ import numpy as np
 NAMES = {
     "_time": "time", "_tick": "tick", "_since": "since", "_h": "h", "_fresh": "d_is_velocity", "_longest": "longest",
     "_frame": "frame", "_drag": "drag", "_started": "started", "_owed": "owed", "_lacked": "lacked",
-    "_parted": "velocity_override", "_placed": "first_moved", "_energy": "energy", "_softened": "softened", "_bound": "bound",
+    "_parted": "velocity_override", "_placed": "first_moved", "_energy": "energy", "_bound": "bound",
     "_kinetic": "kinetic", "_parting": "parting",
 }  # fmt: skip
 
@@ -48,11 +48,10 @@ class Clock:
     rigid constraints that velocities before a start lack, as a time [s]. lacked: `owed` of the last substep if it was a start,
     else 0. velocity_override: velocities, valid until the next step, after constraints that contribute to them were removed or
     velocities were assigned; a start before the next step takes these. first_moved: the first particle that the user placed since
-    the last frame; None if there is none. energy: at the end of the last frame [J]; None if unknown. softened: whether violations
-    held loads that had no direction in the last frame. bound, kinetic, parting: the energy that must not be exceeded [J], None if
-    unknown; the largest kinetic energy since then [J]; whether particles that were placed into each other still part; see
-    energy_bound.py. conserves: whether the scene conserves energy, see energy_bound.conserves(); None if unknown. It follows from
-    the features, and is not recorded.
+    the last frame; None if there is none. energy: at the end of the last frame [J]; None if unknown. bound, kinetic, parting: the
+    energy that must not be exceeded [J], None if unknown; the largest kinetic energy since then [J]; whether particles that were
+    placed into each other still part; see energy_bound.py. conserves: whether the scene conserves energy, see
+    energy_bound.conserves(); None if unknown. It follows from the features, and is not recorded.
     """
 
     time: float = 0.0
@@ -69,7 +68,6 @@ class Clock:
     velocity_override: np.ndarray | None = None
     first_moved: int | None = 0
     energy: float | None = None
-    softened: bool = False
     bound: float | None = None
     kinetic: float = 0.0
     parting: bool = False
@@ -140,7 +138,6 @@ class Clock:
     def hashed(self) -> list[Any]:
         """The values that the next frames depend on, for the hash."""
         later: list[Any] = [self.longest] if self.longest > self.h else []  # matters when h changes
-        later += ["softened"] if self.softened else []
         later += [] if self.velocity_override is None else [np.asarray(self.velocity_override, dtype=np.float64).tobytes()]
         return [self.time, self.tick, self.since, self.h, self.d_is_velocity, *later]
 
@@ -151,7 +148,7 @@ class Clock:
         ):
             return False
         right = [type(k) is int and 0 <= k < 2**31 for k in (self.tick, self.since)]
-        right += [type(some) is bool for some in (self.d_is_velocity, self.started, self.softened, self.parting)]
+        right += [type(some) is bool for some in (self.d_is_velocity, self.started, self.parting)]
         energies = self.energy or 0, self.bound or 0, self.kinetic
         right += [type(v) in (int, float) for v in (self.time, self.h, self.longest, *self.frame, *energies)]
         right += [self.first_moved is None or 0 <= self.first_moved <= particles, len(self.frame) == 3]

@@ -103,7 +103,7 @@ def project(
     """
     ratio = h / longest
     uneven = measured and ratio >= UNEVEN
-    slots, enough = runner.scene.slots, LOOSE if uneven else ENOUGH
+    slots, enough = runner.scene.slots, LOOSE if uneven and not any(b.breaks for b in runner.batches) else ENOUGH
     w, state, memory = runner.scene.inv_mass, runner.scene.state, runner.memory
     x = before = state.get(memory)
     if not (np.abs(x) < LARGEST).all():  # or NaN
@@ -131,7 +131,7 @@ def project(
     undone = start.undone(runner)
     stored = float(np.abs(start.multipliers(runner, undone) * undone).sum()) / (2 * h2_effective_of(runner.clock))
     uneven = uneven and is_slight(runner.clock, stored, ratio)
-    enough = enough if uneven else ENOUGH
+    enough = LOOSE if uneven else ENOUGH
     frail = start.would_break(runner, undone, h, longest, uneven)
     off = max(float(np.abs(undone * start.close).max(initial=0.0)), rails.worst / runner.scene.particles.size)
     if not frail and not would_vibrate(off, ratio, enough):
@@ -498,16 +498,19 @@ class Rows:
     def would_break(self, runner: Any, undone: np.ndarray, h: float, longest: float, uneven: bool) -> bool:
         """Whether a violation would pull so much harder in a substep h that the change counts beside break_at of its row.
 
-        uneven: whether loads may grow, and swing about their new value, as long as they remain below break_at.
+        uneven: whether loads may grow, by 1 / ratio^2 at most, and swing, as long as they remain below break_at.
         """
         if not any(b.breaks for b in self.batches):
             return False
         each: list[Any] = [getattr(b, "break_at", None) for b in self.batches]
         strength = self._each([np.full(b.count, np.inf if s is None else s) for b, s in zip(self.batches, each, strict=True)])
+        extra = np.abs(undone) * (1 / h**2 - 1 / longest**2)
+        frail = extra > FRAIL * strength * self.diagonal
         if uneven:
             load = np.abs(self.multipliers(runner, undone)) / h2_effective_of(runner.clock)
-            return bool((load * (2 * (longest / h) ** 2 - 1) > SAFE * strength).any())
-        return bool((np.abs(undone) * (1 / h**2 - 1 / longest**2) > FRAIL * strength * self.diagonal).any())
+            swing = 2 * np.minimum(_over(extra, self.diagonal), load * ((longest / h) ** 2 - 1))
+            frail &= load + swing > SAFE * strength
+        return bool(frail.any())
 
     def _rigid(self, alpha: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """Return theta. reach: (m,) the move by a force of 1 N in a substep [m]."""

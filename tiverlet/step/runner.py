@@ -268,7 +268,6 @@ class Runner:
             self.settle(dt)
         self.set_multipliers_per_newton()
         report, self.moved, self.released = self.report(substeps, iterations), 0.0, 0.0
-        clock.softened = "softened" in report.flags
         return report
 
     def set_multipliers_per_newton(self) -> None:

@@ -6,7 +6,7 @@ from ..step.clock import Clock
 from ..step.integrator import FREE
 
 # Attributes with the same name and meaning in Clock.
-PLAIN = "time", "tick", "since", "h", "d_is_velocity", "started", "longest", "owed", "lacked", "softened", "kinetic", "parting"
+PLAIN = "time", "tick", "since", "h", "d_is_velocity", "started", "longest", "owed", "lacked", "kinetic", "parting"
 NONE = -1  # first_moved where no particle was placed
 NO, YES, UNKNOWN = range(3)  # whether a world conserves energy
 
@@ -44,7 +44,6 @@ class Clocks:
     longest: np.ndarray
     owed: np.ndarray
     lacked: np.ndarray
-    softened: np.ndarray
     kinetic: np.ndarray
     parting: np.ndarray
 

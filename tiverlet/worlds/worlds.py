@@ -354,7 +354,6 @@ class Worlds:
         )  # fmt: skip
         every[energy_bound.FLAG] = self._gains(before, figures)
         every[energy_bound.LOST] = self._losses(figures[:, -1])[:, None]
-        clocks.softened = every["softened"][:, -1].copy()
         wrong = bad < n
         report = WorldsReport(
             clocks.time.copy(), residual.max(1), overlap.max(1), contacts.max(1).astype(int), energy[:, -1].copy(),
