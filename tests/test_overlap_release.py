@@ -95,8 +95,9 @@ def test_frames_that_a_loop_measures_do_not_wait(world, monkeypatch):
     # and at most this sag is lifted again. h^2 changes by a tenth on average, which leaves a hundredth of that energy to shake.
     n, substeps = 12, 4
     column = np.stack([np.zeros(n), R + np.arange(n)], axis=1)
-    gravity, start = tv.Gravity(G), tv.Particles(column, radius=R)
-    w = world(start, [gravity, tv.Contact(), tv.HalfSpace((0, 1))], substeps=substeps, precision="f64")
+    gravity = tv.Gravity(G)
+    features = [gravity, tv.Contact(), tv.HalfSpace((0, 1))]
+    w = world(tv.Particles(column, radius=R), features, substeps=substeps, precision="f64")
     start = w.run(6.0).energy
     monkeypatch.setattr("tiverlet.step.runner.release", None)
     sag = 2 * np.arange(n) * G * (1.1 / 60 / substeps) ** 2  # of the k-th contact below the top

@@ -185,10 +185,15 @@ class Runner:
         can = clock.first_moved != 0 and not self.probe and any(contact.can_keep_stiffness for contact in self.step.contacts)
         return can and dt != clock.frame[1] and SLIGHTLY * max(clock.h, clock.longest) <= h <= clock.h / SLIGHTLY
 
+    @property
+    def linked(self) -> bool:
+        """Whether there are constraints."""
+        return any(b.count for b in self.batches)
+
     def _sleeping(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the particles that sleep, and their displacements; None if they have to wake where substeps change, since these
         are not all of their state."""
-        if not self.sleep or self.scene.state.spins or any(b.count for b in self.batches):
+        if not self.sleep or self.scene.state.spins or self.linked:
             return None
         who = np.flatnonzero(self.memory.read(self.sleepers.asleep))
         return who, self.memory.read(self.scene.state.d)[who]
@@ -213,8 +218,7 @@ class Runner:
         measured = dt != clock.frame[1] and clock.first_moved != 0
         projected = project(self, h, dt, longest, measured=measured) if keeps else None
         if keeps and projected is not None:
-            linked = any(b.count for b in self.batches)
-            clock.longest = h if linked else still_soft(h, longest, passes)
+            clock.longest = h if self.linked else still_soft(h, longest, passes)
             return True
         self.pressed = 0.0
         released = release(self, h, longest)
