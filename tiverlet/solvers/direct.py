@@ -165,11 +165,14 @@ class Elimination(System):
 
     def keep_softness(self, ratio: float) -> None:
         """Keep parts that give way as soft as they are, where the next substep is `ratio` times as long as the last one."""
-        soft, off, lost = self.memory.read(self.softened).T
-        if soft.any():
-            kept = np.where(soft != 0, np.maximum(np.abs(soft) / ratio**2, 1.0), 0.0)
-            lost = (lost + off * (_over(np.abs(soft)) - _over(kept * ratio**2))) * ratio**2
-            self.memory.write(self.softened, np.stack([np.copysign(kept, soft), off, np.maximum(lost, 0.0)], axis=1))
+        state = self.memory.read(self.softened)
+        some = np.flatnonzero(state[:, 0])
+        if len(some):
+            soft, off, lost = state[some].T
+            kept = np.maximum(np.abs(soft) / ratio**2, 1.0)
+            lost = (lost + off * (1 / np.abs(soft) - 1 / (kept * ratio**2))) * ratio**2
+            state[some] = np.stack([np.copysign(kept, soft), off, np.maximum(lost, 0.0)], axis=1)
+            self.memory.write(self.softened, state)
 
     @property
     def keeps_softness_of_longer(self) -> bool:
@@ -558,8 +561,3 @@ class Elimination(System):
                         least, inverse = softness, 1 / tension
                         new = ti.max(new, 1.1 * softness)
                     softness = new
-
-
-def _over(a: np.ndarray) -> np.ndarray:
-    """Return 1 / a; 0 where a is 0."""
-    return np.divide(1.0, a, out=np.zeros_like(a), where=a > 0)

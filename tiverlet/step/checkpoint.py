@@ -82,7 +82,8 @@ def _hashed(world: "World", values: dict[str, np.ndarray]) -> dict[str, np.ndarr
 
 
 def _late(world: "World") -> set[str]:
-    """Return the names of fields that are allocated when first needed, and count as 0 before."""
+    """Return the names of fields that are not hashed where they are 0: those that are allocated when first needed, and count as 0
+    before, and those of systems."""
     slots = world._runner.scene.slots
     parts = [*world._runner.step.contacts, *([slots.system] if slots and slots.system else [])]
     return {name for part in parts for name in part.late}

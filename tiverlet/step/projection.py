@@ -103,7 +103,8 @@ def project(
     """
     ratio = h / longest
     uneven = measured and ratio >= UNEVEN
-    slots, enough = runner.scene.slots, LOOSE if uneven and not any(b.breaks for b in runner.batches) else ENOUGH
+    breaks = any(b.breaks for b in runner.batches)  # then rows are needed, to compare their loads
+    slots, enough = runner.scene.slots, LOOSE if uneven and not breaks else ENOUGH
     w, state, memory = runner.scene.inv_mass, runner.scene.state, runner.memory
     x = before = state.get(memory)
     if not (np.abs(x) < LARGEST).all():  # or NaN
@@ -129,10 +130,11 @@ def project(
     rails = Rails(runner, x)
     start = Rows(batches, w, x, runner.scene.periodic, rails)
     undone = start.undone(runner)
-    stored = float(np.abs(start.multipliers(runner, undone) * undone).sum()) / (2 * h2_effective_of(runner.clock))
+    load = np.abs(start.multipliers(runner, undone)) / h2_effective_of(runner.clock)
+    stored = float((load * np.abs(undone)).sum()) / 2
     uneven = uneven and is_slight(runner.clock, stored, ratio)
     enough = LOOSE if uneven else ENOUGH
-    frail = start.would_break(runner, undone, h, longest, uneven)
+    frail = start.would_break(undone, load, h, longest, uneven)
     off = max(float(np.abs(undone * start.close).max(initial=0.0)), rails.worst / runner.scene.particles.size)
     if not frail and not would_vibrate(off, ratio, enough):
         return uneven or ratio < FAR
@@ -495,10 +497,11 @@ class Rows:
         lam = self._each(known)
         return np.where(np.isnan(lam), self.weight * _over(undone, self.diagonal), lam)
 
-    def would_break(self, runner: Any, undone: np.ndarray, h: float, longest: float, uneven: bool) -> bool:
+    def would_break(self, undone: np.ndarray, load: np.ndarray, h: float, longest: float, uneven: bool) -> bool:
         """Whether a violation would pull so much harder in a substep h that the change counts beside break_at of its row.
 
-        uneven: whether loads may grow, by 1 / ratio^2 at most, and swing, as long as they remain below break_at.
+        load: of the last substep, (m,). uneven: whether loads may grow, by 1 / ratio^2 at most, and swing, as long as they remain
+        below break_at.
         """
         if not any(b.breaks for b in self.batches):
             return False
@@ -507,7 +510,6 @@ class Rows:
         extra = np.abs(undone) * (1 / h**2 - 1 / longest**2)
         frail = extra > FRAIL * strength * self.diagonal
         if uneven:
-            load = np.abs(self.multipliers(runner, undone)) / h2_effective_of(runner.clock)
             swing = 2 * np.minimum(_over(extra, self.diagonal), load * ((longest / h) ** 2 - 1))
             frail &= load + swing > SAFE * strength
         return bool(frail.any())
