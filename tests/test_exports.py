@@ -13,7 +13,7 @@ import imageio_ffmpeg
 import meshio
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 
 import tiverlet as tv
 from tiverlet.__main__ import main
@@ -256,6 +256,51 @@ def test_a_plane_is_at_zero_and_particles_may_come(changing, tmp_path):
         assert not (tmp_path / f"a.{kind}").exists()
 
 
+@pytest.mark.parametrize("kind", ["obj", "pvd", "glb", "gif"])
+def test_links_that_broke_are_not_shown(kind, tmp_path, world):
+    # Three weights of 1 kg hang on links that bear 5, 15 and 25 N; gravity grows from 1 to 10 and 20 m/s^2, so that the first
+    # link breaks in frame 3, and the second in frame 5. A particle comes after frame 6, except where it must not (.glb).
+    gravity = tv.Gravity(1.0)
+    x = [[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [0.0, -1.0], [1.0, -1.0], [2.0, -1.0]]
+    links = tv.Distance([(0, 3), (1, 4), (2, 5)], break_at=[5.0, 15.0, 25.0])
+    w = world(tv.Particles(x, pinned=[0, 1, 2]), [gravity, links])
+    with tv.Recorder(tmp_path / "a.rrd", w) as recorder:
+        for frame in range(1, 9 if kind == "glb" else 8):
+            gravity.g = 1.0 if frame < 3 else 10.0 if frame < 5 else 20.0
+            if frame == 7 and kind != "glb":
+                w.add(tv.Particles([[3.0, 0.0]]))
+                recorder.log()
+            w.step(1 / 60)
+            recorder.log()
+    recording = tv.replay(tmp_path / "a.rrd")
+    assert recording.verify() and len(recording.frames) == 9
+    unbroken = [recording.world(int(k)).features[1].rods()[0].tolist() for k in recording.frames]
+    assert [len(pairs) for pairs in unbroken] == [3, 3, 3, 2, 2, 1, 1, 1, 1]
+    names = recording.export(tmp_path / f"a.{kind}")
+    if kind == "obj":
+        assert [S.load(name).links.tolist() for name in names] == unbroken
+        assert "p 4\n" in pathlib.Path(names[-1]).read_text()  # what hung on the first link is a point from then on
+    elif kind == "pvd":
+        cells = [{block.type: block.data.tolist() for block in meshio.read(name).cells} for name in names[1:]]
+        assert [cell["line"] for cell in cells] == unbroken and cells[-1]["vertex"] == [[0], [1], [3], [4], [6]]
+    elif kind == "gif":
+        with Image.open(names[0]) as film:
+            pictures = [np.asarray(one.convert("RGB")).max(axis=2) > 60 for one in ImageSequence.Iterator(film)]
+        drawn = [p[p.shape[0] // 2].sum() for p in pictures]  # pixels of links half way down
+        assert drawn[0] > 2 * drawn[-1] > 0
+    else:
+        text, blob = parsed(pathlib.Path(names[0]))
+        [node] = [n for n in text["nodes"] if n["name"] == "links"]
+        [part] = text["meshes"][node["mesh"]]["primitives"]
+        ends = values(text, blob, part["indices"]).reshape(-1, 2)
+        first = values(text, blob, part["attributes"]["POSITION"])
+        moved = [np.zeros_like(first), *(values(text, blob, target["POSITION"]) for target in part["targets"])]
+        for at, pairs, place in zip(moved, unbroken, positions(recording), strict=True):
+            a, b = ((first + at)[ends[:, k], :2] for k in (0, 1))
+            drawn = (a != b).any(axis=1)
+            np.testing.assert_allclose(np.stack([a, b], axis=1)[drawn], place[np.array(pairs)], atol=1e-6)
+
+
 @pytest.mark.parametrize("name", ["10:00.mp4", "-y.mp4"])
 def test_films_may_have_names_that_ffmpeg_would_take_for_something_else(recording, name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -371,9 +416,9 @@ def test_surfaces_have_one_sense():
 
 
 def test_parts_of_a_scene_need_no_function_of_the_users(recording):
-    entry, frames, _ = recording.scenes[0]
-    parts = scene.parts(entry.data, entry.arrays)
-    assert frames == [0, 1, 2, 3, 4] and parts.numbers == (0, 2, 3)
+    first = recording.scenes[0]
+    parts = scene.parts(first.entry.data, first.entry.arrays)
+    assert first.frames == [0, 1, 2, 3, 4] and parts.numbers == (0, 2, 3)
     assert [type(f).__name__ for f in parts.features] == ["Gravity", "Distance", "Dihedral"]
     found = geometry(parts)
     assert found.loose.tolist() == [8, 9] and found.bare.tolist() == [8] and found.up.tolist() == [0, 0, 1]

@@ -61,6 +61,7 @@ class Drawing:
         self.scenes = 0  # the number of the scene that is drawn, from 1 on
         self._in_box = InBox()
         self._touched = self._broke_before = False
+        self._broke: dict[int, list[int]] = {}  # see pop_broken()
 
     def static(self, entity: str, *what: Any) -> None:
         """Log data that hold for all frames."""
@@ -83,6 +84,7 @@ class Drawing:
         self._contacts = len(p) <= FEW and bool(world._runner.step.contacts)
         self._broken = {k: f.broken for k, f in enumerate(world.features) if isinstance(f, Batch) and f.breaks}
         hues = colors(world)
+        self._broke = {k: np.flatnonzero(gone).tolist() for k, gone in self._broken.items() if gone.any()}
         self._join(hues)
         radii = np.where(p.radius > 0, p.radius, POINT)
         if self._surface:
@@ -299,6 +301,8 @@ class Drawing:
             now = f.broken  # type: ignore[attr-defined]
             new = np.flatnonzero(now & ~before)
             self._broken[k] = now
+            if len(new):
+                self._broke.setdefault(k, []).extend(new.tolist())
             for c in new.tolist():
                 members = f.members_of(c)  # type: ignore[attr-defined]
                 marks.append(x[members].mean(axis=0, keepdims=True))
@@ -307,6 +311,11 @@ class Drawing:
                 self.event(f"{f!r} (feature {k}): {len(new)} broke: {named}", "WARN")
         at = np.concatenate(marks).astype(np.float32)
         self._log(f"{self._root}/breaks", self._points(at, radii=[-7.0], colors=[[255, 60, 60, 180]]))
+
+    def pop_broken(self) -> dict[int, list[int]]:
+        """Return the constraints that broke since the last call or had broken when the scene began, by the feature's number."""
+        broke, self._broke = self._broke, {}
+        return broke
 
     def event(self, text: str, level: str = "INFO") -> None:
         """Add a line to the list of events."""

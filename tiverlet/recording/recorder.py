@@ -280,7 +280,9 @@ class Recorder:
         x = picture.drawing.drawn_positions(now.position(len(world.particles)))
         x32 = x.astype(np.float32)
         picture.frame(number, now, x, x32, journal.rounded(), journal.scenes, journal.changed_features)
-        journal.frame_drawn({"time": world.time, "hash": brief(checkpoint.digest(world, now)), "crc": zlib.crc32(x32.tobytes())})
+        data = {"time": world.time, "hash": brief(checkpoint.digest(world, now)), "crc": zlib.crc32(x32.tobytes())}
+        broke = picture.drawing.pop_broken()
+        journal.frame_drawn(data | {"broke": broke} if broke else data)
         self.frames += 1
 
     @interrupts.uninterrupted

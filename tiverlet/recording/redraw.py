@@ -167,6 +167,8 @@ class Redraw:
         self._picture.frame(entry.frame, now, x, x32, report, self.scenes, self._changed_features)
         self._recent, self._changed_features = None, set()
         self.frames += 1
+        if {str(k): rows for k, rows in self._picture.drawing.pop_broken().items()} != entry.data.get("broke", {}):
+            return "other constraints broke than were recorded"
         return None
 
     def logged(self, entry: Entry) -> None:

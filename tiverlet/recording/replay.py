@@ -51,6 +51,20 @@ class Verdict:
         return self.text
 
 
+@dataclass(frozen=True)
+class SceneFrames:
+    """A scene of a recording: its entry in the journal, and the numbers of the frames that show it.
+
+    knobs: those that the user set, (frame, number of the feature, knobs). broken: constraints that broke, (frame, number of the
+    feature, numbers of the constraints). Both hold from that frame on.
+    """
+
+    entry: Entry
+    frames: list[int]
+    knobs: list[tuple[int, int, dict[str, Any]]]
+    broken: list[tuple[int, int, np.ndarray]]
+
+
 def _with_clear_errors(function):
     """Turn the errors that a damaged file causes in Python into one clear ValueError."""
     signature = inspect.signature(function)
@@ -315,22 +329,22 @@ class Replay:
 
     @property
     @_with_clear_errors
-    def scenes(self) -> list[tuple[Entry, list[int], list[tuple[int, int, dict[str, Any]]]]]:
-        """The entry of each scene, the frames that show it, and the knobs set in it: (frame, number of the feature, knobs).
-
-        Knobs hold from that frame on. A new scene begins where particles or features were added or removed.
-        """
-        out, waiting = [], []
+    def scenes(self) -> list[SceneFrames]:
+        """The scenes, and the frames that show them. One begins where particles or features were added or removed."""
+        out, knobs, broken = [], [], []
         for e in self._entries:
             if e.kind == "scene":
-                out.append((e, [], []))
-                waiting = []
+                out.append(SceneFrames(e, [], [], []))
+                knobs, broken = [], []
             elif e.kind == "turned":
-                waiting += self._knob_values(e)
-            elif e.kind == "frame" and e.frame in self._frames:
-                out[-1][1].append(e.frame)
-                out[-1][2].extend((e.frame, k, values) for k, values in waiting)
-                waiting = []
+                knobs += self._knob_values(e)
+            elif e.kind == "frame":
+                broken += [(int(k), np.array(rows, dtype=np.int64)) for k, rows in e.data.get("broke", {}).items()]
+                if e.frame in self._frames:
+                    out[-1].frames.append(e.frame)
+                    out[-1].knobs.extend((e.frame, *change) for change in knobs)
+                    out[-1].broken.extend((e.frame, *change) for change in broken)
+                    knobs, broken = [], []
         return out
 
     @_with_clear_errors

@@ -80,6 +80,7 @@ def _stretch(
 ) -> Iterator[Any]:
     """Yield the pictures of one stretch, with walls at their places in each frame."""
     sketch = Sketch(image, draw, stretch.parts, stretch.geometry(shape), view, ends)
+    geometries = dict(zip(stretch.frames.tolist(), stretch.geometries(shape), strict=True))
     features = dict(zip(stretch.parts.numbers, stretch.parts.features, strict=True))
     changes = list(stretch.knob_changes)
     for frame in wanted:
@@ -87,4 +88,4 @@ def _stretch(
             _, k, values = changes.pop(0)
             if k in features:
                 set_knobs(features[k], values)
-        yield sketch.frame(stretch.recording.position(frame))
+        yield sketch.frame(stretch.recording.position(frame), geometries[frame])

@@ -1,7 +1,7 @@
 """The geometry of a recording for other programs: faces, links, and single particles."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -62,13 +62,23 @@ def geometry(parts: Parts, shape: Shape | None = None) -> Geometry:
     else:
         faces, uv = shape.surface
         found = np.concatenate([np.zeros(0, dtype=np.int64), *faces])
-    hidden = np.isin(np.arange(len(particles)), found)
-    pairs = np.concatenate([np.zeros((0, 2), dtype=np.int64), *(f.indices for _, f in links(parts))])
-    pairs = np.unique(np.sort(pairs[~hidden[pairs].all(axis=1)], axis=1), axis=0)
-    loose = np.flatnonzero(~hidden & ~np.isin(np.arange(len(particles)), pairs))
     within = covered(parts, found)
     bare = np.flatnonzero((particles.radius > 0) & ~within)
-    return Geometry(faces, uv, pairs, loose, bare, colors(parts), up)
+    none = np.zeros(0, dtype=np.int64)
+    return without_broken(Geometry(faces, uv, none.reshape(0, 2), none, bare, colors(parts), up), parts, {})
+
+
+def without_broken(of: Geometry, parts: Parts, broken: Mapping[int, np.ndarray]) -> Geometry:
+    """Return a geometry with the links that are not broken. broken: numbers of broken constraints, by the feature's number.
+
+    Links that may break are not sides of faces, so that the faces stay.
+    """
+    every = np.arange(len(parts.particles))
+    hidden = np.isin(every, of.around)
+    left = [f.indices[~np.isin(np.arange(f.count), broken.get(parts.numbers[k], []))] for k, f in links(parts)]
+    pairs = np.concatenate([np.zeros((0, 2), dtype=np.int64), *left])
+    pairs = np.unique(np.sort(pairs[~hidden[pairs].all(axis=1)], axis=1), axis=0)
+    return replace(of, links=pairs, loose=np.flatnonzero(~hidden & ~np.isin(every, pairs)))
 
 
 def distinct(faces: np.ndarray) -> np.ndarray:

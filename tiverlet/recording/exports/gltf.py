@@ -34,7 +34,8 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
     """
     lib: Any = needed("pygltflib", path)
     stretch = only(recording, path, "mesh", ".csv, .obj, .pvd or .xyz")
-    geometry = stretch.geometry(shape)
+    geometries = [*stretch.geometries(shape)]
+    geometry = geometries[0]
     x = np.array([stretch.flat(x) for _, _, x in stretch], dtype=np.float32)
     if not (x.size and np.isfinite(x).all()):
         why = "has positions that are not finite" if x.size else "has no particles"
@@ -44,7 +45,8 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
     scene = _Scene(lib, x[later], times[later])
     root = scene.node(name="scene", rotation=_turn(geometry.up))
     single = geometry.bare if len(geometry.bare) <= SPHERES else geometry.bare[:0]
-    nodes = _meshes(scene, geometry, np.setdiff1d(geometry.loose, single))
+    unbroken = [g.links for g, kept in zip(geometries, later.tolist(), strict=True) if kept]
+    nodes = _meshes(scene, geometry, unbroken, np.setdiff1d(geometry.loose, single))
     scene.children(root, [*nodes, *_spheres(scene, stretch, geometry, single)])
     return scene.save(path)
 
@@ -58,10 +60,11 @@ def _turn(up: np.ndarray) -> list[float]:
     return [0.0, 0.0, sign * half, half] if axis == 0 else [-sign * half, 0.0, 0.0, half]
 
 
-def _meshes(scene: "_Scene", geometry: Geometry, points: np.ndarray) -> list[int]:
+def _meshes(scene: "_Scene", geometry: Geometry, unbroken: list[np.ndarray], points: np.ndarray) -> list[int]:
     """Return one node for all surfaces, one for links and one for points, as far as there are any.
 
-    They are separate, since programs mix up several kinds of primitives in one animated mesh (VTK 9.7).
+    They are separate, since programs mix up several kinds of primitives in one animated mesh (VTK 9.7). unbroken: the links of
+    each frame, (m, 2). points: particles.
     """
     at, uv, triangles = _vertices(geometry)
     nodes = []
@@ -69,11 +72,26 @@ def _meshes(scene: "_Scene", geometry: Geometry, points: np.ndarray) -> list[int
         normals = np.array([_normals(x, at, triangles) for x in scene.x], dtype=np.float32)
         nodes.append(scene.moving("surfaces", scene.primitive(TRIANGLES, at, geometry.hues, triangles, normals, uv)))
     if len(geometry.links):
-        ends, pairs = np.unique(geometry.links, return_inverse=True)
+        ends, pairs = _ends(unbroken)
         nodes.append(scene.moving("links", scene.primitive(LINES, ends, geometry.hues, pairs)))
     if len(points):
         nodes.append(scene.moving("points", scene.primitive(POINTS, points, geometry.hues)))
     return nodes
+
+
+def _ends(unbroken: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the particle of each vertex of links, (v,) or in each frame (frames, v), and the vertices of each link, (m, 2).
+
+    unbroken: the links of each frame, (m, 2). A mesh has the same links in all frames, so where some break, each link has two
+    vertices of its own, and the second moves to the first when it breaks.
+    """
+    links = unbroken[0]
+    if len(unbroken[-1]) == len(links):
+        return np.unique(links, return_inverse=True)
+    size = links.max() + 1
+    whole = np.array([np.isin(links @ [size, 1], now @ [size, 1]) for now in unbroken])
+    ends = np.stack([np.broadcast_to(links[:, 0], whole.shape), np.where(whole, links[:, 1], links[:, 0])], axis=-1)
+    return ends.reshape(len(ends), -1), np.arange(links.size).reshape(-1, 2)
 
 
 def _vertices(geometry: Geometry) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -173,16 +191,20 @@ class _Scene:
         return len(self._file.materials) - 1
 
     def primitive(self, mode: int, at: np.ndarray, hues: np.ndarray, indices=None, normals=None, uv=()) -> Any:
-        """Return a primitive whose vertices move with the particles `at`. normals: (frames, vertices, 3)."""
-        hue = np.column_stack([np.rint(255 * _linear(hues[at])), np.full(len(at), 255)]).astype(np.uint8)
-        first = {"POSITION": self.add(self.x[0, at], "VEC3", VERTICES, ends=True), "COLOR_0": self.add(hue, "VEC4", VERTICES)}
+        """Return a primitive whose vertices move with the particles `at`, (vertices,) or in each frame (frames, vertices).
+
+        normals: (frames, vertices, 3).
+        """
+        at = np.broadcast_to(at, (len(self.x), at.shape[-1]))
+        hue = np.column_stack([np.rint(255 * _linear(hues[at[0]])), np.full(at.shape[1], 255)]).astype(np.uint8)
+        first = {"POSITION": self.add(self.x[0, at[0]], "VEC3", VERTICES, ends=True), "COLOR_0": self.add(hue, "VEC4", VERTICES)}
         if normals is not None:
             first["NORMAL"] = self.add(normals[0], "VEC3", VERTICES)
         if len(uv):  # glTF's v axis points down
             first["TEXCOORD_0"] = self.add(np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).astype(np.float32), "VEC2", VERTICES)
         targets = []
         for k in range(1, len(self.x)):
-            targets.append({"POSITION": self.add(self.x[k, at] - self.x[0, at], "VEC3", VERTICES, ends=True)})
+            targets.append({"POSITION": self.add(self.x[k, at[k]] - self.x[0, at[0]], "VEC3", VERTICES, ends=True)})
             if normals is not None:
                 targets[-1]["NORMAL"] = self.add(normals[k] - normals[0], "VEC3", VERTICES)
         corners = None if indices is None else self.add(indices.astype(np.uint32).ravel(), "SCALAR", INDICES)

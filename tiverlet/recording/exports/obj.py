@@ -18,12 +18,13 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
     """
     out = []
     for stretch in stretches(recording):
-        geometry = stretch.geometry(shape)
-        rest = [*obj_faces(geometry.faces, geometry.uv), *(f"l {i} {j}" for i, j in (geometry.links + 1).tolist())]
-        rest += [f"p {i}" for i in (geometry.loose + 1).tolist()]
-        tail = "".join(f"{line}\n" for line in rest)
+        written, tail = None, ""
         rows = "v %.9g %.9g %.9g\n" * len(stretch.column("mass"))
-        for frame, time, x in stretch:
+        for (frame, time, x), geometry in zip(stretch, stretch.geometries(shape), strict=True):
+            if geometry is not written:
+                rest = [*obj_faces(geometry.faces, geometry.uv), *(f"l {i} {j}" for i, j in (geometry.links + 1).tolist())]
+                rest += [f"p {i}" for i in (geometry.loose + 1).tolist()]
+                written, tail = geometry, "".join(f"{line}\n" for line in rest)
             out.append(numbered(path, frame))
             with open(out[-1], "w", encoding="ascii") as file:
                 file.write(f"# frame {frame}, {time!r} s\n")

@@ -1,7 +1,7 @@
 """Pictures of frames drawn in software: faces lit from above, particles as discs, links and walls as lines.
 
-They need no graphics driver and some hundredths of a second each, where the viewer takes two seconds. They show less: no strain,
-contacts or breaks.
+They need no graphics driver and some hundredths of a second each, where the viewer takes two seconds. They show less: neither
+strain nor contacts.
 """
 
 from collections.abc import Callable, Sequence
@@ -85,15 +85,14 @@ class Sketch:
         none = np.zeros((0, 2), dtype=np.int64)
         lit = len(self._triangles) and not self._flat
         self._surface = Surface(self._triangles, geometry.hues, none, geometry.up) if lit else None
-        self._dots = np.union1d(geometry.bare, geometry.loose)
 
-    def frame(self, x: np.ndarray) -> Any:
-        """Return the picture of a frame. x: positions [m]."""
+    def frame(self, x: np.ndarray, geometry: Geometry) -> Any:
+        """Return the picture of a frame. x: positions [m]. geometry: with the links of the frame, see Stretch.geometries."""
         view = self._view
         canvas = self._image.new("RGB", tuple(FINE * s for s in view.size), BACK)
         draw = self._draw.Draw(canvas)
         x = x.astype(np.float64)
-        things = [*self._walls(), *self._faces(x), *self._links(x), *self._discs(x)]
+        things = [*self._walls(), *self._faces(x), *self._links(x, geometry.links), *self._discs(x, geometry)]
         for _, kind, places, hue, width in sorted(things, key=lambda thing: thing[0]) if not self._flat else things:
             if kind == "face":
                 draw.polygon(places, fill=hue)
@@ -116,21 +115,21 @@ class Sketch:
         hues = _bytes(self._surface.colors(x, np.zeros(0))) if self._surface else self._geometry.hues
         return self._mesh(x, self._triangles, np.mean, hues)
 
-    def _links(self, x: np.ndarray) -> list[tuple]:
+    def _links(self, x: np.ndarray, links: np.ndarray) -> list[tuple]:
         at, near = self._view.place(x)
-        out, width, links = [], round(2 * FINE * LINE), self._geometry.links
+        out, width = [], round(2 * FINE * LINE)
         across = crosses_box(box_of(self._parts), x[links[:, 0]] - x[links[:, 1]]) if len(links) else np.zeros(0, dtype=bool)
         for i, j in links[~across].tolist():
             places = [*at[i].tolist(), *at[j].tolist()]
             out.append(((near[i] + near[j]) / 2, "line", places, tuple(map(int, self._geometry.hues[i])), width))
         return out
 
-    def _discs(self, x: np.ndarray) -> list[tuple]:
+    def _discs(self, x: np.ndarray, geometry: Geometry) -> list[tuple]:
         at, near = self._view.place(x)
         radii = np.maximum(self._view.scale * self._parts.particles.radius, FINE * DOT / 2)[:, None]
         boxes = np.concatenate([at - radii, at + radii], axis=1)
-        hues = self._geometry.hues.astype(int)
-        return [(near[i], "disc", boxes[i].tolist(), tuple(hues[i].tolist()), 0) for i in self._dots.tolist()]
+        hues, dots = self._geometry.hues.astype(int), np.union1d(geometry.bare, geometry.loose).tolist()
+        return [(near[i], "disc", boxes[i].tolist(), tuple(hues[i].tolist()), 0) for i in dots]
 
     def _walls(self) -> list[tuple]:
         out = []

@@ -10,7 +10,7 @@ import numpy as np
 from ...shapes import Shape
 from ..journal import Entry
 from ..scene import Parts
-from .geometry import Geometry, geometry
+from .geometry import Geometry, geometry, without_broken
 
 if TYPE_CHECKING:
     from ..replay import Replay
@@ -21,7 +21,8 @@ class Stretch:
     """Frames with the same particles and features.
 
     entry: the entry of the scene. frames: their numbers. times [s]. knob_changes: the knobs that the user set: before which
-    frame, the number of the feature, and the values of its knobs.
+    frame, the number of the feature, and the values of its knobs. broken: constraints that broke: before which frame, the number
+    of the feature, and those of its constraints.
     """
 
     recording: "Replay"
@@ -29,6 +30,7 @@ class Stretch:
     frames: np.ndarray
     times: np.ndarray
     knob_changes: list[tuple[int, int, dict[str, Any]]]
+    broken: list[tuple[int, int, np.ndarray]]
 
     def __iter__(self) -> Iterator[tuple[int, float, np.ndarray]]:
         """Yield number, time [s] and positions [m] of each frame."""
@@ -45,8 +47,20 @@ class Stretch:
         return self.recording.parts(self.entry)
 
     def geometry(self, shape: Shape | None) -> Geometry:
-        """Return faces, links and loose particles."""
+        """Return faces, links, also those that break, and loose particles."""
         return geometry(self.parts, shape)
+
+    def geometries(self, shape: Shape | None) -> Iterator[Geometry]:
+        """Yield the geometry of each frame, without broken links; the same object until more links break."""
+        now, coming = self.geometry(shape), list(self.broken)
+        gone: dict[int, np.ndarray] = {}
+        for frame in self.frames.tolist():
+            if coming and coming[0][0] <= frame:
+                while coming and coming[0][0] <= frame:
+                    _, k, rows = coming.pop(0)
+                    gone[k] = np.concatenate([gone.get(k, rows[:0]), rows])
+                now = without_broken(now, self.parts, gone)
+            yield now
 
     def flat(self, x: np.ndarray) -> np.ndarray:
         """Return positions in 3D; a 2D scene lies at z = 0."""
@@ -59,9 +73,10 @@ def stretches(recording: "Replay") -> list[Stretch]:
     """Return the stretches of a recording, in order."""
     times = dict(zip(recording.frames.tolist(), recording.times.tolist(), strict=True))
     out = []
-    for entry, frames, knob_changes in recording.scenes:
-        if frames:
-            out.append(Stretch(recording, entry, np.array(frames), np.array([times[k] for k in frames]), knob_changes))
+    for scene in recording.scenes:
+        if scene.frames:
+            moments = np.array([times[k] for k in scene.frames])
+            out.append(Stretch(recording, scene.entry, np.array(scene.frames), moments, scene.knobs, scene.broken))
     return out
 
 

@@ -28,8 +28,10 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
     """Write points with radius [m] and mass [kg], and cells: faces, other links, loose particles."""
     base, out, sets = os.path.splitext(path)[0], [path], []
     for stretch in stretches(recording):
-        before, after = _laid_out(stretch, stretch.geometry(shape))
-        for frame, time, x in stretch:
+        laid_out = None
+        for (frame, time, x), geometry in zip(stretch, stretch.geometries(shape), strict=True):
+            if geometry is not laid_out:
+                laid_out, (before, after) = geometry, _laid_out(stretch, geometry)
             name = numbered(f"{base}.vtu", frame)
             with open(name, "wb") as file:
                 file.writelines([before, _array("position", stretch.flat(x).astype(np.float32)), after])
@@ -43,7 +45,7 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
 
 
 def _laid_out(stretch: Stretch, geometry: Geometry) -> tuple[bytes, bytes]:
-    """Return the text that is the same in all files, before and after the positions."""
+    """Return the text that is the same in all files until links break, before and after the positions."""
     rows = [*geometry.faces, *geometry.links, *geometry.loose[:, None]]
     kinds = [{3: TRIANGLE, 4: QUAD}.get(len(face), POLYGON) for face in geometry.faces]
     kinds += [LINE] * len(geometry.links) + [VERTEX] * len(geometry.loose)
