@@ -45,6 +45,24 @@ def test_what_rounding_makes_overlap_is_known_too(world):
     assert "Contact.shrunk" not in wide.fields
 
 
+@pytest.mark.parametrize("what", ["another radius", "contacts"])
+def test_a_rebuilt_world_is_compiled_once_for_what_overlaps_in_it(what, world):
+    row = np.stack([np.arange(5) * 0.2, np.zeros(5)], axis=1)
+    if what == "contacts":
+        w = world(tv.Particles(row * 0.4, radius=0.05))
+        w.add(features=[tv.Contact()])
+    else:
+        w = world(tv.Particles(row, radius=0.05), [tv.Contact()])
+        w.step(1e-3)
+        w.add(tv.Particles([[0.03, 0.0]], radius=0.04))
+    step = w._runner.step
+    assert "Contact.shrunk" in w.fields
+    w.step(1e-3)
+    assert w._runner.step is step  # not compiled for another structure
+    w.run(1.0)
+    assert w.step(1e-3).overlap < 1e-3
+
+
 @pytest.mark.slow
 def test_only_scenes_that_start_with_overlap_have_the_field_for_it(world):
     x = np.array([[0.0, 0.0], [0.19, 0.0], [0.5, 0.0], [0.75, 0.0]])

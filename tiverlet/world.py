@@ -11,7 +11,6 @@ import numpy as np
 from . import checks
 from .colliders.collider import Collider
 from .constraints.core.strength import BREAKS
-from .contact.initial_overlap import overlapping
 from .contact.pair_contact import PairContact
 from .contact.rays import Hits, inside, ray
 from .contact.touches import ContactEvents, joined, no_events
@@ -73,10 +72,7 @@ class World:
         features = checked_features(features)
         starts = [None] * len(features)
         self._build(particles, features, starts, substeps, iterations, solver, precision, path, order)
-        for contact in self._runner.step.contacts:
-            scene, batches = self._runner.scene, self._runner.batches
-            if not contact.shrinks and overlapping(scene, batches, contact.table, particles.position):
-                contact.enable_shrink()  # before anything is compiled; later, the frame would have to be compiled again
+        self._runner.expect_overlap(particles.position)
 
     @staticmethod
     def _from_starts(

@@ -170,8 +170,11 @@ class Rebuild:
         for f, values in self.rests.items():
             if f.ramp:  # rest values continue to the assigned ones; those of added constraints begin at their own
                 f.ramp.put([np.append(rows, now[len(rows) :]) for rows, now in zip(values, f.ramp.now(), strict=True)])
+        first = int(self.some.sum())
         if any(isinstance(f, PairContact) for f in self.new_features):
-            world._clock.first_moved = 0
+            world._clock.first_moved = first = 0
+        if first < len(self.particles):
+            runner.expect_overlap(runner.scene.state.get(runner.memory), first)
 
     def _give_contacts(self, contact: PairContact) -> None:
         """Carry over the data of pairs in contact, and by how much radii are shrunk."""

@@ -592,6 +592,15 @@ class Runner:
             else:
                 self.memory.write_some(search.list.stale, 1, some)
 
+    def expect_overlap(self, position: np.ndarray, first: int = 0) -> None:
+        """Before anything is compiled: let particles shrink if some at these positions, (n, dim) [m], overlap.
+
+        Otherwise the frame would have to be compiled again. Only pairs with one of number `first` or more count.
+        """
+        for contact in self.step.contacts:
+            if not contact.shrinks and overlapping(self.scene, self.batches, contact.table, position, first):
+                contact.enable_shrink()
+
     def shrink_overlapping(self, first: int, speed: float = np.inf) -> None:
         """Let particles from number `first` on that the user placed into others part gently, at up to `speed` [m/s]."""
         contact = self.step.contacts[0]
