@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..device import ti
+from ..geometry import rotation
 
 if TYPE_CHECKING:
     from ..features.feature import Batch, Scene
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
 # impulses propagate from link to link. One or two do where a system solves them exactly, and most of MANY have little to do.
 FEW, MANY = 8, 32
 MET = 2.0**-9  # of the first push: a smaller error of the normal displacement counts as met
+FINE = 2.0**-12  # the same where the inverse masses of rigid clusters are known
 CAREFUL = 0.55  # the least secant of a pair. Impacts may change each other: projections converge with steps of less than 1 / 0.5
 FELT = 2.0**-20  # of a squared displacement: a smaller change is no impact
 LINKED, IN_CLUSTER = 1, 2  # what holds a particle: links, or a rigid cluster that shares no particle
@@ -78,8 +80,9 @@ class BodyImpacts:
     Two particles that strike each other, at least one of them linked, obey the same law with the displacement of one relative to
     the other, along their normal; each takes its share of the push by mass. Both sides compute the same push before either
     moves. Constraints do not take it into account, so where they are solved exactly, the push is divided by the part s of the
-    last push that they left, the secant s = (miss_last - miss) / push_last with miss = t - d.n. A particle has one impact of this
-    kind in a substep, on a wall or on a particle; in others it bounces alone.
+    last push that they left, the secant s = (miss_last - miss) / push_last with miss = t - d.n. How rigid clusters answer is
+    known, see inverse_mass(). A disc has one impact of this kind in a substep, on a wall or on another disc; in others it bounces
+    alone, or waits for the next substep if it is in a cluster. Vertices and edges have any number, see PolygonRestitution.
 
     open: for each pass beyond the regular ones of every substep, whether it is needed. pairs: whether particles strike each
     other.
@@ -105,11 +108,18 @@ class BodyImpacts:
         self.reached = add("impacts.stirred", n, kind=ti.i32, state=True)  # whether an impact of the last substep has reached it
         self.open = add("impacts.open", self.passes + 1, kind=ti.i32)
         self.pairs = pairs
+        self.clusters = pairs and any(b.clusters for b in batches)
         if pairs:
+            self.parts = add("impacts.parts", n)  # of each particle in the impacts on other particles that passes make
             self.partner = add("impacts.partner", n, kind=ti.i32)  # the particle that was struck; -1 for a wall
             self.ready = add("impacts.ready", n, kind=ti.i32)  # whether it had struck nothing when the round of bounces began
             self.change = add("impacts.change", n, width=dim)
             self.last_push, self.last_miss = add("impacts.last_push", n), add("impacts.last_miss", n)
+        if self.clusters:  # of the cluster of each particle, by its first particle: mass, sum m r r^T, and the sum of all parts
+            self.body = add("impacts.body", n, kind=ti.i32)
+            self.arm = add("impacts.arm", n, width=dim)  # from the center [m]
+            self.body_mass, self.body_parts = add("impacts.mass", n), add("impacts.body_parts", n)
+            self.body_moment = add("impacts.moment", n, width=dim * dim)
 
     def add_log(self, log: Any) -> int:
         """Return the number of a log; -1 for None."""
@@ -153,6 +163,9 @@ class BodyImpacts:
     def clear(self, i):
         """At the start of a substep: clear the marks of particle i."""
         self.struck[i] = self.reached[i] = 0
+        if ti.static(self.pairs):
+            self.parts[i] = 0
+            self.change[i] = ti.zero(self.change[i])
 
     @ti.func
     def clear_requests(self):
@@ -297,24 +310,70 @@ class BodyImpacts:
     def mark_struck_in_cluster(self, i):
         """Mark particle i of a cluster that an impact has moved."""
         self.reached[i] = 1
-        if self.struck[i] == STRUCK_NOW:
+        if self.struck[i] == STRUCK_NOW and self.by_wall(i):
             self.struck[i] = STRUCK_BEFORE
 
     @ti.func
-    def missing_push(self, i, has):
-        """Return whether the normal displacement `has` of particle i, which struck another, is off, and the push it needs."""
+    def missing_push(self, i, has, give):
+        """Return whether the normal displacement `has` of particle i, which struck another, is off, and the push it needs.
+
+        give: how much a push of 1 on the two particles, were they alone, changes that displacement.
+        """
         miss = self.target[i] - has
         if self.struck[i] == STRUCK_NOW:
             self.first_push[i] = miss
         self.struck[i] = STRUCK_BEFORE
-        part = 1 + 0 * miss
+        part = give
         if ti.static(self.exact):
             if self.last_push[i] != 0:
-                part = ti.max(ti.static(CAREFUL), ti.min((self.last_miss[i] - miss) / self.last_push[i], 1))
+                part *= self.part_left(self.last_miss[i] - miss, give * self.last_push[i])
         pushed = ti.max(self.pushed[i] + miss / part, 0)
         push = pushed - self.pushed[i]
         self.last_push[i], self.last_miss[i], self.pushed[i] = push, miss, pushed
-        return ti.abs(miss) > ti.static(MET) * self.first_push[i], push
+        met = ti.static(MET) + 0 * miss
+        if ti.static(self.clusters):
+            if self.in_cluster(i) and self.in_cluster(self.partner[i]):
+                met = ti.static(FINE) + 0 * miss
+        return ti.abs(miss) > met * self.first_push[i], push
+
+    @ti.func
+    def part_left(self, change, pushed):
+        """Return the part that exactly solved constraints left of the last push of a pair: the secant of a single impact."""
+        return ti.max(ti.static(CAREFUL), ti.min(change / pushed, 1))
+
+    @ti.func
+    def takes_part(self, i):
+        """Whether passes push particle i of a cluster because it struck other particles."""
+        out = False
+        if ti.static(self.clusters):
+            out = self.parts[i] > 0
+        return out
+
+    @ti.func
+    def has_next_pass(self, now):
+        """Whether another pass can follow this one."""
+        return now.it + 1 - now.span.iterations < ti.static(self.passes)
+
+    @ti.func
+    def inverse_mass(self, i, n, m):
+        """Return how much an impulse of 1 along m on particle i changes its velocity along n, as if it struck p times as often.
+
+        That is p w n.m, or for a particle of a cluster p (n.m / M + (r x n) . I^-1 (r x m)). p is the sum of the parts of the
+        particle, or of all particles of the cluster, in impacts. By Cauchy's inequality no eigenvalue of a pass exceeds 1 then.
+        """
+        out = self.parts[i] * self.state.w.of(i) * n.dot(m)
+        if ti.static(self.clusters):
+            if self.in_cluster(i):
+                out = self.cluster_inverse_mass(self.body[i], self.arm[i], n, m)
+        return out
+
+    @ti.func
+    def cluster_inverse_mass(self, b, r, n, m):
+        """Return inverse_mass() at r from the center of the cluster whose first particle is b."""
+        dim = ti.static(self.state.dim)
+        S = ti.Matrix([[self.body_moment[b][dim * j + k] for k in ti.static(range(dim))] for j in ti.static(range(dim))])
+        turn = rotation.turn_rate(S, rotation.axial(m.outer_product(r)))
+        return self.body_parts[b] * (n.dot(m) / self.body_mass[b] + rotation.axial(n.outer_product(r)).dot(turn))
 
     @ti.func
     def by_wall(self, i):
@@ -340,17 +399,17 @@ class BodyImpacts:
 
         It is called for both particles in the same round. Returns whether a later pass does that, as record_impact() does.
         """
-        linked = (self.is_linked(i) and not self.in_cluster(i)) or (self.is_linked(j) and not self.in_cluster(j))
-        out = linked and self.ready[i] != 0 and self.ready[j] != 0
+        out = (self.is_linked(i) or self.is_linked(j)) and self.ready[i] != 0 and self.ready[j] != 0
         if out and self.state.w.positive(i):
             self.struck[i] = STRUCK_NOW
+            self.parts[i] = 1
             self.partner[i] = j
             self.normal[i], self.target[i] = n, target
             self.pushed[i] = self.last_push[i] = 0 * target
         return out
 
     @ti.func
-    def compute_pair_push(self, i):
+    def compute_pair_push(self, i, now):
         """Compute the push of particle i, if it struck another. No particle moves before push_pair().
 
         Returns whether its relative displacement was off, and the relative push.
@@ -358,13 +417,22 @@ class BodyImpacts:
         off, push = False, 0 * self.target[i]
         if self.struck[i] != 0 and not self.by_wall(i):
             j, n, w = self.partner[i], self.normal[i], self.state.w.of(i)
-            off, push = self.missing_push(i, self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n))
-            self.change[i] = w / (w + self.state.w.of(j)) * push * n
+            both = w + self.state.w.of(j)
+            give = (self.inverse_mass(i, n, n) + self.inverse_mass(j, n, n)) / both
+            before = self.pushed[i]
+            off, push = self.missing_push(
+                i, self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n), give
+            )
+            if ti.static(self.clusters):
+                if (self.in_cluster(i) or self.in_cluster(j)) and not (off and self.has_next_pass(now)):
+                    push, self.pushed[i] = 0 * push, before  # no pass would follow, in which clusters take it up
+            self.change[i] = w / both * push * n
         return off, push
 
     @ti.func
     def push_pair(self, i):
         """Push particle i by what compute_pair_push() found."""
         if self.struck[i] != 0 and not self.by_wall(i):
-            self.state.shift(i, self.change[i])
+            if not self.in_cluster(i):  # clusters do that in the next pass
+                self.state.shift(i, self.change[i])
             self.reached[i] = 1

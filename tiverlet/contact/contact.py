@@ -82,10 +82,10 @@ class Contact(PairContact):
     velocity, as far as friction holds it; 0 grips, 1 is a super ball (Walton 1993). Friction of particles without spin does not
     turn them.
 
-    Bodies of rigid links that meet at restitution > 0 leave by Newton's law for rigid bodies, see BodyImpacts. With 0, the
-    default, which has no impacts but only overlaps, two bars that meet head-on leave at 0.35 to 0.41 of their speed, at any
-    number of substeps: links find later that an end was stopped. 1e-9 stops them, for the time and the compilation that
-    restitution takes. Particles of rigid clusters (ShapeMatch) bounce alone: such bars leave at 0.35 with 0, at 0.25 with 1e-9.
+    Bodies of rigid links, and rigid clusters (ShapeMatch), that meet at restitution > 0 leave by Newton's law for rigid bodies,
+    see BodyImpacts. With 0, the default, which has no impacts but only overlaps, bodies that meet head-on leave at a quarter to
+    four tenths of their speed, at any number of substeps: constraints find later that a particle was stopped. 1e-9 stops them,
+    for the time and the compilation that restitution takes.
 
     Several impacts of one particle in a substep are resolved one after the other. A round takes the struck pairs that come first
     for both of their particles; the next round takes the next pairs, on the new paths. Each impact is between two particles, so

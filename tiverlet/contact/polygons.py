@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..colliders.body_impacts import FINE
 from ..device import ti
 from ..device.thread_team import Team
 from ..features.extending import extended
@@ -23,6 +24,7 @@ from .pair_contact import PairContact
 from .polygon_narrow_phase import VERTEX, EdgePairTable, Outline, PolygonGeometry
 from .restitution import SLOW, under_force
 
+AIM = 2.0**-40  # [m] the least displacement with which a contact leaves after an impact, so that its normal can be told from it
 SKIN = 0.15  # skin of a vertex, relative to its longer edge
 
 
@@ -34,7 +36,9 @@ class Polygons(PairContact):
 
     loops: for each body its particles in order around it, at least 3, either way round. Their radii round the rim. Other
     constraints (Distance, Area, ShapeMatch) hold a body together; it may bend, and stretch by a quarter.
-    friction, restitution: as in Contact. Particles in no loop touch as in Contact.
+    friction, restitution: as in Contact. Particles in no loop touch as in Contact. Bodies of rigid links, and rigid clusters, that
+    meet at restitution > 0 leave by the laws of Newton and Coulomb for rigid bodies, see PolygonRestitution. With 0 they leave at
+    up to a quarter of their speed, with 1e-9 they stop, see Contact.
     skin: how far beyond contact distance pairs are listed [m], "auto" for the median of 0.15 of the longer edge of each vertex,
     and of 0.75 of the radius of each disc in no loop.
     push_out: about the speed at which bodies that overlap part [m/s].
@@ -191,7 +195,7 @@ class Polygons(PairContact):
         pair_data = [
             *dev.geometry.carried,
             *([dev.slip] if dev.has_friction else []),
-            *([dev.restitution.aim, dev.restitution.last] if dev.has_restitution else []),
+            *(dev.restitution.pair_data if dev.has_restitution else []),
         ]
         dev.edge_pair_table = EdgePairTable(dev.geometry, self.table, scene.memory.number(self._present_skin, scene.real))
         dev.search = NeighbourSearch(
@@ -200,6 +204,11 @@ class Polygons(PairContact):
         dev.list = dev.search.list
         dev.geometry.bind(dev.search)
         return dev.search
+
+    @property
+    def strikes_bodies(self) -> bool:
+        """Whether bodies held by constraints bounce as wholes: with restitution."""
+        return self.dev.has_restitution
 
     @property
     def bodies(self) -> list[np.ndarray]:  # type: ignore[override]
@@ -286,6 +295,7 @@ class Polygons(PairContact):
         """Compute the corrections of particle i by its contacts."""
         first, final = now.first, now.final
         total, lifts, forced = 0 * self.dev.state.x[i], 0 * self.dev.state.x[i], 0 * self.dev.state.x[i]
+        parts = 0 * self.dev.w.of(i)
         begin, roles = self.dev.list.first[i], self.dev.geometry.roles(i)
         for e in range(begin, begin + ti.select(self.dev.depths[i] > 0, self.dev.list.number[i], 0)):
             for role in range(roles):
@@ -296,23 +306,30 @@ class Polygons(PairContact):
                     if found[0] > 0:
                         overlap, shared = self.dev.geometry.share(self.dev.depths, at, v, a, b, t)
                         d = self.dev.geometry.relative(self.dev.state.d, v, a, b, t)
-                        share, missing = part * self.dev.w.of(i) / shared, 0 * overlap
+                        share, missing, as_bodies = part * self.dev.w.of(i) / shared, 0 * overlap, False
                         back = overlap  # the correction of both position and displacement
                         if ti.static(self.dev.has_restitution):
                             if first != 0:
                                 aim, missing, lift = self.dev.restitution.target(at, v, a, b, t, n, overlap, d.dot(n))
                                 if missing > 0:
-                                    lifts += share * (overlap + lift) * n
                                     back = 0 * overlap
-                                    self.dev.hit[None] = 1
+                                    as_bodies = self.dev.restitution.by_bodies(v, a, b)
+                                    if as_bodies:
+                                        parts += abs(part)
+                                    else:
+                                        self.dev.hit[None] = 1
+                                        lifts += share * (overlap + lift) * n
                                     if role == VERTEX:
-                                        self.dev.restitution.aim.field[e] = aim * n
+                                        self.dev.restitution.begin(e, ti.max(aim, ti.static(AIM)) * n)
+                                elif self.dev.restitution.parts_by_itself(at, v, a, b, t, n):
+                                    back = 0 * overlap
                         if role == VERTEX:
                             if not self.dev.geometry.is_unchanged(i, e):
                                 self.dev.geometry.impulse.field[e] = self.dev.geometry.impulse.field[e] + back / shared
                         want = back * n
                         if ti.static(self.dev.has_friction):
-                            want -= self.table.held(v, a, n, overlap + missing, self.dev.slip.field[at] + d)
+                            if not as_bodies:
+                                want -= self.table.held(v, a, n, overlap + missing, self.dev.slip.field[at] + d)
                         total += share * want
                         if final != 0:
                             approach = -self.dev.geometry.relative(self.dev.forces.before, v, a, b, t).dot(n)
@@ -324,6 +341,7 @@ class Polygons(PairContact):
         if ti.static(self.dev.has_restitution):
             if first != 0:
                 self.dev.restitution.lift[i] = lifts
+                self.dev.restitution.take_part(i, parts)
 
     @ti.func
     def apply_corrections(self, i, first):
@@ -356,7 +374,16 @@ class Polygons(PairContact):
 
 
 class PolygonRestitution:
-    """Restitution of vertices and edges: a contact leaves with -e times its normal velocity at impact, see under_force()."""
+    """Restitution of vertices and edges: a contact leaves with -e times its normal velocity at impact, see under_force().
+
+    Where constraints hold the bodies, passes beside the regular ones of the substep push them, see BodyImpacts. The pushes
+    (p_n, p_t) of a contact along its normal and its tangent, in kg m, become
+
+        p_n' = max(p_n + (aim - d.n) / K_nn, 0),
+
+    with the inverse masses K of BodyImpacts.inverse_mass(); with friction both together, see rub(). Each vertex computes the
+    pushes of its contacts, and then all particles of a contact take their parts of them.
+    """
 
     def __init__(self, scene: Scene, geometry: PolygonGeometry, table: Table):
         n, add = scene.count, scene.memory.field
@@ -367,6 +394,48 @@ class PolygonRestitution:
         self.hit = add("Contact.hit", None, kind=ti.i32)
         self.aim = PairData("aim", 2, persistent=False)  # the displacement with which each contact leaves, times its normal [m]
         self.last = PairData("pushed", 0, persistent=True)  # push of the last substep, 0 after an impact [kg m]
+        # Of impacts of bodies: the sums of their pushes, the pushes of this pass, and of the last one what it was to change and
+        # what it did, with the first normal push [kg m, m].
+        self.push, self.step, self.noted = (
+            PairData(name, width, persistent=False, is_transferred=False)
+            for name, width in (("body_push", 2), ("body_step", 2), ("body_noted", 3))
+        )
+        self.pair_data = [self.aim, self.last, self.push, self.step, self.noted]
+        self.impacts: Any = None  # a BodyImpacts, where bodies bounce as wholes
+
+    def bind(self, scene: Scene, impacts: Any) -> None:
+        """Leave impacts of bodies to the extra passes of a BodyImpacts."""
+        self.impacts = impacts
+
+    @ti.func
+    def parts_by_itself(self, at, v, a, b, t, n):
+        """Whether a contact that bounces overlaps though it does not approach and bore no load in the last substep.
+
+        It was left so by an impact, or found late, when corners passed each other. A push would be an impact of its own.
+        """
+        before = self.geometry.relative(self.state.before, v, a, b, t)
+        return self.table.of(v, a)[2] >= 1 and before.dot(n) >= 0 and self.last.field[at] == 0
+
+    @ti.func
+    def by_bodies(self, v, a, b):
+        """Whether extra passes make the impact of vertex v on the edge from a to b."""
+        out = False
+        if ti.static(bool(self.impacts)):
+            out = self.impacts.is_linked(v) or self.impacts.is_linked(a) or self.impacts.is_linked(b)
+        return out
+
+    @ti.func
+    def begin(self, e, aim):
+        """Store the displacement with which the contact at entry e leaves, times its normal [m]."""
+        self.aim.field[e] = aim
+        self.push.field[e], self.step.field[e] = 0 * aim, 0 * aim
+        self.noted.field[e] = 0 * self.noted.field[e]
+
+    @ti.func
+    def take_part(self, i, parts):
+        """Store the sum of the parts of particle i in impacts of bodies."""
+        if ti.static(bool(self.impacts)):
+            self.impacts.parts[i] = parts
 
     @ti.func
     def target(self, at, v, a, b, t, n, overlap, leaving):
@@ -383,7 +452,7 @@ class PolygonRestitution:
         held = self.last.field[at] * self.geometry.inverse_mass(v, a, b, t)
         fast = approach > ti.static(SLOW) * (-leaving - approach)
         if approach > 0 and (restitution >= 1 or (fast and (held == 0 or aim > overlap + leaving + held))):
-            missing = ti.max(aim - (overlap + leaving), 0)
+            missing = ti.max(aim - (overlap + leaving), ti.static(AIM))  # more overlap than that would become speed
             if overlap <= -leaving:
                 lift = restitution * overlap
             given, left = under_force(0 * overlap, 0 * overlap, -leaving, approach, overlap, restitution)
@@ -403,7 +472,7 @@ class PolygonRestitution:
                     if at >= 0:
                         aim = self.aim.field[at]
                         size = aim.norm()
-                        if size > 0:
+                        if size > 0 and not self.by_bodies(v, a, b):
                             n = aim / size
                             lack = size - self.geometry.relative(self.state.d, v, a, b, t).dot(n)
                             if lack > 0:
@@ -419,3 +488,92 @@ class PolygonRestitution:
         """Change the displacement of particle i, and its displacement before the substep."""
         self.state.d[i] = self.state.d[i] + self.d_change[i]
         self.state.before[i] = self.state.before[i] + self.d_change[i]
+
+    @ti.func
+    def inverse_mass(self, v, a, b, t, n, m):
+        """Return BodyImpacts.inverse_mass() of the contact of vertex v with the edge from a to b, for directions n and m."""
+        edge = (1 - t) * self.impacts.inverse_mass(a, n, m) + t * self.impacts.inverse_mass(b, n, m)
+        if ti.static(self.impacts.clusters):
+            if self.impacts.in_cluster(a) and self.impacts.in_cluster(b) and self.impacts.body[a] == self.impacts.body[b]:
+                arm = (1 - t) * self.impacts.arm[a] + t * self.impacts.arm[b]
+                edge = self.impacts.cluster_inverse_mass(self.impacts.body[a], arm, n, m)
+        return self.impacts.inverse_mass(v, n, m) + edge
+
+    @ti.func
+    def push_body(self, i, now):
+        """In an extra pass: compute the pushes of the contacts of vertex i. Returns whether any of them was off."""
+        off = False
+        if self.impacts.parts[i] > 0:
+            for e in range(self.geometry.list.first[i], self.geometry.list.first[i] + self.geometry.list.number[i]):
+                at, v, a, b, t, _ = self.geometry.participants(i, e, VERTEX)
+                aim = self.aim.field[e]
+                size = aim.norm()
+                if at >= 0 and size > 0:
+                    if self.by_bodies(v, a, b):
+                        off = self.correct(e, v, a, b, t, aim / size, size, now) or off
+        return off
+
+    @ti.func
+    def correct(self, e, v, a, b, t, n, aim, now):
+        """Correct the push of the contact at entry e, of vertex v on the edge from a to b. Returns whether it was off."""
+        d, along = self.geometry.relative(self.state.d, v, a, b, t), ti.Vector([-n[1], n[0]])
+        last, lack = self.push.field[e], aim - d.dot(n)
+        give = self.inverse_mass(v, a, b, t, n, n)
+        if ti.static(self.impacts.exact):
+            noted = self.noted.field[e]
+            if noted[1] != 0 and not (self.impacts.in_cluster(v) and self.impacts.in_cluster(a) and self.impacts.in_cluster(b)):
+                give *= self.impacts.part_left(noted[2] - lack, noted[1])
+        push = ti.Vector([ti.max(last[0] + lack / give, 0), 0 * lack])
+        if ti.static(self.table.has_friction):
+            push = self.rub(last, push[0], lack, d.dot(along), give, v, a, b, t, n, along)
+        step = push - last
+        first = ti.select(last[0] == 0 and self.noted.field[e][0] == 0, step[0], self.noted.field[e][0])
+        off = ti.max(abs(step[0]), abs(step[1])) > ti.static(FINE) * first
+        if not (off and self.impacts.has_next_pass(now)):
+            step *= 0  # no pass would follow, in which constraints take it up
+        self.noted.field[e] = ti.Vector([first, give * step[0], lack])
+        self.push.field[e], self.step.field[e] = last + step, step
+        self.geometry.impulse.field[e] = self.geometry.impulse.field[e] + step[0]
+        return off
+
+    @ti.func
+    def rub(self, last, smooth, lack, slip, give, v, a, b, t, n, along):
+        """Return the pushes along n and across it, where friction takes back the slip as far as it can.
+
+        last: the pushes before. smooth: the push along n without friction. The two equations of a contact are solved together:
+        an impulse across n also turns bodies, and so changes the velocity along n.
+        """
+        both, across = self.inverse_mass(v, a, b, t, n, along), self.inverse_mass(v, a, b, t, along, along)
+        row, det = self.table.of(v, a), give * across - both * both
+        out = ti.Vector([smooth, 0 * smooth])
+        if det > 0:
+            stick = last + ti.Vector([across * lack + both * slip, -both * lack - give * slip]) / det
+            if stick[0] > 0 and abs(stick[1]) <= row[0] * stick[0]:
+                out = stick
+            else:
+                mu = ti.math.sign(stick[1]) * row[1]
+                slides = give + mu * both
+                if slides > give / 2:
+                    out[0] = ti.max((lack + give * last[0] + both * last[1]) / slides, 0)
+                out[1] = mu * out[0]
+        return out
+
+    @ti.func
+    def apply_push(self, i):
+        """Give particle i its parts of what push_body() found. Clusters take it up in the next pass."""
+        if self.impacts.parts[i] > 0:
+            total, begin = 0 * self.state.x[i], self.geometry.list.first[i]
+            for e in range(begin, begin + self.geometry.list.number[i]):
+                for role in range(self.geometry.roles(i)):
+                    at, v, a, b, t, part = self.geometry.participants(i, e, role)
+                    if at >= 0:
+                        aim, step = self.aim.field[at], self.step.field[at]
+                        size = aim.norm()
+                        if size > 0 and self.by_bodies(v, a, b):
+                            n = aim / size
+                            total += part * self.state.w.of(i) * (step[0] * n + step[1] * ti.Vector([-n[1], n[0]]))
+            if self.impacts.in_cluster(i):
+                self.impacts.change[i] = total
+            else:
+                self.state.shift(i, total)
+            self.impacts.reached[i] = 1

@@ -137,6 +137,8 @@ class Restitution:
             if ti.static(bool(self.impacts)):
                 if meets:
                     meets = not self.impacts.record_pair_impact(i, j, self.normal[i], self.target_of[i])
+                    # A second impact on a body is left to the next substep: what one particle gets, the cluster would take back.
+                    meets = meets and not (self.impacts.in_cluster(i) or self.impacts.in_cluster(j))
             if meets:
                 e, d_change = self.first[i], self.d_change[i]
                 impulse = d_change.norm() / self.state.w.of(i)
@@ -163,9 +165,9 @@ class Restitution:
         self.target_of[i] = given + self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n)
 
     @ti.func
-    def push_body(self, i):
+    def push_body(self, i, now):
         """In an extra pass: compute the push of particle i, and store its impulse. Returns whether its displacement was off."""
-        off, push = self.impacts.compute_pair_push(i)
+        off, push = self.impacts.compute_pair_push(i, now)
         if push != 0:
             j = self.impacts.partner[i]
             for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
@@ -175,6 +177,11 @@ class Restitution:
                     if ti.static(self.has_events):
                         self.events.note_impact(e, impulse, self.impacts.first_push[i] / (1 + self.table.of(i, j)[2]))
         return off
+
+    @ti.func
+    def apply_push(self, i):
+        """Push particle i by what push_body() found."""
+        self.impacts.push_pair(i)
 
 
 @ti.func

@@ -99,12 +99,12 @@ class ContactPass:
             if ti.static(c.has_restitution and c.strikes_bodies):
                 for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                     if c.dev.state.awake(i):
-                        if c.dev.restitution.push_body(i):
+                        if c.dev.restitution.push_body(i, now):
                             c.dev.restitution.impacts.request_pass(now)
                 self.team.wait()
                 for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                     if c.dev.state.awake(i):
-                        c.dev.restitution.impacts.push_pair(i)
+                        c.dev.restitution.apply_push(i)
                 self.team.wait()
 
     @ti.func

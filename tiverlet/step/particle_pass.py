@@ -265,6 +265,9 @@ class ParticlePass:
                     if now.it + 1 >= now.span.iterations:
                         impacts.correct_push(i)
                     impacts.request_pass(now)
+                if ti.static(impacts.pairs):
+                    if now.it < now.span.iterations and impacts.parts[i] > 0:
+                        impacts.request_pass(now)
         for c in ti.static(self.contacts):
             if now.checks_list != 0:
                 stale = 0

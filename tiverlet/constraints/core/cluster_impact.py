@@ -1,21 +1,22 @@
-"""Impacts of rigid clusters on walls: the cluster leaves them as a rigid body, by Newton's law, see BodyImpacts."""
+"""Impacts of rigid clusters on walls and other bodies: the cluster leaves as a rigid body, by Newton's law, see BodyImpacts."""
 
 from typing import Any
 
 from ...device import ti
-from . import rotation
+from ...geometry import rotation
 
 SWEEPS = 64  # over the particles that were struck, at most
 MET = 2.0**-12  # of the first push: a smaller change ends the sweeps
 
 
 class ClusterImpact:
-    """In extra passes: pushes the particles of a cluster that struck walls to their targets, and moves it as a rigid body.
+    """In extra passes: moves a cluster as a rigid body, by the pushes on its particles that struck walls or other particles.
 
     A push p along n [m] of a particle of mass m at r from the center moves the body by V += m p n / M, and turns it by
     W += I^-1 (r x m p n). So it adds k p to the normal displacement there, k = m (1 / M + (r x n) . I^-1 (r x n)). Particles take
-    turns, p' = max(p + miss / k, 0), and their friction likewise across n, until all have what they are to have. The cluster
-    keeps the deformation that contacts and loads have left in it.
+    turns, p' = max(p + miss / k, 0), and their friction likewise across n, until all have what they are to have. Pushes between
+    particles are those of the pass before: their contacts compute them, see BodyImpacts.inverse_mass(). The cluster keeps the
+    deformation that contacts and loads have left in it.
 
     cluster: the ClusterPasses. impacts: the BodyImpacts.
     """
@@ -40,7 +41,7 @@ class ClusterImpact:
         begin, end, hit = self.corners.starts[c], self.corners.starts[c + 1], False
         for e in range(begin, end):
             i = self.corners.members[e]
-            hit = hit or (self.impacts.in_cluster(i) and self.is_struck(i))
+            hit = hit or (self.impacts.in_cluster(i) and (self.is_struck(i) or self.impacts.takes_part(i)))
         if hit:
             self.move_as_body(c, begin, end)
         else:
@@ -49,7 +50,7 @@ class ClusterImpact:
 
     @ti.func
     def move_as_body(self, c, begin, end):
-        """Push the particles of cluster c that struck walls, and write the moves of all of its corners."""
+        """Push the particles of cluster c that struck, and write the moves of all of its corners."""
         i0, M, center = self.corners.reference_particle(c), ti.cast(0, ti.f64), self.cluster.zero_vector()
         start = self.cluster.zero_vector()
         S = center.outer_product(center)
@@ -64,6 +65,8 @@ class ClusterImpact:
         S -= M * start.outer_product(start)
         V = 0 * center
         W, off = 0 * rotation.axial(S), True
+        if ti.static(self.impacts.clusters):
+            V, W = self.take_up_pushes(c, begin, end, i0, start, M, S)
         for _ in range(SWEEPS):
             if off:
                 off = False
@@ -81,9 +84,31 @@ class ClusterImpact:
             move = ti.cast(V + T @ r - r, self.real)
             self.cluster.pull[e] = self.cluster.pull[e] + move
             self.count_push(e, 1)
+            if ti.static(self.impacts.clusters):
+                self.cluster.pull[e] = self.cluster.pull[e] - self.impacts.change[i]
+                self.impacts.change[i] = 0 * self.impacts.change[i]
             self.impacts.mark_struck_in_cluster(i)
             self.corners.write_move(e, move)
         self.cluster.write_matrix(self.cluster.pose, c, T @ self.cluster.read_matrix(self.cluster.pose, c))
+
+    @ti.func
+    def take_up_pushes(self, c, begin, end, i0, start, M, S):
+        """Return how the pushes of the last pass on the particles of cluster c move it and turn it.
+
+        It also stores what the next pushes depend on. i0, start, M, S: reference particle, center, mass, and sum m r r^T.
+        """
+        V, parts = self.cluster.zero_vector(), ti.cast(0, self.real)
+        X = V.outer_product(V)
+        for e in range(begin, end):
+            i, m = self.corners.members[e], self.cluster.mass_in_fit(e, c)
+            r, push = self.cluster.relative_position(e, i0, 1) - start, m * self.wide(self.impacts.change[i])
+            V += push / M
+            X += push.outer_product(r)
+            parts += self.impacts.parts[i]
+            self.impacts.body[i], self.impacts.arm[i] = i0, ti.cast(r, self.real)
+        self.impacts.body_mass[i0], self.impacts.body_parts[i0] = ti.cast(M, self.real), parts
+        self.cluster.write_matrix(self.impacts.body_moment, i0, ti.cast(S, self.real))
+        return V, rotation.turn_rate(S, rotation.axial(X))
 
     @ti.func
     def corrected_push(self, i, r, s, V, W, M, S, m):

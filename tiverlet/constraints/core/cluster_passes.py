@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...device import ti
-from . import rotation
+from ...geometry import rotation
 from .cluster_impact import ClusterImpact
 from .passes import Passes
 from .spring import FIRM, Spring, stiff

@@ -5,7 +5,7 @@ Stored as (cos, sin) in 2D and as a quaternion (w, x, y, z) in 3D. K = sum mu q 
 
 import numpy as np
 
-from ...device import ti
+from ..device import ti
 
 STEPS = 16  # Newton iterations at most; from the rotation of the last substep it takes two or three
 
