@@ -36,7 +36,7 @@ class Polygons(PairContact):
 
     loops: for each body its particles in order around it, at least 3, either way round. Their radii round the rim. Other
     constraints (Distance, Area, ShapeMatch) hold a body together; it may bend, and stretch by a quarter.
-    friction, restitution: as in Contact. Particles in no loop touch as in Contact. Bodies of rigid links, and rigid clusters, that
+    friction, restitution: as in Contact. Particles in no loop touch as in Contact. Bodies of rigid links and rigid clusters that
     meet at restitution > 0 leave by the laws of Newton and Coulomb for rigid bodies, see PolygonRestitution. With 0 they leave at
     up to a quarter of their speed, with 1e-9 they stop, see Contact.
     skin: how far beyond contact distance pairs are listed [m], "auto" for the median of 0.15 of the longer edge of each vertex,
