@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from ..constraints.core.equation import RESTARTED
 from ..constraints.core.known_load import WINDOW
 from ..device import ti
 from ..device.thread_team import Team
@@ -55,12 +56,12 @@ class ConstraintPass:
             self.team.wait()
 
     @ti.func
-    def spring_forces(self, thread, h):
-        """Write h^2 times the accelerations by springs at the present positions to the slots."""
+    def spring_forces(self, thread, h, soft, alone):
+        """Write h^2 times the accelerations by springs at the present positions to the slots, see Passes.push_spring_force()."""
         self.reduce_blocks(thread, h, h * h, -1, 0, True)
         for f in ti.static(self.batches):
             for c in range(self.team.chunk_begin(f.count, thread), self.team.chunk_end(f.count, thread)):
-                f.dev.push_spring_force(c, h)
+                f.dev.push_spring_force(c, h, soft, alone)
         self.team.wait()
         self.scatter_blocks(thread, h, h * h, -1, 0)
 
@@ -100,6 +101,8 @@ class ConstraintPass:
         """Every constraint writes the moves that it wants to its slots, or its row to the system that solves it."""
         fresh = now.fresh if ti.static(self.integrator.half_kick) else 0
         h2_effective = self.integrator.h2_effective(now.h, fresh)
+        if fresh != 0 and now.span.owed > 0:
+            fresh = RESTARTED
         if ti.static(len(self.capped) > 0):
             for _ in range(self.team.one(now.first, now.thread)):
                 for f in ti.static(self.capped):

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ..constraints.core.scalar import Scalar
 from ..constraints.path import Path
 from ..contact.initial_overlap import overlapping
 from ..contact.mass_splitting import still_soft
@@ -61,6 +62,7 @@ class Runner:
         step = self.step
         self.n, self.launched, self.team, self.integrator = step.n, step.launched, step.team, step.integrator
         self.driven = [b for b in self.batches if b.driven]
+        self.springs: list[Any] = [b for b in self.batches if isinstance(b, Scalar) and b.soft and not b.dev.equation.forces]
         self.paths = [f for f in step.drivers if isinstance(f, Path)]
         self.known = [c.known for c in step.contacts if c.known]  # KnownLoads of contacts
         self.logs: list[Any] = [*(c.dev.events for c in step.contacts if c.dev.events), *step.wall_logs]  # of events
@@ -85,7 +87,7 @@ class Runner:
         self._measure = CachedLaunch(self.diagnostics, "measure", self.memory.compiler, self.sheet)
         self._velocity: CachedLaunch | None = None  # made when velocities are first read
         self._spin: CachedLaunch | None = None  # made when spins are first read
-        self._turned = np.zeros(2)
+        self._turned = np.zeros(4)
         self._to_velocity = CachedLaunch(self.step, "to_velocity", self.memory.compiler, self._turned)
         self._data, self._given, self._reporter = self.sheet.data, self.sheet.data[H:], self.diagnostics.report
 
@@ -157,7 +159,10 @@ class Runner:
                 if self.scene.slots and self.scene.slots.system and clock.h:
                     self.scene.slots.system.keep_softness(h / clock.h)
                 if h < clock.longest and not self.probe:
+                    x = self.scene.state.get(self.memory) if self.springs else None
                     keeps = self._project(h, dt, substeps * iterations, keeps)
+                    if x is not None:
+                        self._forget_springs(x, self.scene.state.get(self.memory))
                 for contact in self.step.contacts if keeps else []:
                     contact.keep_stiffness(h / clock.h)
                 if asleep is not None and keeps:
@@ -341,8 +346,17 @@ class Runner:
     def forget_loads(self, position: np.ndarray) -> None:
         """Before positions are set: forget the known loads of constraints and contacts that the new positions change."""
         initial_violation.forget(self.scene, self.batches, position)
+        self._forget_springs(self.scene.state.get(self.memory), position)
         for known in self.known:
             known.forget(self.scene, position)
+
+    def _forget_springs(self, before: np.ndarray, now: np.ndarray) -> None:
+        """Let springs whose particles were moved from `before` to `now`, (n, dim), start with the forces that they have now."""
+        moved = (before != now).any(axis=1)
+        for b in self.springs if moved.any() else []:
+            offset = self.memory.read(b.dev.equation.spring.offset)
+            offset[: b.count][np.bincount(b.owner, moved[b.indices.ravel()], minlength=b.count) > 0] = 0.0
+            self.memory.write(b.dev.equation.spring.offset, offset)
 
     def carry_loads(self) -> None:
         """After particles were added, removed or pinned: sum the known loads of their contacts again for each particle."""
@@ -366,7 +380,7 @@ class Runner:
             elif self.probe:
                 self.memory.write(self.scene.state.d, high_order.velocity(self.probe, clock, self.memory, iterations))
             else:
-                self._turned[:] = clock.h, clock.time
+                self._turned[:] = clock.h, clock.time, self.shares()[1], iterations == 1 and not self.semi_iterations
                 self._to_velocity()
                 clock.owed = (clock.drag or FREE)[3] * clock.h
             clock.d_is_velocity, clock.velocity_override = True, None

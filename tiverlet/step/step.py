@@ -305,7 +305,7 @@ class Step:
         """Move every particle by its displacement and forces, and pose moving walls for this substep."""
         if ti.static(self.integrator.springs_pull):
             self.constraints.move_rest_values(now.thread, now.frame_fraction[0])
-            self.constraints.spring_forces(now.thread, now.h)
+            self.constraints.spring_forces(now.thread, now.h, 0 * now.h, 0)
             if now.s % self.integrator.stages == self.integrator.longest + 1:
                 self.constraints.note_turns(now.thread)
         for w in ti.static(self.posed):
@@ -579,28 +579,29 @@ class Step:
 
     @ti.kernel
     def to_velocity(self, given: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
-        """Turn displacements into velocities, for a start with another h or another state. given: h, t.
+        """Turn displacements into velocities, for a start with another h or another state. given: h, t, soft, and alone, see
+        Passes.push_spring_force().
 
         Springs count with their force at x_n. Rigid links do not count: the next substep corrects the part of v_n along them, and
         across them d / h + h a / 2 is the velocity of RATTLE, so no order of accuracy is lost.
         """
         if ti.static(self.particles.whole):
             if given[0] > 0:  # Taichi wakes no threads for loops inside a branch
-                self.turn_to_velocity(given[0], given[1])
+                self.turn_to_velocity(given[0], given[1], given[2], given[3])
         else:
-            self.turn_to_velocity(given[0], given[1])
+            self.turn_to_velocity(given[0], given[1], given[2], given[3])
 
     @ti.func
-    def turn_to_velocity(self, h64, t64):
+    def turn_to_velocity(self, h64, t64, soft64, alone):
         """Overwrite displacements with velocities, after a substep h at time t."""
-        h, t = ti.cast(h64, self.real), ti.cast(t64, self.real)
+        h, t, soft = ti.cast(h64, self.real), ti.cast(t64, self.real), ti.cast(soft64, self.real)
         if ti.static(self.constraints.springs):
             if ti.static(self.team.size == 1):
-                self.constraints.spring_forces(0, h)
+                self.constraints.spring_forces(0, h, soft, alone)
             else:
                 for thread in range(self.team.loop_length):
                     if thread % LEAST == 0:
-                        self.constraints.spring_forces(thread // LEAST, h)
+                        self.constraints.spring_forces(thread // LEAST, h, soft, alone)
         for i in range(self.n):
             force = 0 * self.state.d[i]
             if ti.static(self.constraints.springs):

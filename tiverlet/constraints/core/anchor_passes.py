@@ -90,7 +90,7 @@ class AnchorPasses(Passes):
         self.corners.write_move(c, 0, self.w.of(self.corners.member(c, 0)) * (new - lam))
 
     @ti.func
-    def push_spring_force(self, c, h):
+    def push_spring_force(self, c, h, soft, alone):
         """Push h^2 times the spring acceleration, as in CornerPasses, for each axis."""
         move = ti.Vector.zero(self.real, self.state.dim)
         if ti.static(self.spring.soft):

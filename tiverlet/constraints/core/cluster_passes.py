@@ -238,7 +238,7 @@ class ClusterPasses(Passes):
                 self.write_matrix(self.fit, c, R)
 
     @ti.func
-    def push_spring_force(self, c, h):
+    def push_spring_force(self, c, h, soft, alone):
         """Compute the present position and rotation of the cluster.
 
         scatter_corner() then adds h^2 times the spring acceleration.

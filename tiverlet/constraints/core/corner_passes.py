@@ -356,19 +356,23 @@ class CornerPasses(Passes):
                     self.equation.lam[c] = self.equation.lam[c] + step
 
     @ti.func
-    def push_spring_force(self, c, h):
+    def push_spring_force(self, c, h, soft, alone):
         """Push h^2 w_j F grad_j C, with F of Equation.spring_force().
 
         Rigid links get their force in the next substep, except for the load that they know.
         """
         f, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
         f = self.quantity.unwrap(f, self.equation.rest[c])
-        f0, w = f, ti.cast(0, self.real)
+        f0, w, W = f, ti.cast(0, self.real), ti.cast(0, self.real)
         if ti.static(self.spring.damped):
             f0, _ = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 1))
         for k in ti.static(range(self.arity)):
-            w += self.w.of(self.corners.member(c, k)) * g[k, :].dot(g[k, :])
-        force = self.equation.spring_force(c, f, self.quantity.unwrap(f0, f), w, h)
+            i, gg = self.corners.member(c, k), g[k, :].dot(g[k, :])
+            w += self.w.of(i) * gg
+            W += self.slots.split[i] * gg
+        if alone == 0 or not self.is_outside_systems(c):
+            W = w
+        force = self.equation.spring_force(c, f, self.quantity.unwrap(f0, f), w, W, h, soft)
         if ti.static(self.known.learns):
             if self.spring.is_rigid(c):
                 force = -self.known.load[c]

@@ -10,6 +10,7 @@ from .spring import Spring, stiff
 from .step_limit import StepLimit
 from .strength import Strength
 
+RESTARTED = 2  # `fresh` at a start from velocities that displacements were turned into, see Equation.spring_force()
 SMALLEST = 1e-6  # of the size of the scene: a longer length is not rounding
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ class Equation:
         self.drive: Any = batch.drive_of(scene) if batch.driven else None
         self.lam = add(f"{name}.multiplier", m, state=True)
         compliance, damping = batch.compliance if batch.soft else None, batch.damping if batch.damped else None
-        self.spring = Spring(scene, name, compliance, damping, start)
+        self.spring = Spring(scene, name, compliance, damping, start, restarts=not self.forces)
         self.strength = Strength(scene, name, batch)
         self.limit = StepLimit(scene, name, batch)
         self.cusp, self.ramp = batch.cusp, Ramp(scene.memory, batch)
@@ -99,6 +100,9 @@ class Equation:
                     B = now * self.clip_to_side(self.earlier_violation(c, f0, 1)) + last * self.clip_to_side(
                         self.earlier_violation(c, f_last, 2)
                     )
+                    if ti.static(not self.forces):
+                        if fresh == RESTARTED:
+                            B += (1 - stiff(self.spring.alpha[c], h, w)) * self.spring.offset[c]
                     self.spring.history[c] = B
                     self.spring.last[c] = f0
                 else:
@@ -166,23 +170,44 @@ class Equation:
         return size
 
     @ti.func
-    def spring_force(self, c, f, f0, w, h):
-        """Return F = -(1 - theta) (C / alpha + damping dC/dt), from f now and a substep ago, for starts."""
+    def spring_force(self, c, f, f0, w, W, h, soft):
+        """Return the force of a spring at x_n, for starts: 1 - theta of that of the last substep, and its change since.
+
+        f, f0: now and a substep ago. w, W: as in Spring.force_change(). soft: as in Passes.push_reaction(). Springs that act as
+        forces have F = -(C / alpha + damping dC/dt). With that force, starts are steps of explicit Verlet: they pump the modes
+        in which many springs act together and omega h > 2, though each of them alone is resolved. So the start begins with this
+        force, too: `offset` is -alpha F - C_n, by which F differs from that of a spring.
+        """
         force = ti.cast(0, self.real)
         if ti.static(self.spring.soft):
             alpha = self.spring.alpha[c]
             if w > 0 and alpha > 0 and self.strength.is_intact(c):
-                resolved = ti.cast(1, self.real)
-                if ti.static(not self.forces):
-                    resolved -= stiff(alpha, h, w)
                 C = self.clip_to_side(f - self.rest[c])
-                force = -resolved * C / alpha
-                if ti.static(self.spring.damped):
-                    if ti.static(self.side == 0) or C != 0:
-                        force -= resolved * self.spring.damping[c] * (f - f0) / h
+                if ti.static(self.forces):
+                    force = -C / alpha
+                    if ti.static(self.spring.damped):
+                        if ti.static(self.side == 0) or C != 0:
+                            force -= self.spring.damping[c] * (f - f0) / h
+                else:
+                    had, change = soft * self.lam[c], self.spring.force_change(c, self.growth(c, f), h, w, W)
+                    force, elastic = (1 - stiff(alpha, h, w)) * had + change, had + change
+                    if ti.static(self.side != 0):
+                        force, elastic = -self.clip_to_side(-force), -self.clip_to_side(-elastic)
+                    force /= h * h
+                    elastic /= h * h
+                    if ti.static(self.spring.damped):
+                        elastic += self.spring.damping[c] * (f - f0) / h
+                    if self.corners.awake(c):
+                        self.spring.offset[c] = -alpha * elastic - C
                 if ti.static(self.driven):
                     force = self.drive.clamp_force(c, force)
         return force
+
+    @ti.func
+    def growth(self, c, f):
+        """Return how much the violation of a spring has grown since the start of the last substep, with f now."""
+        last = self.quantity.unwrap(self.spring.last[c], f)
+        return self.clip_to_side(f - self.rest[c]) - self.clip_to_side(self.earlier_violation(c, last, 1))
 
     @ti.func
     def reaction(self, c, f, w, W, h, firm, soft):
@@ -195,9 +220,7 @@ class Equation:
             if not self.spring.is_rigid(c):
                 pull = soft * self.lam[c]
                 if w > 0 and self.strength.is_intact(c):
-                    now, last = self.clip_to_side(f - self.rest[c]), self.quantity.unwrap(self.spring.last[c], f)
-                    grown = now - self.clip_to_side(self.earlier_violation(c, last, 1))
-                    pull += self.spring.force_change(c, grown, h, w, W)
+                    pull += self.spring.force_change(c, self.growth(c, f), h, w, W)
                     if ti.static(self.side != 0):
                         pull = -self.clip_to_side(-pull)
                     if ti.static(self.driven):

@@ -92,10 +92,10 @@ class OutlinePasses(Passes):
         self.corners.write_move(e, self.w.of(self.corners.members[e]) * self.change[c] * n)
 
     @ti.func
-    def push_spring_force(self, c, h):
+    def push_spring_force(self, c, h, soft, alone):
         """Compute h^2 F as in CornerPasses; scatter_corner() pushes it."""
         f, f0, w, W, turn, extent, move = self.sum_blocks(c)
-        self.change[c], self.use_current_gradient[c] = h * h * self.equation.spring_force(c, f, f0, w, h), 1
+        self.change[c], self.use_current_gradient[c] = h * h * self.equation.spring_force(c, f, f0, w, W, h, soft), 1
 
     @ti.func
     def push_reaction(self, c, h, firm, soft):

@@ -30,8 +30,11 @@ class Passes:
         """
 
     @ti.func
-    def push_spring_force(self, c, h):
-        """Push what the constraint's spring, if it has one, adds to h^2 a at the present positions; for starts."""
+    def push_spring_force(self, c, h, soft, alone):
+        """Push what the constraint's spring, if it has one, adds to h^2 a at the present positions; for starts.
+
+        soft: as in push_reaction(). alone: whether a single pass, in which every constraint acts by itself, made the multipliers.
+        """
 
     @ti.func
     def note_spring_turn(self, c):

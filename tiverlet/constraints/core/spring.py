@@ -71,12 +71,14 @@ class Spring:
     """The springs of a batch on the device: compliance, damping, and what soft constraints remember of earlier substeps.
 
     compliance: (m,), or None where all constraints are rigid, which costs nothing. damping: (m,), or None without dashpots.
-    start: C (or f) at the start, one row for each number or vector that is remembered.
+    start: C (or f) at the start, one row for each number or vector that is remembered. restarts: whether there is an `offset` for
+    the next start, see Equation.spring_force().
     in_state: its fields in the exact state, by name.
     """
 
     def __init__(
-        self, scene: "Scene", name: str, compliance: np.ndarray | None, damping: np.ndarray | None, start: np.ndarray
+        self, scene: "Scene", name: str, compliance: np.ndarray | None, damping: np.ndarray | None, start: np.ndarray,
+        restarts: bool = False,
     ):  # fmt: skip
         add, width = scene.memory.field, start.shape[1] if start.ndim == 2 else 0
         self._memory, self.real = scene.memory, scene.real
@@ -86,6 +88,8 @@ class Spring:
             self.last = add(f"{name}.last", len(start), width=width, values=start, state=True)
             self.history = add(f"{name}.history", len(start), width=width, state=bool(scene.state.sleepers))
             self.in_state = {"last": self.last} | ({"history": self.history} if scene.state.sleepers else {})
+            if restarts:
+                self.offset = self.in_state["offset"] = add(f"{name}.offset", len(start), state=True)
         if damping is not None:
             self.damping = add(f"{name}.damping", len(damping), values=damping)
 
