@@ -206,7 +206,7 @@ def test_what_is_absent_has_no_field_and_no_kernel(world):
     rigid = world(tv.Particles(np.zeros((10, 2))), [tv.Distance([[0, 1]], 0.1)])
     soft = world(tv.Particles(np.zeros((10, 2))), [tv.Distance([[0, 1]], 0.1, compliance=1.0)])
     only = set(soft.fields) - set(rigid.fields)
-    assert only == {"Distance.compliance", "Distance.last", "Distance.history"}
+    assert only == {"Distance.compliance", "Distance.last", "Distance.history", "Distance.offset"}
     mixed = world(tv.Particles(10 * np.arange(20.0).reshape(10, 2), radius=np.arange(10) + 1.0), [tv.Contact()])
     assert "radius" in mixed.fields
     assert "Contact.shrunk" not in mixed.fields

@@ -450,9 +450,9 @@ def test_what_few_steps_take_from_rotations_is_told(world):
 @pytest.mark.parametrize("cause", ["length", "placed"])
 def test_soft_bodies_gain_no_energy_where_frames_are_starts(world, solver, cause):
     # A free cube of springs, each of which a substep resolves, (omega h)^2 = w h^2 / alpha = 0.17, while 14 of them act on a
-    # particle together. A start is a frame of another length, by 1e-6 here, or one before which any particle was placed. With the
-    # force -C / alpha, starts were steps of explicit Verlet: the energy grew to 3e3 J within two seconds. Now frames go on as even
-    # ones do, which keep the energy of what substeps resolve.
+    # particle together. A start is a frame of another length, by 1e-6 here, or one before which any particle was placed. With
+    # the force -C / alpha, starts were steps of explicit Verlet: the energy grew to 3e3 J within two seconds. Now frames go on as
+    # even ones do, which keep the energy of what substeps resolve.
     truss = tv.shapes.truss((-0.25, 0, -0.25), (0.25, 0.5, 0.25), (3,) * 3)
     pairs, n = np.concatenate([truss.links, truss.braces]), len(truss.position)
     v = np.concatenate([np.random.default_rng(1).normal(size=(n, 3)) * 1e-3, np.zeros((1, 3))])

@@ -276,6 +276,7 @@ class Contact(PairContact):
         if ti.static(not self.dev.has_restitution):
             carries = ti.cast(ti.select(first != 0 and (fresh == 0 or now.span.since > 0), 1, 0), self.scene.real)
         own, least = self.dev.splitting.weight[i], ti.cast(1, self.scene.real)  # least: the smallest push of i
+        held = ti.cast(0, self.scene.real)
         if own > 0:
             for word in range(self.dev.list.word_count(i)):
                 bits = self.dev.splitting.touching(i, word)
@@ -290,6 +291,8 @@ class Contact(PairContact):
                     if ti.static(self.dev.has_loads):
                         bears = bears or self.dev.known.load.field[e] > 0
                     overlap, each, n, reach = self.dev.geometry.impact(i, j, contact_distance, shared, bears)
+                    if ti.static(self.dev.geometry.shrinks):
+                        held = ti.max(held, self.dev.geometry.excess(i, j, n, overlap, now.h))
                     each *= ti.static(RELAXATION)
                     paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self.dev.w.of(j)
                     push, known = again * last, ti.zero(overlap)  # known: the part of the push that its known load already gave
@@ -364,6 +367,8 @@ class Contact(PairContact):
             if least == 0:
                 self.dev.splitting.invalidate_bound(i)
         self.dev.move[i] = total
+        if ti.static(self.dev.geometry.shrinks):
+            self.dev.geometry.held[i] = held
         if ti.static(self.dev.has_loads):
             self.dev.known.carried.field[i] = carried
         if ti.static(self.dev.spins):

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from ..neighbours.neighbour_search import NeighbourSearch
 
 SHRUNK = "Contact.shrunk"  # the field of how much smaller each particle is than its radius [m]
+BARELY = 2.0**-100  # [m] by which a particle shrinks that is to keep its size
+HELD = "Contact.held"  # the field of by how much each particle shrinks in the coming substep, instead of growing [m]
 SLOWER = "Contact.slower"  # the field of how much slower than at push_out pairs of each shrunk particle part [m/s]
 SAME_PLACE = 2.0**-80  # (distance / contact distance)^2 below which two particles count as in the same place
 
@@ -29,7 +31,7 @@ class DiscGeometry:
     """
 
     push_out: Any = OnDevice()
-    late = (SHRUNK, SLOWER)
+    late = (SHRUNK, SLOWER, HELD)
 
     def __init__(
         self, scene: Scene, search: "NeighbourSearch", push_out: float = 0.0, impulse: PairData | None = None,
@@ -178,6 +180,7 @@ class DiscGeometry:
             self.store = self.scene.memory.make_companion()
             self.shrunk = self.store.field(SHRUNK, self.scene.count, state=True)
             self.slower = self.store.field(SLOWER, self.scene.count, state=True)
+            self.held = self.store.field(HELD, self.scene.count, state=True)
             self.store.place()
             self.shrinks = True
 
@@ -205,9 +208,40 @@ class DiscGeometry:
     def restore(self, i, h):
         """Let particle i grow back for a substep h [s], at push_out / 2 or more slowly: both particles of a pair grow."""
         if ti.static(self.shrinks):
-            self.shrunk[i] = ti.max(self.shrunk[i] - (self.push_out - self.slower[i]) * h / 2, 0)
+            if self.shrunk[i] > 0:
+                less = self.held[i]
+                if not self.is_held(i):
+                    less = -(self.push_out - self.slower[i]) * h / 2
+                self.shrunk[i] = ti.max(self.shrunk[i] + less, 0)
             if self.shrunk[i] == 0:
                 self.slower[i] = 0
+
+    @ti.func
+    def is_held(self, i):
+        """Whether particle i must not grow, see excess(); one that cannot move, and is not asked, if any near it must not."""
+        out = self.held[i] != 0
+        if not self.state.w.positive(i):
+            for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
+                out = out or self.held[self.list.neighbour[e]] != 0
+        return out
+
+    @ti.func
+    def excess(self, i, j, n, overlap, h):
+        """Return by how much particle i is to shrink again because it moves faster than push_out relative to j, BARELY or more.
+
+        0 where it is not so fast. Where they part it is the share of i in their overlap, so that j pushes it no more. A particle
+        between two others moves d / y times as fast as their contact distance d grows, where it is y away from the line between
+        them. Without a limit it would be shot out, the faster the shorter the substep.
+        """
+        d, most = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j), self.push_out * h
+        out = 0 * overlap
+        if overlap > 0 and d.dot(d) > most * most:
+            out += ti.static(BARELY)
+            if d.dot(n) > 0:
+                out = overlap
+                if self.state.w.positive(j):
+                    out *= self.radius.of(i) / (self.radius.of(i) + self.radius.of(j))
+        return out
 
     @ti.func
     def is_shrunk(self, i):
