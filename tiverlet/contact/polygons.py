@@ -35,9 +35,9 @@ class Polygons(PairContact):
     body. t is the place of v along the edge, n the outward normal. Gradients: n, -(1 - t) n, -t n.
 
     loops: for each body its particles in order around it, at least 3, either way round. Their radii round the rim. Other
-    constraints (Distance, Area, ShapeMatch) hold a body together; it may bend, and stretch by a quarter. Rigid are ShapeMatch, and
-    as many links as it takes: the sides, and diagonals from one corner. With more links the solver is Jacobi, under which towers
-    sway and may buckle.
+    constraints (Distance, Area, ShapeMatch) hold a body together; it may bend, and stretch by a quarter. Rigid are ShapeMatch,
+    and as many links as it takes: the sides, and diagonals from one corner. With more links the solver is Jacobi, under which
+    towers sway and may buckle.
     friction, restitution: as in Contact. Particles in no loop touch as in Contact. Bodies of rigid links and rigid clusters that
     meet at restitution > 0 leave by the laws of Newton and Coulomb for rigid bodies, see PolygonRestitution. With 0 they leave at
     up to a quarter of their speed, with 1e-9 they stop, see Contact.
