@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 # impulses propagate from link to link. One or two do where a system solves them exactly, and most of MANY have little to do.
 FEW, MANY = 8, 32
 MET = 2.0**-9  # of the first push: a smaller error of the normal displacement counts as met
-FINE = 2.0**-12  # the same where the inverse masses of rigid clusters are known
+FINE = 2.0**-16  # the same where the inverse masses of rigid clusters are known
 CAREFUL = 0.55  # the least secant of a pair. Impacts may change each other: projections converge with steps of less than 1 / 0.5
 FELT = 2.0**-20  # of a squared displacement: a smaller change is no impact
 LINKED, IN_CLUSTER = 1, 2  # what holds a particle: links, or a rigid cluster that shares no particle
@@ -69,7 +69,7 @@ class BodyImpacts:
     any number of struck particles; there is another one if a particle was struck by it or came free, and for e > 0, until what is
     left of second order is small. What the last pass leaves is lost. All impacts of a substep together are Newton's law for a
     rigid body. At e = 1 it neither removes nor adds energy; energy is conserved to O(h) in an impact, since a body turns in a
-    substep. Friction holds the tangential displacement by up to its coefficient times p.
+    substep, and to O(h^2) where the body is a cluster. Friction holds the tangential displacement by up to its coefficient times p.
 
     These passes leave the violations that the regular passes left, and those of springs: removed all at once, they would become
     speed. Contacts wait for the next substep. A particle that approaches by no more than SLOW substeps of forces and links add
@@ -103,6 +103,7 @@ class BodyImpacts:
         self.coefficients = add("impacts.friction", n, width=2)
         self.target, self.pushed, self.first_push = (add(f"impacts.{k}", n) for k in ("target", "pushed", "first_push"))
         self.held = add("impacts.held", n, width=dim)  # by friction
+        self.bend = add("impacts.bend", n)  # of the path of a particle of a cluster along the normal, see ClusterImpact [m]
         self.logs: list[Any] = []  # of walls that report events
         self.log = add("impacts.log", n, kind=ti.i32)  # of the wall, by its number, or -1
         self.reached = add("impacts.stirred", n, kind=ti.i32, state=True)  # whether an impact of the last substep has reached it
@@ -115,11 +116,12 @@ class BodyImpacts:
             self.ready = add("impacts.ready", n, kind=ti.i32)  # whether it had struck nothing when the round of bounces began
             self.change = add("impacts.change", n, width=dim)
             self.last_push, self.last_miss = add("impacts.last_push", n), add("impacts.last_miss", n)
-        if self.clusters:  # of the cluster of each particle, by its first particle: mass, sum m r r^T, and the sum of all parts
+        if self.clusters:  # of each cluster, by its first particle: mass, sum m r r^T, sum of all parts, turn in this substep
             self.body = add("impacts.body", n, kind=ti.i32)
             self.arm = add("impacts.arm", n, width=dim)  # from the center [m]
             self.body_mass, self.body_parts = add("impacts.mass", n), add("impacts.body_parts", n)
             self.body_moment = add("impacts.moment", n, width=dim * dim)
+            self.body_turn = add("impacts.turn", n, width=scene.particles.axes)
 
     def add_log(self, log: Any) -> int:
         """Return the number of a log; -1 for None."""
@@ -252,6 +254,7 @@ class BodyImpacts:
             self.pushed[i], self.first_push[i] = 0 * target, target - leaving
             self.coefficients[i] = [static, dynamic]
             self.held[i] = ti.zero(n)
+            self.bend[i] = 0 * target
             self.log[i] = log
         return out
 
@@ -273,7 +276,7 @@ class BodyImpacts:
         off = False
         if self.in_cluster(i):
             if self.struck[i] == STRUCK_BEFORE and self.by_wall(i):  # it turns in a substep: second order is left
-                miss = self.target[i] - (self.state.d[i] - self.moved[i]).dot(self.normal[i])
+                miss = self.target[i] + self.bend[i] - (self.state.d[i] - self.moved[i]).dot(self.normal[i])
                 off = (miss > 0 or self.pushed[i] > 0) and ti.abs(miss) > ti.static(MET) * self.first_push[i]
         elif self.struck[i] != 0 and self.by_wall(i):
             n, d, last = self.normal[i], self.state.d[i] - self.moved[i], self.pushed[i]
@@ -314,12 +317,18 @@ class BodyImpacts:
             self.struck[i] = STRUCK_BEFORE
 
     @ti.func
-    def missing_push(self, i, has, give):
+    def missing_push(self, i, has, give, bend):
         """Return whether the normal displacement `has` of particle i, which struck another, is off, and the push it needs.
 
-        give: how much a push of 1 on the two particles, were they alone, changes that displacement.
+        give: how much a push of 1 on the two particles, were they alone, changes that displacement. bend: path_bend() of i
+        relative to that of the other.
         """
-        miss = self.target[i] - has
+        if ti.static(self.clusters):
+            if self.struck[i] == STRUCK_NOW:
+                approach = -self.before(i, self.partner[i])
+                if approach > 0:
+                    self.target[i] = self.target[i] * ti.max(1 - bend / approach, 0)
+        miss = self.target[i] + bend - has
         if self.struck[i] == STRUCK_NOW:
             self.first_push[i] = miss
         self.struck[i] = STRUCK_BEFORE
@@ -376,6 +385,16 @@ class BodyImpacts:
         return self.body_parts[b] * (n.dot(m) / self.body_mass[b] + rotation.axial(n.outer_product(r)).dot(turn))
 
     @ti.func
+    def path_bend(self, i, n):
+        """Return how far the path of particle i bends along n in this substep, if it is in a cluster, see ClusterImpact [m]."""
+        out = 0 * self.state.w.of(i)
+        if ti.static(self.clusters):
+            if self.in_cluster(i):
+                B = rotation.skew(self.body_turn[self.body[i]], n.outer_product(n))
+                out = n.dot(B @ (B @ self.arm[i])) / 2
+        return out
+
+    @ti.func
     def by_wall(self, i):
         """Whether particle i struck a wall, not another particle."""
         out = True
@@ -420,14 +439,21 @@ class BodyImpacts:
             both = w + self.state.w.of(j)
             give = (self.inverse_mass(i, n, n) + self.inverse_mass(j, n, n)) / both
             before = self.pushed[i]
+            bend = self.path_bend(i, n) - self.path_bend(j, n)
             off, push = self.missing_push(
-                i, self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n), give
+                i, self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n), give, bend
             )
             if ti.static(self.clusters):
                 if (self.in_cluster(i) or self.in_cluster(j)) and not (off and self.has_next_pass(now)):
                     push, self.pushed[i] = 0 * push, before  # no pass would follow, in which clusters take it up
             self.change[i] = w / both * push * n
         return off, push
+
+    @ti.func
+    def before(self, i, j):
+        """Return the displacement of particle i relative to j along the normal of their impact, before the substep [m]."""
+        before = self.state.before[i] - self.state.before[j]
+        return self.state.relative_displacement(before, i, j).dot(self.normal[i])
 
     @ti.func
     def push_pair(self, i):

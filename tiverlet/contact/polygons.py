@@ -318,6 +318,7 @@ class Polygons(PairContact):
                                     as_bodies = self.dev.restitution.by_bodies(v, a, b)
                                     if as_bodies:
                                         parts += abs(part)
+                                        aim = self.dev.restitution.undisturbed(v, a, b, t, n)
                                     else:
                                         self.dev.hit[None] = 1
                                         lifts += share * (overlap + lift) * n
@@ -408,6 +409,12 @@ class PolygonRestitution:
     def bind(self, scene: Scene, impacts: Any) -> None:
         """Leave impacts of bodies to the extra passes of a BodyImpacts."""
         self.impacts = impacts
+
+    @ti.func
+    def undisturbed(self, v, a, b, t, n):
+        """Return e times the approach before the substep [m]: for bodies, whose turn under_force() would take for a force."""
+        approach = -self.geometry.relative(self.state.before, v, a, b, t).dot(n)
+        return self.table.of(v, a)[2] * ti.max(approach, 0)
 
     @ti.func
     def parts_by_itself(self, at, v, a, b, t, n):
@@ -519,7 +526,15 @@ class PolygonRestitution:
     def correct(self, e, v, a, b, t, n, aim, now):
         """Correct the push of the contact at entry e, of vertex v on the edge from a to b. Returns whether it was off."""
         d, along = self.geometry.relative(self.state.d, v, a, b, t), ti.Vector([-n[1], n[0]])
-        last, lack = self.push.field[e], aim - d.dot(n)
+        last = self.push.field[e]
+        bend = self.impacts.path_bend(v, n) - (1 - t) * self.impacts.path_bend(a, n) - t * self.impacts.path_bend(b, n)
+        if ti.static(self.impacts.clusters):
+            if self.noted.field[e][0] == 0:  # Newton's law holds for tangents, see ClusterImpact
+                approach = -self.geometry.relative(self.state.before, v, a, b, t).dot(n)
+                if approach > 0:
+                    aim = ti.max(aim * (1 - bend / approach), ti.static(AIM))
+                    self.aim.field[e] = aim * n
+        lack = aim + bend - d.dot(n)
         give = self.inverse_mass(v, a, b, t, n, n)
         if ti.static(self.impacts.exact):
             noted = self.noted.field[e]

@@ -163,6 +163,10 @@ class Restitution:
         """Store the displacement along n with which particle i is to leave particle j."""
         self.normal[i] = n
         self.target_of[i] = given + self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n)
+        if ti.static(self.impacts.clusters):
+            if self.impacts.in_cluster(i) or self.impacts.in_cluster(j):  # under_force() would take a turn for a force
+                _given, _here, a = self.target(i, j, n)
+                self.target_of[i] = self.table.of(i, j)[2] * ti.max(a, 0)
 
     @ti.func
     def push_body(self, i, now):

