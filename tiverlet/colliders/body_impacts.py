@@ -69,7 +69,7 @@ class BodyImpacts:
     any number of struck particles; there is another one if a particle was struck by it or came free, and for e > 0, until what is
     left of second order is small. What the last pass leaves is lost. All impacts of a substep together are Newton's law for a
     rigid body. At e = 1 it neither removes nor adds energy; energy is conserved to O(h) in an impact, since a body turns in a
-    substep, and to O(h^2) where the body is a cluster. Friction holds the tangential displacement by up to its coefficient times p.
+    substep, and to O(h^2) if the body is a cluster. Friction holds the tangential displacement by up to its coefficient times p.
 
     These passes leave the violations that the regular passes left, and those of springs: removed all at once, they would become
     speed. Contacts wait for the next substep. A particle that approaches by no more than SLOW substeps of forces and links add

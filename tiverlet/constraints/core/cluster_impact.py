@@ -105,10 +105,11 @@ class ClusterImpact:
     @ti.func
     def turn_so_far(self, c, begin, end, i0, start, S):
         """Return how far cluster c has turned in this substep, and make the targets of new impacts those of tangents."""
-        X = start.outer_product(start) * 0
+        X = 0 * S
         for e in range(begin, end):
             r = self.cluster.relative_position(e, i0, 1) - start
-            X += self.cluster.mass_in_fit(e, c) * self.wide(self.state.d[self.corners.members[e]]).outer_product(r)
+            d = self.wide(self.state.d[self.corners.members[e]])
+            X += self.cluster.mass_in_fit(e, c) * d.outer_product(r)
         turn = rotation.turn_rate(S, rotation.axial(X))
         for e in range(begin, end):
             i = self.corners.members[e]
