@@ -103,13 +103,15 @@ class BodyImpacts:
         self.coefficients = add("impacts.friction", n, width=2)
         self.target, self.pushed, self.first_push = (add(f"impacts.{k}", n) for k in ("target", "pushed", "first_push"))
         self.held = add("impacts.held", n, width=dim)  # by friction
-        self.bend = add("impacts.bend", n)  # of the path of a particle of a cluster along the normal, see ClusterImpact [m]
+        self.bends = any(b.clusters for b in batches)
+        if self.bends:
+            self.bend = add("impacts.bend", n)  # of the path of a particle of a cluster along the normal, see ClusterImpact [m]
         self.logs: list[Any] = []  # of walls that report events
         self.log = add("impacts.log", n, kind=ti.i32)  # of the wall, by its number, or -1
         self.reached = add("impacts.stirred", n, kind=ti.i32, state=True)  # whether an impact of the last substep has reached it
         self.open = add("impacts.open", self.passes + 1, kind=ti.i32)
         self.pairs = pairs
-        self.clusters = pairs and any(b.clusters for b in batches)
+        self.clusters = pairs and any(b.clusters for b in batches)  # whether pushes between particles move clusters
         if pairs:
             self.parts = add("impacts.parts", n)  # of each particle in the impacts on other particles that passes make
             self.partner = add("impacts.partner", n, kind=ti.i32)  # the particle that was struck; -1 for a wall
@@ -254,7 +256,8 @@ class BodyImpacts:
             self.pushed[i], self.first_push[i] = 0 * target, target - leaving
             self.coefficients[i] = [static, dynamic]
             self.held[i] = ti.zero(n)
-            self.bend[i] = 0 * target
+            if ti.static(self.bends):
+                self.bend[i] = 0 * target
             self.log[i] = log
         return out
 
@@ -275,9 +278,10 @@ class BodyImpacts:
         """
         off = False
         if self.in_cluster(i):
-            if self.struck[i] == STRUCK_BEFORE and self.by_wall(i):  # it turns in a substep: second order is left
-                miss = self.target[i] + self.bend[i] - (self.state.d[i] - self.moved[i]).dot(self.normal[i])
-                off = (miss > 0 or self.pushed[i] > 0) and ti.abs(miss) > ti.static(MET) * self.first_push[i]
+            if ti.static(self.bends):
+                if self.struck[i] == STRUCK_BEFORE and self.by_wall(i):  # it turns in a substep: second order is left
+                    miss = self.target[i] + self.bend[i] - (self.state.d[i] - self.moved[i]).dot(self.normal[i])
+                    off = (miss > 0 or self.pushed[i] > 0) and ti.abs(miss) > ti.static(MET) * self.first_push[i]
         elif self.struck[i] != 0 and self.by_wall(i):
             n, d, last = self.normal[i], self.state.d[i] - self.moved[i], self.pushed[i]
             miss = self.target[i] - d.dot(n)

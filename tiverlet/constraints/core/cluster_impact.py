@@ -107,9 +107,9 @@ class ClusterImpact:
         """Return how far cluster c has turned in this substep, and make the targets of new impacts those of tangents."""
         X = 0 * S
         for e in range(begin, end):
-            r = self.cluster.relative_position(e, i0, 1) - start
-            d = self.wide(self.state.d[self.corners.members[e]])
-            X += self.cluster.mass_in_fit(e, c) * d.outer_product(r)
+            s = self.cluster.relative_position(e, i0, 1)
+            d = self.cluster.relative_position(e, i0, 0) - s
+            X += self.cluster.mass_in_fit(e, c) * d.outer_product(s - start)
         turn = rotation.turn_rate(S, rotation.axial(X))
         for e in range(begin, end):
             i = self.corners.members[e]
