@@ -19,7 +19,7 @@ from tiverlet.device.patches import patched, source_cache, timing
 from tiverlet.device.patches.compiler import BRIEF, LEAN, UNSEARCHED
 from tiverlet.step import build
 
-from .conftest import ARCH, python
+from .conftest import ARCH, compiled, python
 
 PILE = """
 import numpy as np
@@ -335,3 +335,15 @@ def test_functions_that_kernels_call_change_no_bit(monkeypatch, scene, precision
     assert reports == others and digest == other and reports[0].energy != reports[-1].energy
     assert scene is not squares or sum(r.contacts for r in reports) > 5
     assert calls == (patched and ARCH == "cpu") and not copies
+
+
+def test_no_frame_of_a_game_waits_for_what_a_repeated_frame_needs(world):
+    # A soft ring on a floor: under "auto", frame 34 is repeated with shorter substeps, and walls stop what links move meanwhile.
+    ring = tv.shapes.polygon((0, 1.0), 0.35, 24)
+    features = [tv.Gravity(), tv.Distance(ring.links, compliance=1e-4, damping=0.1), tv.Area(ring.loops, compliance=1e-3)]
+    floor = tv.Polygon([(-1, 0), (30, 0), (30, -1), (-1, -1)], friction=0.5)
+    w = world(tv.Particles(ring.position, mass=0.05, radius=0.04), [*features, floor], substeps="auto")
+    w.step(1 / 60)
+    with compiled() as names:
+        tries = max(w.step(1 / 60).tries for _ in range(60))
+    assert tries > 1 and set(names) <= {"to_velocity"}

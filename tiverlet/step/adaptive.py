@@ -104,11 +104,13 @@ class StepController:
         """Run one frame, and repeat it until it is good, nothing helps, or the limit of substeps or the budget is reached."""
         tolerance = None if tolerance is None else checks.number("World.step", "tolerance", tolerance, above=0.0)
         budget = None if budget is None else checks.number("World.step", "budget", budget, above=0.0)
-        end = float("inf") if budget is None else perf_counter() + budget
+        end, first = float("inf") if budget is None else perf_counter() + budget, not self.dt
         self.prepare(world.iterations, dt, tolerance, budget)
         before, flags = world._undo  # type: ignore[misc]  # before the upload of knobs; without an upload, the present state
         kept = checkpoint.keep(world) if any(map(any, flags)) else replace(before, controller=self.memory)
         world._runner.begin(dt, self.substeps, world.iterations)
+        if first:
+            world._runner.compile_for_repeats()
         tries = Tries(self.substeps, self.iterations, self.stuck, world._clock.energy)
         energy = energy_bound.before(world)
         while True:

@@ -412,6 +412,12 @@ class Runner:
             self.left = np.zeros((self.n, left.shape[1]), dtype=left.dtype)
             self.left[: np.count_nonzero(some)] = left[some]
 
+    def compile_for_repeats(self) -> None:
+        """Compile what frames may need that are repeated with other substeps, so that no frame of a game waits for it later."""
+        if self.linked and not self.probe:
+            with self.memory.compiler():
+                self.stop_at_walls(self.scene.state.get(self.memory))
+
     def stop_at_walls(self, before: np.ndarray) -> None:
         """Stop particles at walls that the host has moved from `before`, (n, dim); with memory.compiler()."""
         if self.step.walls:
