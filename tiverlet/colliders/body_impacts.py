@@ -383,9 +383,7 @@ class BodyImpacts:
     @ti.func
     def cluster_inverse_mass(self, b, r, n, m):
         """Return inverse_mass() at r from the center of the cluster whose first particle is b."""
-        dim = ti.static(self.state.dim)
-        S = ti.Matrix([[self.body_moment[b][dim * j + k] for k in ti.static(range(dim))] for j in ti.static(range(dim))])
-        turn = rotation.turn_rate(S, rotation.axial(m.outer_product(r)))
+        turn = rotation.turn_rate(rotation.from_rows(self.body_moment[b]), rotation.axial(m.outer_product(r)))
         return self.body_parts[b] * (n.dot(m) / self.body_mass[b] + rotation.axial(n.outer_product(r)).dot(turn))
 
     @ti.func
@@ -394,8 +392,7 @@ class BodyImpacts:
         out = 0 * self.state.w.of(i)
         if ti.static(self.clusters):
             if self.in_cluster(i):
-                B = rotation.skew(self.body_turn[self.body[i]], n.outer_product(n))
-                out = n.dot(B @ (B @ self.arm[i])) / 2
+                out = rotation.bend(self.body_turn[self.body[i]], self.arm[i], n)
         return out
 
     @ti.func

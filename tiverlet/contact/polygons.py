@@ -411,10 +411,14 @@ class PolygonRestitution:
         self.impacts = impacts
 
     @ti.func
+    def approach(self, v, a, b, t, n):
+        """Return how far vertex v and the edge from a to b came together in the last substep [m]."""
+        return -self.geometry.relative(self.state.before, v, a, b, t).dot(n)
+
+    @ti.func
     def undisturbed(self, v, a, b, t, n):
         """Return e times the approach before the substep [m]: for bodies, whose turn under_force() would take for a force."""
-        approach = -self.geometry.relative(self.state.before, v, a, b, t).dot(n)
-        return self.table.of(v, a)[2] * ti.max(approach, 0)
+        return self.table.of(v, a)[2] * ti.max(self.approach(v, a, b, t, n), 0)
 
     @ti.func
     def parts_by_itself(self, at, v, a, b, t, n):
@@ -422,8 +426,7 @@ class PolygonRestitution:
 
         It was left so by an impact, or found late, when corners passed each other. A push would be an impact of its own.
         """
-        before = self.geometry.relative(self.state.before, v, a, b, t)
-        return self.table.of(v, a)[2] >= 1 and before.dot(n) >= 0 and self.last.field[at] == 0
+        return self.table.of(v, a)[2] >= 1 and self.approach(v, a, b, t, n) <= 0 and self.last.field[at] == 0
 
     @ti.func
     def by_bodies(self, v, a, b):
@@ -455,8 +458,7 @@ class PolygonRestitution:
         1, it also rests where SLOW substeps of forces gave it its speed. Otherwise heaps would hop on: each corner returns what
         the bounce of another one took.
         """
-        before = self.state.before[v] - (1 - t) * self.state.before[a] - t * self.state.before[b]
-        approach, restitution = -before.dot(n), self.table.of(v, a)[2]
+        approach, restitution = self.approach(v, a, b, t, n), self.table.of(v, a)[2]
         aim, missing, lift = restitution * ti.max(approach, 0), 0 * overlap, 0 * overlap
         held = self.last.field[at] * self.geometry.inverse_mass(v, a, b, t)
         fast = approach > ti.static(SLOW) * (-leaving - approach)
@@ -526,25 +528,24 @@ class PolygonRestitution:
     def correct(self, e, v, a, b, t, n, aim, now):
         """Correct the push of the contact at entry e, of vertex v on the edge from a to b. Returns whether it was off."""
         d, along = self.geometry.relative(self.state.d, v, a, b, t), ti.Vector([-n[1], n[0]])
-        last = self.push.field[e]
+        last, noted = self.push.field[e], self.noted.field[e]
         bend = self.impacts.path_bend(v, n) - (1 - t) * self.impacts.path_bend(a, n) - t * self.impacts.path_bend(b, n)
         if ti.static(self.impacts.clusters):
-            if self.noted.field[e][0] == 0:  # Newton's law holds for tangents, see ClusterImpact
-                approach = -self.geometry.relative(self.state.before, v, a, b, t).dot(n)
+            if noted[0] == 0:  # Newton's law holds for tangents, see ClusterImpact
+                approach = self.approach(v, a, b, t, n)
                 if approach > 0:
                     aim = ti.max(aim * (1 - bend / approach), ti.static(AIM))
                     self.aim.field[e] = aim * n
         lack = aim + bend - d.dot(n)
         give = self.inverse_mass(v, a, b, t, n, n)
         if ti.static(self.impacts.exact):
-            noted = self.noted.field[e]
             if noted[1] != 0 and not (self.impacts.in_cluster(v) and self.impacts.in_cluster(a) and self.impacts.in_cluster(b)):
                 give *= self.impacts.part_left(noted[2] - lack, noted[1])
         push = ti.Vector([ti.max(last[0] + lack / give, 0), 0 * lack])
         if ti.static(self.table.has_friction):
             push = self.rub(last, push[0], lack, d.dot(along), give, v, a, b, t, n, along)
         step = push - last
-        first = ti.select(last[0] == 0 and self.noted.field[e][0] == 0, step[0], self.noted.field[e][0])
+        first = ti.select(noted[0] == 0, step[0], noted[0])
         off = ti.max(abs(step[0]), abs(step[1])) > ti.static(FINE) * first
         if not (off and self.impacts.has_next_pass(now)):
             step *= 0  # no pass would follow, in which constraints take it up

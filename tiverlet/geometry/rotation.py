@@ -107,6 +107,20 @@ def skew(x, like):
 
 
 @ti.func
+def from_rows(v):
+    """Return the square matrix whose rows stand one behind another in a vector."""
+    dim = ti.static(2 if v.n == 4 else 3)
+    return ti.Matrix([[v[dim * j + k] for k in ti.static(range(dim))] for j in ti.static(range(dim))])
+
+
+@ti.func
+def bend(turn, r, n):
+    """Return n.(T x (T x r)) / 2: how far the path of a point at r of a body that turns by T bends along n."""
+    B = skew(turn, n.outer_product(n))
+    return n.dot(B @ (B @ r)) / 2
+
+
+@ti.func
 def cayley(x, like):
     """Return the matrix of the rotation about x by 2 arctan(|x| / 2), which is |x| to second order."""
     out = 0 * like

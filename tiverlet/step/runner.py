@@ -346,7 +346,8 @@ class Runner:
     def forget_loads(self, position: np.ndarray) -> None:
         """Before positions are set: forget the known loads of constraints and contacts that the new positions change."""
         initial_violation.forget(self.scene, self.batches, position)
-        self._forget_springs(self.scene.state.get(self.memory), position)
+        if self.springs:
+            self._forget_springs(self.scene.state.get(self.memory), position)
         for known in self.known:
             known.forget(self.scene, position)
 

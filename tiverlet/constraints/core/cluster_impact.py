@@ -71,6 +71,7 @@ class ClusterImpact:
         V = 0 * center
         W, off = 0 * rotation.axial(S), True
         turn = self.turn_so_far(c, begin, end, i0, start, S)
+        self.aim_along_tangents(begin, end, i0, start, turn)
         if ti.static(self.impacts.clusters):
             V, W = self.take_up_pushes(c, begin, end, i0, start, M, S)
         for _ in range(SWEEPS):
@@ -94,7 +95,7 @@ class ClusterImpact:
             self.count_push(e, 1)
             if self.is_struck(i):
                 s = self.cluster.relative_position(e, i0, 1) - start
-                self.impacts.bend[i] = ti.cast(self.bend(turn + W, s, self.wide(self.impacts.normal[i]), S), self.real)
+                self.impacts.bend[i] = ti.cast(rotation.bend(turn + W, s, self.wide(self.impacts.normal[i])), self.real)
             if ti.static(self.impacts.clusters):
                 self.cluster.pull[e] = self.cluster.pull[e] - self.impacts.change[i]
                 self.impacts.change[i] = 0 * self.impacts.change[i]
@@ -104,28 +105,25 @@ class ClusterImpact:
 
     @ti.func
     def turn_so_far(self, c, begin, end, i0, start, S):
-        """Return how far cluster c has turned in this substep, and make the targets of new impacts those of tangents."""
+        """Return how far cluster c has turned in this substep."""
         X = 0 * S
         for e in range(begin, end):
             s = self.cluster.relative_position(e, i0, 1)
             d = self.cluster.relative_position(e, i0, 0) - s
             X += self.cluster.mass_in_fit(e, c) * d.outer_product(s - start)
-        turn = rotation.turn_rate(S, rotation.axial(X))
+        return rotation.turn_rate(S, rotation.axial(X))
+
+    @ti.func
+    def aim_along_tangents(self, begin, end, i0, start, turn):
+        """Make the targets of particles that strike walls in this pass those of tangents, where the body turns by `turn`."""
         for e in range(begin, end):
             i = self.corners.members[e]
             if self.is_struck(i) and self.impacts.is_struck_now(i):
                 target, r = self.wide(self.impacts.target[i]), self.cluster.relative_position(e, i0, 1) - start
-                b = self.bend(turn, r, self.wide(self.impacts.normal[i]), S)
+                b = rotation.bend(turn, r, self.wide(self.impacts.normal[i]))
                 before = target - self.wide(self.impacts.first_push[i]) - 2 * b  # d.n before the substep, -target / e
                 if target > 0 and before < 0:
                     self.impacts.target[i] = ti.cast(target * ti.max(1 + b / before, 0), self.real)
-        return turn
-
-    @ti.func
-    def bend(self, turn, r, n, S):
-        """Return how far the path of a particle at r bends along n, where the body turns by `turn`."""
-        B = rotation.skew(turn, S)
-        return n.dot(B @ (B @ r)) / 2
 
     @ti.func
     def take_up_pushes(self, c, begin, end, i0, start, M, S):
@@ -152,7 +150,7 @@ class ClusterImpact:
         n, p = self.wide(self.impacts.normal[i]), self.impacts.pushed[i]
         B = rotation.skew(W, S)
         d = self.wide(self.state.d[i] - self.impacts.moved[i]) + V + B @ (r + B @ r / 2)
-        miss = self.wide(self.impacts.target[i]) + self.bend(turn + W, s, n, S) - d.dot(n)
+        miss = self.wide(self.impacts.target[i]) + rotation.bend(turn + W, s, n) - d.dot(n)
         self.impacts.pushed[i] = ti.max(p + ti.cast(miss / (m * self.give(s, n, M, S)), self.real), 0)
         push = self.wide(self.impacts.pushed[i] - p) * n
         across = d - d.dot(n) * n

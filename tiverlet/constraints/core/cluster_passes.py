@@ -183,8 +183,7 @@ class ClusterPasses(Passes):
     @ti.func
     def read_matrix(self, field: ti.template(), c):
         """Read a matrix."""
-        dim = ti.static(self.state.dim)
-        return ti.Matrix([[field[c][dim * j + k] for k in ti.static(range(dim))] for j in ti.static(range(dim))])
+        return rotation.from_rows(field[c])
 
     @ti.func
     def is_firm(self, c, h):

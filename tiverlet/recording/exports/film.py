@@ -79,8 +79,8 @@ def _stretch(
     stretch: Stretch, shape: Shape | None, wanted: list[int], image: Any, draw: Any, view: View, ends: tuple
 ) -> Iterator[Any]:
     """Yield the pictures of one stretch, with walls at their places in each frame."""
-    sketch = Sketch(image, draw, stretch.parts, stretch.geometry(shape), view, ends)
     geometries = dict(zip(stretch.frames.tolist(), stretch.geometries(shape), strict=True))
+    sketch = Sketch(image, draw, stretch.parts, next(iter(geometries.values())), view, ends)
     features = dict(zip(stretch.parts.numbers, stretch.parts.features, strict=True))
     changes = list(stretch.knob_changes)
     for frame in wanted:
