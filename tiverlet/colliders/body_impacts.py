@@ -78,11 +78,9 @@ class BodyImpacts:
     A rigid cluster that shares none of its particles moves as a rigid body in these passes, see ClusterImpact.
 
     Two particles that strike each other, at least one of them linked, obey the same law with the displacement of one relative to
-    the other, along their normal; each takes its share of the push by mass. Both sides compute the same push before either
-    moves. Constraints do not take it into account, so where they are solved exactly, the push is divided by the part s of the
-    last push that they left, the secant s = (miss_last - miss) / push_last with miss = t - d.n. How rigid clusters answer is
-    known, see inverse_mass(). A disc has one impact of this kind in a substep, on a wall or on another disc; in others it bounces
-    alone, or waits for the next substep if it is in a cluster. Vertices and edges have any number, see PolygonRestitution.
+    the other: BodyRestitution for discs, PolygonRestitution for vertices and edges. Both sides compute the same push before either
+    moves. A particle has any number of these impacts, but one on a wall. Constraints do not take these pushes into account. How
+    rigid clusters answer is known, see response().
 
     open: for each pass beyond the regular ones of every substep, whether it is needed. pairs: whether particles strike each
     other.
@@ -114,10 +112,7 @@ class BodyImpacts:
         self.clusters = pairs and any(b.clusters for b in batches)  # whether pushes between particles move clusters
         if pairs:
             self.parts = add("impacts.parts", n)  # of each particle in the impacts on other particles that passes make
-            self.partner = add("impacts.partner", n, kind=ti.i32)  # the particle that was struck; -1 for a wall
-            self.ready = add("impacts.ready", n, kind=ti.i32)  # whether it had struck nothing when the round of bounces began
             self.change = add("impacts.change", n, width=dim)
-            self.last_push, self.last_miss = add("impacts.last_push", n), add("impacts.last_miss", n)
         if self.clusters:  # of each cluster, by its first particle: mass, sum m r r^T, sum of all parts, turn in this substep
             self.body = add("impacts.body", n, kind=ti.i32)
             self.arm = add("impacts.arm", n, width=dim)  # from the center [m]
@@ -222,7 +217,7 @@ class BodyImpacts:
     @ti.func
     def is_held(self, i):
         """Whether a wall holds the normal displacement of particle i, whatever constraints do."""
-        return self.struck[i] == STRUCK_BEFORE and self.by_wall(i) and self.pushed[i] > 0
+        return self.struck[i] == STRUCK_BEFORE and self.pushed[i] > 0
 
     @ti.func
     def held_part(self, i, g):
@@ -250,8 +245,6 @@ class BodyImpacts:
         out = self.struck[i] == 0 and self.open[ti.static(self.passes - 1)] == 0
         if out:
             self.struck[i] = STRUCK_NOW
-            if ti.static(self.pairs):
-                self.partner[i] = -1
             self.normal[i], self.moved[i], self.target[i] = n, moved, target
             self.pushed[i], self.first_push[i] = 0 * target, target - leaving
             self.coefficients[i] = [static, dynamic]
@@ -267,7 +260,7 @@ class BodyImpacts:
 
         Otherwise each of the two walls would amplify the push of the other.
         """
-        if self.struck[i] == STRUCK_BEFORE and self.by_wall(i) and n.dot(self.normal[i]) < 0:
+        if self.struck[i] == STRUCK_BEFORE and n.dot(self.normal[i]) < 0:
             self.target[i] = ti.min(self.target[i], 0)
 
     @ti.func
@@ -279,10 +272,10 @@ class BodyImpacts:
         off = False
         if self.in_cluster(i):
             if ti.static(self.bends):
-                if self.struck[i] == STRUCK_BEFORE and self.by_wall(i):  # it turns in a substep: second order is left
+                if self.struck[i] == STRUCK_BEFORE:  # it turns in a substep: second order is left
                     miss = self.target[i] + self.bend[i] - (self.state.d[i] - self.moved[i]).dot(self.normal[i])
                     off = (miss > 0 or self.pushed[i] > 0) and ti.abs(miss) > ti.static(MET) * self.first_push[i]
-        elif self.struck[i] != 0 and self.by_wall(i):
+        elif self.struck[i] != 0:
             n, d, last = self.normal[i], self.state.d[i] - self.moved[i], self.pushed[i]
             miss = self.target[i] - d.dot(n)
             pushed, change = ti.max(last + miss, 0), ti.max(miss, -last) * n
@@ -317,37 +310,8 @@ class BodyImpacts:
     def mark_struck_in_cluster(self, i):
         """Mark particle i of a cluster that an impact has moved."""
         self.reached[i] = 1
-        if self.struck[i] == STRUCK_NOW and self.by_wall(i):
-            self.struck[i] = STRUCK_BEFORE
-
-    @ti.func
-    def missing_push(self, i, has, give, bend):
-        """Return whether the normal displacement `has` of particle i, which struck another, is off, and the push it needs.
-
-        give: how much a push of 1 on the two particles, were they alone, changes that displacement. bend: path_bend() of i
-        relative to that of the other.
-        """
-        if ti.static(self.clusters):
-            if self.struck[i] == STRUCK_NOW:
-                approach = -self.before(i, self.partner[i])
-                if approach > 0:
-                    self.target[i] = self.target[i] * ti.max(1 - bend / approach, 0)
-        miss = self.target[i] + bend - has
         if self.struck[i] == STRUCK_NOW:
-            self.first_push[i] = miss
-        self.struck[i] = STRUCK_BEFORE
-        part = give
-        if ti.static(self.exact):
-            if self.last_push[i] != 0:
-                part *= self.part_left(self.last_miss[i] - miss, give * self.last_push[i])
-        pushed = ti.max(self.pushed[i] + miss / part, 0)
-        push = pushed - self.pushed[i]
-        self.last_push[i], self.last_miss[i], self.pushed[i] = push, miss, pushed
-        met = ti.static(MET) + 0 * miss
-        if ti.static(self.clusters):
-            if self.in_cluster(i) and self.in_cluster(self.partner[i]):
-                met = ti.static(FINE) + 0 * miss
-        return ti.abs(miss) > met * self.first_push[i], push
+            self.struck[i] = STRUCK_BEFORE
 
     @ti.func
     def part_left(self, change, pushed):
@@ -369,22 +333,28 @@ class BodyImpacts:
 
     @ti.func
     def inverse_mass(self, i, n, m):
-        """Return how much an impulse of 1 along m on particle i changes its velocity along n, as if it struck p times as often.
+        """Return how much an impulse of 1 along m on particle i changes its velocity along n, see response()."""
+        return n.dot(self.response(i, m))
 
-        That is p w n.m, or for a particle of a cluster p (n.m / M + (r x n) . I^-1 (r x m)). p is the sum of the parts of the
-        particle, or of all particles of the cluster, in impacts. By Cauchy's inequality no eigenvalue of a pass exceeds 1 then.
+    @ti.func
+    def response(self, i, m):
+        """Return how much an impulse of 1 along m on particle i changes its velocity, as if it struck p times as often.
+
+        That is p w m, or for a particle of a cluster p (m / M + (I^-1 (r x m)) x r). p is the sum of the parts of the particle,
+        or of all particles of the cluster, in impacts. By Cauchy's inequality no eigenvalue of a pass exceeds 1 then.
         """
-        out = self.parts[i] * self.state.w.of(i) * n.dot(m)
+        out = self.parts[i] * self.state.w.of(i) * m
         if ti.static(self.clusters):
             if self.in_cluster(i):
-                out = self.cluster_inverse_mass(self.body[i], self.arm[i], n, m)
+                out = self.cluster_response(self.body[i], self.arm[i], m)
         return out
 
     @ti.func
-    def cluster_inverse_mass(self, b, r, n, m):
-        """Return inverse_mass() at r from the center of the cluster whose first particle is b."""
-        turn = rotation.turn_rate(rotation.from_rows(self.body_moment[b]), rotation.axial(m.outer_product(r)))
-        return self.body_parts[b] * (n.dot(m) / self.body_mass[b] + rotation.axial(n.outer_product(r)).dot(turn))
+    def cluster_response(self, b, r, m):
+        """Return response() at r from the center of the cluster whose first particle is b."""
+        S = rotation.from_rows(self.body_moment[b])
+        turn = rotation.turn_rate(S, rotation.axial(m.outer_product(r)))
+        return self.body_parts[b] * (m / self.body_mass[b] + rotation.skew(turn, S) @ r)
 
     @ti.func
     def path_bend(self, i, n):
@@ -394,72 +364,3 @@ class BodyImpacts:
             if self.in_cluster(i):
                 out = rotation.bend(self.body_turn[self.body[i]], self.arm[i], n)
         return out
-
-    @ti.func
-    def by_wall(self, i):
-        """Whether particle i struck a wall, not another particle."""
-        out = True
-        if ti.static(self.pairs):
-            out = self.partner[i] < 0
-        return out
-
-    @ti.func
-    def begin_round(self, i):
-        """At the start of a round of bounces of pairs: note whether particle i has struck nothing before."""
-        self.ready[i] = ti.cast(self.struck[i] == 0, ti.i32)
-
-    @ti.func
-    def has_struck(self, i, j):
-        """Whether particle i has struck particle j in this substep, so that extra passes push them."""
-        return self.struck[i] != 0 and self.partner[i] == j
-
-    @ti.func
-    def record_pair_impact(self, i, j, n, target):
-        """Record that particle i is to leave particle j with the relative displacement `target` along n, from j to i.
-
-        It is called for both particles in the same round. Returns whether a later pass does that, as record_impact() does.
-        """
-        out = (self.is_linked(i) or self.is_linked(j)) and self.ready[i] != 0 and self.ready[j] != 0
-        if out and self.state.w.positive(i):
-            self.struck[i] = STRUCK_NOW
-            self.parts[i] = 1
-            self.partner[i] = j
-            self.normal[i], self.target[i] = n, target
-            self.pushed[i] = self.last_push[i] = 0 * target
-        return out
-
-    @ti.func
-    def compute_pair_push(self, i, now):
-        """Compute the push of particle i, if it struck another. No particle moves before push_pair().
-
-        Returns whether its relative displacement was off, and the relative push.
-        """
-        off, push = False, 0 * self.target[i]
-        if self.struck[i] != 0 and not self.by_wall(i):
-            j, n, w = self.partner[i], self.normal[i], self.state.w.of(i)
-            both = w + self.state.w.of(j)
-            give = (self.inverse_mass(i, n, n) + self.inverse_mass(j, n, n)) / both
-            before = self.pushed[i]
-            bend = self.path_bend(i, n) - self.path_bend(j, n)
-            off, push = self.missing_push(
-                i, self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n), give, bend
-            )
-            if ti.static(self.clusters):
-                if (self.in_cluster(i) or self.in_cluster(j)) and not (off and self.has_next_pass(now)):
-                    push, self.pushed[i] = 0 * push, before  # no pass would follow, in which clusters take it up
-            self.change[i] = w / both * push * n
-        return off, push
-
-    @ti.func
-    def before(self, i, j):
-        """Return the displacement of particle i relative to j along the normal of their impact, before the substep [m]."""
-        before = self.state.before[i] - self.state.before[j]
-        return self.state.relative_displacement(before, i, j).dot(self.normal[i])
-
-    @ti.func
-    def push_pair(self, i):
-        """Push particle i by what compute_pair_push() found."""
-        if self.struck[i] != 0 and not self.by_wall(i):
-            if not self.in_cluster(i):  # clusters do that in the next pass
-                self.state.shift(i, self.change[i])
-            self.reached[i] = 1

@@ -16,6 +16,7 @@ from ..geometry.ordered import median
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
+from .body_restitution import BodyRestitution
 from .events import EventLog
 from .exclusions import excluded_pairs
 from .force_share import ForceShare
@@ -23,13 +24,12 @@ from .known_loads import KnownLoads
 from .mass_splitting import MassSplitting, lesser
 from .narrow_phase import DiscGeometry
 from .pair_contact import PairContact
-from .restitution import Restitution
+from .restitution import UPTAKE, Restitution
 from .spinning import Spinning
 from .velocity_projection import VelocityProjection
 
 RELAXATION = 1.25  # below 4/3, see Contact
 CARRY = 0.4  # largest share of its last push that a pair keeps; below 1/2
-UPTAKE = 1 / 8  # share of the slack of a pair that a substep removes
 
 
 class Contact(PairContact):
@@ -87,7 +87,7 @@ class Contact(PairContact):
     four tenths of their speed, at any number of substeps: constraints find later that a particle was stopped. 1e-9 stops them,
     for the time and the compilation that restitution takes.
 
-    Several impacts of one particle in a substep are resolved one after the other. A round takes the struck pairs that come first
+    Several impacts of one disc in a substep are resolved one after the other. A round takes the struck pairs that come first
     for both of their particles; the next round takes the next pairs, on the new paths. Each impact is between two particles, so
     it conserves momentum, and energy if e = 1, however many impacts there are.
 
@@ -95,7 +95,8 @@ class Contact(PairContact):
     no spring was there when the pair was thrown together. It is removed from positions only, an eighth per substep. Other overlap
     of pairs that bounce is pushed out: overlap that arose while pushes acted, or in the substep in which the pair comes to rest.
     A pair with slack rests unless it comes together by more than the slack in a substep, or e is 1; otherwise it bounces again,
-    or separates freely. Unless e is 1, a pair also rests if it comes together no faster than two substeps of forces make it.
+    or separates freely. Unless e is 1, a pair also rests if it comes together no faster than two substeps of forces make it. A
+    pair of bodies rests if e times its approach would not end its overlap, and its slack is pushed out, see kept_slack().
     """
 
     def __init__(
@@ -151,7 +152,6 @@ class Contact(PairContact):
         """Declare the fields and the neighbour search, and return the search."""
         dim, dev = scene.particles.dim, self.dev
         linked = excluded_pairs(batches, scene.particles.radius)
-        self.enter(scene)
         dev.move = scene.memory.field("Contact.move", scene.count, width=dim)
         self.table.bind(scene)
         # The push of the pair in the last substep, per inverse mass [kg m].
@@ -167,12 +167,14 @@ class Contact(PairContact):
         dev.known = KnownLoads(scene) if dev.has_loads else None
         loads = dev.known.pair_data if dev.known else []
         struck, bouncing = PairData("struck", 0, persistent=False), [dev.slack] if dev.has_restitution else []
+        bodies = BodyRestitution(scene, self.table) if scene.impacts and scene.impacts.pairs else None
         pair_data = [
             dev.push,
             *loads,
             *([dev.slip] if dev.has_friction else []),
             *([dev.turn] if dev.turn else []),
             *([*bouncing, struck, dev.impulse] if dev.has_restitution else []),
+            *(bodies.pair_data if bodies else []),
         ]
         dev.events = EventLog(scene, self.table) if dev.has_events else None
         if dev.events:
@@ -194,7 +196,7 @@ class Contact(PairContact):
         dev.restitution = None
         if dev.has_restitution:
             noted = dev.events if dev.reports else None
-            dev.restitution = Restitution(scene, dev.geometry, self.table, struck, dev.slack, dev.impulse, noted)
+            dev.restitution = Restitution(scene, dev.geometry, self.table, struck, dev.slack, dev.impulse, noted, bodies)
             dev.hit = dev.restitution.hit
         if dev.spins:
             dev.spinning = Spinning(scene, self.table, dev.splitting.weight, dev.turn)
@@ -220,7 +222,7 @@ class Contact(PairContact):
     @property
     def strikes_bodies(self) -> bool:
         """Whether bodies of linked particles bounce as wholes: with restitution, unless friction turns particles."""
-        return self.dev.has_restitution and not self.dev.spins
+        return self.dev.has_restitution and not (self.scene.state.spins and self.dev.has_friction)
 
     @ti.func
     def is_pressed(self, i, e):
@@ -276,7 +278,7 @@ class Contact(PairContact):
         if ti.static(not self.dev.has_restitution):
             carries = ti.cast(ti.select(first != 0 and (fresh == 0 or now.span.since > 0), 1, 0), self.scene.real)
         own, least = self.dev.splitting.weight[i], ti.cast(1, self.scene.real)  # least: the smallest push of i
-        held = ti.cast(0, self.scene.real)
+        held, parts = ti.cast(0, self.scene.real), ti.cast(0, self.scene.real)
         if own > 0:
             for word in range(self.dev.list.word_count(i)):
                 bits = self.dev.splitting.touching(i, word)
@@ -309,9 +311,13 @@ class Contact(PairContact):
                         given, slack, rests = self.dev.restitution.bounce(i, j, n, held, self.dev.slack.field[e], last, first)
                         slack = ti.min(slack, ti.max(overlap, 0))
                         if first != 0:
-                            back = ti.static(UPTAKE) * ti.min(slack * each, slack / alone)
-                            lift += w * back * n
-                            self.dev.slack.field[e] = slack - alone * back
+                            if self.dev.restitution.joins_bodies(i, j):
+                                slack = self.dev.restitution.kept_slack(i, j, slack, now.h)
+                                self.dev.slack.field[e] = slack
+                            else:
+                                back = ti.static(UPTAKE) * ti.min(slack * each, slack / alone)
+                                lift += w * back * n
+                                self.dev.slack.field[e] = slack - alone * back
                         paid -= slack
                     part = paid * each + keeps * (carries * (last - push))
                     if ti.static(self.dev.has_loads):
@@ -322,7 +328,11 @@ class Contact(PairContact):
                     if ti.static(self.dev.has_restitution):
                         if given > 0:
                             self.dev.restitution.struck.field[e] = 1
-                            if self.dev.hit[None] == 0:
+                            if self.dev.restitution.joins_bodies(i, j):
+                                if ti.static(bool(self.dev.restitution.bodies)):
+                                    self.dev.restitution.bodies.begin(i, j, e, n)
+                                given, parts = ti.zero(given), parts + 1
+                            elif self.dev.hit[None] == 0:
                                 self.dev.hit[None] = 1
                         if not rests:
                             part = ti.zero(part)
@@ -380,6 +390,9 @@ class Contact(PairContact):
                 self.dev.forces.add(i, forced, first)
         if ti.static(self.dev.has_restitution):
             self.dev.restitution.lift[i] = lift
+            if ti.static(bool(self.dev.restitution.bodies)):
+                if first != 0:
+                    self.dev.restitution.bodies.take_part(i, parts)
 
     @ti.func
     def held(self, i, j, n, normal, slip):

@@ -181,11 +181,11 @@ class PairContact(Feature):
         return self.dev.geometry.late
 
     def make_search(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
-        """Declare the fields and the neighbour search, and return the search."""
+        """Declare the fields and the neighbour search, and return the search. enter() comes before."""
         raise NotImplementedError
 
     def enter(self, scene: Scene) -> None:
-        """Store the scene, and fix what kernels contain. Called before fields are declared."""
+        """Store the scene, and fix what kernels contain. Called before fields are declared, and before the impacts of bodies."""
         dev = self.dev
         self.scene, dev.state, dev.w = scene, scene.state, scene.state.w
         dev.has_friction, dev.has_restitution, dev.turns = self.has_friction, self.has_restitution, self.turns

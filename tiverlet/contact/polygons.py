@@ -182,7 +182,6 @@ class Polygons(PairContact):
     def make_search(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields and the neighbour search, and return the search."""
         n, add, dev = scene.count, scene.memory.field, self.dev
-        self.enter(scene)
         dev.forces = ForceShare(scene, sums=True, lasting=False)
         dev.geometry = PolygonGeometry(scene, dev.outline, self.push_out)
         dev.move = add("Contact.move", n, width=2)
@@ -404,11 +403,7 @@ class PolygonRestitution:
             for name, width in (("body_push", 2), ("body_step", 2), ("body_noted", 3))
         )
         self.pair_data = [self.aim, self.last, self.push, self.step, self.noted]
-        self.impacts: Any = None  # a BodyImpacts, where bodies bounce as wholes
-
-    def bind(self, scene: Scene, impacts: Any) -> None:
-        """Leave impacts of bodies to the extra passes of a BodyImpacts."""
-        self.impacts = impacts
+        self.impacts: Any = scene.impacts  # a BodyImpacts, where bodies bounce as wholes, or None
 
     @ti.func
     def approach(self, v, a, b, t, n):
@@ -507,7 +502,7 @@ class PolygonRestitution:
         if ti.static(self.impacts.clusters):
             if self.impacts.in_cluster(a) and self.impacts.in_cluster(b) and self.impacts.body[a] == self.impacts.body[b]:
                 arm = (1 - t) * self.impacts.arm[a] + t * self.impacts.arm[b]
-                edge = self.impacts.cluster_inverse_mass(self.impacts.body[a], arm, n, m)
+                edge = n.dot(self.impacts.cluster_response(self.impacts.body[a], arm, m))
         return self.impacts.inverse_mass(v, n, m) + edge
 
     @ti.func

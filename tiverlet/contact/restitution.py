@@ -9,6 +9,7 @@ from ..neighbours.neighbour_list import PairData
 from .narrow_phase import DiscGeometry
 
 SLOW = 2.0  # a pair rests if this many substeps of forces account for its speed, see Restitution
+UPTAKE = 1 / 8  # share of the slack of a pair that a substep removes
 ELASTIC = 2.0**-8  # the same for e = 1: rounding alone, so that a load at rest does not count as impacts
 
 
@@ -25,13 +26,15 @@ class Restitution:
 
     def __init__(
         self, scene: Scene, geometry: DiscGeometry, table: Table, struck: PairData, slack: PairData, impulse: PairData,
-        events: Any,
+        events: Any, bodies: Any,
     ):  # fmt: skip
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.geometry, self.list, self.table, self.state = geometry, geometry.list, table, scene.state
         self.struck, self.slack, self.impulse, self.events = struck, slack, impulse, events
         self.has_events = events is not None
-        self.impacts: Any = None  # a BodyImpacts, where bodies of linked particles bounce as wholes
+        self.bodies: Any = bodies  # a BodyRestitution, where bodies of linked particles bounce as wholes, or None
+        if bodies:
+            bodies.bind(self)
         self.weight = add("Contact.struck", n)  # the split mass of the first pass, 0 without contact
         self.d_change = add("Contact.d_change", n, width=dim)
         self.lift = add("Contact.lift", n, width=dim)  # moves the position only
@@ -40,11 +43,13 @@ class Restitution:
         self.first = add("Contact.first", n, kind=ti.i32)
         self.hit = add("Contact.hit", None, kind=ti.i32)
 
-    def bind(self, scene: Scene, impacts: Any) -> None:
-        """Leave impacts of linked particles to the extra passes of a BodyImpacts."""
-        n, dim, add = scene.count, scene.particles.dim, scene.memory.field
-        self.impacts = impacts
-        self.normal, self.target_of = add("Contact.normal", n, width=dim), add("Contact.target", n)
+    @ti.func
+    def joins_bodies(self, i, j):
+        """Whether the impact of particles i and j is one of bodies, see BodyRestitution."""
+        out = False
+        if ti.static(bool(self.bodies)):
+            out = self.bodies.joins(i, j)
+        return out
 
     @ti.func
     def clear(self, i, weight):
@@ -66,6 +71,8 @@ class Restitution:
         rests, e = True, self.table.of(i, j)[2]
         if e > 0:
             deep = ti.select(last > 0, overlap, ti.select(e < 1, slack, 0))  # an elastic pair rests only if it was pushed
+            if self.joins_bodies(i, j):  # others press them together: an impact would leave them there
+                deep = overlap
             if last == 0:
                 slack = ti.max(slack, overlap - ti.max(here, 0))
             # First pass only: later passes include pushes of other pairs.
@@ -81,6 +88,16 @@ class Restitution:
         if not rests:
             slack = ti.select(given > 0, ti.max(overlap - given, 0), 0)
         return given, ti.min(slack, overlap), rests
+
+    @ti.func
+    def kept_slack(self, i, j, slack, h):
+        """Return the part of its slack [m] that a pair of bodies keeps in a substep h [s]. The rest is pushed out.
+
+        Lifting a single particle of a body would become speed, as constraints take it back. So an eighth is pushed out, no faster
+        than at push_out, and 1 - e of it whatever the speed: impacts take out more.
+        """
+        slack *= self.table.of(i, j)[2]
+        return slack - ti.min(ti.static(UPTAKE) * slack, self.geometry.push_out * h)
 
     @ti.func
     def target(self, i, j, n):
@@ -107,11 +124,9 @@ class Restitution:
     def choose(self, i):
         """Choose the earliest struck pair of particle i that still approaches, and store its impact on i."""
         first, partner, most, w = -1, -1, 0 * self.weight[i], self.state.w.of(i)
-        if ti.static(bool(self.impacts)):
-            self.impacts.begin_round(i)
         if self.weight[i] > 0:
             for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
-                if self.struck.field[e] > 0 and not self.is_deferred(i, self.list.neighbour[e]):
+                if self.struck.field[e] > 0 and not self.joins_bodies(i, self.list.neighbour[e]):
                     j = self.list.neighbour[e]
                     contact_distance = self.geometry.contact_distance(i, j)
                     overlap, _each, n, _reach = self.geometry.impact(i, j, contact_distance, self.weight[i], False)
@@ -120,8 +135,6 @@ class Restitution:
                         if left > most or (left == most and earlier(i, j, partner)):
                             first, partner, most = e, j, left
                             self.d_change[i] = w / (w + self.state.w.of(j)) * given * n
-                            if ti.static(bool(self.impacts)):
-                                self.set_target(i, j, n, given)
                             if self.hit[None] == 0:
                                 self.hit[None] = 1
         self.first[i] = first
@@ -134,11 +147,6 @@ class Restitution:
         j = self.partner[i]
         if j >= 0:
             meets = self.partner[j] == i or self.state.w.of(j) == 0
-            if ti.static(bool(self.impacts)):
-                if meets:
-                    meets = not self.impacts.record_pair_impact(i, j, self.normal[i], self.target_of[i])
-                    # A second impact on a body is left to the next substep: what one particle gets, the cluster would take back.
-                    meets = meets and not (self.impacts.in_cluster(i) or self.impacts.in_cluster(j))
             if meets:
                 e, d_change = self.first[i], self.d_change[i]
                 impulse = d_change.norm() / self.state.w.of(i)
@@ -151,41 +159,22 @@ class Restitution:
                 self.state.advance(i, self.left[i] * d_change)
 
     @ti.func
-    def is_deferred(self, i, j):
-        """Whether extra passes make the impact of particles i and j, see BodyImpacts."""
-        out = False
-        if ti.static(bool(self.impacts)):
-            out = self.impacts.has_struck(i, j)
-        return out
-
-    @ti.func
-    def set_target(self, i, j, n, given):
-        """Store the displacement along n with which particle i is to leave particle j."""
-        self.normal[i] = n
-        self.target_of[i] = given + self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n)
-        if ti.static(self.impacts.clusters):
-            if self.impacts.in_cluster(i) or self.impacts.in_cluster(j):  # under_force() would take a turn for a force
-                _given, _here, a = self.target(i, j, n)
-                self.target_of[i] = self.table.of(i, j)[2] * ti.max(a, 0)
+    def note_push(self, e, push, speed):
+        """Add a push [kg m] of the pair at entry e, which met at a speed [m per substep], to its impulse and its event."""
+        if push != 0:
+            self.impulse.field[e] = self.impulse.field[e] + push
+            if ti.static(self.has_events):
+                self.events.note_impact(e, push, speed)
 
     @ti.func
     def push_body(self, i, now):
-        """In an extra pass: compute the push of particle i, and store its impulse. Returns whether its displacement was off."""
-        off, push = self.impacts.compute_pair_push(i, now)
-        if push != 0:
-            j = self.impacts.partner[i]
-            for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
-                if self.list.neighbour[e] == j:
-                    impulse = push / (self.state.w.of(i) + self.state.w.of(j))
-                    self.impulse.field[e] = self.impulse.field[e] + impulse
-                    if ti.static(self.has_events):
-                        self.events.note_impact(e, impulse, self.impacts.first_push[i] / (1 + self.table.of(i, j)[2]))
-        return off
+        """In an extra pass: compute the pushes of particle i. Returns whether any of them was off."""
+        return self.bodies.correct(i, now)
 
     @ti.func
     def apply_push(self, i):
         """Push particle i by what push_body() found."""
-        self.impacts.push_pair(i)
+        self.bodies.apply(i)
 
 
 @ti.func

@@ -167,13 +167,13 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
             high_order.check_solved(batches, scene, solver)
     size = size_of(path, scale.work)
     team = Team(memory, size, len(particles), path == "parallel" and size == 1, pieces=PIECES if contact else size)
-    search = contact.make_search(scene, batches, team) if contact else None
+    if contact:
+        contact.enter(scene)
     if can_have_impacts(scene, batches):
         pairs = bool(contact and contact.strikes_bodies)
         if pairs or any(w.has_restitution for w in walls) or (walls and stops_bodies(scene, batches)):
             scene.impacts = BodyImpacts(scene, batches, bool(contact), pairs)
-        if contact and pairs:
-            contact.dev.restitution.bind(scene, scene.impacts)
+    search = contact.make_search(scene, batches, team) if contact else None
     state.remember(
         memory,
         has_friction or any(w.needs_start_position for w in walls) or (bounces and bool(walls)),

@@ -19,6 +19,7 @@ class ContactPass:
 
     def __init__(self, scene: "Scene", contact: Any, particles: "ParticlePass", team: "Team"):
         self.contacts, self.particles, self.team = particles.contacts, particles, team
+        self.impacts: Any = scene.impacts
         self.n, self.real, self.dim = scene.count, scene.real, scene.particles.dim
         self.has_restitution = bool(contact) and contact.has_restitution
         self.remembers = bool(contact) and (contact.has_friction or contact.has_restitution or contact.has_events)
@@ -100,7 +101,7 @@ class ContactPass:
                 for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                     if c.dev.state.awake(i):
                         if c.dev.restitution.push_body(i, now):
-                            c.dev.restitution.impacts.request_pass(now)
+                            self.impacts.request_pass(now)
                 self.team.wait()
                 for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                     if c.dev.state.awake(i):

@@ -33,7 +33,7 @@ class ClusterImpact:
     @ti.func
     def is_struck(self, i):
         """Whether particle i, of a cluster, struck a wall."""
-        return self.impacts.struck[i] != 0 and self.impacts.by_wall(i)
+        return self.impacts.struck[i] != 0
 
     @ti.func
     def wide(self, v):
