@@ -78,7 +78,7 @@ class BodyImpacts:
     A rigid cluster that shares none of its particles moves as a rigid body in these passes, see ClusterImpact.
 
     Two particles that strike each other, at least one of them linked, obey the same law with the displacement of one relative to
-    the other: BodyRestitution for discs, PolygonRestitution for vertices and edges. Both sides compute the same push before either
+    the other: BodyRestitution for discs, PolygonRestitution for vertices and edges. Both compute the same push before either
     moves. A particle has any number of these impacts, but one on a wall. Constraints do not take these pushes into account. How
     rigid clusters answer is known, see response().
 
