@@ -2,8 +2,6 @@
 
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from ..device import ti
 from ..geometry import rotation
 
@@ -17,24 +15,21 @@ MET = 2.0**-9  # of the first push: a smaller error of the normal displacement c
 FINE = 2.0**-16  # the same where the inverse masses of rigid clusters are known
 CAREFUL = 0.55  # the least secant of a pair. Impacts may change each other: projections converge with steps of less than 1 / 0.5
 FELT = 2.0**-20  # of a squared displacement: a smaller change is no impact
-LINKED, IN_CLUSTER = 1, 2  # what holds a particle: links, or a rigid cluster that shares no particle
+LINKED, IN_CLUSTER = 1, 2  # what holds a particle that can move: links, or a rigid cluster that shares none of these
 STRUCK_NOW, STRUCK_BEFORE = 1, 2  # a particle is struck: in the pass in which it meets the wall or particle, and in later passes
+
+
+def holding_bodies(batches: "list[Batch]") -> "list[Batch]":
+    """Return the batches whose particles take each other along in impacts: links, angles and clusters."""
+    return [b for b in batches if b.arity > 1 or b.clusters]
 
 
 def can_have_impacts(scene: "Scene", batches: "list[Batch]") -> bool:
     """Whether there can be passes beside the regular ones of every substep.
 
-    Particles bounce alone in three cases: in stages of higher orders; where passes are steps of a semi-iteration, whose number is
-    fixed; and beside outlines, places, and clusters that share particles with links, whose violations are not recorded. If
-    contacts leave such violations and they are removed all at once, heaps shake for ever.
+    Particles bounce alone in stages of higher orders, and where passes are steps of a semi-iteration, whose number is fixed.
     """
-    links = [b for b in batches if not b.clusters]
-    held, linked = (
-        np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in batches if b.clusters == kind)])
-        for kind in (True, False)
-    )
-    noted = all(b.arity > 1 for b in links) and not np.isin(held, linked).any()
-    return bool(batches) and noted and scene.order == 2 and not scene.slots.semi_iteration
+    return bool(holding_bodies(batches)) and scene.order == 2 and not scene.slots.semi_iteration
 
 
 def is_exact(scene: "Scene", batches: "list[Batch]") -> bool:
@@ -45,6 +40,7 @@ def is_exact(scene: "Scene", batches: "list[Batch]") -> bool:
 
 def stops_bodies(scene: "Scene", batches: "list[Batch]") -> bool:
     """Whether walls without restitution stop bodies as wholes: where one pass more does it, and anything is rigid."""
+    batches = holding_bodies(batches)
     links = [b for b in batches if not b.clusters]
     return (not links or is_exact(scene, links)) and any(b.rigid for b in batches)
 
@@ -72,10 +68,11 @@ class BodyImpacts:
     substep, and to O(h^2) if the body is a cluster. Friction holds the tangential displacement by up to its coefficient times p.
 
     These passes leave the violations that the regular passes left, and those of springs: removed all at once, they would become
-    speed. Contacts wait for the next substep. A particle that approaches by no more than SLOW substeps of forces and links add
-    does not take part, see Surface.
+    speed. Contacts, outlines, places, and clusters that share particles wait for the next substep. A particle that approaches by
+    no more than SLOW substeps of forces and links add does not take part, see Surface.
 
-    A rigid cluster that shares none of its particles moves as a rigid body in these passes, see ClusterImpact.
+    A rigid cluster that shares none of its particles moves as a rigid body in these passes, see ClusterImpact. If some of them
+    cannot move, it turns about these.
 
     Two particles that strike each other, at least one of them linked, obey the same law with the displacement of one relative to
     the other: BodyRestitution for discs, PolygonRestitution for vertices and edges. Both compute the same push before either
@@ -87,7 +84,7 @@ class BodyImpacts:
     """
 
     def __init__(self, scene: "Scene", batches: "list[Batch]", touches: bool, pairs: bool):
-        system = scene.slots.system
+        system, batches = scene.slots.system, holding_bodies(batches)
         self.passes = FEW if (system or all(b.clusters for b in batches)) and not pairs else MANY
         self.spreads = not system  # from link to link; a system solves all links at once
         self.exact = is_exact(scene, [b for b in batches if not b.clusters])
@@ -149,7 +146,8 @@ class BodyImpacts:
         if holds:
             if ti.static(batch.clusters):
                 for e in range(batch.dev.corners.starts[c], batch.dev.corners.starts[c + 1]):
-                    self.rigid[batch.dev.corners.members[e]] = IN_CLUSTER
+                    if self.state.w.positive(batch.dev.corners.members[e]):
+                        self.rigid[batch.dev.corners.members[e]] = IN_CLUSTER
             for k in ti.static(range(batch.arity)):
                 self.rigid[batch.dev.corners.member(c, k)] = LINKED
 

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from ..colliders.body_impacts import holding_bodies
 from ..constraints.core.equation import RESTARTED
 from ..constraints.core.known_load import WINDOW
 from ..device import ti
@@ -22,6 +23,7 @@ class ConstraintPass:
             system.team, system.stride = team, stride
         self.semi_iterations = [scene.slots.semi_iteration] if scene.slots and scene.slots.semi_iteration else []
         self.in_systems = [b for b in batches if b.solvable_together and b.dev.in_system]
+        self.holding = holding_bodies(batches)
         self.ragged = [b for b in batches if not b.arity]
         self.capped: list[Any] = [b for b in batches if b.driven and b.dev.drive.capped]
         self.real = scene.real
@@ -50,6 +52,8 @@ class ConstraintPass:
         """Write the moves of constraints on any number of particles each to the slots of their corners."""
         for f in ti.static(self.ragged):
             n = f.dev.corners.total * (1 - newton)
+            if first >= 0 and not self.acts(f):
+                n = 0 * n
             for e in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                 if f.dev.corners.awake(f.dev.corners.owner[e]):
                     f.dev.scatter_corner(e, h, h2_effective, first, fresh)
@@ -97,6 +101,15 @@ class ConstraintPass:
         return out
 
     @ti.func
+    def acts(self, f: ti.template()):  # type: ignore[valid-type]
+        """Whether the constraints of a batch act in this pass: in extra passes, only those that hold bodies together."""
+        out = True
+        for impacts in ti.static(self.impacts):
+            if ti.static(f not in self.holding):
+                out = not impacts.is_extra_pass()
+        return out
+
+    @ti.func
     def solve(self, now):
         """Every constraint writes the moves that it wants to its slots, or its row to the system that solves it."""
         fresh = now.fresh if ti.static(self.integrator.half_kick) else 0
@@ -117,10 +130,14 @@ class ConstraintPass:
         for f in ti.static(self.batches):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                 for impacts in ti.static(self.impacts):
-                    if now.s == 0 and now.first != 0:
-                        impacts.mark_linked(f, c, now.h)
+                    if ti.static(f in self.holding):
+                        if now.s == 0 and now.first != 0:
+                            impacts.mark_linked(f, c, now.h)
                 if self.takes_part(f, c, now):
-                    f.dev.relax(c, now.h, h2_effective, now.frame_fraction, now.first, fresh)
+                    if self.acts(f):
+                        f.dev.relax(c, now.h, h2_effective, now.frame_fraction, now.first, fresh)
+                    else:
+                        f.dev.corners.rest(c)
         if ti.static(len(self.batches) > 0):
             self.team.wait()
         self.scatter_blocks(now.thread, now.h, h2_effective, now.first, fresh, now.newton)

@@ -6,6 +6,7 @@ from ...device import ti
 from ...geometry import rotation
 
 SWEEPS = 64  # over the particles that were struck, at most
+FIXED = 2.0**20  # mass of a particle that cannot move, in masses of its cluster: such a cluster turns about it
 MET = 2.0**-12  # of the first push: a smaller change ends the sweeps
 
 
@@ -60,7 +61,7 @@ class ClusterImpact:
         start = self.cluster.zero_vector()
         S = center.outer_product(center)
         for e in range(begin, end):
-            m, r = self.cluster.mass_in_fit(e, c), self.cluster.relative_position(e, i0, 1)
+            m, r = self.cluster.mass_of(e, c, FIXED), self.cluster.relative_position(e, i0, 1)
             M += m
             start += m * r
             center += m * self.cluster.relative_position(e, i0, 0)
@@ -81,7 +82,7 @@ class ClusterImpact:
                     i = self.corners.members[e]
                     if self.is_struck(i):
                         r, s = self.cluster.relative_position(e, i0, 0) - center, self.cluster.relative_position(e, i0, 1) - start
-                        push, change = self.corrected_push(i, r, s, V, W, turn, M, S, self.cluster.mass_in_fit(e, c))
+                        push, change = self.corrected_push(i, r, s, V, W, turn, M, S, self.cluster.mass_of(e, c, FIXED))
                         V += push / M
                         W += rotation.turn_rate(S, rotation.axial(push.outer_product(s)))
                         off = off or change > ti.static(MET) * self.impacts.first_push[i]
@@ -110,7 +111,7 @@ class ClusterImpact:
         for e in range(begin, end):
             s = self.cluster.relative_position(e, i0, 1)
             d = self.cluster.relative_position(e, i0, 0) - s
-            X += self.cluster.mass_in_fit(e, c) * d.outer_product(s - start)
+            X += self.cluster.mass_of(e, c, FIXED) * d.outer_product(s - start)
         return rotation.turn_rate(S, rotation.axial(X))
 
     @ti.func
@@ -134,7 +135,7 @@ class ClusterImpact:
         V, parts = self.cluster.zero_vector(), ti.cast(0, self.real)
         X = V.outer_product(V)
         for e in range(begin, end):
-            i, m = self.corners.members[e], self.cluster.mass_in_fit(e, c)
+            i, m = self.corners.members[e], self.cluster.mass_of(e, c, FIXED)
             r, push = self.cluster.relative_position(e, i0, 1) - start, m * self.wide(self.impacts.change[i])
             V += push / M
             X += push.outer_product(r)

@@ -111,7 +111,12 @@ class ClusterPasses(Passes):
     @ti.func
     def mass_in_fit(self, e, c):
         """Return the mass of corner e in a fit."""
-        w, mu = self.w.of(self.corners.members[e]), ti.cast(HEAVY * self.mass[c], ti.f64)
+        return self.mass_of(e, c, HEAVY)
+
+    @ti.func
+    def mass_of(self, e, c, heavy):
+        """Return the mass of corner e, `heavy` times that of its cluster c for a particle that cannot move."""
+        w, mu = self.w.of(self.corners.members[e]), ti.cast(heavy * self.mass[c], ti.f64)
         if w > 0:
             mu = ti.cast(1, ti.f64) / w
         return mu
@@ -187,12 +192,12 @@ class ClusterPasses(Passes):
 
     @ti.func
     def is_firm(self, c, h):
-        """Whether cluster c moves as a body in impacts: it is rigid for a substep h, shares no particle, and none is fixed."""
+        """Whether cluster c moves as a body in impacts: it is rigid for a substep h, and shares no particle that can move."""
         out = self.mass[c] > 0
         for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
             i = self.corners.members[e]
             w = self.w.of(i)
-            out = out and w > 0 and self.slots.split[i] < 2 * w
+            out = out and (w == 0 or self.slots.split[i] < 2 * w)
         if ti.static(self.spring.soft):
             if out and self.spring.alpha[c] > 0:
                 out = stiff(self.spring.alpha[c], h, 1 / self.mass[c]) > FIRM

@@ -50,6 +50,12 @@ class FixedCorners:
             self.slots.move[place] = move
 
     @ti.func
+    def rest(self, c):
+        """Write no moves for constraint c."""
+        for k in ti.static(range(self.arity)):
+            self.write_move(c, k, ti.Vector.zero(self.real, self.state.dim))
+
+    @ti.func
     def relative_positions(self, c, back):
         """Return the corners of constraint c relative to the first, at x - back d: near the origin, where f32 loses no digits."""
         i = self.member(c, 0)
@@ -128,6 +134,12 @@ class VariableCorners:
         place = self.places[e]
         if place >= 0:
             self.slots.move[place] = move
+
+    @ti.func
+    def rest(self, c):
+        """Write no moves for constraint c."""
+        for e in range(self.starts[c], self.starts[c + 1]):
+            self.write_move(e, 0 * self.slots.move[0])
 
     @ti.func
     def reference_particle(self, c):
