@@ -96,23 +96,25 @@ def test_rigid_bodies_leave_by_newtons_law(world, shape, e):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("precision", ["f32", "f64"])
 @pytest.mark.parametrize(
-    "wall", [tv.HalfSpace((0, 1)), tv.Polygon([(-4, -1), (4, -1), (4, 0), (-4, 0)])], ids=["plane", "polygon"]
+    "wall, precision",
+    [(tv.HalfSpace((0, 1)), "f32"), (tv.Polygon([(-4, -1), (4, -1), (4, 0), (-4, 0)]), "f64")],
+    ids=["plane", "polygon"],
 )
 def test_what_lands_upright_without_restitution_stays_down(world, wall, precision):
     # A rod left the floor at 1/4 of its speed and a chain of ten links at 0.6, at any number of substeps: 0.7 and 1.7 m/s here.
     # What is left is the sag of the links under the load, up to 2 g h (N - 1) / 2 for N particles.
-    for x, pairs in ((BAR, links(BAR)), (np.stack([np.zeros(11), 0.1 * np.arange(11)], axis=1), [(i, i + 1) for i in range(10)])):
-        for substeps in (8, 200):
-            w = world(
-                tv.Particles(x + (0, 0.32), velocity=(0.0, -2.0), radius=0.02), [tv.Gravity(9.81), tv.Distance(pairs), wall],
-                substeps=substeps, precision=precision,
-            )  # fmt: skip
-            speeds = [w.step(1 / 60) and w.velocity[:, 1].mean() for _ in range(30)]
-            assert max(speeds) < 9.81 * (len(x) - 1) / (60 * substeps) + 1e-5
-            assert w.velocity == pytest.approx(0, abs=1e-4) and w.position[0, 1] == pytest.approx(0.02, abs=1e-6)
-            w.close()
+    x = np.concatenate([BAR, np.stack([np.ones(11), 0.1 * np.arange(11)], axis=1)])
+    pairs = [(0, 1), *((i, i + 1) for i in range(2, 12))]
+    for substeps in (8, 200):
+        w = world(
+            tv.Particles(x + (0, 0.32), velocity=(0.0, -2.0), radius=0.02), [tv.Gravity(9.81), tv.Distance(pairs), wall],
+            substeps=substeps, precision=precision,
+        )  # fmt: skip
+        speeds = np.array([w.step(1 / 60) and [w.velocity[:2, 1].mean(), w.velocity[2:, 1].mean()] for _ in range(30)])
+        assert (speeds.max(axis=0) < 9.81 * np.array([1, 10]) / (60 * substeps) + 1e-5).all()
+        assert w.velocity == pytest.approx(0, abs=1e-4) and w.position[[0, 2], 1] == pytest.approx(0.02, abs=1e-6)
+        w.close()
 
 
 def test_what_strikes_a_polygon_slides_on_as_on_a_plane(world):
@@ -332,25 +334,35 @@ def test_velocities_have_no_part_of_a_blow(world):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver, e", [(tv.Direct(), 0.7), (tv.Jacobi(), 0.7), (tv.ConjugateGradient(5), 0.0)], ids=repr)
-def test_all_paths_have_the_same_bits(world, solver, e):
-    x, pairs = row(5)
-    bodies = np.concatenate([turned(x, 0.3 * k) + (0.5 + 0.7 * k, 0.6) for k in range(3)])
-    pairs = np.concatenate([pairs + 5 * k for k in range(3)])
-
-    def contact():
-        return tv.Contact(friction=0.2, restitution=e)
+@pytest.mark.parametrize(
+    "contact, e, solver, paths",
+    [
+        ("discs", 0.5, tv.Direct(), ("parallel", "launched")),
+        ("polygons", 0.5, tv.Jacobi(), ("launched",)),
+        ("discs", 0.0, tv.ConjugateGradient(5), ("parallel",)),  # they bounce off walls alone
+    ],
+    ids=["discs, Direct", "polygons, Jacobi", "walls, ConjugateGradient"],
+)
+def test_all_paths_have_the_same_bits(world, contact, e, solver, paths):
+    # Clusters, bodies of links and a stiff rod of five, which strike walls and each other at once. With every way to touch, every
+    # solver and every path, but not all products of them: half of a minute would be compilation.
+    bodies = [turned(TRIANGLE, 0.7 * k) + (0.5 + 0.55 * k, 0.42 + 0.5 * (k % 2)) for k in range(5)]
+    rod, pairs = row(5)
+    x, triangles = np.concatenate([*bodies, turned(rod, 0.3) + (3.4, 0.5)]), np.arange(15).reshape(5, 3)
+    v = np.concatenate([np.repeat([(2.0, -3.0), (-2.0, 1.0), (1.0, -3.0), (0.0, -2.0), (-2.0, -1.0)], 3, axis=0), [(1, -3)] * 5])
 
     def run(path):
+        touch = tv.Contact(0.2, e) if contact == "discs" else tv.Polygons(triangles, 0.2, e)
+        linked = tv.Distance(np.concatenate([links(TRIANGLE) + 9, links(TRIANGLE) + 12, pairs + 15]))
         w = world(
-            tv.Particles(bodies, velocity=(1.0, -3.0), radius=0.04),
-            [tv.Gravity(), tv.Distance(pairs), contact(), tv.Box((0, 0), (3, 2), restitution=0.8, friction=0.3)],
+            tv.Particles(x, velocity=v, radius=0.04),
+            [tv.Gravity(), tv.ShapeMatch(triangles[:3]), linked, touch, tv.Box((0, 0), (4, 2), friction=0.3, restitution=0.4)],
             substeps=8, path=path, solver=solver,
         )  # fmt: skip
-        w.run(1.0)
+        w.run(0.2)
         return w.hash()
 
-    assert run("fused") == run("parallel") == run("launched")
+    assert {run("fused")} == {run(path) for path in paths}
 
 
 @pytest.mark.parametrize("lean", [0.0, -0.1, -5.0])
@@ -417,7 +429,7 @@ def test_the_impulse_of_bodies_that_meet_is_told(world):
 
 
 @pytest.mark.parametrize(
-    "dim, e, compliance", [(2, 0.0, 0.0), (2, 0.5, 0.0), (2, 1.0, 1e-12), pytest.param(3, 0.0, 0.0, marks=pytest.mark.slow)]
+    "dim, e, compliance", [(2, 0.0, 0.0), (2, 1.0, 1e-12), pytest.param(3, 0.5, 0.0, marks=pytest.mark.slow)]
 )
 def test_rigid_clusters_leave_walls_by_newtons_law(world, dim, e, compliance):
     # As bodies of links do: equal pushes on the lowest particles take them from -1 m/s to e. A cluster that falls flat strikes
@@ -437,41 +449,6 @@ def test_rigid_clusters_leave_walls_by_newtons_law(world, dim, e, compliance):
         w.close()
 
 
-def test_clusters_on_walls_have_the_same_bits_on_all_paths(world):
-    x = np.concatenate([turned(TRIANGLE, 0.7 * k) + (0.5 + 0.7 * k, 0.6) for k in range(4)])
-    walls = {"friction": 0.3, "restitution": 0.4}
-
-    def run(path):
-        features = [
-            tv.Gravity(),
-            tv.ShapeMatch(np.arange(12).reshape(4, 3)),
-            tv.Contact(friction=0.2),
-            tv.Box((0, 0), (3, 2), **walls),
-        ]
-        w = world(tv.Particles(x, velocity=(1.0, -3.0), radius=0.04), features, substeps=8, path=path)
-        w.run(0.5)
-        return w.hash()
-
-    assert run("fused") == run("parallel") == run("launched")
-
-
-@pytest.mark.parametrize("contact", ["discs", "polygons"])
-def test_bodies_that_strike_each_other_have_the_same_bits_on_all_paths(world, contact):
-    x = np.concatenate([turned(TRIANGLE, 0.7 * k) + (0.5 + 0.7 * k, 0.6 + 0.6 * (k % 2)) for k in range(5)])
-    bodies = np.arange(15).reshape(5, 3)
-    v = np.repeat([(2.0, -1.0), (-1.0, 1.0), (1.0, 0.0), (0.0, -2.0), (-2.0, 0.0)], 3, axis=0)
-
-    def run(path):
-        touch = tv.Contact(0.2, 0.5) if contact == "discs" else tv.Polygons(bodies, 0.2, 0.5)
-        some = [tv.ShapeMatch(bodies[:3]), tv.Distance(np.concatenate([links(TRIANGLE) + 3 * k for k in (3, 4)]))]
-        features = [tv.Gravity(), *some, touch, tv.Box((0, 0), (4, 2), friction=0.3, restitution=0.4)]
-        w = world(tv.Particles(x, velocity=v, radius=0.04), features, substeps=8, path=path)
-        w.run(0.5)
-        return w.hash()
-
-    assert run("fused") == run("parallel") == run("launched")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["links", "clusters"])
 def test_elastic_polygons_keep_their_energy_and_heaps_of_them_gain_none(world, kind):
@@ -485,9 +462,11 @@ def test_elastic_polygons_keep_their_energy_and_heaps_of_them_gain_none(world, k
     x, loops = np.concatenate(bodies), np.arange(100).reshape(25, 4)
     v = np.repeat(rng.normal(0, 2, (25, 2)), 4, axis=0)
     for g, e, mu in ((0.0, 1.0, 0.0), (10.0, 0.6, 0.5)):
-        features = [tv.Gravity(g), tv.Polygons(loops, friction=mu, restitution=e), held(kind, *bodies)]
-        around = tv.Box((0, 0), (8, 9), friction=mu, restitution=e)
-        w = world(tv.Particles(x, velocity=v), [*features, around], substeps=20 if e == 1 else 4, precision="f64")
+        rough = [tv.Polygons(loops, friction=0.5, restitution=e), tv.Box((0, 0), (8, 9), friction=0.5, restitution=e)]
+        features = [tv.Gravity(g), held(kind, *bodies), *rough]
+        w = world(tv.Particles(x, velocity=v), features, substeps=20 if e == 1 else 4, precision="f64")
+        for surface in rough:  # assigned, so that both scenes share one compilation
+            surface.friction = mu
         energy = np.array([w.step(1 / 60).energy for _ in range(300)])
         assert energy.max() < 1.01 * energy[0]
         assert energy[-1] > kept * energy[0] if e == 1 else (np.diff(energy) < 1e-3 * energy[0]).all()
