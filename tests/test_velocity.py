@@ -53,10 +53,10 @@ def scene(name, damped):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*ROWS, *PLACES])
-def test_velocities_written_back_change_nothing(world, name):
-    # Without gravity a block has the energy of its start. Velocities that are read and written back after each frame may neither
-    # pump a spring nor brake it by more than 1 - (1 - (omega h)^4 / 16) per start. With the force of the substep before in them,
-    # they would grow by 1 + (omega h)^2 / 4 per frame, e^(15 omega^2 h^2) per second.
+def test_starts_from_velocities_that_were_read_change_nothing(world, name):
+    # Without gravity a block has the energy of its start. Starts from the velocities that are read, after each frame, may neither
+    # pump a spring nor brake it by more than 1 - (1 - (omega h)^4 / 16). With the force of the substep before in them, they would
+    # grow by 1 + (omega h)^2 / 4 per frame, e^(15 omega^2 h^2) per second. Assigning what was read makes no start.
     start, made = scene(name, damped=0)
     w = world(start, [made], precision="f64")
     blocks = len(STIFF)
@@ -66,12 +66,12 @@ def test_velocities_written_back_change_nothing(world, name):
         out = []
         for _ in range(frames):
             if back:
-                w.velocity = w.velocity
+                w._start_from(w.velocity)
             w.step(1 / 60)
             out.append((w.particles.mass * (w.velocity**2).sum(axis=1)).reshape(blocks, -1).sum(axis=1))
         return np.array(out)
 
-    for substeps, frames in (2, 600), (8, 300), (20, 200), (80, 60):
+    for substeps, frames in (2, 150), (8, 100), (20, 150), (80, 60):
         w.substeps = substeps
         alone, back = kinetic(False), kinetic(True)
         few = frames // 5
@@ -141,7 +141,7 @@ def test_forces_that_come_change_no_velocity_before_they_act(world, what):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("precision", ["f64", "f32", "f32-compensated"])
+@pytest.mark.parametrize("precision", ["f32", "f32-compensated"])  # the pile below: f64
 def test_what_keeps_its_velocity_goes_on_to_the_bit(world, precision):
     # A swinging chain, spinning discs that roll and touch, and one disc far away that is steered by velocity and spin: an impulse
     # acts on that disc alone. Writing back what was read changes nothing.
@@ -165,7 +165,7 @@ def test_what_keeps_its_velocity_goes_on_to_the_bit(world, precision):
         v[-1], s[-1] = (np.sin(k), 1.0), k
         steered.velocity, steered.spin = v, s
         np.testing.assert_array_equal(steered.velocity, v)
-        np.testing.assert_allclose(steered.spin, s, atol=1e-5 if precision != "f64" else 1e-12)
+        np.testing.assert_allclose(steered.spin, s, atol=1e-5)
         np.testing.assert_array_equal(steered.position[:-1], free.position[:-1])
     assert back.hash() == free.hash() and steered.position[-1, 1] > free.position[-1, 1] + 0.1
 
@@ -193,8 +193,13 @@ def test_piles_come_to_rest_and_sleep_while_one_steers(world):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["velocity", "spin", "both", "many", "sleep"])
-@pytest.mark.parametrize("precision", ["f64", "f32", "f32-compensated"])
+@pytest.mark.parametrize(
+    "precision, how",
+    [
+        *(("f64", how) for how in ("velocity", "spin", "both")), *(("f32", how) for how in ("both", "many")),
+        *(("f32-compensated", how) for how in ("both", "sleep")),
+    ],
+)  # fmt: skip
 def test_a_pile_goes_on_to_the_bit_beside_what_is_driven_on_a_rough_floor(world, precision, how):
     # Friction reverses in every frame. If all particles made a start for it, 24 discs would shake by 2.4e-4 J, and none would
     # sleep.
