@@ -21,20 +21,22 @@ DEMOS = pathlib.Path(__file__).parent.parent / "demos"
 
 @pytest.mark.slow
 def test_what_a_gpu_sums_up_is_the_same(world, monkeypatch):
-    # A GPU sums by 64^2 blocks and then 64, a CPU by 64: the same figures, up to the rounding of a sum of n numbers. The scene
-    # is one of those below, whose kernels it shares.
-    x = 1.8 * tv.golden(np.arange(200), dim=2) - 0.9
+    # A GPU sums by 64^2 blocks and then 64, a CPU by 64: the same figures, up to the rounding of a sum of n numbers. Of a crowded
+    # state that no frame has made, so that only the sums are compiled.
+    x = 1.0 * tv.golden(np.arange(200), dim=2) - 0.5
     reports = []
     for architecture in ("cpu", "cuda"):
         monkeypatch.setattr(diagnostics, "runtime", SimpleNamespace(architecture=lambda a=architecture: a))
-        features = [tv.Gravity(9.81), tv.Distance([[0, 1]]), tv.Contact(friction=0.5, restitution=0.5)]
-        w = world(tv.Particles(x, velocity=-4 * x, radius=0.04), features, substeps=4, path="launched")
+        features = [tv.Gravity(9.81), tv.Distance([[0, 1]]), tv.Contact()]
+        w = world(tv.Particles(x, velocity=-4 * x, radius=0.04), features, path="launched")
         assert w._runner.diagnostics.blocks == (64 if architecture == "cpu" else 64**2)
-        w.run(0.15)
-        reports.append([w.step(1 / 60) for _ in range(2)])
-    for one, two in zip(*reports, strict=True):
-        assert abs(one.energy - two.energy) <= 200 * 2.0**-53 * 200 * 9.81 * 2
-        assert one.contacts > 100 and (one.overlap, one.contacts, one.residual) == (two.overlap, two.contacts, two.residual)
+        w._runner.list_neighbours()
+        w._runner.diagnose_state()
+        reports.append((w._runner.report(), w._runner.diagnostics.report.figures.copy()))
+    (one, figures), (two, others) = reports
+    assert abs(one.energy - two.energy) <= 200 * 2.0**-53 * 200 * 9.81 * 2 and one.energy > 100
+    assert one.contacts > 100 and one.overlap > 0.1 and (one.overlap, one.contacts) == (two.overlap, two.contacts)
+    np.testing.assert_allclose(figures, others, rtol=1e-12)  # all that is summed up, and the largest of all that is
 
 
 def hashes(code: str, runs: str) -> list[str]:
@@ -68,10 +70,10 @@ def results(path):
 
 
 @pytest.mark.slow
-def test_every_solver_has_the_same_bits_on_1_and_8_threads():
+def test_systems_have_the_same_bits_on_1_and_8_threads():
     # Sums over all constraints, as conjugate gradients compute them beside contacts, and systems that several threads solve:
     # cloth that falls on a ball, with hail on it, and ropes. On one thread they run phase by phase, as on a GPU. Jacobi is
-    # tested on all paths below.
+    # tested on all paths below, Chebyshev in test_solvers.py.
     code = """
 import numpy as np
 import pytest
@@ -89,7 +91,7 @@ start = tv.Particles(
 def results(path):
     touching = [tv.Ball((0.5, 0.69, 0.5), 0.3, friction=0.3), tv.Contact(friction=0.3)]
     for solver, pairs, more in (
-        (tv.Direct(), ropes, []), (tv.Chebyshev(), net, []), (tv.ConjugateGradient(steps=4), net, touching),
+        (tv.Direct(), ropes, []), (tv.ConjugateGradient(steps=4), net, touching),
     ):
         features = [tv.Gravity(9.81), tv.Distance(pairs), *more]
         with tv.World(start, features, solver=solver, path=path, substeps=5, iterations=4) as world:
@@ -98,7 +100,7 @@ def results(path):
             yield world.hash()
 """
     made = hashes(code, '((1, "parallel"), (8, "parallel"))')
-    assert len(made) == 6 and len(set(made[:3])) == 3 and made[:3] == made[3:]
+    assert len(made) == 4 and made[0] != made[1] and made[:2] == made[2:]
 
 
 @pytest.mark.slow

@@ -54,7 +54,7 @@ def overlap(w):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "settings, most",
-    [({}, 1e-6), ({"dim": 3, "n": 3}, 1e-6), ({"precision": "f32"}, 1e-6), ({"substeps": 2}, 1e-5),
+    [({}, 1e-6), ({"dim": 3, "n": 3, "precision": "f32"}, 1e-6), ({"substeps": 2}, 1e-5),
      ({"spin": 0.0, "friction": (0.5, 0.5, 0.1, 0.0)}, 1e-6)],
 )  # fmt: skip
 def test_a_pile_at_rest_hardly_overlaps(world, settings, most):
@@ -354,7 +354,7 @@ def test_a_start_finds_the_loads_that_links_know(world):
 
 @pytest.mark.slow
 def test_loads_of_links_are_of_the_state(world):
-    # All paths, clones and Worlds have the same bits; added particles leave known loads as they are.
+    # One kernel, launches, clones and Worlds have the same bits; added particles leave known loads as they are.
     particles, pairs = hung()
 
     def made(path):
@@ -362,10 +362,10 @@ def test_loads_of_links_are_of_the_state(world):
         features = [tv.Gravity(G), tv.Distance(pairs, 0.1), tv.Drag(1.0)]
         return world(particles, features, solver=tv.Jacobi(loads=True), substeps=8, path=path)
 
-    a, b, c = map(made, ("fused", "parallel", "launched"))
-    for w in (a, b, c):
+    a, b = map(made, ("fused", "launched"))
+    for w in (a, b):
         w.run(3.0)
-    assert a.hash() == b.hash() == c.hash()
+    assert a.hash() == b.hash()
     with a.clone() as other, tv.Worlds(a, 2) as many:
         for w in (a, other, many):
             for _ in range(9):  # past the end of a window

@@ -294,7 +294,7 @@ def machine(**settings):
 
 
 @pytest.mark.slow
-def test_drives_have_the_same_bits_on_every_path_and_survive_edits():
+def test_drives_have_the_same_bits_in_one_kernel_and_in_launches_and_survive_edits():
     def drive(world):
         motor, winch = world.features[:2]
         for frame in range(12):
@@ -303,11 +303,10 @@ def test_drives_have_the_same_bits_on_every_path_and_survive_edits():
             world.step(1 / 60)
         return world.hash()
 
-    with machine() as fused, machine(path="parallel") as parallel:
+    with machine() as fused:
         with thread_team.launching():
             launched = machine(path="parallel")
-        want = drive(fused)
-        assert drive(parallel) == want == drive(launched)
+        assert drive(fused) == drive(launched)
         launched.close()
         door, winch = fused.features[:2]
         assert isinstance(door, tv.Motor) and isinstance(winch, tv.Winch)

@@ -204,19 +204,17 @@ def test_64_chebyshev_refuses_what_is_unstable(world):
         tv.World(tv.Particles(x), solver=tv.Direct)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("make", [tv.Chebyshev, tv.ConjugateGradient])
-def test_a_solver_has_the_same_bits_in_one_kernel_and_for_a_team(world, make):
-    # A team has the bits of the launched path, see test_every_solver_has_the_same_bits_on_1_and_8_threads.
+def test_chebyshev_has_the_same_bits_on_all_paths(world):
+    # For systems see test_determinism.py.
     hashes = []
-    for path in ("fused", "parallel"):
+    for path in ("fused", "parallel", "launched"):
         x, pairs = cloth(8)
         features = [tv.Gravity(9.81), tv.Distance(pairs), tv.Rope([[0, 9], [63, 54]])]
-        w = world(tv.Particles(x, pinned=np.arange(8)), features, solver=make(), path=path, iterations=4, substeps=3)
+        w = world(tv.Particles(x, pinned=np.arange(8)), features, solver=tv.Chebyshev(), path=path, iterations=4, substeps=3)
         w.run(0.2)
         assert w.last.residual < 0.2 and "non-finite" not in w.last.flags
         hashes.append(w.hash())
-    assert hashes[0] == hashes[1]
+    assert len(set(hashes)) == 1
 
 
 def test_elimination_leaves_less_than_a_pass_of_relaxation():
