@@ -47,7 +47,8 @@ def drops(k: int, turn: int, dim: int = 2, radius: Any = RADIUS, **more) -> tv.P
 def discs():
     """A world with groups, sensors, events, spins, a wall, a hand, and a spring that holds one disc."""
     n = 40
-    particles = tv.Particles(overlapping(n), radius=RADIUS, group=np.arange(n) % 3, spin=0.5, orientation=0.0)
+    group = (np.arange(n) + 1) % 3  # the two that overlap touch
+    particles = tv.Particles(overlapping(n), radius=RADIUS, group=group, spin=0.5, orientation=0.0)
     contact = tv.Contact(friction={(0, 1): 0.5}, groups=[(0, 1), (1, 1), (0, 0)], sensors=[(0, 2)], events=True)
     features = [
         tv.Gravity(), tv.Drag(0.1), tv.Hand((1.0, 0.2), particle=30), contact, tv.HalfSpace((0, 1), 0.0, events=True),
