@@ -14,7 +14,7 @@ from tiverlet.step import checkpoint
 
 from .bad_starts import BadStart
 from .conftest import order, rms, unprojected
-from .rows import OTHERS, PATH, ROWS, Row
+from .rows import OTHERS, PATH, ROWS, TETRA, WINGS, Row
 
 BLOCKS = ("met", "off", "turned", "held", "stuck", "soft", "free", "swing", "loaded", "weak")
 MASS = np.array([1.0, 2.5, 0.7, 4.0])
@@ -321,6 +321,79 @@ def test_nothing_explodes_where_a_constraint_has_no_direction(world, name):
             size += np.ptp(x, axis=1).max(axis=1) + 1e-6 * np.abs(x).max(axis=(1, 2))
             moved = np.abs(w.position.reshape(x.shape) - x).max(axis=(1, 2))
             assert (moved <= 5 * size).all(), (np.argmax(moved / (size + 1e-300)), np.c_[moved, size])
+
+
+FLAT = WINGS[[0, 3, 1, 2], :2]
+SOFT = {  # constraints that may be soft, and are no row of ROWS
+    "Pin": (FLAT[:1], lambda c, x, **soft: tv.Pin(c[:, 0], x[:, 0], **soft)),
+    "Snap": (FLAT[:1], lambda c, x, **soft: tv.Snap(c[:, 0], 100.0, x[0, 0], **soft)),
+    "Path": (
+        FLAT[:1], lambda c, x, **soft: tv.Path(c[:, 0], [x[0, 0] - (9, 0), x[0, 0] + (9, 0)], smooth=False, **soft)
+    ),
+    "ShapeMatch 2D": (FLAT, lambda c, x, **soft: tv.ShapeMatch(c, x.reshape(-1, 2), **soft)),
+    "ShapeMatch 3D": (WINGS, lambda c, x, **soft: tv.ShapeMatch(c, x.reshape(-1, 3), **soft)),
+    "Motor": (FLAT[:3], lambda c, x, **soft: tv.Motor(c, 0.0, **soft)),
+    "Winch": (FLAT[:2], lambda c, x, **soft: tv.Winch(c, 0.0, **soft)),
+    "Volume of surfaces": (WINGS, lambda c, x, **soft: tv.Volume(np.concatenate([row[TETRA] for row in c]), **soft)),
+}  # fmt: skip
+STIFF = np.array([0.02, 0.05, 0.1, 0.2, 0.32, 0.5, 0.8, 1.3, 2.0, 5.0, 20.0])  # omega h, about, at 20 substeps
+
+
+def springs(name: str) -> tuple[tv.Particles, list]:
+    """Return particles and features: moving blocks of one constraint each, as stiff as STIFF.
+
+    Two more blocks at rest, one rigid and one damped, have rows of ROWS use the kernels of their Scene.
+    """
+    points = ROWS[name].points if name in ROWS else SOFT[name][0]
+    blocks, (k, dim) = len(STIFF) + 2 * (name in ROWS), points.shape
+    corners, x = np.arange(blocks * k).reshape(blocks, k), np.tile(points, (blocks, 1, 1))
+    v = np.tile(0.02 * np.random.default_rng(5).normal(size=points.shape), (blocks, 1, 1))
+    v[len(STIFF) :] = 0
+    if name in ROWS:
+        probe = ROWS[name].make(corners, np.zeros(blocks))
+        probe.prepare(tv.Particles(x.reshape(-1, dim)), np.ones(blocks * k))
+        slopes, rest = probe.gradients(x.reshape(-1, dim)), probe.violation(x.reshape(-1, dim))
+        size = (slopes**2).reshape(blocks, -1).sum(axis=1)
+        if name not in ("Rope 2D", "AngleLimit 3D", "Spacer 2D"):  # one-sided constraints just touch
+            rest[: len(STIFF)] -= 0.1 * ROWS[name].off
+        alpha = np.append(size[: len(STIFF)] / (1200 * STIFF) ** 2, [0.0, 1e-2])
+        damping = np.append(np.zeros(len(STIFF) + 1), 3.0)
+        made = ROWS[name].make(corners, rest, compliance=alpha, damping=damping, break_at=1e9)
+    else:
+        made = SOFT[name][1](corners, x, compliance=1 / (1200 * STIFF) ** 2)
+    start = tv.Particles(x.reshape(-1, dim), velocity=v.reshape(-1, dim), mass=np.tile(MASS[:k], blocks))
+    return start, [tv.Gravity(np.zeros(dim)), made]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*ROWS, *SOFT])
+def test_starts_from_velocities_that_were_read_change_nothing(world, name):
+    # Without gravity a block has the energy of its start. Starts from the velocities that are read, after each frame, may neither
+    # pump a spring nor brake it by more than 1 - (1 - (omega h)^4 / 16). With the force of the substep before in them, they would
+    # grow by 1 + (omega h)^2 / 4 per frame, e^(15 omega^2 h^2) per second. Assigning what was read makes no start.
+    start, features = springs(name)
+    size = len(ROWS[name].points if name in ROWS else SOFT[name][0])  # particles of a block
+    w = world(start, features, precision="f64")
+
+    def kinetic(back):
+        w.position, w.velocity = start.position, start.velocity
+        out = []
+        for _ in range(frames):
+            if back:
+                w._start_from(w.velocity)
+            w.step(1 / 60)
+            each = (start.mass * (w.velocity**2).sum(axis=1)).reshape(-1, size).sum(axis=1)
+            out.append(each[: len(STIFF)])
+        return np.array(out)
+
+    for substeps, frames in (2, 150), (8, 100), (20, 150), (80, 60):
+        w.substeps = substeps
+        alone, back = kinetic(False), kinetic(True)
+        few = frames // 5
+        most, first, last = alone.max(axis=0), back[:few].max(axis=0), back[-few:].max(axis=0)
+        assert (last <= 1.02 * np.maximum(first, most)).all(), (name, substeps, last / np.maximum(first, most))
+        resolved = STIFF * 20 / substeps < 0.3
+        assert (last >= 0.9 * alone[-few:].max(axis=0))[resolved].all(), (name, substeps, last / alone[-few:].max(axis=0))
 
 
 @pytest.mark.slow
