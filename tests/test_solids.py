@@ -101,8 +101,7 @@ def test_friction_in_a_hollow_has_its_closed_form(world):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("precision", ["f64", "f32"])
-@pytest.mark.parametrize("restitution", [0.0, 0.8])
+@pytest.mark.parametrize("precision, restitution", [("f64", 0.0), ("f32", 0.8)])
 def test_nothing_passes_a_shell(world, precision, restitution, briefly):
     # The shell is 4 cm thick, 1/50 of the largest displacement in a substep, 2 m. Points slide, bounce and fly on both sides.
     rng = np.random.default_rng(3)
