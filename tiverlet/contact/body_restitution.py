@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from .restitution import Restitution
 
 MET = 2.0**-12  # of the first push of a pair: a smaller change counts as met, unless the inverse masses are known
-AIM = 2.0**-40  # [m] the least displacement with which a pair leaves after an impact, so that its normal can be told from it
+AIM = 2.0**-40  # [m] the least displacement with which a contact leaves after an impact, so that its normal can be told from it
 
 
 class BodyRestitution:

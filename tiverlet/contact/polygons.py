@@ -17,6 +17,7 @@ from ..geometry.ordered import median
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
+from .body_restitution import AIM
 from .exclusions import excluded_pairs
 from .force_share import ForceShare
 from .loops import checked, flat, laid, refuse_deep
@@ -24,7 +25,6 @@ from .pair_contact import PairContact
 from .polygon_narrow_phase import VERTEX, EdgePairTable, Outline, PolygonGeometry
 from .restitution import SLOW, under_force
 
-AIM = 2.0**-40  # [m] the least displacement with which a contact leaves after an impact, so that its normal can be told from it
 SKIN = 0.15  # skin of a vertex, relative to its longer edge
 
 
