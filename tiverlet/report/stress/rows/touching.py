@@ -3,7 +3,7 @@
 import numpy as np
 
 from ....colliders import Ball, Box, Capsule, HalfSpace, Sdf
-from ....constraints import Distance, Path
+from ....constraints import Distance, Path, ShapeMatch
 from ....contact import Contact
 from ....device import ti
 from ....forces import Drag, Gravity
@@ -255,6 +255,25 @@ def _small_periodic() -> Finding:
             holds[f"collided in {size:g} m"] = not np.allclose(w.velocity, v)
             holds[f"momentum in {size:g} m"] = np.allclose(w.velocity.sum(axis=0), v.sum(axis=0), atol=1e-9)
     return Finding(f"energy to {gained:.0e}", {**holds, "energy": gained < 1e-9})
+
+
+@row(103, "crosses of four discs hook into each other in a heap, e = 0.1 ... 1", "no energy is made, none is pressed together")
+def _crosses() -> Finding:
+    rng, cross, holds = np.random.default_rng(0), 0.28 * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]]), {}
+    angle = rng.uniform(0, 2 * np.pi, 30)
+    turn = np.moveaxis(np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]), 2, 0)
+    places = 0.6 + 0.8 * np.stack(np.divmod(np.arange(30), 6)[::-1], axis=1)
+    x, body = (places[:, None] + cross @ turn).reshape(-1, 2), np.arange(120).reshape(30, 4)
+    pairs = body[:, [[0, 1], [1, 2], [2, 3], [3, 0], [0, 2]]].reshape(-1, 2)
+    worst = 0.0
+    for name, holding in (("links", lambda: Distance(pairs)), ("clusters", lambda: ShapeMatch(body))):
+        for e in (0.1, 0.9, 1.0):
+            features = [Gravity(9.81), holding(), Contact(friction=0.5, restitution=e), Box((0, 0), (5.3, 20), friction=0.5)]
+            with world(Particles(x, radius=0.1), features, substeps=8) as w:
+                energy = [w.step(1 / 60).energy for _ in range(240)]
+                worst = max(worst, w.last.overlap)
+                holds[f"{name}, e = {e}"] = max(energy) <= 1.001 * energy[0] and w.last.overlap < 0.2
+    return Finding(f"overlap of at most {worst:.2g} radii at the end", holds)
 
 
 @row(70, "resting contact on a moving belt", "friction drags the right way: up to its speed after v / (mu g), then along")
