@@ -16,17 +16,32 @@ import numpy as np
 
 from ..features.feature import Batch
 from ..geometry.ordered import distinct
+from ..particles import Particles
 
 DIGIT = 1e-6  # relative tolerance of lengths, for beads that just touch
 FOLDED = 0.25  # radii of the smaller particle: a link that is shorter at the start counts as folded up, and is skipped
 
 
-def excluded_pairs(batches: Sequence[Batch], radius: np.ndarray) -> np.ndarray:
-    """Return pairs of particles that contacts leave out, (m, 2). radius: (n,) [m]."""
+def excluded_pairs(batches: Sequence[Batch], radius: np.ndarray, body: np.ndarray | None = None) -> np.ndarray:
+    """Return pairs of particles that contacts leave out, (m, 2). radius: (n,) [m].
+
+    body: the number of the loop of each particle, -1 for none, or None if there are no loops. Linked corners of two bodies are
+    not left out: a link fixes their distance, not on which side of an edge of the other body each of them is. Boxes in a row, on
+    two rods each, folded into each other. Only corners whose rims the link holds inside each other are left out.
+    """
     own = [b.excluded_pairs(b.start) for b in batches]
+    if body is not None:
+        own = [pairs if b.clusters else pairs[~_joins(pairs, b.start, body)] for b, pairs in zip(batches, own, strict=True)]
     limits = [b.max_distances() for b in batches]
     links, lengths = (np.concatenate(some) for some in zip((np.zeros((0, 2), dtype=np.int32), np.zeros(0)), *limits, strict=True))
     return np.concatenate([np.zeros((0, 2), dtype=np.int32), *own, _inside(links, lengths, radius)])
+
+
+def _joins(pairs: np.ndarray, start: Particles, body: np.ndarray) -> np.ndarray:
+    """Return which pairs (m, 2) are corners of two bodies whose rims are not inside each other, (m,)."""
+    i, j = pairs.T
+    reach, distance = start.radius[i] + start.radius[j], np.linalg.norm(start.position[i] - start.position[j], axis=1)
+    return (body[i] != body[j]) & (np.minimum(body[i], body[j]) >= 0) & ((reach == 0) | (distance > (1 + DIGIT) * reach))
 
 
 def _inside(links: np.ndarray, lengths: np.ndarray, radius: np.ndarray) -> np.ndarray:

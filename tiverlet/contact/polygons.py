@@ -192,7 +192,11 @@ class Polygons(PairContact):
         if dev.has_restitution:
             dev.restitution = PolygonRestitution(scene, dev.geometry, self.table)
             dev.hit = dev.restitution.hit
-        linked = excluded_pairs(batches, scene.particles.radius)
+        body = np.full(len(scene.particles), -1)
+        if self.loops:
+            corner, _begin, owner = flat(self.loops)
+            body[corner] = owner
+        linked = excluded_pairs(batches, scene.particles.radius, body)
         pair_data = [
             *dev.geometry.carried,
             *([dev.slip] if dev.has_friction else []),
