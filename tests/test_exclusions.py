@@ -100,7 +100,7 @@ def test_edits_and_copies_leave_out_the_same(world):
 @pytest.mark.slow
 def test_boxes_in_a_row_do_not_fold_into_each_other(world):
     # Two boxes on two rods, as cars of a train, fall into a heap. Each rod kept its corners from touching the other box, whose
-    # sides then passed these corners: boxes got into each other, and the heap gained three times its energy.
+    # sides then passed these corners: boxes got into each other, and the heap had six times its energy.
     box, rng = np.array([[0.0, 0.0], [0.4, 0.0], [0.4, 0.4], [0.0, 0.4]]), np.random.default_rng(0)
     places = np.stack([0.3 + 1.5 * (np.arange(9) % 3), 0.4 + 1.2 * (np.arange(9) // 3)], axis=1)
     x = (places[:, None, None] + np.array([[0.0, 0.0], [0.6, 0.0]])[:, None] + box).reshape(-1, 2)
