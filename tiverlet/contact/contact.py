@@ -148,6 +148,11 @@ class Contact(PairContact):
         dev.splitting.regroup(n)
         dev.projection.regroup(n, dev.list.team)
 
+    def enter(self, scene: Scene) -> None:
+        """Store the scene, and fix what kernels contain."""
+        super().enter(scene)
+        self.dev.spins, self.dev.axes = scene.state.spins and self.dev.has_friction, scene.particles.axes
+
     def make_search(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields and the neighbour search, and return the search."""
         dim, dev = scene.particles.dim, self.dev
@@ -157,7 +162,6 @@ class Contact(PairContact):
         # The push of the pair in the last substep, per inverse mass [kg m].
         dev.push = PairData("push", 0, persistent=True, only_touching=True)
         dev.slip = PairData("slip", dim, persistent=True)
-        dev.spins, dev.axes = scene.state.spins and dev.has_friction, scene.particles.axes
         dev.turn = PairData("turn", dev.axes, persistent=True) if dev.turns else None
         dev.slack = PairData(
             "slack", 0, persistent=True, only_touching=True
@@ -222,7 +226,7 @@ class Contact(PairContact):
     @property
     def strikes_bodies(self) -> bool:
         """Whether bodies of linked particles bounce as wholes: with restitution, unless friction turns particles."""
-        return self.dev.has_restitution and not (self.scene.state.spins and self.dev.has_friction)
+        return self.dev.has_restitution and not self.dev.spins
 
     @ti.func
     def is_pressed(self, i, e):
