@@ -141,7 +141,7 @@ class BodyImpacts:
         An impact is too short for other springs to act.
         """
         holds = batch.dev.is_firm(c, h)
-        if ti.static(batch.breaks):
+        if ti.static(batch.dev.strength.breaks):
             holds = holds and batch.dev.strength.is_intact(c)
         if holds:
             if ti.static(batch.clusters):
