@@ -76,7 +76,7 @@ def refuse_turning(who: str) -> None:
 def limit_length(v, most, length):
     """Return a vector v, shortened to `length` if it is longer than `most`: the part of a slip v that friction takes back."""
     size = v.norm()
-    if size > most:
+    if size > ti.max(most, 0):  # a load that is taken back is negative, and v may be 0
         v *= length / size
     return v
 
