@@ -15,7 +15,8 @@ MET = 2.0**-9  # of the first push: a smaller error of the normal displacement c
 FINE = 2.0**-16  # the same where the inverse masses of rigid clusters are known
 CAREFUL = 0.55  # the least secant of a pair. Impacts may change each other: projections converge with steps of less than 1 / 0.5
 FELT = 2.0**-20  # of a squared displacement: a smaller change is no impact
-LINKED, IN_CLUSTER = 1, 2  # what holds a particle that can move: links, or a rigid cluster that shares none of these
+# What holds a particle that can move: rigid clusters that share particles, links, or a rigid cluster that shares none.
+IN_SHARED, LINKED, IN_CLUSTER = 1, 2, 3
 STRUCK_NOW, STRUCK_BEFORE = 1, 2  # a particle is struck: in the pass in which it meets the wall or particle, and in later passes
 
 
@@ -92,7 +93,7 @@ class BodyImpacts:
         self.stops = stops_bodies(scene, batches)
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.state = scene.state
-        self.rigid = add("impacts.rigid", n, kind=ti.i32)  # LINKED, IN_CLUSTER, or 0
+        self.rigid = add("impacts.rigid", n, kind=ti.i32)  # IN_SHARED, LINKED, IN_CLUSTER, or 0
         self.struck = add("impacts.struck", n, kind=ti.i32)  # STRUCK_NOW, STRUCK_BEFORE, or 0
         self.normal, self.moved = add("impacts.normal", n, width=dim), add("impacts.wall_moved", n, width=dim)
         self.coefficients = add("impacts.friction", n, width=2)
@@ -126,6 +127,11 @@ class BodyImpacts:
 
     @ti.func
     def is_linked(self, i):
+        """Whether extra passes take particle i along with its body."""
+        return self.rigid[i] >= LINKED
+
+    @ti.func
+    def is_held_rigidly(self, i):
         """Whether rigid constraints hold particle i."""
         return self.rigid[i] != 0
 
@@ -145,11 +151,12 @@ class BodyImpacts:
             holds = holds and batch.dev.strength.is_intact(c)
         if holds:
             if ti.static(batch.clusters):
+                kind = ti.select(batch.dev.is_body(c), IN_CLUSTER, IN_SHARED)
                 for e in range(batch.dev.corners.starts[c], batch.dev.corners.starts[c + 1]):
                     if self.state.w.positive(batch.dev.corners.members[e]):
-                        self.rigid[batch.dev.corners.members[e]] = IN_CLUSTER
+                        ti.atomic_max(self.rigid[batch.dev.corners.members[e]], kind)
             for k in ti.static(range(batch.arity)):
-                self.rigid[batch.dev.corners.member(c, k)] = LINKED
+                ti.atomic_max(self.rigid[batch.dev.corners.member(c, k)], LINKED)
 
     @ti.func
     def is_struck_now(self, i):

@@ -315,7 +315,7 @@ class Contact(PairContact):
                         given, slack, rests = self.dev.restitution.bounce(i, j, n, held, self.dev.slack.field[e], last, first)
                         slack = ti.min(slack, ti.max(overlap, 0))
                         if first != 0:
-                            if self.dev.restitution.joins_bodies(i, j):
+                            if self.dev.restitution.presses_bodies(i, j):
                                 slack = self.dev.restitution.kept_slack(i, j, slack, now.h)
                                 self.dev.slack.field[e] = slack
                             else:

@@ -52,6 +52,14 @@ class Restitution:
         return out
 
     @ti.func
+    def presses_bodies(self, i, j):
+        """Whether rigid constraints hold particle i or j: they would turn a lift into speed, see kept_slack()."""
+        out = False
+        if ti.static(bool(self.bodies)):
+            out = self.bodies.impacts.is_held_rigidly(i) or self.bodies.impacts.is_held_rigidly(j)
+        return out
+
+    @ti.func
     def clear(self, i, weight):
         """Clear the struck flags and impulses of the pairs of particle i before the first pass. weight: m_i w_i of it."""
         self.weight[i] = weight
@@ -71,7 +79,7 @@ class Restitution:
         rests, e = True, self.table.of(i, j)[2]
         if e > 0:
             deep = ti.select(last > 0, overlap, ti.select(e < 1, slack, 0))  # an elastic pair rests only if it was pushed
-            if self.joins_bodies(i, j):  # others press them together: an impact would leave them there
+            if self.presses_bodies(i, j):  # others press them together: an impact would leave them there
                 deep = overlap
             if last == 0:
                 slack = ti.max(slack, overlap - ti.max(here, 0))

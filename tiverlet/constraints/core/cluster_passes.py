@@ -192,15 +192,21 @@ class ClusterPasses(Passes):
 
     @ti.func
     def is_firm(self, c, h):
-        """Whether cluster c moves as a body in impacts: it is rigid for a substep h, and shares no particle that can move."""
+        """Whether cluster c is rigid in impacts, for a substep h."""
         out = self.mass[c] > 0
+        if ti.static(self.spring.soft):
+            if out and self.spring.alpha[c] > 0:
+                out = stiff(self.spring.alpha[c], h, 1 / self.mass[c]) > FIRM
+        return out
+
+    @ti.func
+    def is_body(self, c):
+        """Whether cluster c shares no particle that can move, so that it moves as a body in impacts."""
+        out = True
         for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
             i = self.corners.members[e]
             w = self.w.of(i)
             out = out and (w == 0 or self.slots.split[i] < 2 * w)
-        if ti.static(self.spring.soft):
-            if out and self.spring.alpha[c] > 0:
-                out = stiff(self.spring.alpha[c], h, 1 / self.mass[c]) > FIRM
         return out
 
     @ti.func
