@@ -309,10 +309,10 @@ class Contact(PairContact):
                             known = self.dev.known.known_push(e, now)
                             push = known
                     if ti.static(self.dev.has_restitution):
-                        held = overlap
+                        bearing = overlap
                         if ti.static(self.dev.has_loads):  # bounce() compares what holds the load: add the known load's overlap
-                            held = ti.max(overlap, 0) + ti.max((1 - keeps) / each, alone) * self.dev.known.known_push(e, now)
-                        given, slack, rests = self.dev.restitution.bounce(i, j, n, held, self.dev.slack.field[e], last, first)
+                            bearing = ti.max(overlap, 0) + ti.max((1 - keeps) / each, alone) * self.dev.known.known_push(e, now)
+                        given, slack, rests = self.dev.restitution.bounce(i, j, n, bearing, self.dev.slack.field[e], last, first)
                         slack = ti.min(slack, ti.max(overlap, 0))
                         if first != 0:
                             if self.dev.restitution.presses_bodies(i, j):
