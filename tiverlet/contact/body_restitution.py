@@ -54,14 +54,9 @@ class BodyRestitution:
     @ti.func
     def begin(self, i, j, e, n):
         """Begin the impact of the pair at entry e of the list of particle i, with the normal n from j to i."""
-        self.aim.field[e] = ti.max(self.table.of(i, j)[2] * self.approach(i, j, n), ti.static(AIM)) * n
+        self.aim.field[e] = ti.max(self.table.of(i, j)[2] * self.restitution.approach(i, j, n), ti.static(AIM)) * n
         self.push.field[e] = self.step.field[e] = 0 * n
         self.first.field[e] = 0 * self.first.field[e]
-
-    @ti.func
-    def approach(self, i, j, n):
-        """Return how far particles i and j came together in the last substep [m]."""
-        return -self.state.relative_displacement(self.state.before[i] - self.state.before[j], i, j).dot(n)
 
     @ti.func
     def take_part(self, i, parts):
@@ -93,13 +88,15 @@ class BodyRestitution:
         d = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j)
         if first == 0:
             if ti.static(self.impacts.clusters):  # Newton's law holds for tangents, see ClusterImpact
-                approach = self.approach(i, j, n)
+                approach = self.restitution.approach(i, j, n)
                 if approach > 0:
                     aim = ti.max(aim * (1 - bend / approach), ti.static(AIM))
                     self.aim.field[e] = aim * n
-            speed = (aim + bend - d.dot(n)) / (1 + self.table.of(i, j)[2])
+        lack = aim + bend - d.dot(n)
+        if first == 0:
+            speed = lack / (1 + self.table.of(i, j)[2])
         both = self.impacts.response(i, n) + self.impacts.response(j, n)
-        pressed = ti.max(last.dot(n) + (aim + bend - d.dot(n)) / both.dot(n), 0)
+        pressed = ti.max(last.dot(n) + lack / both.dot(n), 0)
         normal = pressed - last.dot(n)
         step, met = normal * n, ti.static(MET) + 0 * aim
         if ti.static(self.table.has_friction):

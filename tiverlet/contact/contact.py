@@ -332,9 +332,7 @@ class Contact(PairContact):
                     if ti.static(self.dev.has_restitution):
                         if given > 0:
                             self.dev.restitution.struck.field[e] = 1
-                            if self.dev.restitution.joins_bodies(i, j):
-                                if ti.static(bool(self.dev.restitution.bodies)):
-                                    self.dev.restitution.bodies.begin(i, j, e, n)
+                            if self.dev.restitution.leave_to_bodies(i, j, e, n):
                                 given, parts = ti.zero(given), parts + 1
                             elif self.dev.hit[None] == 0:
                                 self.dev.hit[None] = 1

@@ -25,7 +25,7 @@ FOLDED = 0.25  # radii of the smaller particle: a link that is shorter at the st
 def excluded_pairs(batches: Sequence[Batch], radius: np.ndarray, body: np.ndarray | None = None) -> np.ndarray:
     """Return pairs of particles that contacts leave out, (m, 2). radius: (n,) [m].
 
-    body: the number of the loop of each particle, -1 for none, or None if there are no loops. Linked corners of two bodies are
+    body: the number of the body of each particle, see Outline, -1 for none; None without bodies. Linked corners of two bodies are
     not left out: a link fixes their distance, not on which side of an edge of the other body each of them is. Boxes in a row, on
     two rods each, folded into each other. Only corners whose rims the link holds inside each other are left out.
     """

@@ -192,11 +192,7 @@ class Polygons(PairContact):
         if dev.has_restitution:
             dev.restitution = PolygonRestitution(scene, dev.geometry, self.table)
             dev.hit = dev.restitution.hit
-        body = np.full(len(scene.particles), -1)
-        if self.loops:
-            corner, _begin, owner = flat(self.loops)
-            body[corner] = owner
-        linked = excluded_pairs(batches, scene.particles.radius, body)
+        linked = excluded_pairs(batches, scene.particles.radius, dev.outline.body)
         pair_data = [
             *dev.geometry.carried,
             *([dev.slip] if dev.has_friction else []),

@@ -9,8 +9,8 @@ from ..neighbours.neighbour_list import PairData
 from .narrow_phase import DiscGeometry
 
 SLOW = 2.0  # a pair rests if this many substeps of forces account for its speed, see Restitution
-UPTAKE = 1 / 8  # share of the slack of a pair that a substep removes
 ELASTIC = 2.0**-8  # the same for e = 1: rounding alone, so that a load at rest does not count as impacts
+UPTAKE = 1 / 8  # share of the slack of a pair that a substep removes
 
 
 class Restitution:
@@ -49,6 +49,15 @@ class Restitution:
         out = False
         if ti.static(bool(self.bodies)):
             out = self.bodies.joins(i, j)
+        return out
+
+    @ti.func
+    def leave_to_bodies(self, i, j, e, n):
+        """Begin the impact of a pair as one of bodies, if it is one. Returns whether it is."""
+        out = self.joins_bodies(i, j)
+        if ti.static(bool(self.bodies)):
+            if out:
+                self.bodies.begin(i, j, e, n)
         return out
 
     @ti.func
@@ -113,9 +122,14 @@ class Restitution:
 
         Also return how far the pair approaches in this substep, and how far it would without forces [m].
         """
-        a = -self.state.relative_displacement(self.state.before[i] - self.state.before[j], i, j).dot(n)
+        a = self.approach(i, j, n)
         here = -self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n)
         return here + self.table.of(i, j)[2] * ti.max(a, 0), here, a
+
+    @ti.func
+    def approach(self, i, j, n):
+        """Return how far particles i and j came together in the last substep [m]."""
+        return -self.state.relative_displacement(self.state.before[i] - self.state.before[j], i, j).dot(n)
 
     @ti.func
     def collision(self, i, j, n, overlap):

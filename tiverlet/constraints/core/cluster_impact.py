@@ -51,8 +51,7 @@ class ClusterImpact:
         if hit:
             self.move_as_body(c, begin, end)
         else:
-            for e in range(begin, end):
-                self.corners.write_move(e, ti.cast(self.cluster.zero_vector(), self.real))
+            self.corners.rest(c)
 
     @ti.func
     def move_as_body(self, c, begin, end):
@@ -119,7 +118,7 @@ class ClusterImpact:
         """Make the targets of particles that strike walls in this pass those of tangents, where the body turns by `turn`."""
         for e in range(begin, end):
             i = self.corners.members[e]
-            if self.is_struck(i) and self.impacts.is_struck_now(i):
+            if self.impacts.is_struck_now(i):
                 target, r = self.wide(self.impacts.target[i]), self.cluster.relative_position(e, i0, 1) - start
                 b = rotation.bend(turn, r, self.wide(self.impacts.normal[i]))
                 before = target - self.wide(self.impacts.first_push[i]) - 2 * b  # d.n before the substep, -target / e

@@ -102,7 +102,7 @@ class VariableCorners:
     def __init__(
         self, scene: "Scene", name: str, starts: np.ndarray, members: np.ndarray, owner: np.ndarray, places: np.ndarray
     ):  # fmt: skip
-        self.state, self.slots = scene.state, scene.slots
+        self.state, self.slots, self.real = scene.state, scene.slots, scene.real
         count, size, number = len(starts) - 1, len(members), scene.memory.number
         parts = -(-np.diff(starts) // BLOCK)
         first = np.concatenate([[0], np.cumsum(parts)])
@@ -139,7 +139,7 @@ class VariableCorners:
     def rest(self, c):
         """Write no moves for constraint c."""
         for e in range(self.starts[c], self.starts[c + 1]):
-            self.write_move(e, 0 * self.slots.move[0])
+            self.write_move(e, ti.Vector.zero(self.real, self.state.dim))
 
     @ti.func
     def reference_particle(self, c):
