@@ -26,8 +26,8 @@ class DiscGeometry:
     """The geometry of pairs of discs or spheres: C(x) = |x_i - x_j| - (r_i + r_j), normal n = (x_i - x_j) / |x_i - x_j|.
 
     The normal points from j to i. Particles that the user put into each other shrink for a while, and grow back at push_out
-    [m/s], or more slowly after overlap_release.shrink_left(). search: the NeighbourSearch that lists the pairs. impulse: the
-    pushes of listed pairs in the last substep [kg m].
+    [m/s], or more slowly: see parting_speeds(), and overlap_release.shrink_left(). search: the NeighbourSearch that lists the
+    pairs. impulse: the pushes of listed pairs in the last substep [kg m].
     """
 
     push_out: Any = OnDevice()

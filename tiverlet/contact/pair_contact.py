@@ -40,7 +40,7 @@ class Geometry(Protocol):
         """Allow the overlap that particle i has with particles of index `first` or more; pairs part at up to `speed` [m/s]."""
 
     def restore(self, i, h) -> None:
-        """Reduce the allowed overlap of particle i after a substep h, at push_out [m/s]."""
+        """Reduce the allowed overlap of particle i after a substep h, at push_out [m/s] or more slowly."""
 
     def is_shrunk(self, i) -> Any:
         """Whether particle i is allowed to overlap."""

@@ -72,7 +72,8 @@ class PolygonGeometry:
         self.longest = add("Polygons.longest_edge", n, values=outline.longest)
         self.step = scene.memory.number(self._stride(outline), scene.real)
         self.allowed = add("Polygons.allowed", n, state=True)  # overlap [m]
-        self.in_state = {"allowed": self.allowed}
+        self.slower = add("Polygons.slower", n, state=True)  # than at push_out its allowed overlap ends [m/s]
+        self.in_state = {"allowed": self.allowed, "slower": self.slower}
         # Particle 0 writes h. It may sleep, so with Sleep h is part of the state.
         self.h = add("Polygons.substep", None, state=bool(scene.state.sleepers))
         # manifold: for each entry the contact of which its particle is the vertex: overlap, place on the edge (DISCS without an
@@ -463,22 +464,27 @@ class PolygonGeometry:
     def shrink(self, i, first, speed):
         """Allow particle i the overlap that it has as a vertex in contacts with particles of index `first` or more.
 
-        Bodies then part at push_out, whatever `speed` is.
+        Bodies then part at `speed` [m/s], or at push_out if that is less.
         """
         self.detect(i, 0)
-        allowed = ti.select(first > 0, self.allowed[i], 0 * self.w.of(i))
+        before = ti.select(first > 0, self.allowed[i], 0 * self.w.of(i))
+        allowed = before
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             j, found = self.list.neighbour[e], self.manifold.field[e]
             if ti.max(i, j) >= first and (found[1] > DISCS or self.keeps(i, j)):
                 allowed = ti.max(allowed, found[0])
         self.allowed[i] = allowed
+        if allowed > before:
+            self.slower[i] = ti.max(self.push_out - speed, 0)
+        elif allowed == 0:
+            self.slower[i] = 0
 
     @ti.func
     def restore(self, i, h):
-        """Reduce the allowed overlap of particle i after a substep h [s], at push_out. Particle 0 stores h."""
+        """Reduce the allowed overlap of particle i after a substep h [s], at push_out or more slowly. Particle 0 stores h."""
         if i == 0:
             self.h[None] = h
-        self.allowed[i] = ti.max(self.allowed[i] - self.push_out * h, 0)
+        self.allowed[i] = ti.max(self.allowed[i] - (self.push_out - self.slower[i]) * h, 0)
 
     @ti.func
     def is_shrunk(self, i):

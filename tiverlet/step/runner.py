@@ -10,6 +10,7 @@ from ..constraints.core.scalar import Scalar
 from ..constraints.path import Path
 from ..contact.initial_overlap import overlapping
 from ..contact.mass_splitting import still_soft
+from ..contact.parting import parting_speeds
 from ..device.interrupts import deferred_signals
 from ..device.patches.compiler import CachedLaunch
 from ..particles.spin import moments_of_inertia
@@ -623,7 +624,7 @@ class Runner:
                 contact.enable_shrink()
 
     def shrink_overlapping(self, first: int, speed: float = np.inf) -> None:
-        """Let particles from number `first` on that the user placed into others part gently, at up to `speed` [m/s]."""
+        """Let particles from number `first` on that the user placed into others part gently, pairs at up to `speed` [m/s]."""
         contact = self.step.contacts[0]
         if not contact.shrinks:
             x = self.scene.state.get(self.memory) if first else None
@@ -631,7 +632,9 @@ class Runner:
                 return  # overlap under a load is no error of placing
             contact.enable_shrink()
             self.renew()
-        self.step.shrink_overlapping(first, speed)
+        geometry, x = contact.dev.geometry, self.scene.state.get(self.memory)
+        speeds = parting_speeds(self.scene, self.batches, geometry.candidates(x), x, first, contact.push_out)
+        self.step.shrink_overlapping(first, np.minimum(speeds, speed))
 
     def report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
         """The StepReport of the last diagnostics."""

@@ -551,11 +551,11 @@ class Step:
         return self.searches[k].list.need[None]
 
     @ti.kernel
-    def shrink_overlapping(self, first: ti.i32, speed: ti.f64):
-        """Shrink particles that overlap any of number `first` or above until they fit; pairs part at up to `speed` [m/s]."""
+    def shrink_overlapping(self, first: ti.i32, speeds: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+        """Shrink particles that overlap any of number `first` or above until they fit. speeds: of parting, (n,) [m/s]."""
         for c in ti.static(self.contacts):
             for i in range(self.n):
-                c.shrink(i, first, ti.cast(speed, self.real))
+                c.shrink(i, first, ti.cast(speeds[i], self.real))
 
     @ti.kernel
     def stop_moved(self, old: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
