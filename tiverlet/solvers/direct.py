@@ -37,6 +37,8 @@ LEAST_SOFTNESS = 2e-12  # of the largest diagonal: the least softness, so that n
 # made it softer, REGAIN of its softness in a substep. At rest, where violations change by less than STILL in one of the longer
 # substeps, it recovers for nothing, by RECOVERY in this time; violations then change half as fast as they may.
 REGAIN, RECOVERY, STILL = 2.0**-4, 2.0**-14, 2.0**-12
+UNBORNE = 1e30  # (omega h)^2 of a tension that is undetermined
+MANY = 600  # rows of a part, up to which it may stiffen
 GONE = 0.1  # of its violations: what may be left of them a substep after they seem to have been removed
 SOFTENED = "system.softened"  # a field, by its name in recordings
 
@@ -70,8 +72,10 @@ class Direct(Solver):
     at the start of the substep: an arbitrary number, which adds energy. Such a system is detected by a pivot that is a small part
     of its diagonal, while solutions with directions at the start and at the end disagree about the tension. It is solved with
     directions at the end, and softened until (omega h)^2 <= 1; so is a system with a transverse (omega h)^2 > 4. It gives way and
-    loses energy, and the flag "softened" says so. Where the substep gets shorter, such a system remains as soft as it is, and
-    becomes stiffer slowly, at rest: its tension, and with it the energy that is stored, would grow with 1 / h^2.
+    loses energy, and the flag "softened" says so. Where the substep gets shorter, its tension would grow with 1 / h^2, and with
+    it the energy that is stored. So its violations are removed first, and it bears its load again, if the shorter substep can
+    stand the tension and the scene has lost the energy that this takes. Else it remains as soft as it is, and becomes stiffer
+    slowly, at rest.
     """
 
     converges = True
@@ -118,11 +122,13 @@ class Elimination(System):
         item: np.ndarray,
     ):  # fmt: skip
         super().__init__(scene, batches, slots, scalars, found.rows)
+        self._scalars = scalars
         self.plan, self.parts, self.entries = found, self.memory.number(found.parts), self.memory.number(len(found.column))
         # Of each part that gave way in the last substep: (h' / h)^2 for the substep h' that it is softened for, the sum of its
         # violations, and what it lost to longer substeps, in energy h^2 / tension for h' = h. Else 0. The first number is below
-        # 0 where the part seems to have borne its load, until its violations are seen to be gone.
-        self.softened = scene.memory.field(SOFTENED, found.parts, width=3, kind=ti.f64, state=True)
+        # 0 where the part seems to have borne its load, until its violations are seen to be gone. The last is
+        # (omega h)^2 of the tension that it would have borne, UNBORNE where none bears the load.
+        self.softened = scene.memory.field(SOFTENED, found.parts, width=4, kind=ti.f64, state=True)
         product = found.product.copy()
         product[:, 1:] = slot[product[:, 1:]]
         side = np.repeat([b.side for b in scalars], [b.count for b in scalars])[found.rows]
@@ -168,20 +174,69 @@ class Elimination(System):
         state = self.memory.read(self.softened)
         some = np.flatnonzero(state[:, 0])
         if len(some):
-            soft, off, lost = state[some].T
+            soft, off, lost, tension = state[some].T
             kept = np.maximum(np.abs(soft) / ratio**2, 1.0)
             lost = (lost + off * (1 / np.abs(soft) - 1 / (kept * ratio**2))) * ratio**2
-            state[some] = np.stack([np.copysign(kept, soft), off, np.maximum(lost, 0.0)], axis=1)
+            state[some] = np.stack([np.copysign(kept, soft), off, np.maximum(lost, 0.0), tension * ratio**2], axis=1)
             self.memory.write(self.softened, state)
+
+    def _can_stiffen(self) -> np.ndarray:
+        """Return a mask of the parts that gave way in a longer substep, and need not in this one, (parts,)."""
+        state = self.memory.read(self.softened)
+        return (np.abs(state[:, 0]) > 1) & (state[:, 3] <= SOFTENED_TO)
+
+    @property
+    def can_stiffen(self) -> bool:
+        """Whether parts gave way in a longer substep, and may bear their loads in this one."""
+        return bool(self._can_stiffen().any())
+
+    def stiffen(self, x: np.ndarray, h: float, energy: float) -> bool:
+        """Let the parts that can stiffen bear their loads again in substeps h [s], of particles at x, (n, dim) [m].
+
+        energy: the most that violations may add when they are removed in one substep [J]. Returns whether the parts do.
+        """
+        some = self._can_stiffen()
+        done = sum(self._stored(part, x, h) for part in np.flatnonzero(some)) <= energy
+        if done:
+            state = self.memory.read(self.softened)
+            state[some] = 0.0
+            self.memory.write(self.softened, state)
+        return done
+
+    def _stored(self, part: Any, x: np.ndarray, h: float) -> float:
+        """Return the energy that the violations of a part at x add if one substep h [s] removes them, sum C^2 / 2 W h^2 [J].
+
+        It is infinite for more than MANY rows, and where a pivot of the matrix J w J^T is small: some load is hardly borne there.
+        """
+        begin, end = self.plan.part_begin[part : part + 2]
+        if end - begin > MANY:
+            return np.inf
+        J, C = np.zeros((end - begin, *x.shape)), np.zeros(end - begin)
+        for b in self._scalars:
+            row = self.row(b)
+            some = (row >= begin) & (row < end) & ~b.broken
+            np.add.at(J, (row[some, None] - begin, b.indices[some]), b.gradients(x)[some])
+            C[row[some] - begin] = (b.violation(x) if b.side == 0 else np.maximum(b.side * b.violation(x), 0.0))[some]
+        moves = J.any(axis=(0, 2)) & (self.inv_mass > 0)
+        acts = J[:, moves].any(axis=(1, 2))
+        J = (J * np.sqrt(self.inv_mass)[:, None])[acts][:, moves].reshape(acts.sum(), -1)
+        A = J @ J.T
+        W = np.diag(A)
+        try:
+            pivots = np.diag(np.linalg.cholesky(A)) ** 2
+        except np.linalg.LinAlgError:  # not positive definite
+            return np.inf
+        return float((C[acts] ** 2 / W).sum()) / (2 * h * h) if (pivots > SMALL_PIVOT * W).all() else np.inf
 
     @property
     def keeps_softness_of_longer(self) -> bool:
         """Whether a part is softened for a longer substep than the present one, so that shorter ones do not help."""
         return bool((np.abs(self.memory.read(self.softened)[:, 0]) > 1).any())
 
-    def gives_way(self, batch: Batch) -> np.ndarray:
-        """Return a mask of the constraints of a batch in parts that give way, (m,)."""
-        parts = np.repeat(self.memory.read(self.softened)[:, 0] != 0, np.diff(self.plan.part_begin))
+    def gives_way(self, batch: Batch, stiffens: bool = False) -> np.ndarray:
+        """Return a mask of the constraints of a batch in parts that give way, (m,). stiffens: only if they cannot stiffen."""
+        soft = self.memory.read(self.softened)[:, 0] != 0
+        parts = np.repeat(soft & ~(stiffens & self._can_stiffen()), np.diff(self.plan.part_begin))
         row = self.row(batch)
         return parts[row] & (row >= 0)
 
@@ -431,7 +486,7 @@ class Elimination(System):
                 if ti.abs(off - self.softened[b][1]) * ti.sqrt(soft) < STILL * off:
                     new = ti.max(new - 2 * RECOVERY * ti.sqrt(new), 1 + 0 * soft)
                 soft = new
-            self.softened[b] = ti.Vector([soft, off, ti.max(lost, 0 * lost)])
+            self.softened[b] = ti.Vector([soft, off, ti.max(lost, 0 * lost), self.softened[b][3]])
         return soft
 
     @ti.func
@@ -442,7 +497,7 @@ class Elimination(System):
         elif soft > 1:
             self.softened[b][0] = -soft
         else:
-            self.softened[b] = ti.Vector.zero(ti.f64, 3)
+            self.softened[b] = ti.Vector.zero(ti.f64, 4)
 
     @ti.func
     def limit_tensions(self, begin, end, longer):
@@ -529,6 +584,7 @@ class Elimination(System):
                 elif hard == 2:
                     ti.atomic_max(self.tension[None], ti.cast(TENSEST, ti.f64))
                     softness, stage = LEAST_SOFTNESS * most, GIVE_WAY
+                    self.softened[b][3] = UNBORNE
                     self.end_newton(b)
                 else:
                     tension_at_start, total_at_start, bound, stage = tension, total, hard == 0, COMPARE
@@ -542,6 +598,7 @@ class Elimination(System):
                     reported = ti.select(bound, tension_at_start, ti.min(tension, TENSEST))
                     ti.atomic_max(self.tension[None], ti.select(longer > 1, ti.min(reported, TENSEST), reported))
                     softness, stage = LEAST_SOFTNESS * most, GIVE_WAY
+                    self.softened[b][3] = ti.select(bound, tension_at_start, tension) / longer
                     self.end_newton(b)
                     if longer * self.earlier_tension(begin, end) > SOFTENED_TO:
                         self.clear_steps(begin, end)

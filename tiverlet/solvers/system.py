@@ -35,6 +35,7 @@ class System:
     parts: Any = 1  # number of independent systems
     steps = 0  # iterations of a pass, by start(), iterate() and end(); 0 for a solution by solve()
     refines = False  # whether parts may take a second Newton step in a pass, see takes_step() and is_unmet()
+    can_stiffen: Any = False  # whether parts gave way in a longer substep, and may bear their loads in this one
     keeps_softness_of_longer: Any = False  # whether a part is softened for a longer substep, so that shorter ones do not help
     late: tuple[str, ...] = ()  # the names of fields in the state that are not hashed where they are 0
     team: Any  # the threads that share the loops of start(), iterate() and end(); set when kernels are built
@@ -115,9 +116,14 @@ class System:
         off: for some batches, (m,), the violations of rigid constraints that cannot be removed at the new positions.
         """
 
-    def gives_way(self, batch: "Batch") -> np.ndarray:
-        """Return a mask of the constraints of a batch in parts that give way, and stay so in a shorter substep, (m,)."""
+    def gives_way(self, batch: "Batch", stiffens: bool = False) -> np.ndarray:
+        """Return a mask of the constraints of a batch in parts that give way, (m,). stiffens: only if they cannot stiffen."""
         return np.zeros(batch.count, dtype=bool)
+
+    def stiffen(self, x: np.ndarray, h: float, energy: float) -> bool:
+        """Let the parts that can stiffen bear their loads again in substeps h [s], of particles at x, (n, dim) [m]. energy: the
+        most that violations may add when they are removed in one substep [J]. Returns whether the parts do."""
+        return False
 
     def keep_softness(self, ratio: float) -> None:
         """Keep parts that give way as soft as they are, where the next substep is `ratio` times as long as the last one."""

@@ -91,13 +91,15 @@ class Aims(NamedTuple):
 
 
 def project(
-    runner: "Runner", h: float, dt: float, longest: float, contacts: ContactRows | None = None, measured: bool = False
+    runner: "Runner", h: float, dt: float, longest: float, contacts: ContactRows | None = None, measured: bool = False,
+    stiffens: bool = False,
 ) -> bool | None:  # fmt: skip
     """Remove the energy that violations would store in a shorter substep; d holds velocities.
 
     Nothing happens if violations are small, or if the moves would make contacts overlap more. h: the coming substep [s], of a
     frame dt [s]. longest: the longest substep since the last projection [s]. contacts: contacts that move together with links.
-    measured: whether a loop measures dt; then more violation counts as small.
+    measured: whether a loop measures dt; then more violation counts as small. stiffens: whether systems that give way are to bear
+    their loads again; if not, they remain as soft as they are.
     Returns whether positions are settled for h; None where contacts are in the way and the energy is more than a hundredth of the
     kinetic energy.
     """
@@ -115,8 +117,8 @@ def project(
         runner.released = stays
     system = slots and slots.system
     if system and not (system.steps or system.count_relaxed_alone(runner.batches)):
-        # It holds loads without a violation, or gives way, and remains as soft as it is.
-        batches = [b for b in batches if would_vibrate(_off(b, x, ~system.gives_way(b)), ratio, enough)]
+        # It holds loads without a violation, or gives way.
+        batches = [b for b in batches if would_vibrate(_off(b, x, ~system.gives_way(b, stiffens)), ratio, enough)]
     batches += sideways_rows(batches)
     batches += anchor_rows(runner.batches, x)
     clusters = Solids.loaded(runner, x, 1.0, apart=False)  # a fast test
@@ -138,8 +140,9 @@ def project(
     off = max(float(np.abs(undone * start.close).max(initial=0.0)), rails.worst / runner.scene.particles.size)
     if not frail and not would_vibrate(off, ratio, enough):
         return uneven or ratio < FAR
-    start = start.with_goal(start.C - (1 - ratio**2) * undone)
-    rows = start.at(rails.drawn(x, 1 - ratio**2)) if rails.worst else start
+    share = 1.0 if stiffens else 1 - ratio**2  # of the violations: what goes
+    start = start.with_goal(start.C - share * undone)
+    rows = start.at(rails.drawn(x, share)) if rails.worst else start
     kept = memory.read(state.d)
     v = kept.astype(np.float64)
     n = len(x)
@@ -152,7 +155,7 @@ def project(
     finest = ratio**4 if frail else ratio**2  # by loads, or by energies
     products = (SHARED if contacts else PRODUCTS) * (QUICK if measured else 1.0)
     aims = Aims(LEFT * finest, steps, 0.0 if frail else slight, products, DONE[frail])
-    rows, stopped = _moved(runner, start, _leaning(runner, rows, 1 - ratio**2), aims)
+    rows, stopped = _moved(runner, start, _leaning(runner, rows, share), aims)
     left = 0.0
     if contacts:
         rows, stopped, left = _together(runner, start, rows, stopped, contacts.stored(before, w), batches[:-1], aims)
@@ -175,6 +178,31 @@ def project(
         v[:n] = take_energy(start.jacobian, v[:n], moves, due, rows.wall.any(axis=1), None if contacts else bodies)
         memory.write(state.d, v)
     return True
+
+
+def stiffen(runner: "Runner", h: float, dt: float, longest: float, measured: bool) -> None:
+    """Let systems that gave way in a longer substep bear their loads again in substeps of h [s], if no energy comes from that.
+
+    Otherwise one long frame would leave a chain so soft that it stretches ever further. Once it is stiff, its violations store
+    (longest / h)^2 of their energy. So they are removed first, and the motion pays for it. The scene must not have more energy
+    afterwards than it ever had.
+    """
+    system = runner.scene.slots.system if runner.scene.slots else None
+    if not (system and system.can_stiffen):
+        return
+    state, memory, clock = runner.scene.state, runner.memory, runner.clock
+    x, d, energy = state.get(memory), memory.read(state.d), seen_before(runner)[0]
+    most = energy if clock.bound is None else max(energy, clock.bound)
+    done = project(runner, h, dt, longest, measured=measured, stiffens=True)
+    if done is None:
+        done = project(runner, h, dt, longest, ContactRows.of(runner), measured, stiffens=True)
+    if done:
+        room = most + SLIGHTEST * clock.kinetic - seen(runner)[0]
+        if room >= 0 and system.stiffen(state.get(memory), h, room):
+            return
+    state.put(memory, x)
+    memory.write(state.d, d)
+    runner.invalidate()
 
 
 def _leaning(runner: "Runner", rows: "Rows", share: float) -> "Rows":

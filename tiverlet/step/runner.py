@@ -22,7 +22,7 @@ from .frames import Frames
 from .integrator import FREE, decay, h2_effective_of, h2_rigid_of, shares_of
 from .launcher import Launcher
 from .overlap_release import release, shrink_left
-from .projection import project
+from .projection import project, stiffen
 from .span import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Span
 from .step import frame
 from .step_report import StepReport
@@ -222,6 +222,7 @@ class Runner:
         """
         clock, longest = self.clock, self.clock.longest
         measured = dt != clock.frame[1] and clock.first_moved != 0
+        stiffen(self, h, dt, longest, measured)
         projected = project(self, h, dt, longest, measured=measured) if keeps else None
         if keeps and projected is not None:
             clock.longest = h if self.linked else still_soft(h, longest, passes)
