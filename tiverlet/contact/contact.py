@@ -129,13 +129,12 @@ class Contact(PairContact):
         self._smallest_radius = float(radius.min(initial=np.inf))
 
     def can_regroup(self, change: Regrouping) -> bool:
-        """Whether particles can come and go in place: not if the groups, the blocks or the neighbour search would differ."""
+        """Whether particles can come and go in place: not if the blocks or the neighbour search would differ."""
         dev, now = self.dev, change.now
         if not self.can_touch:
             return not bool((now.radius > 0).any())
-        alike = self.table.has_same_rows(change.before.group, now.group)
         splits = dev.splitting.can_regroup(dev.list.team.piece_of(now.count))
-        return alike and splits and bool((now.radius > 0).any()) and dev.search.can_regroup(change, now.radius)
+        return splits and bool((now.radius > 0).any()) and dev.search.can_regroup(change, now.radius)
 
     def regroup(self, change: Regrouping) -> None:
         """Resize the fields after particles came and went. The thread team already has the new number."""

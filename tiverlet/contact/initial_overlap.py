@@ -14,14 +14,19 @@ MANY = 20_000  # particles above which the test takes too long
 CROWD = 16  # particles in a cell above which the test takes too long
 
 
-def overlapping(scene: Scene, batches: list[Batch], table: Table, x: np.ndarray, first: int = 0) -> bool | None:
+def overlapping(
+    scene: Scene, batches: list[Batch], table: Table, x: np.ndarray, first: int = 0, moved: np.ndarray | None = None
+) -> bool | None:  # fmt: skip
     """Whether discs or spheres at x (n, dim) [m] that push each other, by this table, overlap; None if the test would take long.
 
-    Only pairs count of which one particle is free to move and one has an index of `first` or more. Linked pairs never touch.
+    Only pairs count of which one particle is free to move and one has an index of `first` or more, and is in the mask `moved`,
+    (n,), if that is given. Linked pairs never touch.
 
-    With first = 0 an overlap counts exactly if the device finds it, rounding included, because the world is compiled for that.
+    Without both, an overlap counts exactly if the device finds it, rounding included, because the world is compiled for that.
     Otherwise an overlap within the rounding of f32 does not count.
     """
+    chosen, exact = np.arange(len(x)) >= first, first == 0 and moved is None
+    chosen = chosen if moved is None else chosen & moved
     radius, free = scene.particles.radius, scene.inv_mass > 0
     count, number = len(x), np.arange(len(x))
     if scene.periodic is not None:  # particles and their images side by side
@@ -29,12 +34,12 @@ def overlapping(scene: Scene, batches: list[Batch], table: Table, x: np.ndarray,
         radius, free = radius[number], free[number]
     close = 2.0**-20 * float(np.abs(x).max(initial=0.0) + radius.max(initial=0.0))
     begin = first if len(x) == count else 0
-    wide = radius + (0.0 if first else close / 2)  # include pairs that overlap by rounding only
+    wide = radius + (close / 2 if exact else 0.0)  # include pairs that overlap by rounding only
     pairs = _by_all(x, wide, begin) if (len(x) - begin) * len(x) <= FEW else _by_cells(x, wide)
     if pairs is None:
         return None
-    i, j = pairs[(number[pairs] >= first).any(axis=1)].T
-    if first:
+    i, j = pairs[chosen[number[pairs]].any(axis=1)].T
+    if not exact:
         near = ((x[i] - x[j]) ** 2).sum(axis=1) < np.maximum(radius[i] + radius[j] - close, 0) ** 2
     else:
         near = _meet(scene.state, x, radius, i, j)

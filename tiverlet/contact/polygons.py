@@ -156,8 +156,7 @@ class Polygons(PairContact):
         after.prepare(start, change.inv_mass.copy())
         self._after = after
         reach = after.dev.outline.reach
-        alike = after.can_touch and self.table.has_same_rows(change.before.group, now.group)
-        return alike and self.dev.search.can_regroup(change, now.radius, reach)
+        return after.can_touch and self.dev.search.can_regroup(change, now.radius, reach)
 
     def regroup(self, change: Regrouping) -> None:
         """Carry out the planned edit. The thread team already has the new number of particles."""

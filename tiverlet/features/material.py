@@ -1,5 +1,6 @@
 """Friction and restitution: checked arguments, and tables for kernels."""
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -140,7 +141,7 @@ class Table:
         if not self.senses and self.touching is None:
             return np.ones(len(pairs), dtype=bool)
         rank, table = self.rows(group)
-        m = rank.max() + 1
+        m = math.isqrt(len(table))
         return table.reshape(m, m, -1)[rank[pairs[:, 0]], rank[pairs[:, 1]], 3] == TOUCHES
 
     @property
@@ -152,22 +153,21 @@ class Table:
     def rows(self, group: np.ndarray, also: frozenset[int] = frozenset()) -> tuple[np.ndarray, np.ndarray]:
         """Return the rank of each particle's group, (n,), and the table, (ranks * ranks, 7).
 
-        also: groups to distinguish in addition to those that are named.
+        All other groups share the last rank. Groups without particles have ranks, too, so that their first particle compiles
+        nothing. also: groups to distinguish in addition to those that are named.
         """
-        named = self.named | also
+        named = sorted(self.named | also)
+        if len(named) >= MAX_GROUPS:
+            raise ValueError(f"{self.who}: {len(named)} groups of particles are named, but there can be {MAX_GROUPS - 1}.")
         names, which, _ = distinct(group)
-        at = {int(name): k for k, name in enumerate(name for name in names if name in named)}
-        m = len(at) + (len(at) < len(names))  # all other groups share one rank
-        if m > MAX_GROUPS:
-            raise ValueError(f"{self.who}: {len(at)} groups of particles are named, but there can be {MAX_GROUPS}.")
+        at, m = {name: k for k, name in enumerate(named)}, len(named) + 1
         rank = np.array([at.get(int(name), len(at)) for name in names], dtype=np.int64)[which]
         table = np.zeros((m, m, 7))
         table[..., 3] = self.touching is None
         for a, b in self.touching or []:
-            if a in at and b in at:
-                table[at[a], at[b], 3] = table[at[b], at[a], 3] = TOUCHES
+            table[at[a], at[b], 3] = table[at[b], at[a], 3] = TOUCHES
         for a, b in self.sensing:
-            if a in at and b in at and table[at[a], at[b], 3] != SENSES:
+            if table[at[a], at[b], 3] != SENSES:
                 table[at[a], at[b], 3], table[at[b], at[a], 3] = SENSED, SENSES
         for name, columns, given, parse in (
             ("friction", [0, 1, 4, 5], self.friction, friction_of), ("restitution", [2, 6], self.restitution, restitution_of),
@@ -177,9 +177,7 @@ class Table:
                 continue
             for pair, value in given.items():
                 a, b = self._pair(name, pair)
-                if a in at and b in at:
-                    row = parse(self.who, f"value of {pair}", value)
-                    table[at[a], at[b], columns] = table[at[b], at[a], columns] = row
+                table[at[a], at[b], columns] = table[at[b], at[a], columns] = parse(self.who, f"value of {pair}", value)
         return rank, table.reshape(m * m, 7)
 
     def set_columns(self, has_friction: bool, has_restitution: bool, turns: bool) -> None:
@@ -189,7 +187,7 @@ class Table:
     def bind(self, scene: "Scene", asked: bool = False) -> None:
         """Declare the table, and the groups where they differ. asked: whether of() is called even where all rows are 0."""
         rank, rows = self.rows(scene.particles.group)
-        self.groups = int(rank.max(initial=0)) + 1
+        self.groups = math.isqrt(len(rows))
         if self.uniform:
             rows = rows[:1]
         else:
@@ -198,12 +196,8 @@ class Table:
             self.width = 7 if self.turns else 4  # columns on the device
             self.entries = scene.memory.field("Contact.table", len(rows), width=self.width, values=rows[:, : self.width])
 
-    def has_same_rows(self, before: np.ndarray, now: np.ndarray) -> bool:
-        """Whether particles of the groups `now` have the same table as those of the groups `before`."""
-        return self.uniform or np.array_equal(self.rows(before)[1], self.rows(now)[1])
-
     def regroup(self, scene: "Scene", group: np.ndarray) -> None:
-        """Write the groups of the present particles, for which has_same_rows() is true."""
+        """Write the groups of the present particles."""
         if not self.uniform:
             scene.memory.write(self.rank, self.rows(group)[0])
 

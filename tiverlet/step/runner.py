@@ -245,7 +245,7 @@ class Runner:
         if removed is not None:
             way, share = removed
             seen = float(way.max()) if share > initial_violation.SEEN else 0.0
-            self.moved = max(self.moved, seen)
+            self.moved, self.clock.moved = max(self.moved, seen), None
             self.jumped = self.jumped or (bool((way > self.scene.particles.radius).any()) and seen > 0)
             self.invalidate()
 
@@ -261,7 +261,7 @@ class Runner:
         if self.jumped:
             for contact in self.step.contacts:  # the report must say that they may have passed other particles
                 self.memory.write(contact.dev.fast, 1)
-        self.clock.first_moved = None
+        self.clock.first_moved = self.clock.moved = None
 
     def advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
         """Run one frame, after begin()."""
@@ -341,9 +341,10 @@ class Runner:
             self.forget_loads(position)
             moved = (self.scene.state.get(self.memory) != position).any(axis=1)
             self.scene.state.put(self.memory, position)
-        self.clock.energy, self.clock.first_moved = None, 0
+        clock, known = self.clock, moved if self.clock.first_moved is None else self.clock.moved
+        clock.energy, clock.first_moved, clock.moved = None, 0, None if known is None else known | moved
         if (moved | (self.scene.inv_mass == 0)).all():  # what is violated now no pass has left
-            self.clock.longest = 0.0
+            clock.longest = 0.0
 
     def forget_loads(self, position: np.ndarray) -> None:
         """Before positions are set: forget the known loads of constraints and contacts that the new positions change."""
@@ -626,10 +627,10 @@ class Runner:
 
     def shrink_overlapping(self, first: int, speed: float = np.inf) -> None:
         """Let particles from number `first` on that the user placed into others part gently, pairs at up to `speed` [m/s]."""
-        contact = self.step.contacts[0]
+        contact, moved = self.step.contacts[0], self.clock.moved
         if not contact.shrinks:
-            x = self.scene.state.get(self.memory) if first else None
-            if x is not None and overlapping(self.scene, self.batches, contact.table, x, first) is False:
+            x = self.scene.state.get(self.memory) if first or moved is not None else None
+            if x is not None and overlapping(self.scene, self.batches, contact.table, x, first, moved) is False:
                 return  # overlap under a load is no error of placing
             contact.enable_shrink()
             self.renew()
