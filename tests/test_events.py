@@ -383,7 +383,7 @@ def test_absent_and_switched(world):
 def test_refused(world):
     with pytest.raises(ValueError, match=r"groups has \(0, 1\).* sensors"):
         tv.Contact(groups=[(1, 0)], sensors=[(0, 1)])
-    with pytest.raises(TypeError, match="sensors has the key 3, but a pair of groups"):
+    with pytest.raises(TypeError, match="sensors has 3, but a pair of groups"):
         tv.Contact(sensors=[3])
     with pytest.raises(TypeError, match="restitution has the key 0, but a pair of groups"):
         tv.Contact(restitution={0: 0.5})  # type: ignore[arg-type]

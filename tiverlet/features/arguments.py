@@ -46,7 +46,7 @@ class Knob:
         if self.device and inside_kernel() and self.device in vars(feature.dev):
             return at(vars(feature.dev)[self.device], None)
         if self.name not in feature.__dict__:
-            raise AttributeError(f"{feature!r} has no {self.name}.")
+            raise AttributeError(f"{feature!r} has no {self.name} before it is in a World, which takes it from the particles.")
         return feature.__dict__[self.name]
 
     def __set__(self, feature, value) -> None:

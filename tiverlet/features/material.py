@@ -240,4 +240,4 @@ class Table:
         return [self._pair(name, pair) for pair in pairs]
 
     def _pair(self, name: str, pair: Any) -> tuple[int, int]:
-        return checks.group_pair(self.who, name, pair, "the key ")
+        return checks.group_pair(self.who, name, pair, "the key " if name in ("friction", "restitution") else "")
