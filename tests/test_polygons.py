@@ -100,6 +100,7 @@ def test_boxes_stand_on_each_other_and_on_slopes(world):
         assert load == pytest.approx(4 * 9.81 * np.cos(np.radians(degrees)), rel=1e-3)
 
 
+@pytest.mark.filterwarnings("ignore:.*no constraint holds loops")
 def test_impulses_are_what_momentum_changes_by(world):
     # A point of 1 kg meets a free edge at a quarter of its length: the gradients are 1, -3/4 and -1/4, so the impulse is
     # (1 + e) u / (w_v + 9/16 w_a + 1/16 w_b). Another point meets a pinned edge, and a small square a large one, corners on edge.
@@ -237,6 +238,7 @@ def test_bodies_of_links_that_lie_edge_to_edge_fall_asleep(world):
     assert w.last.asleep == len(x) and w.last.overlap < 0.02
 
 
+@pytest.mark.filterwarnings("ignore:.*no constraint holds loops")
 def test_overlap_is_pushed_out_and_collapse_stays_finite(world):
     # A corner that starts inside of a box leaves it: each body is slower than 1.5 push_out (measured: 1.3). A loop without links
     # is pressed flat, and stays finite.
@@ -361,6 +363,7 @@ def test_bad_loops_are_named():
             make()
 
 
+@pytest.mark.filterwarnings("ignore:.*no constraint holds loops")
 def test_discs_beside_wide_bodies_list_what_they_may_touch(world):
     # Two discs are neighbours by their own radii, however long the edges of bodies elsewhere are. Cells and the skin follow the
     # radii, too. A disc is listed with both ends of an edge that is within its radius plus the skin, and few others.
@@ -433,3 +436,20 @@ def test_corners_that_cross_part_over_the_nearer_edge(world):
         parted = max(parted, float(np.abs(w.velocity).max()))
     assert 0.02 < parted < 0.4
     assert max(sat(y[loops[k]], y[loops[k + 1]])[0] for k in range(0, len(shapes), 2)) < 1e-6
+
+
+def test_a_hub_that_is_tied_to_all_corners_is_no_stray_particle(world):
+    # A wheel with its hub inside, in one rigid cluster or by spokes, rolls along the floor: its middle stays a radius above it.
+    angle = np.pi / 6 * np.arange(12)
+    x = np.concatenate([[[0.0, 0.3]], [0.0, 0.3] + 0.3 * np.stack([np.sin(angle), -np.cos(angle)], axis=1)])
+    spokes = [(0, k) for k in range(1, 13)] + [(k, k % 12 + 1) for k in range(1, 13)]
+    loops = [np.arange(1, 13)]
+    for ties in (tv.ShapeMatch([np.arange(13)]), tv.Distance(spokes)):
+        features = [tv.Gravity(), tv.HalfSpace((0, 1), friction=0.5), tv.Polygons(loops), ties]
+        w = world(tv.Particles(x, velocity=(1.0, 0.0)), features)
+        assert w.run(0.5).clean and w.last.contacts == 0
+        np.testing.assert_allclose(np.linalg.norm(w.position[1:] - w.position[0], axis=1), 0.3, rtol=0.02)
+    with pytest.raises(ValueError, match="particle 0 starts 0.29 m inside of loops"):
+        world(tv.Particles(x), [tv.Polygons(loops), tv.ShapeMatch(loops)])
+    with pytest.warns(UserWarning, match=r"no constraint holds loops\[0\] \(1 such in all\)"):
+        world(tv.Particles(x[1:]), [tv.Polygons([np.arange(12)]), tv.Pin([3, 4], compliance=1.0)])

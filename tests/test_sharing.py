@@ -168,6 +168,7 @@ def test_kernels_depend_on_no_number_of_anything(world, name, monkeypatch):
         assert written(w) == first
 
 
+@pytest.mark.filterwarnings("ignore:.*no constraint holds loops")
 @pytest.mark.parametrize("dim", [2, 3])
 def test_kernels_depend_on_no_number_of_particles(world, dim):
     # As above for features that act on all particles: all forces and walls, contacts of discs and of polygons.

@@ -1,6 +1,6 @@
 """Bodies as loops of particles, in NumPy: orientation, edge lengths, and particles that start inside of them (2D)."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -71,8 +71,13 @@ def turned(begin: np.ndarray, by: int) -> np.ndarray:
     return out
 
 
-def refuse_deep(loops: list[np.ndarray], x: np.ndarray, first: int) -> None:
-    """Raise ValueError if a particle of index `first` or more is deeper inside of a body than half of its nearest edge."""
+def refuse_deep(
+    loops: list[np.ndarray], x: np.ndarray, first: int, left_out: Callable[[int, np.ndarray], bool] = lambda i, loop: False
+) -> None:  # fmt: skip
+    """Raise ValueError if a particle of index `first` or more is deeper inside of a body than half of its nearest edge.
+
+    left_out: whether a particle touches no corner of a loop, as a hub that is tied to all of them.
+    """
     if not loops or first >= len(x):
         return
     corner, begin, _ = flat(loops)
@@ -82,10 +87,10 @@ def refuse_deep(loops: list[np.ndarray], x: np.ndarray, first: int) -> None:
         some[:first] = some[loops[k]] = False
         for i in np.flatnonzero(some).tolist():
             depth, edge = depth_of(x[i], x[loops[k]])
-            if depth > edge / 2:
+            if depth > edge / 2 and not left_out(i, loops[k]):
                 raise ValueError(
                     f"Polygons: particle {i} starts {depth:.3g} m inside of loops[{k}], deeper than half of the nearest edge "
-                    f"({edge:.3g} m), so there is no telling where it came from. Move it out."
+                    f"({edge:.3g} m), so there is no telling where it came from. Move it out, or tie it to all corners, as a hub."
                 )
 
 

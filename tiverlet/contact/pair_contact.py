@@ -63,7 +63,7 @@ class Geometry(Protocol):
 class PairContact(Feature):
     """A feature that keeps particles from overlapping. A world has at most one.
 
-    bodies: arrays of particles that sleep and wake together.
+    bodies: arrays of particles that sleep and wake together. ties: the constraints of its world.
 
     A subclass defines prepare() and make_search(), which makes `dev.geometry` and `dev.forces`. In a pass of a substep its
     methods are called in this order:
@@ -88,6 +88,9 @@ class PairContact(Feature):
     _smallest_radius = _present_skin = 0.0  # the smallest radius, and the present skin [m]
     table: Table  # bound to one world
     bodies: Sequence[np.ndarray] = ()
+    host_only = ("ties",)
+    kept_by_world = (*Feature.kept_by_world, "ties")
+    ties: Sequence[Batch] = ()
     can_touch = True
     code_size = 3.0
     neighbours_per_particle = 0  # initial list entries per particle, if more than discs need

@@ -1,5 +1,6 @@
 """Contacts of bodies made of loops of particles (2D)."""
 
+import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -94,9 +95,34 @@ class Polygons(PairContact):
             self.check_range(x)
 
     def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Warn as PairContact.review() does, and refuse particles that start deep inside of bodies."""
+        """Warn as PairContact.review() does, and of bodies that nothing holds. Refuse particles that start deep inside bodies."""
         super().review(particles, inv_mass)
-        refuse_deep(self.loops, particles.position, 0)
+        refuse_deep(self.loops, particles.position, 0, self._left_out)
+        loose = self._loose(inv_mass)
+        if len(loose):
+            k = int(loose[0])
+            warnings.warn(
+                f"{self!r}: no constraint holds loops[{k}] ({len(loose)} such in all), so its corners move one by one. Add "
+                f"tv.ShapeMatch(loops), or links.", stacklevel=3,
+            )  # fmt: skip
+
+    def _left_out(self, i: int, loop: np.ndarray) -> bool:
+        """Whether constraints tie particle i to all corners of a loop, so that it touches none of them."""
+        tied = [np.zeros(0, dtype=np.int32)]
+        for b in self.ties:
+            who = b.indices.ravel()
+            tied.append(who[np.isin(b.owner, b.owner[who == i])])
+        return bool(np.isin(loop, np.concatenate(tied)).all())
+
+    def _loose(self, inv_mass: np.ndarray) -> np.ndarray:
+        """Return the loops with a particle that moves, of which no constraint has two particles."""
+        body, count = self.dev.outline.body, len(self.loops)
+        held = np.bincount(body[(body >= 0) & (inv_mass > 0)], minlength=count) == 0
+        for b in self.ties:
+            own = body[b.indices.ravel()]
+            keys, times = np.unique((b.owner * (count + 1) + own)[own >= 0], return_counts=True)
+            held[keys[times > 1] % (count + 1)] = True
+        return np.flatnonzero(~held)
 
     def check_added(self, particles: Particles, first: int) -> None:
         """Refuse positions too far out, and added particles deep inside of bodies."""
@@ -108,6 +134,7 @@ class Polygons(PairContact):
         """Unbind from the world, and drop a planned edit."""
         super().release()
         self._after = None
+        self.__dict__.pop("ties", None)
 
     @property
     def indices(self) -> np.ndarray:

@@ -95,6 +95,8 @@ def assemble(
 
         refuse_restless(features, order)
     for feature, start in zip(features, starts, strict=True):
+        if isinstance(feature, PairContact):
+            feature.ties = [f for f in features if isinstance(f, Batch)]
         if start is None:
             feature.review(particles, inv_mass)
         else:
