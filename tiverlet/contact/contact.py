@@ -267,7 +267,7 @@ class Contact(PairContact):
         """Compute the corrections of particle i by its pairs, and the new pushes of these pairs."""
         first, fresh, final = now.first, now.fresh, now.final
         total, w = ti.Vector.zero(self.scene.real, self.dev.state.dim), self.dev.w.of(i)
-        lift, forced, carried = total, total, total
+        lift, forced, carried, rubbed = total, total, total, total  # rubbed: by the friction of impacts
         spin_change = ti.Vector.zero(self.scene.real, self.dev.axes)
         spin_forced = spin_change
         if ti.static(self.dev.has_restitution):
@@ -368,6 +368,9 @@ class Contact(PairContact):
                     elif ti.static(self.dev.has_friction):
                         want -= self.held(i, j, n, pressed * shared + given, self.dev.slip.field[e]) / shared
                     total += w * want
+                    if ti.static(self.dev.has_restitution and self.dev.has_friction):
+                        if given > 0:
+                            rubbed += w * (want - part * n)
                     if ti.static(self.dev.has_friction and not self.dev.spins):
                         if final != 0:
                             approach = -self.dev.state.relative_displacement(
@@ -391,6 +394,8 @@ class Contact(PairContact):
                 self.dev.forces.add(i, forced, first)
         if ti.static(self.dev.has_restitution):
             self.dev.restitution.lift[i] = lift
+            if ti.static(self.dev.has_friction):
+                self.dev.restitution.rubbed[i] = rubbed
             if ti.static(bool(self.dev.restitution.bodies)):
                 if first != 0:
                     self.dev.restitution.bodies.take_part(i, parts)
@@ -458,6 +463,7 @@ class Contact(PairContact):
                 self.dev.state.spin.s[i] = self.dev.state.spin.s[i] + self.dev.spinning.change[i]
             if ti.static(self.dev.has_restitution):
                 self.dev.state.advance(i, self.dev.restitution.lift[i])
+                self.dev.restitution.apply_friction(i)
 
     @ti.func
     def finish_substep(self, i, now):

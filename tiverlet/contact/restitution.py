@@ -38,6 +38,8 @@ class Restitution:
         self.weight = add("Contact.struck", n)  # the split mass of the first pass, 0 without contact
         self.d_change = add("Contact.d_change", n, width=dim)
         self.lift = add("Contact.lift", n, width=dim)  # moves the position only
+        if table.has_friction:
+            self.rubbed = add("Contact.rubbed", n, width=dim)  # change of displacement by the friction of impacts
         self.left = add("Contact.left", n)  # the fraction of the substep after the impact
         self.partner = add("Contact.partner", n, kind=ti.i32)
         self.first = add("Contact.first", n, kind=ti.i32)
@@ -143,6 +145,24 @@ class Restitution:
         return given, left, a
 
     @ti.func
+    def parted_by_friction(self, i, j, n):
+        """Return how far friction of impacts is going to part particles i and j along n [m].
+
+        It counts as before the impacts along the normals. After them, friction of the one pair of a disc that meets two others
+        would act along a slip that the other impact has changed, and might add energy.
+        """
+        out = 0 * self.weight[i]
+        if ti.static(self.table.has_friction):
+            out = (self.rubbed[i] - self.rubbed[j]).dot(n)
+        return out
+
+    @ti.func
+    def apply_friction(self, i):
+        """Count friction of impacts of particle i, by which its displacement has changed, as before impacts on walls, too."""
+        if ti.static(self.table.has_friction):
+            self.state.before[i] = self.state.before[i] + self.rubbed[i]
+
+    @ti.func
     def choose(self, i):
         """Choose the earliest struck pair of particle i that still approaches, and store its impact on i."""
         first, partner, most, w = -1, -1, 0 * self.weight[i], self.state.w.of(i)
@@ -153,6 +173,8 @@ class Restitution:
                     contact_distance = self.geometry.contact_distance(i, j)
                     overlap, _each, n, _reach = self.geometry.impact(i, j, contact_distance, self.weight[i], False)
                     given, left, a = self.collision(i, j, n, overlap)
+                    parted = self.parted_by_friction(i, j, n)
+                    given, a = given - (1 + self.table.of(i, j)[2]) * parted, a - parted
                     if overlap > 0 and a > 0 and given > 0:
                         if left > most or (left == most and earlier(i, j, partner)):
                             first, partner, most = e, j, left
