@@ -418,7 +418,7 @@ class Runner:
 
     def compile_for_repeats(self) -> None:
         """Compile what frames may need that are repeated with other substeps, so that no frame of a game waits for it later."""
-        if self.linked and not self.probe:
+        if (self.linked or self.step.contacts) and not self.probe:
             with self.memory.compiler():
                 self.stop_at_walls(self.scene.state.get(self.memory))
 
