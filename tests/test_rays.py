@@ -359,6 +359,7 @@ def test_of_things_at_the_same_distance_the_first_counts(world):
     assert w.ray((0, 3), (0, -1), 2.0, skip=[0]).particle == 1 and w.ray((0, 3), (0, -1), groups=(), features=slab[2:]).wall == 2
 
 
+@pytest.mark.filterwarnings("ignore:.*no constraint holds loops")
 def test_edges_of_polygons_are_links(world):
     body = np.array([(0, 0), (2, 0), (2, 2), (0, 2)])
     both = tv.Particles(np.concatenate([body, body + (4, 0)]), radius=0.1)
