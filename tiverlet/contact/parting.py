@@ -17,8 +17,9 @@ def parting_speeds(
     """Return the speed at which particles at x (n, dim) [m] are to part from those that they overlap, (n,) [m/s].
 
     All pairs of a heap part at the same time. So if d pairs are between two of its particles, these part d times as fast as each
-    pair. A pair parts at push_out / D, where D pairs are between the two particles that are farthest from each other: then no two
-    particles of a heap part faster than at push_out. At push_out itself, a column of ten discs would throw its top one 5 m high.
+    pair. A pair parts at push_out / D, where D pairs are between the two particles that are farthest from each other: then the
+    ends of a heap part at push_out, or at up to 1.7 times that, since pushes are over-relaxed. If each pair parted at push_out, a
+    column of ten discs would throw its top one 5 m high.
 
     Only overlaps of particles with an index of `first` or more count. Bodies move as a whole, so they count as one particle. What
     cannot move connects nothing.
