@@ -193,7 +193,7 @@ class World:
         waiting, clock = [f for f in self._features if f.changed and isinstance(f, Batch) and f.soft], self._clock
         first = initial_violation.first_stiffened(waiting, self.position) if waiting else None
         if first is not None:
-            clock.energy, clock.moved = None, None
+            clock.energy = clock.moved_mask = None
             clock.first_moved = first if clock.first_moved is None else min(first, clock.first_moved)
 
     def _upload_parameters(self) -> None:

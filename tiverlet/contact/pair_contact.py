@@ -235,6 +235,11 @@ class PairContact(Feature):
                 f"from the origin, but f32 tells only {FARTHEST} apart. Shift the scene towards the origin."
             )
 
+    def release(self) -> None:
+        """Unbind from the world, and forget its constraints."""
+        super().release()
+        self.__dict__.pop("ties", None)
+
     def enable_shrink(self) -> None:
         """Prepare for shrink(): from now on particles may be smaller than their radius."""
         self.dev.geometry.enable_shrink()

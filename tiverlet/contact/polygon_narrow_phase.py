@@ -485,6 +485,8 @@ class PolygonGeometry:
         if i == 0:
             self.h[None] = h
         self.allowed[i] = ti.max(self.allowed[i] - (self.push_out - self.slower[i]) * h, 0)
+        if self.allowed[i] == 0:
+            self.slower[i] = 0
 
     @ti.func
     def is_shrunk(self, i):

@@ -134,7 +134,6 @@ class Polygons(PairContact):
         """Unbind from the world, and drop a planned edit."""
         super().release()
         self._after = None
-        self.__dict__.pop("ties", None)
 
     @property
     def indices(self) -> np.ndarray:

@@ -237,7 +237,7 @@ class Table:
         """Check pairs of groups. Thousands of plain pairs are checked at once, ten times as fast as one by one."""
         if {*map(type, pairs)} == {tuple} and {*map(len, pairs)} == {2} and {type(k) for pair in pairs for k in pair} == {int}:
             return pairs
-        return [self._pair(name, pair) for pair in pairs]
+        return [self._pair(name, pair, "") for pair in pairs]
 
-    def _pair(self, name: str, pair: Any) -> tuple[int, int]:
-        return checks.group_pair(self.who, name, pair, "the key " if name in ("friction", "restitution") else "")
+    def _pair(self, name: str, pair: Any, what: str = "the key ") -> tuple[int, int]:
+        return checks.group_pair(self.who, name, pair, what)

@@ -196,37 +196,45 @@ class Elimination(System):
         energy: the most that violations may add when they are removed in one substep [J]. Returns whether the parts do.
         """
         some = self._can_stiffen()
-        done = sum(self._stored(part, x, h) for part in np.flatnonzero(some)) <= energy
+        done = self._stored(np.flatnonzero(some), x, h) <= energy
         if done:
             state = self.memory.read(self.softened)
             state[some] = 0.0
             self.memory.write(self.softened, state)
         return done
 
-    def _stored(self, part: Any, x: np.ndarray, h: float) -> float:
-        """Return the energy that the violations of a part at x add if one substep h [s] removes them, sum C^2 / 2 W h^2 [J].
+    def _stored(self, parts: np.ndarray, x: np.ndarray, h: float) -> float:
+        """Return the energy that the violations of parts at x add if one substep h [s] removes them, sum C^2 / 2 W h^2 [J].
 
         It is infinite for more than MANY rows, and where a pivot of the matrix J w J^T is small: some load is hardly borne there.
         """
-        begin, end = self.plan.part_begin[part : part + 2]
-        if end - begin > MANY:
-            return np.inf
-        J, C = np.zeros((end - begin, *x.shape)), np.zeros(end - begin)
+        C, corners, stored = np.zeros(self.plan.part_begin[-1]), [], 0.0
         for b in self._scalars:
-            row = self.row(b)
-            some = (row >= begin) & (row < end) & ~b.broken
-            np.add.at(J, (row[some, None] - begin, b.indices[some]), b.gradients(x)[some])
-            C[row[some] - begin] = (b.violation(x) if b.side == 0 else np.maximum(b.side * b.violation(x), 0.0))[some]
-        moves = J.any(axis=(0, 2)) & (self.inv_mass > 0)
-        acts = J[:, moves].any(axis=(1, 2))
-        J = (J * np.sqrt(self.inv_mass)[:, None])[acts][:, moves].reshape(acts.sum(), -1)
-        A = J @ J.T
-        W = np.diag(A)
-        try:
-            pivots = np.diag(np.linalg.cholesky(A)) ** 2
-        except np.linalg.LinAlgError:  # not positive definite
-            return np.inf
-        return float((C[acts] ** 2 / W).sum()) / (2 * h * h) if (pivots > SMALL_PIVOT * W).all() else np.inf
+            row, violation = self.row(b), b.violation(x)
+            some = (row >= 0) & ~b.broken
+            C[row[some]] = (violation if b.side == 0 else np.maximum(b.side * violation, 0.0))[some]
+            who = b.indices[some]
+            corners.append((np.repeat(row[some], who.shape[1]), who.ravel(), b.gradients(x)[some].reshape(-1, x.shape[1])))
+        row, who, gradient = (np.concatenate(each) for each in zip(*corners, strict=True))
+        for begin, end in zip(self.plan.part_begin[parts], self.plan.part_begin[parts + 1], strict=True):
+            if end - begin > MANY:
+                return np.inf
+            own = (row >= begin) & (row < end) & (self.inv_mass[who] > 0)
+            particles, local = np.unique(who[own], return_inverse=True)
+            J = np.zeros((end - begin, len(particles), x.shape[1]))
+            np.add.at(J, (row[own] - begin, local), gradient[own])
+            J = (J * np.sqrt(self.inv_mass[particles])[:, None]).reshape(end - begin, -1)
+            acts = J.any(axis=1)
+            A = J[acts] @ J[acts].T
+            W = np.diag(A)
+            try:
+                pivots = np.diag(np.linalg.cholesky(A)) ** 2
+            except np.linalg.LinAlgError:  # not positive definite
+                return np.inf
+            if not (pivots > SMALL_PIVOT * W).all():
+                return np.inf
+            stored += float((C[begin:end][acts] ** 2 / W).sum()) / (2 * h * h)
+        return stored
 
     @property
     def keeps_softness_of_longer(self) -> bool:

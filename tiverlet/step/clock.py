@@ -48,12 +48,11 @@ class Clock:
     rigid constraints that velocities before a start lack, as a time [s]. lacked: `owed` of the last substep if it was a start,
     else 0. velocity_override: velocities, valid until the next step, after constraints that contribute to them were removed or
     velocities were assigned; a start before the next step takes these. first_moved: the first particle that the user placed since
-    the last frame; None if there is none. moved: mask of the particles that were moved, (n,); None: all may be. energy:
-    at the end of the last frame [J]; None if unknown. bound, kinetic, parting: the energy that must not be exceeded [J], None if
-    unknown; the largest kinetic energy since then [J]; whether particles that were placed into each other still part; see
-    energy_bound.py. conserves: whether the scene conserves energy, see
-    energy_bound.conserves(); None if unknown. It follows from the features, and is not recorded; nor is `moved`, which is None
-    after a frame.
+    the last frame; None if there is none. moved_mask: which of the particles from there on moved, (n,); None: all may have.
+    energy: at the end of the last frame [J]; None if unknown. bound, kinetic, parting: the energy that must not be exceeded [J],
+    None if unknown; the largest kinetic energy since then [J]; whether particles that were placed into each other still part; see
+    energy_bound.py. conserves: whether the scene conserves energy, see energy_bound.conserves(); None if unknown. It follows from
+    the features, and is not recorded; nor is moved_mask, which is None after a frame.
     """
 
     time: float = 0.0
@@ -69,7 +68,7 @@ class Clock:
     lacked: float = 0.0
     velocity_override: np.ndarray | None = None
     first_moved: int | None = 0
-    moved: np.ndarray | None = None
+    moved_mask: np.ndarray | None = None
     energy: float | None = None
     bound: float | None = None
     kinetic: float = 0.0

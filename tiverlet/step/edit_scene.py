@@ -260,7 +260,7 @@ def _edited(
         one.follow(number)
     if m or features_too or n < len(some):  # otherwise only the kernels have changed
         clock.energy = None
-    clock.moved = None
+    clock.moved_mask = None
     if clock.first_moved is not None:
         clock.first_moved = int(some[: clock.first_moved].sum())
     elif m:

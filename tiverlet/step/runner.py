@@ -245,7 +245,7 @@ class Runner:
         if removed is not None:
             way, share = removed
             seen = float(way.max()) if share > initial_violation.SEEN else 0.0
-            self.moved, self.clock.moved = max(self.moved, seen), None
+            self.moved, self.clock.moved_mask = max(self.moved, seen), None
             self.jumped = self.jumped or (bool((way > self.scene.particles.radius).any()) and seen > 0)
             self.invalidate()
 
@@ -261,7 +261,7 @@ class Runner:
         if self.jumped:
             for contact in self.step.contacts:  # the report must say that they may have passed other particles
                 self.memory.write(contact.dev.fast, 1)
-        self.clock.first_moved = self.clock.moved = None
+        self.clock.first_moved = self.clock.moved_mask = None
 
     def advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
         """Run one frame, after begin()."""
@@ -341,8 +341,8 @@ class Runner:
             self.forget_loads(position)
             moved = (self.scene.state.get(self.memory) != position).any(axis=1)
             self.scene.state.put(self.memory, position)
-        clock, known = self.clock, moved if self.clock.first_moved is None else self.clock.moved
-        clock.energy, clock.first_moved, clock.moved = None, 0, None if known is None else known | moved
+        clock, known = self.clock, moved if self.clock.first_moved is None else self.clock.moved_mask
+        clock.energy, clock.first_moved, clock.moved_mask = None, 0, None if known is None else known | moved
         if (moved | (self.scene.inv_mass == 0)).all():  # what is violated now no pass has left
             clock.longest = 0.0
 
@@ -627,15 +627,15 @@ class Runner:
 
     def shrink_overlapping(self, first: int, speed: float = np.inf) -> None:
         """Let particles from number `first` on that the user placed into others part gently, pairs at up to `speed` [m/s]."""
-        contact, moved = self.step.contacts[0], self.clock.moved
+        contact, moved, x = self.step.contacts[0], self.clock.moved_mask, self.scene.state.get(self.memory)
         if not contact.shrinks:
-            x = self.scene.state.get(self.memory) if first or moved is not None else None
-            if x is not None and overlapping(self.scene, self.batches, contact.table, x, first, moved) is False:
-                return  # overlap under a load is no error of placing
+            loads = first or moved is not None  # what was there before may overlap under a load, which is no error of placing
+            if loads and overlapping(self.scene, self.batches, contact.table, x, first, moved) is False:
+                return
             contact.enable_shrink()
             self.renew()
-        geometry, x = contact.dev.geometry, self.scene.state.get(self.memory)
-        speeds = parting_speeds(self.scene, self.batches, geometry.candidates(x), x, first, contact.push_out)
+        candidates = contact.dev.geometry.candidates(x)
+        speeds = parting_speeds(self.scene, self.batches, candidates, x, first, contact.push_out)
         self.step.shrink_overlapping(first, np.minimum(speeds, speed))
 
     def report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
