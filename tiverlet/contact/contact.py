@@ -133,7 +133,7 @@ class Contact(PairContact):
         dev, now = self.dev, change.now
         if not self.can_touch:
             return not bool((now.radius > 0).any())
-        splits = dev.splitting.can_regroup(dev.list.team.piece_of(now.count))
+        splits = dev.splitting.can_regroup(dev.list.team.piece_of(now.count)) and dev.projection.can_regroup(now.mass)
         return splits and bool((now.radius > 0).any()) and dev.search.can_regroup(change, now.radius)
 
     def regroup(self, change: Regrouping) -> None:
@@ -203,7 +203,7 @@ class Contact(PairContact):
             dev.hit = dev.restitution.hit
         if dev.spins:
             dev.spinning = Spinning(scene, self.table, dev.splitting.weight, dev.turn)
-        dev.projection = VelocityProjection(scene, dev.list, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
+        dev.projection = VelocityProjection(scene, dev.geometry, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
         return dev.search
 
     def keep_stiffness(self, ratio: float) -> None:
@@ -282,6 +282,7 @@ class Contact(PairContact):
             carries = ti.cast(ti.select(first != 0 and (fresh == 0 or now.span.since > 0), 1, 0), self.scene.real)
         own, least = self.dev.splitting.weight[i], ti.cast(1, self.scene.real)  # least: the smallest push of i
         held, parts = ti.cast(0, self.scene.real), ti.cast(0, self.scene.real)
+        change, borne = ti.cast(0, self.scene.real), ti.cast(0, self.scene.real)  # of overlaps, see note_struck()
         if own > 0:
             for word in range(self.dev.list.word_count(i)):
                 bits = self.dev.splitting.touching(i, word)
@@ -300,6 +301,10 @@ class Contact(PairContact):
                         held = ti.max(held, self.dev.geometry.excess(i, j, n, overlap, now.h))
                     each *= ti.static(RELAXATION)
                     paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self.dev.w.of(j)
+                    if ti.static(self.dev.projection.unequal):
+                        borne = ti.max(borne, alone * last)
+                        if last > 0 and self.dev.projection.are_unequal(i, j):
+                            change = ti.max(change, self.dev.projection.change_of(i, j, n, overlap, alone * last))
                     push, known = again * last, ti.zero(overlap)  # known: the part of the push that its known load already gave
                     left = ti.zero(overlap)  # the part of the substep after an impact
                     keeps = ti.max(lesser(1 - alone * each, ti.static(CARRY)), 0)
@@ -381,6 +386,9 @@ class Contact(PairContact):
             if least == 0:
                 self.dev.splitting.invalidate_bound(i)
         self.dev.move[i] = total
+        if ti.static(self.dev.projection.unequal):
+            if first != 0:
+                self.dev.projection.note_struck(i, change, borne)
         if ti.static(self.dev.geometry.shrinks):
             self.dev.geometry.held[i] = held
         if ti.static(self.dev.has_loads):

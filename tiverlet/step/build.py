@@ -181,7 +181,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         has_friction or any(w.needs_start_position for w in walls) or (bounces and bool(walls)),
         bounces or bool(scene.impacts),
         bounces,
-        bool(contact and walls),
+        bool(contact and contact.projects and walls),
     )
     for feature in of(Batch):
         feature.scene = scene  # also for those that do nothing, because all of their particles are held

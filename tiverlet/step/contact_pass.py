@@ -166,4 +166,15 @@ class ContactPass:
                 begin, end = self.particles.piece(p, thread)
                 for m in range(begin, begin + c.dev.projection.count[self.team.dealt_index(p, 1, thread)]):
                     c.dev.projection.apply(c.dev.projection.loaded[m])
+            ti.loop_config(serialize=True)
+            for _ in range(self.team.one(ti.cast(k == 0, ti.i32), thread)):
+                c.dev.projection.sum_up(self.particles.pieces)
             self.team.wait()
+
+    @ti.func
+    def needs_projection(self, now):
+        """Whether sound is damped after this substep."""
+        out = False
+        for c in ti.static(self.contacts):
+            out = c.dev.projection.is_needed(now)
+        return out

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from ..contact.velocity_projection import EVERY
+from ..contact.velocity_projection import ALWAYS, MAYBE, due
 from ..device.language import template
 from .span import Moment, Span
 
@@ -60,7 +60,7 @@ class Launcher:
 
     def moment(self, span: Span, s: int) -> Moment:
         """Return the Moment of substep s, with the values that the host needs."""
-        return Moment(span, s, damps=(span.since + s) % EVERY == EVERY - 1)
+        return Moment(span, s, damps=due(span.since + s))
 
     def pass_of(self, now: Moment, half: int) -> Moment:
         """Return the Moment of one half of a pass."""
@@ -186,6 +186,16 @@ class Launcher:
     def finish_substep(self, now: Moment) -> None:
         """Add the phase finish_substep, after the last pass."""
         self.put(self.now if self.waiting else now, "finish_substep")
+
+    def needs_projection(self, now: Moment) -> bool:
+        """Whether sound is damped after this substep. Where that depends on the contacts, the host has to wait for the answer."""
+        projection, memory = self.runner.step.contacts[0].dev.projection, self.runner.memory
+        asks = now.damps == MAYBE or projection.unequal
+        if now.damps == ALWAYS or not asks:
+            return now.damps == ALWAYS
+        self.flush()
+        restless = now.damps == MAYBE and memory.read(projection.restless)
+        return bool(restless or (projection.unequal and memory.read(projection.struck)))
 
     def project_contact_velocities(self, now: Moment) -> None:
         """Add one pass of project_contact_velocities, in a launch of its own."""

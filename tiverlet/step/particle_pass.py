@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..colliders.surface import ANY_DEPTH, BEFORE_CONTACTS, BEYOND_ROUNDING, FRICTIONLESS
 from ..contact.force_share import accumulate
+from ..contact.velocity_projection import ALWAYS
 from ..device import inline, ti
 from ..device.number import OnDevice
 from ..device.thread_team import Team, block, blocks
@@ -124,9 +125,10 @@ class ParticlePass:
                 if ti.static(self.state.sums):
                     self.state.low0[i] = self.state.low[i]
         if ti.static(self.state.keeps_wall_push):
-            if now.damps != 0:
-                for i in range(first, end):
-                    self.state.wall_push[i] = ti.zero(self.state.x[i])
+            for c in ti.static(self.contacts):
+                if ti.static(c.dev.projection.unequal) or c.dev.projection.is_due(now):
+                    for i in range(first, end):
+                        self.state.wall_push[i] = ti.zero(self.state.x[i])
         if ti.static(self.state.spins):
             if now.fresh != 0:
                 for i in range(first, end):
@@ -139,7 +141,7 @@ class ParticlePass:
                     impacts.rigid[i] = 0
         self.integrator.advance(first, end, now)
         for weights in ti.static(self.weights):
-            if now.damps != 0:
+            if now.damps == ALWAYS:
                 for i in range(first, end):
                     weights.store_weight(i, now)
         if ti.static(self.knows_loads and len(self.walls) > 0):

@@ -33,10 +33,10 @@ class Moment:
     """The substep, and the pass over the constraints, in which a phase runs.
 
     s, h, last, time: number of the substep, its length, the length of the one before, its beginning [s]. frame_fraction: where it
-    begins and ends in the frame. fresh: whether it is a start. damps: whether sound is damped after it. final: whether it is the
-    last of the frame. it: number of the pass. first: whether multipliers begin in this pass. checks_list: whether the pass ends
-    with a check for a stale list (every substep begins with one, too). half: number of the half, counted through all passes.
-    newton: the Newton step within the pass, 0 or 1.
+    begins and ends in the frame. fresh: whether it is a start. damps: whether sound is damped after it, see due(). final: whether
+    it is the last of the frame. it: number of the pass. first: whether multipliers begin in this pass. checks_list: whether the
+    pass ends with a check for a stale list (every substep begins with one, too). half: number of the half, counted through all
+    passes. newton: the Newton step within the pass, 0 or 1.
     """
 
     def __init__(

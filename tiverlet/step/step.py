@@ -8,7 +8,7 @@ the integrator.
 
 from typing import TYPE_CHECKING, Any
 
-from ..contact.velocity_projection import EVERY, PASSES
+from ..contact.velocity_projection import PASSES, due
 from ..device import called, runtime, ti
 from ..device.number import OnDevice, read_all
 from ..device.thread_team import LEAST, Team
@@ -76,7 +76,7 @@ def substep(do, now):
         if do.ends_substep(now):
             do.finish_substep(now)
     if ti.static(do.projects_velocities):
-        if do.ends_substep(now) and now.damps != 0:
+        if do.ends_substep(now) and do.needs_projection(now):
             for k in range(PASSES):
                 do.project_contact_velocities(now.of(k))
 
@@ -175,8 +175,7 @@ class Step:
         """The Moment of substep s of a frame; s = span.substeps is the round after the last substep."""
         h, last, time, frame_fraction = self.integrator.times(span, s)
         tick, fresh, final = span.tick + s, ti.select(s == 0, span.fresh, 0), ti.cast(s == span.substeps - 1, ti.i32)
-        damps = ti.cast((span.since + s) % EVERY == EVERY - 1, ti.i32)
-        return Moment(span, s, h, last, time, tick, frame_fraction, fresh, damps, final)
+        return Moment(span, s, h, last, time, tick, frame_fraction, fresh, due(span.since + s), final)
 
     @ti.func
     def pass_of(self, now, half):
@@ -504,8 +503,13 @@ class Step:
         self.team.wait()
 
     @ti.func
+    def needs_projection(self, now):
+        """Whether sound is damped after this substep."""
+        return self.contact_pass.needs_projection(now)
+
+    @ti.func
     def project_contact_velocities(self, now):
-        """Every 32 substeps: damp sound in loaded contacts."""
+        """Damp sound in loaded contacts."""
         self.damp_sound(now.thread, now.it)
 
     @called
