@@ -771,11 +771,10 @@ class _Start:
         for log in runner.logs:
             runner.memory.write_some(log.counter, 0, chosen)
         runner.invalidate(chosen)
-        softer = chosen[worlds._clocks.softness[chosen] != self.clocks.softness[chosen]]
+        for k in chosen[worlds._clocks.softness[chosen] != self.clocks.softness[chosen]]:
+            with worlds._as_world(k):
+                runner.set_softness(float(self.clocks.softness[k]))
         worlds._clocks.return_to(self.clocks, chosen)
-        for k in softer:
-            with worlds._as_world(k) as world:
-                runner.set_softness(world._clock.softness)
         if runner.drags:
             runner.memory.write_some(runner.integrator.decay, [[self.clocks.drag[k]] for k in chosen], chosen)
 
