@@ -99,14 +99,14 @@ def test_a_net_rests_where_it_does_in_the_longest_frames(world, solver, iteratio
 
 def test_uneven_frames_lend_no_energy_to_what_swings(world):
     # An undamped net that is let go level, in frames of which a slow machine makes some longer. Links stiffen after these.
-    # They do so slowly, and only while the net has less energy than at the start.
+    # They do so slowly, and only while the net, with what links store, has less energy than at the start.
     shape = tv.shapes.net((0, 0), (1, 0), (0, -1), points=(9, 9))
     x = np.stack([shape.position[:, 0], 0 * shape.position[:, 0], -shape.position[:, 1]], axis=1)
     start = tv.Particles(x, mass=0.01, pinned=np.flatnonzero((x[:, 2] == 0) & np.isin(x[:, 0], (0, 1))))
-    for solver in (tv.ConjugateGradient(5), tv.Jacobi()):
-        w = world(start, [tv.Gravity((0, -G, 0)), tv.Distance(shape.links)], solver=solver, substeps=SUBSTEPS)
-        for frame in range(1200):
-            report = w.step(1 / 30 if frame % 240 < 3 else 1 / 60)
+    for solver, substeps in ((tv.ConjugateGradient(5), SUBSTEPS), (tv.Jacobi(), SUBSTEPS), (tv.Jacobi(), 2)):
+        w = world(start, [tv.Gravity((0, -G, 0)), tv.Distance(shape.links)], solver=solver, substeps=substeps)
+        for frame in range(600):
+            report = w.step(1 / 30 if frame % 240 == 0 else 1 / 60)
             assert report.energy < 1e-3 * 0.81 * G and "energy-gain" not in report.flags
 
 

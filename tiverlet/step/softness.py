@@ -9,8 +9,8 @@ positions to the new place, as in projection.py, takes long, and lifts the net a
 
 s is 1 again in a substep that is longer than all before, which takes energy out. So links are as soft as in the longest recent
 substep. Once frames are even, or none has been about as long for HOLD, s approaches 1, (s - 1)' = -(s - 1) / SETTLE, which lifts
-what sags. This adds a share dt / SETTLE of the stored energy in a frame at most, and stops where the scene has more energy than
-ever. Where contacts keep their stiffness, too, stretched links do not press on them, and nothing has to move.
+what sags. This adds a share dt / SETTLE of the stored energy in a frame at most, and waits where the scene would have more energy
+than ever. Where contacts keep their stiffness, too, stretched links do not press on them, and nothing has to move.
 
 Links are projected instead after a frame in which the machine was busy (MOST), or where substeps get much shorter (LEAST). So are
 springs with alpha near W h^2, which hold their loads by alpha + (1 + 3 theta) s W h^2 / 4: s h^2 does not keep that.
@@ -62,8 +62,10 @@ def keep(runner: "Runner", ratio: float, dt: float) -> None:
     clock, softness = runner.clock, runner.clock.softness
     if ratio != 1 and ratio**2 >= NEAR**2 * softness:
         clock.softened = clock.time
-    elif softness > 1 and clock.time > clock.softened + HOLD and is_slight(clock, 0.0, 1.0):
-        softness = 1 + (softness - 1) * exp(-dt / SETTLE)
+    elif softness > 1 and clock.time > clock.softened + HOLD:
+        stiffer = 1 + (softness - 1) * exp(-dt / SETTLE)
+        if is_slight(clock, _stored(runner), (stiffer / softness) ** 0.5):
+            softness = stiffer
     softness /= ratio**2
     runner.set_softness(softness if softness > 1 + SETTLED else 1.0)
     clock.longest = ratio * clock.h * clock.softness**0.5
@@ -74,6 +76,13 @@ def end(runner: "Runner", h: float) -> None:
     clock = runner.clock
     clock.softened = BUSY if h > MOST * clock.h * clock.softness**0.5 > 0 else 0.0
     runner.set_softness(1.0)
+
+
+def _stored(runner: "Runner") -> float:
+    """Return the energy that violations of scalar constraints store, beside that of their compliance: sum |F Z| / 2 [J]."""
+    x = runner.scene.state.get(runner.memory)
+    some = [(b, b.load) for b in runner.batches if isinstance(b, Scalar) and b.count]
+    return sum(float(np.maximum(np.abs(F * b.violation(x)) - b.compliance * F * F, 0.0).sum()) / 2 for b, F in some)
 
 
 def has_half_resolved_springs(runner: "Runner", h: float) -> bool:
