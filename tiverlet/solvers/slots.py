@@ -69,13 +69,18 @@ class Slots:
         scalars = solvable(batches)
         self.exact = bool(scalars) and (not self.system.steps if self.system else bool(degree.max(initial=0) <= 1))
         self._scalars = bool(scalars)
-        blocks = self.system.blocks if self.system else degree
+        self._blocks = blocks = self.system.blocks if self.system else degree
+        self._sagging: np.ndarray | None = None  # see _in_sagging_bodies()
+        self.can_soften = not self.loads and (not self.system or self.system.steps > 0)
         if self.loads or any(b.breaks for b in batches):
             self._bodies, self._rounding_masses = self._connected_bodies(batches, inv_mass)
         if self.loads:
             self.bodies = memory.number(1 + max(int(b.max(initial=0)) for b in self._bodies.values()))
             self.body_load = memory.field("slots.bears", self.bodies)
         self.split = memory.field("slots.split_mass", scene.count, values=blocks * inv_mass)
+        self.corrects_tension = self.can_soften and self.converges
+        if self.corrects_tension:  # by 1 / softness, since it is computed from split masses
+            self.inverse_softness = memory.field("slots.inverse_softness", None, values=[1.0])
         self.relaxation = solver.relaxed_by(scene, batches, blocks * inv_mass)
 
     @staticmethod
@@ -100,9 +105,38 @@ class Slots:
         """Return the mass in the body of each constraint that rounding of positions moves, (m,) [kg], see Strength."""
         return self._rounding_masses[self.body(batch)]
 
+    def soften(self, memory: Memory, inv_mass: np.ndarray, batches: list[Batch], softness: float) -> None:
+        """Make constraints hold their loads by violations `softness` times as large as those of the solver.
+
+        A pass holds a load F by the violation W h^2 F, so masses are split `softness` times as often. Conjugate gradients hold it
+        by sigma W h^2 F, with their floor sigma. Constraints that a pass solves exactly, as no other one shares their particles,
+        stay exact.
+        """
+        if self._sagging is None:
+            self._sagging = self._in_sagging_bodies(batches, inv_mass)
+        n = len(self._sagging)
+        split = np.zeros(len(inv_mass))
+        split[:n] = self._blocks[:n] * inv_mass[:n] * np.where(self._sagging, softness, 1.0)
+        memory.write(self.split, split)
+        if self.corrects_tension:
+            memory.write(self.inverse_softness, 1 / softness)
+
+    def _in_sagging_bodies(self, batches: list[Batch], inv_mass: np.ndarray) -> np.ndarray:
+        """Return a mask of the particles whose constraints a pass does not solve exactly, with all that is connected to them."""
+        rows = sum(b.count for b in batches)
+        body = bodies_of(rows, *corners_of(batches), inv_mass)[1][: len(self._blocks)]
+        sags = self._blocks > 1
+        for b in batches:
+            sags[b.indices.ravel()[(self.rows(b) >= 0)[b.owner]]] = True  # conjugate gradients
+        out = np.zeros(rows + 1, dtype=bool)
+        out[body[sags]] = True
+        out[rows] = False  # particles that no constraint moves
+        return out[body]
+
     def regroup(self, memory: Memory, change: Regrouping) -> None:
         """Adapt the slots to added and removed particles, none of which any constraint holds."""
         n, first = change.now.count, change.first
+        self._blocks, self._sagging = self._blocks[:first], None
         memory.resize(self.begin, n + 1)
         memory.write_from(self.begin, first, np.full(n + 1 - first, self.total))
 
@@ -118,7 +152,8 @@ class Slots:
 
     def reassign(self, memory: Memory, inv_mass: np.ndarray, batches: list[Batch]) -> None:
         """Move constraints to other particles: assign slots from their present corners."""
-        self._places, degree = assign_slots(batches, inv_mass)
+        self._places, self._blocks = assign_slots(batches, inv_mass)
+        degree, self._sagging = self._blocks, None
         memory.write(self.begin, np.concatenate([[0], np.cumsum(degree)]))
         memory.write(self.split, degree * inv_mass)
         for b in batches:

@@ -121,6 +121,8 @@ def put_back(world: "World", kept: Checkpoint) -> None:
         world._runner.sleepers.review()
     if list(map(id, world._runner.memories)) != stores:
         world._runner.renew()  # fields were allocated
+    if world._clock.softness != kept.clock.softness:
+        world._runner.set_softness(kept.clock.softness)
     world._clock.put_back(kept.clock)
     world._controller.memory = kept.controller
 

@@ -14,7 +14,7 @@ from ..contact.parting import parting_speeds
 from ..device.interrupts import deferred_signals
 from ..device.patches.compiler import CachedLaunch
 from ..particles.spin import moments_of_inertia
-from . import high_order, initial_shape, initial_violation
+from . import high_order, initial_shape, initial_violation, softness
 from .clock import Clock, initial_margin
 from .contact_rows import ContactRows
 from .diagnostics import BARE, EXTENT, STARTED, STEPPED, UNSTEPPED
@@ -64,6 +64,7 @@ class Runner:
         self.n, self.launched, self.team, self.integrator = step.n, step.launched, step.team, step.integrator
         self.driven = [b for b in self.batches if b.driven]
         self.springs: list[Any] = [b for b in self.batches if isinstance(b, Scalar) and b.soft and not b.dev.equation.forces]
+        self.weights_alone: dict[Any, np.ndarray] = {}  # of constraints that passes solve, see softness.py
         self.paths = [f for f in step.drivers if isinstance(f, Path)]
         self.known = [c.known for c in step.contacts if c.known]  # KnownLoads of contacts
         self.logs: list[Any] = [*(c.dev.events for c in step.contacts if c.dev.events), *step.wall_logs]  # of events
@@ -104,7 +105,7 @@ class Runner:
 
     def regroup(self) -> None:
         """Take the new number of particles, after the parts were edited in place."""
-        self.n = self.step.n
+        self.n, self.weights_alone = self.step.n, {}
         self.passes_at_once = self._passes_at_once()
         self.diagnostics.report.regroup()
         if self.sleep:
@@ -141,11 +142,15 @@ class Runner:
         h, clock, self.released, self.jumped = dt / substeps * self.integrator.first, self.clock, 0.0, False
         drag = decay(sum(f.rate for f in self.drags), h) if self.drags else None
         if h == clock.h and drag == clock.drag and not clock.d_is_velocity and clock.first_moved is None:
+            if clock.softness > 1:
+                with self.memory.compiler():
+                    softness.keep(self, 1.0, dt)
             return clock.energy is None
         keeps, goes_on = self._is_slightly_uneven(h, dt), not clock.d_is_velocity
         asleep = self._sleeping() if keeps and goes_on and clock.first_moved is None else None
         if asleep is None:
             self.wake()
+        softens = softness.can_keep(self, h, dt, substeps, keeps)
         with self.memory.compiler():
             self._jump()
             if h != clock.h or drag != clock.drag:
@@ -159,11 +164,15 @@ class Runner:
             if h != clock.h or drag != clock.drag:
                 if self.scene.slots and self.scene.slots.system and clock.h:
                     self.scene.slots.system.keep_softness(h / clock.h)
-                if h < clock.longest and not self.probe:
+                if softens or (h == clock.h and clock.softness > 1):
+                    softness.keep(self, h / clock.h, dt)
+                elif h < clock.longest and not self.probe:
                     x = self.scene.state.get(self.memory) if self.springs else None
                     keeps = self._project(h, dt, substeps * iterations, keeps)
                     if x is not None:
                         self._forget_springs(x, self.scene.state.get(self.memory))
+                if not (h == clock.h or softens):
+                    softness.end(self, h)
                 for contact in self.step.contacts if keeps else []:
                     contact.keep_stiffness(h / clock.h)
                 if asleep is not None and keeps:
@@ -190,6 +199,12 @@ class Runner:
         clock = self.clock
         can = clock.first_moved != 0 and not self.probe and any(contact.can_keep_stiffness for contact in self.step.contacts)
         return can and dt != clock.frame[1] and SLIGHTLY * max(clock.h, clock.longest) <= h <= clock.h / SLIGHTLY
+
+    def set_softness(self, times: float) -> None:
+        """Make links `times` as soft as passes make them, see softness.py."""
+        if times != 1 or self.clock.softness != 1:
+            self.scene.slots.soften(self.memory, self.scene.inv_mass, self.batches, times)
+        self.clock.softness = times
 
     @property
     def linked(self) -> bool:
@@ -345,6 +360,8 @@ class Runner:
         clock.energy, clock.first_moved, clock.moved_mask = None, 0, None if known is None else known | moved
         if (moved | (self.scene.inv_mass == 0)).all():  # what is violated now no pass has left
             clock.longest = 0.0
+            with self.memory.compiler():
+                self.set_softness(1.0)
 
     def forget_loads(self, position: np.ndarray) -> None:
         """Before positions are set: forget the known loads of constraints and contacts that the new positions change."""

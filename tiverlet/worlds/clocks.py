@@ -6,7 +6,10 @@ from ..step.clock import Clock
 from ..step.integrator import FREE
 
 # Attributes with the same name and meaning in Clock.
-PLAIN = "time", "tick", "since", "h", "d_is_velocity", "started", "longest", "owed", "lacked", "kinetic", "parting"
+PLAIN = (
+    "time", "tick", "since", "h", "d_is_velocity", "started", "longest", "softness", "softened", "owed", "lacked",
+    "kinetic", "parting",
+)  # fmt: skip
 NONE = -1  # first_moved where no particle was placed
 NO, YES, UNKNOWN = range(3)  # whether a world conserves energy
 
@@ -42,6 +45,8 @@ class Clocks:
     d_is_velocity: np.ndarray
     started: np.ndarray
     longest: np.ndarray
+    softness: np.ndarray
+    softened: np.ndarray
     owed: np.ndarray
     lacked: np.ndarray
     kinetic: np.ndarray

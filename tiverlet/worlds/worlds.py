@@ -190,8 +190,10 @@ class Worlds:
             while done < frames:
                 with self._open():
                     moved, released = self._begin(dt)
-                    # A target moves during one frame, then the host ends the motion: launch that frame alone.
-                    some = 1 if self._runner.ramping or any(f.moving for f in world.features) else min(at_once, frames - done)
+                    # A target moves during one frame, then the host ends the motion: launch that frame alone. The host stiffens
+                    # soft links between frames, too.
+                    alone = self._runner.ramping or any(f.moving for f in world.features) or (self._clocks.softness > 1).any()
+                    some = 1 if alone else min(at_once, frames - done)
                     report = self._launch(dt, some, moved, released, every, track, done)
                 worst, done = report if worst is None else worst.worse(report), done + some
                 if shown:
@@ -209,7 +211,7 @@ class Worlds:
             clocks.needs_drag |= self._knobs.waiting_mask(drag)
         self._upload()
         h = dt / world.substeps * runner.integrator.first
-        ready = (clocks.first_moved == NONE) & (clocks.h == h) & ~clocks.needs_drag
+        ready = (clocks.first_moved == NONE) & (clocks.h == h) & ~clocks.needs_drag & (clocks.softness == 1)
         clocks.since[ready & clocks.d_is_velocity] = 0
         moved, released, jumped = np.zeros(len(self)), np.zeros(len(self)), np.zeros(len(self), dtype=bool)
         some = np.flatnonzero(~ready)
@@ -769,6 +771,9 @@ class _Start:
         for log in runner.logs:
             runner.memory.write_some(log.counter, 0, chosen)
         runner.invalidate(chosen)
+        for k in chosen[worlds._clocks.softness[chosen] != self.clocks.softness[chosen]]:
+            with worlds._as_world(k):
+                runner.set_softness(float(self.clocks.softness[k]))
         worlds._clocks.return_to(self.clocks, chosen)
         if runner.drags:
             runner.memory.write_some(runner.integrator.decay, [[self.clocks.drag[k]] for k in chosen], chosen)

@@ -328,7 +328,10 @@ class CornerPasses(Passes):
 
         In a chain of links l it is 4 w / l, where W = 2 w.
         """
-        return 2 * W * self.inverse_size[c]
+        out = 2 * W * self.inverse_size[c]
+        if ti.static(self.slots.corrects_tension):
+            out *= self.slots.inverse_softness[None]
+        return out
 
     @ti.func
     def is_outside_systems(self, c):

@@ -1,0 +1,105 @@
+"""Softness: keeps links as stiff as they are where a loop measures dt, so that nets come to rest in frames of uneven length.
+
+A pass holds a load F by a violation Z = s W h^2 F, beside that of its compliance, like a spring of stiffness 1 / (s W h^2). The
+softness s is 1, and the stiffness changes with h. So the place where a net rests would be another one in each frame, and its
+weight would not be balanced: frames that differ by a fifth keep a net of 1 m moving at 0.2 m/s, however well it is damped. Moving
+positions to the new place, as in projection.py, takes long, and lifts the net again and again. Instead,
+
+    s' h'^2 = s h^2,  s' >= 1
+
+s is 1 again in a substep that is longer than all before, which takes energy out. So links are as soft as in the longest recent
+substep. Once frames are even, or none has been about as long for HOLD, s approaches 1, (s - 1)' = -(s - 1) / SETTLE, which lifts
+what sags. This adds a share dt / SETTLE of the stored energy in a frame at most, and waits where the scene would have more energy
+than ever. Where contacts keep their stiffness, too, stretched links do not press on them, and nothing has to move.
+
+Links are projected instead after a frame in which the machine was busy (MOST), or where substeps get much shorter (LEAST). So are
+springs with alpha near W h^2, which hold their loads by alpha + (1 + 3 theta) s W h^2 / 4: s h^2 does not keep that.
+"""
+
+from math import exp
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..constraints.core.anchored import Anchored
+from ..constraints.core.scalar import Scalar
+from .projection import is_slight
+
+if TYPE_CHECKING:
+    from .runner import Runner
+
+LEAST, MOST = 0.2, 2.2  # of the substep whose stiffness links have: the shortest and the longest one after which they keep it
+NEAR = 0.8  # of that substep: a substep about as long
+HOLD, SETTLE = 1.0, 1.0  # how long links stay soft, and the time constant with which they stiffen then [s]
+SETTLED = 1e-3  # excess of s that is dropped
+HALF_RESOLVED = 0.2, 4.0  # (omega h)^2 between which theta depends on h
+BUSY = -1.0  # clock.softened after a frame longer than MOST
+
+
+def can_keep(runner: "Runner", h: float, dt: float, substeps: int, contacts_keep: bool) -> bool:
+    """Whether links keep their stiffness where the coming frame of dt [s] has substeps h [s].
+
+    contacts_keep: whether contacts do, see Contact.keep_stiffness(). A change of `substeps` is made to change the stiffness.
+    """
+    clock, slots = runner.clock, runner.scene.slots
+    if (
+        not (slots and slots.can_soften)
+        or runner.paths
+        or runner.probe
+        or not clock.h
+        or clock.first_moved == 0
+        or dt == clock.frame[1]
+    ):
+        return False
+    kept = clock.h * clock.softness**0.5
+    if round(clock.frame[1] / clock.h) != substeps or not LEAST * kept <= h <= MOST * kept or clock.softened == BUSY:
+        return False
+    return (contacts_keep or not runner.step.contacts) and not has_half_resolved_springs(runner, max(h, kept))
+
+
+def keep(runner: "Runner", ratio: float, dt: float) -> None:
+    """Keep links as soft as they are, where the coming frame dt [s] has substeps `ratio` times as long as the last one."""
+    clock, softness = runner.clock, runner.clock.softness
+    if ratio != 1 and ratio**2 >= NEAR**2 * softness:
+        clock.softened = clock.time
+    elif softness > 1 and clock.time > clock.softened + HOLD:
+        stiffer = 1 + (softness - 1) * exp(-dt / SETTLE)
+        if is_slight(clock, _stored(runner), (stiffer / softness) ** 0.5):
+            softness = stiffer
+    softness /= ratio**2
+    runner.set_softness(softness if softness > 1 + SETTLED else 1.0)
+    clock.longest = ratio * clock.h * clock.softness**0.5
+
+
+def end(runner: "Runner", h: float) -> None:
+    """Make links as stiff as passes of substeps h [s] make them, after they were projected."""
+    clock = runner.clock
+    clock.softened = BUSY if h > MOST * clock.h * clock.softness**0.5 > 0 else 0.0
+    runner.set_softness(1.0)
+
+
+def _stored(runner: "Runner") -> float:
+    """Return the energy that violations of scalar constraints store, beside that of their compliance: sum |F Z| / 2 [J]."""
+    x = runner.scene.state.get(runner.memory)
+    some = [(b, b.load) for b in runner.batches if isinstance(b, Scalar) and b.count]
+    return sum(float(np.maximum(np.abs(F * b.violation(x)) - b.compliance * F * F, 0.0).sum()) / 2 for b, F in some)
+
+
+def has_half_resolved_springs(runner: "Runner", h: float) -> bool:
+    """Whether passes solve springs that substeps h [s] neither resolve nor see as stiff, see stiff()."""
+    for b in runner.batches:
+        if b.soft and b.count:
+            key = b, id(b.start)  # many worlds share a batch, and have masses of their own
+            if key not in runner.weights_alone:
+                runner.weights_alone[key] = _weights(b) * (runner.scene.slots.rows(b) < 0)
+            square = runner.weights_alone[key] * h * h
+            if ((square > HALF_RESOLVED[0] * b.compliance) & (square < HALF_RESOLVED[1] * b.compliance)).any():
+                return True
+    return False
+
+
+def _weights(batch: Any) -> np.ndarray:
+    """Return the inverse mass with which each constraint of a batch vibrates, (m,): w |grad C|^2, or that of a cluster."""
+    if isinstance(batch, (Scalar, Anchored)):
+        return batch.weights(batch.start.position)
+    return 1 / np.bincount(batch.owner, batch.start.mass[batch.indices.ravel()], minlength=batch.count)
