@@ -302,9 +302,10 @@ class Contact(PairContact):
                     each *= ti.static(RELAXATION)
                     paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self.dev.w.of(j)
                     if ti.static(self.dev.projection.unequal):
-                        borne = ti.max(borne, alone * last)
-                        if last > 0 and self.dev.projection.are_unequal(i, j):
-                            change = ti.max(change, self.dev.projection.change_of(i, j, n, overlap, alone * last))
+                        if first != 0:
+                            borne = ti.max(borne, alone * last)
+                            if last > 0 and self.dev.projection.is_heavier(i, j):
+                                change = ti.max(change, self.dev.projection.change_of(i, j, n, overlap, alone * last))
                     push, known = again * last, ti.zero(overlap)  # known: the part of the push that its known load already gave
                     left = ti.zero(overlap)  # the part of the substep after an impact
                     keeps = ti.max(lesser(1 - alone * each, ti.static(CARRY)), 0)

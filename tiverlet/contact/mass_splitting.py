@@ -6,6 +6,7 @@ from ..device import ti
 from ..device.thread_team import BLOCK, Team
 from ..features.feature import Scene
 from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
+from .eigenvalues import largest
 from .narrow_phase import SAME_PLACE, DiscGeometry
 
 # Least (|r| / contact distance)^2 for which all pairs count as being as deep as the deepest. This saves a division per pair. For
@@ -250,13 +251,3 @@ def still_soft(h: float, longest: float, passes: int) -> float:
 def lesser(a, b):
     """Return the lesser of two numbers. ti.min would also test for NaN, which takes longer."""
     return ti.select(a < b, a, b)
-
-
-@ti.func
-def largest(tensor):
-    """Return the largest eigenvalue of a symmetric 2 x 2 matrix, or an upper bound for 3 x 3 (Wolkowicz and Styan 1980)."""
-    n = ti.static(tensor.n)
-    mean = tensor.trace() / n
-    for k in ti.static(range(n)):
-        tensor[k, k] -= mean
-    return mean + ti.static(((n - 1) / n) ** 0.5) * tensor.norm()

@@ -4,21 +4,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..device import inline, ti
+from ..device import ti
 from ..neighbours.neighbour_list import WORD, lowest_bit
+from .eigenvalues import largest
+from .projection_times import ALWAYS, MAYBE
 
 if TYPE_CHECKING:
     from ..device.thread_team import Team
     from ..features.feature import Scene
     from ..neighbours.neighbour_list import PairData
 
-EVERY = 32  # substeps from one projection to the next, in a quiet pile
-OFTEN = 8  # the same, in a restless pile
-NEVER, MAYBE, ALWAYS = range(3)  # whether a substep ends with a projection, see due()
 RESTLESS = 0.25  # change of an overlap in a substep, in overlaps that bear the load of the particle: more of it is restless
 FAINT = 2.0**-10  # the same, in displacements of the particle: less may be rounding
-SHARE = 64  # loaded particles to a restless one, at most, in a restless pile
-UNEQUAL = 1.5  # ratio of the masses of a pair from which it is projected at once
+UNEQUAL = 3.0  # ratio of the masses of a pair from which it is projected at once
+RINGS = 16  # how many contacts away from a restless particle others are projected, too
+FAR = -1  # ring of a particle beyond them
 PASSES = 32
 CONDITION = 400.0  # modes with an eigenvalue of at least 1 / CONDITION keep 1 / T(PASSES) = 8 % of their velocity
 
@@ -36,10 +36,10 @@ class VelocityProjection:
     Inelastic rigid discs, in which there is no sound, behave so. Pairs that bounce (restitution) are left out.
 
     What lands on a pile presses its contacts together, and is thrown back by them. A particle is restless if the overlap of its
-    pairs changes, in a substep, by more than a quarter of the largest overlap that bears its load. Where one loaded particle in
-    SHARE is restless, the next projection comes after OFTEN substeps. A heavy particle, M, on a light one, m, that cannot give
-    way is held as by a spring that turns it round in about sqrt(M / m) substeps. So in a substep in which such a pair is restless
-    there is a projection at once. Pairs that part are left out: what is thrown off a pile is free to go.
+    pairs changes, in a substep, by more than a quarter of the largest overlap that bears its load. What was restless at the last
+    projection is projected again after OFTEN substeps, with all that is up to RINGS contacts away. A heavy particle, M, on a
+    light one, m, that cannot give way is held as by a spring that turns it round in about sqrt(M / m) substeps. So what is
+    restless in such a pair is projected at once. Pairs that part are left out: what is thrown off a pile is free to go.
 
     push: pair data, the push of each pair in the last substep. weight: m_i w_i of each particle. restitution: the Restitution of
     the pairs, or None. change: a scratch field of vectors, (n,).
@@ -54,11 +54,19 @@ class VelocityProjection:
         # number of these pairs, and the particles that have any, piece by piece.
         self.number, self.loaded = self.list.old_number, self.list.old_first
         add, pieces = scene.memory.field, self._pieces(scene.particles.count, team)
-        self.count, self.restless_count = (add(f"Contact.{name}", pieces, kind=ti.i32) for name in ("loaded", "restless"))
+        self.count, self.restless_count = (add(f"Contact.{name}", pieces, kind=ti.i32) for name in ("loaded", "restless_count"))
         self.factors = add("Contact.chebyshev", PASSES, values=chebyshev(PASSES, CONDITION))
-        self.restless = add("Contact.is_restless", None, kind=ti.i32, state=True)  # whether the pile was, when last projected
-        self.struck = add("Contact.struck", None, kind=ti.i32)  # whether a pair of unequal masses is restless in this substep
+        # Which particles were restless at their last projection, and whether any was. The ring of each particle around those that
+        # are projected now.
+        self.restless = add("Contact.restless", scene.count, kind=ti.i32, state=True)
+        self.any_restless = add("Contact.any_restless", None, kind=ti.i32, state=True)
+        self.ring = add("Contact.ring", scene.count, kind=ti.i32)
+        self.moved, self.borne = add("Contact.moved", scene.count), add("Contact.borne", scene.count)  # see is_restless()
+        self.split = add("Contact.split", scene.count)  # m_i w_i by the present normals
         self.unequal = unequal(scene.particles.mass)
+        if self.unequal:  # which particles are restless in a pair of unequal masses in this substep, and whether any is
+            self.struck = add("Contact.struck", scene.count, kind=ti.i32)
+            self.any_struck = add("Contact.any_struck", None, kind=ti.i32)
 
     @staticmethod
     def _pieces(n: int, team: "Team") -> int:
@@ -78,7 +86,7 @@ class VelocityProjection:
         """Whether velocities are projected after this substep, whatever happens in it."""
         out = now.damps == ALWAYS
         if now.damps == MAYBE:
-            out = self.restless[None] != 0
+            out = self.any_restless[None] != 0
         return out
 
     @ti.func
@@ -86,7 +94,7 @@ class VelocityProjection:
         """Whether velocities are projected after this substep, which has ended."""
         out = self.is_due(now)
         if ti.static(self.unequal):
-            out = out or self.struck[None] != 0
+            out = out or self.any_struck[None] != 0
         return out
 
     @ti.func
@@ -106,17 +114,17 @@ class VelocityProjection:
         return change > ti.max(ti.static(RESTLESS) * borne, ti.static(FAINT) * self.state.d[i].norm())
 
     @ti.func
-    def are_unequal(self, i, j):
-        """Whether the masses of two particles are unequal; not if one of them cannot move."""
+    def is_heavier(self, i, j):
+        """Whether particle i has a larger mass than j, and both can move."""
         w, other = self.state.w.of(i), self.state.w.of(j)
-        low, high = ti.min(w, other), ti.max(w, other)
-        return low > 0 and high > ti.static(UNEQUAL) * low
+        return w > 0 and other > ti.static(UNEQUAL) * w
 
     @ti.func
     def note_struck(self, i, change, borne):
-        """Note if particle i is restless. change: that of overlaps in pairs of unequal masses, see is_restless()."""
-        if self.is_restless(i, change, borne):
-            self.struck[None] = 1
+        """Note if particle i is restless. change: that of overlaps with lighter particles, see is_restless()."""
+        self.struck[i] = ti.cast(self.is_restless(i, change, borne), ti.i32)
+        if self.struck[i] != 0:
+            self.any_struck[None] = 1
 
     @ti.func
     def bears(self, i, e):
@@ -128,13 +136,14 @@ class VelocityProjection:
         return out
 
     @ti.func
-    def list_loaded(self, i):
-        """List the loaded pairs of particle i, each with the factor that all passes multiply by.
+    def list_loaded(self, i, every):
+        """List the loaded pairs of particle i: all of them, or without those that part. Returns their number.
 
-        Returns their number, and whether the particle is restless.
+        The mass is split by the normals of now: by those of the start of the substep, a particle that turned around another one,
+        as a small one does that is pressed into a large one, would have eigenvalues above 1, which the polynomial multiplies.
         """
         first, w = self.list.first[i], self.state.w.of(i)
-        change, borne = ti.zero(w), ti.zero(w)
+        change, borne, normals = ti.zero(w), ti.zero(w), ti.Matrix.zero(self.state.real, self.state.dim, self.state.dim)
         at = first
         if self.weight[i] > 0 and self.state.awake(i):
             for word in range(self.list.word_count(i)):
@@ -146,40 +155,99 @@ class VelocityProjection:
                     if self.bears(i, e):
                         j = self.list.neighbour[e]
                         r = self.state.separation(i, j)
-                        rr = r.dot(r)
-                        length, load = ti.sqrt(rr), (w + self.state.w.of(j)) * self.push.field[e]
+                        length, load = r.norm(), (w + self.state.w.of(j)) * self.push.field[e]
                         moved = -1 + 0 * w
-                        if rr > 0:
+                        if length > 0:
                             moved = self.change_of(i, j, r / length, self.geometry.contact_distance(i, j) - length, load)
-                        if moved >= 0:
-                            shared = self.weight[i] + self.weight[j]
+                        if length > 0 and (every or moved >= 0):
                             change, borne = ti.max(change, moved), ti.max(borne, load)
+                            normals += r.outer_product(r) / (length * length)
                             self.list.old_neighbour[at] = j
-                            self.push.old[at] = w / (rr * shared)
                             at += 1
-        return at - first, self.is_restless(i, change, borne)
+        self.moved[i], self.borne[i] = change, borne
+        self.split[i] = ti.max(self.weight[i], w * largest(normals))
+        return at - first
 
     @ti.func
-    def begin(self, piece, begin, end):
-        """List the loaded pairs of particles begin ... end - 1, a piece. Positions do not change: one list serves all passes."""
-        count, restless = 0, 0
+    def begin(self, piece, begin, end, damps):
+        """List the loaded pairs of particles begin ... end - 1, a piece. Positions do not change: one list serves all passes.
+
+        Where not all are projected, also note which particles are at the center of those that are.
+        """
+        count = 0
         for i in range(begin, end):
-            number, is_restless = self.list_loaded(i)
-            self.number[i] = number
+            number = self.list_loaded(i, damps == ALWAYS)
+            self.number[i], self.ring[i] = number, 0
             if number > 0:
-                restless += ti.cast(is_restless, ti.i32)
                 self.loaded[begin + count] = i
                 count += 1
-        self.count[piece], self.restless_count[piece] = count, restless
+                if damps != ALWAYS:
+                    center = damps == MAYBE and self.restless[i] != 0
+                    if ti.static(self.unequal):
+                        center = center or self.struck[i] != 0
+                    self.ring[i] = ti.select(center, 0, FAR)
+        self.count[piece] = count
+
+    @ti.func
+    def spread(self, i, k):
+        """Put what touches particle i, in ring k, into the next ring."""
+        if self.ring[i] == k:
+            for e in range(self.list.first[i], self.list.first[i] + self.number[i]):
+                j = self.list.old_neighbour[e]
+                if self.ring[j] == FAR:
+                    self.ring[j] = k + 1  # whoever else does this writes the same
+
+    @ti.func
+    def finish_list(self, piece, begin, end):
+        """Leave out what is FAR, of particles begin ... end - 1, a piece: particles, and pairs with them. Store the factor of
+        each other pair that all passes multiply by."""
+        count = 0
+        for m in range(begin, begin + self.count[piece]):
+            i = self.loaded[m]
+            first = self.list.first[i]
+            at = first
+            if self.ring[i] != FAR:
+                for e in range(first, first + self.number[i]):
+                    j = self.list.old_neighbour[e]
+                    if self.ring[j] != FAR:
+                        r = self.state.separation(i, j)
+                        split = self.split[i] + ti.select(self.number[j] > 0, self.split[j], self.weight[j])
+                        self.list.old_neighbour[at], self.push.old[at] = j, self.state.w.of(i) / (r.dot(r) * split)
+                        at += 1
+                self.loaded[begin + count] = i
+                count += 1
+            self.number[i] = at - first
+        self.count[piece] = count
+
+    @ti.func
+    def find_restless(self, piece, begin, end, every):
+        """Note which particles are restless, of begin ... end - 1, a piece: of all of them, or of those that were projected.
+
+        What rattles among particles that bear much more is not.
+        """
+        if every:
+            for i in range(begin, end):
+                self.restless[i] = 0
+        for m in range(begin, begin + self.count[piece]):
+            i = self.loaded[m]
+            borne = self.borne[i]
+            for e in range(self.list.first[i], self.list.first[i] + self.number[i]):
+                borne = ti.max(borne, self.borne[self.list.old_neighbour[e]])
+            self.restless[i] = ti.cast(self.is_restless(i, self.moved[i], borne), ti.i32)
+        restless = 0
+        for i in range(begin, end):
+            restless += self.restless[i]
+        self.restless_count[piece] = restless
 
     @ti.func
     def sum_up(self, pieces):
-        """Note whether the pile is restless, and that what was struck is dealt with."""
-        count, restless = 0, 0
+        """Note whether any particle is restless, and that what was struck is dealt with."""
+        restless = 0
         for piece in range(pieces):
-            count += self.count[piece]
             restless += self.restless_count[piece]
-        self.restless[None], self.struck[None] = ti.cast(restless * SHARE > count, ti.i32), 0
+        self.any_restless[None] = ti.cast(restless > 0, ti.i32)
+        if ti.static(self.unequal):
+            self.any_struck[None] = 0
 
     @ti.func
     def relax(self, i, k):
@@ -206,15 +274,10 @@ class VelocityProjection:
         self.state.d[i] = self.state.d[i] + self.change[i]
 
 
-@inline
-def due(k):
-    """Return whether velocities are projected after substep k after a start: NEVER, MAYBE (if the pile is restless) or ALWAYS."""
-    return k % OFTEN // (OFTEN - 1) * (k >= EVERY) + k % EVERY // (EVERY - 1)
-
-
 def unequal(mass: np.ndarray) -> bool:
-    """Whether any two of these masses, (n,) [kg], are unequal."""
-    return bool(len(mass) and mass.max() > UNEQUAL * mass.min())
+    """Whether any two of these masses, (n,) [kg], are unequal, of particles that can move."""
+    some = mass[np.isfinite(mass)]
+    return bool(len(some) and some.max() > UNEQUAL * some.min())
 
 
 def chebyshev(passes: int, condition: float) -> np.ndarray:

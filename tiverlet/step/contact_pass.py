@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+from ..contact.projection_times import ALWAYS
 from ..device import ti
 from ..device.number import OnDevice
 from ..device.thread_team import block, blocks
@@ -151,29 +152,47 @@ class ContactPass:
                     c.dev.hit[None] = 0
 
     @ti.func
-    def project_velocities(self, thread, k):
+    def spread_projection(self, thread, k, damps):
+        """Find what is projected: list all loaded pairs, then ring k + 1 around restless particles."""
+        for c in ti.static(self.contacts):
+            if k == 0:
+                for p in range(self.particles.piece_count(thread)):
+                    begin, end = self.particles.piece(p, thread)
+                    c.dev.projection.begin(self.team.dealt_index(p, 1, thread), begin, end, damps)
+                self.team.wait()
+            for p in range(self.particles.piece_count(thread)):
+                begin, _end = self.particles.piece(p, thread)
+                for m in range(begin, begin + c.dev.projection.count[self.team.dealt_index(p, 1, thread)]):
+                    c.dev.projection.spread(c.dev.projection.loaded[m], k)
+            self.team.wait()
+
+    @ti.func
+    def project_velocities(self, thread, k, damps):
         """Do pass k of the projection that damps sound in loaded contacts."""
         for c in ti.static(self.contacts):
             for p in range(self.particles.piece_count(thread)):
                 begin, end = self.particles.piece(p, thread)
                 piece = self.team.dealt_index(p, 1, thread)
                 if k == 0:
-                    c.dev.projection.begin(piece, begin, end)
+                    c.dev.projection.finish_list(piece, begin, end)
                 for m in range(begin, begin + c.dev.projection.count[piece]):
                     c.dev.projection.relax(c.dev.projection.loaded[m], k)
             self.team.wait()
             for p in range(self.particles.piece_count(thread)):
                 begin, end = self.particles.piece(p, thread)
-                for m in range(begin, begin + c.dev.projection.count[self.team.dealt_index(p, 1, thread)]):
+                piece = self.team.dealt_index(p, 1, thread)
+                if k == 0:
+                    c.dev.projection.find_restless(piece, begin, end, damps == ALWAYS)
+                for m in range(begin, begin + c.dev.projection.count[piece]):
                     c.dev.projection.apply(c.dev.projection.loaded[m])
-            ti.loop_config(serialize=True)
-            for _ in range(self.team.one(ti.cast(k == 0, ti.i32), thread)):
-                c.dev.projection.sum_up(self.particles.pieces)
             self.team.wait()
+            ti.loop_config(serialize=True)
+            for _ in range(self.team.one(ti.cast(k == 1, ti.i32), thread)):
+                c.dev.projection.sum_up(self.particles.pieces)
 
     @ti.func
     def needs_projection(self, now):
-        """Whether sound is damped after this substep."""
+        """Whether sound is damped after this substep, anywhere."""
         out = False
         for c in ti.static(self.contacts):
             out = c.dev.projection.is_needed(now)

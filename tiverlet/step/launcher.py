@@ -2,7 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
-from ..contact.velocity_projection import ALWAYS, MAYBE, due
+from ..contact.projection_times import ALWAYS, MAYBE, due
+from ..contact.velocity_projection import RINGS
 from ..device.language import template
 from .span import Moment, Span
 
@@ -194,8 +195,17 @@ class Launcher:
         if now.damps == ALWAYS or not asks:
             return now.damps == ALWAYS
         self.flush()
-        restless = now.damps == MAYBE and memory.read(projection.restless)
-        return bool(restless or (projection.unequal and memory.read(projection.struck)))
+        restless = now.damps == MAYBE and memory.read(projection.any_restless)
+        return bool(restless or (projection.unequal and memory.read(projection.any_struck)))
+
+    def rings(self, now: Moment) -> int:
+        """How many rounds find the contacts in which sound is damped: one if these are all."""
+        return 1 if now.damps == ALWAYS else RINGS
+
+    def spread_projection(self, now: Moment) -> None:
+        """Add one round of spread_projection, in a launch of its own."""
+        self.flush()
+        self.put(now.of(now.it, half=now.it * self.halves), "spread_projection")
 
     def project_contact_velocities(self, now: Moment) -> None:
         """Add one pass of project_contact_velocities, in a launch of its own."""

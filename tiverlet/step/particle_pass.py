@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..colliders.surface import ANY_DEPTH, BEFORE_CONTACTS, BEYOND_ROUNDING, FRICTIONLESS
 from ..contact.force_share import accumulate
-from ..contact.velocity_projection import ALWAYS
+from ..contact.projection_times import ALWAYS
 from ..device import inline, ti
 from ..device.number import OnDevice
 from ..device.thread_team import Team, block, blocks

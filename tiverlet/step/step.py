@@ -8,7 +8,8 @@ the integrator.
 
 from typing import TYPE_CHECKING, Any
 
-from ..contact.velocity_projection import PASSES, due
+from ..contact.projection_times import ALWAYS, due
+from ..contact.velocity_projection import PASSES, RINGS
 from ..device import called, runtime, ti
 from ..device.number import OnDevice, read_all
 from ..device.thread_team import LEAST, Team
@@ -77,6 +78,8 @@ def substep(do, now):
             do.finish_substep(now)
     if ti.static(do.projects_velocities):
         if do.ends_substep(now) and do.needs_projection(now):
+            for k in range(do.rings(now)):
+                do.spread_projection(now.of(k))
             for k in range(PASSES):
                 do.project_contact_velocities(now.of(k))
 
@@ -504,19 +507,35 @@ class Step:
 
     @ti.func
     def needs_projection(self, now):
-        """Whether sound is damped after this substep."""
+        """Whether sound is damped after this substep, anywhere."""
         return self.contact_pass.needs_projection(now)
+
+    @ti.func
+    def rings(self, now):
+        """How many rounds find the contacts in which sound is damped: one if these are all."""
+        return ti.select(now.damps == ALWAYS, 1, RINGS)
+
+    @ti.func
+    def spread_projection(self, now):
+        """Find the contacts in which sound is damped: all, or ring by ring around restless particles."""
+        self.find_next_ring(now.thread, now.it, now.damps)
+
+    @called
+    @ti.func
+    def find_next_ring(self, thread: ti.i32, it: ti.i32, damps: ti.i32):
+        """One round of spread_projection()."""
+        self.contact_pass.spread_projection(thread, it, damps)
 
     @ti.func
     def project_contact_velocities(self, now):
         """Damp sound in loaded contacts."""
-        self.damp_sound(now.thread, now.it)
+        self.damp_sound(now.thread, now.it, now.damps)
 
     @called
     @ti.func
-    def damp_sound(self, thread: ti.i32, it: ti.i32):
+    def damp_sound(self, thread: ti.i32, it: ti.i32, damps: ti.i32):
         """One pass of project_contact_velocities()."""
-        self.contact_pass.project_velocities(thread, it)
+        self.contact_pass.project_velocities(thread, it, damps)
 
     @ti.func
     def diagnose(self, now):
