@@ -118,6 +118,8 @@ class Constraint(Scalar):
     A given gradient is compared with differences when the world is built: ValueError names the corner and the axis.
     Where function or gradient are not finite, as between coincident corners, the constraint does not act. It cannot act where the
     gradient is 0. A rigid one then reports its violation as residual, with 0 in place of a function that is not finite.
+    A rigid one needs a rest value where function is smooth: at a kink, as at 0 of a sum of lengths, directions are unrelated from
+    one pass to the next, and particles fly apart. Distance(rest=0) holds two particles together.
     """
 
     index_name = "indices"
