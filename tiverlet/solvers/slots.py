@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import checks
 from ..device import ti
 from ..device.memory import Memory
 from ..device.number import OnDevice
@@ -78,7 +79,8 @@ class Slots:
             self.bodies = memory.number(1 + max(int(b.max(initial=0)) for b in self._bodies.values()))
             self.body_load = memory.field("slots.bears", self.bodies)
         self.split = memory.field("slots.split_mass", scene.count, values=blocks * inv_mass)
-        self.relaxation = solver.relaxed_by(scene, batches, blocks * inv_mass)
+        factor = solver.relaxed_by(scene, batches, blocks * inv_mass)
+        self.relaxation = checks.number(type(solver).__name__, "relaxed_by()", factor, above=0.0)
 
     @staticmethod
     def _connected_bodies(batches: list[Batch], inv_mass: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray]:
