@@ -173,5 +173,13 @@ def test_paths_that_are_refused():
         tv.Snap([0], 1.0, compliance=0.0)
     with pytest.raises(ValueError, match=r"Snap: spacing\[0\] = 0"):
         tv.World(tv.Particles([[0.0, 0]]), [tv.Snap([0], 0.0, compliance=1.0)])
-    with pytest.warns(UserWarning, match=r"particle 0 starts 1 m off the curve.*\(0.5, 0.0\)"):
-        tv.World(tv.Particles([[0.5, 1.0]]), [tv.Path([0], [[0, 0], [1, 0]])]).close()
+
+
+def test_beads_off_their_curve_are_moved_there(world):
+    # At once and without velocity, as all that starts off its rigid constraints, with the flag.
+    with pytest.warns(UserWarning, match=r"particle 0 starts 1 m off the curve, and is moved to \(0.5, 0.0\)"):
+        w = world(tv.Particles([[0.5, 1.0], [1.0, 0.0]]), [tv.Path([0, 1], [[0, 0], [2, 0]])], substeps=1)
+    w.step(1 / 60)
+    assert w.last.flags == {"moved"} and "up to 1 m" in w.last.notes[0] and w.last.energy == 0
+    np.testing.assert_array_equal(w.position, [[0.5, 0.0], [1.0, 0.0]])
+    assert w.step(1 / 60).clean and not w.velocity.any()
