@@ -332,3 +332,21 @@ def test_forces_take_as_many_arguments_as_they_name():
 
     with pytest.raises(TypeError, match="1 to 4"):
         tv.Force(five)
+
+
+def test_warnings_name_the_line_of_the_user():
+    # However deep in the package the cause is found, when a world is built and when something is added to it.
+    x, off = [[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [1.0, 2.0]], [(0, 5), (1, 5)]
+    with pytest.warns(UserWarning) as said:
+        worlds = [
+            tv.World(tv.Particles(x, pinned=[0, 1]), [tv.Distance([[0, 1]], rest=2.0)]),
+            tv.World(tv.Particles(x), [tv.Contact()]),
+            tv.World(tv.Particles(x), [tv.Path([0], off)]),
+            tv.World(tv.Particles(x), [tv.Box((0.0, 0.0), (1.0, 1.0))]),
+            tv.World(tv.Particles(x, radius=0.1), [tv.Polygons([[0, 2, 3]])]),
+            tv.World(tv.Particles(x), [tv.Distance([[0, 1], [0, 1]])]),
+        ]
+        worlds[1].add(features=[tv.Path([0], off)])
+    for w in worlds:
+        w.close()
+    assert len(said) >= 7 and {(w.filename, w.category) for w in said} == {(__file__, UserWarning)}

@@ -134,3 +134,48 @@ def test_a_constraint_without_its_parts_is_refused():
         made(Length)()
     with pytest.raises(TypeError, match=r"New: Half.measure\(\) is missing"):
         made(Half, rest=REST_LENGTH)()
+
+
+def difference(a, b, c):
+    """Return the difference of two sides of a triangle."""
+    return (b - a).norm() - (c - b).norm()
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_rest_values_that_are_rounding_are_no_size(world, size):
+    # Two equal sides differ by 1e-16 of their length or not at all, and a flat tetrahedron has 1e-18 of its edge cubed.
+    # Residuals are relative to the size of f, extent times |grad f|, so they are some digits of f32.
+    y = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.3, 0.3]])
+    flat = np.column_stack([y, 0.1 + 0.1 * y[:, 0] + 0.2 * y[:, 1]])
+    even = np.array([[3.0, 0.0, 0.0], [4.0, 0.0, 0.0], [3.5, 0.75**0.5, 0.0]])
+    x = size * np.concatenate([flat, even])
+    v = 0.3 * size * np.random.default_rng(0).normal(size=x.shape)
+    features = [tv.Volume([[0, 1, 2, 3]]), tv.Constraint(difference, [[4, 5, 6]])]
+    w = world(tv.Particles(x, velocity=v), features, solver=tv.Jacobi(), substeps=20)
+    assert 0 < abs(features[0].rest[0]) < 1e-15 * size**3 and abs(features[1].rest_of(x)[0]) < 1e-15 * size
+    assert w.run(0.5).clean and max(f.residual.max() for f in features) < 64 * 2.0**-24
+
+
+def perimeter(a, b, c, d):
+    """Return the length around four corners."""
+    return (a - b).norm() + (b - c).norm() + (c - d).norm() + (d - a).norm()
+
+
+def off_circle(a):
+    """Return the distance from a circle of radius 2 around the origin."""
+    return a.norm() - 2.0
+
+
+@pytest.mark.parametrize("substeps", [8, 20, "auto"])
+def test_a_rest_value_at_a_kink_pulls_together(world, substeps):
+    # Four particles fall into one place, from rest, and go on with the momentum that they have. A function that crosses 0 has no
+    # kink there, wherever the particle starts; it stays second order, solved with the others.
+    x = np.array([[0.0, 0.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5], [2.0, 0.0], [0.0, 9.0]])
+    v = 0.3 * np.random.default_rng(0).normal(size=x.shape)
+    together, beads = tv.Constraint(perimeter, [[0, 1, 2, 3]]), [tv.Constraint(off_circle, [i]) for i in (4, 5)]
+    w = world(tv.Particles(x, velocity=v), [together, *beads], substeps=substeps, precision="f64")
+    assert together.cusp and not any(b.cusp for b in beads)
+    flags = set().union(*[w.step(1 / 60).flags for _ in range(60)])
+    assert flags <= {"moved"} and (w.last.substeps == substeps or w.last.substeps <= 8)
+    middle = x[:4].mean(axis=0) + v[:4].mean(axis=0)
+    np.testing.assert_allclose(w.position[:4], np.tile(middle, (4, 1)), atol=1e-6)

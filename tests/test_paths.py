@@ -92,6 +92,21 @@ def test_driven_along_a_path(world):
     np.testing.assert_array_equal(w.position[0], at)
 
 
+@pytest.mark.parametrize("precision", ["f32", "f32-compensated"])
+def test_a_ring_is_the_same_everywhere(world, precision):
+    # A free bead keeps its energy, and a driven one its place, however far away the ring is. A substep rounds the pull of the
+    # wire by up to a digit e of x, a share v h / (2 R) of it along the wire: n substeps change the energy by less than n e / R.
+    v, R, n = 0.3, 0.5, 2400
+    for away in (0.0, 10.0, 100.0, 1000.0 if precision == "f32-compensated" else -100.0):
+        ring = R * circle(32) + away
+        slides, goes = tv.Path([0], ring, closed=True), tv.Path([1], ring, closed=True, speed=1.0)
+        w = world(tv.Particles(ring[[8, 0]], velocity=(0, v)), [slides, goes], precision=precision, substeps=20)
+        flags = {flag for _ in range(n // 20) for flag in w.step(1 / 60).flags}
+        digit = 2.0**-24 * (R if precision == "f32-compensated" else abs(away) + R)
+        assert not flags and w.last.energy == pytest.approx(v * v / 2, rel=n * digit / R + 1e-3), away
+        np.testing.assert_allclose(w.position[1], goes.place([n / 1200]).ravel(), atol=4 * digit, err_msg=str(away))
+
+
 def test_a_soft_wire_gives_way(world):
     # Static deflection m g compliance across the wire, and free along it.
     wire = tv.Path([0], [[0, 0], [10, 0]], compliance=1e-2, damping=20.0)
@@ -158,5 +173,13 @@ def test_paths_that_are_refused():
         tv.Snap([0], 1.0, compliance=0.0)
     with pytest.raises(ValueError, match=r"Snap: spacing\[0\] = 0"):
         tv.World(tv.Particles([[0.0, 0]]), [tv.Snap([0], 0.0, compliance=1.0)])
-    with pytest.warns(UserWarning, match=r"particle 0 starts 1 m off the curve.*\(0.5, 0.0\)"):
-        tv.World(tv.Particles([[0.5, 1.0]]), [tv.Path([0], [[0, 0], [1, 0]])]).close()
+
+
+def test_beads_off_their_curve_are_moved_there(world):
+    # At once and without velocity, as all that starts off its rigid constraints, with the flag.
+    with pytest.warns(UserWarning, match=r"particle 0 starts 1 m off the curve, and is moved to \(0.5, 0.0\)"):
+        w = world(tv.Particles([[0.5, 1.0], [1.0, 0.0]]), [tv.Path([0, 1], [[0, 0], [2, 0]])], substeps=1)
+    w.step(1 / 60)
+    assert w.last.flags == {"moved"} and "up to 1 m" in w.last.notes[0] and w.last.energy == 0
+    np.testing.assert_array_equal(w.position, [[0.5, 0.0], [1.0, 0.0]])
+    assert w.step(1 / 60).clean and not w.velocity.any()

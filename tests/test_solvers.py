@@ -120,6 +120,14 @@ class Damped(Solver):
         return 0.5
 
 
+@pytest.mark.parametrize("factor, why", [(0.0, "above 0"), (-1.0, "above 0"), (float("nan"), "finite"), (float("inf"), "finite")])
+def test_factors_that_solve_nothing_are_refused(factor, why):
+    # With 0 links fell apart, and a residual of NaN was reported as 0.
+    solver = type("Still", (Solver,), {"relaxed_by": lambda *_: factor})()
+    with pytest.raises(ValueError, match=rf"Still: relaxed_by\(\) = {factor:g}.*, but it must be {why}"):
+        tv.World(tv.Particles([[0.0, 0.0], [1.0, 0.0]]), [tv.Distance([[0, 1]])], solver=solver)
+
+
 class HeavyBall(Solver):
     """Jacobi with momentum (Polyak 1964): d_j = a z_j + b d_(j-1), for eigenvalues from 1 / kappa to 1."""
 

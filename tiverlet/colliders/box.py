@@ -1,7 +1,5 @@
 """A box with particles inside."""
 
-import warnings
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -72,10 +70,9 @@ class Box(Collider):
         out[inv_mass == 0] = 0
         if (out > 1e-6 * particles.size).any():
             (i, k), number = np.unravel_index(int(np.argmax(out)), out.shape), int((out.max(axis=1) > 0).sum())
-            warnings.warn(
+            checks.warn(
                 f"Box: particle {i} starts {out[i, k]:.3g} m outside along axis {k} ({number} such in all); "
-                f"push_out = {self.push_out:g} m/s brings it in. Move it, or make the box larger.",
-                stacklevel=3,
+                f"push_out = {self.push_out:g} m/s brings it in. Move it, or make the box larger."
             )
 
     @property

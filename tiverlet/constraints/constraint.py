@@ -17,6 +17,7 @@ from .core.quantity import Quantity
 from .core.scalar import Scalar
 
 # A relative difference between the given gradient and finite differences that rounding does not explain.
+APPROACH, TRIED, NEAR = 12, 3, 1e-3  # steps towards f = 0; pairs of places that are tried there, and how near, in sizes
 GRADIENT_TOLERANCE = 1e-4
 
 
@@ -118,6 +119,9 @@ class Constraint(Scalar):
     A given gradient is compared with differences when the world is built: ValueError names the corner and the axis.
     Where function or gradient are not finite, as between coincident corners, the constraint does not act. It cannot act where the
     gradient is 0. A rigid one then reports its violation as residual, with 0 in place of a function that is not finite.
+    A rest value of 0 may be at a kink, as that of a sum of lengths, if function is nowhere negative: a rigid constraint is then
+    relaxed by itself. Other rest values of a rigid one need to be where function is smooth. At a kink directions are unrelated
+    from one pass to the next, and particles fly apart.
     """
 
     index_name = "indices"
@@ -190,8 +194,27 @@ class Constraint(Scalar):
         if not np.isfinite(values).all():
             i = int(np.argmin(np.isfinite(values)))
             raise ValueError(f"{self!r}: the function is {values[i]} for {self.index_name}[{i}] at its initial position.")
+        if self.count:
+            self.quantity.has_cusp_at_zero = self._is_nowhere_negative(particles.position)
         if self.gradient is not None and self.count:
             self._check_gradient(particles.position)
+
+    def _is_nowhere_negative(self, position: np.ndarray) -> bool:
+        """Whether function is nowhere below 0 where it is 0, so that it has a kink or a flat minimum there.
+
+        Newton's method goes to f = 0. Around a place where f crosses 0, f(q + e) and f(q - e) have opposite signs.
+        """
+        q = self._corners(position)
+        for _ in range(APPROACH):
+            f, g, _ = self._derivative(q, self._size)
+            square = (g**2).sum(axis=(1, 2))
+            share = np.divide(f, square, out=np.zeros(self.count), where=np.isfinite(f + square) & (square > 0))
+            q = q - share[:, None, None] * np.where(square[:, None, None] > 0, g, 0.0)
+        for k in range(1, TRIED + 1):
+            e = NEAR * self._size * (golden(np.arange(1, q.size + 1) + 1000 * k).reshape(q.shape) - 0.5)
+            if any((self._derivative(near, self._size)[0] < 0).any() for near in (q + e, q - e)):
+                return False
+        return True
 
     def _check_gradient(self, position: np.ndarray) -> None:
         """Compare the gradient with differences at the initial positions and at three places near by.

@@ -1,6 +1,5 @@
 """Beads on a wire."""
 
-import warnings
 from typing import Any
 
 import numpy as np
@@ -109,9 +108,8 @@ class Path(Anchored):
         if not self.is_kinematic and not self.soft and (off > 1e-2 * self.length).any():
             k = int(np.argmax(off))
             at = tuple(round(float(v), 6) for v in self.curve.at(self._start[k]))
-            warnings.warn(
-                f"Path: particle {self.indices[k, 0]} starts {off[k]:.3g} m off the curve, which throws it. Start at {at}.",
-                stacklevel=3,
+            checks.warn(
+                f"Path: particle {self.indices[k, 0]} starts {off[k]:.3g} m off the curve, and is moved to {at}. Start it there."
             )
 
     def tangents(self, x: np.ndarray) -> np.ndarray:

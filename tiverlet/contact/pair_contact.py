@@ -1,6 +1,5 @@
 """The contract of contact features: their common settings, and the methods that a step calls."""
 
-import warnings
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -213,7 +212,7 @@ class PairContact(Feature):
     def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Warn if all radii are 0, so that nothing touches."""
         if not self.can_touch and particles.count:
-            warnings.warn(f"{self!r}: all radii are 0, so nothing touches; give tv.Particles a radius.", stacklevel=3)
+            checks.warn(f"{self!r}: all radii are 0, so nothing touches; give tv.Particles a radius.")
 
     def check_added(self, particles: Particles, first: int) -> None:
         """Refuse positions too far out for the cells, of all particles after some were added."""

@@ -1,12 +1,12 @@
 """Contacts of bodies made of loops of particles (2D)."""
 
-import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .. import checks
 from ..colliders.body_impacts import FINE
 from ..device import ti
 from ..device.thread_team import Team
@@ -101,9 +101,9 @@ class Polygons(PairContact):
         loose = self._loose(inv_mass)
         if len(loose):
             k = int(loose[0])
-            warnings.warn(
+            checks.warn(
                 f"{self!r}: no constraint holds loops[{k}] ({len(loose)} such in all), so its corners move one by one. Add "
-                f"tv.ShapeMatch(loops), or links.", stacklevel=3,
+                f"tv.ShapeMatch(loops), or links."
             )  # fmt: skip
 
     def _left_out(self, i: int, loop: np.ndarray) -> bool:

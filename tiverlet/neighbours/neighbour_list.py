@@ -1,11 +1,11 @@
 """The neighbour list: its storage, and the data of pairs that is carried from one list to the next."""
 
 import contextlib
-import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .. import checks
 from ..device import ti
 from ..device.number import Number, OnDevice
 from ..device.thread_team import Team
@@ -134,10 +134,9 @@ class NeighbourList:
             need = int(self.memory.read(self.need).max())
         each = need * self.blocks / self.n
         if each > CROWDED:
-            warnings.warn(
+            checks.warn(
                 f"Contact: up to {each:.0f} near pairs per particle, so steps cost as the square of their number. Particles "
-                "overlap each other, or one is much larger than the rest.",
-                stacklevel=2,
+                "overlap each other, or one is much larger than the rest."
             )
         new = self.allocate(int(need * 1.25 + 16) * self.blocks)
         self.invalidate()

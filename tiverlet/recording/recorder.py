@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import warnings
 import weakref
 import zlib
 from dataclasses import asdict
@@ -294,13 +293,12 @@ class Recorder:
         if not self._full:
             self._finish()
         if not self._calls and self._journal.worst:
-            warnings.warn(
+            checks.warn(
                 f"Recorder: log() was never called, so {self.path} shows only the frame at the start. Call recorder.log() after "
-                "each step, or give world.run(seconds, recorder=recorder).",
-                stacklevel=2,
+                "each step, or give world.run(seconds, recorder=recorder)."
             )
         if self._note:
-            warnings.warn(self._note, stacklevel=2)
+            checks.warn(self._note)
 
     def _finish(self) -> None:
         journal, world = self._journal, self.world

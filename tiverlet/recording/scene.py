@@ -3,7 +3,6 @@
 import inspect
 import platform
 import textwrap
-import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import colliders, constraints, contact, forces, neighbours, solvers
+from .. import checks, colliders, constraints, contact, forces, neighbours, solvers
 from ..colliders.collider import Collider
 from ..device import runtime
 from ..device.language import is_kernel_function, undecorated
@@ -256,7 +255,7 @@ def rebuild(
         )
     for name, text in scene["needs"].items():
         if text and source(given[name]) not in ("", text):
-            warnings.warn(f"replay: {name} reads otherwise than when it was recorded; the bits may differ.", stacklevel=4)
+            checks.warn(f"replay: {name} reads otherwise than when it was recorded; the bits may differ.")
 
     particles = _particles(scene, arrays)
     everyone = np.ones(len(particles), dtype=bool)

@@ -4,16 +4,19 @@ from typing import Any
 
 import numpy as np
 
+from .. import checks
 from ..device import ti
 from ..device.memory import Memory
 from ..device.number import OnDevice
 from ..features.feature import BENT, FAR, Batch, Scene
 from ..features.regrouping import Regrouping
+from ..tools import golden_steps
 from .corners import bodies_of, corners_of
 from .system import solvable
 
 # Where constraints converge within a substep, SHAKE is an explicit method for transverse vibrations, with a limit of stability:
 TENSEST = 4.0  # (omega h)^2 of a transverse vibration under a tension, beyond which Verlet diverges
+DITHER = golden_steps(1)[0], golden_steps(2)[0]  # steps of the dither of moves, from a substep and from a pass to the next
 
 
 def assign_slots(batches: list[Batch], inv_mass: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray]:
@@ -81,7 +84,8 @@ class Slots:
         self.corrects_tension = self.can_soften and self.converges
         if self.corrects_tension:  # by 1 / softness, since it is computed from split masses
             self.inverse_softness = memory.field("slots.inverse_softness", None, values=[1.0])
-        self.relaxation = solver.relaxed_by(scene, batches, blocks * inv_mass)
+        factor = solver.relaxed_by(scene, batches, blocks * inv_mass)
+        self.relaxation = checks.number(type(solver).__name__, "relaxed_by()", factor, above=0.0)
 
     @staticmethod
     def _connected_bodies(batches: list[Batch], inv_mass: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray]:
@@ -216,16 +220,30 @@ class Slots:
         return total
 
     @ti.func
-    def gather(self, i, newton):
+    def gather(self, i, now):
         """Move particle i by the sum of its slots. In later Newton steps, only particles of systems that take the step move."""
         begin, end = self.begin[i], self.begin[i + 1]
         if ti.static(self.refines):
-            if newton > 0 and end > begin:
+            if now.newton > 0 and end > begin:
                 r = self.system.row_of[begin]
                 if r < 0 or not self.system.is_unmet(r):
                     end = begin
         if end > begin:
             correction = self.correction_of(i)
-            self.state.shift(i, correction)
+            self.shift(i, correction, now)
             if ti.static(self.refines):
                 self.system.record_move(i, begin, end, correction)
+
+    @ti.func
+    def shift(self, i, move, now):
+        """Add a move to x_i and d_i. In f32 without low words, x_i gets it with a dither, see State.dithered().
+
+        A move below half a digit of x would be lost in x and kept in d, which brings it to x a substep later. A spring whose
+        force is late by h gains energy at the rate omega^2 h, and rigid constraints at rest tremble.
+        """
+        if ti.static(self.state.sums or self.state.double):
+            self.state.shift(i, move)
+        else:
+            turn = ti.cast(now.tick, ti.u32) * ti.u32(DITHER[0]) + ti.cast(now.it, ti.u32) * ti.u32(DITHER[1])
+            self.state.d[i] = self.state.d[i] + move
+            self.state.advance(i, self.state.dithered(self.state.x[i], move, turn))

@@ -26,6 +26,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..constraints.core.scalar import Scalar
+from ..constraints.path import Path
 from ..device import ti
 from ..features.feature import Batch, Feature, Scene
 from ..neighbours.queries import between
@@ -110,6 +111,26 @@ def tied(scene: Scene, batches: list[Batch], placed: int) -> np.ndarray:
     body, bodies = _bodies([b for b in batches if isinstance(b, Scalar) and b.count], scene.inv_mass)
     going = np.bincount(body[placed:], minlength=bodies) > 0
     return (going[body] & (scene.inv_mass > 0)) | (np.arange(len(body)) >= placed)
+
+
+def put_on_curves(scene: Scene, batches: list[Batch], placed: int) -> tuple[np.ndarray, float] | None:
+    """Move placed particles on rigid curves that are off by more than SEEN to where the curve is nearest.
+
+    placed: the first placed particle. Returns what remove() does.
+    """
+    x = scene.state.get(scene.memory) if any(isinstance(b, Path) and not b.is_kinematic for b in batches) else np.zeros((0, 0))
+    new, share = x.copy(), 0.0
+    for b in batches:
+        if isinstance(b, Path) and not b.is_kinematic:
+            i, offset = b.indices[:, 0], b.offset(x)
+            off = np.linalg.norm(offset, axis=1) / b.length * ((b.compliance == 0) & (i >= placed) & (scene.inv_mass[i] > 0))
+            some = off > SEEN
+            new[i[some]] -= offset[some]
+            share = max(share, float(off.max(initial=0.0)))
+    if not share > SEEN:
+        return None
+    scene.state.put(scene.memory, new)
+    return np.linalg.norm(new - x, axis=1), share
 
 
 def remove(

@@ -238,17 +238,10 @@ class Verlet:
         """Return `small` with a dither, before it is added to `big`.
 
         In f32, while `small` is constant, such a sum would always be rounded to the same side. In free fall and in uniform motion
-        this would be the largest error. So `small` gets a fraction in (-1/2, 1/2) of the last digit of `big`, from the golden
-        sequence. The rounded sums then follow the exact one, with an error that grows like the logarithm of the number of steps
-        instead of that number.
+        this would be the largest error.
         """
         if ti.static(self.dithers):
-            u = ti.cast(ti.cast(tick, ti.u32) * ti.u32(step), ti.f32) * ti.static(2.0**-32) - 0.5
-            for a in ti.static(range(self.dim)):
-                exponent = ti.bit_cast(big[a], ti.u32) & ti.u32(0x7F800000)
-                sign = ti.bit_cast(small[a], ti.u32) & ti.u32(0x80000000)
-                digit = ti.bit_cast(exponent | sign, ti.f32) * (u * ti.static(2.0**-23))
-                small[a] += ti.select(small[a] == 0, ti.cast(0, ti.f32), digit)
+            small = self.state.dithered(big, small, ti.cast(tick, ti.u32) * ti.u32(step))
         return small
 
     @ti.func

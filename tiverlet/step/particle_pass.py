@@ -206,11 +206,11 @@ class ParticlePass:
         if self.state.awake(i):
             for impacts in ti.static(self.impacts):
                 d = self.state.d[i]
-                self.slots.gather(i, now.newton)
+                self.slots.gather(i, now)
                 if now.it >= now.span.iterations:
                     impacts.mark_reached(i, self.state.d[i] - d)
             if ti.static(len(self.impacts) == 0):
-                self.slots.gather(i, now.newton)
+                self.slots.gather(i, now)
 
     @ti.func
     def apply_corrections(self, now):

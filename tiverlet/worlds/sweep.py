@@ -1,7 +1,6 @@
 """One scene with many parameters: make worlds, step them together and measure them, in processes or on a cluster."""
 
 import inspect
-import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -121,7 +120,7 @@ def _done(parts: list[Part], workers: "Workers") -> Iterable[tuple[Part, dict[st
                     "parameters with executor=1 and at_once=1 to see which of them it is; where memory is short, take a smaller "
                     "at_once or fewer workers."
                 )
-            warnings.warn(f"sweep: {part} is done again: {outcome.why}.", RuntimeWarning, stacklevel=3)
+            checks.warn(f"sweep: {part} is done again: {outcome.why}.", RuntimeWarning)
             todo.appendleft(part)
 
 

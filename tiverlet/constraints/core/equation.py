@@ -11,7 +11,8 @@ from .step_limit import StepLimit
 from .strength import Strength
 
 RESTARTED = 2  # `fresh` at a start from velocities that displacements were turned into, see Equation.spring_force()
-SMALLEST = 1e-6  # of the size of the scene: a longer length is not rounding
+SMALLEST = 1e-6  # of the size of the scene: a longer length is not rounding; of the size of f at a constraint: nor is a larger f
+ROUNDING = 1e-9  # of the size of the scene: a longer rest length is not rounding
 
 if TYPE_CHECKING:
     from ...features.feature import Scene
@@ -33,8 +34,8 @@ class Equation:
 
     CornerPasses and OutlinePasses compute f and its gradients, and call the methods here.
     batch: the Scalar. start: f at the start, (m,). side: 0: C = 0; 1: C <= 0; -1: C >= 0. scale: what residuals are relative to
-    where the rest value is 0. scene_sized: whether that is the size of the scene. in_state: its fields in the exact state, by
-    name.
+    where the rest value is 0, or rounding: not above `least`. scene_sized: whether that is the size of the scene. in_state: its
+    fields in the exact state, by name.
     """
 
     host_only = ("scene_sized",)
@@ -43,9 +44,10 @@ class Equation:
         name, m, add, unit = repr(batch), batch.count, scene.memory.field, batch.quantity.unit
         self.slots, self.real, self.side, self.corners = scene.slots, scene.real, batch.side, corners
         self.forces = bool(batch.acts_as_force(scene).any())
-        least = SMALLEST * batch.start.size if batch.quantity.is_distance else 0.0
-        self.scene_sized = not unit and not (np.abs(start) > least).any()
-        scale = unit or (batch.start.size if self.scene_sized else float(np.abs(start).mean()))
+        scale, self.scene_sized = unit or 0.0, False
+        if not unit:
+            scale, least, self.scene_sized = residual_sizes(batch, start)
+            self.least = scene.memory.number(least, scene.real)
         self.scale = scene.memory.number(scale, scene.real)
         self.rest = add(f"{name}.rest", m, values=batch.goal, state=batch.driven)
         self.driven = batch.driven
@@ -257,6 +259,23 @@ class Equation:
         """Return the scale of the residual of constraint c."""
         size = self.scale.now
         if ti.static(not self.quantity.unit):
-            if self.rest[c] != 0:
+            if ti.abs(self.rest[c]) > self.least.now:
                 size = ti.abs(self.rest[c])
         return size
+
+
+def residual_sizes(batch: Any, start: np.ndarray) -> tuple[float, float, bool]:
+    """Return what residuals are relative to where the rest value is 0 or rounding, the largest rest value that is rounding, and
+    whether the former is the size of the scene.
+
+    start: f at the start, (m,). The size of f at a constraint is its extent times |grad f|, see Scalar.inverse_size(). A volume
+    of 1e-17 m^3 between corners 1 m apart is rounding: its size is 1 m^3.
+    """
+    size, distance = batch.start.size, batch.quantity.is_distance
+    inverse = np.zeros(0) if distance else batch.inverse_size(batch.start.position)
+    sizes = 1 / inverse[inverse > 0]
+    least = SMALLEST * (size if distance else sizes.min(initial=np.inf) if len(sizes) else 0.0)
+    rest = ROUNDING * size if distance else least
+    if (np.abs(start) > least).any():
+        return float(np.abs(start).mean()), rest, False
+    return (float(sizes.mean()), rest, False) if len(sizes) else (size, rest, True)

@@ -18,6 +18,8 @@ WALK = 64  # steps along the pieces of a path that a search takes at most
 class OnCurve(Place):
     """Places of particles on a curve: the piece, and the distance along it.
 
+    The curve and its particles are relative to the middle of the curve, where differences of places lose no digits: away from the
+    origin they would be rounded to a digit of x, which is more than `least`, where a search ends.
     start: initial arc lengths, (m,). extent: of the curve [m]. target: of driven particles, speeds where it `moves`, else arc
     lengths; None where particles slide.
     """
@@ -30,9 +32,11 @@ class OnCurve(Place):
         self.name, self.corners = passes.name, passes.corners
         self.state, self.slots, self.real = scene.state, scene.slots, scene.real
         self.pieces, self.closed = len(curve.lengths), curve.closed
+        middle = ((curve.a.min(axis=0) + curve.a.max(axis=0)) / 2).astype(np.float32).astype(np.float64)
+        self.middle = add("Path.middle", 1, width=dim, values=middle[None])
         self.a, self.b, self.c, self.d = (
             add(f"Path.{name}", self.pieces, width=dim, values=v)
-            for name, v in (("points", curve.a), ("tangents", curve.b), ("second", curve.c), ("third", curve.d))
+            for name, v in (("points", curve.a - middle), ("tangents", curve.b), ("second", curve.c), ("third", curve.d))
         )
         self.lengths = add("Path.lengths", self.pieces, values=curve.lengths)
         piece, rest = curve.split(start)
@@ -48,6 +52,14 @@ class OnCurve(Place):
             self.source = add("Path.from", m, kind=ti.f64, values=start, state=True)
             self.target = add("Path.to", m, kind=ti.f64, values=target, state=True)
             self.in_state |= {"source": self.source, "target": self.target}
+
+    @ti.func
+    def position(self, i):
+        """Return the position of particle i, with any low words, relative to the middle of the curve."""
+        x = self.state.x[i] - self.middle[0]
+        if ti.static(self.state.sums):
+            x += self.state.low[i]
+        return x
 
     @ti.func
     def point(self, k, r):
@@ -78,10 +90,10 @@ class OnCurve(Place):
         i = self.corners.member(c, 0)
         if ti.static(self.state.sums):
             P, T = self.point(low, s - self.begin[low])
-            self.state.bring(i, P)
+            self.state.bring(i, ti.cast(self.middle[0], ti.f64) + P)
         else:
             P, T = self.point(low, ti.cast(s - self.begin[low], self.real))
-            self.state.bring(i, P)
+            self.state.bring(i, self.middle[0] + P)
 
     @ti.func
     def find_nearest(self, x):
@@ -137,7 +149,7 @@ class OnCurve(Place):
         At an end or a bend, P is the nearest point.
         """
         i = self.corners.member(c, 0)
-        x, t, C0 = self.state.place(i), self.tangent[c], ti.Vector.zero(self.real, self.state.dim)
+        x, t, C0 = self.position(i), self.tangent[c], ti.Vector.zero(self.real, self.state.dim)
         k, r = self.piece[c], self.rest[c]
         if first != 0:
             start = x - self.state.d[i]
@@ -163,7 +175,7 @@ class OnCurve(Place):
     def offset_now(self, c, back):
         """Return the offset from the nearest point."""
         i = self.corners.member(c, 0)
-        x = self.state.place(i) - back * self.state.d[i]
+        x = self.position(i) - back * self.state.d[i]
         k, r, lost = self.find_foot(self.piece[c], self.rest[c], x, x, False)
         P, T = self.point(k, r)
         return x - P

@@ -1,6 +1,5 @@
 """Constraints on one number, C = f - rest: their arguments, rest values and loads."""
 
-import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -87,10 +86,9 @@ class Scalar(Batch):
         unique, _, counts = distinct(ordered)
         if len(unique) < len(ordered):
             first = tuple(int(v) for v in unique[int(np.argmax(counts > 1))])
-            warnings.warn(
+            checks.warn(
                 f"{self!r}: {len(ordered) - len(unique)} of the {self.index_name} are duplicates, the first of them {first}. "
-                "They act together: the same result where rigid, stiffer by their number where compliant.",
-                stacklevel=5,
+                "They act together: the same result where rigid, stiffer by their number where compliant."
             )
 
     @property
@@ -237,10 +235,9 @@ class Scalar(Batch):
             if wrong.any():
                 k = int(np.argmax(wrong))
                 at = tuple(int(i) for i in self.members_of(k))
-                warnings.warn(
+                checks.warn(
                     f"{self!r}: {self.index_name}[{k}] = {at} is off by {C[k]:g}, but its particles cannot move "
-                    f"({int(wrong.sum())} such in all). They are skipped.",
-                    stacklevel=3,
+                    f"({int(wrong.sum())} such in all). They are skipped."
                 )
 
     @property

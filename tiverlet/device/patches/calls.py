@@ -32,7 +32,8 @@ _spare: list[tuple[Any, Any]] = []  # its functions without a body: keys and fun
 def called(function: Any) -> Any:
     """Let kernels call a ti.func instead of copying it.
 
-    It must be a method whose other arguments and result are integers, as its annotations say. All other results go to fields.
+    It must be a method whose other arguments and result are numbers of the types of its annotations, the first an integer. All
+    other results go to fields.
     """
     real = _real(function.func.func)
     return _calling(function, lambda self: real)
