@@ -153,17 +153,16 @@ class ContactPass:
 
     @ti.func
     def spread_projection(self, thread, k, damps):
-        """Find what is projected: list all loaded pairs, then ring k + 1 around restless particles."""
+        """Find what is projected: first list all loaded pairs, then take ring k around restless particles."""
         for c in ti.static(self.contacts):
-            if k == 0:
-                for p in range(self.particles.piece_count(thread)):
-                    begin, end = self.particles.piece(p, thread)
-                    c.dev.projection.begin(self.team.dealt_index(p, 1, thread), begin, end, damps)
-                self.team.wait()
             for p in range(self.particles.piece_count(thread)):
-                begin, _end = self.particles.piece(p, thread)
-                for m in range(begin, begin + c.dev.projection.count[self.team.dealt_index(p, 1, thread)]):
-                    c.dev.projection.spread(c.dev.projection.loaded[m], k)
+                begin, end = self.particles.piece(p, thread)
+                piece = self.team.dealt_index(p, 1, thread)
+                if k == 0:
+                    c.dev.projection.begin(piece, begin, end, damps)
+                else:
+                    for m in range(begin, begin + c.dev.projection.count[piece]):
+                        c.dev.projection.spread(c.dev.projection.loaded[m], k - 1)
             self.team.wait()
 
     @ti.func

@@ -200,7 +200,7 @@ class Launcher:
 
     def rings(self, now: Moment) -> int:
         """How many rounds find the contacts in which sound is damped: one if these are all."""
-        return 1 if now.damps == ALWAYS else RINGS
+        return 1 if now.damps == ALWAYS else 1 + RINGS
 
     def spread_projection(self, now: Moment) -> None:
         """Add one round of spread_projection, in a launch of its own."""

@@ -513,7 +513,7 @@ class Step:
     @ti.func
     def rings(self, now):
         """How many rounds find the contacts in which sound is damped: one if these are all."""
-        return ti.select(now.damps == ALWAYS, 1, RINGS)
+        return ti.select(now.damps == ALWAYS, 1, 1 + RINGS)
 
     @ti.func
     def spread_projection(self, now):
