@@ -160,7 +160,7 @@ def test_each_contact_of_a_pyramid_bears_what_statics_says(world):
     x = np.concatenate([np.stack([apart * (np.arange(rows - r) + r / 2), np.full(rows - r, r * up)], 1) for r in range(rows)])
     mass = np.random.default_rng(0).uniform(1, 2, len(x))
     w = smooth(world, (1 + 1e-9) * x + 2.0, mass, range(rows), substeps=8)  # scaled so that none overlap at the start
-    w.run(15.0)
+    w.run(20.0)
     found, free = w.contacts, np.arange(len(x)) >= rows
     forces, c = np.zeros((len(x), 2, len(found))), np.arange(len(found))
     forces[found.pairs[:, 0], :, c] = found.normal

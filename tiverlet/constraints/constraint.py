@@ -209,7 +209,7 @@ class Constraint(Scalar):
             f, g, _ = self._derivative(q, self._size)
             square = (g**2).sum(axis=(1, 2))
             share = np.divide(f, square, out=np.zeros(self.count), where=np.isfinite(f + square) & (square > 0))
-            q = q - share[:, None, None] * np.where(square[:, None, None] > 0, g, 0.0)
+            q = q - share[:, None, None] * np.where(share[:, None, None] != 0, g, 0.0)
         for k in range(1, TRIED + 1):
             e = NEAR * self._size * (golden(np.arange(1, q.size + 1) + 1000 * k).reshape(q.shape) - 0.5)
             if any((self._derivative(near, self._size)[0] < 0).any() for near in (q + e, q - e)):

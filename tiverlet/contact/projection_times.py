@@ -10,4 +10,4 @@ NEVER, MAYBE, ALWAYS = range(3)  # whether a substep ends with a projection
 @inline
 def due(k):
     """Return whether velocities are projected after substep k after a start: NEVER, MAYBE (near what is restless) or ALWAYS."""
-    return k % OFTEN // (OFTEN - 1) * (k >= EVERY) + k % EVERY // (EVERY - 1)
+    return k % OFTEN // (OFTEN - 1) * (k >= EVERY - 1) + k % EVERY // (EVERY - 1)

@@ -61,8 +61,6 @@ class VelocityProjection:
         self.restless = add("Contact.restless", scene.count, kind=ti.i32, state=True)
         self.any_restless = add("Contact.any_restless", None, kind=ti.i32, state=True)
         self.ring = add("Contact.ring", scene.count, kind=ti.i32)
-        self.moved, self.borne = add("Contact.moved", scene.count), add("Contact.borne", scene.count)  # see is_restless()
-        self.split = add("Contact.split", scene.count)  # m_i w_i by the present normals
         self.unequal = unequal(scene.particles.mass)
         if self.unequal:  # which particles are restless in a pair of unequal masses in this substep, and whether any is
             self.struck = add("Contact.struck", scene.count, kind=ti.i32)
@@ -102,10 +100,12 @@ class VelocityProjection:
         """Return the change of the overlap of a pair with the normal n in this substep [m], or -1 if the pair parts.
 
         overlap: its overlap. borne: the one that its push takes back, both [m]. A pair parts if its overlap ends in a substep.
-        Pairs that know their load have almost none, and part if they are restless.
+        Pairs that know their load have almost none, and part if they are restless. What was placed into another particle parts.
         """
         apart = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n)
-        return ti.select(apart > ti.max(overlap, ti.static(RESTLESS) * borne), -1 + 0 * apart, ti.abs(apart))
+        parts = apart > ti.max(overlap, ti.static(RESTLESS) * borne)
+        parts = parts or self.geometry.is_shrunk(i) or self.geometry.is_shrunk(j)
+        return ti.select(parts, -1 + 0 * apart, ti.abs(apart))
 
     @ti.func
     def is_restless(self, i, change, borne):
@@ -139,8 +139,9 @@ class VelocityProjection:
     def list_loaded(self, i, every):
         """List the loaded pairs of particle i: all of them, or without those that part. Returns their number.
 
-        The mass is split by the normals of now: by those of the start of the substep, a particle that turned around another one,
-        as a small one does that is pressed into a large one, would have eigenvalues above 1, which the polynomial multiplies.
+        Its mass is split by the present normals if need be. A particle that has turned around another one since the start of the
+        substep, as a small one does that is pressed into a large one, would have eigenvalues above 1 by the normals there, and
+        the polynomial multiplies these.
         """
         first, w = self.list.first[i], self.state.w.of(i)
         change, borne, normals = ti.zero(w), ti.zero(w), ti.Matrix.zero(self.state.real, self.state.dim, self.state.dim)
@@ -164,8 +165,10 @@ class VelocityProjection:
                             normals += r.outer_product(r) / (length * length)
                             self.list.old_neighbour[at] = j
                             at += 1
-        self.moved[i], self.borne[i] = change, borne
-        self.split[i] = ti.max(self.weight[i], w * largest(normals))
+        self.change[i][0], self.change[i][1] = change, borne  # for find_restless()
+        split = w * largest(normals)
+        if split > ti.static(1 + 1 / CONDITION) * self.weight[i]:  # up to there the polynomial is below 1
+            self.weight[i] = split
         return at - first
 
     @ti.func
@@ -211,8 +214,8 @@ class VelocityProjection:
                     j = self.list.old_neighbour[e]
                     if self.ring[j] != FAR:
                         r = self.state.separation(i, j)
-                        split = self.split[i] + ti.select(self.number[j] > 0, self.split[j], self.weight[j])
-                        self.list.old_neighbour[at], self.push.old[at] = j, self.state.w.of(i) / (r.dot(r) * split)
+                        shared = self.weight[i] + self.weight[j]
+                        self.list.old_neighbour[at], self.push.old[at] = j, self.state.w.of(i) / (r.dot(r) * shared)
                         at += 1
                 self.loaded[begin + count] = i
                 count += 1
@@ -230,10 +233,12 @@ class VelocityProjection:
                 self.restless[i] = 0
         for m in range(begin, begin + self.count[piece]):
             i = self.loaded[m]
-            borne = self.borne[i]
+            borne = self.change[i][1]
             for e in range(self.list.first[i], self.list.first[i] + self.number[i]):
-                borne = ti.max(borne, self.borne[self.list.old_neighbour[e]])
-            self.restless[i] = ti.cast(self.is_restless(i, self.moved[i], borne), ti.i32)
+                j = self.list.old_neighbour[e]
+                if self.number[j] > 0:
+                    borne = ti.max(borne, self.change[j][1])
+            self.restless[i] = ti.cast(self.is_restless(i, self.change[i][0], borne), ti.i32)
         restless = 0
         for i in range(begin, end):
             restless += self.restless[i]

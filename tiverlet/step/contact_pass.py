@@ -152,42 +152,39 @@ class ContactPass:
                     c.dev.hit[None] = 0
 
     @ti.func
-    def spread_projection(self, thread, k, damps):
-        """Find what is projected: first list all loaded pairs, then take ring k around restless particles."""
+    def find_projected(self, thread, k, rounds, damps):
+        """Find what is projected: list all loaded pairs, then take ring k around restless particles, at last finish the lists."""
         for c in ti.static(self.contacts):
             for p in range(self.particles.piece_count(thread)):
                 begin, end = self.particles.piece(p, thread)
                 piece = self.team.dealt_index(p, 1, thread)
                 if k == 0:
                     c.dev.projection.begin(piece, begin, end, damps)
-                else:
+                elif k < rounds - 1:
                     for m in range(begin, begin + c.dev.projection.count[piece]):
                         c.dev.projection.spread(c.dev.projection.loaded[m], k - 1)
+                else:
+                    c.dev.projection.finish_list(piece, begin, end)
+                    c.dev.projection.find_restless(piece, begin, end, damps == ALWAYS)
             self.team.wait()
 
     @ti.func
-    def project_velocities(self, thread, k, damps):
+    def project_velocities(self, thread, k):
         """Do pass k of the projection that damps sound in loaded contacts."""
         for c in ti.static(self.contacts):
             for p in range(self.particles.piece_count(thread)):
                 begin, end = self.particles.piece(p, thread)
-                piece = self.team.dealt_index(p, 1, thread)
-                if k == 0:
-                    c.dev.projection.finish_list(piece, begin, end)
-                for m in range(begin, begin + c.dev.projection.count[piece]):
+                for m in range(begin, begin + c.dev.projection.count[self.team.dealt_index(p, 1, thread)]):
                     c.dev.projection.relax(c.dev.projection.loaded[m], k)
             self.team.wait()
             for p in range(self.particles.piece_count(thread)):
                 begin, end = self.particles.piece(p, thread)
-                piece = self.team.dealt_index(p, 1, thread)
-                if k == 0:
-                    c.dev.projection.find_restless(piece, begin, end, damps == ALWAYS)
-                for m in range(begin, begin + c.dev.projection.count[piece]):
+                for m in range(begin, begin + c.dev.projection.count[self.team.dealt_index(p, 1, thread)]):
                     c.dev.projection.apply(c.dev.projection.loaded[m])
-            self.team.wait()
             ti.loop_config(serialize=True)
-            for _ in range(self.team.one(ti.cast(k == 1, ti.i32), thread)):
+            for _ in range(self.team.one(ti.cast(k == 0, ti.i32), thread)):
                 c.dev.projection.sum_up(self.particles.pieces)
+            self.team.wait()
 
     @ti.func
     def needs_projection(self, now):

@@ -198,14 +198,14 @@ class Launcher:
         restless = now.damps == MAYBE and memory.read(projection.any_restless)
         return bool(restless or (projection.unequal and memory.read(projection.any_struck)))
 
-    def rings(self, now: Moment) -> int:
-        """How many rounds find the contacts in which sound is damped: one if these are all."""
-        return 1 if now.damps == ALWAYS else 1 + RINGS
+    def rounds(self, now: Moment) -> int:
+        """How many rounds find the contacts in which sound is damped: two if these are all."""
+        return 2 if now.damps == ALWAYS else 2 + RINGS
 
-    def spread_projection(self, now: Moment) -> None:
-        """Add one round of spread_projection, in a launch of its own."""
+    def find_projected_contacts(self, now: Moment) -> None:
+        """Add one of these rounds, in a launch of its own."""
         self.flush()
-        self.put(now.of(now.it, half=now.it * self.halves), "spread_projection")
+        self.put(now.of(now.it, half=now.it * self.halves), "find_projected_contacts")
 
     def project_contact_velocities(self, now: Moment) -> None:
         """Add one pass of project_contact_velocities, in a launch of its own."""

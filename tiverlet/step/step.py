@@ -78,8 +78,8 @@ def substep(do, now):
             do.finish_substep(now)
     if ti.static(do.projects_velocities):
         if do.ends_substep(now) and do.needs_projection(now):
-            for k in range(do.rings(now)):
-                do.spread_projection(now.of(k))
+            for k in range(do.rounds(now)):
+                do.find_projected_contacts(now.of(k))
             for k in range(PASSES):
                 do.project_contact_velocities(now.of(k))
 
@@ -511,31 +511,31 @@ class Step:
         return self.contact_pass.needs_projection(now)
 
     @ti.func
-    def rings(self, now):
-        """How many rounds find the contacts in which sound is damped: one if these are all."""
-        return ti.select(now.damps == ALWAYS, 1, 1 + RINGS)
+    def rounds(self, now):
+        """How many rounds find the contacts in which sound is damped: two if these are all."""
+        return ti.select(now.damps == ALWAYS, 2, 2 + RINGS)
 
     @ti.func
-    def spread_projection(self, now):
-        """Find the contacts in which sound is damped: all, or ring by ring around restless particles."""
-        self.find_next_ring(now.thread, now.it, now.damps)
+    def find_projected_contacts(self, now):
+        """One of these rounds."""
+        self.find_projected(now.thread, now.it, self.rounds(now), now.damps)
 
     @called
     @ti.func
-    def find_next_ring(self, thread: ti.i32, it: ti.i32, damps: ti.i32):
-        """One round of spread_projection()."""
-        self.contact_pass.spread_projection(thread, it, damps)
+    def find_projected(self, thread: ti.i32, it: ti.i32, rounds: ti.i32, damps: ti.i32):
+        """One round of find_projected_contacts()."""
+        self.contact_pass.find_projected(thread, it, rounds, damps)
 
     @ti.func
     def project_contact_velocities(self, now):
         """Damp sound in loaded contacts."""
-        self.damp_sound(now.thread, now.it, now.damps)
+        self.damp_sound(now.thread, now.it)
 
     @called
     @ti.func
-    def damp_sound(self, thread: ti.i32, it: ti.i32, damps: ti.i32):
+    def damp_sound(self, thread: ti.i32, it: ti.i32):
         """One pass of project_contact_velocities()."""
-        self.contact_pass.project_velocities(thread, it, damps)
+        self.contact_pass.project_velocities(thread, it)
 
     @ti.func
     def diagnose(self, now):
