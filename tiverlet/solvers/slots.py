@@ -116,14 +116,19 @@ class Slots:
         by sigma W h^2 F, with their floor sigma. Constraints that a pass solves exactly, as no other one shares their particles,
         stay exact.
         """
-        if self._sagging is None:
-            self._sagging = self._in_sagging_bodies(batches, inv_mass)
-        n = len(self._sagging)
+        sags = self.sags(inv_mass, batches)
+        n = len(sags)
         split = np.zeros(len(inv_mass))
-        split[:n] = self._blocks[:n] * inv_mass[:n] * np.where(self._sagging, softness, 1.0)
+        split[:n] = self._blocks[:n] * inv_mass[:n] * np.where(sags, softness, 1.0)
         memory.write(self.split, split)
         if self.corrects_tension:
             memory.write(self.inverse_softness, 1 / softness)
+
+    def sags(self, inv_mass: np.ndarray, batches: list[Batch]) -> np.ndarray:
+        """Return a mask of the particles whose constraints soften() changes, of all that constraints hold."""
+        if self._sagging is None:
+            self._sagging = self._in_sagging_bodies(batches, inv_mass)
+        return self._sagging
 
     def _in_sagging_bodies(self, batches: list[Batch], inv_mass: np.ndarray) -> np.ndarray:
         """Return a mask of the particles whose constraints a pass does not solve exactly, with all that is connected to them."""
