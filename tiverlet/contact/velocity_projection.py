@@ -137,14 +137,9 @@ class VelocityProjection:
 
     @ti.func
     def list_loaded(self, i, every):
-        """List the loaded pairs of particle i: all of them, or without those that part. Returns their number.
-
-        Its mass is split by the present normals if need be. A particle that has turned around another one since the start of the
-        substep, as a small one does that is pressed into a large one, would have eigenvalues above 1 by the normals there, and
-        the polynomial multiplies these.
-        """
+        """List the loaded pairs of particle i: all of them, or without those that part. Returns their number."""
         first, w = self.list.first[i], self.state.w.of(i)
-        change, borne, normals = ti.zero(w), ti.zero(w), ti.Matrix.zero(self.state.real, self.state.dim, self.state.dim)
+        change, borne = ti.zero(w), ti.zero(w)
         at = first
         if self.weight[i] > 0 and self.state.awake(i):
             for word in range(self.list.word_count(i)):
@@ -162,13 +157,9 @@ class VelocityProjection:
                             moved = self.change_of(i, j, r / length, self.geometry.contact_distance(i, j) - length, load)
                         if length > 0 and (every or moved >= 0):
                             change, borne = ti.max(change, moved), ti.max(borne, load)
-                            normals += r.outer_product(r) / (length * length)
                             self.list.old_neighbour[at] = j
                             at += 1
         self.change[i][0], self.change[i][1] = change, borne  # for find_restless()
-        split = w * largest(normals)
-        if split > ti.static(1 + 1 / CONDITION) * self.weight[i]:  # up to there the polynomial is below 1
-            self.weight[i] = split
         return at - first
 
     @ti.func
@@ -199,6 +190,22 @@ class VelocityProjection:
                 j = self.list.old_neighbour[e]
                 if self.ring[j] == FAR:
                     self.ring[j] = k + 1  # whoever else does this writes the same
+
+    @ti.func
+    def split_by_present_normals(self, i):
+        """Split the mass of particle i, which is projected, by the present normals if need be.
+
+        A particle that has turned around another one since the start of the substep, as a small one does that is pressed into a
+        large one, would have eigenvalues above 1 by the normals there, and the polynomial multiplies these.
+        """
+        if self.ring[i] != FAR:
+            normals = ti.Matrix.zero(self.state.real, self.state.dim, self.state.dim)
+            for e in range(self.list.first[i], self.list.first[i] + self.number[i]):
+                r = self.state.separation(i, self.list.old_neighbour[e])
+                normals += r.outer_product(r) / r.dot(r)
+            split = self.state.w.of(i) * largest(normals)
+            if split > ti.static(1 + 1 / CONDITION) * self.weight[i]:  # up to there the polynomial is below 1
+                self.weight[i] = split
 
     @ti.func
     def finish_list(self, piece, begin, end):

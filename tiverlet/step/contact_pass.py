@@ -153,7 +153,8 @@ class ContactPass:
 
     @ti.func
     def find_projected(self, thread, k, rounds, damps):
-        """Find what is projected: list all loaded pairs, then take ring k around restless particles, at last finish the lists."""
+        """Find what is projected: list all loaded pairs, then take ring k around restless particles. The last two rounds split
+        masses by the present normals, and finish the lists."""
         for c in ti.static(self.contacts):
             for p in range(self.particles.piece_count(thread)):
                 begin, end = self.particles.piece(p, thread)
@@ -162,7 +163,10 @@ class ContactPass:
                     c.dev.projection.begin(piece, begin, end, damps)
                 elif k < rounds - 1:
                     for m in range(begin, begin + c.dev.projection.count[piece]):
-                        c.dev.projection.spread(c.dev.projection.loaded[m], k - 1)
+                        if k < rounds - 2:
+                            c.dev.projection.spread(c.dev.projection.loaded[m], k - 1)
+                        else:
+                            c.dev.projection.split_by_present_normals(c.dev.projection.loaded[m])
                 else:
                     c.dev.projection.finish_list(piece, begin, end)
                     c.dev.projection.find_restless(piece, begin, end, damps == ALWAYS)

@@ -199,8 +199,8 @@ class Launcher:
         return bool(restless or (projection.unequal and memory.read(projection.any_struck)))
 
     def rounds(self, now: Moment) -> int:
-        """How many rounds find the contacts in which sound is damped: two if these are all."""
-        return 2 if now.damps == ALWAYS else 2 + RINGS
+        """How many rounds find the contacts in which sound is damped: three if these are all."""
+        return 3 if now.damps == ALWAYS else 3 + RINGS
 
     def find_projected_contacts(self, now: Moment) -> None:
         """Add one of these rounds, in a launch of its own."""

@@ -512,8 +512,8 @@ class Step:
 
     @ti.func
     def rounds(self, now):
-        """How many rounds find the contacts in which sound is damped: two if these are all."""
-        return ti.select(now.damps == ALWAYS, 2, 2 + RINGS)
+        """How many rounds find the contacts in which sound is damped: three if these are all."""
+        return ti.select(now.damps == ALWAYS, 3, 3 + RINGS)
 
     @ti.func
     def find_projected_contacts(self, now):
