@@ -2,6 +2,7 @@
 
 import math
 import numbers
+import os
 import sys
 import warnings
 from collections.abc import Iterable
@@ -13,7 +14,7 @@ import numpy as np
 ANY = 2**31 - 1  # number of particles, while it is not yet known
 OF_SHAPE = {"position": "position", "pairs": "links", "triples": "bends", "quads": "quads", "loops": "loops"}  # by argument
 
-PACKAGE = str(Path(__file__).parent)
+PACKAGE = str(Path(__file__).parent) + os.sep
 
 
 def warn(text: str, category: type[Warning] = UserWarning) -> None:

@@ -16,8 +16,8 @@ from .core.finite_differences import NumericGradient
 from .core.quantity import Quantity
 from .core.scalar import Scalar
 
-# A relative difference between the given gradient and finite differences that rounding does not explain.
 APPROACH, TRIED, NEAR = 12, 3, 1e-3  # steps towards f = 0; pairs of places that are tried there, and how near, in sizes
+# A relative difference between the given gradient and finite differences that rounding does not explain.
 GRADIENT_TOLERANCE = 1e-4
 
 

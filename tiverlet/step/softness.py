@@ -87,11 +87,16 @@ def end(runner: "Runner", h: float) -> None:
     runner.set_softness(1.0)
 
 
+def _borne_by(batch: Scalar, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the loads F of constraints [N], (m,), and |F Z| of their violations at x (n, dim) [m], beside that of compliance."""
+    F = batch.load
+    return F, np.maximum(np.abs(F * batch.violation(x)) - batch.compliance * F * F, 0.0)
+
+
 def _stored(runner: "Runner") -> float:
     """Return the energy that violations of scalar constraints store, beside that of their compliance: sum |F Z| / 2 [J]."""
     x = runner.scene.state.get(runner.memory)
-    some = [(b, b.load) for b in runner.batches if isinstance(b, Scalar) and b.count]
-    return sum(float(np.maximum(np.abs(F * b.violation(x)) - b.compliance * F * F, 0.0).sum()) / 2 for b, F in some)
+    return sum(float(_borne_by(b, x)[1].sum()) / 2 for b in runner.batches if isinstance(b, Scalar) and b.count)
 
 
 def _converges(runner: "Runner") -> bool:
@@ -102,9 +107,9 @@ def _converges(runner: "Runner") -> bool:
     sags = runner.scene.slots.sags(runner.scene.inv_mass, runner.batches)
     for b in runner.batches:
         if isinstance(b, Scalar) and b.count:
-            F, C = b.load, b.violation(x)
+            F, energy = _borne_by(b, x)
             some = np.bincount(b.owner, sags[b.indices.ravel()], minlength=b.count) > 0
-            stored += float((np.maximum(np.abs(F * C) - b.compliance * F * F, 0.0) * some).sum())
+            stored += float((energy * some).sum())
             of_one_pass += float((_weights(b) * (h * F) ** 2 * some).sum())
     return stored < CONVERGED * of_one_pass
 
