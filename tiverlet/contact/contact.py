@@ -193,7 +193,7 @@ class Contact(PairContact):
         slid = [*([dev.slip] if dev.has_friction else []), *([dev.turn] if dev.turn else [])]
         dev.splitting = MassSplitting(scene, dev.geometry, slid, skips, dev.push, ended, team, dev.known)
         if dev.known:
-            dev.known.bind(dev.list)
+            dev.known.bind(dev.list, dev.geometry)
         dev.forces = ForceShare(scene, sums=dev.has_friction, lasting=True)
         dev.fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
         dev.restitution = None

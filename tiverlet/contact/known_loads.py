@@ -1,12 +1,12 @@
 """Known loads: each pair learns the load that it bears at rest, and applies it in every substep like a force."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..device import ti
 from ..features.feature import Acceleration
-from ..features.learning import is_steady, learnt_share
+from ..features.learning import SteadyMotion, is_steady, learnt_share
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.queries import between
 
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 WINDOW = 128  # substeps over which the missing load is averaged; it begins just after sound is removed (EVERY)
 SLOW = 0.3  # substeps that it takes to learn the load of k particles, per k^2
+LAG_BODIES = 448  # more substeps
+SLOW_BODIES = 1.2  # the same for contacts of bodies, whose sound decays more slowly
 SAME = 1e-3  # relative change of the vector between a pair beyond which it forgets its load when positions are assigned
 
 
@@ -31,6 +33,16 @@ class Carried(Acceleration):
     def acceleration(self, i, x, v, t):
         """Return the acceleration of particle i by its known loads."""
         return self.field[i]
+
+
+class LearntLoad:
+    """The data of one load that each pair learns: along the normal, where it only `pushes`, or across it."""
+
+    def __init__(self, names: tuple[str, str, str], pushes: bool):
+        self.pushes = pushes
+        self.load, self.borne, self.earlier = self.pair_data = [
+            PairData(name, 0, persistent=True, only_touching=True) for name in names
+        ]
 
 
 class KnownLoads:
@@ -58,30 +70,37 @@ class KnownLoads:
     z^3 - 3 a z^2 + 3 a z - a, a = 1 - r L, whose roots near 1 grow like (r L)^(1/3) / 2.
     """
 
-    def __init__(self, scene: "Scene"):
-        self.state, self.weights = scene.state, scene.own_weight
-        self.load = PairData("load", 0, persistent=True, only_touching=True)  # [N]
-        self.borne = PairData("borne", 0, persistent=True, only_touching=True)  # sum of the missing part in this window [kg m]
-        self.earlier = PairData("earlier", 0, persistent=True, only_touching=True)  # mean missing part in the window before [N]
-        self.pair_data = [self.load, self.borne, self.earlier]
+    def __init__(self, scene: "Scene", bodies: bool = False, has_friction: bool = False):
+        self.state, self.weights, self.slow = scene.state, scene.own_weight, SLOW_BODIES if bodies else SLOW
+        self.lag = LAG_BODIES if bodies else 0.0
+        # The load [N], the sum of its missing part in this window [kg m], and the mean of it in the window before [N].
+        self.normal = LearntLoad(("load", "borne", "earlier"), True)
+        self.load, self.borne = self.normal.load, self.normal.borne
+        self.friction = LearntLoad(("rub", "rubbed", "rubbed_earlier"), False) if has_friction else None
+        self.pair_data = [*self.normal.pair_data, *(self.friction.pair_data if self.friction else [])]
         n, dim = scene.count, scene.particles.dim
         self.carried = Carried(scene)
-        self.wall_move = scene.memory.field("Contact.lean", n, width=dim)  # by walls, before contacts were solved [m]
         self.in_state = {"carried": self.carried.field}
+        self.motion = SteadyMotion(scene) if bodies else None
+        if self.motion:
+            self.in_state["velocity"] = self.motion.velocity
+        else:
+            self.wall_move = scene.memory.field("Contact.lean", n, width=dim)  # by walls, before contacts were solved [m]
 
-    def bind(self, pairs: "NeighbourList") -> None:
-        """Store the neighbour list, which holds the pair data."""
-        self.list = pairs
+    def bind(self, pairs: "NeighbourList", geometry: Any) -> None:
+        """Store the neighbour list, which holds the pair data, and the geometry of contacts."""
+        self.list, self.geometry = pairs, geometry
 
     def forget(self, scene: "Scene", x: np.ndarray) -> None:
         """Clear the loads of pairs whose relative position changes, before particles are moved to x (n, dim) [m]."""
         pairs, values = self.list.persistent_data()
         if not values["load"].any():
             return
-        i, j = pairs.T
-        old = scene.state.get(scene.memory)
-        before = between(old[i], old[j], scene.periodic)
-        moved = np.linalg.norm(between(x[i], x[j], scene.periodic) - before, axis=1) > SAME * np.linalg.norm(before, axis=1)
+        who = self.geometry.members(pairs)
+        old, one, others = scene.state.get(scene.memory), who[:, :1], who[:, 1:]
+        before = between(old[one], old[others], scene.periodic)
+        way = np.linalg.norm(between(x[one], x[others], scene.periodic) - before, axis=2)
+        moved = (way > SAME * np.linalg.norm(before, axis=2)).any(axis=1)
         for piece in self.pair_data:
             values[piece.name][moved] = 0.0
         self.list.restore(pairs, values)
@@ -92,12 +111,13 @@ class KnownLoads:
 
         values: as returned by NeighbourList.persistent_data().
         """
-        i, j = pairs.T
-        r = between(x[i], x[j], scene.periodic)
-        length = np.linalg.norm(r, axis=1)
-        force = r * np.divide(values["load"], length, out=np.zeros_like(length), where=length > 0)[:, None]
-        sums = [np.bincount(i, column, minlength=len(x)) for column in force.T]
-        scene.memory.write(self.carried.field, scene.inv_mass[:, None] * np.stack(sums, axis=1))
+        n, total = self.geometry.gradients(x, pairs), np.zeros_like(x)
+        force = n * values["load"][:, None, None]
+        if self.friction:
+            force += np.stack([-n[..., 1], n[..., 0]], axis=-1) * values["rub"][:, None, None]
+        for who, each in zip(self.geometry.members(pairs).T, np.moveaxis(force, 1, 0), strict=True):
+            total += np.stack([np.bincount(who, column, minlength=len(x)) for column in each.T], axis=1)
+        scene.memory.write(self.carried.field, scene.inv_mass[:, None] * total)
 
     @ti.func
     def known_push(self, e, now):
@@ -105,32 +125,55 @@ class KnownLoads:
         return self.load.field[e] * self.weights.integrator.h2_effective(now.h, now.fresh)
 
     @ti.func
+    def known_friction(self, e, now):
+        """Return the same of the load across the normal, which friction holds."""
+        return self.friction.load.field[e] * self.weights.integrator.h2_effective(now.h, now.fresh)
+
+    @ti.func
+    def force(self, e, n):
+        """Return the known force of entry e, with the normal n [N]."""
+        out = self.load.field[e] * n
+        if ti.static(bool(self.friction)):
+            out += self.friction.load.field[e] * ti.Vector([-n[1], n[0]])
+        return out
+
+    @ti.func
     def update_load(self, i, j, e, part, push, now):
         """Update the load of entry e, the pair of i and j, and return it [N].
 
         part: the push that contacts added in this pass [kg m]. push: the whole push of the pair [kg m].
         """
-        load, borne = self.load.field[e], self.borne.field[e] + part
+        return self.update(self.normal, i, j, e, part, push > 0, now)
+
+    @ti.func
+    def update(self, of: ti.template(), i, j, e, part, bears, now):  # type: ignore[valid-type]
+        """Update one load of entry e, of which contacts added `part` in this pass. bears: whether the pair bears a load at all."""
+        load, borne = of.load.field[e], of.borne.field[e] + part
         if now.first != 0:
             if now.fresh != 0 and now.span.since == 0:
                 borne = part  # a start (velocities were set): forces were different before it
             if (now.span.since + now.s) % WINDOW == 0:
-                load = self.learn(i, j, e, load, (borne - part) / (WINDOW * now.h * now.h))
-                self.load.field[e] = load
+                load = self.learn(of, i, j, e, load, (borne - part) / (WINDOW * now.h * now.h))
+                of.load.field[e] = load
                 borne = part  # the next window begins with this substep
-        if push <= 0:
+        if not bears:
             load *= 0
-            self.load.field[e] = load
-        self.borne.field[e] = borne
+            of.load.field[e] = load
+        of.borne.field[e] = borne
         return load
 
     @ti.func
-    def learn(self, i, j, e, load, mean):
-        """Return the load of entry e after a window in which `mean` of it was missing on average [N]."""
-        if is_steady(mean, self.earlier.field[e]):
+    def learn(self, of: ti.template(), i, j, e, load, mean):  # type: ignore[valid-type]
+        """Return one load of entry e after a window in which `mean` of it was missing on average [N]."""
+        steady = is_steady(mean, of.earlier.field[e])
+        if ti.static(bool(self.motion)):
+            steady = steady and self.motion.is_steady(i) and self.motion.is_steady(j)
+        if steady:
             k = ti.abs(load + mean) * ti.max(self.state.w.of(i), self.state.w.of(j))
             own = ti.max(self.weights.field[i], self.weights.field[j])
-            share = learnt_share(own * own, SLOW * k * k, WINDOW)
-            load, mean = ti.max(load + share * mean, 0), (1 - share) * mean
-        self.earlier.field[e] = mean
+            share = learnt_share(own * own, ti.static(self.slow) * k * k + ti.static(self.lag) * own * own, WINDOW)
+            load, mean = load + share * mean, (1 - share) * mean
+            if ti.static(of.pushes):
+                load = ti.max(load, 0)
+        of.earlier.field[e] = mean
         return load

@@ -275,6 +275,17 @@ class DiscGeometry:
             worst = ti.select(overlap > worst, overlap, worst)
         return touching, ti.cast(worst, ti.f64)
 
+    def members(self, pairs: np.ndarray) -> np.ndarray:
+        """Return the particles of the contacts of these listed pairs (m, 2)."""
+        return pairs
+
+    def gradients(self, x: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+        """Return the normal of each listed pair (m, 2) at x (n, dim) [m], and 0 for its second particle, which lists it, too."""
+        r = between(x[pairs[:, 0]], x[pairs[:, 1]], self.scene.periodic)
+        length = np.linalg.norm(r, axis=1)
+        n = r * np.divide(1, length, out=np.zeros_like(length), where=length > 0)[:, None]
+        return np.stack([n, 0 * n], axis=1)
+
     def candidates(self, x: np.ndarray) -> DiscCandidates:
         """Return the listed pairs as possible contacts around positions x (n, dim) [m], for the host."""
         particles, (pairs, _) = self.scene.particles, self.list.entries()

@@ -47,6 +47,14 @@ class Geometry(Protocol):
     def worst_overlap(self, i) -> Any:
         """Return the number of contacts that particle i counts for the report, and its worst overlap relative to its size."""
 
+    def members(self, pairs: np.ndarray) -> np.ndarray:
+        """Return the particles of the contacts of these listed pairs (m, 2), (m, k), for KnownLoads."""
+        ...
+
+    def gradients(self, x: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+        """Return the gradients of C of these listed pairs at x (n, dim) [m], (m, k, dim), as far as they store loads for them."""
+        ...
+
     def candidates(self, x: np.ndarray) -> Candidates:
         """Return the contacts that are possible around positions x (n, dim) [m], for the host to move particles apart.
 
@@ -70,6 +78,7 @@ class PairContact(Feature):
     - detect(i, first), if it `detects`
     - count(begin, end, now) and busy(begin), by blocks of particles
     - relax(i, now)
+    - store_pushes(i, now), if its contacts are `stored_once` and know loads
     - choose(i) and apply(i) of its `dev.restitution`, in rounds while `dev.hit` is set, if any pair has restitution
     - apply_corrections(i, first)
     - finish_substep(i, now), at the end of the substep
@@ -93,6 +102,7 @@ class PairContact(Feature):
     can_touch = True
     code_size = 3.0
     neighbours_per_particle = 0  # initial list entries per particle, if more than discs need
+    stored_once = False  # whether one particle stores a contact, and others read it; else each particle of a pair stores its own
     detects = False  # whether each pass calls detect() for all particles, before contacts are counted
     can_keep_stiffness = False  # whether keep_stiffness() works
     projects = False  # whether it has a velocity projection of loaded pairs, see velocity_projection.py
@@ -161,6 +171,11 @@ class PairContact(Feature):
     def has_loads(self) -> bool:
         """Whether pairs store the loads that they bear, see known_loads.py."""
         return bool(vars(self).get("loads"))
+
+    @property
+    def shares_loads(self) -> bool:
+        """Whether particles read the loads of contacts that other particles store."""
+        return self.stored_once and self.has_loads
 
     @property
     def known(self) -> Any:

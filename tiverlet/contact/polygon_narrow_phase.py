@@ -101,9 +101,9 @@ class PolygonGeometry:
         memory.write(self.loop, np.c_[outline.ends, outline.body])
         memory.write(self.longest, outline.longest)
 
-    def bind(self, search: NeighbourSearch) -> None:
-        """Store the neighbour list of a search whose pairs `EdgePairTable` selects."""
-        self.list, self.discs = search.list, DiscGeometry(self.scene, search)
+    def bind(self, search: NeighbourSearch, known: Any) -> None:
+        """Store the neighbour list of a search whose pairs `EdgePairTable` selects, and the KnownLoads of contacts, or None."""
+        self.list, self.discs, self.known = search.list, DiscGeometry(self.scene, search), known
 
     @ti.func
     def after(self, i):
@@ -292,6 +292,9 @@ class PolygonGeometry:
             j = self.list.neighbour[e]
             if self.after(i) < 0 and self.after(j) < 0:
                 overlap, n = self.discs.overlap(i, j, self.radius.of(i) + self.radius.of(j))
+                if ti.static(bool(self.known)):
+                    if overlap <= 0 and moved != 0 and self.known.load.field[e] > 0:
+                        overlap, n = self.discs.gap(i, j)
                 if moved != 0:
                     overlap -= self.allowed[ti.min(i, j)]
                 self.manifold.field[e] = ti.Vector([overlap, ti.cast(DISCS, self.real), n[0], n[1]])
@@ -315,16 +318,63 @@ class PolygonGeometry:
                         t = 0 * t + DISCS
                         if self.corner(j, i) <= 0:
                             overlap = -overlap
+                if ti.static(bool(self.known)):
+                    if overlap <= 0 and moved != 0 and self.known.load.field[e] > 0:
+                        overlap, n, t = self.gap(i, j, e, front)
                 self.manifold.field[e] = ti.Vector([overlap, t, n[0], n[1]])
                 self.update_usual_depth(i, j, e, moved)
                 if self.after(i) >= 0:
                     self.back.field[e] = ti.cast(ti.Vector([self.find(j, i), self.find(j, self.before(i))]), self.real)
 
     @ti.func
+    def gap(self, v, a, e, front):
+        """Return the (negative) overlap, the normal and the place of vertex v at a, if no contact was found but e bears a load.
+
+        The gap is that to the edge from a, or to the corner a. If v is at neither any more, it is wide: the contact takes back
+        what its load gave, and forgets it.
+        """
+        b, r, edge_radius = self.after(a), self.state.separation(v, a), self.radius.of(a)
+        n, t, gap, at_edge = r, 0 * r[0], 0 * r[0], False
+        wide = r.norm() + self.radius.of(v) + edge_radius
+        if b >= 0:
+            u = self.state.separation(b, a)
+            uu = u.dot(u)
+            if self.find(v, b) < 0 or uu == 0:
+                self.known.load.field[e] = 0  # the end of a long edge is not on the list of v, so it would not see the contact
+            else:
+                t, n = r.dot(u) / uu, ti.Vector([u[1], -u[0]])
+                at_edge = -SLACK <= t <= 1 + SLACK
+                t = ti.min(ti.max(t, 0), 1)
+                edge_radius += t * (self.radius.of(b) - edge_radius)
+                wide += ti.sqrt(uu)
+        if not at_edge and front > 0 and self.keeps(v, a) and self.corner(a, v) > 0:
+            at_edge, n, t, edge_radius = True, r, 0 * t + DISCS, self.radius.of(a)
+        n = n.normalized()
+        if at_edge:
+            gap = r.dot(n) - self.radius.of(v) - edge_radius + self.allowed[v]
+        return ti.select(at_edge and gap >= 0, -gap, -wide), n, t
+
+    @ti.func
+    def bears(self, at):
+        """Whether the contact at entry `at` pushes, or has a known load."""
+        out = self.manifold.field[at][0] > 0
+        if ti.static(bool(self.known)):
+            out = out or self.known.load.field[at] > 0
+        return out
+
+    @ti.func
     def update_usual_depth(self, i, j, e, moved):
-        """Update the usual depth of the contact of vertex i with j, at entry e, unless both sleep."""
+        """Update the usual depth of the contact of vertex i with j, at entry e, unless both sleep.
+
+        A known load counts as the depth that would hold it. So masses are split in the same way while a load is learnt.
+        """
         if moved != 0 and (self.state.awake(i) or self.state.awake(self.pressed_particle(j))):
             depth, usual = self.depth(e), self.usual_depth.field[e]
+            if ti.static(bool(self.known)):
+                t = self.manifold.field[e][1]
+                b = self.after(j) if t > DISCS else j
+                alone = self.inverse_mass(i, j, b, ti.max(t, 0))
+                depth = ti.max(depth, 0) + self.known.load.field[e] * self.h[None] ** 2 * alone
             if depth <= 0:
                 usual *= 0
             elif usual == 0:
@@ -534,6 +584,27 @@ class PolygonGeometry:
                 worst = ti.max(worst, found[0] / size)
                 touching += 1
         return touching, worst
+
+    def members(self, pairs: np.ndarray) -> np.ndarray:
+        """Return the vertex and the ends of the edge of the contacts of these listed pairs (m, 2), (m, 3); discs twice."""
+        after = self.outline.ends[pairs[:, 1], 0]
+        return np.column_stack([pairs, np.where(after < 0, pairs[:, 1], after)])
+
+    def gradients(self, x: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+        """Return the gradients of C of these listed pairs (m, 2) at x (n, 2) [m], for each of members(), (m, 3, 2).
+
+        Pairs of particles in no loop are listed for both, so only the first one has a gradient.
+        """
+        v, a, b = self.members(pairs).T
+        r, u = x[v] - x[a], x[b] - x[a]
+        uu = (u**2).sum(axis=1)
+        t = np.divide((r * u).sum(axis=1), uu, out=np.full(len(uu), np.inf), where=uu > 0)
+        disc = np.abs(t - 0.5) > 0.5 + SLACK
+        n, t = np.where(disc[:, None], r, np.stack([u[:, 1], -u[:, 0]], axis=1)), np.where(disc, 0.0, np.clip(t, 0, 1))
+        length = np.linalg.norm(n, axis=1)
+        n *= np.divide(1, length, out=np.zeros_like(length), where=length > 0)[:, None]
+        both = np.where((self.outline.ends[pairs, 0] < 0).all(axis=1), 0.0, 1.0)
+        return np.stack([np.ones(len(t)), both * (t - 1), -t], axis=1)[:, :, None] * n[:, None]
 
     def candidates(self, x: np.ndarray) -> EdgeCandidates:
         """Return the listed pairs as possible contacts around positions x (n, 2) [m], for the host. detect() has run at x."""

@@ -11,7 +11,7 @@ from ..colliders.body_impacts import FINE
 from ..device import ti
 from ..device.thread_team import Team
 from ..features.extending import extended
-from ..features.feature import Batch, Feature, Scene
+from ..features.feature import Batch, Feature, Knob, Scene
 from ..features.material import Table
 from ..features.regrouping import Regrouping
 from ..geometry.ordered import median
@@ -21,6 +21,7 @@ from ..particles import Particles
 from .body_restitution import AIM
 from .exclusions import excluded_pairs
 from .force_share import ForceShare
+from .known_loads import WINDOW, KnownLoads
 from .loops import checked, flat, laid, refuse_deep
 from .pair_contact import PairContact
 from .polygon_narrow_phase import VERTEX, EdgePairTable, Outline, PolygonGeometry
@@ -45,6 +46,7 @@ class Polygons(PairContact):
     skin: how far beyond contact distance pairs are listed [m], "auto" for the median of 0.15 of the longer edge of each vertex,
     and of 0.75 of the radius of each disc in no loop.
     push_out: about the speed at which bodies that overlap part [m/s].
+    loads: whether contacts store the load that they bear at rest, and bodies bear it without giving way; see known_loads.py.
 
     Jacobi pass: each contact takes C back, split by mass, p = -C / (m_v w_v + (1 - t) m_a w_a + t m_b w_b), with m_i = S_i / a.
     a is the usual depth of the contact in the last few substeps. S_i sums the usual depths of all contacts of particle i, each
@@ -66,16 +68,18 @@ class Polygons(PairContact):
 
     host_only = ("loops",)
 
-    detects = True
+    detects = stored_once = True
     _after: Any = None  # the copy with the bodies after a planned edit, see can_regroup()
     neighbours_per_particle = 64  # the particles of near bodies
 
     def __init__(
         self, loops: Iterable, friction: ArrayLike | Mapping = 0.0, restitution: ArrayLike | Mapping = 0.0, *, skin: float | str =
-        "auto", push_out: float = 1.0,
+        "auto", push_out: float = 1.0, loads: bool = False,
     ):  # fmt: skip
-        self.restitution, self.friction, self.skin, self.push_out = restitution, friction, skin, push_out
+        self.restitution, self.friction, self.skin, self.push_out, self.loads = restitution, friction, skin, push_out, loads
         self.loops = checked(loops)
+
+    loads = Knob(lambda f, v: checks.flag("Polygons", "loads", v), "Whether contacts know what they bear.", compiled=True)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Turn all loops counterclockwise and measure them. Refuse flat loops, and positions too far out."""
@@ -218,8 +222,12 @@ class Polygons(PairContact):
             dev.restitution = PolygonRestitution(scene, dev.geometry, self.table)
             dev.hit = dev.restitution.hit
         linked = excluded_pairs(batches, scene.particles.radius, dev.outline.body)
+        dev.known = KnownLoads(scene, True, dev.has_friction) if self.has_loads else None
+        # What contacts push along n and across it in the last pass, beside their known loads [kg m].
+        dev.part = PairData("part", 2, False, is_transferred=False) if dev.known else None
         pair_data = [
             *dev.geometry.carried,
+            *([*dev.known.pair_data, dev.part] if dev.known else []),
             *([dev.slip] if dev.has_friction else []),
             *(dev.restitution.pair_data if dev.has_restitution else []),
         ]
@@ -228,7 +236,9 @@ class Polygons(PairContact):
             scene, self._present_skin, linked, dev.edge_pair_table, pair_data, team, dev.move, dev.outline.reach
         )
         dev.list = dev.search.list
-        dev.geometry.bind(dev.search)
+        dev.geometry.bind(dev.search, dev.known)
+        if dev.known:
+            dev.known.bind(dev.list, dev.geometry)
         return dev.search
 
     @property
@@ -308,7 +318,7 @@ class Polygons(PairContact):
                     for role in range(self.dev.geometry.roles(i)):
                         at, _, _, _, _, part = self.dev.geometry.participants(i, e, role)
                         if at >= 0:
-                            if self.dev.geometry.manifold.field[at][0] > 0:
+                            if self.dev.geometry.bears(at):
                                 depths += abs(part) * self.dev.geometry.usual_depth.field[at]
                                 parts += abs(part)
                 self.dev.depths[i] = depths
@@ -323,44 +333,67 @@ class Polygons(PairContact):
         total, lifts, forced = 0 * self.dev.state.x[i], 0 * self.dev.state.x[i], 0 * self.dev.state.x[i]
         parts = 0 * self.dev.w.of(i)
         begin, roles = self.dev.list.first[i], self.dev.geometry.roles(i)
+        if ti.static(bool(self.dev.known)):
+            if first != 0 and (now.span.since + now.s) % WINDOW == 0:
+                self.dev.known.motion.end_window(i, now, WINDOW)
         for e in range(begin, begin + ti.select(self.dev.depths[i] > 0, self.dev.list.number[i], 0)):
             for role in range(roles):
                 at, v, a, b, t, part = self.dev.geometry.participants(i, e, role)
                 if at >= 0:
                     found = self.dev.geometry.manifold.field[at]
                     n = ti.Vector([found[2], found[3]])
-                    if found[0] > 0:
+                    if self.dev.geometry.bears(at):
                         overlap, shared = self.dev.geometry.share(self.dev.depths, at, v, a, b, t)
+                        bearing, pressed = overlap, overlap  # what would hold the load: by the contact alone, and as split
                         d = self.dev.geometry.relative(self.dev.state.d, v, a, b, t)
                         share, missing, as_bodies = part * self.dev.w.of(i) / shared, 0 * overlap, False
                         back = overlap  # the correction of both position and displacement
+                        leaving, known, alone = d.dot(n), 0 * overlap, 0 * overlap
+                        if ti.static(bool(self.dev.known)):
+                            known, alone = self.dev.known.known_push(at, now), self.dev.geometry.inverse_mass(v, a, b, t)
+                            back = ti.max(overlap, -ti.select(first != 0, known, self.dev.geometry.impulse.field[at]) * shared)
+                            known *= ti.cast(first, self.scene.real)  # later passes find what the first one has left
+                            bearing, pressed = ti.max(overlap + known * alone, 0), ti.max(overlap + known * shared, 0)
+                            leaving -= known * alone
                         if ti.static(self.dev.has_restitution):
                             if first != 0:
-                                aim, missing, lift = self.dev.restitution.target(at, v, a, b, t, n, overlap, d.dot(n))
+                                aim, missing, lift = self.dev.restitution.target(at, v, a, b, t, n, bearing, leaving)
                                 if missing > 0:
-                                    back = 0 * overlap
+                                    back, pressed = 0 * overlap, bearing
+                                    if ti.static(bool(self.dev.known)):
+                                        back -= known * shared  # what bounces has no load
                                     as_bodies = self.dev.restitution.by_bodies(v, a, b)
                                     if as_bodies:
                                         parts += abs(part)
                                         aim = self.dev.restitution.undisturbed(v, a, b, t, n)
                                     else:
                                         self.dev.hit[None] = 1
-                                        lifts += share * (overlap + lift) * n
+                                        lifts += share * (bearing + lift) * n
                                     if role == VERTEX:
                                         self.dev.restitution.begin(e, ti.max(aim, ti.static(AIM)) * n)
                                 elif self.dev.restitution.parts_by_itself(at, v, a, b, t, n):
                                     back = 0 * overlap
-                        if role == VERTEX:
-                            if not self.dev.geometry.is_unchanged(i, e):
-                                self.dev.geometry.impulse.field[e] = self.dev.geometry.impulse.field[e] + back / shared
+                        if ti.static(not self.dev.known):
+                            if role == VERTEX:
+                                if not self.dev.geometry.is_unchanged(i, e):
+                                    self.dev.geometry.impulse.field[e] = self.dev.geometry.impulse.field[e] + back / shared
                         want = back * n
                         if ti.static(self.dev.has_friction):
+                            slip = self.dev.slip.field[at] + d
+                            if ti.static(bool(self.dev.known)):
+                                if first != 0:
+                                    along = self.dev.known.known_friction(at, now) * ti.Vector([-n[1], n[0]])
+                                    slip -= ti.select(missing > 0, alone, shared) * along
+                                    want -= shared * along
                             if not as_bodies:
-                                want -= self.table.held(v, a, n, overlap + missing, self.dev.slip.field[at] + d)
+                                want -= self.table.held(v, a, n, pressed + missing, slip)
+                        if ti.static(bool(self.dev.known)):
+                            if role == VERTEX:
+                                self.dev.part.field[e] = ti.Vector([want.dot(n), n.cross(want)]) / shared
                         total += share * want
                         if final != 0:
                             approach = -self.dev.geometry.relative(self.dev.forces.before, v, a, b, t).dot(n)
-                            pushed = overlap * self.dev.geometry.inverse_mass(v, a, b, t) / shared
+                            pushed = pressed * self.dev.geometry.inverse_mass(v, a, b, t) / shared
                             forced += self.dev.forces.share(approach, pushed) * share * want
         self.dev.move[i] = total
         if final != 0:
@@ -369,6 +402,20 @@ class Polygons(PairContact):
             if first != 0:
                 self.dev.restitution.lift[i] = lifts
                 self.dev.restitution.take_part(i, parts)
+
+    @ti.func
+    def store_pushes(self, i, now):
+        """Store the pushes and the loads of the contacts of which particle i is the vertex, after all particles have read them."""
+        for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
+            if self.dev.geometry.bears(e) and not self.dev.geometry.is_unchanged(i, e):
+                j, part, push = self.dev.list.neighbour[e], self.dev.part.field[e], self.dev.geometry.impulse.field[e]
+                if now.first != 0:
+                    push += self.dev.known.known_push(e, now)
+                push += part[0]
+                self.dev.geometry.impulse.field[e] = push
+                load = self.dev.known.update_load(i, j, e, part[0], push, now)
+                if ti.static(self.dev.has_friction):
+                    self.dev.known.update(self.dev.known.friction, i, j, e, part[1], load > 0, now)
 
     @ti.func
     def apply_corrections(self, i, first):
@@ -383,21 +430,42 @@ class Polygons(PairContact):
     @ti.func
     def finish_substep(self, i, now):
         """Update the slip of each contact at the end of a substep, as far as friction can hold it, and its last push."""
+        if ti.static(bool(self.dev.known)):
+            self.dev.known.carried.field[i] = self.carried_by(i)
         if ti.static(self.dev.has_friction):
             for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
                 slip = 0 * self.dev.state.x[i]
                 at, v, a, b, t, _ = self.dev.geometry.participants(i, e, VERTEX)
                 if at >= 0:
                     found = self.dev.geometry.manifold.field[at]
-                    if found[0] > 0:
+                    if self.dev.geometry.bears(at):
                         n, d = ti.Vector([found[2], found[3]]), self.dev.geometry.relative(self.dev.state.d, v, a, b, t)
-                        overlap, _ = self.dev.geometry.share(self.dev.depths, at, v, a, b, t)
-                        slip = self.table.held(v, a, n, overlap, self.dev.slip.field[e] + d)
+                        overlap, shared = self.dev.geometry.share(self.dev.depths, at, v, a, b, t)
+                        moved = self.dev.slip.field[e] + d
+                        if ti.static(bool(self.dev.known)):
+                            along = shared * self.dev.known.known_friction(at, now) * ti.Vector([-n[1], n[0]])
+                            overlap = ti.max(overlap + self.dev.known.known_push(at, now) * shared, 0)
+                            slip = self.table.held(v, a, n, overlap, moved - along) + along
+                        else:
+                            slip = self.table.held(v, a, n, overlap, moved)
                 self.dev.slip.field[e] = slip
         if ti.static(self.dev.has_restitution):
             for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
                 aim, pushed = self.dev.restitution.aim.field[e], self.dev.geometry.impulse.field[e]
                 self.dev.restitution.last.field[e] = ti.select(aim.dot(aim) > 0, 0 * pushed, pushed)
+
+
+    @ti.func
+    def carried_by(self, i):
+        """Return the acceleration of particle i by the known loads of its contacts [m/s^2]."""
+        total, begin = 0 * self.dev.state.x[i], self.dev.list.first[i]
+        for e in range(begin, begin + self.dev.list.number[i]):
+            for role in range(self.dev.geometry.roles(i)):
+                at, _, _, _, _, part = self.dev.geometry.participants(i, e, role)
+                if at >= 0:
+                    found = self.dev.geometry.manifold.field[at]
+                    total += part * self.dev.known.force(at, ti.Vector([found[2], found[3]]))
+        return self.dev.w.of(i) * total
 
 
 class PolygonRestitution:

@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from .feature import Acceleration, Scene
 
 STEADY = 0.2  # relative difference of the missing load between two windows, at most
+SWING = 0.1  # acceleration in a window, relative to its own weight, above which a body learns no load
 GAIN = 0.8  # largest share of the missing load that is learnt at once
 LAG = 64  # least number of substeps in which a load is learnt
 
@@ -34,6 +35,32 @@ class OwnWeight:
         for f in ti.static(self.loads):
             a -= f.acceleration(i, x, v, now.time)
         self.field[i] = a.norm()
+
+
+class SteadyMotion:
+    """How much each particle is accelerated in a window, against its own weight: bodies that swing learn no loads.
+
+    At the end of its swing a pile bears up to twice its load, and for long enough to look steady. velocity: (n, dim) [m/s], at the
+    end of the window before. acceleration: (n,) [m/s^2], its mean over the last window.
+    """
+
+    def __init__(self, scene: "Scene"):
+        n, dim, add = scene.count, scene.particles.dim, scene.memory.field
+        self.state, self.weights = scene.state, scene.own_weight
+        self.velocity = add("Contact.window_velocity", n, width=dim, state=True)
+        self.acceleration = add("Contact.window_acceleration", n)
+
+    @ti.func
+    def end_window(self, i, now, window):
+        """Measure the acceleration of particle i at the end of a window of so many substeps."""
+        v = self.state.d[i] / now.h
+        self.acceleration[i] = (v - self.velocity[i]).norm() / (window * now.h)
+        self.velocity[i] = v
+
+    @ti.func
+    def is_steady(self, i):
+        """Whether particle i was hardly accelerated in the last window."""
+        return self.acceleration[i] <= ti.static(SWING) * self.weights.field[i] or not self.state.w.positive(i)
 
 
 @ti.func

@@ -23,7 +23,7 @@ class ContactPass:
         self.impacts: Any = scene.impacts
         self.n, self.real, self.dim = scene.count, scene.real, scene.particles.dim
         self.has_restitution = bool(contact) and contact.has_restitution
-        self.remembers = bool(contact) and (contact.has_friction or contact.has_restitution or contact.has_events)
+        self.remembers = bool(contact) and (contact.has_friction or contact.has_restitution or contact.has_events or contact.shares_loads)
         self.projects_velocities = bool(contact) and contact.projects
         if self.has_restitution and team.launched:  # the host does not read whether any pair bounces in a round
             self.bounces = scene.memory.field("Contact.bounces", None, kind=ti.i32)
@@ -60,6 +60,10 @@ class ContactPass:
                                     if ti.static(c.dev.forces.spins):
                                         c.dev.forces.add_turn(i, 0 * c.dev.forces.turned[i], now.first)
             self.team.wait()
+            if ti.static(c.shares_loads):
+                for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+                    if c.dev.state.awake(i):
+                        c.store_pushes(i, now)
 
     @ti.func
     def struck(self):
@@ -139,7 +143,7 @@ class ContactPass:
         """Store the slip of friction and the slack of restitution, and log events."""
         thread = now.thread
         for c in ti.static(self.contacts):
-            if ti.static(c.has_friction or c.has_restitution):
+            if ti.static(c.has_friction or c.has_restitution or c.shares_loads):
                 for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
                     if c.dev.state.awake(i):
                         c.finish_substep(i, now)

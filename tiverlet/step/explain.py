@@ -143,7 +143,7 @@ def _absent(world: "World") -> list[str]:
         (not step.walls, "wall pass: no wall"),
         (not world.particles.spins and bool(step.walls or step.search), "spin: particles have none"),
         (not step.state.images, "nearest images: no Periodic"),
-        (any(not c.has_loads and not c.detects for c in step.contacts), "loads that pairs know: no Contact(loads=True)"),
+        (any(not c.has_loads for c in step.contacts), "loads that pairs know: no contact with loads=True"),
         (bool(step.batches) and not step.constraints.learners, "loads that links know: no Jacobi(loads=True)"),
         (not step.sleepers, "islands and who sleeps: no Sleep"),
         (not step.integrator.forces.all, "accelerations: no force"),

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 from ..colliders.surface import ANY_DEPTH, BEFORE_CONTACTS, BEYOND_ROUNDING, FRICTIONLESS
 from ..contact.force_share import accumulate
 from ..contact.projection_times import ALWAYS
+from ..contact.wall_loads import WallLoads
 from ..device import inline, ti
 from ..device.number import OnDevice
 from ..device.thread_team import Team, block, blocks
@@ -46,6 +47,8 @@ class ParticlePass:
         self.contacts = [contact] if contact else []
         self.acts = self.gathers or bool(contact or walls)
         self.knows_loads = bool(contact) and contact.has_loads
+        self.leaves_walls_early = bool(walls) and self.knows_loads and not contact.shares_loads
+        self.wall_loads = [WallLoads(scene, contact.known)] if walls and contact and contact.shares_loads else []
         self.impacts = [scene.impacts] if scene.impacts else []
         self.weights = [scene.own_weight] if scene.own_weight else []
         self.rough = any(w.has_friction or w.has_restitution for w in walls)
@@ -144,7 +147,10 @@ class ParticlePass:
             if now.damps == ALWAYS:
                 for i in range(first, end):
                     weights.store_weight(i, now)
-        if ti.static(self.knows_loads and len(self.walls) > 0):
+        for loads in ti.static(self.wall_loads):
+            for i in range(first, end):
+                loads.give(i, now)
+        if ti.static(self.leaves_walls_early):
             self.leave_walls_early(first, end, now)
         for c in ti.static(self.contacts):
             stale, fast = 0, 0
@@ -228,7 +234,11 @@ class ParticlePass:
         if ti.static(self.gathers):
             for i in range(begin, end):
                 self.gather(i, now)
-        if ti.static(self.knows_loads and len(self.walls) > 0):
+        for loads in ti.static(self.wall_loads):
+            if now.first != 0:
+                for i in range(begin, end):
+                    loads.take_back(i)
+        if ti.static(self.leaves_walls_early):
             if now.first != 0:
                 self.undo_wall_moves(begin, end)
         for c in ti.static(self.contacts):
@@ -247,6 +257,9 @@ class ParticlePass:
                     for i in range(begin, end):
                         if self.state.awake(i):
                             accumulate(self.wall_turn, i, -self.state.spin.s[i], now.first)
+        for loads in ti.static(self.wall_loads):
+            for i in range(begin, end):
+                accumulate(loads.pushed, i, -self.state.d[i], now.first)
         for impacts in ti.static(self.impacts):
             if now.it >= now.span.iterations:
                 for i in range(begin, end):
@@ -261,6 +274,9 @@ class ParticlePass:
                 if self.near_walls(low, high) != 0:
                     for i in range(low, high):
                         self.confine(i, now.h, now.frame_fraction)
+        for loads in ti.static(self.wall_loads):
+            for i in range(begin, end):
+                loads.pushed[i] = loads.pushed[i] + self.state.d[i]
         for impacts in ti.static(self.impacts):
             for i in range(begin, end):
                 if impacts.is_struck_now(i):
@@ -307,6 +323,14 @@ class ParticlePass:
                 self.wall_displacement[i] = self.wall_displacement[i] - blow * n
                 if ti.static(self.turned_by_walls):
                     self.wall_turn[i] = 0 * self.wall_turn[i]
+
+    @ti.func
+    def learn_wall_loads(self, now):
+        """At the end of a substep: learn the loads with which walls hold particles."""
+        for loads in ti.static(self.wall_loads):
+            for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+                if self.state.awake(i):
+                    loads.learn(i, now)
 
     @ti.func
     def near_walls(self, begin, end):

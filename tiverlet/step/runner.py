@@ -371,6 +371,8 @@ class Runner:
             self._forget_springs(self.scene.state.get(self.memory), position)
         for known in self.known:
             known.forget(self.scene, position)
+        for loads in self.step.particles.wall_loads:
+            loads.forget((self.scene.state.get(self.memory) != position).any(axis=1))
 
     def _forget_springs(self, before: np.ndarray, now: np.ndarray) -> None:
         """Let springs whose particles were moved from `before` to `now`, (n, dim), start with the forces that they have now."""

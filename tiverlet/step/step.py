@@ -495,6 +495,7 @@ class Step:
                 f.dev.break_overloaded(c, h2_rigid, h2_effective, now.tick)
         self.constraints.learn(now)
         self.contact_pass.finish(now)
+        self.particles.learn_wall_loads(now)
         if ti.static(self.orients):
             for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                 if self.state.awake(i):
