@@ -415,7 +415,24 @@ class Polygons(PairContact):
                 self.dev.geometry.impulse.field[e] = push
                 load = self.dev.known.update_load(i, j, e, part[0], push, now)
                 if ti.static(self.dev.has_friction):
-                    self.dev.known.update(self.dev.known.friction, i, j, e, part[1], load > 0, now)
+                    self.learn_friction(i, e, part[1], load > 0, now)
+
+    @ti.func
+    def learn_friction(self, i, e, part, bears, now):
+        """Learn what friction holds at entry e of vertex i, of which a pass added `part`. bears: whether the contact has a load.
+
+        What is learnt is taken from the slip, so that friction holds as much as before, and bodies stay where they are. If the
+        slip went back instead, friction that bodies brought on each other as they came to rest would grow until they slide.
+        """
+        before = self.dev.known.friction.load.field[e]
+        learnt = self.dev.known.update(self.dev.known.friction, i, self.dev.list.neighbour[e], e, part, bears, now) - before
+        if bears and learnt != 0:
+            at, v, a, b, t, _ = self.dev.geometry.participants(i, e, VERTEX)
+            if at >= 0:
+                found = self.dev.geometry.manifold.field[e]
+                _, shared = self.dev.geometry.share(self.dev.depths, e, v, a, b, t)
+                along = ti.Vector([-found[3], found[2]])
+                self.dev.slip.field[e] = self.dev.slip.field[e] + learnt * now.h * now.h * shared * along
 
     @ti.func
     def apply_corrections(self, i, first):
