@@ -1,0 +1,296 @@
+"""Bodies with known loads: stacks and heaps of Polygons give way to nothing at rest, and bear what statics says."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.contact.known_loads import LAG_BODIES, SLOW_BODIES, WINDOW
+from tiverlet.features.learning import GAIN, LAG, STEADY, SWING
+
+G = 10.0
+
+
+def block(width, height, center):
+    """Return the corners of a block, counterclockwise from below on the left."""
+    return np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * np.array([width, height]) / 2 + center
+
+
+def column(n, shrink=0.04):
+    """Return blocks 1 m high on each other, each narrower by `shrink` than the one below [m]."""
+    return [block(1.0 - shrink * k, 1.0, (0.0, k + 0.5)) for k in range(n)]
+
+
+def tossed(columns, rows):
+    """Return boxes of several sizes in the air, at random angles."""
+    rng, out = np.random.default_rng(0), []
+    for k, row in np.ndindex(columns, rows):
+        a = rng.uniform(0, 6.28) + np.pi / 2 * np.arange(4)
+        out.append(rng.uniform(0.5, 0.7) * np.stack([np.cos(a), np.sin(a)], axis=1) + (1.5 * k + 1, 1.5 * row + 1))
+    return out
+
+
+def standing(
+    world, shapes, mass: object = 1.0, friction: object = 0.5, pinned=(), discs=(), loads=True, low=(-99, 0), high=(99, 99),
+    restitution=0.0, velocity=0.0, links=False, **settings
+):  # fmt: skip
+    """Return a world of rigid bodies of these masses on a floor, and the particles of each.
+
+    Friction is set after the build, and all have a pinned particle out of the way, so that worlds share compiled kernels.
+    """
+    loops = [4 * k + np.arange(4) for k in range(len(shapes))]
+    x = np.concatenate([*shapes, np.reshape(discs, (-1, 2)), [(90.0, 90.0)]])
+    each = np.r_[np.repeat(np.broadcast_to(mass, len(shapes)) / 4, 4), np.full(len(discs), 0.5), 1.5]
+    radius = np.r_[np.zeros(4 * len(shapes)), np.full(len(discs), 0.3), 0.1]
+    held = [*(i for k in pinned for i in loops[k]), len(x) - 1]
+    corners = np.array(loops)
+    sides = np.concatenate([corners[:, [k, m]] for k, m in ((0, 1), (1, 2), (2, 3), (3, 0), (0, 2))])
+    ties: Any = tv.Distance(sides) if links else tv.ShapeMatch(loops)
+    polygons, box = tv.Polygons(loops, friction=0.5, restitution=restitution, loads=loads), tv.Box(low, high, friction=0.5)
+    start = tv.Particles(x, mass=each, radius=radius, pinned=held, velocity=velocity)
+    w = world(start, [tv.Gravity(G), polygons, ties, box], **({"substeps": 8, "precision": "f64"} | settings))
+    polygons.friction = box.friction = friction  # type: ignore[assignment]
+    return w, loops
+
+
+def bent(w, loops):
+    """Return the largest change of a distance between corners of one body [m]."""
+    lengths = [
+        np.array([np.linalg.norm(x[loop][:, None] - x[loop], axis=2) for loop in loops])
+        for x in (w.position, w.features[1].start.position)
+    ]
+    return np.abs(lengths[0] - lengths[1]).max()
+
+
+def contact_forces(w):
+    """Return the force of contacts on each particle, (n, 2) [N], along the normals."""
+    found, out = w.contacts, np.zeros_like(w.position)
+    force = found.impulse[:, None] * found.normal * 60 * w.substeps
+    shares = ((found.pairs[:, 0], 1 + 0 * found.place), (found.pairs[:, 1], found.place - 1), (found.ends, -found.place))
+    for who, share in shares:
+        np.add.at(out, who, share[:, None] * force)
+    return out
+
+
+def reference(n, h, substeps):
+    """Return the heights of the lower and upper edges of a column(n) of mass 1, and the loads of contacts, in NumPy.
+
+    By symmetry a block is a lower and an upper point of mass 1/2. In each substep known loads and gravity act, blocks become
+    rigid, contacts take back overlap and no more than they gave, and the floor takes back what is below it.
+    """
+    low, up, w = np.arange(n) * 1.0, np.arange(n) + 1.0, 2.0
+    d_low, d_up = np.zeros(n), np.zeros(n)
+    load, borne, earlier, seen = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((2, n))  # the first one is that of the floor
+    for s in range(substeps):
+        kick = h * h / (2 if s == 0 else 1)
+        known = kick * load
+        d_low, d_up = d_low - kick * G, d_up - kick * G
+        d_low, d_up[:-1] = d_low + w * known, d_up[:-1] - w * known[1:]
+        turn = (up + d_up - low - d_low - 1) / 2
+        d_low, d_up = d_low + turn, d_up - turn
+        at_end = s % WINDOW == 0
+        if at_end:
+            now = np.stack([d_low, d_up]) / h
+            now[0, 0] -= w * known[0] / h * 0
+            calm, seen = np.abs(now - seen) / (WINDOW * h) <= SWING * G, now
+        part = np.maximum((up + d_up)[:-1] - (low + d_low)[1:], -2 * w * known[1:]) / (2 * w)
+        part[(part < 0) & (load[1:] == 0)] = 0
+        d_low[0] -= w * known[0]
+        d_low[1:], d_up[:-1] = d_low[1:] + w * part, d_up[:-1] - w * part
+        floor = max(-(low[0] + d_low[0]), 0)
+        d_low[0] += floor
+        low, up = low + d_low, up + d_up
+        part = np.r_[floor / w - known[0], part]
+        if at_end:
+            mean = borne / (WINDOW * h * h)
+            steady = (np.abs(mean - earlier) < STEADY * np.abs(mean)) & calm[0] & np.r_[True, calm[1, :-1]]
+            k = (load + mean) * w / G
+            share = steady * np.minimum(WINDOW / (LAG + LAG_BODIES + SLOW_BODIES * k * k), GAIN)
+            load, earlier, borne = np.maximum(load + share * mean, 0), (1 - share) * mean, 0 * borne
+        borne += part
+    return low, up, load
+
+
+def test_a_column_learns_as_the_reference_does(world):
+    # Four blocks for ten windows at 2 substeps: sums of the same numbers, to rounding.
+    w, loops = standing(world, column(4), friction=0.0, substeps=2)
+    w.run(10 * WINDOW / 120)
+    low, up, load = reference(4, 1 / 120, 10 * WINDOW)
+    assert load.min() > 1.0
+    x = w.position[:16].reshape(4, 4, 2)[:, :, 1]
+    np.testing.assert_allclose(x, np.stack([low, low, up, up], axis=1), atol=1e-11)
+    pairs, values = w._runner.search.list.persistent_data()
+    body = np.minimum(pairs, 15) // 4
+    np.testing.assert_allclose(np.bincount(body[:, 0], values["load"], minlength=4)[1:], load[1:], rtol=1e-9)
+
+
+@pytest.mark.parametrize("links", [False, True])
+def test_a_column_bears_what_is_above(world, links):
+    # Without known loads, clusters are pressed flat by (2 + 4 F / m g) g h^2, see test_polygons.py.
+    mass = 2.0 + np.arange(6) % 2
+    w, loops = standing(world, column(6), mass, substeps=4, links=links)
+    start = G * (mass * (np.arange(6) + 0.5)).sum()
+    assert max(w.step(1 / 60).energy for _ in range(2400)) <= start + 1e-9
+    # By body, the pushes of contacts add up to its weight.
+    total = contact_forces(w)[:24, 1].reshape(6, 4).sum(axis=1)
+    np.testing.assert_allclose(total[1:], G * mass[1:], rtol=1e-7)
+    assert total[0] == pytest.approx(-G * mass[1:].sum(), rel=1e-7)
+    assert bent(w, loops) < 1e-8 and np.abs(w.velocity).max() < 1e-7
+    np.testing.assert_allclose(w.position[:24], np.concatenate(column(6)), atol=1e-8)
+
+
+def test_a_beam_on_two_supports(world):
+    # A beam of 2 kg and 6 m lies on posts at -2 and 2 m. A block of 3 kg stands on it at 1 m.
+    shapes = [block(0.5, 1.0, (-2.0, 0.5)), block(0.5, 1.0, (2.0, 0.5)), block(6.0, 0.2, (0.0, 1.1)), block(0.4, 0.4, (1.0, 1.4))]
+    w, loops = standing(world, shapes, [1, 1, 2, 3], pinned=(0, 1), substeps=2)
+    w.run(60.0)
+    force = contact_forces(w)
+    posts = -np.array([force[loop].sum(axis=0) for loop in loops[:2]])
+    right = force[:8]  # its point of action: the moment of the posts about the left one
+    moment = -(w.position[:8, 0] * right[:, 1]).sum()
+    np.testing.assert_allclose(posts.sum(axis=0), [0, 5 * G], atol=5 * G * 1e-6)
+    assert moment == pytest.approx(3 * G * 1.0, rel=1e-5)
+    assert bent(w, loops) < 1e-6 and w.contacts.overlap.max() < 1e-7
+
+
+def test_each_box_of_a_pyramid_is_in_equilibrium(world):
+    # 15 boxes of 1 to 2 kg in rows of 5 to 1, with gaps in a row. Every box above the lowest row bears its weight and what is on it:
+    # no net force, and no moment.
+    rows = 5
+    shapes = [block(1.0, 1.0, (1.1 * (i + r / 2), r + 0.5)) for r in range(rows) for i in range(rows - r)]
+    mass = np.random.default_rng(0).uniform(1, 2, len(shapes))
+    w, loops = standing(world, shapes, mass, 0.0, substeps=4)
+    w.run(60.0)
+    force, x = contact_forces(w), w.position
+    for k, loop in enumerate(loops[rows:], rows):
+        np.testing.assert_allclose(force[loop].sum(axis=0), [0, G * mass[k]], atol=1e-5 * G * mass.sum())
+        arm = x[loop] - x[loop].mean(axis=0)
+        assert np.abs((arm[:, 0] * force[loop][:, 1] - arm[:, 1] * force[loop][:, 0]).sum()) < 1e-5 * G * mass.sum()
+    assert bent(w, loops) < 1e-5 and w.contacts.overlap.max(initial=0) < 1e-6
+
+
+def test_friction_bears_its_load_on_a_slope(world):
+    # A box sticks to a slope of 20 degrees: friction holds m g sin, and the box is not bent by it. It does not creep.
+    a = np.radians(20.0)
+    t, n = np.array([np.cos(a), np.sin(a)]), np.array([-np.sin(a), np.cos(a)])
+    turned = np.stack([t, n])
+    shapes = [block(6.0, 1.0, (0.0, -0.5)) @ turned + [0, 5], block(1.0, 1.0, (0.0, 0.5)) @ turned + [0, 5]]
+    w, loops = standing(world, shapes, pinned=(0,), substeps=4)
+    w.run(30.0)
+    before = w.position
+    w.run(30.0)
+    np.testing.assert_allclose(w.position, before, atol=1e-9)
+    pairs, values = w._runner.search.list.persistent_data()
+    assert values["load"].sum() == pytest.approx(G * np.cos(a), rel=1e-6)
+    assert np.abs(values["rub"].sum()) == pytest.approx(G * np.sin(a), rel=1e-6)
+    assert bent(w, loops) < 1e-8
+
+
+@pytest.mark.slow
+def test_loads_are_gone_with_what_bore_them(world):
+    # The floor goes: boxes fall as one, but for the loads of at most one more substep.
+    w, loops = standing(world, column(5), substeps=8)
+    w.run(15.0)
+    assert bent(w, loops) < 1e-6
+    w.features[3].lower = (-99.0, -99.0)  # type: ignore[attr-defined]
+    v = [w.velocity[:-1] for _ in range(30) if w.step(1 / 60)]
+    assert np.abs(v[-1][:, 1] - v[0][:, 1] + G * 29 / 60).max() < 1e-6
+    assert np.ptp(v[-1][:, 1]) < 2 * 5 * G / 480
+    # The lowest box goes: what was on it falls by its height, and gains no more energy than that.
+    w, loops = standing(world, column(5), substeps=2)
+    w.run(40.0)
+    before = G * (np.arange(1, 5) + 0.5).sum()
+    w.remove(loops[0])
+    assert max(w.step(1 / 60).energy for _ in range(600)) <= before + 1e-2
+    w.run(40.0)
+    assert np.abs(w.velocity).max() < 1e-3 and w.position[:-1, 1].max() == pytest.approx(4.0, abs=1e-3)
+    # A box that is put elsewhere falls as it would alone, and the others keep their loads.
+    x = w.position.copy()
+    x[12:16] += [5.0, 3.0]
+    known = w._runner.search.list.persistent_data()[1]["load"].sum()
+    w.position = x
+    kept = w._runner.search.list.persistent_data()[1]["load"].sum()
+    assert kept == pytest.approx(known - G, rel=1e-2)
+    w.step(1 / 60)
+    np.testing.assert_allclose(w.position[12:16] - x[12:16], [[0.0, -G / 60**2 / 2]] * 4, atol=1e-4)
+
+
+def test_what_a_lift_carries_weighs_more_as_it_speeds_up(world):
+    # The floor moves up at 0.3 m/s^2: contacts bear m (g + a), and at a constant speed m g. Its speed changes from frame to frame.
+    w, loops = standing(world, column(3), substeps=8)
+    w.run(10.0)
+    box, y, v = w.features[3], 0.0, 0.0
+    for a, frames in ((0.3, 240), (0.0, 480)):
+        for _ in range(frames):
+            v += a / 60
+            y += v / 60
+            box.lower = (-99.0, y)  # type: ignore[attr-defined]
+            w.step(1 / 60)
+        if a == 0:
+            np.testing.assert_allclose(contact_forces(w)[4:12, 1].reshape(2, 4).sum(axis=1), G, rtol=1e-3)
+        np.testing.assert_allclose(w.velocity[:-1], [[0.0, v]] * 12, atol=0.02)
+    assert bent(w, loops) < 1e-3 and w.position[:-1, 1].min() == pytest.approx(y, abs=1e-9)
+
+
+def test_what_was_learnt_holds_at_any_substep(world):
+    # A load is a force: what was learnt at 40 substeps a frame bears ten boxes at 2 substeps, without the loads they would sink
+    # by a third of a box.
+    w, loops = standing(world, column(10, 0.02), substeps=40, precision="f32")
+    w.run(8.0)
+    w.substeps = 2
+    w.run(8.0)
+    assert bent(w, loops) < 2e-3 and np.abs(w.velocity).max() < 2e-2
+    assert np.abs(w.position[:40] - np.concatenate(column(10, 0.02))).max() < 5e-3
+
+
+@pytest.mark.slow
+def test_a_heap_with_discs_hardly_overlaps(world):
+    # 24 boxes and 12 discs between rough walls. Energy never rises above the start.
+    discs = np.stack([0.8 + 0.9 * (np.arange(12) % 6), 9.0 + 0.9 * (np.arange(12) // 6)], axis=1)
+    found = []
+    for loads in (True, False):
+        w, loops = standing(world, tossed(4, 6), discs=discs, loads=loads, low=(0, 0), high=(6.5, 99))
+        start = w.step(1 / 60).energy
+        assert max(w.step(1 / 60).energy for _ in range(2400)) <= start * (1 + 1e-9)
+        found.append((bent(w, loops), np.maximum(w.contacts.overlap, 0).mean()))
+        assert np.abs(w.velocity).max() < 1e-2
+    assert found[0][0] < 0.1 * found[1][0] and found[0][1] < 0.1 * found[1][1], found
+
+
+def test_boxes_that_bounce_know_no_load(world):
+    # A box falls on a pinned one and leaves at e times its speed, with and without loads alike. Later it rests on its known load.
+    shapes, frames = [block(3.0, 1.0, (0.0, 0.5)), block(1.0, 1.0, (0.0, 2.0))], []
+    for loads in (True, False):
+        w, loops = standing(world, shapes, pinned=(0,), loads=loads, restitution=0.6)
+        frames.append([w.position for _ in range(60) if w.step(1 / 60)])
+        w.run(20.0)
+        assert w.contacts.impulse.sum() * 480 == pytest.approx(G, rel=1e-6)
+        assert (bent(w, loops) < 1e-8) == loads
+    np.testing.assert_allclose(*frames, atol=1e-9)
+    assert max(x[4:8, 1].min() for x in frames[0][30:]) == pytest.approx(1.0 + 0.36 * 0.5, abs=0.02)
+
+
+@pytest.mark.slow
+def test_loads_are_of_the_state(world):
+    # Both paths, clones and Worlds have the same bits, also after an edit in place. Loads may be switched on later.
+    hashes = []
+    for path in ("fused", "parallel"):
+        w, _ = standing(world, tossed(3, 3), low=(0, 0), high=(5, 99), precision="f32", path=path)
+        w.run(6.0)
+        hashes.append(w.hash())
+        with w.clone() as other, tv.Worlds(w, 2) as many:
+            for each in (w, other, many):
+                for _ in range(20):
+                    each.step(1 / 60)
+            assert other.hash() == w.hash()
+            np.testing.assert_array_equal(many.position[1], w.position)
+    assert hashes[0] == hashes[1]
+    late, loops = standing(world, column(4), substeps=4, loads=False)
+    late.run(5.0)
+    before = bent(late, loops)
+    late.features[1].loads = True  # type: ignore[attr-defined]
+    late.run(20.0)
+    assert bent(late, loops) < 1e-5 * before
+    with pytest.raises(TypeError, match="loads"):
+        tv.Polygons([[0, 1, 2]], loads="yes")  # type: ignore[arg-type]
