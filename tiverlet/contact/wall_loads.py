@@ -33,6 +33,7 @@ class WallLoads:
         self.earlier = add("WallLoads.earlier", n, width=dim, state=True)  # mean missing part in the window before [N]
         self.given = add("WallLoads.given", n, width=dim)  # the displacement that is undone before walls act [m]
         self.pushed = add("WallLoads.pushed", n, width=dim)  # by walls in this substep [m]
+        self.normal = add("WallLoads.normal", n, width=dim)  # of the walls at the end of a window, of any length
 
     def forget(self, moved: np.ndarray) -> None:
         """Forget the loads of particles in the mask `moved`, (n,)."""
@@ -59,6 +60,11 @@ class WallLoads:
             self.state.shift(i, -given)
 
     @ti.func
+    def ends_window(self, now):
+        """Whether loads are learnt in this substep."""
+        return (now.span.since + now.s) % WINDOW == 0
+
+    @ti.func
     def learn(self, i, now):
         """At the end of a substep: learn the load of particle i, if walls pushed it."""
         if self.state.moves(i):
@@ -67,13 +73,26 @@ class WallLoads:
             borne = self.borne[i] + missing
             if now.fresh != 0 and now.span.since == 0:
                 borne = missing  # a start (velocities were set): forces were different before it
-            if (now.span.since + now.s) % WINDOW == 0:
+            if self.ends_window(now):
                 mean, earlier = (borne - missing) / (WINDOW * now.h * now.h), self.earlier[i]
                 if (mean - earlier).norm() < ti.static(STEADY) * mean.norm() and self.motion.is_steady(i):
                     k, own = (load + mean).norm() * w, self.weights.field[i]
                     share = learnt_share(own * own, ti.static(self.slow) * k * k + ti.static(self.lag) * own * own, WINDOW)
+                    self.slide(i, -w * now.h * now.h * share * mean)
                     load, mean = load + share * mean, (1 - share) * mean
                 self.earlier[i], borne = mean, missing
             if (pushed == 0).all():
                 load *= 0
             self.load[i], self.borne[i] = load, borne
+
+    @ti.func
+    def slide(self, i, way):
+        """Move particle i by the part of `way` along walls; its displacement stays.
+
+        Friction holds corners where they came to rest, also where a body is bent between them. So what is learnt across the normal
+        is taken from this bend. Otherwise the load would grow in each window, until the corner slides.
+        """
+        n = self.normal[i]
+        nn = n.dot(n)
+        if nn > 0:
+            self.state.advance(i, way - way.dot(n) / nn * n)

@@ -189,6 +189,15 @@ class ParticlePass:
         return self.state.d[i] - d
 
     @ti.func
+    def normal_of_walls(self, i, now):
+        """Return how far walls would push particle i without friction [m]. It does not move."""
+        out = ti.zero(self.state.x[i])
+        if self.state.moves(i):
+            out = self.leave_walls(i, now)
+            self.state.shift(i, -out)
+        return out
+
+    @ti.func
     def undo_wall_moves(self, begin, end):
         """Undo leave_walls_early(): move particles back to where they were."""
         for c in ti.static(self.contacts):
@@ -258,6 +267,9 @@ class ParticlePass:
                         if self.state.awake(i):
                             accumulate(self.wall_turn, i, -self.state.spin.s[i], now.first)
         for loads in ti.static(self.wall_loads):
+            if now.first != 0 and loads.ends_window(now):
+                for i in range(begin, end):
+                    loads.normal[i] = self.normal_of_walls(i, now)
             for i in range(begin, end):
                 accumulate(loads.pushed, i, -self.state.d[i], now.first)
         for impacts in ti.static(self.impacts):
@@ -443,7 +455,10 @@ class ParticlePass:
         for c in ti.static(self.contacts):
             reaction += firm * c.reaction(i, h, soft)
             if ti.static(self.knows_loads):
-                reaction -= ti.select(firm == 0, h * h, 0 * h) * c.dev.known.carried.field[i]
+                left_out = firm == 0
+                for impacts in ti.static(self.impacts if c.shares_loads else []):
+                    left_out = left_out or impacts.reached[i] != 0  # as the constraints of the body, which hold against them
+                reaction -= ti.select(left_out, h * h, 0 * h) * c.dev.known.carried.field[i]
         if ti.static(len(self.walls) > 0):
             push = firm * self.wall_displacement[i]
             v = self.state.d[i] / h
