@@ -265,7 +265,7 @@ def test_the_rows_have_every_feature():
     for name, like in LIKE.items():
         kind = getattr(tv, name)
         assert {*knobs_of(kind)} == {*knobs_of(like)} - (
-            {"groups", "events", "sensors", "loads"} if kind is tv.Polygons else set()
+            {"groups", "events", "sensors"} if kind is tv.Polygons else set()
         ) and kind.upload is like.upload
     assert knobs_of(tv.Force) == ()
 

@@ -23,7 +23,9 @@ class ContactPass:
         self.impacts: Any = scene.impacts
         self.n, self.real, self.dim = scene.count, scene.real, scene.particles.dim
         self.has_restitution = bool(contact) and contact.has_restitution
-        self.remembers = bool(contact) and (contact.has_friction or contact.has_restitution or contact.has_events or contact.shares_loads)
+        self.remembers = bool(contact) and (
+            contact.has_friction or contact.has_restitution or contact.has_events or contact.shares_loads
+        )
         self.projects_velocities = bool(contact) and contact.projects
         if self.has_restitution and team.launched:  # the host does not read whether any pair bounces in a round
             self.bounces = scene.memory.field("Contact.bounces", None, kind=ti.i32)
