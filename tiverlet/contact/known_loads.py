@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 WINDOW = 128  # substeps over which the missing load is averaged; it begins just after sound is removed (EVERY)
 SLOW = 0.3  # substeps that it takes to learn the load of k particles, per k^2
-LAG_BODIES = 448  # more substeps
 SLOW_BODIES = 1.2  # the same for contacts of bodies, whose sound decays more slowly
+LAG_BODIES = 448  # further substeps that bodies take to learn any load, so that no step makes them swing beyond their height
 SAME = 1e-3  # relative change of the vector between a pair beyond which it forgets its load when positions are assigned
 
 
@@ -66,6 +66,11 @@ class KnownLoads:
     them while contacts are solved (`wall_move`). Walls then start again with the whole displacement into them, which friction
     needs.
 
+    Bodies of loops (Polygons) know loads by contact: the vertex stores F, which acts on it and, by shares 1 - t and t, on the
+    ends of the edge. They also know F_t, which friction holds across the normal, see Polygons.learn_friction(). Columns of N
+    bodies swing, and the slowest mode decays in 3 N^2 substeps, with k = 2 N: s^2 + L s + L (1 + K / s) = 0 is stable where the
+    share K learnt in a substep is below L = 2.7 / k^2, and K = 1 / (SLOW_BODIES k^2). See SteadyMotion and WallLoads, too.
+
     Warm starting (Box2D) of a single pass would be unstable: a mode of eigenvalue L has the characteristic polynomial
     z^3 - 3 a z^2 + 3 a z - a, a = 1 - r L, whose roots near 1 grow like (r L)^(1/3) / 2.
     """
@@ -76,12 +81,12 @@ class KnownLoads:
         # The load [N], the sum of its missing part in this window [kg m], and the mean of it in the window before [N].
         self.normal = LearntLoad(("load", "borne", "earlier"), True)
         self.load, self.borne = self.normal.load, self.normal.borne
-        self.friction = LearntLoad(("rub", "rubbed", "rubbed_earlier"), False) if has_friction else None
+        self.friction: Any = LearntLoad(("rub", "rubbed", "rubbed_earlier"), False) if has_friction else None
         self.pair_data = [*self.normal.pair_data, *(self.friction.pair_data if self.friction else [])]
         n, dim = scene.count, scene.particles.dim
         self.carried = Carried(scene)
         self.in_state = {"carried": self.carried.field}
-        self.motion = SteadyMotion(scene) if bodies else None
+        self.motion: Any = SteadyMotion(scene) if bodies else None
         if self.motion:
             self.in_state["velocity"] = self.motion.velocity
         else:
@@ -147,7 +152,7 @@ class KnownLoads:
 
     @ti.func
     def update(self, of: ti.template(), i, j, e, part, bears, now):  # type: ignore[valid-type]
-        """Update one load of entry e, of which contacts added `part` in this pass. bears: whether the pair bears a load at all."""
+        """Update one load of entry e, of which a pass added `part`, and return it [N]. bears: whether the pair bears any load."""
         load, borne = of.load.field[e], of.borne.field[e] + part
         if now.first != 0:
             if now.fresh != 0 and now.span.since == 0:

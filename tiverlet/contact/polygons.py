@@ -405,7 +405,7 @@ class Polygons(PairContact):
 
     @ti.func
     def store_pushes(self, i, now):
-        """Store the pushes and the loads of the contacts of which particle i is the vertex, after all particles have read them."""
+        """Store the pushes and loads of the contacts of which particle i is the vertex, after all particles have read them."""
         for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
             if self.dev.geometry.bears(e) and not self.dev.geometry.is_unchanged(i, e):
                 j, part, push = self.dev.list.neighbour[e], self.dev.part.field[e], self.dev.geometry.impulse.field[e]
@@ -470,7 +470,6 @@ class Polygons(PairContact):
             for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
                 aim, pushed = self.dev.restitution.aim.field[e], self.dev.geometry.impulse.field[e]
                 self.dev.restitution.last.field[e] = ti.select(aim.dot(aim) > 0, 0 * pushed, pushed)
-
 
     @ti.func
     def carried_by(self, i):

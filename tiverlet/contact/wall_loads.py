@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from .known_loads import KnownLoads
 
 
-
 class WallLoads:
     """The loads L [N] with which walls hold particles, as vectors, friction included; for bodies on walls.
 
@@ -89,8 +88,8 @@ class WallLoads:
     def slide(self, i, way):
         """Move particle i by the part of `way` along walls; its displacement stays.
 
-        Friction holds corners where they came to rest, also where a body is bent between them. So what is learnt across the normal
-        is taken from this bend. Otherwise the load would grow in each window, until the corner slides.
+        Friction holds corners where they came to rest, also where a body is bent between them. So what is learnt across the
+        normal is taken from this bend. Otherwise the load would grow in each window, until the corner slides.
         """
         n = self.normal[i]
         nn = n.dot(n)

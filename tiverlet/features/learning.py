@@ -40,8 +40,8 @@ class OwnWeight:
 class SteadyMotion:
     """How much each particle is accelerated in a window, against its own weight: bodies that swing learn no loads.
 
-    At the end of its swing a pile bears up to twice its load, and for long enough to look steady. velocity: (n, dim) [m/s], at the
-    end of the window before. acceleration: (n,) [m/s^2], its mean over the last window.
+    At the end of its swing a pile bears up to twice its load, and for long enough to look steady. velocity: (n, dim) [m/s], at
+    the end of the window before. acceleration: (n,) [m/s^2], its mean over the last window.
     """
 
     def __init__(self, scene: "Scene"):
