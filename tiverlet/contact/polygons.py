@@ -26,6 +26,7 @@ from .loops import checked, flat, laid, refuse_deep
 from .pair_contact import PairContact
 from .polygon_narrow_phase import VERTEX, EdgePairTable, Outline, PolygonGeometry
 from .restitution import SLOW, under_force
+from .wall_loads import WallLoads
 
 SKIN = 0.15  # skin of a vertex, relative to its longer edge
 
@@ -240,6 +241,10 @@ class Polygons(PairContact):
         if dev.known:
             dev.known.bind(dev.list, dev.geometry)
         return dev.search
+
+    def make_wall_loads(self) -> WallLoads:
+        """Declare the fields of the loads with which walls hold particles, and return them. Called if `shares_loads`."""
+        return WallLoads(self.scene, self.dev.known)
 
     @property
     def strikes_bodies(self) -> bool:

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any
 from ..colliders.surface import ANY_DEPTH, BEFORE_CONTACTS, BEYOND_ROUNDING, FRICTIONLESS
 from ..contact.force_share import accumulate
 from ..contact.projection_times import ALWAYS
-from ..contact.wall_loads import WallLoads
 from ..device import inline, ti
 from ..device.number import OnDevice
 from ..device.thread_team import Team, block, blocks
@@ -48,7 +47,7 @@ class ParticlePass:
         self.acts = self.gathers or bool(contact or walls)
         self.knows_loads = bool(contact) and contact.has_loads
         self.leaves_walls_early = bool(walls) and self.knows_loads and not contact.shares_loads
-        self.wall_loads = [WallLoads(scene, contact.known)] if walls and contact and contact.shares_loads else []
+        self.wall_loads = [contact.make_wall_loads()] if walls and contact and contact.shares_loads else []
         self.impacts = [scene.impacts] if scene.impacts else []
         self.weights = [scene.own_weight] if scene.own_weight else []
         self.rough = any(w.has_friction or w.has_restitution for w in walls)
