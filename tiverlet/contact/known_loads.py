@@ -71,6 +71,8 @@ class KnownLoads:
     bodies swing, and the slowest mode decays in 3 N^2 substeps, with k = 2 N: s^2 + L s + L (1 + K / s) = 0 is stable where the
     share K learnt in a substep is below L = 2.7 / k^2, and K = 1 / (SLOW_BODIES k^2). See SteadyMotion and WallLoads, too.
 
+    bodies: whether these are contacts of bodies. has_friction: whether they learn what friction holds.
+
     Warm starting (Box2D) of a single pass would be unstable: a mode of eigenvalue L has the characteristic polynomial
     z^3 - 3 a z^2 + 3 a z - a, a = 1 - r L, whose roots near 1 grow like (r L)^(1/3) / 2.
     """
