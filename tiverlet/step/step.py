@@ -457,7 +457,7 @@ class Step:
 
     @ti.func
     def solve_contacts(self, now):
-        """Solve every pair in contact, from both sides."""
+        """Solve every pair in contact."""
         self.contact_pass.solve(now)
 
     @ti.func
