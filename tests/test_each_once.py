@@ -8,7 +8,7 @@ from tiverlet.contact.contact import Contact
 
 
 def heap(with_large: bool):
-    """Return some 1100 discs in a box, or some pinned ones and two large ones that touch each other and more than 32 discs each."""
+    """Return some 1100 discs; with_large: some pinned, and two large ones that touch each other and over 32 discs each."""
     k = np.arange(1400 if with_large else 1100)
     x = np.stack([k % 36 * 1.01, k // 36 * 1.01], axis=1) + 0.5 + 0.01 * tv.golden(k, dim=2)
     radius, pinned = np.full(len(k), 0.5), []
