@@ -312,7 +312,7 @@ class Contact(PairContact):
             carries = ti.cast(ti.select(first != 0 and (fresh == 0 or now.span.since > 0), 1, 0), self.scene.real)
         own = self.dev.splitting.weight[i]
         held, parts = ti.cast(0, self.scene.real), ti.cast(0, self.scene.real)
-        change, borne = ti.cast(0, self.scene.real), ti.cast(0, self.scene.real)  # of overlaps, see note_struck()
+        change, borne, least = ti.Vector.zero(self.scene.real, 3)  # see note_struck()
         solves, words = own > 0, self.dev.list.word_count(i)
         if ti.static(self.dev.once):
             solves, words = True, self.dev.each_once.word_count(i, turn)
@@ -358,6 +358,7 @@ class Contact(PairContact):
                             borne = ti.max(borne, alone * last)
                             if last > 0 and self.dev.projection.is_heavier(i, j):
                                 change = ti.max(change, self.dev.projection.change_of(i, j, n, overlap, alone * last))
+                                least = ti.max(least, self.dev.w.of(j))
                     push, known = again * last, ti.zero(overlap)  # known: the part of the push that its known load already gave
                     left = ti.zero(overlap)  # the part of the substep after an impact
                     keeps = ti.max(lesser(1 - alone * each, ti.static(CARRY)), 0)
@@ -451,7 +452,7 @@ class Contact(PairContact):
         self.dev.move[i] = total
         if ti.static(self.dev.projection.unequal):
             if first != 0:
-                self.dev.projection.note_struck(i, change, borne)
+                self.dev.projection.note_struck(i, change, borne, least)
         if ti.static(self.dev.geometry.shrinks):
             self.dev.geometry.held[i] = held
         if ti.static(self.dev.has_loads):
