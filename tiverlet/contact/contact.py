@@ -17,7 +17,7 @@ from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from .body_restitution import BodyRestitution
-from .each_once import EachOnce
+from .each_once import ROUNDS, EachOnce
 from .events import EventLog
 from .exclusions import excluded_pairs
 from .force_share import ForceShare
@@ -210,10 +210,10 @@ class Contact(PairContact):
         return dev.search
 
     def _solves_once(self, scene: Scene, team: Team) -> bool:
-        """Whether each pair is solved once, see EachOnce: not where a GPU's threads, or what rests, take other turns. What spins,
-        bounces or differs much in mass has sums of its own; small worlds compile faster without."""
+        """Whether each pair is solved once, see EachOnce: not where a GPU's threads, or what rests, take other turns. What spins
+        or bounces has sums of its own; small worlds compile faster without."""
         dev = self.dev
-        alike = not (dev.has_restitution or dev.spins or dev.projection.unequal or scene.state.sleepers)
+        alike = not (dev.has_restitution or dev.spins or scene.state.sleepers)
         both = not (dev.search.has_static and (dev.has_loads or dev.reports))  # static particles store nothing of a pair
         return alike and both and not team.launched and not scene.memory.compiler.few
 
@@ -283,6 +283,8 @@ class Contact(PairContact):
         """Begin the pass of particle i, in which pairs add up its corrections."""
         nothing = ti.Vector.zero(self.scene.real, self.dev.state.dim)
         self.dev.each_once.begin(i)
+        if ti.static(self.dev.projection.unequal):
+            self.dev.projection.begin_strike(i)
         self.dev.move[i] = nothing
         if ti.static(self.dev.has_loads):
             self.dev.known.carried.field[i] = nothing
@@ -303,6 +305,8 @@ class Contact(PairContact):
         if ti.static(self.dev.has_restitution):
             if first != 0:
                 self.dev.restitution.clear(i, self.dev.splitting.weight[i])
+        if ti.static(self.dev.projection.unequal and not self.dev.once):
+            self.dev.projection.begin_strike(i)
         # Factors 1 or 0, faster than a branch in the loop: whether pairs continue from their push in this substep (again), or
         # from the push of the last substep (carries). After a start it does, too, where only the substep has another length.
         # Worlds with restitution start from the velocities that users read, and need half of the push first, as C gives it alone.
@@ -312,7 +316,6 @@ class Contact(PairContact):
             carries = ti.cast(ti.select(first != 0 and (fresh == 0 or now.span.since > 0), 1, 0), self.scene.real)
         own = self.dev.splitting.weight[i]
         held, parts = ti.cast(0, self.scene.real), ti.cast(0, self.scene.real)
-        change, borne, least = ti.Vector.zero(self.scene.real, 3)  # see note_struck()
         solves, words = own > 0, self.dev.list.word_count(i)
         if ti.static(self.dev.once):
             solves, words = True, self.dev.each_once.word_count(i, turn)
@@ -355,10 +358,9 @@ class Contact(PairContact):
                     paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self.dev.w.of(j)
                     if ti.static(self.dev.projection.unequal):
                         if first != 0:
-                            borne = ti.max(borne, alone * last)
-                            if last > 0 and self.dev.projection.is_heavier(i, j):
-                                change = ti.max(change, self.dev.projection.change_of(i, j, n, overlap, alone * last))
-                                least = ti.max(least, self.dev.w.of(j))
+                            self.dev.projection.note_pair(i, j, n, overlap, alone * last)
+                            if other >= 0:
+                                self.dev.projection.note_pair(j, i, -n, overlap, alone * last)
                     push, known = again * last, ti.zero(overlap)  # known: the part of the push that its known load already gave
                     left = ti.zero(overlap)  # the part of the substep after an impact
                     keeps = ti.max(lesser(1 - alone * each, ti.static(CARRY)), 0)
@@ -451,8 +453,8 @@ class Contact(PairContact):
                                     self.dev.forces.sum[j] = self.dev.forces.sum[j] - self.dev.w.of(j) * force
         self.dev.move[i] = total
         if ti.static(self.dev.projection.unequal):
-            if first != 0:
-                self.dev.projection.note_struck(i, change, borne, least)
+            if first != 0 and turn.round == ROUNDS - 1:
+                self.dev.projection.note_struck(i)
         if ti.static(self.dev.geometry.shrinks):
             self.dev.geometry.held[i] = held
         if ti.static(self.dev.has_loads):

@@ -67,6 +67,9 @@ class VelocityProjection:
         if self.unequal:  # how far around a particle that is restless in a pair of unequal masses others are projected in this
             # substep (0: it is not), and whether any is restless
             self.struck = add("Contact.struck", scene.count, kind=ti.i32)
+            # The largest change of overlaps with lighter particles, the largest overlap that bears a load, both [m], and the
+            # inverse mass of the lightest of these particles.
+            self.strike = add("Contact.strike", scene.count, width=3)
             self.any_struck = add("Contact.any_struck", None, kind=ti.i32)
 
     @staticmethod
@@ -123,9 +126,22 @@ class VelocityProjection:
         return w > 0 and other > ti.static(UNEQUAL) * w
 
     @ti.func
-    def note_struck(self, i, change, borne, least):
-        """Note if particle i is restless, and how far around it. change: that of overlaps with lighter particles. borne: see
-        is_restless(). least: the inverse mass of the lightest of these particles."""
+    def begin_strike(self, i):
+        """Begin a substep of particle i, before its pairs are noted."""
+        self.strike[i] = ti.Vector.zero(self.state.real, 3)
+
+    @ti.func
+    def note_pair(self, i, j, n, overlap, borne):
+        """Note for particle i what its pair with j, with the normal n, changes and bears in this substep, see change_of()."""
+        self.strike[i][1] = ti.max(self.strike[i][1], borne)
+        if borne > 0 and self.is_heavier(i, j):
+            self.strike[i][0] = ti.max(self.strike[i][0], self.change_of(i, j, n, overlap, borne))
+            self.strike[i][2] = ti.max(self.strike[i][2], self.state.w.of(j))
+
+    @ti.func
+    def note_struck(self, i):
+        """Note if particle i is restless, and how far around it, once all of its pairs are noted."""
+        change, borne, least = self.strike[i]
         reach = 0
         if self.is_restless(i, change, borne):
             reach = ti.cast(ti.min(ti.static(REACH) * ti.sqrt(least / self.state.w.of(i)), ti.static(RINGS)), ti.i32)
