@@ -166,14 +166,11 @@ def renew(world: Any) -> None:
         build_again(world, np.ones(len(world.particles), dtype=bool), None, world.features, NONE)
         return
     told = world._all_events() if runner.logs else world._events
-    loose = grabbing.some[runner.scene.inv_mass[grabbing.some] == 0]
-    loose = np.unique(loose) if len(loose) > 1 else loose
-    seen, moved = clock.velocity_override, runner.scene.inv_mass > 0
-    had = None
+    seen, inv_mass, had = clock.velocity_override, runner.scene.inv_mass, None
     if seen is not None:
-        had = seen[loose]
+        had = seen[grabbing.before]
     elif not clock.d_is_velocity:
-        had = runner.memory.view(runner.scene.state.d)[loose] / clock.h
+        had = runner.memory.rows(grabbing.before, runner.scene.state.d)[0] / clock.h
     if grabbing.soft or not impulse.has_enough_digits(runner):
         with runner.memory.compiler():
             runner.restart_between(world.iterations)
@@ -182,9 +179,9 @@ def renew(world: Any) -> None:
     edit_in_place.grab(world, grabbing)
     world._events = told
     if had is not None:
-        impulse.let_go(runner, loose, had, world.iterations)
+        impulse.let_go(runner, grabbing.before, had, world._iterations)
     if clock.velocity_override is not None:
-        clock.velocity_override = _held(runner, clock.velocity_override, moved)
+        clock.velocity_override = _held(runner, clock.velocity_override, inv_mass > 0)
     for watcher in world._watchers:
         watcher.regrouped()
 
@@ -226,7 +223,7 @@ def _seen(
     for f in world.features:
         if isinstance(f, Pin) and f in features and f.needs_new_state:  # a pin that takes other particles
             if f.is_kinematic:
-                loose[f.held] = loses = True
+                loose[f.held[:, 0]] = loses = True
         elif isinstance(f, Batch | PairContact):
             stays = f.kept_mask(number)[0] if f in features else np.zeros(1, dtype=bool)
             if not stays.all():

@@ -69,6 +69,7 @@ class Runner:
         self.known = [c.known for c in step.contacts if c.known]  # KnownLoads of contacts
         self.logs: list[Any] = [*(c.dev.events for c in step.contacts if c.dev.events), *step.wall_logs]  # of events
         self.semi_iterations, self.drags = step.constraints.semi_iterations, step.integrator.forces.drags
+        self._immovable: int | None = None
         self.probe = high_order.Probe(step) if self.scene.order > 2 else None
         self.passes_at_once = self._passes_at_once()
         self.asks_velocities = any(wall.has_switch for wall in step.walls)
@@ -105,11 +106,18 @@ class Runner:
 
     def regroup(self) -> None:
         """Take the new number of particles, after the parts were edited in place."""
-        self.n, self.weights_alone = self.step.n, {}
+        self.n, self.weights_alone, self._immovable = self.step.n, {}, None
         self.passes_at_once = self._passes_at_once()
         self.diagnostics.report.regroup()
         if self.sleep:
             self.sleep.regroup()
+
+    @property
+    def immovable(self) -> int:
+        """How many particles cannot move; pins that take others change nothing of that."""
+        if self._immovable is None:
+            self._immovable = self.n - int(np.count_nonzero(self.scene.inv_mass))
+        return self._immovable
 
     # Frames.
 
@@ -224,11 +232,11 @@ class Runner:
         """Scale what the last substep has left of the sleeping particles `who`, with displacements d, to one of `ratio` times the
         length. For them the coming frame is no start."""
         memory, forces = self.memory, [contact.dev.forces for contact in self.step.contacts]
-        memory.write_rows(self.scene.state.d, who, d * ratio)
+        memory.write_rows(who, (self.scene.state.d, d * ratio))
         left = [(f.before, ratio) for f in forces] + [(f.sum, ratio**2) for f in forces if "sum" in f.in_state]
         left += [(self.step.particles.wall_displacement, ratio**2)] if self.step.walls else []
         for field, factor in left:
-            memory.write_rows(field, who, memory.read(field)[who] * factor)
+            memory.write_rows(who, (field, memory.rows(who, field)[0] * factor))
 
     def _project(self, h: float, dt: float, passes: int, keeps: bool) -> bool:
         """Remove the energy that violations and overlaps would store in a shorter substep h [s], of a frame dt [s].
@@ -475,7 +483,7 @@ class Runner:
 
     def _velocities(self, first: int = 0, end: int | None = None, links: bool = True, touches: bool = True) -> np.ndarray:
         """Launch the kernel that computes velocities from displacements."""
-        launch = self._with_room(self._velocity, "velocities", 7, self.step.dim)
+        launch = self._with_room(self._velocity, "velocities", 7, self.scene.state.dim)
         self._velocity = launch if self.n <= KEPT else None
         given, out = launch.arrays
         end = self.n if end is None else end
@@ -493,7 +501,7 @@ class Runner:
 
     def _list_again(self) -> None:
         """After a state was restored: build the neighbour list, which the reactions of contacts need."""
-        if self.search and self.memory.read(self.search.list.old_saved)[0]:
+        if self.search and self.search.list.saved:
             self.list_neighbours()
 
     def spin(self) -> np.ndarray:
