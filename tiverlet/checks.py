@@ -168,6 +168,8 @@ def rows(who: str, name: str, value: Any, what: str) -> list:
 
 def plain(who: str, name: str, value: Any) -> np.ndarray:
     """Return anything whose rows have equal lengths as an array."""
+    if type(value) is np.ndarray and value.dtype.kind != "O":
+        return value
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         raise ValueError(f"{who}: {name} has masked values, which would count as any other. Fill them, or leave their rows out.")
     try:

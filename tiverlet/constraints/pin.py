@@ -19,7 +19,7 @@ def _targets(pin: "Pin", target):
     if target.ndim == 3 and target.shape[1] == 1:  # as world.position[pin.indices]
         target = target[:, 0]
     if target.ndim == 1:  # one point for all
-        target = target[None].repeat(pin.members.count, axis=0)
+        target = target[None] if len(pin.members.rows) == 1 else target[None].repeat(pin.members.count, axis=0)
     target = checks.points("Pin", "target", target, dim=pin.dim, count=pin.members.count)
     in_range("Pin", "target", target)
     return target
@@ -201,9 +201,10 @@ class Pin(Anchored):
 
     def upload(self) -> None:
         """Write the new target, which the next frame moves to."""
-        super().upload()
         if self.acts:
-            self.scene.memory.write(self.dev.place.target, self.target)
+            if not self.is_kinematic:
+                self.dev.spring.upload(self.compliance, self.damping)
+            self.scene.memory.write(self.dev.place.target, vars(self)["target"])
             self.moving = True
 
     def end_motion(self) -> None:

@@ -36,6 +36,11 @@ def rows_of(indices: np.ndarray) -> Rows:
     return indices[:, 0]
 
 
+def numbers_of(some: Rows) -> Any:
+    """Return the indices of rows_of(), (m,); a number where there is one."""
+    return some.start if isinstance(some, slice) else some
+
+
 class Memory:
     """The fields of one world: declared first, then placed together, freed together.
 

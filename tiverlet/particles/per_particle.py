@@ -36,21 +36,11 @@ class PerParticle:
         else:
             memory.write(self.field, values)
 
-    def can_change(self, values: np.ndarray, *some: "Rows") -> bool:
-        """Return can_assign() for values that differ from the present ones only at `some`.
-
-        If the values at `some` differ from each other, the others need no comparison.
-        """
-        return (not self.uniform and len({v for rows in some for v in values[rows].tolist()}) > 1) or self.can_assign(values)
-
     def change(self, memory: "Memory", values: np.ndarray, *some: "Rows") -> None:
-        """Write the values at `some`, for which can_change() is true, in an elastic memory."""
-        if self.uniform:
-            self.assign(memory, values)
-        else:
-            view = memory.view(self.field)
-            for rows in some:
-                view[rows] = values[rows]
+        """Write the values at `some`, in an elastic memory, where values were and are not all equal."""
+        view = memory.view(self.field)
+        for rows in some:
+            view[rows] = values[rows]
 
     @inline
     def of(self, i):

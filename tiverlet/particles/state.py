@@ -71,12 +71,13 @@ class State:
         if self.spins:
             self.spin.regroup(memory, change)
 
-    def can_set_inverse_mass(self, particles: "Particles", inv_mass: np.ndarray, *some: "Rows") -> bool:
-        """Whether other inverse masses can be written in place. some: the particles whose inverse mass may differ."""
-        return self.w.can_change(inv_mass, *some) and (not self.spins or self.spin.can_set_inverse_mass(particles, inv_mass))
+    def can_set_inverse_mass(self, particles: "Particles", inv_mass: np.ndarray) -> bool:
+        """Whether other inverse masses can be written in place, if as many are 0 as before."""
+        return not self.w.uniform and (not self.spins or self.spin.can_set_inverse_mass(particles, inv_mass))
 
     def set_inverse_mass(self, memory: "Memory", particles: "Particles", inv_mass: np.ndarray, *some: "Rows") -> None:
-        """Write other inverse masses, for which can_set_inverse_mass() is true."""
+        """Write other inverse masses, for which can_set_inverse_mass() is true. some: the particles whose inverse mass may
+        differ."""
         self.w.change(memory, inv_mass, *some)
         if self.spins:
             self.spin.set_inverse_mass(memory, particles, inv_mass)

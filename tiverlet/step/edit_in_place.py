@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..constraints.core.anchored import refuse_held_twice
+from ..constraints.core.anchored import Anchored, refuse_held_twice
 from ..constraints.pin import Pin
 from ..features.feature import Batch, Feature
 from ..features.regrouping import Regrouping
@@ -164,7 +164,7 @@ def grabbing(world: Any) -> Grab | None:
         inv_mass = inv_mass.copy()
         inv_mass[before] = world._particles.inv_mass[before]
         inv_mass[after] = 0.0
-        if not scene.state.can_set_inverse_mass(world._particles, inv_mass, before, after) or (
+        if not scene.state.can_set_inverse_mass(world._particles, inv_mass) or (
             runner.search and not runner.search.has_static
         ):
             return None
@@ -174,7 +174,9 @@ def grabbing(world: Any) -> Grab | None:
     soft = len(driving) < len(pins)
     if soft and not scene.slots.can_reassign(inv_mass, runner.batches):
         return None
-    refuse_held_twice(world._particles, world._features, pins)
+    # Fast path: a single feature holds particles, and those that it drives from now on could move.
+    if soft or 0.0 in scene.inv_mass[after].tolist() or len([f for f in world._features if isinstance(f, Anchored)]) > 1:
+        refuse_held_twice(world._particles, world._features, pins)
     return Grab(pins, soft, inv_mass, before, after)
 
 

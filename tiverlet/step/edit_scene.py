@@ -166,20 +166,23 @@ def renew(world: Any) -> None:
         build_again(world, np.ones(len(world.particles), dtype=bool), None, world.features, NONE)
         return
     told = world._all_events() if runner.logs else world._events
-    seen, inv_mass, had = clock.velocity_override, runner.scene.inv_mass, None
-    if seen is not None:
-        had = seen[grabbing.before]
-    elif not clock.d_is_velocity:
-        had = runner.memory.rows(grabbing.before, runner.scene.state.d)[0] / clock.h
-    if grabbing.soft or not impulse.has_enough_digits(runner):
+    seen, inv_mass, before = clock.velocity_override, runner.scene.inv_mass, grabbing.before
+    want = None if seen is None else seen[before]
+    if clock.d_is_velocity or grabbing.soft or not impulse.has_enough_digits(runner):
+        clock.energy = None
+        if want is None and not clock.d_is_velocity:
+            want = runner.memory.rows(before, runner.scene.state.d)[0] / clock.h
         with runner.memory.compiler():
             runner.restart_between(world.iterations)
-    clock.energy = None
-    runner.wake()
-    edit_in_place.grab(world, grabbing)
+        edit_in_place.grab(world, grabbing)
+        if want is not None:
+            impulse.let_go(runner, before, want, world.iterations)
+    else:
+        edit_in_place.grab(world, grabbing)
+        change = runner.release(before, want, grabbing.after, inv_mass)
+        knows = clock.energy is not None and not (runner.scene.state.spins or runner.step.pair_forces)
+        clock.energy = clock.energy + change if knows else None
     world._events = told
-    if had is not None:
-        impulse.let_go(runner, grabbing.before, had, world._iterations)
     if clock.velocity_override is not None:
         clock.velocity_override = _held(runner, clock.velocity_override, inv_mass > 0)
     for watcher in world._watchers:
@@ -268,8 +271,9 @@ def _edited(
         _launch(world, n)
     if seen is not None:  # removed constraints contributed to the velocities of particles that remain
         seen = seen[some] if added is None else np.concatenate([seen[some], added.velocity])
-        _let_go(world, seen, np.concatenate([loose[some], np.zeros(m, dtype=bool)]))
-        clock.velocity_override = _held(world._runner, seen, np.concatenate([moved[some], np.ones(m, dtype=bool)]))
+        moved = np.concatenate([moved[some], np.ones(m, dtype=bool)])
+        _let_go(world, seen, np.concatenate([loose[some], np.zeros(m, dtype=bool)]), moved)
+        clock.velocity_override = _held(world._runner, seen, moved)
     for watcher in world._watchers:
         watcher.regrouped()
 
@@ -280,11 +284,19 @@ def _held(runner: Any, velocity: np.ndarray, moved: np.ndarray) -> np.ndarray:
     return np.where(now[:, None], runner.memory.read(runner.scene.state.d)[: runner.n] / h, velocity)
 
 
-def _let_go(world: Any, seen: np.ndarray, loose: np.ndarray) -> None:
-    """Let the particles in the mask `loose` continue with the velocities `seen`, (n, dim), that they had before the edit."""
+def _let_go(world: Any, seen: np.ndarray, loose: np.ndarray, moved: np.ndarray) -> None:
+    """Let the particles in the mask `loose` continue with the velocities `seen`, (n, dim), that they had before the edit.
+
+    moved: which particles could move then; the others were driven.
+    """
     runner, some = world._runner, np.flatnonzero(loose)
-    if runner.clock.d_is_velocity or impulse.has_enough_digits(runner):
+    if runner.clock.d_is_velocity:
         impulse.let_go(runner, some, seen[some], world.iterations)
+    elif impulse.has_enough_digits(runner):
+        driven, free = some[~moved[some]], some[moved[some]]
+        impulse.let_go(runner, free, seen[free], world.iterations)
+        if len(driven):
+            runner.release(driven, seen[driven])
     elif len(some):
         world._start_from(seen)
 

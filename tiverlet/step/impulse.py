@@ -46,6 +46,11 @@ def lengthened(d: np.ndarray, low: np.ndarray | None = None, more: Any = 0.0) ->
     return [new, whole - new]
 
 
+def factor_of(clock: Any) -> float:
+    """Return factor() for a single world (not one of many copies)."""
+    return clock.h / max((clock.drag or FREE)[0], NOTHING)
+
+
 class Displacements:
     """Displacements of some particles, (..., dim) [m], with their low words and the parts that forces gave them.
 
@@ -237,7 +242,7 @@ def let_go(runner: Any, some: Rows, want: np.ndarray, iterations: int) -> None:
     else:
         first = int(some[0])
         lack = want - runner.velocity(iterations, first, int(some[-1]) + 1)[some - first]
-    more, low = runner.clock.h / max((runner.clock.drag or FREE)[0], NOTHING) * lack, [state.d_low] if state.carries else []
+    more, low = factor_of(runner.clock) * lack, [state.d_low] if state.carries else []
     others = [integrator.free] if integrator.uses_velocity else []
     d, *was = memory.rows(some, state.d, *others, *low)
     new = lengthened(d, was.pop() if low else None, more)
@@ -260,9 +265,9 @@ def give_new(runner: Any, first: int, want: np.ndarray, iterations: int) -> None
 
     with runner.memory.compiler():  # for orders above 2
         if any(f.may_act_from(first) for f in runner.integrator.forces.velocity_dependent):
-            those.give(want, velocity, _factor(runner))
+            those.give(want, velocity, np.array([factor_of(runner.clock)]))
         else:
-            those.lengthen(_factor(runner) * (want - velocity()))
+            those.lengthen(factor_of(runner.clock) * (want - velocity()))
 
 
 def _movable(runner: Any, some: np.ndarray) -> tuple[int, int, np.ndarray]:
@@ -271,11 +276,6 @@ def _movable(runner: Any, some: np.ndarray) -> tuple[int, int, np.ndarray]:
     rows = np.flatnonzero(some)
     first, end = (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, 0)
     return first, end, some[first:end]
-
-
-def _factor(runner: Any) -> np.ndarray:
-    """Return factor() for a single world (not one of many copies), (1,)."""
-    return factor(runner.clock.h, np.array([runner.clock.drag or FREE]))
 
 
 def _those(runner: Any, first: int, some: np.ndarray) -> Displacements:

@@ -133,7 +133,7 @@ def refuse_held_twice(particles: "Particles", features: tuple[Feature, ...], som
     some: the features that hold other particles than before; None for all.
     """
     tethers = [(k, f) for k, f in enumerate(features) if isinstance(f, Anchored) and f.exclusive]
-    if some is not None and len(tethers) == 1 and not any(np.asarray(particles.pinned)[tethers[0][1].members.rows[:, 0]].tolist()):
+    if some is not None and len(tethers) == 1 and not particles.pinned[tethers[0][1].members.rows].any():
         return
     holder = np.full(len(particles), -1)
     for k, f in sorted(
