@@ -15,9 +15,9 @@ import numpy as np
 
 from ..constraints.core.anchored import Anchored, refuse_held_twice
 from ..constraints.pin import Pin
+from ..device.memory import Rows, rows_of
 from ..features.feature import Batch, Feature
 from ..features.regrouping import Regrouping
-from ..device.memory import Rows, rows_of
 from ..particles import Particles
 from .bind_again import Bound, bind, bound_again
 from .scale import Scale
@@ -164,9 +164,7 @@ def grabbing(world: Any) -> Grab | None:
         inv_mass = inv_mass.copy()
         inv_mass[before] = world._particles.inv_mass[before]
         inv_mass[after] = 0.0
-        if not scene.state.can_set_inverse_mass(world._particles, inv_mass) or (
-            runner.search and not runner.search.has_static
-        ):
+        if not scene.state.can_set_inverse_mass(world._particles, inv_mass) or (runner.search and not runner.search.has_static):
             return None
         for b in runner.batches:
             if (inv_mass[b.indices] != scene.inv_mass[b.indices]).any():

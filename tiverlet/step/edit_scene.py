@@ -15,6 +15,7 @@ from ..colliders.collider import Collider
 from ..constraints.pin import Pin
 from ..contact.pair_contact import PairContact
 from ..contact.touches import ContactEvents
+from ..device.memory import numbers_of
 from ..features.feature import Batch, Feature
 from ..neighbours.periodic import Periodic
 from ..particles import Particles
@@ -170,18 +171,18 @@ def renew(world: Any) -> None:
     want = None if seen is None else seen[before]
     if clock.d_is_velocity or grabbing.soft or not impulse.has_enough_digits(runner):
         clock.energy = None
-        if want is None and not clock.d_is_velocity:
-            want = runner.memory.rows(before, runner.scene.state.d)[0] / clock.h
-        with runner.memory.compiler():
-            runner.restart_between(world.iterations)
+        if not clock.d_is_velocity:
+            want = runner.memory.rows(before, runner.scene.state.d)[0] / clock.h if want is None else want
+            with runner.memory.compiler():
+                runner.restart_between(world.iterations)
         edit_in_place.grab(world, grabbing)
         if want is not None:
-            impulse.let_go(runner, before, want, world.iterations)
+            impulse.let_go(runner, np.atleast_1d(numbers_of(before)), want, world.iterations)
     else:
         edit_in_place.grab(world, grabbing)
         change = runner.release(before, want, grabbing.after, inv_mass)
-        knows = clock.energy is not None and not (runner.scene.state.spins or runner.step.pair_forces)
-        clock.energy = clock.energy + change if knows else None
+        known = clock.energy is not None and not (runner.scene.state.spins or runner.step.pair_forces)
+        clock.energy = clock.energy + change if known else None
     world._events = told
     if clock.velocity_override is not None:
         clock.velocity_override = _held(runner, clock.velocity_override, inv_mass > 0)

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from ..device.memory import Rows
 from .integrator import FREE
 
 ROUNDS = 100  # evaluations of velocities, at most, where forces read them
@@ -34,16 +33,6 @@ def factor(h: Any, drag: np.ndarray) -> np.ndarray:
     Where drag leaves almost nothing of a velocity in a substep, d does not matter, and the factor is bounded.
     """
     return h / np.maximum(drag[:, 0], NOTHING)
-
-
-def lengthened(d: np.ndarray, low: np.ndarray | None = None, more: Any = 0.0) -> list[np.ndarray]:
-    """Return displacements d + more, and their low words if they have some."""
-    new = d.astype(np.float64) + more
-    if low is None:
-        return [new]
-    whole = new + low
-    new = whole.astype(d.dtype)
-    return [new, whole - new]
 
 
 def factor_of(clock: Any) -> float:
@@ -72,10 +61,14 @@ class Displacements:
 
     def lengthen(self, more: np.ndarray) -> None:
         """Restore the displacements and add `more`, (..., dim) [m]."""
-        both = [field for field in (self.field, self.low) if field]
-        was = [self.was[field] for field in both]
-        for field, before, new in zip(both, was, lengthened(*was, more=more), strict=True):
-            self.write(field, np.where(self.some, new, before))
+        d = self.was[self.field]
+        new = d.astype(np.float64) + more
+        if self.low:
+            low = self.was[self.low]
+            whole = new + low
+            new = whole.astype(d.dtype)
+            self.write(self.low, np.where(self.some, whole - new, low))
+        self.write(self.field, np.where(self.some, new, d))
         for field in self.others:
             self.write(field, np.where(self.some, self.was[field] + more, self.was[field]))
 
@@ -226,27 +219,23 @@ def restore_turn(runner: Any, first: int, share: np.ndarray, spun: np.ndarray | 
         memory.write(field, left)
 
 
-def let_go(runner: Any, some: Rows, want: np.ndarray, iterations: int) -> None:
-    """Let particles `some`, k numbers in ascending order, go on with velocities `want`, (k, dim) [m/s], as far as they can
+def let_go(runner: Any, some: np.ndarray, want: np.ndarray, iterations: int) -> None:
+    """Let particles `some`, (k,) numbers in ascending order, go on with velocities `want`, (k, dim) [m/s], as far as they can
     move."""
-    memory, state, integrator, inv_mass = runner.memory, runner.scene.state, runner.integrator, runner.scene.inv_mass[some]
-    if 0.0 in inv_mass.tolist():
-        some, want = np.arange(runner.n)[some][inv_mass > 0], want[inv_mass > 0]
-    if not len(want):
+    memory, moves = runner.memory, runner.scene.inv_mass[some] > 0
+    if not moves.all():
+        some, want = some[moves], want[moves]
+    if not len(some):
         return
     if runner.clock.d_is_velocity:
-        memory.write_rows(some, (state.d, want))
+        memory.write_rows(some, (runner.scene.state.d, want))
         return
-    if isinstance(some, slice):
-        lack = want - runner.velocity(iterations, some.start, some.stop)
-    else:
-        first = int(some[0])
-        lack = want - runner.velocity(iterations, first, int(some[-1]) + 1)[some - first]
-    more, low = factor_of(runner.clock) * lack, [state.d_low] if state.carries else []
-    others = [integrator.free] if integrator.uses_velocity else []
-    d, *was = memory.rows(some, state.d, *others, *low)
-    new = lengthened(d, was.pop() if low else None, more)
-    memory.write_rows(some, *zip((state.d, *low), new, strict=False), *((f, v + more) for f, v in zip(others, was, strict=True)))
+    first = int(some[0])
+    lack = want - runner.velocity(iterations, first, int(some[-1]) + 1)[some - first]
+    those = Displacements(
+        runner, moves[moves], lambda field: memory.view(field)[some], lambda field, rows: memory.write_rows(some, (field, rows))
+    )
+    those.lengthen(factor_of(runner.clock) * lack)
 
 
 def give_new(runner: Any, first: int, want: np.ndarray, iterations: int) -> None:

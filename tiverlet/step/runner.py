@@ -77,7 +77,7 @@ class Runner:
         self.probe = high_order.Probe(step) if self.scene.order > 2 else None
         self.passes_at_once = self._passes_at_once()
         self.asks_velocities = any(wall.has_switch for wall in step.walls)
-        self.asks_release = self._may_release()
+        self.asks_release = any(isinstance(f, Pin) for f in step.drivers)
         self.bounces = any(f.has_restitution for f in (*step.walls, *step.contacts))
         self.launcher = Launcher(self)
         self._prepare()
@@ -110,14 +110,6 @@ class Runner:
         """The largest number of passes over the constraints in one launch."""
         return max(1, LONG // (1 + self.n + sum(b.count for b in self.batches)))
 
-    def _may_release(self) -> bool:
-        """Whether a Pin drives particles without links: it may take others without a rebuild, see edit_in_place.grabbing()."""
-        pins = [f.members.rows for f in self.step.drivers if isinstance(f, Pin)]
-        if not pins or self.sleep or self.launched or self.probe or not self.memory.elastic:
-            return False
-        linked = np.concatenate([NONE, *(b.indices.ravel() for b in self.batches)])
-        return not all(np.isin(rows, linked).any() for rows in pins)
-
     def regroup(self) -> None:
         """Take the new number of particles, after the parts were edited in place."""
         self.n, self.weights_alone, self._immovable = self.step.n, {}, None
@@ -130,7 +122,8 @@ class Runner:
     def immovable(self) -> int:
         """How many particles cannot move; pins that take others change nothing of that."""
         if self._immovable is None:
-            self._immovable = self.n - int(np.count_nonzero(self.scene.inv_mass))
+            out = self._immovable = self.n - int(np.count_nonzero(self.scene.inv_mass))
+            return out
         return self._immovable
 
     # Frames.
@@ -149,8 +142,8 @@ class Runner:
                 if self.asks_velocities:  # compile the kernel now; switching a wall off will need it
                     self._velocities()
                     self.asks_velocities = False
-                if self.asks_release:  # the same for pins that take other particles
-                    self.release(NONE)
+                if self.asks_release:
+                    self._compile_release()
                     self.asks_release = False
                 if placed:
                     report = self.report()
@@ -524,8 +517,8 @@ class Runner:
     def release(self, released: Rows, want: np.ndarray | None = None, taken: Rows = NONE, had: np.ndarray = NONE) -> float:
         """Let particles that were driven go on with velocities `want`, (k, dim) [m/s]; None: as they were driven.
 
-        Those among them that cannot move now stay as they are. taken: the particles that are driven instead. had: (n,) the inverse
-        masses before. Returns by how much the energy changes, beside that of spins and pair forces [J].
+        Those among them that cannot move now stay as they are. taken: the particles that are driven instead. had: (n,) the
+        inverse masses before. Returns by how much the energy changes, beside that of spins and pair forces [J].
         """
         clock, now, before = self.clock, self.scene.inv_mass[released], had[taken]
         first, k = len(now), len(now) + len(before)
@@ -540,6 +533,18 @@ class Runner:
         given[:] = clock.h, clock.time, firm, soft, factor_of(clock), want is not None, first, k
         launch()
         return given.item(0)
+
+    def _compile_release(self) -> None:
+        """Compile release() where a Pin drives particles without links: it may take others, and no frame must wait for it then.
+
+        For pins of linked particles the world is rebuilt, see edit_in_place.grabbing().
+        """
+        pins = [f.members.rows for f in self.step.drivers if isinstance(f, Pin)]
+        linked = np.concatenate([NONE, *(b.indices.ravel() for b in self.batches)])
+        elastic = self.memory.elastic and not (self.sleep or self.launched or self.probe)
+        if elastic and not all(np.isin(rows, linked).any() for rows in pins):
+            self._release = self._with_room(None, "release", 8, 2 + self.scene.state.dim, 2 * sum(map(len, pins)))
+            self.release(NONE)
 
     def spin(self) -> np.ndarray:
         """Surface velocities r omega, (n, axes) [m/s], of the same order as velocity()."""

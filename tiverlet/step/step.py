@@ -683,10 +683,10 @@ class Step:
     def release(self, given: ti.types.ndarray(ti.f64, 1), rows: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
         """Let driven particles go on with a velocity, as impulse.let_go() does, and sum up by how much the energy changes.
 
-        given: h, t, the shares `firm` and `soft` of Passes.push_reaction, the displacement per velocity of impulse.factor(), whether
-        rows have velocities, the number of particles that go on, and with those that are driven from now on. The change of energy
-        [J] replaces the first. rows: the index of a particle; its inverse mass, 0 for a particle that stays driven; the velocity
-        that it keeps, else that of its displacement.
+        given: h, t, the shares `firm` and `soft` of Passes.push_reaction, impulse.factor(), whether rows have velocities, the
+        number of particles that go on, and that number with those that are driven from now on. The change of energy [J] replaces
+        the first. rows: the index of a particle; its inverse mass, 0 for a particle that stays driven; the velocity with which it
+        goes on, else it is that of its displacement.
         """
         if given[0] > 0:  # Taichi wakes no threads for loops inside a branch
             self.write_reactions(given[0], given[2], given[3])
