@@ -90,7 +90,7 @@ class Pin(Anchored):
     indices: (m,) particles, read as (m, 1), a row for each. target: (m, dim), (m, 1, dim) as world.position[pin.indices], or
     (dim,) [m]; None holds the particles at their initial positions. Both are live. Assign to .target between frames, and the
     particles go there in a straight line during the next frame. Assign as many other particles to .indices, and the Pin holds
-    those from then on, as a new Pin would. That compiles nothing; a tv.Hand takes other particles faster still.
+    those from then on, as a new Pin would. That compiles nothing, and takes as long as with a tv.Hand.
     compliance: number or (m,) [m/N]. 0 takes the particles out of the solver and drives them, whatever forces act on them; above
     0 a spring of stiffness 1 / compliance draws them, as a mouse does. damping: [N s/m], of that spring.
 
