@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
-from ..device.memory import rows_of
+from ..device.memory import ALL, rows_of
 from ..features.feature import Knob, Scene
 from ..particles import Particles, in_range
 from .core.anchor_passes import AnchorPasses, Place
@@ -160,7 +160,7 @@ class Pin(Anchored):
             memory.write(dev.lam, np.zeros_like(here))
             dev.spring.begin(self.compliance, self.damping)
             dev.size.set(self.start.size)
-        memory.write_each((dev.corners.members, rows), (dev.place.source, here), (dev.place.target, here))
+        memory.write_rows(ALL, (dev.corners.members, rows), (dev.place.source, here), (dev.place.target, here))
 
     def select(self, some: np.ndarray, number: np.ndarray) -> None:
         """Keep the rows in the mask `some`, with the new numbers of their particles."""

@@ -26,6 +26,7 @@ from .redeclaration import Redeclaration
 
 GROUP = 16  # fields per transfer kernel; Taichi unrolls the loop over them
 Rows = np.ndarray | slice  # which elements of fields, by index; NumPy finds a single one in a fifth of the time by a slice
+ALL = slice(None)
 
 
 def rows_of(indices: np.ndarray) -> Rows:
@@ -352,11 +353,6 @@ class Memory:
         array = np.asarray(values, dtype=np.float64)
         if array.size:
             self._load([self._find(field)], [array])
-
-    def write_each(self, *values: tuple[Any, np.ndarray]) -> None:
-        """Overwrite several fields, each with a non-empty array."""
-        self.check()
-        self._load([self._find(field) for field, _ in values], [array for _, array in values])
 
     def write_from(self, field, first: int, values) -> None:
         """Overwrite elements of a field from index `first` on. For a single world (not one of many copies)."""
