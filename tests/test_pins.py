@@ -1,10 +1,13 @@
 """Particles that are held at targets, rigidly or by springs."""
 
+import sys
+
 import numpy as np
 import pytest
 
 import tiverlet as tv
 from tiverlet.device.patches import patched
+from tiverlet.device.patches.compiler import CachedLaunch
 
 from .conftest import ARCH, compiled, order, rerun, rms
 
@@ -142,3 +145,56 @@ def test_a_recording_knows_which_particles_were_held(world, tmp_path, compliance
     assert verdict.kind == "intact", verdict
     again = recording.world(20)
     assert again.features[4].indices.tolist() == [[5]] and not again.features[3].active
+
+
+def crowd(world, *features, spin=None):
+    """Return a world of discs in a box, one of which a Pin holds, and the Pin."""
+    i, pin = np.arange(30), tv.Pin([8])
+    particles = tv.Particles(0.19 * np.stack([i % 6, i // 6], axis=1) + 0.1, radius=0.1, spin=spin)
+    w = world(particles, [tv.Gravity(9.81), tv.Box((0, 0), (1.2, 3)), tv.Contact(), *features, pin], substeps=8)
+    w.run(0.2)
+    return w, pin
+
+
+@pytest.mark.skipif(not patched or ARCH != "cpu", reason="every edit builds the world anew there")
+def test_a_pin_takes_another_disc_in_one_launch(world, monkeypatch):
+    # Nothing waits for it: the first time compiles nothing, and each takes one launch beside that of the frame, and few calls.
+    w, pin = crowd(world)
+    launched, launch, calls = [], CachedLaunch.launch, [0]
+    monkeypatch.setattr(CachedLaunch, "launch", lambda self: (launched.append(self.name), launch(self))[1])
+
+    def called(frame, event, _):
+        calls[0] += event == "call"
+
+    with compiled() as names:
+        for k in (9, 3, 14):
+            pin.indices, pin.target = [k], w.position[k]
+            w.step(1 / 60)
+    assert names == [] and launched == ["release", "fused"] * 3
+    counts = []
+    for edit in (lambda: None, lambda: setattr(pin, "indices", [20]) or setattr(pin, "target", w.position[20])):
+        w.step(1 / 60)
+        calls[0] = 0
+        sys.setprofile(called)
+        edit()
+        w.step(1 / 60)
+        sys.setprofile(None)
+        counts.append(calls[0])
+    assert counts[1] - counts[0] <= 180  # 153 with Python 3.11
+
+
+@pytest.mark.skipif(not patched or ARCH != "cpu", reason="every edit builds the world anew there")
+@pytest.mark.parametrize("spin", [None, 1.0])
+def test_the_energy_counts_what_a_pin_lets_go_and_not_what_it_takes(world, spin):
+    # As if all of it were summed up anew.
+    w, pin = crowd(world, tv.Drag(0.2), tv.Attractor((0.5, 2.0), 3.0), tv.Hand((0.3, 1.0), particle=9), spin=spin)
+    for k in (9, 3, 14):
+        before = w.last.energy
+        pin.indices, pin.target = [k], w.position[k] + 0.01
+        w._upload_parameters()
+        known = w._clock.energy
+        w._runner.diagnose_state(bare=True)
+        energy = w._runner.sheet.item(0)
+        assert known == (pytest.approx(energy, rel=1e-7) if spin is None else None) and abs(energy - before) > 1e-3
+        report = w.step(1 / 60)
+        assert report.energy_change == pytest.approx(report.energy - energy, rel=1e-6)

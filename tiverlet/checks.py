@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 ANY = 2**31 - 1  # number of particles, while it is not yet known
+FEW = 16  # numbers that Python examines faster than NumPy, at most
 OF_SHAPE = {"position": "position", "pairs": "links", "triples": "bends", "quads": "quads", "loops": "loops"}  # by argument
 
 PACKAGE = str(Path(__file__).parent) + os.sep
@@ -110,6 +111,8 @@ def direction(array: np.ndarray) -> np.ndarray:
 
 def finite(who: str, name: str, array: np.ndarray) -> None:
     """Raise ValueError for the first element that is NaN or infinite."""
+    if array.size <= FEW and all(map(math.isfinite, array.ravel().tolist())):
+        return
     sound = np.isfinite(array)
     if not sound.all():
         at = np.unravel_index(int(np.argmin(sound)), array.shape)
@@ -129,7 +132,7 @@ def indices(who: str, name: str, value, count: int, *, arity: int | None = None,
         one = array.ndim == (1 if arity else 0) and array.size <= 4
         write = f"; write [{array.tolist()}]" if one else ""
         raise ValueError(f"{who}: {name} has shape {array.shape}, but {shape} is needed{write}.")
-    if array.astype(np.uint64).max() >= count:  # as unsigned numbers, negative ones are large, too
+    if _beyond(array, count):
         bad = (array < 0) | (array >= count)
         i = int(np.argmax(bad.any(axis=1) if arity else bad))
         least = int(array[i].min())
@@ -145,6 +148,13 @@ def indices(who: str, name: str, value, count: int, *, arity: int | None = None,
     return np.ascontiguousarray(array, dtype=np.int32)
 
 
+def _beyond(array: np.ndarray, count: int) -> bool:
+    """Whether any of the integers is negative, or `count` or more."""
+    if array.size <= FEW:
+        return not all(0 <= i < count for i in array.ravel().tolist())
+    return bool(array.astype(np.uint64).max() >= count)  # as unsigned numbers, negative ones are large, too
+
+
 def _show(row) -> str:
     return str(tuple(int(v) for v in row)) if np.ndim(row) else str(int(row))
 
@@ -158,7 +168,9 @@ def rows(who: str, name: str, value: Any, what: str) -> list:
 
 def plain(who: str, name: str, value: Any) -> np.ndarray:
     """Return anything whose rows have equal lengths as an array."""
-    if np.ma.is_masked(value):
+    if type(value) is np.ndarray and value.dtype.kind != "O":
+        return value
+    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         raise ValueError(f"{who}: {name} has masked values, which would count as any other. Fill them, or leave their rows out.")
     try:
         array = np.asarray(value)

@@ -222,11 +222,11 @@ class World:
         The old force is lost when it is overwritten, or left out of a copy. steps: see _rebuild_for_knobs().
         """
         changed = [f for f in self._features if f.changed]
-        if self._releases_load:
+        if any([f.has_released_load for f in changed]):
             if not steps:
                 self._runner.note_displacements()
             self._restart_with_reactions()
-        elif any(f.new_force or isinstance(f, Acceleration) for f in changed):
+        elif any([f.new_force or isinstance(f, Acceleration) for f in changed]):
             with self._runner.memory.compiler():
                 (self._runner.restart if steps else self._runner.restart_between)(self._iterations)
 
@@ -246,7 +246,7 @@ class World:
         steps: whether a frame follows at once, so that residuals of the last frame are not read before it.
         """
         self._restart_for_new_forces(steps)
-        if any(f.needs_other_kernels for f in self._features if f.changed):
+        if any([f.needs_other_kernels for f in self._features if f.changed]):
             edit_scene.renew(self)
 
     def _upload(self) -> None:

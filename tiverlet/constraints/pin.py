@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
+from ..device.memory import ALL, rows_of
 from ..features.feature import Knob, Scene
 from ..particles import Particles, in_range
 from .core.anchor_passes import AnchorPasses, Place
@@ -18,8 +19,8 @@ def _targets(pin: "Pin", target):
     if target.ndim == 3 and target.shape[1] == 1:  # as world.position[pin.indices]
         target = target[:, 0]
     if target.ndim == 1:  # one point for all
-        target = target[None].repeat(pin.count, axis=0)
-    target = checks.points("Pin", "target", target, dim=pin.dim, count=pin.count)
+        target = target[None] if len(pin.members.rows) == 1 else target[None].repeat(pin.members.count, axis=0)
+    target = checks.points("Pin", "target", target, dim=pin.dim, count=pin.members.count)
     in_range("Pin", "target", target)
     return target
 
@@ -29,13 +30,13 @@ def _indices(pin: "Pin", indices) -> np.ndarray:
     rows = np.array(indices)  # a copy, which its owner cannot change later
     rows = rows[:, 0] if rows.ndim == 2 and rows.shape[1] == 1 else rows  # (m, 1), the shape in which indices are read
     members, own = one_each("Pin", rows, checks.ANY if pin.start is None else pin.start.count), vars(pin)
-    before = pin.members.rows
-    if members.count != len(before):
-        raise ValueError(f"Pin: indices has {members.count} particles, but this Pin holds {pin.count}. Make another one.")
+    now, before = members.rows, pin.members.rows
+    if len(now) != len(before):
+        raise ValueError(f"Pin: indices has {len(now)} particles, but this Pin holds {len(before)}. Make another one.")
     if pin.scene is not None and not pin._grabs:
-        own.update(_held=before[:, 0], _grabs=members.rows.tobytes() != before.tobytes())
+        own.update(_held=before, _grabs=now.tobytes() != before.tobytes())
     own["members"] = members
-    return members.indices
+    return now
 
 
 class Target(Place):
@@ -89,7 +90,7 @@ class Pin(Anchored):
     indices: (m,) particles, read as (m, 1), a row for each. target: (m, dim), (m, 1, dim) as world.position[pin.indices], or
     (dim,) [m]; None holds the particles at their initial positions. Both are live. Assign to .target between frames, and the
     particles go there in a straight line during the next frame. Assign as many other particles to .indices, and the Pin holds
-    those from then on, as a new Pin would. That compiles nothing; a tv.Hand takes other particles faster still.
+    those from then on, as a new Pin would. That compiles nothing, and takes as long as with a tv.Hand.
     compliance: number or (m,) [m/N]. 0 takes the particles out of the solver and drives them, whatever forces act on them; above
     0 a spring of stiffness 1 / compliance draws them, as a mouse does. damping: [N s/m], of that spring.
 
@@ -106,7 +107,7 @@ class Pin(Anchored):
     exclusive = True
     indices: Any = Knob(_indices, "The particles that are held, (m, 1).")
     _grabs = False  # whether other particles were assigned since the last frame; the previous ones are in _held
-    _held = np.zeros(0, dtype=np.int32)
+    _held = np.zeros((0, 1), dtype=np.int32)
     target = Knob(_targets, "Where the particles are held, (m, dim) [m].")
 
     def __init__(self, indices, target=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0):
@@ -145,7 +146,7 @@ class Pin(Anchored):
 
     @property
     def held(self) -> np.ndarray:
-        """The particles that the Pin held before others were assigned, (m,)."""
+        """The particles that the Pin held before others were assigned, (m, 1)."""
         return self._held
 
     def grab(self, scene: Scene) -> None:
@@ -153,13 +154,13 @@ class Pin(Anchored):
         memory, dev, own, kinematic, rows = scene.memory, self.dev, vars(self), self.is_kinematic, self.members.rows
         self.note_arguments()
         own.update(_grabs=False, changed=kinematic, moving=False, new_force=False)
-        here = scene.state.get_some(memory, rows[:, 0]) if kinematic else own["target"]
+        here = scene.state.get_some(memory, rows_of(rows)) if kinematic else own["target"]
         if not kinematic:
             self.start = scene.particles
             memory.write(dev.lam, np.zeros_like(here))
             dev.spring.begin(self.compliance, self.damping)
             dev.size.set(self.start.size)
-        memory.write_each((dev.corners.members, rows), (dev.place.source, here), (dev.place.target, here))
+        memory.write_rows(ALL, (dev.corners.members, rows), (dev.place.source, here), (dev.place.target, here))
 
     def select(self, some: np.ndarray, number: np.ndarray) -> None:
         """Keep the rows in the mask `some`, with the new numbers of their particles."""
@@ -200,9 +201,10 @@ class Pin(Anchored):
 
     def upload(self) -> None:
         """Write the new target, which the next frame moves to."""
-        super().upload()
         if self.acts:
-            self.scene.memory.write(self.dev.place.target, self.target)
+            if not self.is_kinematic:
+                self.dev.spring.upload(self.compliance, self.damping)
+            self.scene.memory.write(self.dev.place.target, vars(self)["target"])
             self.moving = True
 
     def end_motion(self) -> None:

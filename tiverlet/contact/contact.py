@@ -17,6 +17,7 @@ from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from .body_restitution import BodyRestitution
+from .each_once import ROUNDS, EachOnce
 from .events import EventLog
 from .exclusions import excluded_pairs
 from .force_share import ForceShare
@@ -194,6 +195,7 @@ class Contact(PairContact):
         dev.splitting = MassSplitting(scene, dev.geometry, slid, skips, dev.push, ended, team, dev.known)
         if dev.known:
             dev.known.bind(dev.list, dev.geometry)
+        dev.each_once = EachOnce(dev.list, dev.splitting)
         dev.forces = ForceShare(scene, sums=dev.has_friction, lasting=True)
         dev.fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
         dev.restitution = None
@@ -204,7 +206,21 @@ class Contact(PairContact):
         if dev.spins:
             dev.spinning = Spinning(scene, self.table, dev.splitting.weight, dev.turn)
         dev.projection = VelocityProjection(scene, dev.geometry, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
+        dev.once = self._solves_once(scene, team)
         return dev.search
+
+    def _solves_once(self, scene: Scene, team: Team) -> bool:
+        """Whether each pair is solved once, see EachOnce: not where a GPU's threads, or what rests, take other turns. What spins
+        or bounces has sums of its own; small worlds compile faster without."""
+        dev = self.dev
+        alike = not (dev.has_restitution or dev.spins or scene.state.sleepers)
+        both = not (dev.search.has_static and (dev.has_loads or dev.reports))  # static particles store nothing of a pair
+        return alike and both and not team.launched and not scene.memory.compiler.few
+
+    @property
+    def once(self) -> bool:
+        """Whether each pair is solved once, in rounds."""
+        return self.dev.once
 
     def keep_stiffness(self, ratio: float) -> None:
         """Push as hard as before where the next substep is `ratio` times as long as the last one.
@@ -263,8 +279,24 @@ class Contact(PairContact):
         return self.dev.splitting.busy(begin)
 
     @ti.func
-    def relax(self, i, now):
-        """Compute the corrections of particle i by its pairs, and the new pushes of these pairs."""
+    def begin(self, i, now):
+        """Begin the pass of particle i, in which pairs add up its corrections."""
+        nothing = ti.Vector.zero(self.scene.real, self.dev.state.dim)
+        self.dev.each_once.begin(i)
+        if ti.static(self.dev.projection.unequal):
+            self.dev.projection.begin_strike(i)
+        self.dev.move[i] = nothing
+        if ti.static(self.dev.has_loads):
+            self.dev.known.carried.field[i] = nothing
+        if ti.static(self.dev.geometry.shrinks):
+            self.dev.geometry.held[i] = 0
+        if ti.static(self.dev.has_friction):
+            if now.final != 0 and now.first != 0:
+                self.dev.forces.sum[i] = nothing
+
+    @ti.func
+    def relax(self, i, turn, now):
+        """Compute the corrections of particle i by its pairs of this turn, and the new pushes of these pairs."""
         first, fresh, final = now.first, now.fresh, now.final
         total, w = ti.Vector.zero(self.scene.real, self.dev.state.dim), self.dev.w.of(i)
         lift, forced, carried, rubbed = total, total, total, total  # rubbed: by the friction of impacts
@@ -273,6 +305,8 @@ class Contact(PairContact):
         if ti.static(self.dev.has_restitution):
             if first != 0:
                 self.dev.restitution.clear(i, self.dev.splitting.weight[i])
+        if ti.static(self.dev.projection.unequal and not self.dev.once):
+            self.dev.projection.begin_strike(i)
         # Factors 1 or 0, faster than a branch in the loop: whether pairs continue from their push in this substep (again), or
         # from the push of the last substep (carries). After a start it does, too, where only the substep has another length.
         # Worlds with restitution start from the velocities that users read, and need half of the push first, as C gives it alone.
@@ -280,16 +314,37 @@ class Contact(PairContact):
         carries = ti.cast(ti.select(first != 0 and fresh == 0, 1, 0), self.scene.real)
         if ti.static(not self.dev.has_restitution):
             carries = ti.cast(ti.select(first != 0 and (fresh == 0 or now.span.since > 0), 1, 0), self.scene.real)
-        own, least = self.dev.splitting.weight[i], ti.cast(1, self.scene.real)  # least: the smallest push of i
+        own = self.dev.splitting.weight[i]
         held, parts = ti.cast(0, self.scene.real), ti.cast(0, self.scene.real)
-        change, borne = ti.cast(0, self.scene.real), ti.cast(0, self.scene.real)  # of overlaps, see note_struck()
-        if own > 0:
-            for word in range(self.dev.list.word_count(i)):
-                bits = self.dev.splitting.touching(i, word)
+        solves, words = own > 0, self.dev.list.word_count(i)
+        if ti.static(self.dev.once):
+            solves, words = True, self.dev.each_once.word_count(i, turn)
+        if ti.static(self.dev.has_friction):
+            if final != 0 and (first == 0 or ti.static(self.dev.once)):
+                forced = self.dev.forces.sum[i]
+        if ti.static(self.dev.once):  # what came from the first round, and from particles whose turn was before
+            total = self.dev.move[i]
+            if ti.static(self.dev.has_loads):
+                carried = self.dev.known.carried.field[i]
+            if ti.static(self.dev.geometry.shrinks):
+                held = self.dev.geometry.held[i]
+        if solves:
+            for word in range(words):
+                bits = ti.u32(0)
+                if ti.static(self.dev.once):
+                    bits = self.dev.each_once.bits(i, word, turn)
+                else:
+                    bits = self.dev.splitting.touching(i, word)
                 while bits != 0:
                     e = self.dev.list.entry(i, word, bits)
                     bits &= bits - ti.u32(1)
-                    j = self.dev.list.neighbour[e]
+                    j, other, sign = self.dev.list.neighbour[e], -1, ti.cast(1, self.scene.real)
+                    if ti.static(self.dev.once):
+                        other = self.dev.each_once.take_over(i, j, turn)
+                        if not self.dev.w.positive(i):  # a particle that cannot move stores nothing of a pair
+                            if other < 0:
+                                continue
+                            e, sign = other, -sign
                     last = self.dev.push.field[e]
                     shared = own + self.dev.splitting.weight[j]
                     contact_distance = self.dev.geometry.contact_distance(i, j)
@@ -303,9 +358,9 @@ class Contact(PairContact):
                     paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self.dev.w.of(j)
                     if ti.static(self.dev.projection.unequal):
                         if first != 0:
-                            borne = ti.max(borne, alone * last)
-                            if last > 0 and self.dev.projection.is_heavier(i, j):
-                                change = ti.max(change, self.dev.projection.change_of(i, j, n, overlap, alone * last))
+                            self.dev.projection.note_pair(i, j, n, overlap, alone * last)
+                            if other >= 0:
+                                self.dev.projection.note_pair(j, i, -n, overlap, alone * last)
                     push, known = again * last, ti.zero(overlap)  # known: the part of the push that its known load already gave
                     left = ti.zero(overlap)  # the part of the substep after an impact
                     keeps = ti.max(lesser(1 - alone * each, ti.static(CARRY)), 0)
@@ -344,17 +399,17 @@ class Contact(PairContact):
                         if not rests:
                             part = ti.zero(part)
                             push -= known
-                    if ti.static(self.dev.has_loads):
-                        load = self.dev.known.update_load(i, j, e, part, push + part, now)
-                        carried += w * load * self.dev.geometry.direction(i, j)  # the normal as the next substep starts
+                    load = 0 * n
+                    if ti.static(self.dev.has_loads):  # along the normal as the next substep starts
+                        load = self.dev.known.update_load(i, j, e, part, push + part, now) * self.dev.geometry.direction(i, j)
+                        carried += w * load
                     pressed = part + known
                     if ti.static(self.dev.has_restitution):
                         self.dev.impulse.field[e] = self.dev.impulse.field[e] + pressed
                     if ti.static(self.dev.reports):
                         self.dev.events.record(i, j, e, n, pressed, final)
                     push += part
-                    least = lesser(push, least)
-                    want = part * n
+                    want, force = part * n, 0 * n  # force: the part of friction that counts as one
                     if ti.static(self.dev.has_restitution and self.dev.has_friction):
                         if given > 0:
                             given, left, _approach = self.dev.restitution.collision(i, j, n, overlap)
@@ -372,7 +427,7 @@ class Contact(PairContact):
                             forced += share * tangential
                             spin_forced += share * turned
                     elif ti.static(self.dev.has_friction):
-                        want -= self.held(i, j, n, pressed * shared + given, self.dev.slip.field[e]) / shared
+                        want -= self.held(i, j, n, pressed * shared + given, sign * self.dev.slip.field[e]) / shared
                     total += w * want
                     if ti.static(self.dev.has_restitution and self.dev.has_friction):
                         if given > 0:
@@ -382,14 +437,24 @@ class Contact(PairContact):
                             approach = -self.dev.state.relative_displacement(
                                 self.dev.forces.before[i] - self.dev.forces.before[j], i, j
                             ).dot(n)
-                            forced += self.dev.forces.share(approach, pressed * alone) * w * (want - part * n)
-                    self.dev.push.field[e] = push
-            if least == 0:
-                self.dev.splitting.invalidate_bound(i)
+                            force = self.dev.forces.share(approach, pressed * alone) * (want - part * n)
+                            forced += w * force
+                    self.store_push(i, e, push)
+                    if ti.static(self.dev.once):
+                        if other >= 0:
+                            self.push_back(i, j, e, other, push, want)
+                            if ti.static(self.dev.has_loads):
+                                self.dev.known.push_back(j, e, other, load)
+                            if ti.static(self.dev.geometry.shrinks):
+                                out = ti.max(self.dev.geometry.held[j], self.dev.geometry.excess(j, i, -n, overlap, now.h))
+                                self.dev.geometry.held[j] = out
+                            if ti.static(self.dev.has_friction):
+                                if final != 0:
+                                    self.dev.forces.sum[j] = self.dev.forces.sum[j] - self.dev.w.of(j) * force
         self.dev.move[i] = total
         if ti.static(self.dev.projection.unequal):
-            if first != 0:
-                self.dev.projection.note_struck(i, change, borne)
+            if first != 0 and turn.round == ROUNDS - 1:
+                self.dev.projection.note_struck(i)
         if ti.static(self.dev.geometry.shrinks):
             self.dev.geometry.held[i] = held
         if ti.static(self.dev.has_loads):
@@ -400,7 +465,7 @@ class Contact(PairContact):
                 self.dev.forces.add_turn(i, spin_forced, first)
         if ti.static(self.dev.has_friction):
             if final != 0:
-                self.dev.forces.add(i, forced, first)
+                self.dev.forces.sum[i] = forced
         if ti.static(self.dev.has_restitution):
             self.dev.restitution.lift[i] = lift
             if ti.static(self.dev.has_friction):
@@ -410,9 +475,23 @@ class Contact(PairContact):
                     self.dev.restitution.bodies.take_part(i, parts)
 
     @ti.func
+    def store_push(self, i, e, push):
+        """Store the push of the pair at entry e of the list of particle i, unless i cannot move, see NeighbourSearch."""
+        if self.dev.w.positive(i):
+            self.dev.push.field[e] = push
+            if push == 0:
+                self.dev.splitting.invalidate_bound(i)
+
+    @ti.func
+    def push_back(self, i, j, e, other, push, want):
+        """Correct particle j, too, by what pair e of particle i wants of i. other: the entry of i in the list of j."""
+        self.dev.move[j] = self.dev.move[j] - self.dev.w.of(j) * want
+        self.store_push(j, other, push)
+
+    @ti.func
     def held(self, i, j, n, normal, slip):
         """Return the part of a pair's slip [m], this substep included, that friction takes back for a normal displacement."""
-        moved = self.dev.state.relative_displacement(slip + self.dev.state.d[i] - self.dev.state.d[j], i, j)
+        moved = self.dev.state.relative_displacement(slip + (self.dev.state.d[i] - self.dev.state.d[j]), i, j)
         return self.table.held(i, j, n, normal, moved)
 
     @ti.func

@@ -170,6 +170,13 @@ class KnownLoads:
         return load
 
     @ti.func
+    def push_back(self, j, e, other, load):
+        """Let particle j bear the opposite of a load (a vector) [N]. e, other: the entries of the pair in both lists."""
+        self.carried.field[j] = self.carried.field[j] - self.state.w.of(j) * load
+        for piece in ti.static(self.pair_data):
+            piece.field[other] = piece.field[e]
+
+    @ti.func
     def learn(self, of: ti.template(), i, j, e, load, mean):  # type: ignore[valid-type]
         """Return one load of entry e after a window in which `mean` of it was missing on average [N]."""
         steady = is_steady(mean, of.earlier.field[e])

@@ -77,7 +77,8 @@ class PairContact(Feature):
 
     - detect(i, first), if it `detects`
     - count(begin, end, now) and busy(begin), by blocks of particles
-    - relax(i, now)
+    - begin(i, now), if pairs are solved `once`
+    - relax(i, turn, now)
     - store_pushes(i, now), if its contacts are `stored_once` and know loads
     - choose(i) and apply(i) of its `dev.restitution`, in rounds while `dev.hit` is set, if any pair has restitution
     - apply_corrections(i, first)
@@ -105,6 +106,7 @@ class PairContact(Feature):
     stored_once = False  # whether one particle stores a contact, and others read it; else each particle of a pair stores its own
     detects = False  # whether each pass calls detect() for all particles, before contacts are counted
     can_keep_stiffness = False  # whether keep_stiffness() works
+    once = False  # whether a pair is solved once for both particles, see EachOnce
     projects = False  # whether it has a velocity projection of loaded pairs, see velocity_projection.py
 
     def _surface(self, name: str, value):

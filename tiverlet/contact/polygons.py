@@ -332,7 +332,7 @@ class Polygons(PairContact):
                         self.dev.restitution.split[i] = parts
 
     @ti.func
-    def relax(self, i, now):
+    def relax(self, i, turn, now):
         """Compute the corrections of particle i by its contacts."""
         first, final = now.first, now.final
         total, lifts, forced = 0 * self.dev.state.x[i], 0 * self.dev.state.x[i], 0 * self.dev.state.x[i]

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 RESTLESS = 0.25  # change of an overlap in a substep, in overlaps that bear the load of the particle: more of it is restless
 FAINT = 2.0**-10  # the same, in displacements of the particle: less may be rounding
 UNEQUAL = 3.0  # ratio of the masses of a pair from which it is projected at once
-RINGS = 16  # how many contacts away from a restless particle others are projected, too
+RINGS = 16  # how many contacts away from a restless particle others are projected, too, at most
+REACH = 2.0  # around what is projected at once, per root of the ratio of masses: it presses on no more than that
 FAR = -1  # ring of a particle beyond them
 PASSES = 32
 CONDITION = 400.0  # modes with an eigenvalue of at least 1 / CONDITION keep 1 / T(PASSES) = 8 % of their velocity
@@ -39,7 +40,8 @@ class VelocityProjection:
     pairs changes, in a substep, by more than a quarter of the largest overlap that bears its load. What was restless at the last
     projection is projected again after OFTEN substeps, with all that is up to RINGS contacts away. A heavy particle, M, on a
     light one, m, that cannot give way is held as by a spring that turns it round in about sqrt(M / m) substeps. So what is
-    restless in such a pair is projected at once. Pairs that part are left out: what is thrown off a pile is free to go.
+    restless in such a pair is projected at once, with all that is up to REACH sqrt(M / m) contacts away: what presses on heaps of
+    unequal discs in every substep costs that in each. Pairs that part are left out: what is thrown off a pile is free to go.
 
     push: pair data, the push of each pair in the last substep. weight: m_i w_i of each particle. restitution: the Restitution of
     the pairs, or None. change: a scratch field of vectors, (n,).
@@ -62,8 +64,12 @@ class VelocityProjection:
         self.any_restless = add("Contact.any_restless", None, kind=ti.i32, state=True)
         self.ring = add("Contact.ring", scene.count, kind=ti.i32)
         self.unequal = unequal(scene.particles.mass)
-        if self.unequal:  # which particles are restless in a pair of unequal masses in this substep, and whether any is
+        if self.unequal:  # how far around a particle that is restless in a pair of unequal masses others are projected in this
+            # substep (0: it is not), and whether any is restless
             self.struck = add("Contact.struck", scene.count, kind=ti.i32)
+            # The largest change of overlaps with lighter particles, the largest overlap that bears a load, both [m], and the
+            # inverse mass of the lightest of these particles.
+            self.strike = add("Contact.strike", scene.count, width=3)
             self.any_struck = add("Contact.any_struck", None, kind=ti.i32)
 
     @staticmethod
@@ -120,11 +126,27 @@ class VelocityProjection:
         return w > 0 and other > ti.static(UNEQUAL) * w
 
     @ti.func
-    def note_struck(self, i, change, borne):
-        """Note if particle i is restless. change: that of overlaps with lighter particles, see is_restless()."""
-        self.struck[i] = ti.cast(self.is_restless(i, change, borne), ti.i32)
-        if self.struck[i] != 0:
+    def begin_strike(self, i):
+        """Begin a substep of particle i, before its pairs are noted."""
+        self.strike[i] = ti.Vector.zero(self.state.real, 3)
+
+    @ti.func
+    def note_pair(self, i, j, n, overlap, borne):
+        """Note for particle i what its pair with j, with the normal n, changes and bears in this substep, see change_of()."""
+        self.strike[i][1] = ti.max(self.strike[i][1], borne)
+        if borne > 0 and self.is_heavier(i, j):
+            self.strike[i][0] = ti.max(self.strike[i][0], self.change_of(i, j, n, overlap, borne))
+            self.strike[i][2] = ti.max(self.strike[i][2], self.state.w.of(j))
+
+    @ti.func
+    def note_struck(self, i):
+        """Note if particle i is restless, and how far around it, once all of its pairs are noted."""
+        change, borne, least = self.strike[i]
+        reach = 0
+        if self.is_restless(i, change, borne):
+            reach = ti.cast(ti.min(ti.static(REACH) * ti.sqrt(least / self.state.w.of(i)), ti.static(RINGS)), ti.i32)
             self.any_struck[None] = 1
+        self.struck[i] = reach
 
     @ti.func
     def bears(self, i, e):
@@ -176,10 +198,11 @@ class VelocityProjection:
                 self.loaded[begin + count] = i
                 count += 1
                 if damps != ALWAYS:
-                    center = damps == MAYBE and self.restless[i] != 0
+                    ring = ti.select(damps == MAYBE and self.restless[i] != 0, 0, FAR)
                     if ti.static(self.unequal):
-                        center = center or self.struck[i] != 0
-                    self.ring[i] = ti.select(center, 0, FAR)
+                        if ring == FAR and self.struck[i] != 0:
+                            ring = ti.static(RINGS) - self.struck[i]
+                    self.ring[i] = ring
         self.count[piece] = count
 
     @ti.func
@@ -188,7 +211,7 @@ class VelocityProjection:
         if self.ring[i] == k:
             for e in range(self.list.first[i], self.list.first[i] + self.number[i]):
                 j = self.list.old_neighbour[e]
-                if self.ring[j] == FAR:
+                if self.ring[j] == FAR or self.ring[j] > k + 1:
                     self.ring[j] = k + 1  # whoever else does this writes the same
 
     @ti.func

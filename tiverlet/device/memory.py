@@ -25,6 +25,21 @@ from .patches.compiler import LEAN, Compiler
 from .redeclaration import Redeclaration
 
 GROUP = 16  # fields per transfer kernel; Taichi unrolls the loop over them
+Rows = np.ndarray | slice  # which elements of fields, by index; NumPy finds a single one in a fifth of the time by a slice
+ALL = slice(None)
+
+
+def rows_of(indices: np.ndarray) -> Rows:
+    """Return indices, (m, 1), as Rows."""
+    if len(indices) == 1:
+        i = indices.item()
+        return slice(i, i + 1)
+    return indices[:, 0]
+
+
+def numbers_of(some: Rows) -> Any:
+    """Return the indices of rows_of(), (m,); a number where there is one."""
+    return some.start if isinstance(some, slice) else some
 
 
 class Memory:
@@ -335,13 +350,9 @@ class Memory:
     def write(self, field, values) -> None:
         """Overwrite a whole field. Without a chosen copy, write to all: values are the same for all, or have one more axis."""
         self.check()
-        if np.size(values):
-            self._load([self._find(field)], [np.asarray(values, dtype=np.float64)])
-
-    def write_each(self, *values: tuple[Any, np.ndarray]) -> None:
-        """Overwrite several fields, each with a non-empty array."""
-        self.check()
-        self._load([self._find(field) for field, _ in values], [array for _, array in values])
+        array = np.asarray(values, dtype=np.float64)
+        if array.size:
+            self._load([self._find(field)], [array])
 
     def write_from(self, field, first: int, values) -> None:
         """Overwrite elements of a field from index `first` on. For a single world (not one of many copies)."""
@@ -354,16 +365,17 @@ class Memory:
         else:
             view[first : first + len(values)] = values
 
-    def write_rows(self, field, some: np.ndarray, values) -> None:
-        """Overwrite some elements of a field, by index. For a single world (not one of many copies)."""
+    def write_rows(self, some: Rows, *values: tuple[Any, Any]) -> None:
+        """Overwrite some elements of fields. For a single world (not one of many copies)."""
         self.check()
-        view = self._host_views().get(id(self._find(field)))
-        if view is None:
-            rows = self.read(field)
-            rows[some] = values
-            self.write(field, rows)
-        else:
-            view[some] = values
+        views = self._host_views()
+        for field, rows in values:
+            if views:
+                views[id(self.entries[self._at[id(field)]])][some] = rows
+            else:
+                whole = self.read(field)
+                whole[some] = rows
+                self.write(field, whole)
 
     def write_some(self, field, values, some: np.ndarray) -> None:
         """Overwrite a field of some copies. values: one value for all of them, or one row per copy."""
@@ -408,6 +420,12 @@ class Memory:
         self.check()
         view = self._host_views().get(id(self._find(field)))
         return self.read(field) if view is None else view
+
+    def rows(self, some: Rows, *fields) -> list[np.ndarray]:
+        """Return some elements of fields, which the caller must not change. For a single world (not one of many copies)."""
+        self.check()
+        views, entries = self._host_views(), [self.entries[self._at[id(field)]] for field in fields]
+        return [(views[id(e)] if views else self._dump([e])[0])[some] for e in entries]
 
     def state(self) -> dict[str, np.ndarray]:
         """Return copies of the fields that make up the exact state, by name."""

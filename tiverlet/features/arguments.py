@@ -67,7 +67,7 @@ def record_arguments(kind: Any) -> None:
 
 def set_attribute(thing: Any, name: str, value: Any) -> None:
     """The __setattr__ of classes that record arguments. After __init__, it sets only knobs and attributes that a world keeps."""
-    if name.startswith("_") or name in thing.kept_by_world or isinstance(getattr(type(thing), name, None), Knob):
+    if name.startswith("_") or name in thing.kept_by_world or name in knobs_of(type(thing)):
         object.__setattr__(thing, name, value)
     elif "arguments" in thing.__dict__:
         raise AttributeError(_refused(thing, name))

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from ..particles import Particles, State
     from .regrouping import Regrouping
 
-ONE = (float, int, type(None))  # types of one value for all constraints
+ONE = (float, int, str, np.generic, type(None))  # types of one value for all constraints
 BENT, FAR = 1, 2  # a constraint turned in a substep by more than 26 degrees, by more than 41
 
 
@@ -386,7 +386,7 @@ class Batch(Feature):
         now = {name: self.__dict__[name] for name in self.each if name in self.__dict__} | {self.index_name: self.listing}
         if "rest" in now:
             now[self.rest_name] = now["rest"]
-        self.arguments = {k: v if type(v) in ONE or np.isscalar(v) else now.get(k, v) for k, v in self.arguments.items()}
+        self.arguments = {k: v if isinstance(v, ONE) else now.get(k, v) for k, v in self.arguments.items()}
 
     @property
     def listing(self) -> Any:

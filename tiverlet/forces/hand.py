@@ -31,7 +31,7 @@ class Hand(Acceleration):
 
     The hand is a critically damped spring. So the particle comes to a fixed target without oscillation in a few times 1 / rate,
     whatever its mass. Particles that hang on it weigh it down. The hand can take another particle at any time; a Pin with
-    compliance holds many particles, but always the same ones.
+    compliance holds many particles, and can take as many others.
 
     target: (dim,) [m]. It jumps at the start of a frame, where the target of a Pin glides. In a periodic box its nearest image
     counts. particle: the index, -1 for none. rate: [1/s], at least 0; the step resolves it while h times the rate is well below

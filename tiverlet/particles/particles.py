@@ -146,7 +146,8 @@ def _fixed(name: str, array: np.ndarray) -> np.ndarray:
 
 def in_range(who: str, name: str, position: np.ndarray) -> None:
     """Raise ValueError for coordinates above LARGEST, whose squares might overflow in f32."""
-    if np.abs(position).max(initial=0.0) > LARGEST:
+    few = position.size <= checks.FEW
+    if (max(map(abs, position.ravel().tolist()), default=0.0) if few else np.abs(position).max(initial=0.0)) > LARGEST:
         far = np.abs(position) > LARGEST
         i, k = np.unravel_index(int(np.argmax(far)), far.shape)
         raise ValueError(

@@ -8,7 +8,7 @@ from ..device import at, inline, ti
 from ..device.number import Number, OnDevice
 
 if TYPE_CHECKING:
-    from ..device.memory import Memory
+    from ..device.memory import Memory, Rows
 
 
 class PerParticle:
@@ -36,19 +36,11 @@ class PerParticle:
         else:
             memory.write(self.field, values)
 
-    def can_change(self, values: np.ndarray, some: np.ndarray) -> bool:
-        """Return can_assign() for values that differ from the present ones only at `some`.
-
-        If the values at `some` differ from each other, the others need no comparison.
-        """
-        return (not self.uniform and len({*values[some].tolist()}) > 1) or self.can_assign(values)
-
-    def change(self, memory: "Memory", values: np.ndarray, some: np.ndarray) -> None:
-        """Write the values at `some`, for which can_change() is true, in an elastic memory."""
-        if self.uniform:
-            self.assign(memory, values)
-        else:
-            memory.view(self.field)[some] = values[some]
+    def change(self, memory: "Memory", values: np.ndarray, *some: "Rows") -> None:
+        """Write the values at `some`, in an elastic memory, where values were and are not all equal."""
+        view = memory.view(self.field)
+        for rows in some:
+            view[rows] = values[rows]
 
     @inline
     def of(self, i):

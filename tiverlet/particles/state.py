@@ -9,7 +9,7 @@ from ..features.regrouping import Regrouping
 from .per_particle import PerParticle
 
 if TYPE_CHECKING:
-    from ..device.memory import Memory
+    from ..device.memory import Memory, Rows
     from .particles import Particles
 
 
@@ -71,13 +71,14 @@ class State:
         if self.spins:
             self.spin.regroup(memory, change)
 
-    def can_set_inverse_mass(self, particles: "Particles", inv_mass: np.ndarray, some: np.ndarray) -> bool:
-        """Whether other inverse masses can be written in place. some: the particles whose inverse mass may differ."""
-        return self.w.can_change(inv_mass, some) and (not self.spins or self.spin.can_set_inverse_mass(particles, inv_mass))
+    def can_set_inverse_mass(self, particles: "Particles", inv_mass: np.ndarray) -> bool:
+        """Whether other inverse masses can be written in place, if as many are 0 as before."""
+        return not self.w.uniform and (not self.spins or self.spin.can_set_inverse_mass(particles, inv_mass))
 
-    def set_inverse_mass(self, memory: "Memory", particles: "Particles", inv_mass: np.ndarray, some: np.ndarray) -> None:
-        """Write other inverse masses, for which can_set_inverse_mass() is true."""
-        self.w.change(memory, inv_mass, some)
+    def set_inverse_mass(self, memory: "Memory", particles: "Particles", inv_mass: np.ndarray, *some: "Rows") -> None:
+        """Write other inverse masses, for which can_set_inverse_mass() is true. some: the particles whose inverse mass may
+        differ."""
+        self.w.change(memory, inv_mass, *some)
         if self.spins:
             self.spin.set_inverse_mass(memory, particles, inv_mass)
 
@@ -86,10 +87,12 @@ class State:
         out = memory.read(self.x, np.float64)
         return (out + memory.read(self.low) if self.sums else out)[..., : self.count, :]
 
-    def get_some(self, memory: "Memory", some: np.ndarray) -> np.ndarray:
+    def get_some(self, memory: "Memory", some: "Rows") -> np.ndarray:
         """Return the positions of the particles `some`, by their numbers, as get() does. For a single world."""
-        out = memory.view(self.x)[some].astype(np.float64)
-        return out + memory.view(self.low)[some] if self.sums else out
+        if self.sums:
+            x, low = memory.rows(some, self.x, self.low)
+            return x.astype(np.float64) + low
+        return memory.rows(some, self.x)[0].astype(np.float64)
 
     def put(self, memory: "Memory", position: np.ndarray) -> None:
         """Overwrite the positions."""

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+from ..contact.each_once import ROUNDS, Turn, first_round
 from ..contact.projection_times import ALWAYS
 from ..device import ti
 from ..device.number import OnDevice
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class ContactPass:
-    """The contacts of one world, if it has any. Each pair is solved from both sides, particle by particle."""
+    """The contacts of one world, if it has any. Pairs are solved particle by particle."""
 
     n: Any = OnDevice()  # particles
 
@@ -48,19 +49,23 @@ class ContactPass:
             self.team.wait()
             for k in range(self.particles.piece_count(now.thread)):
                 begin, end = self.particles.piece(k, now.thread)
-                for b in range(blocks(begin, end)):
-                    low, high = block(b, begin, end)
-                    if c.busy(low) != 0:
-                        for i in range(low, high):
-                            if c.dev.state.awake(i):
-                                c.relax(i, now)
-                    elif now.final != 0:
-                        if ti.static(c.has_friction):
+                if ti.static(c.once):
+                    for i in range(begin, end):
+                        c.begin(i, now)
+                for r in range(first_round(c, begin), ROUNDS):
+                    for b in range(blocks(begin, end)):
+                        low, high = block(b, begin, end)
+                        if c.busy(low) != 0:
                             for i in range(low, high):
                                 if c.dev.state.awake(i):
-                                    c.dev.forces.add(i, ti.Vector.zero(self.real, self.dim), now.first)
-                                    if ti.static(c.dev.forces.spins):
-                                        c.dev.forces.add_turn(i, 0 * c.dev.forces.turned[i], now.first)
+                                    c.relax(i, Turn(begin, end, r), now)
+                        elif now.final != 0:
+                            if ti.static(c.has_friction and not c.once):
+                                for i in range(low, high):
+                                    if c.dev.state.awake(i):
+                                        c.dev.forces.add(i, ti.Vector.zero(self.real, self.dim), now.first)
+                                        if ti.static(c.dev.forces.spins):
+                                            c.dev.forces.add_turn(i, 0 * c.dev.forces.turned[i], now.first)
             self.team.wait()
             if ti.static(c.shares_loads):
                 for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):

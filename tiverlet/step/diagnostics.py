@@ -98,22 +98,28 @@ class Diagnostics:
 
         Second order in the middle of a substep, where d / h is the velocity.
         """
-        d = self.state.d[i] * ti.cast(1, ti.f64)
         out, kinetic = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         if self.state.w.positive(i):
-            out = 0.5 * scale * scale * d.dot(d)
-            kinetic = out
-            for f in ti.static(self.step.integrator.forces.all):
-                if ti.static(f.conservative):
-                    out += f.potential(i, ti.cast(x, ti.f64) - back * d)
-            if ti.static(self.state.spins):
-                turning = scale * scale * self.state.spin.energy(i)
-                out += turning
-                kinetic += turning
+            out, kinetic = self.energy_per_mass(i, x, scale, back)
             out /= self.state.w.of(i)
             kinetic /= self.state.w.of(i)
             for f in ti.static(self.measured):
                 out += f.energy(i, back)
+        return out, kinetic
+
+    @ti.func
+    def energy_per_mass(self, i, x, scale, back):
+        """Return energy() per mass, without the energy of pair forces."""
+        d = self.state.d[i] * ti.cast(1, ti.f64)
+        kinetic = 0.5 * scale * scale * d.dot(d)
+        out = kinetic
+        for f in ti.static(self.step.integrator.forces.all):
+            if ti.static(f.conservative):
+                out += f.potential(i, ti.cast(x, ti.f64) - back * d)
+        if ti.static(self.state.spins):
+            turning = scale * scale * self.state.spin.energy(i)
+            out += turning
+            kinetic += turning
         return out, kinetic
 
     @ti.func

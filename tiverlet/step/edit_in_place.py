@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from ..constraints.core.anchored import refuse_held_twice
+from ..constraints.core.anchored import Anchored, refuse_held_twice
 from ..constraints.pin import Pin
+from ..device.memory import Rows, rows_of
 from ..features.feature import Batch, Feature
 from ..features.regrouping import Regrouping
 from ..particles import Particles
@@ -129,18 +130,19 @@ def regroup(world: Any, edit: Edit, added: Particles | None) -> None:
     runner.carry_loads()
 
 
-@dataclass(frozen=True)
+@dataclass
 class Grab:
     """A planned change of the particles that pins hold.
 
     soft: whether any of the pins is a spring. inv_mass: (n,) inverse masses of all particles after the change, 0 for driven ones.
-    some: the particles whose inverse mass may change.
+    before, after: the particles that pins have driven, in ascending order, and those that they will drive, see Rows.
     """
 
     pins: list[Pin]
     soft: bool
     inv_mass: np.ndarray
-    some: np.ndarray
+    before: Rows
+    after: Rows
 
 
 def grabbing(world: Any) -> Grab | None:
@@ -156,34 +158,34 @@ def grabbing(world: Any) -> Grab | None:
     for f in pins:
         if not (f.needs_new_state and f.acts):
             return None
-    driving, inv_mass, some = [f for f in pins if f.is_kinematic], scene.inv_mass, NOBODY
+    driving, inv_mass, before, after = [f for f in pins if f.is_kinematic], scene.inv_mass, NOBODY, NOBODY
     if driving:
-        before, after = _joined([f.held for f in driving]), _joined([f.members.rows[:, 0] for f in driving])
-        inv_mass, some = inv_mass.copy(), _joined([before, after])
+        before, after = _joined([f.held for f in driving]), _joined([f.members.rows for f in driving])
+        inv_mass = inv_mass.copy()
         inv_mass[before] = world._particles.inv_mass[before]
         inv_mass[after] = 0.0
-        if not scene.state.can_set_inverse_mass(world._particles, inv_mass, some) or (
-            runner.search and not runner.search.has_static
-        ):
+        if not scene.state.can_set_inverse_mass(world._particles, inv_mass) or (runner.search and not runner.search.has_static):
             return None
-        if any((inv_mass[b.indices] != scene.inv_mass[b.indices]).any() for b in runner.batches):
-            return None
+        for b in runner.batches:
+            if (inv_mass[b.indices] != scene.inv_mass[b.indices]).any():
+                return None
     soft = len(driving) < len(pins)
     if soft and not scene.slots.can_reassign(inv_mass, runner.batches):
         return None
-    refuse_held_twice(world._particles, world._features, pins)
-    return Grab(pins, soft, inv_mass, some)
+    # Fast path: a single feature holds particles, and those that it drives from now on could move.
+    if soft or 0.0 in scene.inv_mass[after].tolist() or len([f for f in world._features if isinstance(f, Anchored)]) > 1:
+        refuse_held_twice(world._particles, world._features, pins)
+    return Grab(pins, soft, inv_mass, before, after)
 
 
 def grab(world: Any, change: Grab) -> None:
     """Carry out a planned change of the particles that pins hold."""
     runner, pins = world._runner, change.pins
     scene, memory, particles = runner.scene, runner.memory, world._particles
-    if len(change.some):
-        free = min(np.count_nonzero(inv_mass) for inv_mass in (scene.inv_mass, change.inv_mass))
+    if change.inv_mass is not scene.inv_mass:
         scene.inv_mass = change.inv_mass
-        scene.state.set_inverse_mass(memory, particles, change.inv_mass, change.some)
-        if free < len(change.inv_mass) - 1:  # lists lack pairs in which neither particle can move
+        scene.state.set_inverse_mass(memory, particles, change.inv_mass, change.before, change.after)
+        if runner.immovable > 1:  # lists lack pairs in which neither particle can move
             runner.invalidate()
     if change.soft:
         scene.particles = particles.placed(scene.state.get(memory))
@@ -195,9 +197,9 @@ def grab(world: Any, change: Grab) -> None:
     runner.carry_loads()
 
 
-def _joined(some: list[np.ndarray]) -> np.ndarray:
-    """Return arrays joined one behind the other."""
-    return some[0] if len(some) == 1 else np.concatenate(some)
+def _joined(some: list[np.ndarray]) -> Rows:
+    """Return the particles of several pins, (m, 1) each, in ascending order."""
+    return rows_of(some[0] if len(some) == 1 == len(some[0]) else np.sort(np.concatenate(some), axis=0))
 
 
 def _pairs(near: Any, change: Regrouping) -> tuple[np.ndarray, dict[str, np.ndarray]]:

@@ -15,6 +15,7 @@ from ..colliders.collider import Collider
 from ..constraints.pin import Pin
 from ..contact.pair_contact import PairContact
 from ..contact.touches import ContactEvents
+from ..device.memory import numbers_of
 from ..features.feature import Batch, Feature
 from ..neighbours.periodic import Periodic
 from ..particles import Particles
@@ -166,25 +167,25 @@ def renew(world: Any) -> None:
         build_again(world, np.ones(len(world.particles), dtype=bool), None, world.features, NONE)
         return
     told = world._all_events() if runner.logs else world._events
-    loose = grabbing.some[runner.scene.inv_mass[grabbing.some] == 0]
-    loose = np.unique(loose) if len(loose) > 1 else loose
-    seen, moved = clock.velocity_override, runner.scene.inv_mass > 0
-    had = None
-    if seen is not None:
-        had = seen[loose]
-    elif not clock.d_is_velocity:
-        had = runner.memory.view(runner.scene.state.d)[loose] / clock.h
-    if grabbing.soft or not impulse.has_enough_digits(runner):
-        with runner.memory.compiler():
-            runner.restart_between(world.iterations)
-    clock.energy = None
-    runner.wake()
-    edit_in_place.grab(world, grabbing)
+    seen, inv_mass, before = clock.velocity_override, runner.scene.inv_mass, grabbing.before
+    want = None if seen is None else seen[before]
+    if clock.d_is_velocity or grabbing.soft or not impulse.has_enough_digits(runner):
+        clock.energy = None
+        if not clock.d_is_velocity:
+            want = runner.memory.rows(before, runner.scene.state.d)[0] / clock.h if want is None else want
+            with runner.memory.compiler():
+                runner.restart_between(world.iterations)
+        edit_in_place.grab(world, grabbing)
+        if want is not None:
+            impulse.let_go(runner, np.atleast_1d(numbers_of(before)), want, world.iterations)
+    else:
+        edit_in_place.grab(world, grabbing)
+        change = runner.release(before, want, grabbing.after, inv_mass)
+        known = clock.energy is not None and not (runner.scene.state.spins or runner.step.pair_forces)
+        clock.energy = clock.energy + change if known else None
     world._events = told
-    if had is not None:
-        impulse.let_go(runner, loose, had, world.iterations)
     if clock.velocity_override is not None:
-        clock.velocity_override = _held(runner, clock.velocity_override, moved)
+        clock.velocity_override = _held(runner, clock.velocity_override, inv_mass > 0)
     for watcher in world._watchers:
         watcher.regrouped()
 
@@ -226,7 +227,7 @@ def _seen(
     for f in world.features:
         if isinstance(f, Pin) and f in features and f.needs_new_state:  # a pin that takes other particles
             if f.is_kinematic:
-                loose[f.held] = loses = True
+                loose[f.held[:, 0]] = loses = True
         elif isinstance(f, Batch | PairContact):
             stays = f.kept_mask(number)[0] if f in features else np.zeros(1, dtype=bool)
             if not stays.all():
@@ -271,8 +272,9 @@ def _edited(
         _launch(world, n)
     if seen is not None:  # removed constraints contributed to the velocities of particles that remain
         seen = seen[some] if added is None else np.concatenate([seen[some], added.velocity])
-        _let_go(world, seen, np.concatenate([loose[some], np.zeros(m, dtype=bool)]))
-        clock.velocity_override = _held(world._runner, seen, np.concatenate([moved[some], np.ones(m, dtype=bool)]))
+        moved = np.concatenate([moved[some], np.ones(m, dtype=bool)])
+        _let_go(world, seen, np.concatenate([loose[some], np.zeros(m, dtype=bool)]), moved)
+        clock.velocity_override = _held(world._runner, seen, moved)
     for watcher in world._watchers:
         watcher.regrouped()
 
@@ -283,11 +285,19 @@ def _held(runner: Any, velocity: np.ndarray, moved: np.ndarray) -> np.ndarray:
     return np.where(now[:, None], runner.memory.read(runner.scene.state.d)[: runner.n] / h, velocity)
 
 
-def _let_go(world: Any, seen: np.ndarray, loose: np.ndarray) -> None:
-    """Let the particles in the mask `loose` continue with the velocities `seen`, (n, dim), that they had before the edit."""
+def _let_go(world: Any, seen: np.ndarray, loose: np.ndarray, moved: np.ndarray) -> None:
+    """Let the particles in the mask `loose` continue with the velocities `seen`, (n, dim), that they had before the edit.
+
+    moved: which particles could move then; the others were driven.
+    """
     runner, some = world._runner, np.flatnonzero(loose)
-    if runner.clock.d_is_velocity or impulse.has_enough_digits(runner):
+    if runner.clock.d_is_velocity:
         impulse.let_go(runner, some, seen[some], world.iterations)
+    elif impulse.has_enough_digits(runner):
+        driven, free = some[~moved[some]], some[moved[some]]
+        impulse.let_go(runner, free, seen[free], world.iterations)
+        if len(driven):
+            runner.release(driven, seen[driven])
     elif len(some):
         world._start_from(seen)
 

@@ -35,6 +35,11 @@ def factor(h: Any, drag: np.ndarray) -> np.ndarray:
     return h / np.maximum(drag[:, 0], NOTHING)
 
 
+def factor_of(clock: Any) -> float:
+    """Return factor() for a single world (not one of many copies)."""
+    return clock.h / max((clock.drag or FREE)[0], NOTHING)
+
+
 class Displacements:
     """Displacements of some particles, (..., dim) [m], with their low words and the parts that forces gave them.
 
@@ -223,14 +228,14 @@ def let_go(runner: Any, some: np.ndarray, want: np.ndarray, iterations: int) -> 
     if not len(some):
         return
     if runner.clock.d_is_velocity:
-        memory.write_rows(runner.scene.state.d, some, want)
+        memory.write_rows(some, (runner.scene.state.d, want))
         return
     first = int(some[0])
     lack = want - runner.velocity(iterations, first, int(some[-1]) + 1)[some - first]
     those = Displacements(
-        runner, moves[moves], lambda field: memory.view(field)[some], lambda field, rows: memory.write_rows(field, some, rows)
+        runner, moves[moves], lambda field: memory.view(field)[some], lambda field, rows: memory.write_rows(some, (field, rows))
     )
-    those.lengthen(_factor(runner) * lack)
+    those.lengthen(factor_of(runner.clock) * lack)
 
 
 def give_new(runner: Any, first: int, want: np.ndarray, iterations: int) -> None:
@@ -249,9 +254,9 @@ def give_new(runner: Any, first: int, want: np.ndarray, iterations: int) -> None
 
     with runner.memory.compiler():  # for orders above 2
         if any(f.may_act_from(first) for f in runner.integrator.forces.velocity_dependent):
-            those.give(want, velocity, _factor(runner))
+            those.give(want, velocity, np.array([factor_of(runner.clock)]))
         else:
-            those.lengthen(_factor(runner) * (want - velocity()))
+            those.lengthen(factor_of(runner.clock) * (want - velocity()))
 
 
 def _movable(runner: Any, some: np.ndarray) -> tuple[int, int, np.ndarray]:
@@ -260,11 +265,6 @@ def _movable(runner: Any, some: np.ndarray) -> tuple[int, int, np.ndarray]:
     rows = np.flatnonzero(some)
     first, end = (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, 0)
     return first, end, some[first:end]
-
-
-def _factor(runner: Any) -> np.ndarray:
-    """Return factor() for a single world (not one of many copies), (1,)."""
-    return factor(runner.clock.h, np.array([runner.clock.drag or FREE]))
 
 
 def _those(runner: Any, first: int, some: np.ndarray) -> Displacements:

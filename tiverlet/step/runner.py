@@ -8,10 +8,12 @@ import numpy as np
 
 from ..constraints.core.scalar import Scalar
 from ..constraints.path import Path
+from ..constraints.pin import Pin
 from ..contact.initial_overlap import overlapping
 from ..contact.mass_splitting import still_soft
 from ..contact.parting import parting_speeds
 from ..device.interrupts import deferred_signals
+from ..device.memory import Rows, numbers_of
 from ..device.patches.compiler import CachedLaunch
 from ..particles.spin import moments_of_inertia
 from . import high_order, initial_shape, initial_violation, softness
@@ -19,6 +21,7 @@ from .clock import Clock, initial_margin
 from .contact_rows import ContactRows
 from .diagnostics import BARE, EXTENT, STARTED, STEPPED, UNSTEPPED
 from .frames import Frames
+from .impulse import factor_of
 from .integrator import FREE, decay, h2_effective_of, h2_rigid_of, shares_of
 from .launcher import Launcher
 from .overlap_release import release, shrink_left
@@ -27,6 +30,7 @@ from .span import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Span
 from .step import frame
 from .step_report import StepReport
 
+NONE = np.zeros(0, dtype=np.int64)
 KEPT = 100_000  # particles up to which the array for velocities is kept; above, allocating it costs next to nothing
 SLIGHTLY = 0.4  # of the substep: contacts that are still as soft as those of longer substeps may gain energy as they stiffen
 LONG = 10_000_000  # (particles + constraints) x passes in one launch at most: it takes about a second
@@ -69,9 +73,11 @@ class Runner:
         self.known = [c.known for c in step.contacts if c.known]  # KnownLoads of contacts
         self.logs: list[Any] = [*(c.dev.events for c in step.contacts if c.dev.events), *step.wall_logs]  # of events
         self.semi_iterations, self.drags = step.constraints.semi_iterations, step.integrator.forces.drags
+        self._immovable: int | None = None
         self.probe = high_order.Probe(step) if self.scene.order > 2 else None
         self.passes_at_once = self._passes_at_once()
         self.asks_velocities = any(wall.has_switch for wall in step.walls)
+        self.asks_release = any(isinstance(f, Pin) for f in step.drivers)
         self.bounces = any(f.has_restitution for f in (*step.walls, *step.contacts))
         self.launcher = Launcher(self)
         self._prepare()
@@ -89,6 +95,7 @@ class Runner:
         self._measure = CachedLaunch(self.diagnostics, "measure", self.memory.compiler, self.sheet)
         self._velocity: CachedLaunch | None = None  # made when velocities are first read
         self._spin: CachedLaunch | None = None  # made when spins are first read
+        self._release: CachedLaunch | None = None  # made when a Pin first lets particles go
         self._turned = np.zeros(4)
         self._to_velocity = CachedLaunch(self.step, "to_velocity", self.memory.compiler, self._turned)
         self._data, self._given, self._reporter = self.sheet.data, self.sheet.data[H:], self.diagnostics.report
@@ -105,11 +112,19 @@ class Runner:
 
     def regroup(self) -> None:
         """Take the new number of particles, after the parts were edited in place."""
-        self.n, self.weights_alone = self.step.n, {}
+        self.n, self.weights_alone, self._immovable = self.step.n, {}, None
         self.passes_at_once = self._passes_at_once()
         self.diagnostics.report.regroup()
         if self.sleep:
             self.sleep.regroup()
+
+    @property
+    def immovable(self) -> int:
+        """How many particles cannot move; pins that take others change nothing of that."""
+        if self._immovable is None:
+            out = self._immovable = self.n - int(np.count_nonzero(self.scene.inv_mass))
+            return out
+        return self._immovable
 
     # Frames.
 
@@ -127,6 +142,9 @@ class Runner:
                 if self.asks_velocities:  # compile the kernel now; switching a wall off will need it
                     self._velocities()
                     self.asks_velocities = False
+                if self.asks_release:
+                    self._compile_release()
+                    self.asks_release = False
                 if placed:
                     report = self.report()
                     if not clock.tick:
@@ -224,11 +242,11 @@ class Runner:
         """Scale what the last substep has left of the sleeping particles `who`, with displacements d, to one of `ratio` times the
         length. For them the coming frame is no start."""
         memory, forces = self.memory, [contact.dev.forces for contact in self.step.contacts]
-        memory.write_rows(self.scene.state.d, who, d * ratio)
+        memory.write_rows(who, (self.scene.state.d, d * ratio))
         left = [(f.before, ratio) for f in forces] + [(f.sum, ratio**2) for f in forces if "sum" in f.in_state]
         left += [(self.step.particles.wall_displacement, ratio**2)] if self.step.walls else []
         for field, factor in left:
-            memory.write_rows(field, who, memory.read(field)[who] * factor)
+            memory.write_rows(who, (field, memory.rows(who, field)[0] * factor))
 
     def _project(self, h: float, dt: float, passes: int, keeps: bool) -> bool:
         """Remove the energy that violations and overlaps would store in a shorter substep h [s], of a frame dt [s].
@@ -477,7 +495,7 @@ class Runner:
 
     def _velocities(self, first: int = 0, end: int | None = None, links: bool = True, touches: bool = True) -> np.ndarray:
         """Launch the kernel that computes velocities from displacements."""
-        launch = self._with_room(self._velocity, "velocities", 7, self.step.dim)
+        launch = self._with_room(self._velocity, "velocities", 7, self.scene.state.dim, self.n)
         self._velocity = launch if self.n <= KEPT else None
         given, out = launch.arrays
         end = self.n if end is None else end
@@ -486,17 +504,49 @@ class Runner:
         launch()
         return out[first:end].copy()
 
-    def _with_room(self, launch: CachedLaunch | None, kernel: str, numbers: int, axes: int) -> CachedLaunch:
-        """The launch of a kernel with so many arguments and an output row per particle; `launch` itself if it is large enough."""
-        if launch is not None and len(launch.arrays[1]) >= self.n:
+    def _with_room(self, launch: CachedLaunch | None, kernel: str, numbers: int, axes: int, rows: int) -> CachedLaunch:
+        """The launch of a kernel with so many arguments, and an array of so many rows; `launch` itself if it is large enough."""
+        if launch is not None and len(launch.arrays[1]) >= rows:
             return launch
-        room = np.zeros((1 << self.n.bit_length(), axes))
+        room = np.zeros((1 << rows.bit_length(), axes))
         return CachedLaunch(self.step, kernel, self.memory.compiler, np.zeros(numbers), room)
 
     def _list_again(self) -> None:
         """After a state was restored: build the neighbour list, which the reactions of contacts need."""
-        if self.search and self.memory.read(self.search.list.old_saved)[0]:
+        if self.search and self.search.list.saved:
             self.list_neighbours()
+
+    def release(self, released: Rows, want: np.ndarray | None = None, taken: Rows = NONE, had: np.ndarray = NONE) -> float:
+        """Let particles that were driven go on with velocities `want`, (k, dim) [m/s]; None: as they were driven.
+
+        Those among them that cannot move now stay as they are. taken: the particles that are driven instead. had: (n,) the
+        inverse masses before. Returns by how much the energy changes, beside that of spins and pair forces [J].
+        """
+        clock, now, before = self.clock, self.scene.inv_mass[released], had[taken]
+        first, k = len(now), len(now) + len(before)
+        self._list_again()
+        self._release = launch = self._with_room(self._release, "release", 8, 2 + self.scene.state.dim, k)
+        given, rows = launch.arrays
+        rows[:first, 0], rows[:first, 1] = numbers_of(released), now
+        rows[first:k, 0], rows[first:k, 1] = numbers_of(taken), before
+        if want is not None:
+            rows[:first, 2:] = want
+        firm, soft = self.shares()
+        given[:] = clock.h, clock.time, firm, soft, factor_of(clock), want is not None, first, k
+        launch()
+        return given.item(0)
+
+    def _compile_release(self) -> None:
+        """Compile release() where a Pin drives particles without links: it may take others, and no frame must wait for it then.
+
+        For pins of linked particles the world is rebuilt, see edit_in_place.grabbing().
+        """
+        pins = [f.members.rows for f in self.step.drivers if isinstance(f, Pin)]
+        linked = np.concatenate([NONE, *(b.indices.ravel() for b in self.batches)])
+        elastic = self.memory.elastic and not (self.sleep or self.launched or self.probe)
+        if elastic and not all(np.isin(rows, linked).any() for rows in pins):
+            self._release = self._with_room(None, "release", 8, 2 + self.scene.state.dim, 2 * sum(map(len, pins)))
+            self.release(NONE)
 
     def spin(self) -> np.ndarray:
         """Surface velocities r omega, (n, axes) [m/s], of the same order as velocity()."""
@@ -504,7 +554,7 @@ class Runner:
         if clock.d_is_velocity:
             return self.memory.read(spin.s).astype(np.float64)[: self.n]
         self._list_again()
-        launch = self._with_room(self._spin, "spins", 4, spin.axes)
+        launch = self._with_room(self._spin, "spins", 4, spin.axes, self.n)
         self._spin = launch if self.n <= KEPT else None
         given, out = launch.arrays
         given[:] = clock.h, clock.time, *self.shares()

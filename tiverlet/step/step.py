@@ -457,7 +457,7 @@ class Step:
 
     @ti.func
     def solve_contacts(self, now):
-        """Solve every pair in contact, from both sides."""
+        """Solve every pair in contact."""
         self.contact_pass.solve(now)
 
     @ti.func
@@ -679,6 +679,49 @@ class Step:
             v = self.velocity_of(i, given[0], given[1], given[6], given[3])
             for k in ti.static(range(self.dim)):
                 out[i, k] = v[k]
+
+    @ti.kernel
+    def release(self, given: ti.types.ndarray(ti.f64, 1), rows: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
+        """Let driven particles go on with a velocity, as impulse.let_go() does, and sum up by how much the energy changes.
+
+        given: h, t, the shares `firm` and `soft` of Passes.push_reaction, impulse.factor(), whether rows have velocities, the
+        number of particles that go on, and that number with those that are driven from now on. The change of energy [J] replaces
+        the first. rows: the index of a particle; its inverse mass, 0 for a particle that stays driven; the velocity with which it
+        goes on, else it is that of its displacement.
+        """
+        if given[0] > 0:  # Taichi wakes no threads for loops inside a branch
+            self.write_reactions(given[0], given[2], given[3])
+            change, scale = ti.cast(0, ti.f64), 1 / given[0]
+            for k in range(integer(given, 7)):
+                i, w = ti.cast(rows[k, 0], ti.i32), rows[k, 1]
+                if w > 0:
+                    sign = ti.cast(-1, ti.f64)
+                    if k < integer(given, 6):
+                        self.keep_velocity(i, k, given, rows)
+                        sign = -sign
+                    energy, _kinetic = self.diagnostics.energy_per_mass(i, self.state.place(i), scale, ti.cast(0.5, self.real))
+                    change += sign * energy / w
+            given[0] = change
+
+    @ti.func
+    def keep_velocity(self, i, k, given: ti.template(), rows: ti.template()):  # type: ignore[valid-type]
+        """Lengthen the displacement of particle i to that of its velocity, in row k of release()."""
+        d = self.state.d[i]
+        v = self.velocity_of(i, given[0], given[1], given[2], given[3])
+        more = ti.Vector.zero(ti.f64, self.dim)
+        for a in ti.static(range(self.dim)):
+            want = ti.cast(d[a] / ti.cast(given[0], self.real), ti.f64)
+            if given[5] > 0:
+                want = rows[k, 2 + a]
+            more[a] = given[4] * (want - v[a])
+        new = ti.cast(d, ti.f64) + more
+        if ti.static(self.state.carries):
+            new += ti.cast(self.state.d_low[i], ti.f64)
+        self.state.d[i] = ti.cast(new, self.real)
+        if ti.static(self.state.carries):
+            self.state.d_low[i] = ti.cast(new - ti.cast(self.state.d[i], ti.f64), self.real)
+        if ti.static(self.integrator.uses_velocity):
+            self.integrator.free[i] = ti.cast(ti.cast(self.integrator.free[i], ti.f64) + more, self.real)
 
     @ti.func
     def write_reactions(self, h64, firm64, soft64):

@@ -3,6 +3,7 @@
 These objects do not change: other particles are another object.
 """
 
+import functools
 from collections.abc import Sequence
 from copy import copy
 from typing import TYPE_CHECKING, Any
@@ -20,11 +21,17 @@ if TYPE_CHECKING:
 class FixedSize:
     """m constraints on `arity` particles each. indices: (m, arity). kind: the class of the batch, for errors."""
 
+    host_only = ("indices",)
+
     def __init__(self, kind: str, indices: np.ndarray):
         self.kind = kind
         self.rows = np.asarray(indices, dtype=np.int32)
-        self.indices = as_read_only(self.rows, structure_advice(kind, "indices"))  # for users, with advice in its error
         self.arity = self.rows.shape[1]
+
+    @functools.cached_property
+    def indices(self) -> np.ndarray:
+        """The same for users, with advice in its error; made when it is first read, which other particles of a Pin seldom are."""
+        return as_read_only(self.rows, structure_advice(self.kind, "indices"))
 
     @property
     def count(self) -> int:
