@@ -259,6 +259,7 @@ class World:
                 feature.changed = feature.new_force = False
                 feature.upload()
         self._runner.find_ramps()
+        self._runner.find_bodies()
 
     def run(
         self, seconds: float, dt: float = 1 / 60, recorder=None, progress: bool = False, *, tolerance: float | None = None,

@@ -16,6 +16,7 @@ from ..geometry.ordered import median
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
+from .body_projection import NEAR, NONE, BodyProjection
 from .body_restitution import BodyRestitution
 from .each_once import ROUNDS, EachOnce
 from .events import EventLog
@@ -84,9 +85,7 @@ class Contact(PairContact):
     turn them.
 
     Bodies of rigid links, and rigid clusters (ShapeMatch), that meet at restitution > 0 leave by Newton's law for rigid bodies,
-    see BodyImpacts. With 0, the default, which has no impacts but only overlaps, bodies that meet head-on leave at a quarter to
-    four tenths of their speed, at any number of substeps: constraints find later that a particle was stopped. 1e-9 stops them,
-    for the time and the compilation that restitution takes.
+    see BodyImpacts. With 0, the default, bodies that meet go on together, see BodyProjection.
 
     Several impacts of one disc in a substep are resolved one after the other. A round takes the struck pairs that come first
     for both of their particles; the next round takes the next pairs, on the new paths. Each impact is between two particles, so
@@ -180,6 +179,9 @@ class Contact(PairContact):
             *([*bouncing, struck, dev.impulse] if dev.has_restitution else []),
             *(bodies.pair_data if bodies else []),
         ]
+        dev.bodies = None if dev.has_restitution else BodyProjection.made(scene, batches, self.table, 1)
+        if dev.bodies:
+            pair_data += dev.bodies.pair_data
         dev.events = EventLog(scene, self.table) if dev.has_events else None
         if dev.events:
             pair_data.append(dev.events.touched)
@@ -211,9 +213,9 @@ class Contact(PairContact):
 
     def _solves_once(self, scene: Scene, team: Team) -> bool:
         """Whether each pair is solved once, see EachOnce: not where a GPU's threads, or what rests, take other turns. What spins
-        or bounces has sums of its own; small worlds compile faster without."""
+        or bounces, and rigid bodies, have sums of their own; small worlds compile faster without."""
         dev = self.dev
-        alike = not (dev.has_restitution or dev.spins or scene.state.sleepers)
+        alike = not (dev.has_restitution or dev.spins or dev.bodies or scene.state.sleepers)
         both = not (dev.search.has_static and (dev.has_loads or dev.reports))  # static particles store nothing of a pair
         return alike and both and not team.launched and not scene.memory.compiler.few
 
@@ -269,9 +271,51 @@ class Contact(PairContact):
         return out
 
     @ti.func
+    def relative(self, d: ti.template(), v, a, b, t):  # type: ignore[valid-type]
+        """Return the displacement of particle v relative to a [m], see BodyProjection."""
+        return self.dev.state.relative_displacement(d[v] - d[a], v, a)
+
+    @ti.func
+    def near_contact(self, i, e):
+        """Return the place of the contact at entry e of the list of i, NONE if it is far, the normal, and the gap [m]."""
+        j = self.dev.list.neighbour[e]
+        distance = self.dev.geometry.contact_distance(i, j)
+        near = self.dev.geometry.push_each_other(i, j, ti.static(NEAR) * distance)
+        gap = self.dev.state.separation(i, j).norm() - distance
+        return ti.select(near, 0 * gap, NONE), self.dev.geometry.direction(i, j), gap
+
+    @ti.func
+    def entry_of(self, i, e, role):
+        """Return the entry that stores the contact at entry e of the list of particle i."""
+        return e
+
+    @ti.func
+    def ends(self, i, e, t):
+        """Return the particles of the contact at entry e of the list of i: i, and twice the other one."""
+        j = self.dev.list.neighbour[e]
+        return i, j, j
+
+    @ti.func
+    def part_of(self, t, role):
+        """Return the part of a particle in a contact."""
+        return 1 + 0 * t
+
+    @ti.func
+    def add_push(self, e, push):
+        """Do nothing: a pair does not keep the push of an impact."""
+
+    @ti.func
     def count(self, begin, end, now):
         """Find the touching pairs of particles begin ... end - 1, and how often their masses are split."""
         self.dev.splitting.count(begin, end, now)
+
+    @ti.func
+    def may_project(self, now):
+        """Whether displacements may be projected after this substep, so that the pushes of walls have to be known."""
+        out = True
+        if ti.static(not (self.dev.bodies or self.dev.projection.unequal)):
+            out = self.dev.projection.is_due(now)
+        return out
 
     @ti.func
     def busy(self, begin):
@@ -399,6 +443,13 @@ class Contact(PairContact):
                         if not rests:
                             part = ti.zero(part)
                             push -= known
+                    if ti.static(bool(self.dev.bodies)):
+                        struck = self.dev.bodies.struck.field[e] != 0
+                        if first != 0:
+                            struck = overlap > 0 and self.dev.bodies.strikes(self, i, j, j, 0 * w, n, alone * last)
+                        self.dev.bodies.note(e, n, struck)
+                        if struck:  # see BodyProjection; what strikes has no load
+                            part, push = -known, known
                     load = 0 * n
                     if ti.static(self.dev.has_loads):  # along the normal as the next substep starts
                         load = self.dev.known.update_load(i, j, e, part, push + part, now) * self.dev.geometry.direction(i, j)

@@ -309,6 +309,11 @@ class PairContact(Feature):
         return self.dev.forces.sum[i]
 
     @ti.func
+    def may_project(self, now):
+        """Whether displacements may be projected after this substep, so that the pushes of walls have to be known."""
+        return True
+
+    @ti.func
     def busy(self, begin):
         """Return 0 if no particle in the block that begins at `begin` is in contact. Here always 1."""
         return 1

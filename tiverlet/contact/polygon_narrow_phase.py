@@ -452,6 +452,30 @@ class PolygonGeometry:
         return d[v] - (1 - t) * d[a] - t * d[b]
 
     @ti.func
+    def near_contact(self, v, e, near):
+        """Return the place of the contact of vertex v at entry e, by the last detect(), the normal, and the gap [m].
+
+        A contact that does not overlap counts where v is in front of the edge, and nearer than the part `near` of its length;
+        else its place is below DISCS.
+        """
+        a, found = self.list.neighbour[e], self.manifold.field[e]
+        place, n, gap = found[1], ti.Vector([found[2], found[3]]), -found[0]
+        if gap >= 0:
+            place = 0 * gap + 2 * DISCS
+            if self.after(a) >= 0:
+                u, r = self.state.separation(self.after(a), a), self.state.separation(v, a)
+                uu = u.dot(u)
+                if uu > 0:
+                    length, t = ti.sqrt(uu), r.dot(u) / uu
+                    n = ti.Vector([u[1], -u[0]]) / length
+                    height = r.dot(n)
+                    within = ti.min(ti.max(t, 0), 1)
+                    gap = height - self.radius.of(v) - (1 - within) * self.radius.of(a) - within * self.radius.of(self.after(a))
+                    if -SLACK <= t <= 1 + SLACK and gap >= 0 and gap < near * length and self.find(v, self.after(a)) >= 0:
+                        place = within
+        return place, n, gap
+
+    @ti.func
     def inverse_mass(self, v, a, b, t):
         """Return the inverse mass of a contact whose particles have no other contact."""
         return self.w.of(v) + (1 - t) * (1 - t) * self.w.of(a) + t * t * self.w.of(b)

@@ -18,13 +18,14 @@ from ..geometry.ordered import median
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
+from .body_projection import NEAR, BodyProjection
 from .body_restitution import AIM
 from .exclusions import excluded_pairs
 from .force_share import ForceShare
 from .known_loads import WINDOW, KnownLoads
 from .loops import checked, flat, laid, refuse_deep
 from .pair_contact import PairContact
-from .polygon_narrow_phase import VERTEX, EdgePairTable, Outline, PolygonGeometry
+from .polygon_narrow_phase import DISCS, START, VERTEX, EdgePairTable, Outline, PolygonGeometry
 from .restitution import SLOW, under_force
 from .wall_loads import WallLoads
 
@@ -42,8 +43,8 @@ class Polygons(PairContact):
     and as many links as it takes: the sides, and diagonals from one corner. With more links the solver is Jacobi, under which
     towers sway and may buckle.
     friction, restitution: as in Contact. Particles in no loop touch as in Contact. Bodies of rigid links and rigid clusters that
-    meet at restitution > 0 leave by the laws of Newton and Coulomb for rigid bodies, see PolygonRestitution. With 0 they leave at
-    up to a quarter of their speed, with 1e-9 they stop, see Contact.
+    meet at restitution > 0 leave by the laws of Newton and Coulomb for rigid bodies, see PolygonRestitution. With 0 they go on
+    together, see BodyProjection.
     skin: how far beyond contact distance pairs are listed [m], "auto" for the median of 0.15 of the longer edge of each vertex,
     and of 0.75 of the radius of each disc in no loop.
     push_out: about the speed at which bodies that overlap part [m/s].
@@ -222,11 +223,13 @@ class Polygons(PairContact):
         if dev.has_restitution:
             dev.restitution = PolygonRestitution(scene, dev.geometry, self.table)
             dev.hit = dev.restitution.hit
+        dev.bodies = None if dev.has_restitution else BodyProjection.made(scene, batches, self.table, 3)
         linked = excluded_pairs(batches, scene.particles.radius, dev.outline.body)
         dev.known = KnownLoads(scene, True, dev.has_friction) if self.has_loads else None
         # What contacts push along n and across it in the last pass, beside their known loads [kg m].
         dev.part = PairData("part", 2, False, is_transferred=False) if dev.known else None
         pair_data = [
+            *(dev.bodies.pair_data if dev.bodies else []),
             *dev.geometry.carried,
             *([*dev.known.pair_data, dev.part] if dev.known else []),
             *([dev.slip] if dev.has_friction else []),
@@ -314,6 +317,41 @@ class Polygons(PairContact):
         return out
 
     @ti.func
+    def relative(self, d: ti.template(), v, a, b, t):  # type: ignore[valid-type]
+        """Return the displacement of vertex v relative to the point t of the edge from a to b [m], see BodyProjection."""
+        return self.dev.geometry.relative(d, v, a, b, t)
+
+    @ti.func
+    def near_contact(self, i, e):
+        """Return the place of the contact of vertex i at entry e, NONE if it is far, the normal, and the gap [m]."""
+        return self.dev.geometry.near_contact(i, e, ti.static(NEAR))
+
+    @ti.func
+    def entry_of(self, i, e, role):
+        """Return the entry that stores the contact in which particle i has a role, with the particle at entry e, or -1."""
+        at = -1
+        if role < self.dev.geometry.roles(i):
+            at, _, _, _, _, _ = self.dev.geometry.participants(i, e, role)
+        return at
+
+    @ti.func
+    def ends(self, i, e, t):
+        """Return the particles of the contact of vertex i at entry e, with the place t on the edge."""
+        a = self.dev.list.neighbour[e]
+        return i, a, ti.select(t > DISCS, self.dev.geometry.after(a), a)
+
+    @ti.func
+    def part_of(self, t, role):
+        """Return the part of a particle in a contact with the place t on the edge, by its role."""
+        place = ti.max(t, 0)
+        return ti.select(role == VERTEX, 1 + 0 * t, ti.select(role == START, place - 1, -place))
+
+    @ti.func
+    def add_push(self, e, push):
+        """Add the push of an impact to those of the contact at entry e."""
+        self.dev.geometry.impulse.field[e] = self.dev.geometry.impulse.field[e] + push
+
+    @ti.func
     def count(self, begin, end, now):
         """Sum the usual depths of the contacts of particles begin ... end - 1; for restitution also their parts."""
         for i in range(begin, end):
@@ -378,6 +416,15 @@ class Polygons(PairContact):
                                         self.dev.restitution.begin(e, ti.max(aim, ti.static(AIM)) * n)
                                 elif self.dev.restitution.parts_by_itself(at, v, a, b, t, n):
                                     back = 0 * overlap
+                        if ti.static(bool(self.dev.bodies)):
+                            as_bodies = self.dev.bodies.struck.field[at] != 0
+                            if first != 0:
+                                usual = self.dev.geometry.usual_depth.field[at]
+                                as_bodies = self.dev.bodies.strikes(self.dev.geometry, v, a, b, t, n, usual)
+                            if as_bodies:
+                                back = -known * shared  # what strikes has no load
+                            if role == VERTEX:
+                                self.dev.bodies.note(e, n, as_bodies)
                         if ti.static(not self.dev.known):
                             if role == VERTEX:
                                 if not self.dev.geometry.is_unchanged(i, e):
@@ -394,7 +441,7 @@ class Polygons(PairContact):
                                 want -= self.table.held(v, a, n, pressed + missing, slip)
                         if ti.static(bool(self.dev.known)):
                             if role == VERTEX:
-                                self.dev.part.field[e] = ti.Vector([want.dot(n), n.cross(want)]) / shared
+                                self.dev.part.field[e] = ti.Vector([want.dot(n), n[0] * want[1] - n[1] * want[0]]) / shared
                         total += share * want
                         if final != 0:
                             approach = -self.dev.geometry.relative(self.dev.forces.before, v, a, b, t).dot(n)

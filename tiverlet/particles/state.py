@@ -181,15 +181,16 @@ class State:
             x += self.low0[i]
         return x
 
-    def remember(self, memory: "Memory", start: bool, before: bool, lifts: bool, wall_push: bool) -> None:
+    def remember(self, memory: "Memory", start: bool, before: bool, lifts: bool, wall_push: bool, lasts: bool) -> None:
         """Declare what friction, swept walls and impacts need.
 
         start, before: position and displacement at the start of the substep. lifts: whether particles that bounced may not be
-        where their displacement says. wall_push: how far walls have pushed since then.
+        where their displacement says. wall_push: how far walls have pushed since then. lasts: whether the next substep needs
+        that.
         """
         self.starts, self.befores, self.lifts, self.keeps_wall_push = start, before, lifts, wall_push
         if wall_push:
-            self.wall_push = memory.field("wall_push", self.number, width=self.dim)
+            self.wall_push = memory.field("wall_push", self.number, width=self.dim, state=lasts)
         if start:
             self.x0 = memory.field("position_at_start", self.number, width=self.dim)
             if self.sums:

@@ -176,12 +176,14 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         if pairs or any(w.has_restitution for w in walls) or (walls and stops_bodies(scene, batches)):
             scene.impacts = BodyImpacts(scene, batches, bool(contact), pairs)
     search = contact.make_search(scene, batches, team) if contact else None
+    bodies = bool(search and contact and contact.dev.bodies)
     state.remember(
         memory,
         has_friction or any(w.needs_start_position for w in walls) or (bounces and bool(walls)),
-        bounces or bool(scene.impacts),
+        bounces or bool(scene.impacts) or bodies,
         bounces,
-        bool(contact and contact.projects and walls),
+        bool(contact and (contact.projects or bodies) and walls),
+        bodies,
     )
     for feature in of(Batch):
         feature.scene = scene  # also for those that do nothing, because all of their particles are held

@@ -28,6 +28,7 @@ class ContactPass:
             contact.has_friction or contact.has_restitution or contact.has_events or contact.shares_loads
         )
         self.projects_velocities = bool(contact) and contact.projects
+        self.projects_bodies = bool(contact and contact.dev.bodies)
         if self.has_restitution and team.launched:  # the host does not read whether any pair bounces in a round
             self.bounces = scene.memory.field("Contact.bounces", None, kind=ti.i32)
 
@@ -161,6 +162,47 @@ class ContactPass:
                 ti.loop_config(serialize=True)
                 for _ in range(self.team.one(1, thread)):
                     c.dev.hit[None] = 0
+
+    @ti.func
+    def has_struck_bodies(self):
+        """Whether bodies struck each other in this substep."""
+        out = False
+        for c in ti.static(self.contacts):
+            out = c.dev.bodies.any_struck[None] != 0
+        return out
+
+    @ti.func
+    def body_rounds(self):
+        """Return how many rounds find the impacts of bodies: two to begin, one for each pass, and one to end."""
+        out = 0
+        for c in ti.static(self.contacts):
+            out = c.dev.bodies.passes + 3
+        return out
+
+    @ti.func
+    def project_bodies(self, thread, k, tick):
+        """Do round k of the impacts of bodies in substep `tick`, see BodyProjection."""
+        for c in ti.static(self.contacts):
+            begin, end = self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)
+            for i in range(begin, end):
+                if k == 0:
+                    c.dev.bodies.begin(i, c, tick + 1)
+                elif k == 1:
+                    c.dev.bodies.list_contacts(i, c, tick + 1)
+                elif k < c.dev.bodies.passes + 2:
+                    c.dev.bodies.press(i, k - 2, c, tick + 1)
+                elif c.dev.bodies.end(i, c):
+                    c.note_motion(c.dev.search.moved_too_far(i), 0)
+            self.team.wait()
+            for i in range(begin, end):
+                if k == 0:
+                    c.dev.bodies.begin_body(i)
+                elif k > 1 and k < c.dev.bodies.passes + 2:
+                    c.dev.bodies.follow(i, c)
+            ti.loop_config(serialize=True)
+            for _ in range(self.team.one(ti.cast(k == 0, ti.i32), thread)):
+                c.dev.bodies.any_struck[None] = 0
+            self.team.wait()
 
     @ti.func
     def find_projected(self, thread, k, rounds, damps):

@@ -69,6 +69,8 @@ def planned(
     known = {id(start): start for start in (world._particles, *(f.start for f in world.features))}
     starts = {one: now.placed(change.regrouped_rows(start.position, came)) for one, start in known.items()}
     bound, tied = None, [f for f in batches if not f.can_regroup(change)]
+    if links and runner.lacks_bodies(list(links.values()), now.position, inv_mass):
+        return None
     if links or tied:
         if any(not f.acts for f in tied):
             return None
@@ -121,6 +123,7 @@ def regroup(world: Any, edit: Edit, added: Particles | None) -> None:
         bind(world, change, bound)
     if runner.sleep:
         runner.sleep.bind_again(step.drivers, runner.batches)
+    runner.find_bodies(everything=True)
     runner.regroup()
     for log in runner.logs:
         log.forget()
@@ -190,6 +193,7 @@ def grab(world: Any, change: Grab) -> None:
     if change.soft:
         scene.particles = particles.placed(scene.state.get(memory))
         scene.slots.reassign(memory, change.inv_mass, runner.batches)
+        runner.find_bodies(everything=True)
     for f in pins:
         f.grab(scene)
     for log in runner.logs:

@@ -128,8 +128,10 @@ class ParticlePass:
                     self.state.low0[i] = self.state.low[i]
         if ti.static(self.state.keeps_wall_push):
             for c in ti.static(self.contacts):
-                if ti.static(c.dev.projection.unequal) or c.dev.projection.is_due(now):
+                if c.may_project(now):
                     for i in range(first, end):
+                        if ti.static(bool(c.dev.bodies)):
+                            c.dev.bodies.note_wall(i, now.tick)
                         self.state.wall_push[i] = ti.zero(self.state.x[i])
         if ti.static(self.state.spins):
             if now.fresh != 0:

@@ -12,9 +12,11 @@ from ..constraints.pin import Pin
 from ..contact.initial_overlap import overlapping
 from ..contact.mass_splitting import still_soft
 from ..contact.parting import parting_speeds
+from ..contact.rigid_bodies import rigid_bodies
 from ..device.interrupts import deferred_signals
 from ..device.memory import Rows, numbers_of
 from ..device.patches.compiler import CachedLaunch
+from ..features.feature import Batch
 from ..particles.spin import moments_of_inertia
 from . import high_order, initial_shape, initial_violation, softness
 from .clock import Clock, initial_margin
@@ -319,6 +321,17 @@ class Runner:
         """Set the factors by which loads follow from the multipliers of the last substep."""
         factor = self.integrator.h2_factor
         self.scene.multipliers_per_newton = factor * h2_rigid_of(self.clock), factor * h2_effective_of(self.clock)
+
+    def find_bodies(self, everything: bool = False) -> None:
+        """Tell contacts which constraints make rigid bodies, if knobs have changed that. everything: also their masses."""
+        for c in self.step.contacts:
+            if c.dev.bodies:
+                c.dev.bodies.update(self.batches, everything)
+
+    def lacks_bodies(self, batches: "list[Batch]", x: np.ndarray, inv_mass: np.ndarray) -> bool:
+        """Whether these constraints, of particles at x (n, dim) [m], make the first rigid bodies: that takes other kernels."""
+        touching = [c for c in self.step.contacts if not (c.dev.bodies or c.dev.has_restitution)]
+        return bool(touching) and bool(rigid_bodies(batches, x, inv_mass))
 
     def find_ramps(self) -> None:
         """After knobs were uploaded: find the batches with new rest values."""

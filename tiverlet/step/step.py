@@ -73,6 +73,10 @@ def substep(do, now):
                     if not do.is_regular(now, half):
                         do.push_bodies(this_pass)
                 do.apply_corrections(this_pass)
+    if ti.static(do.projects_bodies):
+        if do.ends_substep(now) and do.has_struck_bodies(now):
+            for k in range(do.body_rounds(now)):
+                do.project_bodies(now.of(k))
     if ti.static(do.finishes):
         if do.ends_substep(now):
             do.finish_substep(now)
@@ -120,6 +124,7 @@ class Step:
         self.has_pair_impacts = self.has_impacts and self.impacts.pairs
         self.newton_steps = 2 if scene.slots and scene.slots.refines else 1  # most of them in a pass
         self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
+        self.projects_bodies = self.contact_pass.projects_bodies
         self.orients = self.state.spins and self.state.spin.orients
         keeps = self.contact_pass.remembers or bool(self.breakers)
         self.finishes = keeps or self.orients or bool(self.wall_logs) or bool(self.constraints.learners)
@@ -505,6 +510,27 @@ class Step:
             for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
                 log.close(i)
         self.team.wait()
+
+    @ti.func
+    def has_struck_bodies(self, now):
+        """Whether bodies struck each other in this substep."""
+        return self.contact_pass.has_struck_bodies()
+
+    @ti.func
+    def body_rounds(self, now):
+        """How many rounds find the impacts of bodies."""
+        return self.contact_pass.body_rounds()
+
+    @ti.func
+    def project_bodies(self, now):
+        """One round of the impacts of bodies."""
+        self.push_struck_bodies(now.thread, now.it, now.tick)
+
+    @called
+    @ti.func
+    def push_struck_bodies(self, thread: ti.i32, it: ti.i32, tick: ti.i32):
+        """One round of project_bodies()."""
+        self.contact_pass.project_bodies(thread, it, tick)
 
     @ti.func
     def needs_projection(self, now):

@@ -1,0 +1,174 @@
+"""Impacts of rigid bodies without restitution: the laws of inelastic impacts, and what lands on something lighter stays there."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.contact.body_projection import SLOW
+from tiverlet.contact.rigid_bodies import rigid_bodies
+
+BOX = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])  # of side 1
+DIAGONAL, BOTH = [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2)], [*itertools.combinations(range(4), 2)]
+HOLDS = {
+    "shape": lambda loops: tv.ShapeMatch(loops),
+    "diagonal": lambda loops: _links(loops, DIAGONAL),
+    "both": lambda loops: _links(loops, BOTH),
+}
+G = 10.0
+
+
+def _links(loops, pairs):
+    return tv.Distance(np.concatenate([np.asarray(loop)[np.array(pairs)] for loop in loops]))
+
+
+def boxes(world, kind, hold, centers, masses, velocities=None, friction=0.0, g=G, floor=True, **settings):
+    """Return a world of boxes of side 1: as `Polygons`, or as clusters of four discs ("discs")."""
+    n = len(centers)
+    x = np.concatenate([center + BOX * (1 if kind == "polygons" else 0.5) for center in centers])
+    v = np.repeat(np.zeros((n, 2)) if velocities is None else velocities, 4, axis=0)
+    start = tv.Particles(x, velocity=v, mass=np.repeat(masses, 4) / 4, radius=0.0 if kind == "polygons" else 0.25)
+    loops = np.arange(4 * n).reshape(n, 4)
+    contact = tv.Polygons(loops, friction=friction) if kind == "polygons" else tv.Contact(friction=friction)
+    features = [tv.Gravity(g), HOLDS[hold](loops), contact, *([tv.HalfSpace((0, 1), friction=friction)] if floor else [])]
+    return world(start, features, **({"precision": "f64"} | settings))
+
+
+def cross(a, b):
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def centers(values):
+    return values.reshape(-1, 4, 2).mean(axis=1)
+
+
+@pytest.mark.parametrize("kind", ["polygons", "discs"])
+@pytest.mark.parametrize("hold", HOLDS)
+def test_a_box_that_falls_on_a_box_stays_there(world, kind, hold):
+    # What closes no faster than SLOW substeps of gravity is no impact: (SLOW g h)^2 / 2 g is left of the height, and what the
+    # passes leave, a hundredth for a hundred times the mass.
+    fall = 1.0
+    for ratio, substeps in [(1, 2), (1, 8), (10, 2), (10, 8), (10, 20), (100, 8)]:
+        w = boxes(world, kind, hold, [(0, 0.5), (0, 1.5 + fall)], [1.0, ratio], friction=0.5, substeps=substeps)
+        w.run(np.sqrt(2 * fall / G) + 1 / 60)
+        height = [centers(w.position)[1, 1] for _ in range(45) if w.step(1 / 60)]
+        h = 1 / (60 * substeps)
+        assert max(height) < 1.5 + SLOW**2 * G * h**2 / 2 + 1e-2 * fall, (ratio, substeps)
+        assert min(height) > 1.5 - 20 * (1 + ratio) * G * h**2, (ratio, substeps)  # links that passes solve give way by that
+
+
+@pytest.mark.parametrize("kind", ["polygons", "discs"])
+def test_a_box_on_a_column_of_boxes(world, kind):
+    for ratio in (1, 10):
+        w = boxes(world, kind, "shape", [*((0, 0.5 + k) for k in range(5)), (0, 6.5)], [1.0] * 5 + [ratio], friction=0.5)
+        w.run(np.sqrt(2 / G) + 1 / 60)
+        height = [centers(w.position)[5, 1] for _ in range(60) if w.step(1 / 60)]
+        assert max(height) < 5.5 + 0.02
+
+
+@pytest.mark.parametrize("kind", ["polygons", "discs"])
+@pytest.mark.parametrize("hold", HOLDS)
+def test_boxes_that_meet_head_on_go_on_together(world, kind, hold):
+    v, m = np.array([(2.0, 0.3), (0.0, 0.3)]), np.array([1.0, 3.0])
+    w = boxes(world, kind, hold, [(-1.05, 0), (0, 0)], m, v, g=0.0, floor=False)
+    w.run(0.25)
+    assert np.abs(w.velocity - (m @ v) / m.sum()).max() < 1e-3
+    assert np.abs(m @ centers(w.velocity) - m @ v).max() < 1e-9
+
+
+@pytest.mark.parametrize("substeps", [8, 20])
+def test_an_eccentric_impact_is_that_of_rigid_bodies(world, substeps):
+    # Faces that overlap by 0.7 touch at the ends of that part: two pushes, by which neither closes any further.
+    m, v, high = np.array([1.0, 3.0]), 2.0, 0.3
+    w = boxes(
+        world, "polygons", "shape", [(-1.05, 0), (0, high)], m, np.array([(v, 0), (0, 0)]), g=0.0, floor=False, substeps=substeps
+    )
+    w.run(1 / 30)  # they meet after 1 / 40 s
+    at = np.array([high - 0.5, 0.5])
+    arms = np.stack([at, at - high])  # of the pushes along x, about the center of each box
+    moment = m / 2  # of four corners
+    A = sum(1 / m[k] + np.outer(arms[k], arms[k]) / moment[k] for k in range(2))
+    p = np.linalg.solve(A, [v, v])
+    assert (p > 0).all()
+    velocity = np.array([v - p.sum() / m[0], p.sum() / m[1]])
+    turn = np.array([(arms[0] @ p) / moment[0], -(arms[1] @ p) / moment[1]])
+    got, x = w.velocity.reshape(2, 4, 2), w.position.reshape(2, 4, 2)
+    r, u = x - x.mean(axis=1, keepdims=True), got - got.mean(axis=1, keepdims=True)
+    spin = (r[..., 0] * u[..., 1] - r[..., 1] * u[..., 0]).sum(axis=1) / (r**2).sum(axis=(1, 2))
+    assert np.abs(got.mean(axis=1)[:, 0] - velocity).max() < 1e-3 * v
+    assert np.abs(spin - turn).max() < 3e-3 * v
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.1, 0.2])
+def test_friction_of_an_impact_is_coulombs(world, friction):
+    # A box lands on a platform at 3 m/s and slides: it loses friction times that speed.
+    x = np.concatenate([[(-5, -1), (5, -1), (5, 0), (-5, 0)], BOX + (0, 0.55)])
+    v = np.repeat([(0.0, 0.0), (1.0, -3.0)], 4, axis=0)
+    loops = np.arange(8).reshape(2, 4)
+    features = [tv.ShapeMatch(loops[1:]), tv.Polygons(loops, friction=friction)]
+    w = world(tv.Particles(x, velocity=v, mass=0.25, pinned=[0, 1, 2, 3]), features, precision="f64", substeps=8)
+    w.run(0.1)
+    assert np.abs(w.velocity[4:] - (1 - 3 * friction, 0)).max() < 1e-3
+
+
+@pytest.mark.parametrize("ratio", [1, 10])
+def test_cubes_of_spheres(world, ratio):
+    cube = np.array(list(itertools.product((-0.25, 0.25), repeat=3)))
+    x, clusters = np.concatenate([cube + (0, 0, 0.5), cube + (0, 0, 2.5)]), np.arange(16).reshape(2, 8)
+    features = [tv.Gravity((0, 0, -G)), tv.HalfSpace((0, 0, 1)), tv.ShapeMatch(clusters), tv.Contact()]
+    w = world(tv.Particles(x, mass=np.repeat([1.0, ratio], 8), radius=0.25), features, precision="f64", substeps=8)
+    w.run(np.sqrt(2 / G) + 1 / 60)
+    height = [w.position[8:, 2].mean() for _ in range(45) if w.step(1 / 60)]
+    assert max(height) < 1.5 + 0.01 and min(height) > 1.5 - 0.01
+
+
+def test_boxes_thrown_at_each_other_keep_momentum(world):
+    # Discs also keep angular momentum, but for the turn of normals in the substep of an impact.
+    a = np.linspace(0, 2 * np.pi, 9)[:-1]
+    place, m = 3 * np.stack([np.cos(a), np.sin(a)], axis=1), 1.0 + np.arange(8)
+    v = -3 * np.stack([np.cos(a + 0.1), np.sin(a + 0.1)], axis=1)
+    for kind, turned in (("polygons", 1e-2), ("discs", 1e-3)):
+        w = boxes(world, kind, "shape", place, m, v, g=0.0, floor=False, substeps=8)
+        corner, x = np.repeat(m, 4) / 4, w.position
+        first = np.repeat(v, 4, axis=0)
+        w.run(2.0)
+        assert np.abs(corner @ w.velocity - corner @ first).max() < 1e-8
+        change = corner @ cross(w.position, w.velocity) - corner @ cross(x, first)
+        assert abs(change) < turned * (corner @ np.linalg.norm(x, axis=1)) * 3
+        assert (corner @ w.velocity**2).sum() < 0.6 * (corner @ first**2).sum()
+
+
+def test_bodies_are_found(world):
+    def found(features, x, pinned=()):
+        w = world(tv.Particles(x, radius=0.1, pinned=pinned), features)
+        scene = w._runner.scene
+        return sorted(sorted(body) for body in rigid_bodies(w._runner.batches, scene.particles.position, scene.inv_mass))
+
+    two = np.concatenate([BOX, BOX + (3, 0)])
+    assert found([_links([range(4)], DIAGONAL)], BOX) == [[0, 1, 2, 3]]
+    assert found([_links([range(4)], DIAGONAL[:4])], BOX) == []  # it shears
+    hinged = [*DIAGONAL, *(np.array(DIAGONAL) + 4), (1, 4)]
+    assert found([tv.Distance(hinged)], two) == [[0, 1, 2, 3], [4, 5, 6, 7]]
+    assert found([tv.ShapeMatch([range(4), range(4, 8)]), tv.Distance([(1, 4)])], two) == [[0, 1, 2, 3], [4, 5, 6, 7]]
+    assert found([tv.ShapeMatch([range(4), range(2, 8)])], two) == [list(range(8))]  # they share two particles
+    assert found([tv.Distance(DIAGONAL, compliance=1e-3)], BOX) == []
+    assert found([tv.Distance(DIAGONAL, break_at=1.0)], BOX) == []
+    assert found([tv.Distance(DIAGONAL)], BOX, pinned=[0]) == [[0, 1, 2, 3]]
+    flat = np.c_[BOX, np.zeros(4)]
+    assert found([_links([range(4)], BOTH)], flat) == []  # it folds
+    flat[3, 2] = 0.5
+    assert found([_links([range(4)], BOTH)], flat) == [[0, 1, 2, 3]]
+
+
+@pytest.mark.parametrize("kind", ["polygons", "discs"])
+def test_the_same_bits_on_all_paths(world, kind):
+    place = [(x + 0.5 * row, 0.5 + row) for row in range(3) for x in range(3 - row)]
+    v = np.zeros((7, 2))
+    v[6] = 9.0, 0.0
+    out = []
+    for path in ("fused", "parallel", "launched"):
+        w = boxes(world, kind, "shape", [*place, (-3, 1.7)], [1.0] * 6 + [5.0], v, friction=0.5, substeps=8, path=path)
+        w.run(0.6)
+        out.append(w.hash())
+    assert out[0] == out[1] == out[2]
