@@ -441,7 +441,7 @@ class Polygons(PairContact):
                                 want -= self.table.held(v, a, n, pressed + missing, slip)
                         if ti.static(bool(self.dev.known)):
                             if role == VERTEX:
-                                self.dev.part.field[e] = ti.Vector([want.dot(n), n[0] * want[1] - n[1] * want[0]]) / shared
+                                self.dev.part.field[e] = ti.Vector([n.dot(want), n[0] * want[1] - n[1] * want[0]]) / shared
                         total += share * want
                         if final != 0:
                             approach = -self.dev.geometry.relative(self.dev.forces.before, v, a, b, t).dot(n)
