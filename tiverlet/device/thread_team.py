@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 LEAST = 512  # the fewest iterations of a loop that Taichi gives to a CPU thread
 PIECES = 16  # the most pieces into which a team divides particles with contacts
-SMALL = 128  # fewest particles per piece: sending data of neighbours between cores takes as long as computing with it
+SMALL = 2048  # fewest particles per piece: sending data of neighbours between cores takes longer than computing with it
 EVEN = 64  # pieces are multiples of this, so that they fill whole cache lines
 BLOCK = 32  # particles per block: one test finds whether any of them is near a wall or has a contact
 SHARE = 500  # fewest particles and constraints per thread; with fewer, threads wait longer than they work
