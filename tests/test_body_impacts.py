@@ -224,6 +224,7 @@ def test_bodies_leave_each_other_by_newtons_law(world, shape, kind):
         w.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["links", "clusters"])
 @pytest.mark.parametrize("e, mu", [(0.0, 0.0), (0.5, 0.0), (1.0, 0.0), (0.5, 0.1), (0.3, 0.8)])
 def test_polygons_leave_each_other_by_newtons_and_coulombs_laws(world, kind, e, mu):
@@ -447,6 +448,7 @@ def test_the_impulse_of_bodies_that_meet_is_told(world):
     assert w.velocity[:4, 0] == pytest.approx([-0.5, -0.5, 0.5, 0.5], rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "dim, e, compliance", [(2, 0.0, 0.0), (2, 1.0, 1e-12), pytest.param(3, 0.5, 0.0, marks=pytest.mark.slow)]
 )
@@ -486,6 +488,7 @@ def test_elastic_polygons_keep_their_energy_and_heaps_of_them_gain_none(world, k
         assert energy[-1] > kept * energy[0] if e == 1 else (np.diff(energy) < 1e-3 * energy[0]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["wall", "discs", "polygons"])
 def test_impacts_of_clusters_that_turn_conserve_energy_to_second_order(world, what):
     # Newton's law holds for velocities along tangents. Displacements are chords, which differ from these by (omega h)^2 r / 2: an
@@ -562,6 +565,7 @@ def test_clusters_that_hang_on_a_fixed_particle_keep_their_energy(world, dim):
         assert max(energy) < 1.001 * energy[0] and energy[-1] > 0.97 * energy[0], fixed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beside", ["pin", "outline", "shared"])
 def test_impacts_do_not_depend_on_what_else_is_in_the_scene(world, beside):
     # Two bars of two discs meet head on, beside a square of other constraints. All bodies of a scene with one of these bounced

@@ -111,6 +111,7 @@ def reference(n, h, substeps):
     return low, up, load
 
 
+@pytest.mark.slow
 def test_a_column_learns_as_the_reference_does(world):
     # Four blocks for ten windows at 2 substeps: sums of the same numbers, to rounding.
     w, loops = standing(world, column(4), friction=0.0, substeps=2)
@@ -124,6 +125,7 @@ def test_a_column_learns_as_the_reference_does(world):
     np.testing.assert_allclose(np.bincount(body[:, 0], values["load"], minlength=4)[1:], load[1:], rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("links", [False, True])
 def test_a_column_bears_what_is_above(world, links):
     # Without known loads, clusters are pressed flat by (2 + 4 F / m g) g h^2, see test_polygons.py.
@@ -231,6 +233,7 @@ def test_a_lift_carries_a_stack(world):
     assert bent(w, loops) < 1e-3 and w.position[:-1, 1].min() == pytest.approx(y, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_what_was_learnt_holds_at_any_substep(world):
     # A load is a force: what was learnt at 40 substeps a frame bears five boxes at 2 substeps. Without loads they would sink by
     # the sum of (2 + 4 k) g h^2, k = 0 ... 4, 0.035 m.

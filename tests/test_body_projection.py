@@ -43,6 +43,7 @@ def centers(values):
     return values.reshape(-1, 4, 2).mean(axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["polygons", "discs"])
 @pytest.mark.parametrize("hold", HOLDS)
 def test_a_box_that_falls_on_a_box_stays_there(world, kind, hold):
@@ -67,6 +68,7 @@ def test_a_box_on_a_column_of_boxes(world, kind):
         assert max(height) < 5.5 + 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["polygons", "discs"])
 @pytest.mark.parametrize("hold", HOLDS)
 def test_boxes_that_meet_head_on_go_on_together(world, kind, hold):
@@ -100,6 +102,7 @@ def test_an_eccentric_impact_is_that_of_rigid_bodies(world, substeps):
     assert np.abs(spin - turn).max() < 3e-3 * v
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.0, 0.1, 0.2])
 def test_friction_of_an_impact_is_coulombs(world, friction):
     # A box lands on a platform at 3 m/s and slides: it loses friction times that speed.
@@ -112,6 +115,7 @@ def test_friction_of_an_impact_is_coulombs(world, friction):
     assert np.abs(w.velocity[4:] - (1 - 3 * friction, 0)).max() < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [1, 10])
 def test_cubes_of_spheres(world, ratio):
     cube = np.array(list(itertools.product((-0.25, 0.25), repeat=3)))
@@ -161,6 +165,7 @@ def test_bodies_are_found(world):
     assert found([_links([range(4)], BOTH)], flat) == [[0, 1, 2, 3]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["polygons", "discs"])
 def test_the_same_bits_on_all_paths(world, kind):
     place = [(x + 0.5 * row, 0.5 + row) for row in range(3) for x in range(3 - row)]

@@ -337,6 +337,7 @@ def test_functions_that_kernels_call_change_no_bit(monkeypatch, scene, precision
     assert calls == (patched and ARCH == "cpu") and not copies
 
 
+@pytest.mark.slow
 def test_no_frame_of_a_game_waits_for_what_a_repeated_frame_needs(world):
     # A soft ring on a floor: under "auto", frame 34 is repeated with shorter substeps, and walls stop what links move meanwhile.
     ring = tv.shapes.polygon((0, 1.0), 0.35, 24)

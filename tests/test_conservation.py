@@ -211,6 +211,7 @@ def radii(x, pairs, most):
     return out
 
 
+@pytest.mark.slow
 def test_a_flat_scene_is_the_same_in_3d(world):
     x, v, m, pairs, rest, alpha, damping = net(2, seed=2)
     alpha = np.maximum(alpha, 1e-12)  # rigid triangles would be bodies in 2D, see BodyProjection; in 3D they fold
@@ -316,6 +317,7 @@ def test_a_stiff_spring_that_turns_stores_what_its_load_does(world):
         assert report.energy == pytest.approx(turning + m / 2 * u**2, rel=(v / L / 120) ** 2 / 3)
 
 
+@pytest.mark.slow
 def test_springs_in_f32_gain_nothing(world):
     # Springs that move particles by less than half a digit of x in a substep. Where such moves are lost in x and kept in d, the
     # force is late by h, and the energy grows by exp(omega^2 h t) = 1.44 in t = 1.8 s. Dithered, they are right on average, and

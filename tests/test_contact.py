@@ -129,6 +129,7 @@ def test_settled_piles_are_quiet(world):
             assert up[across].sum() == pytest.approx(9.81 * (height > level).sum(), rel=1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["f64", "f32"])
 def test_what_falls_on_something_lighter_stays_there(world, precision):
     # Without restitution nothing is thrown back, whatever lies between a disc and the floor: one pass per substep would hold a
@@ -190,6 +191,7 @@ def test_idle_columns_do_not_creep(world):
     assert tv.measure.kinetic_energy(w) <= 1e-6 * 9.81 * 0.5
 
 
+@pytest.mark.slow
 def test_idle_piles_do_not_creep(world):
     # Row 43: a settled pile with friction does not creep either: in 1e5 substeps only the last digits of coordinates change.
     k = np.arange(40)

@@ -51,6 +51,7 @@ def test_article_runs_and_checks_itself(printed, tmp_path):
     assert (tmp_path / "article.rrd").stat().st_size > 100_000
 
 
+@pytest.mark.slow
 def test_the_article_gains_no_energy_under_auto(taichi):
     # The discs lie on ropes, so a shorter substep cannot correct discs and ropes one after the other. If they were not corrected
     # together, the 78th frame would have 3e7 J instead of 5e4 J, after nine tries with twice the substeps each.

@@ -248,6 +248,7 @@ def test_launches_count_what_the_scene_needs(world):
         assert f"{total} per frame" in w.explain()
 
 
+@pytest.mark.slow
 def test_the_host_asks_once_in_a_frame(world):
     # Launched phase by phase, as on a GPU, the host does not wait for launches. It reads the result of the frame. Where the
     # neighbour list is stale, it also reads whether the new list fits, and the result of the frame that continues from there.

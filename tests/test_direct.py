@@ -422,6 +422,7 @@ def test_what_gives_way_gains_no_energy_where_substeps_change(world, substeps):
         assert twin.hash() == w.hash()
 
 
+@pytest.mark.slow
 def test_discs_that_bounce_on_a_taut_rope_gain_no_energy(world):
     # As above, with contacts in the way of moves that would first take out what is stored. The tension is found to a fifth, so
     # energies err by a twentieth of that of the impact also where substeps do not change.

@@ -325,6 +325,7 @@ def test_what_cannot_stay_is_built_anew():
     w.close()
 
 
+@pytest.mark.slow
 def test_an_edit_makes_and_compiles_nothing():
     w, more = discs()
     w.run(0.1)

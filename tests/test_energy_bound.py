@@ -203,6 +203,7 @@ def test_less_of_a_force_is_less_to_lose(world):
         assert FLAG in w.run(1.0).flags
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["alone", "one of many"])
 def test_what_springs_lose_to_the_substep_is_told(world, place):
     # Two discs of 1 kg vibrate with C^2 / 2 alpha, C = 0.1 m. At omega h = sqrt(2 / alpha) h = 0.012 this stays; at 1.2 a period

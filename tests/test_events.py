@@ -355,6 +355,7 @@ def test_nothing_is_lost_where_lists_grow(world):
     np.testing.assert_allclose(through.touches.speed, (r * v[j]).sum(1) / np.linalg.norm(r, axis=1), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_absent_and_switched(world):
     w = stage(world, sensing=False, events=False)
     assert not any("event" in name or "touched" in name for name in w.fields)

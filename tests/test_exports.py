@@ -256,6 +256,7 @@ def test_a_plane_is_at_zero_and_particles_may_come(changing, tmp_path):
         assert not (tmp_path / f"a.{kind}").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["obj", "pvd", "glb", "gif"])
 def test_links_that_broke_are_not_shown(kind, tmp_path, world):
     # Three weights of 1 kg hang on links that bear 5, 15 and 25 N; gravity grows from 1 to 10 and 20 m/s^2, so that the first

@@ -50,6 +50,7 @@ def test_forgeries_are_named(original, quick, tmp_path):
     assert not passed
 
 
+@pytest.mark.slow
 def test_what_was_not_forged_is_intact(original, quick, tmp_path):
     assert tv.replay(Forgery(original).save(tmp_path / "b.rrd")).verify()
     open_ended = tv.replay(Forgery(original).save(tmp_path / "c.rrd", seal=False)).verify()

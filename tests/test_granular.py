@@ -21,6 +21,7 @@ def test_gas_of_spheres():
     assert figures["moment"] == pytest.approx(1, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim, fraction", [(2, 0.5), (3, 0.3)])
 def test_energy_of_a_gas(dim, fraction):
     # R23: 1000 collisions per particle at 12 substeps between two, to the rounding of f32: 1e4 substeps, each of which may

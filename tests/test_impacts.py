@@ -161,6 +161,7 @@ def in_rows(rows, dim=2):
     return start, [np.flatnonzero((group == k) & (flat[:, 4] == 0)) for k in range(len(rows))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind, limit", [("discs", 1e-12), ("polygons", 1e-12), ("spheres in f32", 1e-4)])
 def test_what_bounces_on_pinned_particles_keeps_its_energy(world, kind, limit):
     # Under gravity, E = v^2 / 2 + g y is kept for any substep where e = 1: for a particle that falls on a pinned one, flies to
@@ -418,6 +419,7 @@ def test_heaps_are_steeper_with_friction_and_flat_without(world, dim):
     assert 0.02 < slopes[0] < 0.5 * slopes[1], slopes
 
 
+@pytest.mark.slow
 def test_what_takes_over_a_state_goes_on_to_the_bit(world):
     # Also with other neighbour lists. test_sleep.py tests the paths.
     rng = np.random.default_rng(3)
@@ -470,6 +472,7 @@ def test_what_is_driven_strikes(world, e):
     np.testing.assert_allclose(w.velocity[[1, 3], 0], (1 + e) * V, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_what_bounces_is_the_same_with_a_new_list(world):
     # Mass splitting is recomputed when other pairs touch than before. A new list takes from the data of pairs whether they
     # touch. It must not take pairs for touching that were pushed early in a substep and separated in a later pass.
@@ -505,6 +508,7 @@ def test_bodies_of_discs_that_bounce_come_to_rest(world):
     assert np.abs(w.velocity).max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_dense_gas_gains_no_energy_in_several_passes(world):
     # Where e < 1 every impact takes energy. In later passes pairs approach by what others pushed in earlier ones, which is no
     # force. If it counted as one, pairs would rest that should bounce, and be pushed apart: the gas would gain 9 J of 300 a
@@ -528,6 +532,7 @@ def test_what_starts_on_a_wall_bounces(world, precision):
     np.testing.assert_allclose(w.velocity[:, 1], 1.5, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_what_hangs_side_by_side_stays_finite(world):
     # Five bobs of two discs that just touch fall by the sag of their rods, all alike: slips of pairs are 0, and loads that were
     # too large by rounding are taken back. Friction then divided 0 by 0.
@@ -544,6 +549,7 @@ def test_what_hangs_side_by_side_stays_finite(world):
             assert np.isfinite(w.velocity).all() and np.abs(w.position - x)[:, 0].max() < 0.01, (e, substeps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spin", [None, 0.0])
 def test_friction_where_a_disc_meets_two_adds_no_energy(spin, world):
     # A ball breaks a rack of 15 that touch almost, so discs meet several others in one substep. At e = 1 impacts keep the energy

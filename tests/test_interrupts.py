@@ -99,6 +99,7 @@ def in_parts(w, passes, frames):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("passes", [1, 2, 5, 7])
 def test_long_frames_in_several_launches_have_the_same_bits(w, passes):
     whole, parted = in_parts(w, passes, 12)  # of 12 passes each

@@ -89,6 +89,7 @@ def smooth(world, x, mass, pinned=(), high=(99.0, 99.0), **settings):
     return w
 
 
+@pytest.mark.slow
 def test_a_column_bears_what_is_above(world):
     # A contact bears the weight of all discs above it, and the ground bears all. Loads are exact to rounding; nothing overlaps.
     mass = 2.0 + np.arange(10) % 2
@@ -100,6 +101,7 @@ def test_a_column_bears_what_is_above(world):
     assert np.abs(w.velocity).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_a_load_is_learnt_where_it_is_steady_and_lost_where_it_is_let_go(world):
     # A disc of 1 kg bears one of 99 kg. The part of the pair's load that is not known is learnt if it was the same in the
     # previous window of 128 substeps. Nothing is learnt in the first window, before which nothing was missing. Then each window
@@ -255,6 +257,7 @@ def test_what_bounces_knows_no_load(world):
     assert abs(known.contacts.overlap[0]) < 1e-9 and known.contacts.impulse[0] * 1200 == pytest.approx(G, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_loads_are_of_the_state(world):
     # Clones and Worlds have the same bits, and loads may be switched on later. For all paths see test_determinism.py.
     a = pile(world, precision="f32")

@@ -25,6 +25,7 @@ def reference(name, t):
     return np.array(values.get("nodes_1based", np.arange(len(xy)) + 1)), xy
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("high", HIGH)
 def test_orders_and_the_error_of_a_good_peer(world, high):
     # MuJoCo 4.0 with RK4 in joint coordinates, RMS error of positions: D01 at t = 2 with 60 and 240 steps/s: 2.2e-6, 2.5e-8 m;

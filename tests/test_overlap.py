@@ -48,6 +48,7 @@ def test_what_rounding_makes_overlap_is_known_too(world):
     assert "Contact.shrunk" not in wide.fields
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["another radius", "contacts"])
 def test_a_rebuilt_world_is_compiled_once_for_what_overlaps_in_it(what, world):
     row = np.stack([np.arange(5) * 0.2, np.zeros(5)], axis=1)
@@ -93,6 +94,7 @@ def test_only_scenes_that_start_with_overlap_have_the_field_for_it(world):
             assert "Contact.shrunk" in checkpoint.keep(w).values and w.hash() == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pinned", [(), (0, 1)], ids=["linked", "pinned"])
 def test_what_starts_between_others_is_not_shot_out(world, pinned):
     # A disc y away from the middle between two others, d away from each: d^2 = y^2 + (L / 2)^2, so y' = d' d / y, which has no
@@ -130,6 +132,7 @@ def test_diameters_are_those_of_all_distances():
         assert more or found[0] == apart.max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["discs", "spheres", "boxes"])
 def test_what_overlaps_in_a_row_parts_at_push_out(kind, world):
     # Ten in a row, each in the next one by a fifth: if each pair parted at push_out, the ends would part at 9 push_out. A pair
@@ -153,6 +156,7 @@ def test_what_overlaps_in_a_row_parts_at_push_out(kind, world):
     assert report.overlap < 1e-6 and abs(w.position.mean(axis=0) - middle).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_what_goes_to_a_free_place_compiles_nothing(world):
     # Six discs rest on each other, and overlap as their loads make them. One is carried off, twice before it is seen: the others
     # still bear loads, which are no error of placing. The first disc of a group that is named, but had no particles, is not

@@ -70,6 +70,7 @@ def test_a_pile_gains_no_energy_however_the_substep_changes(world, dim, friction
         assert most <= start * (1 + 1e-3), turns
 
 
+@pytest.mark.slow
 def test_frames_much_shorter_than_the_last_throw_nothing(world):
     # A jammed pile under steps of 1/60 s, 10 us and 0.1 ms in turns, as a loop measures them. The overlap that the moves leave
     # would store (h / h')^2, up to 1e6, times its energy: 5e5 J in the first step. At most it lifts the pile by what it has
@@ -136,6 +137,7 @@ def test_ropes_in_a_heap_gain_none_either(world):
     assert w.last.energy == pytest.approx(rest, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_what_is_taken_out_does_not_depend_on_lists(world):
     # A clone builds its own neighbour list. For other paths, which have their own lists, see test_determinism.py.
     w = pile(world, lattice(5, 2), 0.3, 0.0, 2)
@@ -255,6 +257,7 @@ def test_moves_of_whole_bodies(world, dim):
     np.testing.assert_allclose(solids.fitted(x @ turn + 1.0)[:8], (x @ turn + 1.0)[:8], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hold", ["links", "shapes"])
 def test_planks_on_a_hinge_go_where_their_load_needs_them(world, hold):
     # Two planks between two pins, hinged at the same height by a link of length 0, with a box on them, at rest at 8 substeps. The

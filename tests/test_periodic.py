@@ -100,6 +100,7 @@ def test_no_pair_is_missed_whichever_image_is_near(world, name):
         assert twin.hash() == w.hash()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("contact", [True, False])
 def test_queries_find_the_nearest_image(world, contact):
     rng, length = np.random.default_rng(1), np.array([4.0, 3.0])
@@ -287,6 +288,7 @@ def strain(w):
     return w.features[0].strain
 
 
+@pytest.mark.slow
 def test_many_worlds_have_boxes_of_their_own():
     particles, features, settings = crowd(np.zeros(2), False, tv.Contact(), shear=0.5)
     with tv.World(particles, [features[0], features[2]], **settings) as one, tv.Worlds(one, 3) as many:

@@ -127,6 +127,7 @@ def test_a_pin_that_takes_other_particles_is_as_a_new_one(world, compliance, pre
             pin.indices = value
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not patched, reason="takes minutes to compile there")
 @pytest.mark.parametrize(("compliance", "precision"), KINDS)
 def test_a_recording_knows_which_particles_were_held(world, tmp_path, compliance, precision):
@@ -183,6 +184,7 @@ def test_a_pin_takes_another_disc_in_one_launch(world, monkeypatch):
     assert counts[1] - counts[0] <= 180  # 153 with Python 3.11
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not patched or ARCH != "cpu", reason="every edit builds the world anew there")
 @pytest.mark.parametrize("spin", [None, 1.0])
 def test_the_energy_counts_what_a_pin_lets_go_and_not_what_it_takes(world, spin):

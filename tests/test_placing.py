@@ -219,6 +219,7 @@ def direction(x):
     return ti.atan2(x.x, 1.0)
 
 
+@pytest.mark.slow
 def test_bodies_without_extent_are_moved_without_velocity(world):
     # A bead of a user's constraint at x = 20: a step of -atan(20) (1 + 20^2) went to -590 m, and the next ones to 1e14 m.
     bead = world(tv.Particles([[20.0, 0.4]]), [tv.Constraint(direction, [0], rest=0.0)])

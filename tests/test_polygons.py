@@ -100,6 +100,7 @@ def test_boxes_stand_on_each_other_and_on_slopes(world):
         assert load == pytest.approx(4 * 9.81 * np.cos(np.radians(degrees)), rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*no constraint holds loops")
 def test_impulses_are_what_momentum_changes_by(world):
     # A point of 1 kg meets a free edge at a quarter of its length: the gradients are 1, -3/4 and -1/4, so the impulse is
@@ -207,6 +208,7 @@ def test_a_pile_settles_without_overlap_and_alike_on_both_paths(world):
     assert apart.min() > 0.16 * 0.98
 
 
+@pytest.mark.slow
 def test_corners_of_one_width_carry_each_other(world):
     # Rigid boxes of one width, corners on corners. At so few substeps, one substep moves corners deeper than edges reach beyond
     # their ends. Contacts are resolved. A pass gives a cluster of four corners of mass m back half of the displacement by a load
@@ -438,6 +440,7 @@ def test_corners_that_cross_part_over_the_nearer_edge(world):
     assert max(sat(y[loops[k]], y[loops[k + 1]])[0] for k in range(0, len(shapes), 2)) < 1e-6
 
 
+@pytest.mark.slow
 def test_a_hub_that_is_tied_to_all_corners_is_no_stray_particle(world):
     # A wheel with its hub inside, in one rigid cluster or by spokes, rolls along the floor: its middle stays a radius above it.
     angle = np.pi / 6 * np.arange(12)

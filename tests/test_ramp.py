@@ -190,6 +190,7 @@ def test_copies_edits_and_recordings_know_where_a_ramp_begins(world, tmp_path):
     assert tv.replay(tmp_path / "a.rrd").verify().kind == "intact"
 
 
+@pytest.mark.slow
 def test_what_comes_while_a_ramp_waits_begins_at_rest_values_of_its_own(world):
     particles, features, turn = crowd()
     n, far = len(particles), particles.position + [0, 20.0]

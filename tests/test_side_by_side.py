@@ -53,6 +53,7 @@ def test_each_view_is_the_picture_of_that_world(taichi, tmp_path, overlays):
         w.close()
 
 
+@pytest.mark.slow
 def test_time_goes_on_where_worlds_are_reset(taichi, tmp_path):
     with tv.Worlds(scene(0), 3) as many:
         with tv.WorldsRecorder(tmp_path / "a.rrd", many, every=2) as recorder:

@@ -85,6 +85,7 @@ def test_a_row_that_was_never_disturbed_is_hit_to_the_bit(world):
     assert worlds[1].velocity[4] == pytest.approx([10.0, 0.0], abs=2e-5)
 
 
+@pytest.mark.slow
 def test_against_a_world_that_never_rested(world):
     """Until the disc arrives, a sleeping pile is off by less than speed * time from one that is awake.
 
@@ -404,6 +405,7 @@ def test_linked_particles(world, solver):
     assert w.last.asleep == 0 and 1.5 < w.time < 1.65  # when the ball arrives: sqrt(2 * 12 / g) = 1.56 s
 
 
+@pytest.mark.slow
 def test_what_is_grazed_wakes_before_its_links_are_solved(world):
     """A grazed disc wakes before its links are solved, so that these hold it in the same substep.
 
@@ -465,6 +467,7 @@ def test_bodies_of_loops(world):
     worlds[-1].close()
 
 
+@pytest.mark.slow
 def test_a_surface_and_a_cluster(world):
     """A loop with pressure and a soft cluster on a pinned corner, of any number of corners, sleep without a change.
 
@@ -544,6 +547,7 @@ def test_refusals(world):
         tv.Worlds(w, 3)
 
 
+@pytest.mark.slow
 def test_braced_bodies_bear_nothing_in_free_fall_and_are_not_solved_where_they_sleep(world):
     # Six links of a square do the work of five: the violation that is left is rounding, partly in the null space, where steps of
     # conjugate gradients could have any multiplier. Free fall needs none, and rows that sleep are not solved.

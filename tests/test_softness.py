@@ -61,6 +61,7 @@ SCENES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", SCENES)
 def test_what_hangs_or_stands_comes_to_rest(world, scene, monkeypatch):
     # Frames differ by up to a fifth. At a start, velocities lack half a kick of the old substep, so what is at rest gets
@@ -77,6 +78,7 @@ def test_what_hangs_or_stands_comes_to_rest(world, scene, monkeypatch):
     assert np.mean(fastest) < G * 0.4 / 60 / SUBSTEPS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver, iterations", [(None, 1), (tv.Jacobi(), 1), (tv.Chebyshev(), 4)], ids=repr)
 def test_a_net_rests_where_it_does_in_the_longest_frames(world, solver, iterations):
     # s W h^2 is that of the longer frames, and so is the sag s W h^2 F, but for less than a move g h^2 k of row k in a substep.

@@ -232,6 +232,7 @@ def test_the_top_of_a_box_is_a_plane(stage, world):
             np.testing.assert_allclose(got, plane.position, atol=2e-4 if stage.single else 9.81 / 2 / 1200**2)
 
 
+@pytest.mark.slow
 def test_restitution_on_every_solid(stage):
     # R16: heights h0 e^(2 n), at rest at t_rest; h = 1/600.
     want = case("R16_bounce_e0.5")["values"]

@@ -212,6 +212,7 @@ def test_64_chebyshev_refuses_what_is_unstable(world):
         tv.World(tv.Particles(x), solver=tv.Direct)
 
 
+@pytest.mark.slow
 def test_chebyshev_has_the_same_bits_on_all_paths(world):
     # For systems see test_determinism.py.
     hashes = []
@@ -452,6 +453,7 @@ def test_what_few_steps_take_from_rotations_is_told(world):
         assert (abs(moment - 1) < 1e-3) == kept, moment
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [tv.Jacobi(), tv.ConjugateGradient(5)], ids=repr)
 @pytest.mark.parametrize("cause", ["length", "placed"])
 def test_soft_bodies_gain_no_energy_where_frames_are_starts(world, solver, cause):

@@ -119,6 +119,7 @@ def test_a_scene_of_links_has_a_residual(monkeypatch, capsys):
     assert look["launches"] == 1 and look["path"] == "fused" and not look["flags"]
 
 
+@pytest.mark.slow
 def test_edits_are_timed(report):
     assert {w.act for w in report.waits} == {*waits.FIRST, *waits.AIMS} and {w.particles for w in report.waits} == {400}
     assert all(w.cold >= 0 and w.warm >= 0 and w.aim == waits.AIMS.get(w.act) for w in report.waits)

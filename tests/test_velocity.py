@@ -104,6 +104,7 @@ def test_what_keeps_its_velocity_goes_on_to_the_bit(world, precision):
     assert back.hash() == free.hash() and steered.position[-1, 1] > free.position[-1, 1] + 0.1
 
 
+@pytest.mark.slow
 def test_piles_come_to_rest_and_sleep_while_one_steers(world):
     # Loads stay known and sound is damped, though velocities are clipped after each frame and another particle is steered. With a
     # start in every frame the pile would keep shaking by 2e-4 J.

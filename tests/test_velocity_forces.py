@@ -285,6 +285,7 @@ def test_the_same_bits_in_copies(world):
         assert twin.hash() == w.hash()
 
 
+@pytest.mark.slow
 def test_a_recording_proves_itself_and_goes_on(world, tmp_path):
     w = world(*scene(), substeps=2)
     path = tmp_path / "wild.rrd"

@@ -296,6 +296,7 @@ def sliding(friction=0.4, restitution=0.3, offset=0.0, between=0.5, apart=0.2, a
     return tv.World(start, [tv.Gravity(9.81), floor, tv.Contact(friction=between, restitution=apart)], precision="f64")
 
 
+@pytest.mark.slow
 def test_walls_and_contacts_take_each_knob_per_world(taichi):
     # Knobs set one after the other or in one call, before and after steps, with values for all in between: as in worlds built
     # with them.
