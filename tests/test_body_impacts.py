@@ -424,6 +424,7 @@ def test_what_is_struck_is_never_inside(world):
         assert (w.position >= -1e-12).all() and (w.position <= 2 + 1e-12).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("e", [0.0, 0.5])
 def test_the_impulse_of_an_impact_is_that_of_the_body(world, e):
     # M (1 + e) v for a body of three particles that lands flat on two of them.

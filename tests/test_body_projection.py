@@ -127,6 +127,7 @@ def test_cubes_of_spheres(world, ratio):
     assert max(height) < 1.5 + 0.01 and min(height) > 1.5 - 0.01
 
 
+@pytest.mark.slow
 def test_boxes_thrown_at_each_other_keep_momentum(world):
     # Discs also keep angular momentum, but for the turn of normals in the substep of an impact.
     a = np.linspace(0, 2 * np.pi, 9)[:-1]

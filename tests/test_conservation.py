@@ -254,6 +254,7 @@ def test_motion_is_reversible(world):
     np.testing.assert_allclose(s["position"], begin["position"] - begin["displacement"], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_splitting_a_run_changes_nothing(world):
     x, v, m, pairs, rest, alpha, damping = net(2, seed=2)
     links = tv.Distance(pairs, rest, compliance=alpha, damping=damping)

@@ -124,6 +124,7 @@ def test_a_load_is_learnt_where_it_is_steady_and_lost_where_it_is_let_go(world):
     assert known(w) == 0.0 and 1.0 < np.linalg.norm(w.position[1] - w.position[0]) < 1.02
 
 
+@pytest.mark.slow
 def test_what_is_known_holds_at_any_substep(world):
     # A load is a force: loads that were learnt in a second at 200 substeps a frame bear a column of 50 at 2 substeps. Contacts
     # alone would overlap by 2 k g h^2 there, 7e-2 of a diameter at the ground. A pile of 25 with friction stands at 1 substep.

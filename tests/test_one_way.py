@@ -56,6 +56,7 @@ def test_a_platform_that_moves_and_turns(world):
     assert (w.position[:2, 1] < -3).all() and not w.step(1 / 60).flags
 
 
+@pytest.mark.slow
 def test_a_sheet_in_space(world):
     corners = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], dtype=float)
     sheet = tv.Mesh(corners, [(0, 2, 1), (0, 3, 2)], closed=False, one_way=(0, 1, 0))

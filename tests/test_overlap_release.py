@@ -293,6 +293,7 @@ def test_planks_on_a_hinge_go_where_their_load_needs_them(world, hold):
     assert tv.measure.kinetic_energy(w) < 0.01
 
 
+@pytest.mark.slow
 def test_what_is_lifted_does_not_end_inside_of_what_was_far(world):
     # A bob of 20 kg on a rope rests 0.7 m lower at 2 substeps than at 20, which lift it by m g 0.7 = 144 J. A bead, on no
     # neighbour list of the bob, is pinned where the bob ends up. The bob must not end inside of the bead, which would bring up to
@@ -358,6 +359,7 @@ def test_slow_motion_brings_no_energy_into_soft_bodies(world):
         short.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compliance", [0.0, 1e-7])
 def test_a_lattice_that_swings_keeps_its_energy_where_the_substep_gets_shorter(world, compliance):
     # Clusters of 6 x 6 share particles, hang from one and sag at 2 substeps by what passes leave. At 20 they have the shape that

@@ -196,6 +196,7 @@ def test_a_ring_around_the_box_swings_as_a_periodic_chain(world):
     np.testing.assert_allclose(w.position[:, 1], 0.5, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rigid", [True, False])
 def test_a_closed_chain_with_bends_rests_as_it_was_put(world, rigid):
     # A chain straight around the box: all lengths and angles are met, also across the boundary, so only its centre moves.

@@ -136,6 +136,7 @@ def test_what_was_recorded_reads_back(falling, tmp_path):
         recording.export("a.txt")
 
 
+@pytest.mark.slow
 def test_damage_is_named(falling, tmp_path, read_here):
     whole = falling.read_bytes()
     path = tmp_path / "b.rrd"

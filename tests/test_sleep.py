@@ -485,6 +485,7 @@ def test_a_surface_and_a_cluster(world):
         assert w.hash() == other.hash()
 
 
+@pytest.mark.slow
 def test_frames_that_a_loop_measures_wake_nothing(world):
     """A heap sleeps where it lies while frames get up to a tenth longer and shorter, and stays there when it wakes.
 

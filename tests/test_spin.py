@@ -181,6 +181,7 @@ def test_a_super_ball_comes_back(world):
     assert tv.measure.kinetic_energy(w) == pytest.approx(energy, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_what_rolls_off_another_does_so_to_second_order(world):
     # (1 + 1 / k) (R + r) theta'' = g sin theta for a body that rolls on a pinned one; the reference is by Runge and Kutta.
     k, R, r, theta, T = 2.5, 1.0, 0.2, 0.3, 0.5

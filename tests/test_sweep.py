@@ -58,6 +58,7 @@ def test_parts_of_any_size_have_the_same_bits(here, at_once):
     assert same(here, tv.sweep(pendulum, rows, ends, at_once=at_once, progress=True))
 
 
+@pytest.mark.slow
 def test_processes_have_the_same_bits_and_share_the_cores(here, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "3")  # for workers of executors; workers of the sweep set their own
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

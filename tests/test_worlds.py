@@ -183,6 +183,7 @@ def test_a_list_that_is_too_short_in_one_grows_in_all(taichi):
         assert many.each(lambda world: len(world.contacts)) == [len(w.contacts) for w in alone]
 
 
+@pytest.mark.slow
 def test_what_is_wrong_in_one_is_flagged_for_it_alone(taichi):
     # NaN and an explosion in two of eight worlds; the others have the bits of worlds without such a neighbour.
     worlds = [heap(k, 20) for k in range(8)]
