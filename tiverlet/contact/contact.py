@@ -493,12 +493,10 @@ class Contact(PairContact):
                     self.store_push(i, e, push)
                     if ti.static(self.dev.once):
                         if other >= 0:
-                            self.push_back(i, j, e, other, push, want)
-                            if ti.static(self.dev.has_loads):
-                                self.dev.known.push_back(j, e, other, load)
+                            self.push_back(j, e, other, push, want, load)
                             if ti.static(self.dev.geometry.shrinks):
-                                out = ti.max(self.dev.geometry.held[j], self.dev.geometry.excess(j, i, -n, overlap, now.h))
-                                self.dev.geometry.held[j] = out
+                                excess = self.dev.geometry.excess(j, i, -n, overlap, now.h)
+                                self.dev.geometry.held[j] = ti.max(self.dev.geometry.held[j], excess)
                             if ti.static(self.dev.has_friction):
                                 if final != 0:
                                     self.dev.forces.sum[j] = self.dev.forces.sum[j] - self.dev.w.of(j) * force
@@ -534,10 +532,13 @@ class Contact(PairContact):
                 self.dev.splitting.invalidate_bound(i)
 
     @ti.func
-    def push_back(self, i, j, e, other, push, want):
-        """Correct particle j, too, by what pair e of particle i wants of i. other: the entry of i in the list of j."""
+    def push_back(self, j, e, other, push, want, load):
+        """Correct particle j, too: the opposite of what the pair at entry e `want`s of i, and of its load, a vector [N]. other:
+        the entry of i in the list of j."""
         self.dev.move[j] = self.dev.move[j] - self.dev.w.of(j) * want
         self.store_push(j, other, push)
+        if ti.static(self.dev.has_loads):
+            self.dev.known.push_back(j, e, other, load)
 
     @ti.func
     def held(self, i, j, n, normal, slip):
