@@ -7,6 +7,7 @@ import numpy as np
 from ..device import ti
 from ..features.feature import Acceleration
 from ..features.learning import SteadyMotion, is_steady, learnt_share
+from ..geometry import rotation
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.queries import between
 
@@ -141,7 +142,7 @@ class KnownLoads:
         """Return the known force of entry e, with the normal n [N]."""
         out = self.load.field[e] * n
         if ti.static(bool(self.friction)):
-            out += self.friction.load.field[e] * ti.Vector([-n[1], n[0]])
+            out += self.friction.load.field[e] * rotation.across(n)
         return out
 
     @ti.func
@@ -177,6 +178,11 @@ class KnownLoads:
             piece.field[other] = piece.field[e]
 
     @ti.func
+    def share(self, own, k):
+        """Return the share that is learnt of a load of k [m/s^2], of particles accelerated by their own weight `own` [m/s^2]."""
+        return learnt_share(own * own, ti.static(self.slow) * k * k + ti.static(self.lag) * own * own, WINDOW)
+
+    @ti.func
     def learn(self, of: ti.template(), i, j, e, load, mean):  # type: ignore[valid-type]
         """Return one load of entry e after a window in which `mean` of it was missing on average [N]."""
         steady = is_steady(mean, of.earlier.field[e])
@@ -185,7 +191,7 @@ class KnownLoads:
         if steady:
             k = ti.abs(load + mean) * ti.max(self.state.w.of(i), self.state.w.of(j))
             own = ti.max(self.weights.field[i], self.weights.field[j])
-            share = learnt_share(own * own, ti.static(self.slow) * k * k + ti.static(self.lag) * own * own, WINDOW)
+            share = self.share(own, k)
             load, mean = load + share * mean, (1 - share) * mean
             if ti.static(of.pushes):
                 load = ti.max(load, 0)

@@ -14,6 +14,7 @@ from ..features.extending import extended
 from ..features.feature import Batch, Feature, Knob, Scene
 from ..features.material import Table
 from ..features.regrouping import Regrouping
+from ..geometry import rotation
 from ..geometry.ordered import median
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
@@ -434,7 +435,7 @@ class Polygons(PairContact):
                             slip = self.dev.slip.field[at] + d
                             if ti.static(bool(self.dev.known)):
                                 if first != 0:
-                                    along = self.dev.known.known_friction(at, now) * ti.Vector([-n[1], n[0]])
+                                    along = self.dev.known.known_friction(at, now) * rotation.across(n)
                                     slip -= ti.select(missing > 0, alone, shared) * along
                                     want -= shared * along
                             if not as_bodies:
@@ -483,7 +484,7 @@ class Polygons(PairContact):
             if at >= 0:
                 found = self.dev.geometry.manifold.field[e]
                 _, shared = self.dev.geometry.share(self.dev.depths, e, v, a, b, t)
-                along = ti.Vector([-found[3], found[2]])
+                along = rotation.across(ti.Vector([found[2], found[3]]))
                 self.dev.slip.field[e] = self.dev.slip.field[e] + learnt * now.h * now.h * shared * along
 
     @ti.func
@@ -512,7 +513,7 @@ class Polygons(PairContact):
                         overlap, shared = self.dev.geometry.share(self.dev.depths, at, v, a, b, t)
                         moved = self.dev.slip.field[e] + d
                         if ti.static(bool(self.dev.known)):
-                            along = shared * self.dev.known.known_friction(at, now) * ti.Vector([-n[1], n[0]])
+                            along = shared * self.dev.known.known_friction(at, now) * rotation.across(n)
                             overlap = ti.max(overlap + self.dev.known.known_push(at, now) * shared, 0)
                             slip = self.table.held(v, a, n, overlap, moved - along) + along
                         else:
@@ -683,7 +684,7 @@ class PolygonRestitution:
     @ti.func
     def correct(self, e, v, a, b, t, n, aim, now):
         """Correct the push of the contact at entry e, of vertex v on the edge from a to b. Returns whether it was off."""
-        d, along = self.geometry.relative(self.state.d, v, a, b, t), ti.Vector([-n[1], n[0]])
+        d, along = self.geometry.relative(self.state.d, v, a, b, t), rotation.across(n)
         last, noted = self.push.field[e], self.noted.field[e]
         bend = self.impacts.path_bend(v, n) - (1 - t) * self.impacts.path_bend(a, n) - t * self.impacts.path_bend(b, n)
         if ti.static(self.impacts.clusters):
@@ -745,7 +746,7 @@ class PolygonRestitution:
                         size = aim.norm()
                         if size > 0 and self.by_bodies(v, a, b):
                             n = aim / size
-                            total += part * self.state.w.of(i) * (step[0] * n + step[1] * ti.Vector([-n[1], n[0]]))
+                            total += part * self.state.w.of(i) * (step[0] * n + step[1] * rotation.across(n))
             if self.impacts.in_cluster(i):
                 self.impacts.change[i] = total
             else:

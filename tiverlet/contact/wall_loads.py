@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..device import ti
-from ..features.learning import STEADY, learnt_share
+from ..features.learning import STEADY
 from .known_loads import WINDOW
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ class WallLoads:
     def __init__(self, scene: "Scene", known: "KnownLoads"):
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.memory, self.state, self.weights = scene.memory, scene.state, scene.own_weight
-        self.slow, self.lag, self.motion = known.slow, known.lag, known.motion
+        self.known, self.motion = known, known.motion
         self.load = add("WallLoads.load", n, width=dim, state=True)  # [N]
         self.borne = add("WallLoads.borne", n, width=dim, state=True)  # sum of the missing part in this window [kg m]
         self.earlier = add("WallLoads.earlier", n, width=dim, state=True)  # mean missing part in the window before [N]
@@ -76,7 +76,7 @@ class WallLoads:
                 mean, earlier = (borne - missing) / (WINDOW * now.h * now.h), self.earlier[i]
                 if (mean - earlier).norm() < ti.static(STEADY) * mean.norm() and self.motion.is_steady(i):
                     k, own = (load + mean).norm() * w, self.weights.field[i]
-                    share = learnt_share(own * own, ti.static(self.slow) * k * k + ti.static(self.lag) * own * own, WINDOW)
+                    share = self.known.share(own, k)
                     self.slide(i, -w * now.h * now.h * share * mean)
                     load, mean = load + share * mean, (1 - share) * mean
                 self.earlier[i], borne = mean, missing

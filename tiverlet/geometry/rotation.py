@@ -107,6 +107,12 @@ def skew(x, like):
 
 
 @ti.func
+def across(n):
+    """Return a vector in the plane, turned by a quarter to the left."""
+    return ti.Vector([-n[1], n[0]])
+
+
+@ti.func
 def from_rows(v):
     """Return the square matrix whose rows stand one behind another in a vector."""
     dim = ti.static(2 if v.n == 4 else 3)
