@@ -22,6 +22,7 @@ from .each_once import ROUNDS, EachOnce
 from .events import EventLog
 from .exclusions import excluded_pairs
 from .force_share import ForceShare
+from .impact_projection import ImpactProjection
 from .known_loads import KnownLoads
 from .mass_splitting import MassSplitting, lesser
 from .narrow_phase import DiscGeometry
@@ -208,6 +209,9 @@ class Contact(PairContact):
         if dev.spins:
             dev.spinning = Spinning(scene, self.table, dev.splitting.weight, dev.turn)
         dev.projection = VelocityProjection(scene, dev.geometry, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
+        dev.impacts = None
+        if self.lands:
+            dev.impacts = ImpactProjection(scene, dev.geometry, dev.push, dev.splitting.weight, dev.move)
         dev.once = self._solves_once(scene, team)
         return dev.search
 
@@ -313,7 +317,7 @@ class Contact(PairContact):
     def may_project(self, now):
         """Whether displacements may be projected after this substep, so that the pushes of walls have to be known."""
         out = True
-        if ti.static(not (self.dev.bodies or self.dev.projection.unequal)):
+        if ti.static(not (self.dev.bodies or self.dev.impacts or self.dev.projection.unequal)):
             out = self.dev.projection.is_due(now)
         return out
 
@@ -405,6 +409,9 @@ class Contact(PairContact):
                             self.dev.projection.note_pair(i, j, n, overlap, alone * last)
                             if other >= 0:
                                 self.dev.projection.note_pair(j, i, -n, overlap, alone * last)
+                    if ti.static(bool(self.dev.impacts)):
+                        if first != 0:
+                            self.dev.impacts.note(i, j, n, overlap, alone * last, other, now.h)
                     push, known = again * last, ti.zero(overlap)  # known: the part of the push that its known load already gave
                     left = ti.zero(overlap)  # the part of the substep after an impact
                     keeps = ti.max(lesser(1 - alone * each, ti.static(CARRY)), 0)

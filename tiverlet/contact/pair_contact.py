@@ -175,6 +175,11 @@ class PairContact(Feature):
         return bool(vars(self).get("loads"))
 
     @property
+    def lands(self) -> bool:
+        """Whether single particles have inelastic impacts, see impact_projection.py."""
+        return self.projects and not self.has_restitution
+
+    @property
     def shares_loads(self) -> bool:
         """Whether particles read the loads of contacts that other particles store."""
         return self.stored_once and self.has_loads

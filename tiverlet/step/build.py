@@ -155,7 +155,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     surfaces = [*walls, *([contact] if contact else [])]
     has_friction, bounces = any(f.has_friction for f in surfaces), any(f.has_restitution for f in surfaces)
     solver = solver or (choose_solver(batches, scene) if scene.order == 2 else Direct())
-    if (batches and solver.loads) or (contact and contact.has_loads):
+    if (batches and solver.loads) or (contact and (contact.has_loads or contact.lands)):
         scene.own_weight = OwnWeight(scene)
     if batches:
         with memory.owned("slots"):

@@ -3,6 +3,8 @@
 from typing import TYPE_CHECKING, Any
 
 from ..contact.each_once import ROUNDS, Turn, first_round
+from ..contact.impact_projection import AROUND, STRUCK
+from ..contact.impact_projection import ROUNDS as IMPACT_ROUNDS
 from ..contact.projection_times import ALWAYS
 from ..device import ti
 from ..device.number import OnDevice
@@ -28,6 +30,7 @@ class ContactPass:
             contact.has_friction or contact.has_restitution or contact.has_events or contact.shares_loads
         )
         self.projects_velocities = bool(contact) and contact.projects
+        self.projects_impacts = bool(contact and contact.dev.impacts)
         self.projects_bodies = bool(contact and contact.dev.bodies)
         if self.has_restitution and team.launched:  # the host does not read whether any pair bounces in a round
             self.bounces = scene.memory.field("Contact.bounces", None, kind=ti.i32)
@@ -162,6 +165,43 @@ class ContactPass:
                 ti.loop_config(serialize=True)
                 for _ in range(self.team.one(1, thread)):
                     c.dev.hit[None] = 0
+
+    @ti.func
+    def has_struck_discs(self):
+        """Whether discs struck each other in this substep."""
+        out = False
+        for c in ti.static(self.contacts):
+            out = c.dev.impacts.any_struck[None] != 0
+        return out
+
+    @ti.func
+    def project_discs(self, thread, k):
+        """Do round k of the impacts of discs, see ImpactProjection."""
+        for c in ti.static(self.contacts):
+            n = ti.select(k == 0, self.n, 0)
+            for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                c.dev.impacts.begin(i)
+            size = ti.select(k == 0, 0, c.dev.impacts.size[None])
+            begin, end = self.team.chunk_begin(size, thread), self.team.chunk_end(size, thread)
+            for m in range(begin, end):
+                if k <= AROUND:
+                    c.dev.impacts.spread(c.dev.impacts.near[m], STRUCK + 1 - k)
+                elif k == AROUND + 1:
+                    c.dev.impacts.list_pairs(c.dev.impacts.near[m])
+                else:
+                    c.dev.impacts.relax(c.dev.impacts.near[m], k - AROUND - 2)
+            self.team.wait()
+            for m in range(begin, end):
+                i = c.dev.impacts.near[m]
+                if k > AROUND + 1:
+                    c.dev.impacts.apply(i)
+                if k == IMPACT_ROUNDS - 1:
+                    c.dev.impacts.ring[i] = 0
+                    c.note_motion(c.dev.search.moved_too_far(i), 0)
+            ti.loop_config(serialize=True)
+            for _ in range(self.team.one(1, thread)):
+                c.dev.impacts.end_round(k == IMPACT_ROUNDS - 1)
+            self.team.wait()
 
     @ti.func
     def has_struck_bodies(self):

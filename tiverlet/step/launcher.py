@@ -23,7 +23,7 @@ class Launcher:
         self.runner, step = runner, runner.step
         self.halves, self.newton_steps, self.has_restitution = step.halves, step.newton_steps, step.has_restitution
         self.finishes, self.projects_velocities = step.finishes, step.projects_velocities
-        self.projects_bodies = step.projects_bodies
+        self.projects_bodies, self.projects_impacts = step.projects_bodies, step.projects_impacts
         self.drives, self.constrains, self.touches, self.acts = map(
             bool, (step.drivers, step.batches, step.contacts, step.particles.acts)
         )
@@ -184,6 +184,16 @@ class Launcher:
     def apply_corrections(self, now: Moment) -> None:
         """Add the last phase of a pass, if particles have corrections to apply."""
         self.put(now, "apply_corrections", self.acts)
+
+    def has_struck_discs(self, now: Moment) -> bool:
+        """Whether discs struck each other in this substep. The host has to wait for the answer."""
+        self.flush()
+        return bool(self.runner.memory.read(self.runner.step.contacts[0].dev.impacts.any_struck))
+
+    def project_discs(self, now: Moment) -> None:
+        """Add one round of the impacts of discs, in a launch of its own."""
+        self.flush()
+        self.put(now.of(now.it, half=now.it * self.halves), "project_discs")
 
     def has_struck_bodies(self, now: Moment) -> bool:
         """Whether bodies struck each other in this substep. The host has to wait for the answer."""

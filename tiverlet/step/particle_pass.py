@@ -145,7 +145,7 @@ class ParticlePass:
                     impacts.rigid[i] = 0
         self.integrator.advance(first, end, now)
         for weights in ti.static(self.weights):
-            if now.damps == ALWAYS:
+            if now.damps == ALWAYS or now.fresh != 0:
                 for i in range(first, end):
                     weights.store_weight(i, now)
         for loads in ti.static(self.wall_loads):

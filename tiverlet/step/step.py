@@ -8,6 +8,7 @@ the integrator.
 
 from typing import TYPE_CHECKING, Any
 
+from ..contact.impact_projection import ROUNDS as IMPACT_ROUNDS
 from ..contact.projection_times import ALWAYS, due
 from ..contact.velocity_projection import PASSES, RINGS
 from ..device import called, runtime, ti
@@ -73,6 +74,10 @@ def substep(do, now):
                     if not do.is_regular(now, half):
                         do.push_bodies(this_pass)
                 do.apply_corrections(this_pass)
+    if ti.static(do.projects_impacts):
+        if do.ends_substep(now) and do.has_struck_discs(now):
+            for k in range(IMPACT_ROUNDS):
+                do.project_discs(now.of(k))
     if ti.static(do.projects_bodies):
         if do.ends_substep(now) and do.has_struck_bodies(now):
             for k in range(do.body_rounds(now)):
@@ -124,7 +129,7 @@ class Step:
         self.has_pair_impacts = self.has_impacts and self.impacts.pairs
         self.newton_steps = 2 if scene.slots and scene.slots.refines else 1  # most of them in a pass
         self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
-        self.projects_bodies = self.contact_pass.projects_bodies
+        self.projects_bodies, self.projects_impacts = self.contact_pass.projects_bodies, self.contact_pass.projects_impacts
         self.orients = self.state.spins and self.state.spin.orients
         keeps = self.contact_pass.remembers or bool(self.breakers)
         self.finishes = keeps or self.orients or bool(self.wall_logs) or bool(self.constraints.learners)
@@ -510,6 +515,22 @@ class Step:
             for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
                 log.close(i)
         self.team.wait()
+
+    @ti.func
+    def has_struck_discs(self, now):
+        """Whether discs struck each other in this substep."""
+        return self.contact_pass.has_struck_discs()
+
+    @ti.func
+    def project_discs(self, now):
+        """One round of the impacts of discs."""
+        self.push_struck_discs(now.thread, now.it)
+
+    @called
+    @ti.func
+    def push_struck_discs(self, thread: ti.i32, it: ti.i32):
+        """One round of project_discs()."""
+        self.contact_pass.project_discs(thread, it)
 
     @ti.func
     def has_struck_bodies(self, now):

@@ -1,0 +1,178 @@
+"""Impacts of discs without restitution: what is struck goes on with what it presses, and no overlap is left to throw it back."""
+
+from typing import TYPE_CHECKING, Any
+
+from ..device import ti
+from .eigenvalues import largest
+from .velocity_projection import chebyshev
+
+if TYPE_CHECKING:
+    from ..features.feature import Scene
+    from ..neighbours.neighbour_list import PairData
+
+FALL = 0.25  # a pair is struck if it closes as after a fall by this share of the distance of its centers,
+SLOW = 8.0  # and if it closes by more than so many substeps of forces
+AROUND = 2  # how many contacts away from a struck pair others are projected, too
+STRUCK = AROUND + 1  # ring of a struck particle; those around it have lower ones, down to 1, and all others 0
+PASSES = 12
+CONDITION = 36.0  # modes with an eigenvalue of at least 1 / CONDITION keep 1 / T(PASSES) = 4 % of their velocity
+RELAXATION = 1.6  # of the passes that take back overlap; below 2
+ROUNDS = 1 + AROUND + 1 + PASSES  # find what is struck, then what is around it, list pairs, and the passes
+
+
+class ImpactProjection:
+    """The inelastic impact of discs and spheres that touch others.
+
+    A pass takes overlap back by pushes, which act like springs. Where a column lands, these throw it back: three discs come back
+    to half of the height of their fall. So where a pair closes fast, the substep ends with a projection of the discs
+    around it. Pairs that touch and do not part go on together, and no pair overlaps by more than before:
+
+        (d_i - d_j) . n = 0,    C <= C_0,
+
+    for displacements d and overlaps C. C_0 is 0 for struck pairs, and the overlap before the substep for others, which bears
+    their load. The velocity with which struck pairs close is lost, as in the inelastic impact of rigid discs. Overlap is taken
+    back from positions, without velocity, and struck pairs forget their push. What is further away follows in the next substeps.
+
+    Passes are those of Jacobi, with masses split as in Contact. Those of velocities have Chebyshev's acceleration, as in
+    VelocityProjection: the polynomial is within -1 ... 1 on all eigenvalues 0 ... 1, so it adds no kinetic energy. Corrections
+    of a pair are opposite, so momentum is conserved. Positions change by about the overlap of an impact, v h. Of the energy
+    m v^2 / 2 that an impact takes out, that is the part 2 g h / v. Particles pressed on a wall do not move into it or off it.
+
+    A pair is struck if its overlap doubles, and it closes in the substep by s with
+
+        s > SLOW f    and    s^2 > FALL (r_i + r_j) f,    f = h^2 (|a_i| + |a_j|),
+
+    for accelerations a by forces. Under gravity that is a fall by FALL (r_i + r_j). So nothing is struck in a pile at rest.
+    Particles of constraints take no part, because constraints would not know of it. Worlds with restitution have no such
+    projection, see Restitution.
+
+    struck, any_struck: whether each particle, and any, was struck in this substep. ring: of each particle around those that were
+    struck. near: the particles in rings, `count` of them; `size` is the count that all threads read. Their order depends on
+    threads, but no result does.
+    """
+
+    def __init__(self, scene: "Scene", geometry: Any, push: "PairData", weight: Any, move: Any):
+        self.state, self.w, self.slots = scene.state, scene.state.w, scene.slots
+        self.geometry, self.list, self.push, self.weight, self.move = geometry, geometry.list, push, weight, move
+        self.own_weight = scene.own_weight
+        # The fields of the old list are free except while a list is built. Here they hold the pairs that are projected.
+        self.near, self.number = self.list.old_first, self.list.old_number
+        add, n = scene.memory.field, scene.count
+        self.any_struck, self.count, self.size = (add(f"impacts.{k}", None, kind=ti.i32) for k in ("any_struck", "count", "size"))
+        self.struck, self.ring = (add(f"impacts.{k}", n, kind=ti.i32) for k in ("struck", "ring"))
+        self.lift = add("impacts.lift", n, width=scene.particles.dim)
+        self.factors = add("impacts.chebyshev", PASSES, values=chebyshev(PASSES, CONDITION))
+
+    @ti.func
+    def note(self, i, j, n, overlap, borne, other, h):
+        """Note whether a pair is struck, before it is pushed.
+
+        borne: the overlap that its push in the last substep takes back [m]. One that has not doubled was not struck. other: at
+        least 0 if this is for particle j, too.
+        """
+        if overlap > 2 * borne:
+            closes = -self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n)
+            forced = h * h * (self.own_weight.field[i] + self.own_weight.field[j])
+            falls = closes * closes > ti.static(FALL) * self.geometry.contact_distance(i, j) * forced
+            if falls and closes > ti.static(SLOW) * forced and self.is_loose(i) and self.is_loose(j):
+                self.struck[i] = self.any_struck[None] = 1
+                if other >= 0:
+                    self.struck[j] = 1
+
+    @ti.func
+    def is_loose(self, i):
+        """Whether particle i is in no constraint."""
+        out = True
+        if ti.static(bool(self.slots)):
+            out = self.slots.begin[i] == self.slots.begin[i + 1]
+        return out
+
+    @ti.func
+    def take(self, i, ring):
+        """Put particle i into a ring, unless it is in one. Those in the next ring up are known already."""
+        if ti.atomic_max(self.ring[i], ring) == 0:
+            self.near[ti.atomic_add(self.count[None], 1)] = i
+
+    @ti.func
+    def begin(self, i):
+        """Put particle i into the first ring if it was struck."""
+        if self.struck[i] != 0:
+            self.struck[i] = 0
+            self.take(i, ti.static(STRUCK))
+
+    @ti.func
+    def spread(self, i, ring):
+        """Put what touches particle i, in this ring, or may do so in this substep, into the ring around it."""
+        if self.ring[i] == ring:
+            for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
+                j = self.list.neighbour[e]
+                reach = self.geometry.contact_distance(i, j) + ti.abs(self.state.d[i] - self.state.d[j]).sum()
+                r = self.state.separation(i, j)
+                if r.dot(r) < reach * reach and self.state.moves(j) and self.is_loose(j):
+                    self.take(j, ring - 1)
+
+    @ti.func
+    def list_pairs(self, i):
+        """List the pairs of particle i that may overlap, each with C_0, and split its mass for them.
+
+        Pairs that go on together are listed by the index of the other particle j, others by ~j.
+        """
+        normals = ti.Matrix.zero(self.state.real, self.state.dim, self.state.dim)
+        first, w = self.list.first[i], self.w.of(i)
+        at = first
+        for e in range(first, first + self.list.number[i]):
+            j = self.list.neighbour[e]
+            r, distance, push = self.state.separation(i, j), self.geometry.contact_distance(i, j), self.push.field[e]
+            moved = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j)
+            length = r.norm()
+            if 0 < length < distance + moved.norm():
+                overlap, listed = distance - length, ~j
+                kept = ti.min(ti.max(distance - (r - moved).norm(), 0), ti.max(overlap, 0))
+                if self.ring[j] != 0 and (overlap > 0 or push > 0):
+                    if self.ring[i] == STRUCK and self.ring[j] == STRUCK:
+                        listed, kept, self.push.field[e] = j, ti.zero(kept), ti.zero(kept)
+                    elif moved.dot(r) < length * ti.max(overlap, (w + self.w.of(j)) * push):
+                        listed = j
+                normals += r.outer_product(r) / (length * length)
+                self.list.old_neighbour[at], self.push.old[at] = listed, kept
+                at += 1
+        self.number[i] = at - first
+        self.move[i] = ti.zero(self.state.d[i])
+        self.weight[i] = ti.max(self.weight[i], w * largest(normals))
+
+    @ti.func
+    def relax(self, i, k):
+        """Compute pass k for particle i: the change of its displacement, and of its position alone."""
+        want, first, w = ti.zero(self.state.d[i]), self.list.first[i], self.w.of(i)
+        lift = want
+        for e in range(first, first + self.number[i]):
+            listed = self.list.old_neighbour[e]
+            j = ti.max(listed, ~listed)
+            r = self.state.separation(i, j)
+            length = r.norm()
+            push = w / ((self.weight[i] + self.weight[j]) * length) * r
+            lift += ti.max(self.geometry.contact_distance(i, j) - length - self.push.old[e], 0) * push
+            if listed >= 0:
+                want -= self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(r) / length * push
+        if ti.static(self.state.keeps_wall_push):
+            wall_push = self.state.wall_push[i]
+            size = wall_push.dot(wall_push)
+            if size > 0:
+                want -= want.dot(wall_push) / size * wall_push
+                lift -= lift.dot(wall_push) / size * wall_push
+        factor = self.factors[k]
+        self.move[i] = factor * ti.static(2 / (1 + 1 / CONDITION)) * want + (factor - 1) * self.move[i]
+        self.lift[i] = ti.static(RELAXATION) * lift
+
+    @ti.func
+    def apply(self, i):
+        """Add the changes of this pass."""
+        self.state.d[i] = self.state.d[i] + self.move[i]
+        self.state.advance(i, self.lift[i])
+
+    @ti.func
+    def end_round(self, last):
+        """Tell all threads how many particles are near what was struck; after the last round, that there are none."""
+        self.size[None] = self.count[None]
+        if last:
+            self.any_struck[None] = self.count[None] = 0
