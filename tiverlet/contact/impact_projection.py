@@ -103,12 +103,12 @@ class ImpactProjection:
     @ti.func
     def spread(self, i, ring):
         """Put what touches particle i, in this ring, or may do so in this substep, into the ring around it."""
-        if self.ring[i] == ring:
+        if self.ring[i] == ring and self.state.moves(i):
             for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
                 j = self.list.neighbour[e]
-                reach = self.geometry.contact_distance(i, j) + ti.abs(self.state.d[i] - self.state.d[j]).sum()
+                reach = self.geometry.contact_distance(i, j) + (self.state.d[i] - self.state.d[j]).norm()
                 r = self.state.separation(i, j)
-                if r.dot(r) < reach * reach and self.state.moves(j) and self.is_loose(j):
+                if r.dot(r) < reach * reach and self.state.awake(j) and self.is_loose(j):
                     self.take(j, ring - 1)
 
     @ti.func
@@ -120,7 +120,7 @@ class ImpactProjection:
         normals = ti.Matrix.zero(self.state.real, self.state.dim, self.state.dim)
         first, w = self.list.first[i], self.w.of(i)
         at = first
-        for e in range(first, first + self.list.number[i]):
+        for e in range(first, first + ti.select(w > 0, self.list.number[i], 0)):
             j = self.list.neighbour[e]
             r, distance, push = self.state.separation(i, j), self.geometry.contact_distance(i, j), self.push.field[e]
             moved = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j)
@@ -150,10 +150,12 @@ class ImpactProjection:
             j = ti.max(listed, ~listed)
             r = self.state.separation(i, j)
             length = r.norm()
-            push = w / ((self.weight[i] + self.weight[j]) * length) * r
-            lift += ti.max(self.geometry.contact_distance(i, j) - length - self.push.old[e], 0) * push
-            if listed >= 0:
-                want -= self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(r) / length * push
+            if length > 0:
+                push = w / ((self.weight[i] + self.weight[j]) * length) * r
+                lift += ti.max(self.geometry.contact_distance(i, j) - length - self.push.old[e], 0) * push
+                if listed >= 0:
+                    apart = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(r) / length
+                    want -= apart * push
         if ti.static(self.state.keeps_wall_push):
             wall_push = self.state.wall_push[i]
             size = wall_push.dot(wall_push)

@@ -1,0 +1,95 @@
+"""Impacts of discs without restitution: what falls stays where it lands, as the inelastic impact of rigid discs has it."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.contact.impact_projection import CONDITION, FALL, PASSES
+
+G, R = 10.0, 0.1
+
+
+def lattice(*counts):
+    """Return places of touching discs or spheres on a floor at y = 0: so many along each axis."""
+    return R * (1 + 2 * np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, len(counts)))
+
+
+def dropped(world, x, height, friction=0.0, spin=None, **settings):
+    """Return a world of discs that will fall by `height` to the places x."""
+    up = np.eye(x.shape[1])[1]
+    start = tv.Particles(x + height * up, radius=R, spin=spin)
+    features = [tv.Gravity(G), tv.Contact(friction=friction), tv.HalfSpace(up, friction=friction)]
+    return world(start, features, **settings)
+
+
+@pytest.mark.parametrize(
+    "counts, more",
+    [
+        ((1, 1), {}), ((1, 3), {}), ((1, 3), {"friction": 0.5, "spin": 0.0}), ((1, 5), {}), ((5, 5), {}),
+        ((5, 5), {"friction": 0.5, "precision": "f64"}), ((3, 3, 3), {}),
+    ],
+)  # fmt: skip
+def test_what_falls_stays_where_it_lands(world, counts, more):
+    # Pairs that close as after a fall by less than FALL (2 R) are pushed apart again. If that gave each disc all of its energy,
+    # their center of mass would rise by as much. Blocks that springs throw back rise by up to half of their fall.
+    fall = 1.0
+    for substeps in (4, 8, 30):
+        w = dropped(world, lattice(*counts), fall, substeps=substeps, **more)
+        w.run(np.sqrt(2 * fall / G) + 2 / 60)
+        height = np.array([w.position[:, 1].mean() for _ in range(60) if w.step(1 / 60)])
+        landed = R * counts[1]
+        assert height.max() < landed + FALL * 2 * R, substeps
+        assert height[:6].min() > 0.9 * landed, substeps  # it is not pressed into the floor
+
+
+@pytest.mark.parametrize("struck", [1, 2])
+def test_a_row_that_is_hit_goes_on_as_one(world, struck):
+    # Momentum is conserved, m v = (n + 1) m u, and all n + 1 discs have the same velocity u, up to what the passes leave of the
+    # slowest mode, 1 / T(PASSES), for each of two substeps. In a Newton's cradle with e = 0, the last disc does not fly off.
+    n, v = struck + 1, 3.0
+    x = np.zeros((n + 1, 2))
+    x[1:, 0] = 2 * R * np.arange(n)
+    x[0, 0] = -0.5
+    start = tv.Particles(x, velocity=[(v, 0.0)] + [(0.0, 0.0)] * n, radius=R)
+    w = world(start, [tv.Contact()], substeps=8, precision="f64")
+    w.run(0.5)
+    left = 2 / np.cosh(PASSES * np.arccosh((CONDITION + 1) / (CONDITION - 1)))
+    assert np.allclose(w.velocity.sum(axis=0), (v, 0.0), atol=1e-12)
+    assert np.allclose(w.velocity[:, 0], v / (n + 1), atol=left * v)
+
+
+def test_discs_that_fly_together_keep_their_momentum_and_gain_no_energy(world):
+    rng = np.random.default_rng(1)
+    x = lattice(8, 8) * 1.3 + 0.02 * rng.normal(size=(64, 2))
+    v = 2 * (x.mean(axis=0) - x) + 0.5 * rng.normal(size=x.shape)
+    w = world(tv.Particles(x, velocity=v, radius=R, mass=rng.uniform(0.5, 2, 64)), [tv.Contact()], substeps=8, precision="f64")
+    p, energy = tv.measure.momentum(w), [0.5 * (w.particles.mass * (v**2).sum(axis=1)).sum()]
+    for _ in range(60):
+        energy.append(w.step(1 / 60).energy)
+    assert np.allclose(tv.measure.momentum(w), p, atol=1e-12 * np.abs(w.particles.mass[:, None] * v).sum())
+    assert energy[-1] < 0.3 * energy[0] and np.diff(energy).max() < 1e-3 * energy[0]
+
+
+@pytest.mark.slow
+def test_the_same_bits_on_all_paths(world):
+    out = []
+    for path in ("fused", "parallel", "launched"):
+        w = dropped(world, lattice(6, 5), 0.3, friction=0.4, substeps=4, path=path)
+        w.run(0.5)
+        out.append(w.hash())
+    assert out[0] == out[1] == out[2]
+
+
+def test_particles_of_constraints_take_no_part(world):
+    # A rope of discs does not know of the projection. One that falls on the floor, side by side with free discs, has the bits
+    # that it has alone.
+    rope = lattice(1, 6) * (1.2, 1.2)
+    links = tv.Distance([(k, k + 1) for k in range(5)])
+    out = []
+    for more in (0, 3):
+        free = lattice(1, 3)[:more] + (3.0, 0.0)
+        start = tv.Particles(np.concatenate([rope, free]) + (0.0, 1.0), radius=R)
+        w = world(start, [tv.Gravity(G), tv.Contact(), links.copy(), tv.HalfSpace((0, 1))], substeps=8)
+        w.run(1.0)
+        out.append(w.position[:6])
+    assert (out[0] == out[1]).all()
