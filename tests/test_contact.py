@@ -278,6 +278,7 @@ def test_both_of_a_pair_agree_that_they_touch(world):
     n = 330
     radius, place = rng.uniform(0.1, 0.5, (n, 3)), np.stack(np.divmod(np.arange(n), 64), axis=1) * 4.0
     last = (radius[:, 1] + radius[:, 2]) * (1 + 1e-6)
+    hit = 0
     for k in range(12):
         angle = rng.uniform(0, 2 * np.pi, n)
         way = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -292,7 +293,8 @@ def test_both_of_a_pair_agree_that_they_touch(world):
             w.step(1e-2)
             d = w._runner.memory.state()["displacement"].astype(float).reshape(n, 3, 2)
             np.testing.assert_allclose(d.sum(axis=1), -1e-6 * way, atol=4e-12)
-        assert w.last.contacts > n / 10
+        hit += np.count_nonzero(np.abs(d[:, 0]).max(axis=1) > 1e-9)  # the first discs, which only the second ones can push
+    assert hit > n
 
 
 def tossed(world, start, links, rest, friction, low, high, **settings):
@@ -365,16 +367,18 @@ def test_discs_in_the_same_place_have_the_normal_along_which_they_part(world, di
 def test_masses_are_split_as_often_however_deep_pairs_are(world):
     # Four discs overlap with a fifth by c from left and right, and by a little from above and below. The sum of n n^T is 2 I for
     # the middle disc, so its mass is split by 2 and those of the others by 1; each outer disc moves out by r c / 3 with r = 5/4.
-    # If all pairs counted as deep as the deepest, masses would be split by up to 1 / (1 - c)^2 more, and by four at most.
+    # If all pairs counted as deep as the deepest, masses would be split by up to 1 / (1 - c)^2 more, and by four at most. All
+    # fall with g = 1 meanwhile, by g h^2 / 2: beside such a force, none of them is fast enough for the projection of an impact.
     out = np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]])
     low = (-99.0, -99.0)
     for c, off in ((0.05, 0.04), (0.2, 1e-5), (0.45, 1e-5)):
         deep = np.array([c, c, 0.01, 0.01])[:, None]
         start = tv.Particles(np.vstack([[0, 0], 1.01 * out]), velocity=np.vstack([[0, 0], -(deep + 0.01) * out]), radius=0.5)
-        w = smooth(world, start, g=0.0, low=low, precision="f32", substeps=1)
+        w = smooth(world, start, g=1.0, low=low, precision="f32", substeps=1)
         w.step(1.0)
-        np.testing.assert_allclose(w.position[1:], (1 - deep + 1.25 * deep / 3) * out, atol=off * c)
-        np.testing.assert_allclose(w.position[0], 0, atol=1e-6)
+        x = w.position + (0.0, 0.5)
+        np.testing.assert_allclose(x[1:], (1 - deep + 1.25 * deep / 3) * out, atol=off * c)
+        np.testing.assert_allclose(x[0], 0, atol=1e-6)
 
 
 def test_a_column_that_is_too_heavy_for_the_substep_is_flagged(world):

@@ -93,11 +93,16 @@ class WallLog:
         self.impulse[i] = self.impulse[i] + push
 
     @ti.func
+    def presses(self, i):
+        """Return 1 if the wall presses particle i in this substep, else 0."""
+        return ti.cast(self.when[i][1] == self.substep[None], ti.i32)
+
+    @ti.func
     def close(self, i):
         """At the end of a frame: store whether particle i touches. A sleeping particle touches if it did before."""
         if self.when[i][0] == BEFORE and not self.state.awake(i):
             self.when[i][1] = self.substep[None]
-        self.touching[i] = ti.cast(self.when[i][1] == self.substep[None], ti.i32)
+        self.touching[i] = self.presses(i)
 
     @property
     def counter(self) -> Any:

@@ -186,6 +186,9 @@ class Contact(PairContact):
         dev.events = EventLog(scene, self.table) if dev.has_events else None
         if dev.events:
             pair_data.append(dev.events.touched)
+        given = PairData("landed", 0, persistent=False)
+        if self.lands and dev.reports:
+            pair_data.append(given)
         dev.search = NeighbourSearch(scene, self._present_skin, linked, self.table, pair_data, team, dev.move)
         dev.list = dev.search.list
         dev.geometry = DiscGeometry(scene, dev.search, self.push_out, dev.impulse if dev.has_restitution else dev.push)
@@ -211,7 +214,8 @@ class Contact(PairContact):
         dev.projection = VelocityProjection(scene, dev.geometry, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
         dev.impacts = None
         if self.lands:
-            dev.impacts = ImpactProjection(scene, dev.geometry, dev.push, dev.splitting.weight, dev.move)
+            reported = dev.events if dev.reports else None
+            dev.impacts = ImpactProjection(scene, dev.geometry, dev.push, dev.splitting.weight, dev.move, reported, given)
         dev.once = self._solves_once(scene, team)
         return dev.search
 

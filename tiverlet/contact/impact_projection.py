@@ -3,10 +3,10 @@
 from typing import TYPE_CHECKING, Any
 
 from ..device import ti
-from .eigenvalues import largest
-from .velocity_projection import chebyshev
+from .eigenvalues import chebyshev, largest
 
 if TYPE_CHECKING:
+    from ..colliders.wall_log import WallLog
     from ..features.feature import Scene
     from ..neighbours.neighbour_list import PairData
 
@@ -48,10 +48,16 @@ class ImpactProjection:
 
     struck, any_struck: whether each particle, and any, was struck in this substep. ring: of each particle around those that were
     struck. near: the particles in rings, `count` of them; `size` is the count that all threads read. Their order depends on
-    threads, but no result does.
+    threads, but no result does. events, given: the log of pairs that reports impulses, or None, and for it the push of a pair in
+    a pass [kg m]. wall_logs, free: those of walls, and for them how far a pass would move each particle without walls [m].
     """
 
-    def __init__(self, scene: "Scene", geometry: Any, push: "PairData", weight: Any, move: Any):
+    wall_logs: "list[WallLog]" = []
+
+    def __init__(
+        self, scene: "Scene", geometry: Any, push: "PairData", weight: Any, move: Any, events: Any, given: "PairData"
+    ):  # fmt: skip
+        self.events, self.given = events, given
         self.state, self.w, self.slots = scene.state, scene.state.w, scene.slots
         self.geometry, self.list, self.push, self.weight, self.move = geometry, geometry.list, push, weight, move
         self.own_weight = scene.own_weight
@@ -60,8 +66,14 @@ class ImpactProjection:
         add, n = scene.memory.field, scene.count
         self.any_struck, self.count, self.size = (add(f"impacts.{k}", None, kind=ti.i32) for k in ("any_struck", "count", "size"))
         self.struck, self.ring = (add(f"impacts.{k}", n, kind=ti.i32) for k in ("struck", "ring"))
-        self.lift = add("impacts.lift", n, width=scene.particles.dim)
+        self.lift, self.split = add("impacts.lift", n, width=scene.particles.dim), add("impacts.split_mass", n)
         self.factors = add("impacts.chebyshev", PASSES, values=chebyshev(PASSES, CONDITION))
+
+    def report_to(self, scene: "Scene", wall_logs: "list[WallLog]") -> None:
+        """Report to the logs of walls what these take up. Call it before fields are placed."""
+        self.wall_logs = wall_logs
+        if wall_logs:
+            self.free = scene.memory.field("impacts.free", scene.count, width=scene.particles.dim)
 
     @ti.func
     def note(self, i, j, n, overlap, borne, other, h):
@@ -81,10 +93,10 @@ class ImpactProjection:
 
     @ti.func
     def is_loose(self, i):
-        """Whether particle i is in no constraint."""
-        out = True
+        """Whether particle i is in no constraint, and has its full size: what was placed into others parts in its own way."""
+        out = not self.geometry.is_shrunk(i)
         if ti.static(bool(self.slots)):
-            out = self.slots.begin[i] == self.slots.begin[i + 1]
+            out = out and self.slots.begin[i] == self.slots.begin[i + 1]
         return out
 
     @ti.func
@@ -115,7 +127,7 @@ class ImpactProjection:
     def list_pairs(self, i):
         """List the pairs of particle i that may overlap, each with C_0, and split its mass for them.
 
-        Pairs that go on together are listed by the index of the other particle j, others by ~j.
+        Pairs that go on together are listed by their entry e, others by ~e.
         """
         normals = ti.Matrix.zero(self.state.real, self.state.dim, self.state.dim)
         first, w = self.list.first[i], self.w.of(i)
@@ -126,45 +138,65 @@ class ImpactProjection:
             moved = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j)
             length = r.norm()
             if 0 < length < distance + moved.norm():
-                overlap, listed = distance - length, ~j
+                overlap, listed = distance - length, ~e
                 kept = ti.min(ti.max(distance - (r - moved).norm(), 0), ti.max(overlap, 0))
                 if self.ring[j] != 0 and (overlap > 0 or push > 0):
                     if self.ring[i] == STRUCK and self.ring[j] == STRUCK:
-                        listed, kept, self.push.field[e] = j, ti.zero(kept), ti.zero(kept)
+                        listed, kept, self.push.field[e] = e, ti.zero(kept), ti.zero(kept)
                     elif moved.dot(r) < length * ti.max(overlap, (w + self.w.of(j)) * push):
-                        listed = j
+                        listed = e
                 normals += r.outer_product(r) / (length * length)
                 self.list.old_neighbour[at], self.push.old[at] = listed, kept
                 at += 1
         self.number[i] = at - first
         self.move[i] = ti.zero(self.state.d[i])
-        self.weight[i] = ti.max(self.weight[i], w * largest(normals))
+        self.split[i] = ti.max(self.weight[i], w * largest(normals))
 
     @ti.func
     def relax(self, i, k):
         """Compute pass k for particle i: the change of its displacement, and of its position alone."""
         want, first, w = ti.zero(self.state.d[i]), self.list.first[i], self.w.of(i)
-        lift = want
-        for e in range(first, first + self.number[i]):
-            listed = self.list.old_neighbour[e]
-            j = ti.max(listed, ~listed)
+        lift, again = want, self.factors[k] - 1
+        gain = self.factors[k] * ti.static(2 / (1 + 1 / CONDITION))
+        for m in range(first, first + self.number[i]):
+            listed = self.list.old_neighbour[m]
+            e = ti.max(listed, ~listed)
+            j = self.list.neighbour[e]
             r = self.state.separation(i, j)
             length = r.norm()
             if length > 0:
-                push = w / ((self.weight[i] + self.weight[j]) * length) * r
-                lift += ti.max(self.geometry.contact_distance(i, j) - length - self.push.old[e], 0) * push
+                shared = self.split[i] + ti.select(self.ring[j] != 0, self.split[j], self.weight[j])
+                push = w / (shared * length) * r
+                lift += ti.max(self.geometry.contact_distance(i, j) - length - self.push.old[m], 0) * push
                 if listed >= 0:
                     apart = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(r) / length
                     want -= apart * push
+                    if ti.static(bool(self.events)):
+                        given = ti.select(k == 0, 0 * gain, again * self.given.field[e])
+                        self.given.field[e] = given - gain * apart / shared
+                        self.events.record(i, j, e, r / length, self.given.field[e], 0)
+        free = want
         if ti.static(self.state.keeps_wall_push):
             wall_push = self.state.wall_push[i]
             size = wall_push.dot(wall_push)
             if size > 0:
                 want -= want.dot(wall_push) / size * wall_push
                 lift -= lift.dot(wall_push) / size * wall_push
-        factor = self.factors[k]
-        self.move[i] = factor * ti.static(2 / (1 + 1 / CONDITION)) * want + (factor - 1) * self.move[i]
+        self.move[i] = gain * want + again * self.move[i]
         self.lift[i] = ti.static(RELAXATION) * lift
+        if ti.static(len(self.wall_logs) > 0):
+            self.free[i] = gain * free + ti.select(k == 0, 0 * free, again * self.free[i])
+            self.report_walls(i, self.move[i] - self.free[i])
+
+    @ti.func
+    def report_walls(self, i, push):
+        """Add a push [m] to the impulses of the walls that press particle i in this substep, in equal parts."""
+        number = 0
+        for log in ti.static(self.wall_logs):
+            number += log.presses(i)
+        for log in ti.static(self.wall_logs):
+            if log.presses(i) != 0:
+                log.add(i, push / number)
 
     @ti.func
     def apply(self, i):

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..device import ti
 from ..neighbours.neighbour_list import WORD, lowest_bit
-from .eigenvalues import largest
+from .eigenvalues import chebyshev, largest
 from .projection_times import ALWAYS, MAYBE
 
 if TYPE_CHECKING:
@@ -313,12 +313,3 @@ def unequal(mass: np.ndarray) -> bool:
     """Whether any two of these masses, (n,) [kg], are unequal, of particles that can move."""
     some = mass[np.isfinite(mass)]
     return bool(len(some) and some.max() > UNEQUAL * some.min())
-
-
-def chebyshev(passes: int, condition: float) -> np.ndarray:
-    """Return the factors of a Chebyshev semi-iteration for eigenvalues 1 / condition ... 1 (Golub and Varga 1961)."""
-    rho = (condition - 1) / (condition + 1)
-    out = [1.0, 2 / (2 - rho * rho)]
-    while len(out) < passes:
-        out.append(4 / (4 - rho * rho * out[-1]))
-    return np.array(out[:passes])

@@ -130,6 +130,8 @@ class Step:
         self.newton_steps = 2 if scene.slots and scene.slots.refines else 1  # most of them in a pass
         self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
         self.projects_bodies, self.projects_impacts = self.contact_pass.projects_bodies, self.contact_pass.projects_impacts
+        if self.projects_impacts:
+            contact.dev.impacts.report_to(scene, self.wall_logs)
         self.orients = self.state.spins and self.state.spin.orients
         keeps = self.contact_pass.remembers or bool(self.breakers)
         self.finishes = keeps or self.orients or bool(self.wall_logs) or bool(self.constraints.learners)
