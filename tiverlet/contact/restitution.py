@@ -109,6 +109,31 @@ class Restitution:
         return given, ti.min(slack, overlap), rests
 
     @ti.func
+    def remove_slack(self, pair, slack, own, now):
+        """Return the part of its slack that a pair does not push out [m]. The first pass removes some of it from positions."""
+        slack = ti.min(slack, ti.max(pair.overlap, 0))
+        if now.first != 0:
+            if self.presses_bodies(pair.i, pair.j):
+                slack = self.kept_slack(pair.i, pair.j, slack, now.h)
+                self.slack.field[pair.e] = slack
+            else:
+                back = ti.static(UPTAKE) * ti.min(slack * pair.stiffness, slack / pair.alone)
+                own.lift += own.w * back * pair.n
+                self.slack.field[pair.e] = slack - pair.alone * back
+        return slack
+
+    @ti.func
+    def strike(self, pair, impact, own):
+        """Mark a pair as struck if it has an impact [m]. Returns the impact, or 0 if it is one of bodies, see BodyRestitution."""
+        if impact > 0:
+            self.struck.field[pair.e] = 1
+            if self.leave_to_bodies(pair.i, pair.j, pair.e, pair.n):
+                impact, own.impacts = ti.zero(impact), own.impacts + 1
+            elif self.hit[None] == 0:
+                self.hit[None] = 1
+        return impact
+
+    @ti.func
     def kept_slack(self, i, j, slack, h):
         """Return the part of its slack [m] that a pair of bodies keeps in a substep h [s]. The rest is pushed out.
 
