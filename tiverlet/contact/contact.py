@@ -16,7 +16,7 @@ from ..geometry.ordered import median
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
-from .body_projection import NEAR, NONE, BodyProjection
+from .body_projection import BodyProjection
 from .body_restitution import BodyRestitution
 from .each_once import ROUNDS, EachOnce
 from .events import EventLog
@@ -272,40 +272,6 @@ class Contact(PairContact):
         return out
 
     @ti.func
-    def relative(self, d: ti.template(), v, a, b, t):  # type: ignore[valid-type]
-        """Return the displacement of particle v relative to a [m], see BodyProjection."""
-        return self.dev.state.relative_displacement(d[v] - d[a], v, a)
-
-    @ti.func
-    def near_contact(self, i, e):
-        """Return the place of the contact at entry e of the list of i, NONE if it is far, the normal, and the gap [m]."""
-        j = self.dev.list.neighbour[e]
-        distance = self.dev.geometry.contact_distance(i, j)
-        near = self.dev.geometry.push_each_other(i, j, ti.static(NEAR) * distance)
-        gap = self.dev.state.separation(i, j).norm() - distance
-        return ti.select(near, 0 * gap, NONE), self.dev.geometry.direction(i, j), gap
-
-    @ti.func
-    def entry_of(self, i, e, role):
-        """Return the entry that stores the contact at entry e of the list of particle i."""
-        return e
-
-    @ti.func
-    def ends(self, i, e, t):
-        """Return the particles of the contact at entry e of the list of i: i, and twice the other one."""
-        j = self.dev.list.neighbour[e]
-        return i, j, j
-
-    @ti.func
-    def part_of(self, t, role):
-        """Return the part of a particle in a contact."""
-        return 1 + 0 * t
-
-    @ti.func
-    def add_push(self, e, push):
-        """Do nothing: a pair does not keep the push of an impact."""
-
-    @ti.func
     def count(self, begin, end, now):
         """Find the touching pairs of particles begin ... end - 1, and how often their masses are split."""
         self.dev.splitting.count(begin, end, now)
@@ -521,7 +487,7 @@ class Contact(PairContact):
         struck = self.dev.bodies.struck.field[pair.e] != 0
         if now.first != 0:
             borne, place = pair.alone * pair.last, 0 * pair.alone
-            struck = pair.overlap > 0 and self.dev.bodies.strikes(self, pair.i, pair.j, pair.j, place, pair.n, borne)
+            struck = pair.overlap > 0 and self.dev.bodies.strikes(self.dev.geometry, pair.i, pair.j, pair.j, place, pair.n, borne)
         self.dev.bodies.note(pair.e, pair.n, struck)
         return struck
 

@@ -186,19 +186,19 @@ class ContactPass:
             begin, end = self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)
             for i in range(begin, end):
                 if k == 0:
-                    c.dev.bodies.begin(i, c, tick + 1)
+                    c.dev.bodies.begin(i, c.dev.geometry, tick + 1)
                 elif k == 1:
-                    c.dev.bodies.list_contacts(i, c, tick + 1)
+                    c.dev.bodies.list_contacts(i, c.dev.geometry, tick + 1)
                 elif k < c.dev.bodies.passes + 2:
-                    c.dev.bodies.press(i, k - 2, c, tick + 1)
-                elif c.dev.bodies.end(i, c):
+                    c.dev.bodies.press(i, k - 2, c.dev.geometry, tick + 1)
+                elif c.dev.bodies.end(i, c.dev.geometry):
                     c.note_motion(c.dev.search.moved_too_far(i), 0)
             self.team.wait()
             for i in range(begin, end):
                 if k == 0:
                     c.dev.bodies.begin_body(i)
                 elif k > 1 and k < c.dev.bodies.passes + 2:
-                    c.dev.bodies.follow(i, c)
+                    c.dev.bodies.follow(i, c.dev.geometry)
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(ti.cast(k == 0, ti.i32), thread)):
                 c.dev.bodies.any_struck[None] = 0
