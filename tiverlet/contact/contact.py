@@ -10,7 +10,7 @@ from .. import checks
 from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Knob, Scene
-from ..features.material import is_elastic, refuse_turning
+from ..features.material import TANGENTIAL, is_elastic, refuse_turning
 from ..features.regrouping import Regrouping
 from ..geometry.ordered import median
 from ..neighbours.neighbour_list import PairData
@@ -594,7 +594,7 @@ class Contact(PairContact):
         slip = self.dev.slip.field[e] + self.dev.spinning.slip(i, j, m)
         if ti.static(self.dev.turns and self.dev.has_restitution):
             if bounces:
-                slip *= 1 + self.table.of(i, j)[6]
+                slip *= 1 + self.table.of(i, j)[TANGENTIAL]
         push = -self.table.held(i, j, n, pressed * split_mass, slip) / split_mass
         turned = self.dev.spinning.turned(i, m, push)
         if ti.static(self.dev.turns):
@@ -642,42 +642,40 @@ class Contact(PairContact):
 
     @ti.func
     def finish_substep(self, i, now):
-        """Update the slip of each pair at the end of a substep, as far as friction can hold it, and clear slack of parted pairs.
-
-        Pairs that began to overlap after the pushes wait until the next substep: a list with a narrow skin may not have them yet.
-        """
+        """At the end of a substep: store the slip of each pair, and clear the slack of parted pairs."""
         if ti.static(self.dev.has_friction):
             for word in range(self.dev.list.word_count(i)):
                 bits = self.dev.splitting.sliding(i, word, now)
                 while bits != 0:
                     e = self.dev.list.entry(i, word, bits)
                     bits &= bits - ti.u32(1)
-                    j = self.dev.list.neighbour[e]
-                    overlap, n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
-                    slip, turn = 0 * self.dev.state.x[i], ti.Vector.zero(self.scene.real, self.dev.axes)
-                    if ti.static(self.dev.has_loads):
-                        if overlap <= 0 and self.dev.push.field[e] > 0:
-                            overlap, n = self.dev.geometry.gap(i, j)
-                    if (overlap > 0 or ti.static(self.dev.has_loads)) and self.dev.push.field[e] > 0:
-                        shared = self.dev.splitting.weight[i] + self.dev.splitting.weight[j]
-                        pressed = self.dev.push.field[e] * shared
-                        if ti.static(self.dev.spins):
-                            pressed = ti.max(overlap, pressed) / shared
-                            reach = pressed * self.dev.spinning.split_mass(i, j)
-                            slip = self.dev.slip.field[e] + self.dev.spinning.slip(i, j, self.dev.spinning.arm(i, j, n))
-                            slip = self.table.held(i, j, n, reach, slip)
-                            if ti.static(self.dev.turns):
-                                turn = self.dev.spinning.left(i, j, e, n, pressed)
-                        else:
-                            slip = self.held(i, j, n, ti.max(overlap, pressed), self.dev.slip.field[e])
-                    self.dev.slip.field[e] = slip
-                    if ti.static(self.dev.turns):
-                        self.dev.turn.field[e] = turn
+                    self.store_slip(i, self.dev.list.neighbour[e], e)
         if ti.static(self.dev.has_restitution):
-            if self.dev.splitting.weight[i] > 0:
-                for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
-                    if self.dev.slack.field[e] > 0:
-                        j = self.dev.list.neighbour[e]
-                        overlap, _n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
-                        if overlap <= 0:
-                            self.dev.slack.field[e] = 0
+            self.dev.restitution.clear_slack(i, self.dev.splitting.weight[i])
+
+    @ti.func
+    def store_slip(self, i, j, e):
+        """Store the slip and the turn of a pair, as far as friction can hold them: none if the pair has no push or has parted.
+
+        Pairs that began to overlap after the pushes wait until the next substep: a list with a narrow skin may not have them yet.
+        """
+        overlap, n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
+        slip, turn = 0 * self.dev.state.x[i], ti.Vector.zero(self.scene.real, self.dev.axes)
+        if ti.static(self.dev.has_loads):
+            if overlap <= 0 and self.dev.push.field[e] > 0:
+                overlap, n = self.dev.geometry.gap(i, j)
+        if (overlap > 0 or ti.static(self.dev.has_loads)) and self.dev.push.field[e] > 0:
+            shared = self.dev.splitting.weight[i] + self.dev.splitting.weight[j]
+            pressed = self.dev.push.field[e] * shared
+            if ti.static(self.dev.spins):
+                pressed = ti.max(overlap, pressed) / shared
+                most = pressed * self.dev.spinning.split_mass(i, j)
+                slip = self.dev.slip.field[e] + self.dev.spinning.slip(i, j, self.dev.spinning.arm(i, j, n))
+                slip = self.table.held(i, j, n, most, slip)
+                if ti.static(self.dev.turns):
+                    turn = self.dev.spinning.left(i, j, e, n, pressed)
+            else:
+                slip = self.held(i, j, n, ti.max(overlap, pressed), self.dev.slip.field[e])
+        self.dev.slip.field[e] = slip
+        if ti.static(self.dev.turns):
+            self.dev.turn.field[e] = turn

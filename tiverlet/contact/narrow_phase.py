@@ -7,7 +7,7 @@ import numpy as np
 from ..device import ti
 from ..device.number import OnDevice
 from ..features.feature import Scene
-from ..features.material import TOUCHES
+from ..features.material import TOUCH, TOUCHES
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.queries import Contacts, between
 from .candidates import DiscCandidates
@@ -55,7 +55,7 @@ class DiscGeometry:
         """Return 1 if particles i and j push each other where they overlap, 0 if they do not, as for sensors."""
         out = 1
         if ti.static(self.senses):
-            out = ti.cast(ti.cast(self.search.table.of(i, j)[3], ti.i32) == TOUCHES, ti.i32)
+            out = ti.cast(ti.cast(self.search.table.of(i, j)[TOUCH], ti.i32) == TOUCHES, ti.i32)
         return out
 
     @ti.func
