@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import checks
-from ..device import ti
+from ..device import inline, ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Knob, Scene
 from ..features.material import TANGENTIAL, is_elastic, refuse_turning
@@ -399,25 +399,16 @@ class Contact(PairContact):
                 excess = self.dev.geometry.held[i]
         return PairSums(w, split, again, carries, move, lift, rubbed, forced, turned, turned_by_force, carried, excess, impacts)
 
-    @ti.func
+    @inline
     def word_count(self, i, own, turn):
         """Return the number of words of pairs_of_turn()."""
-        out = 0
-        if ti.static(self.dev.once):
-            out = self.dev.each_once.word_count(i, turn)
-        elif own.split > 0:
-            out = self.dev.list.word_count(i)
-        return out
+        once, listed = self.dev.each_once, self.dev.list
+        return once.word_count(i, turn) if self.dev.once else ti.select(own.split > 0, listed.word_count(i), 0)
 
-    @ti.func
+    @inline
     def pairs_of_turn(self, i, word, turn):
         """Return the bits of the pairs of this turn, in one word of the list of particle i."""
-        out = ti.u32(0)
-        if ti.static(self.dev.once):
-            out = self.dev.each_once.bits(i, word, turn)
-        else:
-            out = self.dev.splitting.touching(i, word)
-        return out
+        return self.dev.each_once.bits(i, word, turn) if self.dev.once else self.dev.splitting.touching(i, word)
 
     @ti.func
     def measure(self, i, j, e, other, sign, own, now):
