@@ -378,11 +378,12 @@ class Contact(PairContact):
         excess, impacts = ti.cast(0, self.scene.real), ti.cast(0, self.scene.real)
         w, split = self.dev.w.of(i), self.dev.splitting.weight[i]
         again = ti.cast(ti.select(now.first == 0, 1, 0), self.scene.real)
-        # After a start pairs carry pushes, too, if only the substep has another length. Worlds with restitution start from the
+        # After a start pairs go on, too, if only the substep has another length. Worlds with restitution start from the
         # velocities that users read, and need half of the push first, as C gives it alone.
-        carries = ti.cast(ti.select(now.first != 0 and now.fresh == 0, 1, 0), self.scene.real)
+        goes_on = now.fresh == 0
         if ti.static(not self.dev.has_restitution):
-            carries = ti.cast(ti.select(now.first != 0 and (now.fresh == 0 or now.span.since > 0), 1, 0), self.scene.real)
+            goes_on = goes_on or now.span.since > 0
+        carries = ti.cast(ti.select(now.first != 0 and goes_on, 1, 0), self.scene.real)
         if ti.static(self.dev.has_restitution):
             if now.first != 0:
                 self.dev.restitution.clear(i, split)
