@@ -87,7 +87,7 @@ def test_a_cradle(world):
 
 
 def cloud(dim, n, seed):
-    """Return discs or spheres of different sizes and masses that fall onto static ones, too slowly for impacts to be projected."""
+    """Return discs or spheres of different sizes and masses above static ones, too slow for impacts to be projected."""
     rng = np.random.default_rng(seed)
     m = int(np.ceil(n ** (1 / dim)))
     x = np.stack(np.meshgrid(*[np.arange(m)] * dim, indexing="ij"), axis=-1).reshape(-1, dim)[:n] * 0.2

@@ -251,6 +251,7 @@ class World:
 
     def _upload(self) -> None:
         """Write to the device what was changed in Python since the last frame."""
+        constraints_changed = any(b.changed for b in self._runner.batches)
         for feature in self._features:
             if feature.moving:
                 feature.moving = False
@@ -259,7 +260,8 @@ class World:
                 feature.changed = feature.new_force = False
                 feature.upload()
         self._runner.find_ramps()
-        self._runner.find_bodies()
+        if constraints_changed:
+            self._runner.find_bodies()
 
     def run(
         self, seconds: float, dt: float = 1 / 60, recorder=None, progress: bool = False, *, tolerance: float | None = None,

@@ -8,6 +8,7 @@ from ..device import ti
 from ..device.number import OnDevice
 from ..geometry import rotation
 from ..neighbours.neighbour_list import PairData
+from .narrow_phase import NONE
 from .rigid_bodies import rigid_bodies
 
 if TYPE_CHECKING:
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 PASSES, MOST = 32, 256  # where no body has more than EQUAL times the mass of another one; and at most, see _passes()
 EQUAL = 2.0
 SLOW = 8.0  # a contact is struck if it closes faster than so many substeps of forces and constraints make it
-NONE = -2.0  # the place on an edge where there is no contact
 NEAR = 1 / 64  # of an edge, or of the distance of two discs: contacts with a smaller gap hold what is pressed into them
 TINY = 1e-30  # inverse mass of contacts of particles that cannot move
 LASTS = 8  # substeps for which a wall is known that has pushed a particle
@@ -109,15 +109,15 @@ class BodyProjection:
         self.passes = _passes(bodies, self.scene.inv_mass)
 
     @ti.func
-    def strikes(self, contact: ti.template(), v, a, b, t, n, borne):  # type: ignore[valid-type]
+    def strikes(self, geometry: ti.template(), v, a, b, t, n, borne):  # type: ignore[valid-type]
         """Whether a contact is an impact of a body: particle v, and the point t between a and b, with the normal n.
 
         borne: the overlap that bears its load [m]. What closes by less is sound.
         """
         out = False
         if self.alone[v] == 0 or self.alone[a] == 0 or self.alone[b] == 0:
-            closes = -contact.relative(self.state.d, v, a, b, t).dot(n)
-            before = -contact.relative(self.state.before, v, a, b, t).dot(n)
+            closes = -geometry.relative(self.state.d, v, a, b, t).dot(n)
+            before = -geometry.relative(self.state.before, v, a, b, t).dot(n)
             out = closes > 0 and closes >= borne and before > ti.static(SLOW) * ti.abs(closes - before)
         return out
 
@@ -139,17 +139,17 @@ class BodyProjection:
             self.wall_offset[i] = self.state.x[i].dot(push / size)
 
     @ti.func
-    def begin(self, i, contact: ti.template(), tick):  # type: ignore[valid-type]
+    def begin(self, i, geometry: ti.template(), tick):  # type: ignore[valid-type]
         """Find what each contact of particle i lacks, and how far the wall is. Set its move, and pushes, to 0."""
         if self.state.awake(i):
-            for e in range(contact.dev.list.first[i], contact.dev.list.first[i] + contact.dev.list.number[i]):
-                t, n, gap = contact.near_contact(i, e)
+            for e in range(geometry.list.first[i], geometry.list.first[i] + geometry.list.number[i]):
+                t, n, gap = geometry.near_contact(i, e, ti.static(NEAR))
                 lack = ti.max(gap, 0) * n
                 if self.struck.field[e] != 0:
                     n = self.normal.field[e]
-                    v, a, b = contact.ends(i, e, t)
+                    v, a, b = geometry.ends(i, e, t)
                     self.reached[v] = self.reached[a] = self.reached[b] = 1
-                    moved = contact.relative(self.state.d, v, a, b, ti.max(t, 0))
+                    moved = geometry.relative(self.state.d, v, a, b, ti.max(t, 0))
                     closed = ti.min(moved.dot(n), 0)
                     lack = moved + (ti.max(gap, closed) - moved.dot(n)) * n
                 self.normal.field[e], self.place.field[e], self.lack.field[e] = n, t, lack
@@ -160,23 +160,23 @@ class BodyProjection:
             self.note_wall(i, tick)
 
     @ti.func
-    def list_contacts(self, i, contact: ti.template(), tick):  # type: ignore[valid-type]
+    def list_contacts(self, i, geometry: ti.template(), tick):  # type: ignore[valid-type]
         """List the contacts of particle i, and split its mass among them."""
-        first, count, parts = contact.dev.list.first[i], 0, 0 * self.w.of(i)
+        first, count, parts = geometry.list.first[i], 0, 0 * self.w.of(i)
         if self.state.awake(i):
-            for e in range(first, first + contact.dev.list.number[i]):
+            for e in range(first, first + geometry.list.number[i]):
                 some = False
                 for role in range(ti.static(self.roles)):
-                    at = contact.entry_of(i, e, role)
+                    at = geometry.entry_of(i, e, role)
                     if at >= 0:
-                        part = contact.part_of(self.place.field[at], role)
+                        part = geometry.part_of(self.place.field[at], role)
                         if self.place.field[at] == NONE or part == 0:
                             at = -1
                         else:
                             some, parts = True, parts + abs(part)
                     self.listed.field[first + count][role] = at
                 if some:
-                    self.partner.field[first + count] = contact.dev.list.neighbour[e]
+                    self.partner.field[first + count] = geometry.list.neighbour[e]
                     count += 1
         self.number[i] = count
         if ti.static(self.state.keeps_wall_push):
@@ -211,16 +211,16 @@ class BodyProjection:
                 k = self.next[k]
 
     @ti.func
-    def press(self, i, k, contact: ti.template(), tick):  # type: ignore[valid-type]
+    def press(self, i, k, geometry: ti.template(), tick):  # type: ignore[valid-type]
         """In pass k: compute the pushes of the contacts of particle i, and of the wall on it."""
-        first, keep = contact.dev.list.first[i], ti.cast(k, self.scene.real) / (k + 3)
+        first, keep = geometry.list.first[i], ti.cast(k, self.scene.real) / (k + 3)
         if k == self.passes - 1:
             keep *= 0
         for m in range(first, first + ti.select(self.reached[i] != 0, self.number[i], 0)):
             e = self.listed.field[m][0]
             if e >= 0:
                 n, t = self.normal.field[e], ti.max(self.place.field[e], 0)
-                v, a, b = contact.ends(i, e, self.place.field[e])
+                v, a, b = geometry.ends(i, e, self.place.field[e])
                 shared = self.split[v] + (1 - t) * self.split[a] + t * self.split[b]
                 lacks = self.lack.field[e] + self.move[v] - (1 - t) * self.move[a] - t * self.move[b]
                 new = self.ahead.field[e] - lacks / ti.max(shared, ti.static(TINY))
@@ -245,7 +245,7 @@ class BodyProjection:
                 self.wall_pressed[i], self.wall_ahead[i] = new, ahead
 
     @ti.func
-    def follow(self, i, contact: ti.template()):  # type: ignore[valid-type]
+    def follow(self, i, geometry: ti.template()):  # type: ignore[valid-type]
         """Move the body of which particle i is the first by what pushes have changed in this pass."""
         if self.head[i] == i:
             total, near, k = ti.zero(self.move[i]), 0, i
@@ -257,11 +257,11 @@ class BodyProjection:
             while k >= 0:
                 if self.split[k] > 0 or self.number[k] > 0:
                     change = self.wall_step[k]
-                    for m in range(contact.dev.list.first[k], contact.dev.list.first[k] + self.number[k]):
+                    for m in range(geometry.list.first[k], geometry.list.first[k] + self.number[k]):
                         for role in range(ti.static(self.roles)):
                             at = self.listed.field[m][role]
                             if at >= 0:
-                                change += contact.part_of(self.place.field[at], role) * self.step.field[at]
+                                change += geometry.part_of(self.place.field[at], role) * self.step.field[at]
                     total += change
                     X += change.outer_product(self.arm[k])
                 k = self.next[k]
@@ -273,18 +273,18 @@ class BodyProjection:
                     if self.w.positive(k):
                         self.move[k] = self.move[k] + total / self.body_mass[i] + B @ self.arm[k]
                     self.reached[k] = 1
-                    for m in range(contact.dev.list.first[k], contact.dev.list.first[k] + self.number[k]):
+                    for m in range(geometry.list.first[k], geometry.list.first[k] + self.number[k]):
                         self.reached[self.partner.field[m]] = 1
                     k = self.next[k]
 
     @ti.func
-    def end(self, i, contact: ti.template()):  # type: ignore[valid-type]
+    def end(self, i, geometry: ti.template()):  # type: ignore[valid-type]
         """Move particle i, and clear the marks of its contacts. Returns whether it moves."""
-        for m in range(contact.dev.list.first[i], contact.dev.list.first[i] + self.number[i]):
+        for m in range(geometry.list.first[i], geometry.list.first[i] + self.number[i]):
             e = self.listed.field[m][0]
             if e >= 0:
                 self.struck.field[e] = 0
-                contact.add_push(e, self.push.field[e].dot(self.normal.field[e]))
+                geometry.add_push(e, self.push.field[e].dot(self.normal.field[e]))
         self.reached[i] = 0
         moves = (self.move[i] != 0).any()
         if moves:

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 from ..colliders.body_impacts import FINE
 from ..device import ti
+from ..features.material import DYNAMIC, RESTITUTION, STATIC
 from ..neighbours.neighbour_list import PairData
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ class BodyRestitution:
     @ti.func
     def begin(self, i, j, e, n):
         """Begin the impact of the pair at entry e of the list of particle i, with the normal n from j to i."""
-        self.aim.field[e] = ti.max(self.table.of(i, j)[2] * self.restitution.approach(i, j, n), ti.static(AIM)) * n
+        self.aim.field[e] = ti.max(self.table.of(i, j)[RESTITUTION] * self.restitution.approach(i, j, n), ti.static(AIM)) * n
         self.push.field[e] = self.step.field[e] = 0 * n
         self.first.field[e] = 0 * self.first.field[e]
 
@@ -94,7 +95,7 @@ class BodyRestitution:
                     self.aim.field[e] = aim * n
         lack = aim + bend - d.dot(n)
         if first == 0:
-            speed = lack / (1 + self.table.of(i, j)[2])
+            speed = lack / (1 + self.table.of(i, j)[RESTITUTION])
         both = self.impacts.response(i, n) + self.impacts.response(j, n)
         pressed = ti.max(last.dot(n) + lack / both.dot(n), 0)
         normal = pressed - last.dot(n)
@@ -121,12 +122,12 @@ class BodyRestitution:
         """
         slip, out = d - d.dot(n) * n, 0 * d
         size, row = slip.norm(), self.table.of(i, j)
-        if row[0] > 0 and size > 0:
+        if row[STATIC] > 0 and size > 0:
             along = slip / size
             new = held - slip / (self.impacts.inverse_mass(i, along, along) + self.impacts.inverse_mass(j, along, along))
             wanted = new.norm()
-            if wanted > row[0] * pressed:
-                new *= row[1] * pressed / wanted
+            if wanted > row[STATIC] * pressed:
+                new *= row[DYNAMIC] * pressed / wanted
             out = new - held
         return out
 

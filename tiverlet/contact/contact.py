@@ -7,16 +7,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import checks
-from ..device import ti
+from ..device import inline, ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Knob, Scene
-from ..features.material import is_elastic, refuse_turning
+from ..features.material import TANGENTIAL, is_elastic, refuse_turning
 from ..features.regrouping import Regrouping
 from ..geometry.ordered import median
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
-from .body_projection import NEAR, NONE, BodyProjection
+from .body_projection import BodyProjection
 from .body_restitution import BodyRestitution
 from .each_once import ROUNDS, EachOnce
 from .events import EventLog
@@ -26,8 +26,9 @@ from .impact_projection import ImpactProjection
 from .known_loads import KnownLoads
 from .mass_splitting import MassSplitting, lesser
 from .narrow_phase import DiscGeometry
+from .pair import Pair, PairSums
 from .pair_contact import PairContact
-from .restitution import UPTAKE, Restitution
+from .restitution import Restitution
 from .spinning import Spinning
 from .velocity_projection import VelocityProjection
 
@@ -279,40 +280,6 @@ class Contact(PairContact):
         return out
 
     @ti.func
-    def relative(self, d: ti.template(), v, a, b, t):  # type: ignore[valid-type]
-        """Return the displacement of particle v relative to a [m], see BodyProjection."""
-        return self.dev.state.relative_displacement(d[v] - d[a], v, a)
-
-    @ti.func
-    def near_contact(self, i, e):
-        """Return the place of the contact at entry e of the list of i, NONE if it is far, the normal, and the gap [m]."""
-        j = self.dev.list.neighbour[e]
-        distance = self.dev.geometry.contact_distance(i, j)
-        near = self.dev.geometry.push_each_other(i, j, ti.static(NEAR) * distance)
-        gap = self.dev.state.separation(i, j).norm() - distance
-        return ti.select(near, 0 * gap, NONE), self.dev.geometry.direction(i, j), gap
-
-    @ti.func
-    def entry_of(self, i, e, role):
-        """Return the entry that stores the contact at entry e of the list of particle i."""
-        return e
-
-    @ti.func
-    def ends(self, i, e, t):
-        """Return the particles of the contact at entry e of the list of i: i, and twice the other one."""
-        j = self.dev.list.neighbour[e]
-        return i, j, j
-
-    @ti.func
-    def part_of(self, t, role):
-        """Return the part of a particle in a contact."""
-        return 1 + 0 * t
-
-    @ti.func
-    def add_push(self, e, push):
-        """Do nothing: a pair does not keep the push of an impact."""
-
-    @ti.func
     def count(self, begin, end, now):
         """Find the touching pairs of particles begin ... end - 1, and how often their masses are split."""
         self.dev.splitting.count(begin, end, now)
@@ -348,191 +315,218 @@ class Contact(PairContact):
 
     @ti.func
     def relax(self, i, turn, now):
-        """Compute the corrections of particle i by its pairs of this turn, and the new pushes of these pairs."""
-        first, fresh, final = now.first, now.fresh, now.final
-        total, w = ti.Vector.zero(self.scene.real, self.dev.state.dim), self.dev.w.of(i)
-        lift, forced, carried, rubbed = total, total, total, total  # rubbed: by the friction of impacts
-        spin_change = ti.Vector.zero(self.scene.real, self.dev.axes)
-        spin_forced = spin_change
+        """Compute the corrections of particle i by its pairs of this turn, and the new pushes of these pairs.
+
+        For each pair: find the overlap and the normal; compute what this pass adds to the push along the normal, then friction;
+        store the push, and give the opposite to the other particle if the pair is solved once.
+        """
+        own = self.begin_sums(i, now)
+        for word in range(self.word_count(i, own, turn)):
+            bits = self.pairs_of_turn(i, word, turn)
+            while bits != 0:
+                e = self.dev.list.entry(i, word, bits)
+                bits &= bits - ti.u32(1)
+                j, other, sign = self.dev.list.neighbour[e], -1, ti.cast(1, self.scene.real)
+                if ti.static(self.dev.once):
+                    other = self.dev.each_once.take_over(i, j, turn)
+                    if not self.dev.w.positive(i):  # a particle that cannot move stores nothing of a pair
+                        if other < 0:
+                            continue
+                        e, sign = other, -sign
+                pair = self.measure(i, j, e, other, sign, own, now)
+                self.note_overlap(pair, own, now)
+
+                # Along the normal: the push of this substep before this pass, `known` of it by a known load, and the part added.
+                before, known = self.push_before(pair, own, now)
+                overlap, impact, rests = pair.overlap, ti.zero(pair.overlap), True
+                if ti.static(self.dev.has_restitution):
+                    impact, slack, rests = self.bounce(pair, now)
+                    overlap -= self.dev.restitution.remove_slack(pair, slack, own, now)
+                part = self.added_push(pair, overlap, before, own)
+                if ti.static(self.dev.has_restitution):
+                    impact = self.dev.restitution.strike(pair, impact, own)
+                    if not rests:
+                        part, before = ti.zero(part), before - known
+                if ti.static(bool(self.dev.bodies)):
+                    if self.is_left_to_bodies(pair, now):
+                        part, before = -known, known  # it pushes nothing, and has no load
+                push, pressed = before + part, part + known
+
+                # What later substeps and the user get to know of it.
+                load = 0 * pair.n
+                if ti.static(self.dev.has_loads):  # along the normal as the next substep starts
+                    load = self.dev.known.update_load(i, j, e, part, push, now) * self.dev.geometry.direction(i, j)
+                    own.carried += own.w * load
+                if ti.static(self.dev.has_restitution):
+                    self.dev.impulse.field[e] = self.dev.impulse.field[e] + pressed
+                if ti.static(self.dev.reports):
+                    self.dev.events.record(i, j, e, pair.n, pressed, now.final)
+
+                # As a vector, with friction: what both particles get.
+                want, force = part * pair.n, 0 * pair.n
+                if ti.static(self.dev.has_friction):
+                    want, force = self.add_friction(pair, part, pressed, impact, own, now)
+                own.move += own.w * want
+                self.store_push(i, e, push)
+                if ti.static(self.dev.once):
+                    if other >= 0:
+                        self.push_back(pair, push, want, load, force, now)
+        self.store_sums(i, own, turn, now)
+
+    @ti.func
+    def begin_sums(self, i, now):
+        """Return the sums of particle i as its turn begins: 0, or what particles before it have added, see EachOnce.
+
+        Also clear what its pairs note anew in each substep.
+        """
+        move = ti.Vector.zero(self.scene.real, self.dev.state.dim)
+        lift, rubbed, forced, carried = move, move, move, move
+        turned = ti.Vector.zero(self.scene.real, self.dev.axes)
+        turned_by_force = turned
+        excess, impacts = ti.cast(0, self.scene.real), ti.cast(0, self.scene.real)
+        w, split = self.dev.w.of(i), self.dev.splitting.weight[i]
+        again = ti.cast(ti.select(now.first == 0, 1, 0), self.scene.real)
+        # After a start pairs go on, too, if only the substep has another length. Worlds with restitution start from the
+        # velocities that users read, and need half of the push first, as C gives it alone.
+        goes_on = now.fresh == 0
+        if ti.static(not self.dev.has_restitution):
+            goes_on = goes_on or now.span.since > 0
+        carries = ti.cast(ti.select(now.first != 0 and goes_on, 1, 0), self.scene.real)
         if ti.static(self.dev.has_restitution):
-            if first != 0:
-                self.dev.restitution.clear(i, self.dev.splitting.weight[i])
+            if now.first != 0:
+                self.dev.restitution.clear(i, split)
         if ti.static(self.dev.projection.unequal and not self.dev.once):
             self.dev.projection.begin_strike(i)
-        # Factors 1 or 0, faster than a branch in the loop: whether pairs continue from their push in this substep (again), or
-        # from the push of the last substep (carries). After a start it does, too, where only the substep has another length.
-        # Worlds with restitution start from the velocities that users read, and need half of the push first, as C gives it alone.
-        again = ti.cast(ti.select(first == 0, 1, 0), self.scene.real)
-        carries = ti.cast(ti.select(first != 0 and fresh == 0, 1, 0), self.scene.real)
-        if ti.static(not self.dev.has_restitution):
-            carries = ti.cast(ti.select(first != 0 and (fresh == 0 or now.span.since > 0), 1, 0), self.scene.real)
-        own = self.dev.splitting.weight[i]
-        held, parts = ti.cast(0, self.scene.real), ti.cast(0, self.scene.real)
-        solves, words = own > 0, self.dev.list.word_count(i)
-        if ti.static(self.dev.once):
-            solves, words = True, self.dev.each_once.word_count(i, turn)
         if ti.static(self.dev.has_friction):
-            if final != 0 and (first == 0 or ti.static(self.dev.once)):
+            if now.final != 0 and (now.first == 0 or ti.static(self.dev.once)):
                 forced = self.dev.forces.sum[i]
-        if ti.static(self.dev.once):  # what came from the first round, and from particles whose turn was before
-            total = self.dev.move[i]
+        if ti.static(self.dev.once):
+            move = self.dev.move[i]
             if ti.static(self.dev.has_loads):
                 carried = self.dev.known.carried.field[i]
             if ti.static(self.dev.geometry.shrinks):
-                held = self.dev.geometry.held[i]
-        if solves:
-            for word in range(words):
-                bits = ti.u32(0)
-                if ti.static(self.dev.once):
-                    bits = self.dev.each_once.bits(i, word, turn)
-                else:
-                    bits = self.dev.splitting.touching(i, word)
-                while bits != 0:
-                    e = self.dev.list.entry(i, word, bits)
-                    bits &= bits - ti.u32(1)
-                    j, other, sign = self.dev.list.neighbour[e], -1, ti.cast(1, self.scene.real)
-                    if ti.static(self.dev.once):
-                        other = self.dev.each_once.take_over(i, j, turn)
-                        if not self.dev.w.positive(i):  # a particle that cannot move stores nothing of a pair
-                            if other < 0:
-                                continue
-                            e, sign = other, -sign
-                    last = self.dev.push.field[e]
-                    shared = own + self.dev.splitting.weight[j]
-                    contact_distance = self.dev.geometry.contact_distance(i, j)
-                    bears = last > 0 and first != 0
-                    if ti.static(self.dev.has_loads):
-                        bears = bears or self.dev.known.load.field[e] > 0
-                    overlap, each, n, reach = self.dev.geometry.impact(i, j, contact_distance, shared, bears)
-                    if ti.static(self.dev.geometry.shrinks):
-                        held = ti.max(held, self.dev.geometry.excess(i, j, n, overlap, now.h))
-                    each *= ti.static(RELAXATION)
-                    paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self.dev.w.of(j)
-                    if ti.static(self.dev.projection.unequal):
-                        if first != 0:
-                            self.dev.projection.note_pair(i, j, n, overlap, alone * last)
-                            if other >= 0:
-                                self.dev.projection.note_pair(j, i, -n, overlap, alone * last)
-                    if ti.static(bool(self.dev.impacts)):
-                        if first != 0:
-                            self.dev.impacts.note(i, j, n, overlap, alone * last, other, now.h)
-                    push, known = again * last, ti.zero(overlap)  # known: the part of the push that its known load already gave
-                    left = ti.zero(overlap)  # the part of the substep after an impact
-                    keeps = ti.max(lesser(1 - alone * each, ti.static(CARRY)), 0)
-                    if ti.static(self.dev.has_loads):
-                        if first != 0:
-                            known = self.dev.known.known_push(e, now)
-                            push = known
-                    if ti.static(self.dev.has_restitution):
-                        bearing = overlap
-                        if ti.static(self.dev.has_loads):  # bounce() compares what holds the load: add the known load's overlap
-                            bearing = ti.max(overlap, 0) + ti.max((1 - keeps) / each, alone) * self.dev.known.known_push(e, now)
-                        given, slack, rests = self.dev.restitution.bounce(i, j, n, bearing, self.dev.slack.field[e], last, first)
-                        slack = ti.min(slack, ti.max(overlap, 0))
-                        if first != 0:
-                            if self.dev.restitution.presses_bodies(i, j):
-                                slack = self.dev.restitution.kept_slack(i, j, slack, now.h)
-                                self.dev.slack.field[e] = slack
-                            else:
-                                back = ti.static(UPTAKE) * ti.min(slack * each, slack / alone)
-                                lift += w * back * n
-                                self.dev.slack.field[e] = slack - alone * back
-                        paid -= slack
-                    part = paid * each + keeps * (carries * (last - push))
-                    if ti.static(self.dev.has_loads):
-                        part = ti.select(paid > 0, lesser(part, paid / alone), ti.max(part, paid / alone))
-                        part = ti.max(part, -push)
-                    else:
-                        part = lesser(part, paid / alone)  # no branch: it would be mispredicted
-                    if ti.static(self.dev.has_restitution):
-                        if given > 0:
-                            self.dev.restitution.struck.field[e] = 1
-                            if self.dev.restitution.leave_to_bodies(i, j, e, n):
-                                given, parts = ti.zero(given), parts + 1
-                            elif self.dev.hit[None] == 0:
-                                self.dev.hit[None] = 1
-                        if not rests:
-                            part = ti.zero(part)
-                            push -= known
-                    if ti.static(bool(self.dev.bodies)):
-                        struck = self.dev.bodies.struck.field[e] != 0
-                        if first != 0:
-                            struck = overlap > 0 and self.dev.bodies.strikes(self, i, j, j, 0 * w, n, alone * last)
-                        self.dev.bodies.note(e, n, struck)
-                        if struck:  # see BodyProjection; what strikes has no load
-                            part, push = -known, known
-                    load = 0 * n
-                    if ti.static(self.dev.has_loads):  # along the normal as the next substep starts
-                        load = self.dev.known.update_load(i, j, e, part, push + part, now) * self.dev.geometry.direction(i, j)
-                        carried += w * load
-                    pressed = part + known
-                    if ti.static(self.dev.has_restitution):
-                        self.dev.impulse.field[e] = self.dev.impulse.field[e] + pressed
-                    if ti.static(self.dev.reports):
-                        self.dev.events.record(i, j, e, n, pressed, final)
-                    push += part
-                    want, force = part * n, 0 * n  # force: the part of friction that counts as one
-                    if ti.static(self.dev.has_restitution and self.dev.has_friction):
-                        if given > 0:
-                            given, left, _approach = self.dev.restitution.collision(i, j, n, overlap)
-                    if ti.static(self.dev.spins):
-                        tangential, turned = self.spin_friction(i, j, e, n, reach, pressed + given / shared, given > 0)
-                        want += tangential
-                        if ti.static(self.dev.has_restitution):
-                            if given > 0:  # friction of an impact acts from the time of impact on
-                                lift -= (1 - left) * w * tangential
-                        spin_change += w * turned
-                        if final != 0:
-                            before = self.dev.forces.before[i] - self.dev.forces.before[j]
-                            approach = -self.dev.state.relative_displacement(before, i, j).dot(n)
-                            share = self.dev.forces.share(approach, pressed * alone) * w
-                            forced += share * tangential
-                            spin_forced += share * turned
-                    elif ti.static(self.dev.has_friction):
-                        want -= self.held(i, j, n, pressed * shared + given, sign * self.dev.slip.field[e]) / shared
-                    total += w * want
-                    if ti.static(self.dev.has_restitution and self.dev.has_friction):
-                        if given > 0:
-                            rubbed += w * (want - part * n)
-                    if ti.static(self.dev.has_friction and not self.dev.spins):
-                        if final != 0:
-                            approach = -self.dev.state.relative_displacement(
-                                self.dev.forces.before[i] - self.dev.forces.before[j], i, j
-                            ).dot(n)
-                            force = self.dev.forces.share(approach, pressed * alone) * (want - part * n)
-                            forced += w * force
-                    self.store_push(i, e, push)
-                    if ti.static(self.dev.once):
-                        if other >= 0:
-                            self.push_back(j, e, other, push, want, load)
-                            if ti.static(self.dev.geometry.shrinks):
-                                excess = self.dev.geometry.excess(j, i, -n, overlap, now.h)
-                                self.dev.geometry.held[j] = ti.max(self.dev.geometry.held[j], excess)
-                            if ti.static(self.dev.has_friction):
-                                if final != 0:
-                                    self.dev.forces.sum[j] = self.dev.forces.sum[j] - self.dev.w.of(j) * force
-        self.dev.move[i] = total
-        if ti.static(self.dev.projection.unequal):
-            if first != 0 and turn.round == ROUNDS - 1:
-                self.dev.projection.note_struck(i)
-        if ti.static(self.dev.geometry.shrinks):
-            self.dev.geometry.held[i] = held
+                excess = self.dev.geometry.held[i]
+        return PairSums(w, split, again, carries, move, lift, rubbed, forced, turned, turned_by_force, carried, excess, impacts)
+
+    @inline
+    def word_count(self, i, own, turn):
+        """Return the number of words of pairs_of_turn()."""
+        once, listed = self.dev.each_once, self.dev.list
+        return once.word_count(i, turn) if self.dev.once else ti.select(own.split > 0, listed.word_count(i), 0)
+
+    @inline
+    def pairs_of_turn(self, i, word, turn):
+        """Return the bits of the pairs of this turn, in one word of the list of particle i."""
+        return self.dev.each_once.bits(i, word, turn) if self.dev.once else self.dev.splitting.touching(i, word)
+
+    @ti.func
+    def measure(self, i, j, e, other, sign, own, now):
+        """Return the Pair of particles i and j, with its overlap, its normal and its inverse masses."""
+        last, shared = self.dev.push.field[e], own.split + self.dev.splitting.weight[j]
+        contact_distance, bears = self.dev.geometry.contact_distance(i, j), last > 0 and now.first != 0
         if ti.static(self.dev.has_loads):
-            self.dev.known.carried.field[i] = carried
-        if ti.static(self.dev.spins):
-            self.dev.spinning.change[i] = spin_change
-            if final != 0:
-                self.dev.forces.add_turn(i, spin_forced, first)
-        if ti.static(self.dev.has_friction):
-            if final != 0:
-                self.dev.forces.sum[i] = forced
+            bears = bears or self.dev.known.load.field[e] > 0
+        overlap, stiffness, n, reach = self.dev.geometry.impact(i, j, contact_distance, shared, bears)
+        stiffness *= ti.static(RELAXATION)
+        alone = own.w + self.dev.w.of(j)
+        carry = ti.max(lesser(1 - alone * stiffness, ti.static(CARRY)), 0)
+        return Pair(i, j, e, other, sign, overlap, n, reach, last, shared, alone, stiffness, carry)
+
+    @ti.func
+    def note_overlap(self, pair, own, now):
+        """Note the overlap of a pair, for particles that grow back and for projections."""
+        if ti.static(self.dev.geometry.shrinks):
+            own.excess = ti.max(own.excess, self.dev.geometry.excess(pair.i, pair.j, pair.n, pair.overlap, now.h))
+        if ti.static(self.dev.projection.unequal):
+            if now.first != 0:
+                borne = pair.alone * pair.last
+                self.dev.projection.note_pair(pair.i, pair.j, pair.n, pair.overlap, borne)
+                if pair.other >= 0:
+                    self.dev.projection.note_pair(pair.j, pair.i, -pair.n, pair.overlap, borne)
+        if ti.static(bool(self.dev.impacts)):
+            if now.first != 0:
+                self.dev.impacts.note(pair, now.h)
+
+    @ti.func
+    def push_before(self, pair, own, now):
+        """Return the push of a pair in this substep before this pass, and the part of it that its known load gave [kg m].
+
+        The load counts in the first pass. Later passes find it in the push.
+        """
+        push, known = own.again * pair.last, ti.zero(pair.overlap)
+        if ti.static(self.dev.has_loads):
+            if now.first != 0:
+                known = self.dev.known.known_push(pair.e, now)
+                push = known
+        return push, known
+
+    @ti.func
+    def bounce(self, pair, now):
+        """Return the impact of a pair [m], its slack [m], and whether it rests, see Restitution.bounce()."""
+        bearing = pair.overlap
+        if ti.static(self.dev.has_loads):  # with the overlap that would hold the known load
+            per_push = ti.max((1 - pair.carry) / pair.stiffness, pair.alone)
+            bearing = ti.max(pair.overlap, 0) + per_push * self.dev.known.known_push(pair.e, now)
+        slack = self.dev.slack.field[pair.e]
+        return self.dev.restitution.bounce(pair.i, pair.j, pair.n, bearing, slack, pair.last, now.first)
+
+    @ti.func
+    def added_push(self, pair, overlap, before, own):
+        """Return what this pass adds to the push `before` of a pair, to take back an overlap: r C / M + c p_last, see Contact.
+
+        It is no more than separates the pair alone. Contacts may take back what a known load gave, but never pull.
+        """
+        part = overlap * pair.stiffness + pair.carry * (own.carries * (pair.last - before))
+        if ti.static(self.dev.has_loads):
+            part = ti.select(overlap > 0, lesser(part, overlap / pair.alone), ti.max(part, overlap / pair.alone))
+            part = ti.max(part, -before)
+        else:
+            part = lesser(part, overlap / pair.alone)  # no branch: it would be mispredicted
+        return part
+
+    @ti.func
+    def is_left_to_bodies(self, pair, now):
+        """Whether a pair is an impact that BodyProjection solves after the passes. The first pass of a substep decides."""
+        struck = self.dev.bodies.struck.field[pair.e] != 0
+        if now.first != 0:
+            borne, place = pair.alone * pair.last, 0 * pair.alone
+            struck = pair.overlap > 0 and self.dev.bodies.strikes(self.dev.geometry, pair.i, pair.j, pair.j, place, pair.n, borne)
+        self.dev.bodies.note(pair.e, pair.n, struck)
+        return struck
+
+    @ti.func
+    def add_friction(self, pair, part, pressed, impact, own, now):
+        """Return the push of a pair with friction, and the part of friction that counts as a force, both vectors [kg m].
+
+        part: the push along the normal that this pass adds [kg m]. Friction is bounded by `pressed`, the same with the known load
+        [kg m], and by the impact [m]. own: gets the sums that only friction needs.
+        """
+        want, force, left = part * pair.n, 0 * pair.n, ti.zero(part)  # left: the part of the substep after the impact
         if ti.static(self.dev.has_restitution):
-            self.dev.restitution.lift[i] = lift
-            if ti.static(self.dev.has_friction):
-                self.dev.restitution.rubbed[i] = rubbed
-            if ti.static(bool(self.dev.restitution.bodies)):
-                if first != 0:
-                    self.dev.restitution.bodies.take_part(i, parts)
+            if impact > 0:
+                impact, left, _approach = self.dev.restitution.collision(pair.i, pair.j, pair.n, pair.overlap)
+        if ti.static(self.dev.spins):
+            across, turned = self.spin_friction(pair, pressed + impact / pair.shared, impact > 0)
+            want += across
+            if ti.static(self.dev.has_restitution):
+                if impact > 0:  # friction of an impact acts from the time of impact on
+                    own.lift -= (1 - left) * own.w * across
+            own.turned += own.w * turned
+            if now.final != 0:
+                share = self.dev.forces.share_of(pair.i, pair.j, pair.n, pressed * pair.alone) * own.w
+                own.forced += share * across
+                own.turned_by_force += share * turned
+        else:
+            slip = pair.sign * self.dev.slip.field[pair.e]
+            want -= self.held(pair.i, pair.j, pair.n, pressed * pair.shared + impact, slip) / pair.shared
+            if now.final != 0:
+                share = self.dev.forces.share_of(pair.i, pair.j, pair.n, pressed * pair.alone)
+                force = share * (want - part * pair.n)
+                own.forced += own.w * force
+        if ti.static(self.dev.has_restitution):
+            if impact > 0:
+                own.rubbed += own.w * (want - part * pair.n)
+        return want, force
 
     @ti.func
     def store_push(self, i, e, push):
@@ -543,13 +537,48 @@ class Contact(PairContact):
                 self.dev.splitting.invalidate_bound(i)
 
     @ti.func
-    def push_back(self, j, e, other, push, want, load):
-        """Correct particle j, too: the opposite of what the pair at entry e `want`s of i, and of its load, a vector [N]. other:
-        the entry of i in the list of j."""
-        self.dev.move[j] = self.dev.move[j] - self.dev.w.of(j) * want
-        self.store_push(j, other, push)
+    def push_back(self, pair, push, want, load, force, now):
+        """Give particle j of a pair the opposite of what i gets.
+
+        want: the push [kg m]. load: the known load [N]. force: the part of friction that counts as a force [kg m]. All vectors.
+        """
+        j, w = pair.j, self.dev.w.of(pair.j)
+        self.dev.move[j] = self.dev.move[j] - w * want
+        self.store_push(j, pair.other, push)
         if ti.static(self.dev.has_loads):
-            self.dev.known.push_back(j, e, other, load)
+            self.dev.known.push_back(j, pair.e, pair.other, load)
+        if ti.static(self.dev.geometry.shrinks):
+            excess = self.dev.geometry.excess(j, pair.i, -pair.n, pair.overlap, now.h)
+            self.dev.geometry.held[j] = ti.max(self.dev.geometry.held[j], excess)
+        if ti.static(self.dev.has_friction):
+            if now.final != 0:
+                self.dev.forces.sum[j] = self.dev.forces.sum[j] - w * force
+
+    @ti.func
+    def store_sums(self, i, own, turn, now):
+        """Store what particle i has summed up over its pairs."""
+        self.dev.move[i] = own.move
+        if ti.static(self.dev.projection.unequal):
+            if now.first != 0 and turn.round == ROUNDS - 1:
+                self.dev.projection.note_struck(i)
+        if ti.static(self.dev.geometry.shrinks):
+            self.dev.geometry.held[i] = own.excess
+        if ti.static(self.dev.has_loads):
+            self.dev.known.carried.field[i] = own.carried
+        if ti.static(self.dev.spins):
+            self.dev.spinning.change[i] = own.turned
+            if now.final != 0:
+                self.dev.forces.add_turn(i, own.turned_by_force, now.first)
+        if ti.static(self.dev.has_friction):
+            if now.final != 0:
+                self.dev.forces.sum[i] = own.forced
+        if ti.static(self.dev.has_restitution):
+            self.dev.restitution.lift[i] = own.lift
+            if ti.static(self.dev.has_friction):
+                self.dev.restitution.rubbed[i] = own.rubbed
+            if ti.static(bool(self.dev.restitution.bodies)):
+                if now.first != 0:
+                    self.dev.restitution.bodies.take_part(i, own.impacts)
 
     @ti.func
     def held(self, i, j, n, normal, slip):
@@ -558,16 +587,17 @@ class Contact(PairContact):
         return self.table.held(i, j, n, normal, moved)
 
     @ti.func
-    def spin_friction(self, i, j, e, n, reach, pressed, bounces):
+    def spin_friction(self, pair, pressed, bounces):
         """Return how far friction between spinning particles pushes i and turns its surface, both per inverse mass [kg m].
 
-        pressed: the push along the normal n [kg m]. reach: the distance of the pair [m]. bounces: whether this is an impact.
+        pressed: the push along the normal [kg m]. bounces: whether this is an impact.
         """
-        m, split_mass = self.dev.spinning.arm_of(i, j, n, reach), self.dev.spinning.split_mass(i, j)
+        i, j, e, n = pair.i, pair.j, pair.e, pair.n
+        m, split_mass = self.dev.spinning.arm_of(i, j, n, pair.reach), self.dev.spinning.split_mass(i, j)
         slip = self.dev.slip.field[e] + self.dev.spinning.slip(i, j, m)
         if ti.static(self.dev.turns and self.dev.has_restitution):
             if bounces:
-                slip *= 1 + self.table.of(i, j)[6]
+                slip *= 1 + self.table.of(i, j)[TANGENTIAL]
         push = -self.table.held(i, j, n, pressed * split_mass, slip) / split_mass
         turned = self.dev.spinning.turned(i, m, push)
         if ti.static(self.dev.turns):
@@ -594,10 +624,7 @@ class Contact(PairContact):
                     length = r.norm()
                     if push > 0 and length > 0:
                         n = r / length
-                        approach = -self.dev.state.relative_displacement(
-                            self.dev.forces.before[i] - self.dev.forces.before[j], i, j
-                        ).dot(n)
-                        share = self.dev.forces.share(approach, push * (w + self.dev.w.of(j)))
+                        share = self.dev.forces.share_of(i, j, n, push * (w + self.dev.w.of(j)))
                         if ti.static(self.dev.has_loads):
                             push -= self.dev.known.load.field[e] * h * h / soft
                         total += share * w * push * n
@@ -618,42 +645,40 @@ class Contact(PairContact):
 
     @ti.func
     def finish_substep(self, i, now):
-        """Update the slip of each pair at the end of a substep, as far as friction can hold it, and clear slack of parted pairs.
-
-        Pairs that began to overlap after the pushes wait until the next substep: a list with a narrow skin may not have them yet.
-        """
+        """At the end of a substep: store the slip of each pair, and clear the slack of parted pairs."""
         if ti.static(self.dev.has_friction):
             for word in range(self.dev.list.word_count(i)):
                 bits = self.dev.splitting.sliding(i, word, now)
                 while bits != 0:
                     e = self.dev.list.entry(i, word, bits)
                     bits &= bits - ti.u32(1)
-                    j = self.dev.list.neighbour[e]
-                    overlap, n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
-                    slip, turn = 0 * self.dev.state.x[i], ti.Vector.zero(self.scene.real, self.dev.axes)
-                    if ti.static(self.dev.has_loads):
-                        if overlap <= 0 and self.dev.push.field[e] > 0:
-                            overlap, n = self.dev.geometry.gap(i, j)
-                    if (overlap > 0 or ti.static(self.dev.has_loads)) and self.dev.push.field[e] > 0:
-                        shared = self.dev.splitting.weight[i] + self.dev.splitting.weight[j]
-                        pressed = self.dev.push.field[e] * shared
-                        if ti.static(self.dev.spins):
-                            pressed = ti.max(overlap, pressed) / shared
-                            reach = pressed * self.dev.spinning.split_mass(i, j)
-                            slip = self.dev.slip.field[e] + self.dev.spinning.slip(i, j, self.dev.spinning.arm(i, j, n))
-                            slip = self.table.held(i, j, n, reach, slip)
-                            if ti.static(self.dev.turns):
-                                turn = self.dev.spinning.left(i, j, e, n, pressed)
-                        else:
-                            slip = self.held(i, j, n, ti.max(overlap, pressed), self.dev.slip.field[e])
-                    self.dev.slip.field[e] = slip
-                    if ti.static(self.dev.turns):
-                        self.dev.turn.field[e] = turn
+                    self.store_slip(i, self.dev.list.neighbour[e], e)
         if ti.static(self.dev.has_restitution):
-            if self.dev.splitting.weight[i] > 0:
-                for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
-                    if self.dev.slack.field[e] > 0:
-                        j = self.dev.list.neighbour[e]
-                        overlap, _n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
-                        if overlap <= 0:
-                            self.dev.slack.field[e] = 0
+            self.dev.restitution.clear_slack(i, self.dev.splitting.weight[i])
+
+    @ti.func
+    def store_slip(self, i, j, e):
+        """Store the slip and the turn of a pair, as far as friction can hold them: none if the pair has no push or has parted.
+
+        Pairs that began to overlap after the pushes wait until the next substep: a list with a narrow skin may not have them yet.
+        """
+        overlap, n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
+        slip, turn = 0 * self.dev.state.x[i], ti.Vector.zero(self.scene.real, self.dev.axes)
+        if ti.static(self.dev.has_loads):
+            if overlap <= 0 and self.dev.push.field[e] > 0:
+                overlap, n = self.dev.geometry.gap(i, j)
+        if (overlap > 0 or ti.static(self.dev.has_loads)) and self.dev.push.field[e] > 0:
+            shared = self.dev.splitting.weight[i] + self.dev.splitting.weight[j]
+            pressed = self.dev.push.field[e] * shared
+            if ti.static(self.dev.spins):
+                pressed = ti.max(overlap, pressed) / shared
+                most = pressed * self.dev.spinning.split_mass(i, j)
+                slip = self.dev.slip.field[e] + self.dev.spinning.slip(i, j, self.dev.spinning.arm(i, j, n))
+                slip = self.table.held(i, j, n, most, slip)
+                if ti.static(self.dev.turns):
+                    turn = self.dev.spinning.left(i, j, e, n, pressed)
+            else:
+                slip = self.held(i, j, n, ti.max(overlap, pressed), self.dev.slip.field[e])
+        self.dev.slip.field[e] = slip
+        if ti.static(self.dev.turns):
+            self.dev.turn.field[e] = turn

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..device import ti
 from ..features.feature import Scene
-from ..features.material import SENSES, Table
+from ..features.material import SENSES, TOUCH, Table
 from ..neighbours.neighbour_list import Column, PairData
 from .touches import BEFORE, NEVER, ContactEvents, Touches, span
 
@@ -137,7 +137,7 @@ class EventLog:
         if self.is_sensor[rank] != 0:
             for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
                 j = self.list.neighbour[e]
-                if ti.cast(self.table.of(i, j)[3], ti.i32) == SENSES and (rank != self.table.rank[j] or i < j):
+                if ti.cast(self.table.of(i, j)[TOUCH], ti.i32) == SENSES and (rank != self.table.rank[j] or i < j):
                     overlap, n = self.geometry.overlap(i, j, self.radius.of(i) + self.radius.of(j))
                     if overlap > 0:
                         self.write(i, j, e, n, 0 * overlap, final)

@@ -42,6 +42,11 @@ class ForceShare:
         return ti.max(1 - ti.select(push > 0, ti.max(approach, 0) / push, ti.zero(push)) ** 2, 0)
 
     @ti.func
+    def share_of(self, i, j, n, push):
+        """Return share() of the push of particles i and j along their normal n [m]."""
+        return self.share(-self.state.relative_displacement(self.before[i] - self.before[j], i, j).dot(n), push)
+
+    @ti.func
     def add_turn(self, i, turned, first):
         """Add how far forces of a pass turned the surface of particle i [m]. The first pass begins the sum."""
         accumulate(self.turned, i, turned, first)

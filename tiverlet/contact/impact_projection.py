@@ -76,19 +76,16 @@ class ImpactProjection:
             self.free = scene.memory.field("impacts.free", scene.count, width=scene.particles.dim)
 
     @ti.func
-    def note(self, i, j, n, overlap, borne, other, h):
-        """Note whether a pair is struck, before it is pushed.
-
-        borne: the overlap that its push in the last substep takes back [m]. One that has not doubled was not struck. other: at
-        least 0 if this is for particle j, too.
-        """
-        if overlap > 2 * borne:
-            closes = -self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n)
+    def note(self, pair, h):
+        """Note whether a pair is struck, before it is pushed."""
+        i, j = pair.i, pair.j
+        if pair.overlap > 2 * pair.alone * pair.last:  # it has doubled since the last push, which took back alone * last
+            closes = -self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(pair.n)
             forced = h * h * (self.own_weight.field[i] + self.own_weight.field[j])
             falls = closes * closes > ti.static(FALL) * self.geometry.contact_distance(i, j) * forced
             if falls and closes > ti.static(SLOW) * forced and self.is_loose(i) and self.is_loose(j):
                 self.struck[i] = self.any_struck[None] = 1
-                if other >= 0:
+                if pair.other >= 0:
                     self.struck[j] = 1
 
     @ti.func
@@ -111,6 +108,16 @@ class ImpactProjection:
         if self.struck[i] != 0:
             self.struck[i] = 0
             self.take(i, ti.static(STRUCK))
+
+    @ti.func
+    def find(self, i, k):
+        """Do round k > 0 of particle i, which is in a ring: find those around it, then its pairs, then its changes."""
+        if k <= AROUND:
+            self.spread(i, STRUCK + 1 - k)
+        elif k == AROUND + 1:
+            self.list_pairs(i)
+        else:
+            self.relax(i, k - AROUND - 2)
 
     @ti.func
     def spread(self, i, ring):
@@ -199,14 +206,19 @@ class ImpactProjection:
                 log.add(i, push / number)
 
     @ti.func
-    def apply(self, i):
-        """Add the changes of this pass."""
-        self.state.d[i] = self.state.d[i] + self.move[i]
-        self.state.advance(i, self.lift[i])
+    def apply(self, i, k):
+        """Add the changes of particle i in round k. Returns whether that was the last round."""
+        if k > AROUND + 1:
+            self.state.d[i] = self.state.d[i] + self.move[i]
+            self.state.advance(i, self.lift[i])
+        ends = k == ROUNDS - 1
+        if ends:
+            self.ring[i] = 0
+        return ends
 
     @ti.func
-    def end_round(self, last):
+    def end_round(self, k):
         """Tell all threads how many particles are near what was struck; after the last round, that there are none."""
         self.size[None] = self.count[None]
-        if last:
+        if k == ROUNDS - 1:
             self.any_struck[None] = self.count[None] = 0

@@ -7,7 +7,7 @@ import numpy as np
 from ..device import ti
 from ..device.number import OnDevice
 from ..features.feature import Scene
-from ..features.material import TOUCHES
+from ..features.material import TOUCH, TOUCHES
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.queries import Contacts, between
 from .candidates import DiscCandidates
@@ -19,6 +19,7 @@ SHRUNK = "Contact.shrunk"  # the field of how much smaller each particle is than
 BARELY = 2.0**-100  # [m] by which a particle shrinks that is to keep its size
 HELD = "Contact.held"  # the field of by how much each particle shrinks in the coming substep, instead of growing [m]
 SLOWER = "Contact.slower"  # the field of how much slower than at push_out pairs of each shrunk particle part [m/s]
+NONE = -2.0  # in near_contact(): the place on an edge where there is no contact
 SAME_PLACE = 2.0**-80  # (distance / contact distance)^2 below which two particles count as in the same place
 
 
@@ -54,7 +55,7 @@ class DiscGeometry:
         """Return 1 if particles i and j push each other where they overlap, 0 if they do not, as for sensors."""
         out = 1
         if ti.static(self.senses):
-            out = ti.cast(ti.cast(self.search.table.of(i, j)[3], ti.i32) == TOUCHES, ti.i32)
+            out = ti.cast(ti.cast(self.search.table.of(i, j)[TOUCH], ti.i32) == TOUCHES, ti.i32)
         return out
 
     @ti.func
@@ -256,6 +257,43 @@ class DiscGeometry:
         """Whether particles i and j push each other, and are less than `margin` [m] from overlapping."""
         r, distance = self.state.separation(i, j), self.contact_distance(i, j) + margin
         return r.dot(r) < distance * distance and self.pushes(i, j) != 0
+
+    @ti.func
+    def near_contact(self, i, e, near):
+        """Return the place of the pair at entry e of the list of i, the normal, and the gap [m].
+
+        The place is 0, or NONE if the gap is wider than the part `near` of the distance at which the pair touches.
+        """
+        j = self.list.neighbour[e]
+        distance = self.contact_distance(i, j)
+        is_near = self.push_each_other(i, j, near * distance)
+        gap = self.state.separation(i, j).norm() - distance
+        return ti.select(is_near, 0 * gap, NONE), self.direction(i, j), gap
+
+    @ti.func
+    def ends(self, i, e, t):
+        """Return the particles of the pair at entry e of the list of i as those of a contact: i, and twice the other one."""
+        j = self.list.neighbour[e]
+        return i, j, j
+
+    @ti.func
+    def entry_of(self, i, e, role):
+        """Return the entry that stores the pair at entry e of the list of particle i: e itself."""
+        return e
+
+    @ti.func
+    def part_of(self, t, role):
+        """Return the part of particle i in a pair: 1."""
+        return 1 + 0 * t
+
+    @ti.func
+    def relative(self, d: ti.template(), v, a, b, t):  # type: ignore[valid-type]
+        """Return the displacement of particle v relative to a [m]."""
+        return self.state.relative_displacement(d[v] - d[a], v, a)
+
+    @ti.func
+    def add_push(self, e, push):
+        """Do nothing: a pair does not keep the push of an impact of bodies."""
 
     @ti.func
     def worst_overlap(self, i):

@@ -47,6 +47,30 @@ class Geometry(Protocol):
     def worst_overlap(self, i) -> Any:
         """Return the number of contacts that particle i counts for the report, and its worst overlap relative to its size."""
 
+    def near_contact(self, i, e, near) -> Any:
+        """Return the place t, the normal and the gap [m] of the contact of particle i at entry e of its list, for BodyProjection.
+
+        t is the place on an edge, at most 0 without one; NONE if the gap is wider than `near` times the size of the contact.
+        """
+
+    def ends(self, i, e, t) -> Any:
+        """Return the particles v, a and b of that contact: v touches the point t between a and b."""
+
+    def entry_of(self, i, e, role) -> Any:
+        """Return the entry that stores the contact in which particle i has a role, with the particle at entry e, or -1.
+
+        The roles are 0 for v, 1 for a, 2 for b; discs have the first one only.
+        """
+
+    def part_of(self, t, role) -> Any:
+        """Return the part of a particle in a contact with place t, by its role: 1, -(1 - t) or -t, the factor of its gradient."""
+
+    def relative(self, d, v, a, b, t) -> Any:
+        """Return the displacement of v relative to the point t between a and b [m], where d is the field of displacements."""
+
+    def add_push(self, e, push) -> None:
+        """Add the push of an impact of bodies to those of the contact at entry e [kg m], if it keeps any."""
+
     def members(self, pairs: np.ndarray) -> np.ndarray:
         """Return the particles of the contacts of these listed pairs (m, 2), (m, k), for KnownLoads."""
         ...

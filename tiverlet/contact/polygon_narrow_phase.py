@@ -12,7 +12,7 @@ from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.queries import Contacts
 from .candidates import EdgeCandidates
-from .narrow_phase import DiscGeometry
+from .narrow_phase import NONE, DiscGeometry
 
 # Lengths relative to an edge.
 SLACK = 1 / 512  # extension of an edge at its ends, so that bodies of the same width stand on each other
@@ -456,12 +456,12 @@ class PolygonGeometry:
         """Return the place of the contact of vertex v at entry e, by the last detect(), the normal, and the gap [m].
 
         A contact that does not overlap counts where v is in front of the edge, and nearer than the part `near` of its length;
-        else its place is below DISCS.
+        else its place is NONE.
         """
         a, found = self.list.neighbour[e], self.manifold.field[e]
         place, n, gap = found[1], ti.Vector([found[2], found[3]]), -found[0]
         if gap >= 0:
-            place = 0 * gap + 2 * DISCS
+            place = 0 * gap + NONE
             if self.after(a) >= 0:
                 u, r = self.state.separation(self.after(a), a), self.state.separation(v, a)
                 uu = u.dot(u)
@@ -474,6 +474,31 @@ class PolygonGeometry:
                     if -SLACK <= t <= 1 + SLACK and gap >= 0 and gap < near * length and self.find(v, self.after(a)) >= 0:
                         place = within
         return place, n, gap
+
+    @ti.func
+    def ends(self, i, e, t):
+        """Return the particles v, a, b of the contact of vertex i at entry e, with the place t on the edge."""
+        a = self.list.neighbour[e]
+        return i, a, ti.select(t > DISCS, self.after(a), a)
+
+    @ti.func
+    def entry_of(self, i, e, role):
+        """Return the entry that stores the contact in which particle i has a role, with the particle at entry e, or -1."""
+        at = -1
+        if role < self.roles(i):
+            at, _, _, _, _, _ = self.participants(i, e, role)
+        return at
+
+    @ti.func
+    def part_of(self, t, role):
+        """Return the part of a particle in a contact with the place t on the edge, by its role."""
+        place = ti.max(t, 0)
+        return ti.select(role == VERTEX, 1 + 0 * t, ti.select(role == START, place - 1, -place))
+
+    @ti.func
+    def add_push(self, e, push):
+        """Add the push of an impact to those of the contact at entry e [kg m]."""
+        self.impulse.field[e] = self.impulse.field[e] + push
 
     @ti.func
     def inverse_mass(self, v, a, b, t):

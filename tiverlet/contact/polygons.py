@@ -19,14 +19,14 @@ from ..geometry.ordered import median
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
-from .body_projection import NEAR, BodyProjection
+from .body_projection import BodyProjection
 from .body_restitution import AIM
 from .exclusions import excluded_pairs
 from .force_share import ForceShare
 from .known_loads import WINDOW, KnownLoads
 from .loops import checked, flat, laid, refuse_deep
 from .pair_contact import PairContact
-from .polygon_narrow_phase import DISCS, START, VERTEX, EdgePairTable, Outline, PolygonGeometry
+from .polygon_narrow_phase import VERTEX, EdgePairTable, Outline, PolygonGeometry
 from .restitution import SLOW, under_force
 from .wall_loads import WallLoads
 
@@ -317,41 +317,6 @@ class Polygons(PairContact):
                 if met and not self.dev.state.awake(other):
                     out = other
         return out
-
-    @ti.func
-    def relative(self, d: ti.template(), v, a, b, t):  # type: ignore[valid-type]
-        """Return the displacement of vertex v relative to the point t of the edge from a to b [m], see BodyProjection."""
-        return self.dev.geometry.relative(d, v, a, b, t)
-
-    @ti.func
-    def near_contact(self, i, e):
-        """Return the place of the contact of vertex i at entry e, NONE if it is far, the normal, and the gap [m]."""
-        return self.dev.geometry.near_contact(i, e, ti.static(NEAR))
-
-    @ti.func
-    def entry_of(self, i, e, role):
-        """Return the entry that stores the contact in which particle i has a role, with the particle at entry e, or -1."""
-        at = -1
-        if role < self.dev.geometry.roles(i):
-            at, _, _, _, _, _ = self.dev.geometry.participants(i, e, role)
-        return at
-
-    @ti.func
-    def ends(self, i, e, t):
-        """Return the particles of the contact of vertex i at entry e, with the place t on the edge."""
-        a = self.dev.list.neighbour[e]
-        return i, a, ti.select(t > DISCS, self.dev.geometry.after(a), a)
-
-    @ti.func
-    def part_of(self, t, role):
-        """Return the part of a particle in a contact with the place t on the edge, by its role."""
-        place = ti.max(t, 0)
-        return ti.select(role == VERTEX, 1 + 0 * t, ti.select(role == START, place - 1, -place))
-
-    @ti.func
-    def add_push(self, e, push):
-        """Add the push of an impact to those of the contact at entry e."""
-        self.dev.geometry.impulse.field[e] = self.dev.geometry.impulse.field[e] + push
 
     @ti.func
     def count(self, begin, end, now):

@@ -4,7 +4,7 @@ from typing import Any
 
 from ..device import ti
 from ..features.feature import Scene
-from ..features.material import Table
+from ..features.material import RESTITUTION, Table
 from ..neighbours.neighbour_list import PairData
 from .narrow_phase import DiscGeometry
 
@@ -86,27 +86,65 @@ class Restitution:
         Only resting pairs are pushed apart. overlap: including the overlap that would hold a known load. last: the push of the
         pair in the last substep [kg m].
         """
-        given, here, a = self.target(i, j, n)
-        rests, e = True, self.table.of(i, j)[2]
-        if e > 0:
-            deep = ti.select(last > 0, overlap, ti.select(e < 1, slack, 0))  # an elastic pair rests only if it was pushed
+        impact, closing, approach = self.target(i, j, n)
+        rests, restitution = True, self.table.of(i, j)[RESTITUTION]
+        if restitution > 0:
+            # The overlap up to which an impact counts as rest; an elastic pair rests only if it was pushed.
+            deep = ti.select(last > 0, overlap, ti.select(restitution < 1, slack, 0))
             if self.presses_bodies(i, j):  # others press them together: an impact would leave them there
                 deep = overlap
             if last == 0:
-                slack = ti.max(slack, overlap - ti.max(here, 0))
+                slack = ti.max(slack, overlap - ti.max(closing, 0))
             # First pass only: later passes include pushes of other pairs.
-            slow = ti.select(e < 1, ti.static(SLOW) * (here - a), ti.static(ELASTIC) * (here - a))
-            if first != 0 and a <= slow:
-                deep = ti.max(deep, given)
-            if a > 0:
-                rests = deep > 0 and (first == 0 or given <= deep)
-            elif a < 0:
-                rests = deep > 0 or overlap <= here
-        if rests or a < 0 or first == 0:
-            given = 0 * given
+            forced = closing - approach
+            slow = ti.select(restitution < 1, ti.static(SLOW) * forced, ti.static(ELASTIC) * forced)
+            if first != 0 and approach <= slow:
+                deep = ti.max(deep, impact)
+            if approach > 0:
+                rests = deep > 0 and (first == 0 or impact <= deep)
+            elif approach < 0:
+                rests = deep > 0 or overlap <= closing
+        if rests or approach < 0 or first == 0:
+            impact = 0 * impact
         if not rests:
-            slack = ti.select(given > 0, ti.max(overlap - given, 0), 0)
-        return given, ti.min(slack, overlap), rests
+            slack = ti.select(impact > 0, ti.max(overlap - impact, 0), 0)
+        return impact, ti.min(slack, overlap), rests
+
+    @ti.func
+    def remove_slack(self, pair, slack, own, now):
+        """Return the part of its slack that a pair does not push out [m]. The first pass removes some of it from positions."""
+        slack = ti.min(slack, ti.max(pair.overlap, 0))
+        if now.first != 0:
+            if self.presses_bodies(pair.i, pair.j):
+                slack = self.kept_slack(pair.i, pair.j, slack, now.h)
+                self.slack.field[pair.e] = slack
+            else:
+                back = ti.static(UPTAKE) * ti.min(slack * pair.stiffness, slack / pair.alone)
+                own.lift += own.w * back * pair.n
+                self.slack.field[pair.e] = slack - pair.alone * back
+        return slack
+
+    @ti.func
+    def strike(self, pair, impact, own):
+        """Mark a pair as struck if it has an impact [m]. Returns the impact, or 0 if it is one of bodies, see BodyRestitution."""
+        if impact > 0:
+            self.struck.field[pair.e] = 1
+            if self.leave_to_bodies(pair.i, pair.j, pair.e, pair.n):
+                impact, own.impacts = ti.zero(impact), own.impacts + 1
+            elif self.hit[None] == 0:
+                self.hit[None] = 1
+        return impact
+
+    @ti.func
+    def clear_slack(self, i, weight):
+        """Clear the slack of pairs of particle i that do not overlap at the end of a substep. weight: as it is split now."""
+        if weight > 0:
+            for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
+                if self.slack.field[e] > 0:
+                    j = self.list.neighbour[e]
+                    overlap, _n = self.geometry.overlap(i, j, self.geometry.contact_distance(i, j))
+                    if overlap <= 0:
+                        self.slack.field[e] = 0
 
     @ti.func
     def kept_slack(self, i, j, slack, h):
@@ -115,7 +153,7 @@ class Restitution:
         Lifting a single particle of a body would become speed, as constraints take it back. So an eighth is pushed out, no faster
         than at push_out, and 1 - e of it whatever the speed: impacts take out more.
         """
-        slack *= self.table.of(i, j)[2]
+        slack *= self.table.of(i, j)[RESTITUTION]
         return slack - ti.min(ti.static(UPTAKE) * slack, self.geometry.push_out * h)
 
     @ti.func
@@ -124,9 +162,9 @@ class Restitution:
 
         Also return how far the pair approaches in this substep, and how far it would without forces [m].
         """
-        a = self.approach(i, j, n)
-        here = -self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n)
-        return here + self.table.of(i, j)[2] * ti.max(a, 0), here, a
+        approach = self.approach(i, j, n)
+        closing = -self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(n)
+        return closing + self.table.of(i, j)[RESTITUTION] * ti.max(approach, 0), closing, approach
 
     @ti.func
     def approach(self, i, j, n):
@@ -139,10 +177,10 @@ class Restitution:
 
         Also return the fraction of the substep after the impact, and how far the pair would approach without forces [m].
         """
-        given, here, a = self.target(i, j, n)
-        left = ti.select(overlap < here, overlap / here, 1)
-        given, left = under_force(given, left, here, a, overlap, self.table.of(i, j)[2])
-        return given, left, a
+        impact, closing, approach = self.target(i, j, n)
+        left = ti.select(overlap < closing, overlap / closing, 1)
+        impact, left = under_force(impact, left, closing, approach, overlap, self.table.of(i, j)[RESTITUTION])
+        return impact, left, approach
 
     @ti.func
     def parted_by_friction(self, i, j, n):
@@ -172,13 +210,13 @@ class Restitution:
                     j = self.list.neighbour[e]
                     contact_distance = self.geometry.contact_distance(i, j)
                     overlap, _each, n, _reach = self.geometry.impact(i, j, contact_distance, self.weight[i], False)
-                    given, left, a = self.collision(i, j, n, overlap)
+                    impact, left, approach = self.collision(i, j, n, overlap)
                     parted = self.parted_by_friction(i, j, n)
-                    given, a = given - (1 + self.table.of(i, j)[2]) * parted, a - parted
-                    if overlap > 0 and a > 0 and given > 0:
+                    impact, approach = impact - (1 + self.table.of(i, j)[RESTITUTION]) * parted, approach - parted
+                    if overlap > 0 and approach > 0 and impact > 0:
                         if left > most or (left == most and earlier(i, j, partner)):
                             first, partner, most = e, j, left
-                            self.d_change[i] = w / (w + self.state.w.of(j)) * given * n
+                            self.d_change[i] = w / (w + self.state.w.of(j)) * impact * n
                             if self.hit[None] == 0:
                                 self.hit[None] = 1
         self.first[i] = first
@@ -196,8 +234,8 @@ class Restitution:
                 impulse = d_change.norm() / self.state.w.of(i)
                 self.impulse.field[e] = self.impulse.field[e] + impulse
                 if ti.static(self.has_events):
-                    given = impulse * (self.state.w.of(i) + self.state.w.of(j))
-                    self.events.note_impact(e, impulse, given / (1 + self.table.of(i, j)[2]))
+                    impact = impulse * (self.state.w.of(i) + self.state.w.of(j))
+                    self.events.note_impact(e, impulse, impact / (1 + self.table.of(i, j)[RESTITUTION]))
                 self.state.d[i] = self.state.d[i] + d_change
                 self.state.before[i] = self.state.before[i] + d_change
                 self.state.advance(i, self.left[i] * d_change)
@@ -222,25 +260,26 @@ class Restitution:
 
 
 @ti.func
-def under_force(given, left, here, a, overlap, e):
+def under_force(impact, left, closing, approach, overlap, e):
     """Return the impact of a pair in a substep in which a force acts, and the fraction of the substep after the impact.
 
-    The impact is the change of displacement from approach to separation [m]. Returns `given` and `left` if no force acts, or if
-    the pair would not be free of overlap at the end.
+    The impact is the change of displacement from approach to separation [m]. Returns `impact` and `left` if no force acts, or
+    if the pair would not be free of overlap at the end.
 
-    In units of the substep, the pair approaches by `here`, of which forces added f = here - a. At time s it has moved by
-    u s + f s^2 / 2, u = here - f / 2, with the velocity u + f s. It meets at s = 2 gap / (u + sqrt(u^2 + 2 f gap)), gap = here -
-    overlap. It leaves at e times its velocity at that time, and falls back by f (1 - s)^2 / 2. So energy is conserved at e = 1,
-    whatever s is: a change J of the velocity at s changes the energy of d and x at the end by J (J / 2 - u - f s).
+    In units of the substep, the pair approaches by `closing`, of which forces added f = closing - approach. At time s it has
+    moved by u s + f s^2 / 2, u = closing - f / 2, with the velocity u + f s. It meets at s = 2 gap / (u + sqrt(u^2 + 2 f gap)),
+    gap = closing - overlap. It leaves at e times its velocity at that time, and falls back by f (1 - s)^2 / 2. So energy is
+    conserved at e = 1, whatever s is: a change J of the velocity at s changes the energy of d and x at the end by
+    J (J / 2 - u - f s).
     """
-    f, gap = here - a, here - overlap
-    u = here - f / 2
+    f, gap = closing - approach, closing - overlap
+    u = closing - f / 2
     if f != 0 and gap > 0 and u > 0:
         s = ti.min(2 * gap / (u + ti.sqrt(ti.max(u * u + 2 * f * gap, 0))), 1)
-        met = here + (s - 0.5) * f
+        met = closing + (s - 0.5) * f
         if e * met > ti.max((1 - s) * f / 2, 0):
-            given, left = (1 + e) * met, 1 - s
-    return given, left
+            impact, left = (1 + e) * met, 1 - s
+    return impact, left
 
 
 @ti.func

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from ..device import ti
-from ..features.material import Table, limit_length
+from ..features.material import ROLLING, TWISTING, Table, limit_length
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
@@ -88,7 +88,8 @@ class Spinning:
         a, row = self.part(i, j), self.table.of(i, j)
         rolled = self.turn.field[e] + ((1 - a) * s_i - a * s_j)
         twist = self.spin.along(rolled, n)
-        return limit_length(rolled - twist, row[4] * most, row[4] * most) + limit_length(twist, row[5] * most, row[5] * most)
+        rolling, twisting = row[ROLLING] * most, row[TWISTING] * most
+        return limit_length(rolled - twist, rolling, rolling) + limit_length(twist, twisting, twisting)
 
     @ti.func
     def resist(self, i, j, e, n, m, push, pressed):

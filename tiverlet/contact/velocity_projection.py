@@ -185,6 +185,25 @@ class VelocityProjection:
         return at - first
 
     @ti.func
+    def find(self, piece, begin, end, k, rounds, damps):
+        """Do round k of finding what is projected, of particles begin ... end - 1, a piece.
+
+        The first round lists all loaded pairs. The next ones take one ring after the other around restless particles. The last
+        two split masses by the present normals, and finish the lists.
+        """
+        if k == 0:
+            self.begin(piece, begin, end, damps)
+        elif k == rounds - 1:
+            self.finish_list(piece, begin, end)
+            self.find_restless(piece, begin, end, damps == ALWAYS)
+        else:
+            for m in range(begin, begin + self.count[piece]):
+                if k < rounds - 2:
+                    self.spread(self.loaded[m], k - 1)
+                else:
+                    self.split_by_present_normals(self.loaded[m])
+
+    @ti.func
     def begin(self, piece, begin, end, damps):
         """List the loaded pairs of particles begin ... end - 1, a piece. Positions do not change: one list serves all passes.
 

@@ -150,7 +150,11 @@ def copied_with(types: Any) -> Any:
 
 
 def record(kind: Any) -> Any:
-    """Let kernels use a class of several named values: they can construct it, pass it on whole and read it."""
+    """Let kernels use a class of several named values: they can construct it, pass it on whole and read it.
+
+    It stores what it is given, not a copy: a variable can be assigned to through it, an expression is computed wherever it is
+    read.
+    """
     kind._data_oriented = True  # Taichi passes such objects on unchanged
     return inline(kind)
 

@@ -83,7 +83,13 @@ def limit_length(v, most, length):
 
 
 MAX_GROUPS = 1000  # groups of particles that the table can distinguish
-TOUCHES, SENSES, SENSED = 1, 2, 3  # a particle of the one group pushes that of the other, senses it, is sensed by it
+# The columns of a Table, the last three only where `turns`.
+STATIC, DYNAMIC, RESTITUTION, TOUCH, ROLLING, TWISTING, TANGENTIAL = COLUMNS = range(7)
+TOUCHES, SENSES, SENSED = (
+    1,
+    2,
+    3,
+)  # in column TOUCH: a particle of the one group pushes that of the other, senses it, is sensed by it
 
 
 class Table:
@@ -142,7 +148,7 @@ class Table:
             return np.ones(len(pairs), dtype=bool)
         rank, table = self.rows(group)
         m = math.isqrt(len(table))
-        return table.reshape(m, m, -1)[rank[pairs[:, 0]], rank[pairs[:, 1]], 3] == TOUCHES
+        return table.reshape(m, m, -1)[rank[pairs[:, 0]], rank[pairs[:, 1]], TOUCH] == TOUCHES
 
     @property
     def named(self) -> frozenset[int]:
@@ -151,7 +157,7 @@ class Table:
         return frozenset(k for pairs in (*given, self.touching or (), self.sensing) for pair in pairs for k in pair)
 
     def rows(self, group: np.ndarray, also: frozenset[int] = frozenset()) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rank of each particle's group, (n,), and the table, (ranks * ranks, 7).
+        """Return the rank of each particle's group, (n,), and the table, (ranks * ranks, columns).
 
         All other groups share the last rank. Groups without particles have ranks, too, so that their first particle compiles
         nothing. also: groups to distinguish in addition to those that are named.
@@ -162,23 +168,24 @@ class Table:
         names, which, _ = distinct(group)
         at, m = {name: k for k, name in enumerate(named)}, len(named) + 1
         rank = np.array([at.get(int(name), len(at)) for name in names], dtype=np.int64)[which]
-        table = np.zeros((m, m, 7))
-        table[..., 3] = self.touching is None
+        table = np.zeros((m, m, len(COLUMNS)))
+        table[..., TOUCH] = self.touching is None
         for a, b in self.touching or []:
-            table[at[a], at[b], 3] = table[at[b], at[a], 3] = TOUCHES
+            table[at[a], at[b], TOUCH] = table[at[b], at[a], TOUCH] = TOUCHES
         for a, b in self.sensing:
-            if table[at[a], at[b], 3] != SENSES:
-                table[at[a], at[b], 3], table[at[b], at[a], 3] = SENSED, SENSES
+            if table[at[a], at[b], TOUCH] != SENSES:
+                table[at[a], at[b], TOUCH], table[at[b], at[a], TOUCH] = SENSED, SENSES
         for name, columns, given, parse in (
-            ("friction", [0, 1, 4, 5], self.friction, friction_of), ("restitution", [2, 6], self.restitution, restitution_of),
-        ):  # fmt: skip
+            ("friction", [STATIC, DYNAMIC, ROLLING, TWISTING], self.friction, friction_of),
+            ("restitution", [RESTITUTION, TANGENTIAL], self.restitution, restitution_of),
+        ):
             if not isinstance(given, Mapping):
                 table[..., columns] = parse(self.who, name, given)
                 continue
             for pair, value in given.items():
                 a, b = self._pair(name, pair)
                 table[at[a], at[b], columns] = table[at[b], at[a], columns] = parse(self.who, f"value of {pair}", value)
-        return rank, table.reshape(m * m, 7)
+        return rank, table.reshape(m * m, len(COLUMNS))
 
     def set_columns(self, has_friction: bool, has_restitution: bool, turns: bool) -> None:
         """Set which columns exist, even where all values are 0."""
@@ -193,7 +200,7 @@ class Table:
         else:
             self.rank = scene.memory.field("Contact.group", scene.count, kind=ti.i32, values=rank)
         if self.has_friction or self.has_restitution or not self.uniform or asked:
-            self.width = 7 if self.turns else 4  # columns on the device
+            self.width = len(COLUMNS) if self.turns else ROLLING  # columns on the device
             self.entries = scene.memory.field("Contact.table", len(rows), width=self.width, values=rows[:, : self.width])
 
     def regroup(self, scene: "Scene", group: np.ndarray) -> None:
@@ -226,7 +233,7 @@ class Table:
         It is at most friction times that displacement (Cundall and Strack 1979).
         """
         s, row = slip - slip.dot(n) * n, self.of(i, j)
-        return limit_length(s, row[0] * normal, row[1] * normal)
+        return limit_length(s, row[STATIC] * normal, row[DYNAMIC] * normal)
 
     @inline
     def cutoff(self, radius, i, j):

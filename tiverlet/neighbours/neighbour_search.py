@@ -16,6 +16,7 @@ from ..device.number import OnDevice
 from ..device.prefix_sum import MOST, Sums
 from ..device.sorting import exchange, sort, sorting_network
 from ..device.thread_team import Team
+from ..features.material import TOUCH
 from ..features.regrouping import Regrouping
 from ..geometry.ordered import distinct
 from .cell_list import CellList, add_to
@@ -348,7 +349,7 @@ class NeighbourSearch:
                 yes = ti.cast(self.state.w.of(i) + self.state.w.of(j) > 0, ti.i32)
         if ti.static(not self.table.uniform):
             if yes != 0:
-                yes = ti.cast(self.table.of(i, j)[3] > 0, ti.i32)
+                yes = ti.cast(self.table.of(i, j)[TOUCH] > 0, ti.i32)
         if ti.static(self.has_excluded):
             if yes != 0:
                 for e in range(self.excluded_begin[i], self.excluded_begin[i + 1]):

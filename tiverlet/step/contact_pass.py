@@ -3,9 +3,6 @@
 from typing import TYPE_CHECKING, Any
 
 from ..contact.each_once import ROUNDS, Turn, first_round
-from ..contact.impact_projection import AROUND, STRUCK
-from ..contact.impact_projection import ROUNDS as IMPACT_ROUNDS
-from ..contact.projection_times import ALWAYS
 from ..device import ti
 from ..device.number import OnDevice
 from ..device.thread_team import block, blocks
@@ -40,41 +37,66 @@ class ContactPass:
         """Detect contacts, and compute the moves that they want of their particles."""
         for c in ti.static(self.contacts):
             if ti.static(c.detects and not c.dev.state.sleepers):  # with Sleep, Step.look_for_sleepers() has done this
-                for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
-                    c.detect(i, now.first)
-                self.team.wait()
+                self.detect(c, now)
             if ti.static(c.dev.has_events):
                 self.start_events(now)
-            for k in range(self.particles.piece_count(now.thread)):
-                begin, end = self.particles.piece(k, now.thread)
+            self.count(c, now)
+            self.relax(c, now)
+            if ti.static(c.shares_loads):
+                self.store_pushes(c, now)
+
+    @ti.func
+    def detect(self, c: ti.template(), now):  # type: ignore[valid-type]
+        """Find the contacts of all particles."""
+        for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+            c.detect(i, now.first)
+        self.team.wait()
+
+    @ti.func
+    def count(self, c: ti.template(), now):  # type: ignore[valid-type]
+        """Count the contacts of each particle, among which its mass is split."""
+        for k in range(self.particles.piece_count(now.thread)):
+            begin, end = self.particles.piece(k, now.thread)
+            for b in range(blocks(begin, end)):
+                low, high = block(b, begin, end)
+                c.count(low, high, now)
+        self.team.wait()
+
+    @ti.func
+    def relax(self, c: ti.template(), now):  # type: ignore[valid-type]
+        """Compute the moves of all particles, and the new pushes of their contacts."""
+        for k in range(self.particles.piece_count(now.thread)):
+            begin, end = self.particles.piece(k, now.thread)
+            if ti.static(c.once):
+                for i in range(begin, end):
+                    c.begin(i, now)
+            for r in range(first_round(c, begin), ROUNDS):
                 for b in range(blocks(begin, end)):
                     low, high = block(b, begin, end)
-                    c.count(low, high, now)
-            self.team.wait()
-            for k in range(self.particles.piece_count(now.thread)):
-                begin, end = self.particles.piece(k, now.thread)
-                if ti.static(c.once):
-                    for i in range(begin, end):
-                        c.begin(i, now)
-                for r in range(first_round(c, begin), ROUNDS):
-                    for b in range(blocks(begin, end)):
-                        low, high = block(b, begin, end)
-                        if c.busy(low) != 0:
-                            for i in range(low, high):
-                                if c.dev.state.awake(i):
-                                    c.relax(i, Turn(begin, end, r), now)
-                        elif now.final != 0:
-                            if ti.static(c.has_friction and not c.once):
-                                for i in range(low, high):
-                                    if c.dev.state.awake(i):
-                                        c.dev.forces.add(i, ti.Vector.zero(self.real, self.dim), now.first)
-                                        if ti.static(c.dev.forces.spins):
-                                            c.dev.forces.add_turn(i, 0 * c.dev.forces.turned[i], now.first)
-            self.team.wait()
-            if ti.static(c.shares_loads):
-                for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+                    self.relax_block(c, low, high, Turn(begin, end, r), now)
+        self.team.wait()
+
+    @ti.func
+    def relax_block(self, c: ti.template(), low, high, turn, now):  # type: ignore[valid-type]
+        """Relax the contacts of particles low ... high - 1. Without any, only clear what friction did in earlier frames."""
+        if c.busy(low) != 0:
+            for i in range(low, high):
+                if c.dev.state.awake(i):
+                    c.relax(i, turn, now)
+        elif now.final != 0:
+            if ti.static(c.has_friction and not c.once):
+                for i in range(low, high):
                     if c.dev.state.awake(i):
-                        c.store_pushes(i, now)
+                        c.dev.forces.add(i, ti.Vector.zero(self.real, self.dim), now.first)
+                        if ti.static(c.dev.forces.spins):
+                            c.dev.forces.add_turn(i, 0 * c.dev.forces.turned[i], now.first)
+
+    @ti.func
+    def store_pushes(self, c: ti.template(), now):  # type: ignore[valid-type]
+        """Store the pushes of contacts that one particle stores, after all particles have read them."""
+        for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+            if c.dev.state.awake(i):
+                c.store_pushes(i, now)
 
     @ti.func
     def struck(self):
@@ -184,23 +206,15 @@ class ContactPass:
             size = ti.select(k == 0, 0, c.dev.impacts.size[None])
             begin, end = self.team.chunk_begin(size, thread), self.team.chunk_end(size, thread)
             for m in range(begin, end):
-                if k <= AROUND:
-                    c.dev.impacts.spread(c.dev.impacts.near[m], STRUCK + 1 - k)
-                elif k == AROUND + 1:
-                    c.dev.impacts.list_pairs(c.dev.impacts.near[m])
-                else:
-                    c.dev.impacts.relax(c.dev.impacts.near[m], k - AROUND - 2)
+                c.dev.impacts.find(c.dev.impacts.near[m], k)
             self.team.wait()
             for m in range(begin, end):
                 i = c.dev.impacts.near[m]
-                if k > AROUND + 1:
-                    c.dev.impacts.apply(i)
-                if k == IMPACT_ROUNDS - 1:
-                    c.dev.impacts.ring[i] = 0
+                if c.dev.impacts.apply(i, k):
                     c.note_motion(c.dev.search.moved_too_far(i), 0)
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, thread)):
-                c.dev.impacts.end_round(k == IMPACT_ROUNDS - 1)
+                c.dev.impacts.end_round(k)
             self.team.wait()
 
     @ti.func
@@ -226,19 +240,19 @@ class ContactPass:
             begin, end = self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)
             for i in range(begin, end):
                 if k == 0:
-                    c.dev.bodies.begin(i, c, tick + 1)
+                    c.dev.bodies.begin(i, c.dev.geometry, tick + 1)
                 elif k == 1:
-                    c.dev.bodies.list_contacts(i, c, tick + 1)
+                    c.dev.bodies.list_contacts(i, c.dev.geometry, tick + 1)
                 elif k < c.dev.bodies.passes + 2:
-                    c.dev.bodies.press(i, k - 2, c, tick + 1)
-                elif c.dev.bodies.end(i, c):
+                    c.dev.bodies.press(i, k - 2, c.dev.geometry, tick + 1)
+                elif c.dev.bodies.end(i, c.dev.geometry):
                     c.note_motion(c.dev.search.moved_too_far(i), 0)
             self.team.wait()
             for i in range(begin, end):
                 if k == 0:
                     c.dev.bodies.begin_body(i)
                 elif k > 1 and k < c.dev.bodies.passes + 2:
-                    c.dev.bodies.follow(i, c)
+                    c.dev.bodies.follow(i, c.dev.geometry)
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(ti.cast(k == 0, ti.i32), thread)):
                 c.dev.bodies.any_struck[None] = 0
@@ -246,23 +260,11 @@ class ContactPass:
 
     @ti.func
     def find_projected(self, thread, k, rounds, damps):
-        """Find what is projected: list all loaded pairs, then take ring k around restless particles. The last two rounds split
-        masses by the present normals, and finish the lists."""
+        """Do round k of finding what is projected, see VelocityProjection.find()."""
         for c in ti.static(self.contacts):
             for p in range(self.particles.piece_count(thread)):
                 begin, end = self.particles.piece(p, thread)
-                piece = self.team.dealt_index(p, 1, thread)
-                if k == 0:
-                    c.dev.projection.begin(piece, begin, end, damps)
-                elif k < rounds - 1:
-                    for m in range(begin, begin + c.dev.projection.count[piece]):
-                        if k < rounds - 2:
-                            c.dev.projection.spread(c.dev.projection.loaded[m], k - 1)
-                        else:
-                            c.dev.projection.split_by_present_normals(c.dev.projection.loaded[m])
-                else:
-                    c.dev.projection.finish_list(piece, begin, end)
-                    c.dev.projection.find_restless(piece, begin, end, damps == ALWAYS)
+                c.dev.projection.find(self.team.dealt_index(p, 1, thread), begin, end, k, rounds, damps)
             self.team.wait()
 
     @ti.func

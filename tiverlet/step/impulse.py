@@ -60,7 +60,7 @@ class Displacements:
             self.write(field, d)
 
     def lengthen(self, more: np.ndarray) -> None:
-        """Restore the displacements and add `more`, (..., dim) [m]."""
+        """Restore the displacements and add `more`, (..., dim) [m]. Step.keep_velocity() does the same on the device."""
         d = self.was[self.field]
         new = d.astype(np.float64) + more
         if self.low:

@@ -323,7 +323,7 @@ class Runner:
         self.scene.multipliers_per_newton = factor * h2_rigid_of(self.clock), factor * h2_effective_of(self.clock)
 
     def find_bodies(self, everything: bool = False) -> None:
-        """Tell contacts which constraints make rigid bodies, if knobs have changed that. everything: also their masses."""
+        """Tell contacts which constraints make rigid bodies, if knobs of these have changed it. everything: also their masses."""
         for c in self.step.contacts:
             if c.dev.bodies:
                 c.dev.bodies.update(self.batches, everything)

@@ -754,7 +754,10 @@ class Step:
 
     @ti.func
     def keep_velocity(self, i, k, given: ti.template(), rows: ti.template()):  # type: ignore[valid-type]
-        """Lengthen the displacement of particle i to that of its velocity, in row k of release()."""
+        """Lengthen the displacement of particle i to that of its velocity, in row k of release().
+
+        The law is that of Displacements.lengthen() on the host, see impulse.py.
+        """
         d = self.state.d[i]
         v = self.velocity_of(i, given[0], given[1], given[2], given[3])
         more = ti.Vector.zero(ti.f64, self.dim)
