@@ -144,14 +144,17 @@ class BodyProjection:
         if self.state.awake(i):
             for e in range(contact.dev.list.first[i], contact.dev.list.first[i] + contact.dev.list.number[i]):
                 t, n, gap = contact.near_contact(i, e)
-                lack = ti.max(gap, 0) * n
-                if self.struck.field[e] != 0:
-                    n = self.normal.field[e]
+                lack = 0 * n
+                if t != NONE or self.struck.field[e] != 0:
                     v, a, b = contact.ends(i, e, t)
-                    self.reached[v] = self.reached[a] = self.reached[b] = 1
                     moved = contact.relative(self.state.d, v, a, b, ti.max(t, 0))
-                    closed = ti.min(moved.dot(n), 0)
-                    lack = moved + (ti.max(gap, closed) - moved.dot(n)) * n
+                    if self.struck.field[e] != 0:
+                        n = self.normal.field[e]
+                        self.reached[v] = self.reached[a] = self.reached[b] = 1
+                        closed = ti.min(moved.dot(n), 0)
+                        lack = moved + (ti.max(gap, closed) - moved.dot(n)) * n
+                    else:
+                        lack = ti.max(ti.max(gap, 0), moved.dot(n)) * n
                 self.normal.field[e], self.place.field[e], self.lack.field[e] = n, t, lack
                 self.ahead.field[e] = self.push.field[e] = self.step.field[e] = 0 * n
         self.move[i] = self.wall_step[i] = ti.zero(self.move[i])

@@ -16,6 +16,7 @@ from .narrow_phase import DiscGeometry
 
 # Lengths relative to an edge.
 SLACK = 1 / 512  # extension of an edge at its ends, so that bodies of the same width stand on each other
+TIE = 2.0**-16
 STRETCH = 1.25  # longest edge, relative to its first length, for which all contacts in its middle are listed
 BEYOND = 1 / 4  # how far beyond the end of an edge a contact may be
 REACH = 1.35  # from one end of an edge to the farthest contact: |(1 + BEYOND, 1 / 2)|
@@ -135,7 +136,7 @@ class PolygonGeometry:
         return out
 
     @ti.func
-    def edge(self, v, a, front, moved):
+    def edge(self, v, a, front, moved, usual):
         """Return the overlap of v with the edge that begins at a, the normal, the place on the edge, and the largest push.
 
         The overlap [m] is negative without contact. The largest push is how far v may be pushed out in this substep [m].
@@ -158,7 +159,7 @@ class PolygonGeometry:
                     d = self.state.d[a]
                     r0, u0 = r - (self.state.d[v] - d), u - (self.state.d[b] - d)
                     height0, t0 = r0.dot(ti.Vector([u0[1], -u0[0]])) / length, r0.dot(u0) / ti.max(u0.dot(u0), uu * SLACK)
-                    came = height0 >= -SLACK * length
+                    came = -height0 <= ti.max(height0 - height, usual / RATE)
                     if height0 > 0:
                         cross = t0 + height0 / (height0 - height) * (t - t0)
                         passed = -SLACK <= cross <= 1 + SLACK
@@ -189,7 +190,7 @@ class PolygonGeometry:
                         out = ti.select(most > 0, out, ti.min(out, most))
                     if tips == OVER_EDGE:
                         came = True
-                    elif back.dot(n) >= 0 and self.inside(r + (ti.min(ti.max(t, SLACK), 1 - SLACK) - t) * u, a):
+                    elif back.dot(n) >= 0 and self.inside(r + (ti.min(ti.max(t, TIE), 1 - TIE) - t) * u, a):
                         came = self.nearest(v, a, shared, height, back)
                 if came:
                     overlap = out
@@ -303,7 +304,7 @@ class PolygonGeometry:
                 overlap, n, t = 0 * self.w.of(i) - 1, 0 * self.state.x[i], 0 * self.w.of(i)
                 front = self.corner(i, j)
                 if self.after(j) >= 0:
-                    overlap, n, t, self.push_limit.field[e] = self.edge(i, j, front, moved)
+                    overlap, n, t, self.push_limit.field[e] = self.edge(i, j, front, moved, self.usual_depth.field[e])
                     if overlap > 0:
                         if self.find(i, self.after(j)) < 0:
                             overlap = -overlap  # the end of a long edge is not on the list of i: momentum would be lost
