@@ -16,7 +16,6 @@ from .narrow_phase import DiscGeometry
 
 # Lengths relative to an edge.
 SLACK = 1 / 512  # extension of an edge at its ends, so that bodies of the same width stand on each other
-TIE = 2.0**-16
 STRETCH = 1.25  # longest edge, relative to its first length, for which all contacts in its middle are listed
 BEYOND = 1 / 4  # how far beyond the end of an edge a contact may be
 REACH = 1.35  # from one end of an edge to the farthest contact: |(1 + BEYOND, 1 / 2)|
@@ -72,6 +71,7 @@ class PolygonGeometry:
         self.loop = add("Polygons.loop", n, width=3, kind=ti.i32, values=np.c_[outline.ends, outline.body])
         self.longest = add("Polygons.longest_edge", n, values=outline.longest)
         self.step = scene.memory.number(self._stride(outline), scene.real)
+        self.tie = 2.0**-16 if scene.real == ti.f32 else 2.0**-44  # of an edge: what is nearer to its end is at it, by rounding
         self.allowed = add("Polygons.allowed", n, state=True)  # overlap [m]
         self.slower = add("Polygons.slower", n, state=True)  # than at push_out its allowed overlap ends [m/s]
         self.in_state = {"allowed": self.allowed, "slower": self.slower}
@@ -141,9 +141,17 @@ class PolygonGeometry:
 
         The overlap [m] is negative without contact. The largest push is how far v may be pushed out in this substep [m].
 
-        A vertex in front of the edge at the start of the substep came in over it if it crossed between the ends of the edge. A
-        vertex that was behind already leaves over the nearest edge that faces its own body, at push_out. front: what corner(v, a)
-        returned. moved: as in detect().
+        A vertex came in over the edge if it was in front of it at the start of the substep, and crossed it between its ends. One
+        that was behind came in over it if the contact was as deep in the last substep: then it pushes like a spring. Or else if
+        the vertex goes deeper in this substep by as much as it was behind, as after rounding: then it leaves no faster than it
+        came.
+
+        Any other vertex that was behind leaves at push_out, over the nearest edge that faces its own body, if it is inside of the
+        body. It may be outside: where a corner slides off the end of an edge, that end is behind the line of an edge beside the
+        corner. If it were pushed out by its depth C, bodies would gain m (C / h)^2 / 2.
+
+        front: what corner(v, a) returned. moved: as in detect(). usual: the usual depth of the contact, 0 if there was none in
+        the last substep [m]; the depth was usual / RATE at most.
         """
         b = self.after(a)
         r, u = self.state.separation(v, a), self.state.separation(b, a)
@@ -190,8 +198,9 @@ class PolygonGeometry:
                         out = ti.select(most > 0, out, ti.min(out, most))
                     if tips == OVER_EDGE:
                         came = True
-                    elif back.dot(n) >= 0 and self.inside(r + (ti.min(ti.max(t, TIE), 1 - TIE) - t) * u, a):
-                        came = self.nearest(v, a, shared, height, back)
+                    elif back.dot(n) >= 0:
+                        aside = ti.min(ti.max(t, ti.static(self.tie)), ti.static(1 - self.tie)) - t
+                        came = self.inside(r + aside * u, a) and self.nearest(v, a, shared, height, back)
                 if came:
                     overlap = out
         return overlap, n, t, most
