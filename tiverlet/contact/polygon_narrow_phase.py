@@ -71,7 +71,7 @@ class PolygonGeometry:
         self.loop = add("Polygons.loop", n, width=3, kind=ti.i32, values=np.c_[outline.ends, outline.body])
         self.longest = add("Polygons.longest_edge", n, values=outline.longest)
         self.step = scene.memory.number(self._stride(outline), scene.real)
-        self.tie = 2.0**-16 if scene.real == ti.f32 else 2.0**-44  # of an edge: what is nearer to its end is at it, by rounding
+        self.tie = 2.0**-16 if scene.real == ti.f32 else 2.0**-44  # what is so near to the end of an edge is at it, by rounding
         self.allowed = add("Polygons.allowed", n, state=True)  # overlap [m]
         self.slower = add("Polygons.slower", n, state=True)  # than at push_out its allowed overlap ends [m/s]
         self.in_state = {"allowed": self.allowed, "slower": self.slower}
@@ -199,7 +199,8 @@ class PolygonGeometry:
                     if tips == OVER_EDGE:
                         came = True
                     elif back.dot(n) >= 0:
-                        aside = ti.min(ti.max(t, ti.static(self.tie)), ti.static(1 - self.tie)) - t
+                        tie = ti.cast(ti.static(self.tie), self.real)
+                        aside = ti.min(ti.max(t, tie), 1 - tie) - t
                         came = self.inside(r + aside * u, a) and self.nearest(v, a, shared, height, back)
                 if came:
                     overlap = out
