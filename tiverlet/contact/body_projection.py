@@ -34,10 +34,15 @@ class BodyProjection:
 
         p_n >= 0,    (J D)_n + c >= 0,    p_n ((J D)_n + c) = 0,    |p_t| <= friction times p_n.
 
-    c is the gap of a contact; of one that was struck minus its overlap, as far as it arose in this substep, and 0 for others
-    that overlap. Friction takes back the slip, in this substep, of what was struck. So two bodies that meet go on together, and
-    what leaves is not held. Contacts that are open by less than NEAR count, as the passes below leave slight gaps. Walls hold
-    particles that they have pushed in the last few substeps, without friction.
+    With the displacements d of this substep, c is max(gap, min((J d)_n, 0)) of a contact that was struck: it takes back the
+    overlap that arose in this substep. Of other ones c is max(gap, (J d)_n, 0). Friction takes back the slip (J d)_t. So two
+    bodies that meet go on together, and what leaves is not held. Contacts that are open by less than NEAR count, as the passes
+    below leave slight gaps. Walls hold particles that they have pushed in the last few substeps, without friction.
+
+    With d' = d + D, an impact changes |d'|^2 / 2, by masses, by the sum of p_n (J d')_n + p_t (J d')_t over contacts, minus
+    |D|^2 / 2. None of these is above 0: contacts that push have (J d')_n = (J d)_n - c <= 0, and friction acts against the slip.
+    So no impact adds energy. If contacts that opened in this substep had to stay open, such as those on the far side of a tip
+    that a corner passed through, (J d')_n would be above 0, and bodies would be pushed apart.
 
     Passes are those of Jacobi with the masses of particles split among their contacts, p' = y - (J D(y) + c) / m, m = sum |a| S w
     over the particles of a contact, with their parts a in it and the sums S of all |a| of each. A body takes up the mean of what
@@ -144,14 +149,17 @@ class BodyProjection:
         if self.state.awake(i):
             for e in range(geometry.list.first[i], geometry.list.first[i] + geometry.list.number[i]):
                 t, n, gap = geometry.near_contact(i, e, ti.static(NEAR))
-                lack = ti.max(gap, 0) * n
-                if self.struck.field[e] != 0:
-                    n = self.normal.field[e]
+                lack = 0 * n
+                if t != NONE:
                     v, a, b = geometry.ends(i, e, t)
-                    self.reached[v] = self.reached[a] = self.reached[b] = 1
                     moved = geometry.relative(self.state.d, v, a, b, ti.max(t, 0))
-                    closed = ti.min(moved.dot(n), 0)
-                    lack = moved + (ti.max(gap, closed) - moved.dot(n)) * n
+                    opened = ti.max(moved.dot(n), 0)
+                    if self.struck.field[e] != 0:
+                        n = self.normal.field[e]
+                        opened = ti.min(moved.dot(n), 0)
+                        self.reached[v] = self.reached[a] = self.reached[b] = 1
+                    lack = moved + (ti.max(gap, opened) - moved.dot(n)) * n
+                self.struck.field[e] = 0
                 self.normal.field[e], self.place.field[e], self.lack.field[e] = n, t, lack
                 self.ahead.field[e] = self.push.field[e] = self.step.field[e] = 0 * n
         self.move[i] = self.wall_step[i] = ti.zero(self.move[i])
@@ -279,11 +287,10 @@ class BodyProjection:
 
     @ti.func
     def end(self, i, geometry: ti.template()):  # type: ignore[valid-type]
-        """Move particle i, and clear the marks of its contacts. Returns whether it moves."""
+        """Move particle i, and report the pushes of its contacts. Returns whether it moves."""
         for m in range(geometry.list.first[i], geometry.list.first[i] + self.number[i]):
             e = self.listed.field[m][0]
             if e >= 0:
-                self.struck.field[e] = 0
                 geometry.add_push(e, self.push.field[e].dot(self.normal.field[e]))
         self.reached[i] = 0
         moves = (self.move[i] != 0).any()

@@ -71,6 +71,7 @@ class PolygonGeometry:
         self.loop = add("Polygons.loop", n, width=3, kind=ti.i32, values=np.c_[outline.ends, outline.body])
         self.longest = add("Polygons.longest_edge", n, values=outline.longest)
         self.step = scene.memory.number(self._stride(outline), scene.real)
+        self.tie = 2.0**-16 if scene.real == ti.f32 else 2.0**-44  # what is so near to the end of an edge is at it, by rounding
         self.allowed = add("Polygons.allowed", n, state=True)  # overlap [m]
         self.slower = add("Polygons.slower", n, state=True)  # than at push_out its allowed overlap ends [m/s]
         self.in_state = {"allowed": self.allowed, "slower": self.slower}
@@ -135,14 +136,22 @@ class PolygonGeometry:
         return out
 
     @ti.func
-    def edge(self, v, a, front, moved):
+    def edge(self, v, a, front, moved, usual):
         """Return the overlap of v with the edge that begins at a, the normal, the place on the edge, and the largest push.
 
         The overlap [m] is negative without contact. The largest push is how far v may be pushed out in this substep [m].
 
-        A vertex in front of the edge at the start of the substep came in over it if it crossed between the ends of the edge. A
-        vertex that was behind already leaves over the nearest edge that faces its own body, at push_out. front: what corner(v, a)
-        returned. moved: as in detect().
+        A vertex came in over the edge if it was in front of it at the start of the substep, and crossed it between its ends. One
+        that was behind came in over it if the contact was as deep in the last substep: then it pushes like a spring. Or else if
+        the vertex goes deeper in this substep by as much as it was behind, as after rounding: then it leaves no faster than it
+        came.
+
+        Any other vertex that was behind leaves at push_out, over the nearest edge that faces its own body, if it is inside of the
+        body. It may be outside: where a corner slides off the end of an edge, that end is behind the line of an edge beside the
+        corner. If it were pushed out by its depth C, bodies would gain m (C / h)^2 / 2.
+
+        front: what corner(v, a) returned. moved: as in detect(). usual: the usual depth of the contact, 0 if there was none in
+        the last substep [m]; the depth was usual / RATE at most.
         """
         b = self.after(a)
         r, u = self.state.separation(v, a), self.state.separation(b, a)
@@ -158,7 +167,7 @@ class PolygonGeometry:
                     d = self.state.d[a]
                     r0, u0 = r - (self.state.d[v] - d), u - (self.state.d[b] - d)
                     height0, t0 = r0.dot(ti.Vector([u0[1], -u0[0]])) / length, r0.dot(u0) / ti.max(u0.dot(u0), uu * SLACK)
-                    came = height0 >= -SLACK * length
+                    came = -height0 <= ti.max(height0 - height, usual / RATE)
                     if height0 > 0:
                         cross = t0 + height0 / (height0 - height) * (t - t0)
                         passed = -SLACK <= cross <= 1 + SLACK
@@ -189,8 +198,10 @@ class PolygonGeometry:
                         out = ti.select(most > 0, out, ti.min(out, most))
                     if tips == OVER_EDGE:
                         came = True
-                    elif back.dot(n) >= 0 and self.inside(r + (ti.min(ti.max(t, SLACK), 1 - SLACK) - t) * u, a):
-                        came = self.nearest(v, a, shared, height, back)
+                    elif back.dot(n) >= 0:
+                        tie = ti.cast(ti.static(self.tie), self.real)
+                        aside = ti.min(ti.max(t, tie), 1 - tie) - t
+                        came = self.inside(r + aside * u, a) and self.nearest(v, a, shared, height, back)
                 if came:
                     overlap = out
         return overlap, n, t, most
@@ -303,7 +314,7 @@ class PolygonGeometry:
                 overlap, n, t = 0 * self.w.of(i) - 1, 0 * self.state.x[i], 0 * self.w.of(i)
                 front = self.corner(i, j)
                 if self.after(j) >= 0:
-                    overlap, n, t, self.push_limit.field[e] = self.edge(i, j, front, moved)
+                    overlap, n, t, self.push_limit.field[e] = self.edge(i, j, front, moved, self.usual_depth.field[e])
                     if overlap > 0:
                         if self.find(i, self.after(j)) < 0:
                             overlap = -overlap  # the end of a long edge is not on the list of i: momentum would be lost
