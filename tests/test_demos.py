@@ -78,7 +78,7 @@ def test_pay_finds_that_features_only_add(printed):
         ("hourglass", {"built": {"grains": 200}}, "through the neck"),
         ("polygons", {"seconds": 1.0}, "36 bodies"),
         ("cloth", {"built": {"points": 17}, "seconds": 1.5}, "cloth.rrd"),
-        ("wrecking", {"seconds": 2.5}, "before they were hit"),
+        ("wrecking", {"seconds": 3.5}, "before they were hit"),
         ("jelly", {"settings": [("CELLS", 4)]}, "of its height"),
         ("flag", {"settings": [("POINTS", (13, 9))], "seconds": 1.2}, "where the wind blew"),
         ("galaxy", {"settings": [("STARS", 60)], "seconds": 3.0}, "energy kept"),

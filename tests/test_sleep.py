@@ -201,7 +201,7 @@ def test_a_sensor_that_sleeps_and_a_stack_that_wakes(world):
 
     A pair that wakes in the middle of a frame has not met again: the speed at which it came together is 0.
     """
-    x = [(0.0, R), (9.0, R), (9.0, 3 * R + 1e-3), (-9.0, 0.3 * R), (9.4, 6.0)]
+    x = [(0.0, R), (9.0, R), (9.0, 3 * R + 1e-3), (-9.0, 0.3 * R), (9.05, 6.0)]
     v = np.zeros((5, 2))
     v[3, 0] = 14.0
     start = tv.Particles(x, velocity=v, radius=[R, R, R, 0.3 * R, R], group=[1, 0, 0, 0, 0])

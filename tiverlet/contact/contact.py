@@ -216,7 +216,9 @@ class Contact(PairContact):
         dev.impacts = None
         if self.lands:
             reported = dev.events if dev.reports else None
-            dev.impacts = ImpactProjection(scene, dev.geometry, dev.push, dev.splitting.weight, dev.move, reported, given)
+            dev.impacts = ImpactProjection(
+                scene, dev.geometry, dev.push, dev.splitting, dev.move, reported, given, dev.projection.ring
+            )
         dev.once = self._solves_once(scene, team)
         return dev.search
 

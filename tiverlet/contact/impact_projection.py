@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from ..colliders.wall_log import WallLog
     from ..features.feature import Scene
     from ..neighbours.neighbour_list import PairData
+    from .mass_splitting import MassSplitting
 
 FALL = 0.25  # a pair is struck if it closes as after a fall by this share of the distance of its centers,
 SLOW = 8.0  # and if it closes by more than so many substeps of forces
@@ -17,6 +18,7 @@ STRUCK = AROUND + 1  # ring of a struck particle; those around it have lower one
 PASSES = 12
 CONDITION = 36.0  # modes with an eigenvalue of at least 1 / CONDITION keep 1 / T(PASSES) = 4 % of their velocity
 RELAXATION = 1.6  # of the passes that take back overlap; below 2
+LEFT = 2.0**-6  # of the overlap of a struck pair, so that it still touches
 ROUNDS = 1 + AROUND + 1 + PASSES  # find what is struck, then what is around it, list pairs, and the passes
 
 
@@ -29,9 +31,9 @@ class ImpactProjection:
 
         (d_i - d_j) . n = 0,    C <= C_0,
 
-    for displacements d and overlaps C. C_0 is 0 for struck pairs, and the overlap before the substep for others, which bears
-    their load. The velocity with which struck pairs close is lost, as in the inelastic impact of rigid discs. Overlap is taken
-    back from positions, without velocity, and struck pairs forget their push. What is further away follows in the next substeps.
+    for displacements d and overlaps C. C_0 is nearly 0 for struck pairs, and the overlap before the substep for others, which
+    bears their load. The velocity with which struck pairs close is lost, as in the inelastic impact of rigid discs. Overlap is
+    taken back from positions, without velocity, and struck pairs forget their push. What is farther away follows later.
 
     Passes are those of Jacobi, with masses split as in Contact. Those of velocities have Chebyshev's acceleration, as in
     VelocityProjection: the polynomial is within -1 ... 1 on all eigenvalues 0 ... 1, so it adds no kinetic energy. Corrections
@@ -46,26 +48,29 @@ class ImpactProjection:
     Particles of constraints take no part, because constraints would not know of it. Worlds with restitution have no such
     projection, see Restitution.
 
-    struck, any_struck: whether each particle, and any, was struck in this substep. ring: of each particle around those that were
-    struck. near: the particles in rings, `count` of them; `size` is the count that all threads read. Their order depends on
-    threads, but no result does. events, given: the log of pairs that reports impulses, or None, and for it the push of a pair in
-    a pass [kg m]. wall_logs, free: those of walls, and for them how far a pass would move each particle without walls [m].
+    struck, any_struck: whether each particle, and any, was struck in this substep. ring: a scratch field, (n,): the ring of each
+    particle around those that were struck. near: the particles in rings, `count` of them; `size` is the count that all threads
+    read. Their order depends on threads, but no result does. events, given: the log of pairs that reports impulses, or None, and
+    for it the push of a pair in a pass [kg m]. wall_logs, free: those of walls, and for them how far a pass would move each
+    particle without walls [m].
     """
 
     wall_logs: "list[WallLog]" = []
 
     def __init__(
-        self, scene: "Scene", geometry: Any, push: "PairData", weight: Any, move: Any, events: Any, given: "PairData"
+        self, scene: "Scene", geometry: Any, push: "PairData", splitting: "MassSplitting", move: Any, events: Any,
+        given: "PairData", ring: Any,
     ):  # fmt: skip
         self.events, self.given = events, given
         self.state, self.w, self.slots = scene.state, scene.state.w, scene.slots
-        self.geometry, self.list, self.push, self.weight, self.move = geometry, geometry.list, push, weight, move
+        self.geometry, self.list, self.push, self.move = geometry, geometry.list, push, move
+        self.splitting, self.weight = splitting, splitting.weight
         self.own_weight = scene.own_weight
         # The fields of the old list are free except while a list is built. Here they hold the pairs that are projected.
         self.near, self.number = self.list.old_first, self.list.old_number
         add, n = scene.memory.field, scene.count
         self.any_struck, self.count, self.size = (add(f"impacts.{k}", None, kind=ti.i32) for k in ("any_struck", "count", "size"))
-        self.struck, self.ring = (add(f"impacts.{k}", n, kind=ti.i32) for k in ("struck", "ring"))
+        self.struck, self.ring = add("impacts.struck", n, kind=ti.i32), ring
         self.lift, self.split = add("impacts.lift", n, width=scene.particles.dim), add("impacts.split_mass", n)
         self.factors = add("impacts.chebyshev", PASSES, values=chebyshev(PASSES, CONDITION))
 
@@ -85,7 +90,7 @@ class ImpactProjection:
             falls = closes * closes > ti.static(FALL) * self.geometry.contact_distance(i, j) * forced
             if falls and closes > ti.static(SLOW) * forced and self.is_loose(i) and self.is_loose(j):
                 self.struck[i] = self.any_struck[None] = 1
-                if pair.other >= 0:
+                if pair.other >= 0 or not self.w.positive(j):
                     self.struck[j] = 1
 
     @ti.func
@@ -104,7 +109,8 @@ class ImpactProjection:
 
     @ti.func
     def begin(self, i):
-        """Put particle i into the first ring if it was struck."""
+        """Put particle i into the first ring if it was struck, else into none."""
+        self.ring[i] = 0
         if self.struck[i] != 0:
             self.struck[i] = 0
             self.take(i, ti.static(STRUCK))
@@ -121,18 +127,17 @@ class ImpactProjection:
 
     @ti.func
     def spread(self, i, ring):
-        """Put what touches particle i, in this ring, or may do so in this substep, into the ring around it."""
+        """Put what touches particle i, in this ring, into the ring around it."""
         if self.ring[i] == ring and self.state.moves(i):
             for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
                 j = self.list.neighbour[e]
-                reach = self.geometry.contact_distance(i, j) + (self.state.d[i] - self.state.d[j]).norm()
-                r = self.state.separation(i, j)
-                if r.dot(r) < reach * reach and self.state.awake(j) and self.is_loose(j):
+                r, distance = self.state.separation(i, j), self.geometry.contact_distance(i, j)
+                if r.dot(r) < distance * distance and self.state.awake(j) and self.is_loose(j):
                     self.take(j, ring - 1)
 
     @ti.func
     def list_pairs(self, i):
-        """List the pairs of particle i that may overlap, each with C_0, and split its mass for them.
+        """List the pairs of particle i that touch, each with C_0, and split its mass for them.
 
         Pairs that go on together are listed by their entry e, others by ~e.
         """
@@ -144,12 +149,13 @@ class ImpactProjection:
             r, distance, push = self.state.separation(i, j), self.geometry.contact_distance(i, j), self.push.field[e]
             moved = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j)
             length = r.norm()
-            if 0 < length < distance + moved.norm():
+            if length > 0 and (length < distance or push > 0):
                 overlap, listed = distance - length, ~e
                 kept = ti.min(ti.max(distance - (r - moved).norm(), 0), ti.max(overlap, 0))
                 if self.ring[j] != 0 and (overlap > 0 or push > 0):
                     if self.ring[i] == STRUCK and self.ring[j] == STRUCK:
-                        listed, kept, self.push.field[e] = e, ti.zero(kept), ti.zero(kept)
+                        listed, kept, self.push.field[e] = e, ti.static(LEFT) * ti.max(overlap, 0), ti.zero(kept)
+                        self.splitting.invalidate_bound(i)
                     elif moved.dot(r) < length * ti.max(overlap, (w + self.w.of(j)) * push):
                         listed = e
                 normals += r.outer_product(r) / (length * length)
@@ -211,10 +217,7 @@ class ImpactProjection:
         if k > AROUND + 1:
             self.state.d[i] = self.state.d[i] + self.move[i]
             self.state.advance(i, self.lift[i])
-        ends = k == ROUNDS - 1
-        if ends:
-            self.ring[i] = 0
-        return ends
+        return k == ROUNDS - 1
 
     @ti.func
     def end_round(self, k):

@@ -57,7 +57,7 @@ class Scene:
     inv_mass: np.ndarray  # (n,) after pins: 0 for particles that constraints cannot move
     radius: Any = None  # set where a feature needs radii
     slots: Any = None  # the slots into which constraints write corrections
-    own_weight: Any = None  # the OwnWeight of particles, where loads become known loads
+    own_weight: Any = None  # the OwnWeight of particles, where loads become known loads, or discs land on others
     impacts: Any = None  # the BodyImpacts, where linked particles may bounce off walls
     residuals: Any = None  # batch -> the residual of each of its violations after the last substep
     order: int = 2  # of the error in h

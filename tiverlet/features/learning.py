@@ -14,9 +14,10 @@ LAG = 64  # least number of substeps in which a load is learnt
 
 
 class OwnWeight:
-    """The acceleration of each particle by forces other than known loads, at the end of a window: field, (n,) [m/s^2].
+    """The acceleration of each particle by forces other than known loads, at a start and at the end of a window: field, (n,)
+    [m/s^2].
 
-    Loads are compared with it: a load of k times a particle's own weight is that of k particles.
+    Loads are compared with it: a load of k times a particle's own weight is that of k particles. So are impacts.
     """
 
     def __init__(self, scene: "Scene"):

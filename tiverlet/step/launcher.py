@@ -83,6 +83,10 @@ class Launcher:
 
     ends_substep = has_pass
 
+    def ends_passes(self, now: Moment) -> bool:
+        """Whether this is a substep, and the frame did not stop after its passes."""
+        return self.has_pass(now) and self.first_half(now) <= self.last_half(now)
+
     def ends_frame(self, now: Moment) -> bool:
         """Whether all substeps are done."""
         return now.s >= now.span.substeps
@@ -189,6 +193,12 @@ class Launcher:
         """Whether discs struck each other in this substep. The host has to wait for the answer."""
         self.flush()
         return bool(self.runner.memory.read(self.runner.step.contacts[0].dev.impacts.any_struck))
+
+    def list_what_touches(self, now: Moment) -> None:
+        """Check the neighbour list. The frame may stop here until the list is rebuilt."""
+        now = now.of(0, half=self.last_half(now) + 1)
+        self.put(now, "check_list")
+        self.put(now, "ask_for_list")
 
     def project_discs(self, now: Moment) -> None:
         """Add one round of the impacts of discs, in a launch of its own."""

@@ -74,23 +74,25 @@ def substep(do, now):
                     if not do.is_regular(now, half):
                         do.push_bodies(this_pass)
                 do.apply_corrections(this_pass)
-    if ti.static(do.projects_impacts):
-        if do.ends_substep(now) and do.has_struck_discs(now):
-            for k in range(IMPACT_ROUNDS):
-                do.project_discs(now.of(k))
     if ti.static(do.projects_bodies):
-        if do.ends_substep(now) and do.has_struck_bodies(now):
+        if do.ends_passes(now) and do.has_struck_bodies(now):
             for k in range(do.body_rounds(now)):
                 do.project_bodies(now.of(k))
     if ti.static(do.finishes):
-        if do.ends_substep(now):
+        if do.ends_passes(now):
             do.finish_substep(now)
     if ti.static(do.projects_velocities):
-        if do.ends_substep(now) and do.needs_projection(now):
+        if do.ends_passes(now) and do.needs_projection(now):
             for k in range(do.rounds(now)):
                 do.find_projected_contacts(now.of(k))
             for k in range(PASSES):
                 do.project_contact_velocities(now.of(k))
+    if ti.static(do.projects_impacts):
+        if do.ends_substep(now) and do.has_struck_discs(now):
+            do.list_what_touches(now)
+            if do.ends_substep(now):
+                for k in range(IMPACT_ROUNDS):
+                    do.project_discs(now.of(k))
 
 
 @ti.data_oriented
@@ -265,6 +267,11 @@ class Step:
         return now.s < now.span.substeps and now.span.part == now.span.iterations and self.halted() == 0
 
     @ti.func
+    def ends_passes(self, now):
+        """Whether all passes of the substep are done, and the frame did not stop after them."""
+        return self.ends_substep(now) and self.first_half(now) <= self.last_half(now)
+
+    @ti.func
     def ends_frame(self, now):
         """Whether all substeps are done."""
         return now.s >= now.span.substeps and self.halted() == 0
@@ -365,18 +372,40 @@ class Step:
     def update_neighbours(self, now, half):
         """Rebuild the neighbour list if it is stale. If it has no room for all pairs, the frame stops."""
         if ti.static(self.hashes):
-            if self.halted() == 0 and self.is_stale() != 0:
-                if ti.static(bool(self.strays)):
-                    self.strays.keep_list(now.thread)
-                if self.is_stale() != 0:
-                    self.list_particles(now.thread)
-                    if self.search.list.need[None] > self.search.list.capacity:
-                        self.halt[None] = [1, now.s, half]  # all write the same
+            self.rebuild_stale(now, half)
         if ti.static(self.looks):
             if self.has_pass(now) and (self.sleepers.count[None] > 0 or ti.static(self.detects)):
                 self.look_for_sleepers(self.pass_of(now, half))
                 if self.sleepers.calls[None] != 0:
                     self.halt[None] = [1, now.s, half]
+
+    @ti.func
+    def rebuild_stale(self, now, half):
+        """Rebuild the neighbour list of contacts if it is stale. If it has no room, the frame stops before this half."""
+        if self.halted() == 0 and self.is_stale() != 0:
+            if ti.static(bool(self.strays)):
+                self.strays.keep_list(now.thread)
+            if self.is_stale() != 0:
+                self.list_particles(now.thread)
+                if self.search.list.need[None] > self.search.list.capacity:
+                    self.halt[None] = [1, now.s, half]  # all write the same
+
+    @ti.func
+    def list_what_touches(self, now):
+        """At the end of a substep: rebuild the neighbour list if it may lack pairs that touch now.
+
+        If it has no room for all pairs, the frame stops, and goes on here.
+        """
+        self.check_list(now)
+        self.rebuild_stale(now, self.last_half(now) + 1)
+
+    @ti.func
+    def check_list(self, now):
+        """Mark the neighbour list of contacts as stale if a particle has moved too far."""
+        for c in ti.static(self.contacts):
+            for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+                c.note_motion(self.search.moved_too_far(i), 0)
+        self.team.wait()
 
     @called
     @ti.func
