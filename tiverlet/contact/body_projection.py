@@ -76,7 +76,8 @@ class BodyProjection:
         # Of each particle: its contacts, how often its mass is split, its place from the center of its body, its move, and the
         # wall that has pushed it last: until when that counts, its plane, and its pushes y, p, and the last change of y.
         # reached: whether anything near it has moved, so that its contacts have pushes to find.
-        self.reached = add("bodies.reached", n, kind=ti.i32)
+        # near: the same of the body of which it is the first, as a pass begins; bodies that move reach others.
+        self.reached, self.near = (add(f"bodies.{k}", n, kind=ti.i32) for k in ("reached", "near"))
         self.number, self.split = add("bodies.contacts", n, kind=ti.i32), add("bodies.split", n)
         self.arm, self.move, self.wall_step = (add(f"bodies.{k}", n, width=dim) for k in ("arm", "move", "wall_step"))
         self.wall_ahead, self.wall_pressed = (add(f"bodies.{k}", n) for k in ("wall_ahead", "wall_pressed"))
@@ -221,6 +222,7 @@ class BodyProjection:
     @ti.func
     def press(self, i, k, geometry: ti.template(), tick):  # type: ignore[valid-type]
         """In pass k: compute the pushes of the contacts of particle i, and of the wall on it."""
+        self.find_near(i)
         first, keep = geometry.list.first[i], ti.cast(k, self.scene.real) / (k + 3)
         if k == self.passes - 1:
             keep *= 0
@@ -253,15 +255,20 @@ class BodyProjection:
                 self.wall_pressed[i], self.wall_ahead[i] = new, ahead
 
     @ti.func
+    def find_near(self, i):
+        """If particle i is the first of its body: note whether anything near the body has moved."""
+        near, k = 0, ti.select(self.head[i] == i, i, -1)
+        while k >= 0:
+            near |= self.reached[k]
+            k = self.next[k]
+        self.near[i] = near
+
+    @ti.func
     def follow(self, i, geometry: ti.template()):  # type: ignore[valid-type]
         """Move the body of which particle i is the first by what pushes have changed in this pass."""
         if self.head[i] == i:
-            total, near, k = ti.zero(self.move[i]), 0, i
+            total, k = ti.zero(self.move[i]), ti.select(self.near[i] != 0, i, -1)
             X = total.outer_product(total)
-            while k >= 0:
-                near |= self.reached[k]
-                k = self.next[k]
-            k = ti.select(near != 0, i, -1)
             while k >= 0:
                 if self.split[k] > 0 or self.number[k] > 0:
                     change = self.wall_step[k]

@@ -69,16 +69,16 @@ class ImpactProjection:
         # The fields of the old list are free except while a list is built. Here they hold the pairs that are projected.
         self.near, self.number = self.list.old_first, self.list.old_number
         add, n = scene.memory.field, scene.count
-        self.any_struck, self.count, self.size = (add(f"impacts.{k}", None, kind=ti.i32) for k in ("any_struck", "count", "size"))
-        self.struck, self.ring = add("impacts.struck", n, kind=ti.i32), ring
-        self.lift, self.split = add("impacts.lift", n, width=scene.particles.dim), add("impacts.split_mass", n)
-        self.factors = add("impacts.chebyshev", PASSES, values=chebyshev(PASSES, CONDITION))
+        self.any_struck, self.count, self.size = (add(f"landing.{k}", None, kind=ti.i32) for k in ("any_struck", "count", "size"))
+        self.struck, self.ring = add("landing.struck", n, kind=ti.i32), ring
+        self.lift, self.split = add("landing.lift", n, width=scene.particles.dim), add("landing.split_mass", n)
+        self.factors = add("landing.chebyshev", PASSES, values=chebyshev(PASSES, CONDITION))
 
     def report_to(self, scene: "Scene", wall_logs: "list[WallLog]") -> None:
         """Report to the logs of walls what these take up. Call it before fields are placed."""
         self.wall_logs = wall_logs
         if wall_logs:
-            self.free = scene.memory.field("impacts.free", scene.count, width=scene.particles.dim)
+            self.free = scene.memory.field("landing.free", scene.count, width=scene.particles.dim)
 
     @ti.func
     def note(self, pair, h):
