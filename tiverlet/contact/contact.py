@@ -187,8 +187,9 @@ class Contact(PairContact):
         dev.events = EventLog(scene, self.table) if dev.has_events else None
         if dev.events:
             pair_data.append(dev.events.touched)
+        reported = dev.events if dev.reports else None
         given = PairData("landed", 0, persistent=False)
-        if self.lands and dev.reports:
+        if self.lands and reported:
             pair_data.append(given)
         dev.search = NeighbourSearch(scene, self._present_skin, linked, self.table, pair_data, team, dev.move)
         dev.list = dev.search.list
@@ -207,16 +208,14 @@ class Contact(PairContact):
         dev.fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
         dev.restitution = None
         if dev.has_restitution:
-            noted = dev.events if dev.reports else None
-            dev.restitution = Restitution(scene, dev.geometry, self.table, struck, dev.slack, dev.impulse, noted, bodies)
+            dev.restitution = Restitution(scene, dev.geometry, self.table, struck, dev.slack, dev.impulse, reported, bodies)
             dev.hit = dev.restitution.hit
         if dev.spins:
             dev.spinning = Spinning(scene, self.table, dev.splitting.weight, dev.turn)
         dev.projection = VelocityProjection(scene, dev.geometry, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
-        dev.impacts = None
+        dev.landing = None
         if self.lands:
-            reported = dev.events if dev.reports else None
-            dev.impacts = ImpactProjection(
+            dev.landing = ImpactProjection(
                 scene, dev.geometry, dev.push, dev.splitting, dev.move, reported, given, dev.projection.ring
             )
         dev.once = self._solves_once(scene, team)
@@ -290,7 +289,7 @@ class Contact(PairContact):
     def may_project(self, now):
         """Whether displacements may be projected after this substep, so that the pushes of walls have to be known."""
         out = True
-        if ti.static(not (self.dev.bodies or self.dev.impacts or self.dev.projection.unequal)):
+        if ti.static(not (self.dev.bodies or self.dev.landing or self.dev.projection.unequal)):
             out = self.dev.projection.is_due(now)
         return out
 
@@ -445,9 +444,9 @@ class Contact(PairContact):
                 self.dev.projection.note_pair(pair.i, pair.j, pair.n, pair.overlap, borne)
                 if pair.other >= 0:
                     self.dev.projection.note_pair(pair.j, pair.i, -pair.n, pair.overlap, borne)
-        if ti.static(bool(self.dev.impacts)):
+        if ti.static(bool(self.dev.landing)):
             if now.first != 0:
-                self.dev.impacts.note(pair, now.h)
+                self.dev.landing.note(pair, now.h)
 
     @ti.func
     def push_before(self, pair, own, now):

@@ -55,7 +55,7 @@ class ImpactProjection:
     particle without walls [m].
     """
 
-    wall_logs: "list[WallLog]" = []
+    wall_logs: "list[WallLog]"
 
     def __init__(
         self, scene: "Scene", geometry: Any, push: "PairData", splitting: "MassSplitting", move: Any, events: Any,
@@ -188,17 +188,10 @@ class ImpactProjection:
                         given = ti.select(k == 0, 0 * gain, again * self.given.field[e])
                         self.given.field[e] = given - gain * apart / shared
                         self.events.record(i, j, e, r / length, self.given.field[e], 0)
-        free = want
-        if ti.static(self.state.keeps_wall_push):
-            wall_push = self.state.wall_push[i]
-            size = wall_push.dot(wall_push)
-            if size > 0:
-                want -= want.dot(wall_push) / size * wall_push
-                lift -= lift.dot(wall_push) / size * wall_push
-        self.move[i] = gain * want + again * self.move[i]
-        self.lift[i] = ti.static(RELAXATION) * lift
+        self.move[i] = gain * self.state.across_walls(i, want) + again * self.move[i]
+        self.lift[i] = ti.static(RELAXATION) * self.state.across_walls(i, lift)
         if ti.static(len(self.wall_logs) > 0):
-            self.free[i] = gain * free + ti.select(k == 0, 0 * free, again * self.free[i])
+            self.free[i] = gain * want + ti.select(k == 0, 0 * want, again * self.free[i])
             self.report_walls(i, self.move[i] - self.free[i])
 
     @ti.func

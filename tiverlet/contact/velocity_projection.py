@@ -311,11 +311,7 @@ class VelocityProjection:
             j = self.list.old_neighbour[e]
             r = self.state.separation(i, j)
             want -= self.push.old[e] * self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(r) * r
-        if ti.static(self.state.keeps_wall_push):
-            wall_push = self.state.wall_push[i]
-            size = wall_push.dot(wall_push)
-            if size > 0:
-                want -= want.dot(wall_push) / size * wall_push
+        want = self.state.across_walls(i, want)
         factor = self.factors[k]
         want *= factor * ti.static(2 / (1 + 1 / CONDITION))
         if k > 0:

@@ -27,7 +27,7 @@ class ContactPass:
             contact.has_friction or contact.has_restitution or contact.has_events or contact.shares_loads
         )
         self.projects_velocities = bool(contact) and contact.projects
-        self.projects_impacts = bool(contact and contact.dev.impacts)
+        self.projects_discs = bool(contact and contact.dev.landing)
         self.projects_bodies = bool(contact and contact.dev.bodies)
         if self.has_restitution and team.launched:  # the host does not read whether any pair bounces in a round
             self.bounces = scene.memory.field("Contact.bounces", None, kind=ti.i32)
@@ -193,7 +193,7 @@ class ContactPass:
         """Whether discs struck each other in this substep."""
         out = False
         for c in ti.static(self.contacts):
-            out = c.dev.impacts.any_struck[None] != 0
+            out = c.dev.landing.any_struck[None] != 0
         return out
 
     @ti.func
@@ -202,19 +202,19 @@ class ContactPass:
         for c in ti.static(self.contacts):
             n = ti.select(k == 0, self.n, 0)
             for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-                c.dev.impacts.begin(i)
-            size = ti.select(k == 0, 0, c.dev.impacts.size[None])
+                c.dev.landing.begin(i)
+            size = ti.select(k == 0, 0, c.dev.landing.size[None])
             begin, end = self.team.chunk_begin(size, thread), self.team.chunk_end(size, thread)
             for m in range(begin, end):
-                c.dev.impacts.find(c.dev.impacts.near[m], k)
+                c.dev.landing.find(c.dev.landing.near[m], k)
             self.team.wait()
             for m in range(begin, end):
-                i = c.dev.impacts.near[m]
-                if c.dev.impacts.apply(i, k):
+                i = c.dev.landing.near[m]
+                if c.dev.landing.apply(i, k):
                     c.note_motion(c.dev.search.moved_too_far(i), 0)
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, thread)):
-                c.dev.impacts.end_round(k)
+                c.dev.landing.end_round(k)
             self.team.wait()
 
     @ti.func

@@ -23,7 +23,7 @@ class Launcher:
         self.runner, step = runner, runner.step
         self.halves, self.newton_steps, self.has_restitution = step.halves, step.newton_steps, step.has_restitution
         self.finishes, self.projects_velocities = step.finishes, step.projects_velocities
-        self.projects_bodies, self.projects_impacts = step.projects_bodies, step.projects_impacts
+        self.projects_bodies, self.projects_discs = step.projects_bodies, step.projects_discs
         self.drives, self.constrains, self.touches, self.acts = map(
             bool, (step.drivers, step.batches, step.contacts, step.particles.acts)
         )
@@ -192,7 +192,7 @@ class Launcher:
     def has_struck_discs(self, now: Moment) -> bool:
         """Whether discs struck each other in this substep. The host has to wait for the answer."""
         self.flush()
-        return bool(self.runner.memory.read(self.runner.step.contacts[0].dev.impacts.any_struck))
+        return bool(self.runner.memory.read(self.runner.step.contacts[0].dev.landing.any_struck))
 
     def list_what_touches(self, now: Moment) -> None:
         """Check the neighbour list. The frame may stop here until the list is rebuilt."""

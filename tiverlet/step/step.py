@@ -8,7 +8,7 @@ the integrator.
 
 from typing import TYPE_CHECKING, Any
 
-from ..contact.impact_projection import ROUNDS as IMPACT_ROUNDS
+from ..contact.impact_projection import ROUNDS as LANDING_ROUNDS
 from ..contact.projection_times import ALWAYS, due
 from ..contact.velocity_projection import PASSES, RINGS
 from ..device import called, runtime, ti
@@ -87,11 +87,11 @@ def substep(do, now):
                 do.find_projected_contacts(now.of(k))
             for k in range(PASSES):
                 do.project_contact_velocities(now.of(k))
-    if ti.static(do.projects_impacts):
+    if ti.static(do.projects_discs):
         if do.ends_substep(now) and do.has_struck_discs(now):
             do.list_what_touches(now)
             if do.ends_substep(now):
-                for k in range(IMPACT_ROUNDS):
+                for k in range(LANDING_ROUNDS):
                     do.project_discs(now.of(k))
 
 
@@ -131,9 +131,9 @@ class Step:
         self.has_pair_impacts = self.has_impacts and self.impacts.pairs
         self.newton_steps = 2 if scene.slots and scene.slots.refines else 1  # most of them in a pass
         self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
-        self.projects_bodies, self.projects_impacts = self.contact_pass.projects_bodies, self.contact_pass.projects_impacts
-        if self.projects_impacts:
-            contact.dev.impacts.report_to(scene, self.wall_logs)
+        self.projects_bodies, self.projects_discs = self.contact_pass.projects_bodies, self.contact_pass.projects_discs
+        if self.projects_discs:
+            contact.dev.landing.report_to(scene, self.wall_logs)
         self.orients = self.state.spins and self.state.spin.orients
         keeps = self.contact_pass.remembers or bool(self.breakers)
         self.finishes = keeps or self.orients or bool(self.wall_logs) or bool(self.constraints.learners)
