@@ -57,13 +57,13 @@ def test_loops_are_copied_for_the_user_alone():
 import os
 from tiverlet.device import ti
 import tiverlet as tv
-from tiverlet.device.patches import unrolling
+from tiverlet.device.patches import llvm_switches
 told = "-pass-remarks=loop-unroll"
-unrolling.SWITCHES = (told, *unrolling.SWITCHES[:COUNT])
+llvm_switches.SWITCHES = (told, *llvm_switches.SWITCHES[:COUNT])
 world = tv.World(tv.Particles([(0, 0.2), (0.15, 0.1)], radius=0.1), [tv.Gravity(), tv.Contact(), tv.HalfSpace((0, 1))])
 world.step(1 / 60)
 print(world.hash())
-unrolling.command_line().set_switches(told)
+llvm_switches.command_line().set_switches(told)
 seen = ti.field(ti.f32, 100)
 @ti.kernel
 def add(count: ti.i32):
@@ -77,6 +77,22 @@ add(5)
     copies = [[part.count("by a factor of") for part in done.stderr.split("theirs")] for done in (ours, as_ever)]
     assert ours.stdout == as_ever.stdout and copies[0][0] == 0 and copies[1][0] > 10
     assert copies[0][1] == copies[1][1] > 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (ARCH == "cpu" and sys.platform == "linux"), reason="LLVM's switches are found there")
+def test_only_frames_of_many_particles_are_worth_a_search():
+    # LLVM prints its passes. Taichi asks for a search for addresses with fewer additions; by default LLVM makes a second one.
+    code = """
+import numpy as np
+import tiverlet as tv
+from tiverlet.device.patches import llvm_switches
+llvm_switches.SWITCHES = ("-debug-pass=Structure", *llvm_switches.SWITCHES)
+x = np.arange(COUNT)
+tv.World(tv.Particles(np.stack([x, 0 * x], axis=1), radius=0.1), [tv.Contact()]).step(1 / 60)
+"""
+    few, many = (python(code.replace("COUNT", count), TI_OFFLINE_CACHE="0").stderr for count in ("10", "1000"))
+    assert many.count("Loop Strength Reduction") == 2 * few.count("Loop Strength Reduction") > 0
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ import numpy as np
 from ..language import active, impl, sources
 from ..user_errors import shortened
 from . import lean, patched
-from .unrolling import disable_unrolling, restore_switches
+from .llvm_switches import restore_switches, set_switches
 
 HOSTS = ("Arch.x64", "Arch.arm64")  # where LLVM makes kernels as fast without Taichi's passes; measured on x64
 # Loops do not cache a field element in a variable: Taichi misses that another index may be the same element, such as field[k] for
@@ -141,7 +141,7 @@ class Compiler:
     def compile_fast(self) -> None:
         """Have LLVM spend less time on the kernel that is compiled next. Its first launch must come before the context ends."""
         if self._host and not self.thorough:
-            disable_unrolling()
+            set_switches(search=self.passes is LEAN)
             self._fast = True
 
     def compile_thoroughly(self) -> None:
