@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from .. import checks
 from ..colliders.body_impacts import FINE
-from ..device import ti
+from ..device import record, ti
 from ..device.thread_team import Team
 from ..features.extending import extended
 from ..features.feature import Batch, Feature, Knob, Scene
@@ -31,6 +31,34 @@ from .restitution import SLOW, under_force
 from .wall_loads import WallLoads
 
 SKIN = 0.15  # skin of a vertex, relative to its longer edge
+
+
+@record
+class BodyContact:
+    """A contact of two bodies in a pass, solved by a particle that has a role in it.
+
+    at: the entry of the neighbour list that stores it. v, a, b, t: vertex v touches the edge from a to b at t. n: the normal.
+    d: the displacement of v relative to the edge [m]. overlap: C [m], and by split masses shared [1/kg].
+    part: of the correction that the particle gets, see PolygonGeometry.participants(). share: the same, as moves [1].
+    e, role: the entry of the particle's own list, and its role.
+    """
+
+    def __init__(self, at, v, a, b, t, n, d, overlap, shared, part, share, e, role):
+        self.at, self.v, self.a, self.b, self.t, self.n = at, v, a, b, t, n
+        self.d, self.overlap, self.shared, self.part, self.share = d, overlap, shared, part, share
+        self.e, self.role = e, role
+
+
+@record
+class BodySums:
+    """What a particle sums up over its contacts in a pass.
+
+    move: its correction [m]. lift: that of its position only, by impacts [m]. forced: the part of `move` that counts as a force,
+    see ForceShare [m]. parts: its parts in impacts of bodies.
+    """
+
+    def __init__(self, move, lift, forced, parts):
+        self.move, self.lift, self.forced, self.parts = move, lift, forced, parts
 
 
 class Polygons(PairContact):
@@ -338,14 +366,18 @@ class Polygons(PairContact):
 
     @ti.func
     def relax(self, i, turn, now):
-        """Compute the corrections of particle i by its contacts."""
-        first, final = now.first, now.final
-        total, lifts, forced = 0 * self.dev.state.x[i], 0 * self.dev.state.x[i], 0 * self.dev.state.x[i]
-        parts = 0 * self.dev.w.of(i)
-        begin, roles = self.dev.list.first[i], self.dev.geometry.roles(i)
+        """Compute the corrections of particle i by its contacts.
+
+        For each contact in which it has a role: find the overlap; compute what this pass takes back along the normal, then across
+        it by friction; note what later substeps get to know of it.
+        """
         if ti.static(bool(self.dev.known)):
-            if first != 0 and (now.span.since + now.s) % WINDOW == 0:
+            if now.first != 0 and (now.span.since + now.s) % WINDOW == 0:
                 self.dev.known.motion.end_window(i, now, WINDOW)
+        move, parts = 0 * self.dev.state.x[i], 0 * self.dev.w.of(i)
+        lift, forced = move, move
+        own = BodySums(move, lift, forced, parts)
+        begin, roles = self.dev.list.first[i], self.dev.geometry.roles(i)
         for e in range(begin, begin + ti.select(self.dev.depths[i] > 0, self.dev.list.number[i], 0)):
             for role in range(roles):
                 at, v, a, b, t, part = self.dev.geometry.participants(i, e, role)
@@ -354,73 +386,115 @@ class Polygons(PairContact):
                     n = ti.Vector([found[2], found[3]])
                     if self.dev.geometry.bears(at):
                         overlap, shared = self.dev.geometry.share(self.dev.depths, at, v, a, b, t)
-                        bearing, pressed = overlap, overlap  # what would hold the load: by the contact alone, and as split
                         d = self.dev.geometry.relative(self.dev.state.d, v, a, b, t)
-                        share, missing, as_bodies = part * self.dev.w.of(i) / shared, 0 * overlap, False
-                        back = overlap  # the correction of both position and displacement
-                        leaving, known, alone = d.dot(n), 0 * overlap, 0 * overlap
-                        if ti.static(bool(self.dev.known)):
-                            known, alone = self.dev.known.known_push(at, now), self.dev.geometry.inverse_mass(v, a, b, t)
-                            back = ti.max(overlap, -ti.select(first != 0, known, self.dev.geometry.impulse.field[at]) * shared)
-                            known *= ti.cast(first, self.scene.real)  # later passes find what the first one has left
-                            bearing, pressed = ti.max(overlap + known * alone, 0), ti.max(overlap + known * shared, 0)
-                            leaving -= known * alone
-                        if ti.static(self.dev.has_restitution):
-                            if first != 0:
-                                aim, missing, lift = self.dev.restitution.target(at, v, a, b, t, n, bearing, leaving)
-                                if missing > 0:
-                                    back, pressed = 0 * overlap, bearing
-                                    if ti.static(bool(self.dev.known)):
-                                        back -= known * shared  # what bounces has no load
-                                    as_bodies = self.dev.restitution.by_bodies(v, a, b)
-                                    if as_bodies:
-                                        parts += abs(part)
-                                        aim = self.dev.restitution.undisturbed(v, a, b, t, n)
-                                    else:
-                                        self.dev.hit[None] = 1
-                                        lifts += share * (bearing + lift) * n
-                                    if role == VERTEX:
-                                        self.dev.restitution.begin(e, ti.max(aim, ti.static(AIM)) * n)
-                                elif self.dev.restitution.parts_by_itself(at, v, a, b, t, n):
-                                    back = 0 * overlap
-                        if ti.static(bool(self.dev.bodies)):
-                            as_bodies = self.dev.bodies.struck.field[at] != 0
-                            if first != 0:
-                                usual = self.dev.geometry.usual_depth.field[at]
-                                as_bodies = self.dev.bodies.strikes(self.dev.geometry, v, a, b, t, n, usual)
-                            if as_bodies:
-                                back = -known * shared  # what strikes has no load
-                            if role == VERTEX:
-                                self.dev.bodies.note(e, n, as_bodies)
-                        if ti.static(not self.dev.known):
-                            if role == VERTEX:
-                                if not self.dev.geometry.is_unchanged(i, e):
-                                    self.dev.geometry.impulse.field[e] = self.dev.geometry.impulse.field[e] + back / shared
+                        share = part * self.dev.w.of(i) / shared
+                        contact = BodyContact(at, v, a, b, t, n, d, overlap, shared, part, share, e, role)
+                        back, pressed, missing, alone, as_bodies = self.take_back(contact, own, now)
                         want = back * n
                         if ti.static(self.dev.has_friction):
-                            slip = self.dev.slip.field[at] + d
-                            if ti.static(bool(self.dev.known)):
-                                if first != 0:
-                                    along = self.dev.known.known_friction(at, now) * rotation.across(n)
-                                    slip -= ti.select(missing > 0, alone, shared) * along
-                                    want -= shared * along
-                            if not as_bodies:
-                                want -= self.table.held(v, a, n, pressed + missing, slip)
+                            want = self.rub(contact, want, pressed, missing, alone, as_bodies, now)
                         if ti.static(bool(self.dev.known)):
                             if role == VERTEX:
                                 self.dev.part.field[e] = ti.Vector([n.dot(want), n[0] * want[1] - n[1] * want[0]]) / shared
-                        total += share * want
-                        if final != 0:
-                            approach = -self.dev.geometry.relative(self.dev.forces.before, v, a, b, t).dot(n)
-                            pushed = pressed * self.dev.geometry.inverse_mass(v, a, b, t) / shared
-                            forced += self.dev.forces.share(approach, pushed) * share * want
-        self.dev.move[i] = total
-        if final != 0:
-            self.dev.forces.add(i, forced, first)
+                        own.move += share * want
+                        if now.final != 0:
+                            own.forced += self.part_by_forces(contact, pressed) * share * want
+        self.store_sums(i, own, now)
+
+    @ti.func
+    def take_back(self, contact, own, now):
+        """Return what this pass takes back of the overlap of a contact, from position and displacement [m], and more about it.
+
+        That is the overlap that would hold the load as masses are split [m], what an impact lacks of its displacement [m], the
+        inverse mass of the contact alone, or 0 without known loads, and whether it is left to an impact of whole bodies.
+        """
+        at, v, a, b, t, n = contact.at, contact.v, contact.a, contact.b, contact.t, contact.n
+        back, pressed, known, alone = contact.overlap, contact.overlap, 0 * contact.overlap, 0 * contact.overlap
+        bearing, leaving, missing, as_bodies = contact.overlap, contact.d.dot(n), 0 * contact.overlap, False
+        if ti.static(bool(self.dev.known)):
+            known, alone = self.dev.known.known_push(at, now), self.dev.geometry.inverse_mass(v, a, b, t)
+            given = -ti.select(now.first != 0, known, self.dev.geometry.impulse.field[at]) * contact.shared
+            back = ti.max(contact.overlap, given)  # it may give back what it was given, but never pulls
+            known *= ti.cast(now.first, self.scene.real)  # later passes find what the first one has left
+            bearing, pressed = ti.max(bearing + known * alone, 0), ti.max(pressed + known * contact.shared, 0)
+            leaving -= known * alone
         if ti.static(self.dev.has_restitution):
-            if first != 0:
-                self.dev.restitution.lift[i] = lifts
-                self.dev.restitution.take_part(i, parts)
+            if now.first != 0:
+                aim, lack, lift = self.dev.restitution.target(at, v, a, b, t, n, bearing, leaving)
+                if lack > 0:
+                    missing, pressed = lack, bearing
+                    back = 0 * back - known * contact.shared  # what bounces has no load
+                    as_bodies = self.begin_impact(contact, aim, bearing + lift, own)
+                elif self.dev.restitution.parts_by_itself(at, v, a, b, t, n):
+                    back = 0 * back
+        if ti.static(bool(self.dev.bodies)):
+            as_bodies = self.strikes_as_body(contact, now)
+            if as_bodies:
+                back = -known * contact.shared  # what strikes has no load
+        if ti.static(not self.dev.known):
+            if contact.role == VERTEX and not self.dev.geometry.is_unchanged(v, contact.e):
+                e = contact.e
+                self.dev.geometry.impulse.field[e] = self.dev.geometry.impulse.field[e] + back / contact.shared
+        return back, pressed, missing, alone, as_bodies
+
+    @ti.func
+    def begin_impact(self, contact, aim, lift, own):
+        """Begin the impact of a contact, which leaves with `aim` [m] and is lifted [m]. Returns whether it is one of bodies."""
+        v, a, b, t, n = contact.v, contact.a, contact.b, contact.t, contact.n
+        as_bodies = self.dev.restitution.by_bodies(v, a, b)
+        if as_bodies:
+            own.parts += abs(contact.part)
+            aim = self.dev.restitution.undisturbed(v, a, b, t, n)
+        else:
+            self.dev.hit[None] = 1
+            own.lift += contact.share * lift * n
+        if contact.role == VERTEX:
+            self.dev.restitution.begin(contact.e, ti.max(aim, ti.static(AIM)) * n)
+        return as_bodies
+
+    @ti.func
+    def strikes_as_body(self, contact, now):
+        """Whether a contact is left to BodyProjection in this substep; decided in the first pass."""
+        v, a, b, t, n = contact.v, contact.a, contact.b, contact.t, contact.n
+        out = self.dev.bodies.struck.field[contact.at] != 0
+        if now.first != 0:
+            usual = self.dev.geometry.usual_depth.field[contact.at]
+            out = self.dev.bodies.strikes(self.dev.geometry, v, a, b, t, n, usual)
+        if contact.role == VERTEX:
+            self.dev.bodies.note(contact.e, n, out)
+        return out
+
+    @ti.func
+    def rub(self, contact, want, pressed, missing, alone, as_bodies, now):
+        """Return the correction of a contact [m] with friction. Known friction is in the displacement already."""
+        slip = self.dev.slip.field[contact.at] + contact.d
+        if ti.static(bool(self.dev.known)):
+            if now.first != 0:
+                along = self.dev.known.known_friction(contact.at, now) * rotation.across(contact.n)
+                slip -= ti.select(missing > 0, alone, contact.shared) * along
+                want -= contact.shared * along
+        if not as_bodies:
+            want -= self.table.held(contact.v, contact.a, contact.n, pressed + missing, slip)
+        return want
+
+    @ti.func
+    def part_by_forces(self, contact, pressed):
+        """Return which part of the push of a contact counts as a force, see ForceShare."""
+        v, a, b, t = contact.v, contact.a, contact.b, contact.t
+        approach = -self.dev.geometry.relative(self.dev.forces.before, v, a, b, t).dot(contact.n)
+        pushed = pressed * self.dev.geometry.inverse_mass(v, a, b, t) / contact.shared
+        return self.dev.forces.share(approach, pushed)
+
+    @ti.func
+    def store_sums(self, i, own, now):
+        """Store what the contacts of particle i sum up to."""
+        self.dev.move[i] = own.move
+        if now.final != 0:
+            self.dev.forces.add(i, own.forced, now.first)
+        if ti.static(self.dev.has_restitution):
+            if now.first != 0:
+                self.dev.restitution.lift[i] = own.lift
+                self.dev.restitution.take_part(i, own.parts)
 
     @ti.func
     def store_pushes(self, i, now):
