@@ -64,9 +64,12 @@ class BodyImpacts:
     Constraints take into account that the wall will do that: while p > 0, they have their gradients at the particle, and so its
     part in the matrix, without the direction of the normal. So one pass suffices where they are solved exactly, for any body and
     any number of struck particles; there is another one if a particle was struck by it or came free, and for e > 0, until what is
-    left of second order is small. What the last pass leaves is lost. All impacts of a substep together are Newton's law for a
-    rigid body. At e = 1 it neither removes nor adds energy; energy is conserved to O(h) in an impact, since a body turns in a
-    substep, and to O(h^2) if the body is a cluster. Friction holds the tangential displacement by up to its coefficient times p.
+    left of second order is small. A wall that would have to pull, p < 0, does so until the next pass, in which constraints take
+    into account that it lets go. If it let go at once, its particle would be thrown as far as the wall has to hold it: the second
+    corner of a plank that lands almost upright, both of which are struck in one substep, by several times its length. What the
+    last pass leaves is lost. All impacts of a substep together are Newton's law for a rigid body. At e = 1 it neither removes nor
+    adds energy; energy is conserved to O(h) in an impact, since a body turns in a substep, and to O(h^2) if the body is a
+    cluster. Friction holds the tangential displacement by up to its coefficient times p.
 
     These passes leave the violations that the regular passes left, and those of springs: removed all at once, they would become
     speed. Contacts, outlines, places, and clusters that share particles wait for the next substep. A particle that approaches by
@@ -233,6 +236,19 @@ class BodyImpacts:
         return out
 
     @ti.func
+    def is_pulled(self, i):
+        """Whether a wall pulls particle i until the next pass."""
+        return self.struck[i] == STRUCK_BEFORE and self.pushed[i] < 0
+
+    @ti.func
+    def release(self, i):
+        """Return how far particle i will move as the wall that pulls it lets go, or 0."""
+        out = 0 * self.normal[i]
+        if self.is_pulled(i):
+            out = -self.pushed[i] * self.normal[i]
+        return out
+
+    @ti.func
     def wall_change(self, i):
         """Return how far a wall that it struck has changed the displacement of particle i."""
         out = 0 * self.normal[i]
@@ -269,12 +285,16 @@ class BodyImpacts:
             self.target[i] = ti.min(self.target[i], 0)
 
     @ti.func
-    def correct_push(self, i):
+    def correct_push(self, i, now):
         """Push particle i, which struck a wall, to its target, or correct the push. Returns whether constraints have to follow.
 
         Where they are solved exactly, they have taken into account that the wall holds it, if the wall held it before.
         """
-        off = False
+        off = self.is_pulled(i)
+        if off:
+            self.log_push(i, self.release(i))
+            self.move(i, self.release(i))
+            self.pushed[i] = ti.zero(self.pushed[i])
         if self.in_cluster(i):
             if ti.static(self.bends):
                 if self.struck[i] == STRUCK_BEFORE:  # it turns in a substep: second order is left
@@ -286,23 +306,32 @@ class BodyImpacts:
             pushed, change = ti.max(last + miss, 0), ti.max(miss, -last) * n
             if self.struck[i] == STRUCK_NOW:  # another wall may have pushed it meanwhile
                 pushed, change = self.first_push[i], miss * n
+            elif ti.static(self.exact):
+                if last > 0 and self.has_next_pass(now):
+                    pushed, change = last + miss, miss * n
             self.struck[i] = STRUCK_BEFORE
             self.pushed[i] = pushed
-            off = (pushed > 0) != (last > 0)
+            off = off or (pushed > 0) != (last > 0)
             if ti.static(not self.exact) or self.target[i] > 0:
                 off = off or ti.abs(miss) > ti.static(MET) * self.first_push[i]
             self.log_push(i, change)
             held = self.held[i] + d - d.dot(n) * n
             size = held.norm()
-            if size > self.coefficients[i][0] * pushed:
-                held *= self.coefficients[i][1] * pushed / size
+            support = ti.max(pushed, 0)
+            if size > self.coefficients[i][0] * support:
+                held *= self.coefficients[i][1] * support / size
             change -= held - self.held[i]
             self.held[i] = held
-            self.state.shift(i, change)
+            self.move(i, change)
             self.reached[i] = 1
-            if ti.static(self.state.keeps_wall_push):
-                self.state.wall_push[i] = self.state.wall_push[i] + change
         return off
+
+    @ti.func
+    def move(self, i, change):
+        """Move particle i as a wall does."""
+        self.state.shift(i, change)
+        if ti.static(self.state.keeps_wall_push):
+            self.state.wall_push[i] = self.state.wall_push[i] + change
 
     @ti.func
     def log_push(self, i, change):

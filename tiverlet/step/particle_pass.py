@@ -276,7 +276,7 @@ class ParticlePass:
         for impacts in ti.static(self.impacts):
             if now.it >= now.span.iterations:
                 for i in range(begin, end):
-                    if impacts.correct_push(i):
+                    if impacts.correct_push(i, now):
                         impacts.request_pass(now)
         if ti.static(len(self.walls) > 0 and self.few):
             for i in range(begin, end):
@@ -294,7 +294,7 @@ class ParticlePass:
             for i in range(begin, end):
                 if impacts.is_struck_now(i):
                     if now.it + 1 >= now.span.iterations:
-                        impacts.correct_push(i)
+                        impacts.correct_push(i, now)
                     impacts.request_pass(now)
                 if ti.static(impacts.pairs):
                     if now.it < now.span.iterations and impacts.parts[i] > 0:

@@ -269,6 +269,9 @@ class CornerPasses(Passes):
                             out -= g[k, :].dot(self.impacts.wall_change(self.corners.member(c, k)))
                     self.left[c] = out
                 out = self.left[c]
+            if ti.static(self.impacts.exact):
+                for k in ti.static(range(self.arity)):  # walls that pull are about to let go
+                    out -= g[k, :].dot(self.impacts.release(self.corners.member(c, k)))
         return out
 
     @ti.func
