@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ..contact.impact_projection import ROUNDS as LANDING_ROUNDS
 from ..contact.projection_times import ALWAYS, due
 from ..contact.velocity_projection import PASSES, RINGS
-from ..device import called, runtime, ti
+from ..device import called, called_rarely, runtime, ti
 from ..device.number import OnDevice, read_all
 from ..device.thread_team import LEAST, Team
 from ..features.feature import Batch, Scene
@@ -557,7 +557,7 @@ class Step:
         """One round of the impacts of discs."""
         self.push_struck_discs(now.thread, now.it)
 
-    @called
+    @called_rarely
     @ti.func
     def push_struck_discs(self, thread: ti.i32, it: ti.i32):
         """One round of project_discs()."""
@@ -578,7 +578,7 @@ class Step:
         """One round of the impacts of bodies."""
         self.push_struck_bodies(now.thread, now.it, now.tick)
 
-    @called
+    @called_rarely
     @ti.func
     def push_struck_bodies(self, thread: ti.i32, it: ti.i32, tick: ti.i32):
         """One round of project_bodies()."""
@@ -599,7 +599,7 @@ class Step:
         """One of these rounds."""
         self.find_projected(now.thread, now.it, self.rounds(now), now.damps)
 
-    @called
+    @called_rarely
     @ti.func
     def find_projected(self, thread: ti.i32, it: ti.i32, rounds: ti.i32, damps: ti.i32):
         """One round of find_projected_contacts()."""
@@ -610,7 +610,7 @@ class Step:
         """Damp sound in loaded contacts."""
         self.damp_sound(now.thread, now.it)
 
-    @called
+    @called_rarely
     @ti.func
     def damp_sound(self, thread: ti.i32, it: ti.i32):
         """One pass of project_contact_velocities()."""
