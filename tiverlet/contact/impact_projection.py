@@ -252,19 +252,13 @@ class ImpactProjection:
     @ti.func
     def relax(self, i, k):
         """Compute pass k for particle i: the change of its displacement, and of its position alone."""
-        if ti.static(self.lifts == 0):
-            self.find_change(i, k, True, True)
-        elif k < self.passes:
-            self.find_change(i, k, True, False)
-        else:
-            self.find_change(i, k, False, True)
-
-    @ti.func
-    def find_change(self, i, k, velocities: ti.template(), positions: ti.template()):  # type: ignore[valid-type]
-        """Compute the changes of particle i in pass k: of its displacement, of its position alone, or both."""
+        # Without `lifts` all passes are of both.
+        velocities, positions = True, True
+        if ti.static(self.lifts > 0):
+            velocities, positions = k < self.passes, k >= self.passes
         want, first, w = ti.zero(self.state.d[i]), self.list.first[i], self.w.of(i)
         lift, again, gain = want, ti.zero(w), ti.zero(w)
-        if ti.static(velocities):
+        if velocities:
             again = self.factors[k] - 1
             gain = self.factors[k] * ti.static(2 / (1 + 1 / self.condition))
         for m in range(first, first + self.number[i]):
@@ -276,9 +270,9 @@ class ImpactProjection:
             if length > 0:
                 shared = self.split[i] + ti.select(self.ring[j] != 0, self.split[j], self.weight[j])
                 push = w / (shared * length) * r
-                if ti.static(positions):
+                if positions:
                     lift += ti.max(self.geometry.contact_distance(i, j) - length - self.push.old[m], 0) * push
-                if ti.static(velocities):
+                if velocities:
                     if listed >= 0:
                         apart = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(r) / length
                         want -= apart * push
@@ -288,9 +282,10 @@ class ImpactProjection:
                             self.events.record(i, j, e, r / length, self.given.field[e], 0)
         self.move[i] = gain * self.state.across_walls(i, want) + again * self.move[i]
         self.lift[i] = ti.static(RELAXATION) * self.state.across_walls(i, lift)
-        if ti.static(velocities and len(self.wall_logs) > 0):
-            self.free[i] = gain * want + ti.select(k == 0, 0 * want, again * self.free[i])
-            self.report_walls(i, self.move[i] - self.free[i])
+        if ti.static(len(self.wall_logs) > 0):
+            if velocities:
+                self.free[i] = gain * want + ti.select(k == 0, 0 * want, again * self.free[i])
+                self.report_walls(i, self.move[i] - self.free[i])
 
     @ti.func
     def report_walls(self, i, push):
