@@ -91,7 +91,8 @@ class Contact(PairContact):
 
     Several impacts of one disc in a substep are resolved one after the other. A round takes the struck pairs that come first
     for both of their particles; the next round takes the next pairs, on the new paths. Each impact is between two particles, so
-    it conserves momentum, and energy if e = 1, however many impacts there are.
+    it conserves momentum, and energy if e = 1, however many impacts there are. Unless e > 0.97, what touches others when a wall
+    strikes it leaves the wall with them, see ImpactProjection.
 
     Slack is the overlap left after an impact. It is not pushed out, which would add energy, because pushes act like springs and
     no spring was there when the pair was thrown together. It is removed from positions only, an eighth per substep. Other overlap
@@ -216,7 +217,7 @@ class Contact(PairContact):
         dev.landing = None
         if self.lands:
             dev.landing = ImpactProjection(
-                scene, dev.geometry, dev.push, dev.splitting, dev.move, reported, given, dev.projection.ring
+                scene, dev.geometry, dev.push, dev.splitting, dev.move, reported, given, dev.projection.ring, dev.restitution
             )
         dev.once = self._solves_once(scene, team)
         return dev.search
@@ -343,6 +344,9 @@ class Contact(PairContact):
                 if ti.static(self.dev.has_restitution):
                     impact, slack, rests = self.bounce(pair, now)
                     overlap -= self.dev.restitution.remove_slack(pair, slack, own, now)
+                    if ti.static(bool(self.dev.landing)):
+                        if rests and now.first != 0:
+                            self.dev.landing.note(pair, now.h)
                 part = self.added_push(pair, overlap, before, own)
                 if ti.static(self.dev.has_restitution):
                     impact = self.dev.restitution.strike(pair, impact, own)
@@ -444,7 +448,7 @@ class Contact(PairContact):
                 self.dev.projection.note_pair(pair.i, pair.j, pair.n, pair.overlap, borne)
                 if pair.other >= 0:
                     self.dev.projection.note_pair(pair.j, pair.i, -pair.n, pair.overlap, borne)
-        if ti.static(bool(self.dev.landing)):
+        if ti.static(bool(self.dev.landing) and not self.dev.has_restitution):
             if now.first != 0:
                 self.dev.landing.note(pair, now.h)
 

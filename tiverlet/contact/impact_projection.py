@@ -1,8 +1,9 @@
-"""Impacts of discs without restitution: what is struck goes on with what it presses, and no overlap is left to throw it back."""
+"""Impacts of discs that touch others: what is struck goes on with what it presses, and no overlap is left to throw it back."""
 
 from typing import TYPE_CHECKING, Any
 
 from ..device import ti
+from ..features.material import RESTITUTION
 from .eigenvalues import chebyshev, largest
 
 if TYPE_CHECKING:
@@ -14,12 +15,17 @@ if TYPE_CHECKING:
 FALL = 0.25  # a pair is struck if it closes as after a fall by this share of the distance of its centers,
 SLOW = 8.0  # and if it closes by more than so many substeps of forces
 AROUND = 2  # how many contacts away from a struck pair others are projected, too
-STRUCK = AROUND + 1  # ring of a struck particle; those around it have lower ones, down to 1, and all others 0
 PASSES = 12
 CONDITION = 36.0  # modes with an eigenvalue of at least 1 / CONDITION keep 1 / T(PASSES) = 4 % of their velocity
+# The same around what bounces off a wall, with 0.3 % left of the velocity of these modes. A column of FAR_AROUND has them all.
+FAR_AROUND, MANY_PASSES, LARGE_CONDITION = 16, 64, 400.0
+LIFTS = 32  # passes of positions there
+GAP = 2.0**-10  # of the distance of their centers: particles this close touch
+PARTED = 1 / 64  # of the velocity with which they close after an impact: particles that parted faster before it did not touch
+ELASTIC = 31 / 32  # restitution above which pairs bounce one after the other
+BY_PAIR, BY_WALL = 1, 2  # what struck a particle
 RELAXATION = 1.6  # of the passes that take back overlap; below 2
 LEFT = 2.0**-6  # of the overlap of a struck pair, so that it still touches
-ROUNDS = 1 + AROUND + 1 + PASSES  # find what is struck, then what is around it, list pairs, and the passes
 
 
 class ImpactProjection:
@@ -45,22 +51,43 @@ class ImpactProjection:
         s > SLOW f    and    s^2 > FALL (r_i + r_j) f,    f = h^2 (|a_i| + |a_j|),
 
     for accelerations a by forces. Under gravity that is a fall by FALL (r_i + r_j). So nothing is struck in a pile at rest.
-    Particles of constraints take no part, because constraints would not know of it. Worlds with restitution have no such
-    projection, see Restitution.
+    Particles of constraints take no part, because constraints would not know of it.
+
+    Restitution. Pairs and walls bounce one after the other, see Restitution. What a wall strikes may have others on it, which
+    strike it in turn, and so on without end. So if a wall strikes a particle, by the same measure, that touched another as the
+    substep began, and now closes with it, all that touches, up to FAR_AROUND contacts away, is struck at the same time. By
+    Newton's law each contact is left with -e times its velocity:
+
+        u_wall' = -e u_wall,    u_pair' = -e 0 = 0.
+
+    So a column leaves the floor as a whole, with e times its speed. The impulses p give it the energy sum p . (u + u') / 2,
+    which is p (1 - e) u_wall / 2 < 0 at the wall and 0 in pairs. Pairs that parted before, or are more than GAP apart, bounce one
+    after the other. So do nearly elastic pairs, e > ELASTIC: the wall takes hardly any energy from them, and errors in u_pair
+    could give them more. A pair that does not bounce, but rests with its slack, is struck as above if it closes fast and e > 0.
+    At e = 0, among others that bounce, it is left to the pass: that has friction, and these have none.
+
+    Many passes find these displacements before others take back overlap. Together, positions would turn the normals in which
+    masses are split; eigenvalues exceed 1 by a few %, and the polynomial of 64 passes multiplies such modes by 1000.
 
     struck, any_struck: whether each particle, and any, was struck in this substep. ring: a scratch field, (n,): the ring of each
     particle around those that were struck. near: the particles in rings, `count` of them; `size` is the count that all threads
-    read. Their order depends on threads, but no result does. events, given: the log of pairs that reports impulses, or None, and
-    for it the push of a pair in a pass [kg m]. wall_logs, free: those of walls, and for them how far a pass would move each
-    particle without walls [m].
+    read. Their order depends on threads, but no result does. restitution: the Restitution of the pairs, or None. events, given:
+    the log of pairs that reports impulses, or None, and for it the push of a pair in a pass [kg m]. wall_logs, free: those of
+    walls, and for them how far a pass would move each particle without walls [m].
     """
 
     wall_logs: "list[WallLog]"
 
     def __init__(
         self, scene: "Scene", geometry: Any, push: "PairData", splitting: "MassSplitting", move: Any, events: Any,
-        given: "PairData", ring: Any,
+        given: "PairData", ring: Any, restitution: Any,
     ):  # fmt: skip
+        self.restitution, self.has_restitution, self.bounces = restitution, restitution is not None, scene.bounces
+        self.around, self.passes, self.lifts, self.condition, self.gap = AROUND, PASSES, 0, CONDITION, 0.0
+        if self.bounces:
+            self.around, self.passes, self.lifts, self.condition, self.gap = FAR_AROUND, MANY_PASSES, LIFTS, LARGE_CONDITION, GAP
+        # Find what is struck, then what is around it, list pairs, and the passes.
+        self.rounds = 1 + self.around + 1 + self.passes + self.lifts
         self.events, self.given = events, given
         self.state, self.w, self.slots = scene.state, scene.state.w, scene.slots
         self.geometry, self.list, self.push, self.move = geometry, geometry.list, push, move
@@ -72,7 +99,7 @@ class ImpactProjection:
         self.any_struck, self.count, self.size = (add(f"landing.{k}", None, kind=ti.i32) for k in ("any_struck", "count", "size"))
         self.struck, self.ring = add("landing.struck", n, kind=ti.i32), ring
         self.lift, self.split = add("landing.lift", n, width=scene.particles.dim), add("landing.split_mass", n)
-        self.factors = add("landing.chebyshev", PASSES, values=chebyshev(PASSES, CONDITION))
+        self.factors = add("landing.chebyshev", self.passes, values=chebyshev(self.passes, self.condition))
 
     def report_to(self, scene: "Scene", wall_logs: "list[WallLog]") -> None:
         """Report to the logs of walls what these take up. Call it before fields are placed."""
@@ -88,10 +115,53 @@ class ImpactProjection:
             closes = -self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(pair.n)
             forced = h * h * (self.own_weight.field[i] + self.own_weight.field[j])
             falls = closes * closes > ti.static(FALL) * self.geometry.contact_distance(i, j) * forced
-            if falls and closes > ti.static(SLOW) * forced and self.is_loose(i) and self.is_loose(j):
-                self.struck[i] = self.any_struck[None] = 1
+            loose = self.is_loose(i) and self.is_loose(j) and self.is_inelastic(i, j)
+            if falls and closes > ti.static(SLOW) * forced and loose:
+                self.struck[i] = self.any_struck[None] = BY_PAIR
                 if pair.other >= 0 or not self.w.positive(j):
-                    self.struck[j] = 1
+                    self.struck[j] = BY_PAIR
+
+    @ti.func
+    def note_bounce(self, i, h):
+        """At the end of a substep h [s]: note whether a wall struck particle i, which now closes with one that it touched."""
+        blow, forced = self.state.wall_push[i].norm(), h * h * self.own_weight.field[i]
+        falls = blow * blow > ti.static(FALL) * self.geometry.contact_distance(i, i) * forced
+        if falls and blow > ti.static(SLOW) * forced and self.is_loose(i):
+            for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
+                j = self.list.neighbour[e]
+                r, distance = self.state.separation(i, j), ti.static(1 + GAP) * self.geometry.contact_distance(i, j)
+                way = self.state.place(i) - self.state.begin(i) - (self.state.place(j) - self.state.begin(j))
+                start = r - self.state.relative_displacement(way, i, j)
+                moved = self.state.d[i] - self.state.d[j]
+                came = moved - (self.state.wall_push[i] - self.state.wall_push[j])
+                closes = -self.state.relative_displacement(moved, i, j).dot(r)
+                parted = self.state.relative_displacement(came, i, j).dot(r)
+                if start.dot(start) < distance * distance and parted < ti.static(PARTED) * closes:
+                    if closes > 0.5 * blow * distance and self.joins(i, j):
+                        self.struck[i] = self.any_struck[None] = BY_WALL
+
+    @ti.func
+    def is_elastic(self, i, j):
+        """Whether particles i and j lose hardly any energy in an impact."""
+        out = False
+        if ti.static(self.has_restitution):
+            out = self.restitution.table.of(i, j)[RESTITUTION] > ti.static(ELASTIC)
+        return out
+
+    @ti.func
+    def is_inelastic(self, i, j):
+        """Whether a pair that closes fast is struck. Among pairs that bounce, those without restitution are not, see above."""
+        out = True
+        if ti.static(self.has_restitution):
+            e = self.restitution.table.of(i, j)[RESTITUTION]
+            out = e > 0 and e <= ti.static(ELASTIC)
+        return out
+
+    @ti.func
+    def joins(self, i, j):
+        """Whether particle j takes part in what strikes particle i, if they touch."""
+        pushes = self.geometry.pushes(i, j) != 0
+        return pushes and self.state.awake(j) and self.is_loose(j) and not self.is_elastic(i, j)
 
     @ti.func
     def is_loose(self, i):
@@ -111,19 +181,20 @@ class ImpactProjection:
     def begin(self, i):
         """Put particle i into the first ring if it was struck, else into none."""
         self.ring[i] = 0
-        if self.struck[i] != 0:
-            self.struck[i] = 0
-            self.take(i, ti.static(STRUCK))
+        if self.struck[i] == BY_WALL:
+            self.take(i, self.around + 1)
+        elif self.struck[i] == BY_PAIR:
+            self.take(i, AROUND + 1)
 
     @ti.func
     def find(self, i, k):
         """Do round k > 0 of particle i, which is in a ring: find those around it, then its pairs, then its changes."""
-        if k <= AROUND:
-            self.spread(i, STRUCK + 1 - k)
-        elif k == AROUND + 1:
+        if k <= self.around:
+            self.spread(i, self.around + 2 - k)
+        elif k == self.around + 1:
             self.list_pairs(i)
         else:
-            self.relax(i, k - AROUND - 2)
+            self.relax(i, k - self.around - 2)
 
     @ti.func
     def spread(self, i, ring):
@@ -131,8 +202,8 @@ class ImpactProjection:
         if self.ring[i] == ring and self.state.moves(i):
             for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
                 j = self.list.neighbour[e]
-                r, distance = self.state.separation(i, j), self.geometry.contact_distance(i, j)
-                if r.dot(r) < distance * distance and self.state.awake(j) and self.is_loose(j):
+                r, distance = self.state.separation(i, j), ti.static(1 + self.gap) * self.geometry.contact_distance(i, j)
+                if r.dot(r) < distance * distance and self.joins(i, j):
                     self.take(j, ring - 1)
 
     @ti.func
@@ -149,14 +220,16 @@ class ImpactProjection:
             r, distance, push = self.state.separation(i, j), self.geometry.contact_distance(i, j), self.push.field[e]
             moved = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j)
             length = r.norm()
-            if length > 0 and (length < distance or push > 0):
+            near = ti.static(self.gap) * distance
+            touches = length > 0 and (length < distance + near or push > 0)
+            if touches and self.geometry.pushes(i, j) != 0 and not self.is_elastic(i, j):
                 overlap, listed = distance - length, ~e
                 kept = ti.min(ti.max(distance - (r - moved).norm(), 0), ti.max(overlap, 0))
-                if self.ring[j] != 0 and (overlap > 0 or push > 0):
-                    if self.ring[i] == STRUCK and self.ring[j] == STRUCK:
+                if self.ring[j] != 0:
+                    if self.struck[i] == BY_PAIR and self.struck[j] == BY_PAIR:
                         listed, kept, self.push.field[e] = e, ti.static(LEFT) * ti.max(overlap, 0), ti.zero(kept)
                         self.splitting.invalidate_bound(i)
-                    elif moved.dot(r) < length * ti.max(overlap, (w + self.w.of(j)) * push):
+                    elif moved.dot(r) < length * self.least_way(i, e, ti.max(overlap, near, (w + self.w.of(j)) * push)):
                         listed = e
                 normals += r.outer_product(r) / (length * length)
                 self.list.old_neighbour[at], self.push.old[at] = listed, kept
@@ -166,11 +239,28 @@ class ImpactProjection:
         self.split[i] = ti.max(self.weight[i], w * largest(normals))
 
     @ti.func
+    def least_way(self, i, e, overlap):
+        """Return how far the pair at entry e of particle i comes apart in a substep, at least, if it parts [m].
+
+        It is this overlap, as pushes take back. A pair that bounced parts however slow it is.
+        """
+        if ti.static(self.has_restitution):
+            if self.restitution.weight[i] > 0 and self.restitution.struck.field[e] != 0:
+                overlap = ti.zero(overlap)
+        return overlap
+
+    @ti.func
     def relax(self, i, k):
         """Compute pass k for particle i: the change of its displacement, and of its position alone."""
+        # Without `lifts` all passes are of both.
+        velocities, positions = True, True
+        if ti.static(self.lifts > 0):
+            velocities, positions = k < self.passes, k >= self.passes
         want, first, w = ti.zero(self.state.d[i]), self.list.first[i], self.w.of(i)
-        lift, again = want, self.factors[k] - 1
-        gain = self.factors[k] * ti.static(2 / (1 + 1 / CONDITION))
+        lift, again, gain = want, ti.zero(w), ti.zero(w)
+        if velocities:
+            again = self.factors[k] - 1
+            gain = self.factors[k] * ti.static(2 / (1 + 1 / self.condition))
         for m in range(first, first + self.number[i]):
             listed = self.list.old_neighbour[m]
             e = ti.max(listed, ~listed)
@@ -180,19 +270,22 @@ class ImpactProjection:
             if length > 0:
                 shared = self.split[i] + ti.select(self.ring[j] != 0, self.split[j], self.weight[j])
                 push = w / (shared * length) * r
-                lift += ti.max(self.geometry.contact_distance(i, j) - length - self.push.old[m], 0) * push
-                if listed >= 0:
-                    apart = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(r) / length
-                    want -= apart * push
-                    if ti.static(bool(self.events)):
-                        given = ti.select(k == 0, 0 * gain, again * self.given.field[e])
-                        self.given.field[e] = given - gain * apart / shared
-                        self.events.record(i, j, e, r / length, self.given.field[e], 0)
+                if positions:
+                    lift += ti.max(self.geometry.contact_distance(i, j) - length - self.push.old[m], 0) * push
+                if velocities:
+                    if listed >= 0:
+                        apart = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(r) / length
+                        want -= apart * push
+                        if ti.static(bool(self.events)):
+                            given = ti.select(k == 0, 0 * gain, again * self.given.field[e])
+                            self.given.field[e] = given - gain * apart / shared
+                            self.events.record(i, j, e, r / length, self.given.field[e], 0)
         self.move[i] = gain * self.state.across_walls(i, want) + again * self.move[i]
         self.lift[i] = ti.static(RELAXATION) * self.state.across_walls(i, lift)
         if ti.static(len(self.wall_logs) > 0):
-            self.free[i] = gain * want + ti.select(k == 0, 0 * want, again * self.free[i])
-            self.report_walls(i, self.move[i] - self.free[i])
+            if velocities:
+                self.free[i] = gain * want + ti.select(k == 0, 0 * want, again * self.free[i])
+                self.report_walls(i, self.move[i] - self.free[i])
 
     @ti.func
     def report_walls(self, i, push):
@@ -207,14 +300,17 @@ class ImpactProjection:
     @ti.func
     def apply(self, i, k):
         """Add the changes of particle i in round k. Returns whether that was the last round."""
-        if k > AROUND + 1:
+        last = k == self.rounds - 1
+        if k > self.around + 1:
             self.state.d[i] = self.state.d[i] + self.move[i]
             self.state.advance(i, self.lift[i])
-        return k == ROUNDS - 1
+        if last:
+            self.struck[i] = 0
+        return last
 
     @ti.func
     def end_round(self, k):
         """Tell all threads how many particles are near what was struck; after the last round, that there are none."""
         self.size[None] = self.count[None]
-        if k == ROUNDS - 1:
+        if k == self.rounds - 1:
             self.any_struck[None] = self.count[None] = 0

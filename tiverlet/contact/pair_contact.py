@@ -201,7 +201,7 @@ class PairContact(Feature):
     @property
     def lands(self) -> bool:
         """Whether single particles have inelastic impacts, see impact_projection.py."""
-        return self.projects and not self.has_restitution
+        return self.projects
 
     @property
     def shares_loads(self) -> bool:

@@ -154,6 +154,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         scene.radius = Radii(memory, particles.radius, scene.count)
     surfaces = [*walls, *([contact] if contact else [])]
     has_friction, bounces = any(f.has_friction for f in surfaces), any(f.has_restitution for f in surfaces)
+    scene.bounces = bounces and bool(walls)
     solver = solver or (choose_solver(batches, scene) if scene.order == 2 else Direct())
     if (batches and solver.loads) or (contact and (contact.has_loads or contact.lands)):
         scene.own_weight = OwnWeight(scene)
@@ -179,7 +180,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     bodies = bool(search and contact and contact.dev.bodies)
     state.remember(
         memory,
-        has_friction or any(w.needs_start_position for w in walls) or (bounces and bool(walls)),
+        has_friction or any(w.needs_start_position for w in walls) or scene.bounces,
         bounces or bool(scene.impacts) or bodies,
         bounces,
         bool(contact and (contact.projects or bodies) and walls),

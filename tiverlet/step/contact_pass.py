@@ -26,8 +26,11 @@ class ContactPass:
         self.remembers = bool(contact) and (
             contact.has_friction or contact.has_restitution or contact.has_events or contact.shares_loads
         )
-        self.projects_velocities = bool(contact) and contact.projects
         self.projects_discs = bool(contact and contact.dev.landing)
+        self.closes_late = self.projects_discs and contact.dev.reports
+        self.notes_bounces = bool(contact and contact.dev.landing and contact.dev.landing.bounces)
+        self.remembers = self.remembers or self.notes_bounces
+        self.projects_velocities = bool(contact) and contact.projects
         self.projects_bodies = bool(contact and contact.dev.bodies)
         if self.has_restitution and team.launched:  # the host does not read whether any pair bounces in a round
             self.bounces = scene.memory.field("Contact.bounces", None, kind=ti.i32)
@@ -162,11 +165,18 @@ class ContactPass:
 
     @ti.func
     def finish_events(self, now):
-        """Record what sensors overlap, and at the end of a frame the pairs that touch."""
+        """Record what sensors overlap, and at the end of a frame the pairs that touch, unless discs may still land."""
         for c in ti.static(self.contacts):
             if ti.static(c.dev.events.senses):
                 for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                     c.dev.events.sense(i, now.final)
+            if ti.static(not self.closes_late):
+                self.close_events(now)
+
+    @ti.func
+    def close_events(self, now):
+        """At the end of a frame: record the pairs that touch. After that, no impulse can be added to a pair."""
+        for c in ti.static(self.contacts):
             n = self.n * now.final
             for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
                 c.dev.events.close(i)
@@ -180,6 +190,10 @@ class ContactPass:
                 for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
                     if c.dev.state.awake(i):
                         c.finish_substep(i, now)
+            if ti.static(self.notes_bounces):
+                for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
+                    if c.dev.state.awake(i):
+                        c.dev.landing.note_bounce(i, now.h)
             if ti.static(c.dev.has_events):
                 self.finish_events(now)
             self.team.wait()

@@ -24,6 +24,7 @@ class Launcher:
         self.halves, self.newton_steps, self.has_restitution = step.halves, step.newton_steps, step.has_restitution
         self.finishes, self.projects_velocities = step.finishes, step.projects_velocities
         self.projects_bodies, self.projects_discs = step.projects_bodies, step.projects_discs
+        self.landing_rounds, self.closes_late = step.landing_rounds, step.closes_late
         self.drives, self.constrains, self.touches, self.acts = map(
             bool, (step.drivers, step.batches, step.contacts, step.particles.acts)
         )
@@ -204,6 +205,12 @@ class Launcher:
         """Add one round of the impacts of discs, in a launch of its own."""
         self.flush()
         self.put(now.of(now.it, half=now.it * self.halves), "project_discs")
+
+    def close_events(self, now: Moment) -> None:
+        """Add this phase, in a launch of its own."""
+        self.flush()
+        self.put(now.of(0, half=self.last_half(now) - 1), "close_events")
+        self.flush()
 
     def has_struck_bodies(self, now: Moment) -> bool:
         """Whether bodies struck each other in this substep. The host has to wait for the answer."""

@@ -8,7 +8,6 @@ the integrator.
 
 from typing import TYPE_CHECKING, Any
 
-from ..contact.impact_projection import ROUNDS as LANDING_ROUNDS
 from ..contact.projection_times import ALWAYS, due
 from ..contact.velocity_projection import PASSES, RINGS
 from ..device import called, called_rarely, runtime, ti
@@ -91,8 +90,11 @@ def substep(do, now):
         if do.ends_substep(now) and do.has_struck_discs(now):
             do.list_what_touches(now)
             if do.ends_substep(now):
-                for k in range(LANDING_ROUNDS):
+                for k in range(do.landing_rounds):
                     do.project_discs(now.of(k))
+    if ti.static(do.closes_late):
+        if do.ends_substep(now):
+            do.close_events(now)
 
 
 @ti.data_oriented
@@ -132,6 +134,8 @@ class Step:
         self.newton_steps = 2 if scene.slots and scene.slots.refines else 1  # most of them in a pass
         self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
         self.projects_bodies, self.projects_discs = self.contact_pass.projects_bodies, self.contact_pass.projects_discs
+        self.closes_late = self.contact_pass.closes_late
+        self.landing_rounds = contact.dev.landing.rounds if self.projects_discs else 0
         if self.projects_discs:
             contact.dev.landing.report_to(scene, self.wall_logs)
         self.orients = self.state.spins and self.state.spin.orients
@@ -562,6 +566,12 @@ class Step:
     def push_struck_discs(self, thread: ti.i32, it: ti.i32):
         """One round of project_discs()."""
         self.contact_pass.project_discs(thread, it)
+
+    @ti.func
+    def close_events(self, now):
+        """At the end of a frame: record the pairs that touch."""
+        self.contact_pass.close_events(now)
+        self.team.wait()
 
     @ti.func
     def has_struck_bodies(self, now):
