@@ -190,7 +190,7 @@ class Contact(PairContact):
             pair_data.append(dev.events.touched)
         reported = dev.events if dev.reports else None
         given = PairData("landed", 0, persistent=False)
-        if self.lands and reported:
+        if self.lands and (reported or dev.has_friction):
             pair_data.append(given)
         dev.search = NeighbourSearch(scene, self._present_skin, linked, self.table, pair_data, team, dev.move)
         dev.list = dev.search.list
@@ -217,8 +217,9 @@ class Contact(PairContact):
         dev.landing = None
         if self.lands:
             dev.landing = ImpactProjection(
-                scene, dev.geometry, dev.push, dev.splitting, dev.move, reported, given, dev.projection.ring, dev.restitution
-            )
+                scene, dev.geometry, self.table, dev.push, dev.slip, dev.splitting, dev.move, reported, given,
+                dev.projection.ring, dev.restitution,
+            )  # fmt: skip
         dev.once = self._solves_once(scene, team)
         return dev.search
 

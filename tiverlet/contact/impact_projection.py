@@ -25,6 +25,7 @@ PARTED = 1 / 64  # of the velocity with which they close after an impact: partic
 ELASTIC = 31 / 32  # restitution above which pairs bounce one after the other
 BY_PAIR, BY_WALL = 1, 2  # what struck a particle
 RELAXATION = 1.6  # of the passes that take back overlap; below 2
+RUBS = 8  # passes of friction
 LEFT = 2.0**-6  # of the overlap of a struck pair, so that it still touches
 
 
@@ -63,8 +64,7 @@ class ImpactProjection:
     So a column leaves the floor as a whole, with e times its speed. The impulses p give it the energy sum p . (u + u') / 2,
     which is p (1 - e) u_wall / 2 < 0 at the wall and 0 in pairs. Pairs that parted before, or are more than GAP apart, bounce one
     after the other. So do nearly elastic pairs, e > ELASTIC: the wall takes hardly any energy from them, and errors in u_pair
-    could give them more. A pair that does not bounce, but rests with its slack, is struck as above if it closes fast and e > 0.
-    At e = 0, among others that bounce, it is left to the pass: that has friction, and these have none.
+    could give them more. A pair that does not bounce, but rests with its slack, is struck as above if it closes fast.
 
     Many passes find these displacements before others take back overlap. Together, positions would turn the normals in which
     masses are split; eigenvalues exceed 1 by a few %, and the polynomial of 64 passes multiplies such modes by 1000.
@@ -79,16 +79,18 @@ class ImpactProjection:
     wall_logs: "list[WallLog]"
 
     def __init__(
-        self, scene: "Scene", geometry: Any, push: "PairData", splitting: "MassSplitting", move: Any, events: Any,
-        given: "PairData", ring: Any, restitution: Any,
+        self, scene: "Scene", geometry: Any, table: Any, push: "PairData", slip: "PairData", splitting: "MassSplitting",
+        move: Any, events: Any, given: "PairData", ring: Any, restitution: Any,
     ):  # fmt: skip
         self.restitution, self.has_restitution, self.bounces = restitution, restitution is not None, scene.bounces
         self.around, self.passes, self.lifts, self.condition, self.gap = AROUND, PASSES, 0, CONDITION, 0.0
         if self.bounces:
             self.around, self.passes, self.lifts, self.condition, self.gap = FAR_AROUND, MANY_PASSES, LIFTS, LARGE_CONDITION, GAP
+        self.table, self.has_friction = table, table.has_friction and not scene.state.spins
+        self.rubs = RUBS if self.has_friction else 0
         # Find what is struck, then what is around it, list pairs, and the passes.
-        self.rounds = 1 + self.around + 1 + self.passes + self.lifts
-        self.events, self.given = events, given
+        self.rounds = 1 + self.around + 1 + self.passes + self.lifts + self.rubs
+        self.events, self.given, self.slip = events, given, slip
         self.state, self.w, self.slots = scene.state, scene.state.w, scene.slots
         self.geometry, self.list, self.push, self.move = geometry, geometry.list, push, move
         self.splitting, self.weight = splitting, splitting.weight
@@ -99,6 +101,8 @@ class ImpactProjection:
         self.any_struck, self.count, self.size = (add(f"landing.{k}", None, kind=ti.i32) for k in ("any_struck", "count", "size"))
         self.struck, self.ring = add("landing.struck", n, kind=ti.i32), ring
         self.lift, self.split = add("landing.lift", n, width=scene.particles.dim), add("landing.split_mass", n)
+        if self.has_friction:
+            self.lifted = add("landing.lifted", n, width=scene.particles.dim)
         self.factors = add("landing.chebyshev", self.passes, values=chebyshev(self.passes, self.condition))
 
     def report_to(self, scene: "Scene", wall_logs: "list[WallLog]") -> None:
@@ -150,12 +154,8 @@ class ImpactProjection:
 
     @ti.func
     def is_inelastic(self, i, j):
-        """Whether a pair that closes fast is struck. Among pairs that bounce, those without restitution are not, see above."""
-        out = True
-        if ti.static(self.has_restitution):
-            e = self.restitution.table.of(i, j)[RESTITUTION]
-            out = e > 0 and e <= ti.static(ELASTIC)
-        return out
+        """Whether a pair that closes fast, and rests, is struck."""
+        return not self.is_elastic(i, j)
 
     @ti.func
     def joins(self, i, j):
@@ -193,8 +193,10 @@ class ImpactProjection:
             self.spread(i, self.around + 2 - k)
         elif k == self.around + 1:
             self.list_pairs(i)
-        else:
+        elif k < self.rounds - self.rubs:
             self.relax(i, k - self.around - 2)
+        elif ti.static(self.has_friction):
+            self.rub(i)
 
     @ti.func
     def spread(self, i, ring):
@@ -236,6 +238,8 @@ class ImpactProjection:
                 at += 1
         self.number[i] = at - first
         self.move[i] = ti.zero(self.state.d[i])
+        if ti.static(self.has_friction):
+            self.lifted[i] = ti.zero(self.state.d[i])
         self.split[i] = ti.max(self.weight[i], w * largest(normals))
 
     @ti.func
@@ -271,21 +275,62 @@ class ImpactProjection:
                 shared = self.split[i] + ti.select(self.ring[j] != 0, self.split[j], self.weight[j])
                 push = w / (shared * length) * r
                 if positions:
-                    lift += ti.max(self.geometry.contact_distance(i, j) - length - self.push.old[m], 0) * push
+                    deep = ti.max(self.geometry.contact_distance(i, j) - length - self.push.old[m], 0)
+                    lift += deep * push
+                    if ti.static(self.has_friction):
+                        if self.ring[j] != 0:
+                            slip = self.state.relative_displacement(self.lifted[i] - self.lifted[j], i, j)
+                            lift -= w / self.split_by_number(i, j) * self.table.held(i, j, r / length, deep, slip)
                 if velocities:
                     if listed >= 0:
                         apart = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j).dot(r) / length
                         want -= apart * push
-                        if ti.static(bool(self.events)):
-                            given = ti.select(k == 0, 0 * gain, again * self.given.field[e])
-                            self.given.field[e] = given - gain * apart / shared
-                            self.events.record(i, j, e, r / length, self.given.field[e], 0)
+                        if ti.static(self.has_friction or bool(self.events)):
+                            given = ti.select(k == 0, 0 * gain, again * self.given.field[e]) - gain * apart / shared
+                            self.given.field[e] = given
+                            self.note_push(i, j, e, given, r / length, k)
         self.move[i] = gain * self.state.across_walls(i, want) + again * self.move[i]
         self.lift[i] = ti.static(RELAXATION) * self.state.across_walls(i, lift)
         if ti.static(len(self.wall_logs) > 0):
             if velocities:
                 self.free[i] = gain * want + ti.select(k == 0, 0 * want, again * self.free[i])
                 self.report_walls(i, self.move[i] - self.free[i])
+
+    @ti.func
+    def note_push(self, i, j, e, given, n, k):
+        """Note what pass k pushed the pair at entry e along n [kg m]: friction and the log of events need it."""
+        if ti.static(self.has_friction):
+            self.slip.old[e] = ti.select(k == 0, 0 * n, self.slip.old[e]) + given * n
+        if ti.static(bool(self.events)):
+            self.events.record(i, j, e, n, given, 0)
+
+    @ti.func
+    def split_by_number(self, i, j):
+        """Return the inverse mass of a pair, with masses split by the number of pairs, so that pushes may have any direction."""
+        return self.w.of(i) * self.number[i] + self.w.of(j) * self.number[j]
+
+    @ti.func
+    def rub(self, i):
+        """Compute a pass of friction for particle i: pairs that go on together do so across n, too, as far as friction holds."""
+        want, first, w = ti.zero(self.state.d[i]), self.list.first[i], self.w.of(i)
+        for m in range(first, first + self.number[i]):
+            e = self.list.old_neighbour[m]
+            if e >= 0:
+                j = self.list.neighbour[e]
+                r = self.state.separation(i, j)
+                length = r.norm()
+                if length > 0:
+                    n, shared, push = r / length, self.split_by_number(i, j), self.slip.old[e]
+                    pressed, moved = push.dot(n), self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j)
+                    after = (pressed - moved.dot(n) / shared) * n
+                    after -= self.table.held(i, j, n, ti.max(pressed, 0), moved / shared - push)
+                    self.slip.old[e] = after
+                    want += w * (after - push)
+                    if ti.static(bool(self.events)):
+                        self.events.record(i, j, e, n, after.dot(n) - pressed, 0)
+        self.move[i], self.lift[i] = self.state.across_walls(i, want), ti.zero(want)
+        if ti.static(len(self.wall_logs) > 0):
+            self.report_walls(i, self.move[i] - want)
 
     @ti.func
     def report_walls(self, i, push):
@@ -304,6 +349,8 @@ class ImpactProjection:
         if k > self.around + 1:
             self.state.d[i] = self.state.d[i] + self.move[i]
             self.state.advance(i, self.lift[i])
+            if ti.static(self.has_friction):
+                self.lifted[i] = self.lifted[i] + self.lift[i]
         if last:
             self.struck[i] = 0
         return last

@@ -2,8 +2,8 @@
 
 LLVM takes longer for one long function than for two of half its length. Kernels of small worlds compile longer than they run. So
 in these worlds, a function that is long and used in several places, or that runs once per frame, is compiled once and called. In
-large worlds it is copied into each place, unless few substeps need it: Taichi's simplifier, too, takes longer for a long function.
-In many copies of a world and on a GPU all functions are copied.
+large worlds it is copied into each place, unless few substeps need it, since Taichi's simplifier, too, takes longer for one long
+function. In many copies of a world and on a GPU all functions are copied.
 
 Everything here depends on the internals of Taichi 1.7.4; with another version, all functions are copied.
 """
