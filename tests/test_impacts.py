@@ -262,7 +262,7 @@ def test_struck_by_two_in_one_substep(world, dim):
     sides = rng.normal(size=(100, 2, dim))
     sides[:, 1] -= 1.2 * sides[:, 0]
     sides /= np.linalg.norm(sides, axis=2, keepdims=True)
-    x, v, mass = np.zeros((100, 3, dim)), rng.normal(size=(100, 3, dim)), rng.uniform(0.5, 2, size=(100, 3))
+    x, v, mass = np.zeros((100, 3, dim)), rng.normal(size=(100, 3, dim)), rng.uniform(0.5, 1.5, size=(100, 3))
     x[:, 0, 1] = 4.0 * np.arange(100)
     x[:, 1:] = x[:, :1] + sides * rng.uniform(1.0, 1.04, size=(100, 2, 1))
     v[:, 1:] -= sides * rng.uniform(10, 20, size=(100, 2, 1))
