@@ -85,7 +85,6 @@ add(5)
     assert copies[0][1] == copies[1][1] > 0
 
 
-@pytest.mark.slow
 def test_what_the_user_compiles_is_compiled_as_ever():
     # parts() assigns a vector to a variable that holds a number. Taichi's analysis finds that the variable is never read; without
     # it, LLVM ends the process. Only frames with such functions are analysed, which takes ten times as long with contacts.
@@ -262,7 +261,6 @@ def test_compiling_leaves_nothing_behind(world):
     assert not source_cache.active and gc.isenabled()
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(ARCH != "cpu" or not patched, reason="of the patches of Taichi on a CPU")
 def test_long_kernels_are_compiled_without_a_search_to_the_same_bits(world, monkeypatch):
     rods = [tv.Capsule((0.2 * k, 0.0), (0.2 * k, 1.0), 0.02, friction=0.3) for k in range(4)]

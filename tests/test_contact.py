@@ -191,7 +191,6 @@ def test_idle_columns_do_not_creep(world):
     assert tv.measure.kinetic_energy(w) <= 1e-6 * 9.81 * 0.5
 
 
-@pytest.mark.slow
 def test_idle_piles_do_not_creep(world):
     # Row 43: a settled pile with friction does not creep either: in 1e5 substeps only the last digits of coordinates change.
     k = np.arange(40)
