@@ -17,7 +17,6 @@ def triples(n: int) -> np.ndarray:
     return np.stack([k, k + 1, k + 2], axis=1)
 
 
-@pytest.mark.slow
 def test_rods_swing_through_straight_and_every_compliance_is_stable(world):
     # Row 56: an unsigned angle has a kink at straight. With the remembered side, a free rod moves in 3D as in 2D, without a
     # flag.
@@ -59,7 +58,6 @@ def test_rods_swing_through_straight_and_every_compliance_is_stable(world):
     np.testing.assert_array_equal(*ends)
 
 
-@pytest.mark.slow
 def test_a_crooked_rod_is_straightened_without_velocity_in_3d_as_in_2d(world):
     # Rods of rigid angles that start crooked by 0.2 rad are moved to where they are straight, at rest. If Newton's method may
     # bend a path across its plane at will, it ends at 5e-3 rad, and passes make 0.06 m/s of the rest.

@@ -139,7 +139,7 @@ def test_what_falls_on_something_lighter_stays_there(world, precision):
     columns = [[1.0, 2.5], [1.0, 10.0], [1.0, 100.0], [1.0] * 10 + [10.0], [1.0] * 3 + [30.0]]
     for mass in columns:
         for height in np.linspace(0.35, 0.65, 5):
-            y = r + 2 * r * np.arange(len(mass))
+            y = r + 2 * r * (1 + 1e-6) * np.arange(len(mass))  # no overlap by rounding, which would compile other kernels
             y[-1] += height
             start = tv.Particles(np.stack([np.full(len(y), 5.0), y], axis=1), radius=r, mass=mass)
             w = smooth(world, start, precision=precision, substeps=8)
@@ -191,7 +191,6 @@ def test_idle_columns_do_not_creep(world):
     assert tv.measure.kinetic_energy(w) <= 1e-6 * 9.81 * 0.5
 
 
-@pytest.mark.slow
 def test_idle_piles_do_not_creep(world):
     # Row 43: a settled pile with friction does not creep either: in 1e5 substeps only the last digits of coordinates change.
     k = np.arange(40)

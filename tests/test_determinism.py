@@ -216,7 +216,9 @@ def test_what_is_absent_has_no_field_and_no_kernel(world):
 
 @pytest.mark.slow
 def test_launches_count_what_the_scene_needs(world):
-    # Kernel launches of a frame, counted at Taichi's entry point: one on a CPU; otherwise one per pass of a substep.
+    # Kernel launches of a frame, counted at Taichi's entry point: one on a CPU; otherwise one per pass of a substep. There are as
+    # many particles as in the next test, which uses the kernels again.
+    x = np.array([[0.0, 0.0], [1.0, 0.0], *([0.5 * k, 5.0] for k in range(198))])
     for features, path, expected in (
         ([tv.Gravity(1.0)], "launched", {"integrate": 5, "measure": 1}),
         ([tv.Gravity(1.0), tv.Distance([[0, 1]])], "launched", {f"integrate {PASS}": 5, PASS: 5, "measure": 1}),
@@ -238,7 +240,7 @@ def test_launches_count_what_the_scene_needs(world):
         ([tv.Gravity(1.0), tv.Distance([[0, 1]])], "parallel" if cores() > 1 else "fused", {"fused": 1}),
         ([tv.Gravity(1.0), tv.Distance([[0, 1]])], "fused", {"fused": 1}),
     ):
-        w = world(tv.Particles([[0.0, 0], [1, 0]], radius=0.1), features, path=path, substeps=5, iterations=2)
+        w = world(tv.Particles(x, radius=0.1), features, path=path, substeps=5, iterations=2)
         w.step(0.01)
         w.step(0.01)
         with counting.launches() as count:

@@ -23,7 +23,7 @@ def heap(with_large: bool):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("options", [{"friction": 0.4}, {"friction": 0.4, "loads": True}], ids=str)
-def test_pairs_solved_once_have_the_bits_of_pairs_solved_from_both_sides(world, monkeypatch, options):
+def test_pairs_solved_once_have_the_bits_of_pairs_solved_from_both_sides(world, monkeypatch, briefly, options):
     # The push on j is the opposite of that on i to the bit, and pushes are added up in the order of the list either way. Loads
     # are learnt in windows of 128 substeps, so there are 140. Lists of large discs need a second word of bits.
     states = []

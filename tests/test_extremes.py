@@ -106,7 +106,6 @@ def test_18_a_whip_asks_for_more_substeps(world):
     assert "turned" in report.flags and "more substeps" in " ".join(report.notes)
 
 
-@pytest.mark.slow
 def test_36_nothing_and_almost_nothing(world):
     one = [[1.0, 2.0]]
     for x, path in ((np.zeros((0, 3)), "parallel"), (one, "fused")):

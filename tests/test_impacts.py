@@ -62,7 +62,6 @@ def test_head_on_collisions(world, dim, precision, limit):
         np.testing.assert_allclose(momentum, m1 * u1 + m2 * u2, rtol=limit)
 
 
-@pytest.mark.slow
 def test_blows_are_reported(world):
     # The impulses of all substeps add up to (1 + e) u / (w1 + w2), and each equals the change of the disc's momentum. The same
     # holds for a fixed disc, and for a disc that throws the next one onto a third in the same substep.
@@ -253,7 +252,6 @@ def by_events(x, v, mass, seconds):
     return x, v
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 def test_struck_by_two_in_one_substep(world, dim):
     # Two discs hit a third, which is thrown from one to the other, up to four impacts in one substep of 1/240 s. Each impact is
@@ -262,7 +260,7 @@ def test_struck_by_two_in_one_substep(world, dim):
     sides = rng.normal(size=(100, 2, dim))
     sides[:, 1] -= 1.2 * sides[:, 0]
     sides /= np.linalg.norm(sides, axis=2, keepdims=True)
-    x, v, mass = np.zeros((100, 3, dim)), rng.normal(size=(100, 3, dim)), rng.uniform(0.5, 2, size=(100, 3))
+    x, v, mass = np.zeros((100, 3, dim)), rng.normal(size=(100, 3, dim)), rng.uniform(0.5, 1.5, size=(100, 3))
     x[:, 0, 1] = 4.0 * np.arange(100)
     x[:, 1:] = x[:, :1] + sides * rng.uniform(1.0, 1.04, size=(100, 2, 1))
     v[:, 1:] -= sides * rng.uniform(10, 20, size=(100, 2, 1))
@@ -363,7 +361,6 @@ def test_a_moving_wall_drags_along(world):
     assert w.position[0, 0] == pytest.approx(3.5 + 9 / (2 * 0.5 * 9.81), rel=1e-2)
 
 
-@pytest.mark.slow
 def test_leaving_a_sphere(world):
     # R19: a point that slides off a smooth sphere leaves it at cos = 2/3.
     want = case("R19_sphere_departure")["values"]
@@ -422,7 +419,6 @@ def test_heaps_are_steeper_with_friction_and_flat_without(world, dim):
     assert 0.02 < slopes[0] < 0.5 * slopes[1], slopes
 
 
-@pytest.mark.slow
 def test_what_takes_over_a_state_goes_on_to_the_bit(world):
     # Also with other neighbour lists. test_sleep.py tests the paths.
     rng = np.random.default_rng(3)

@@ -89,7 +89,6 @@ def smooth(world, x, mass, pinned=(), high=(99.0, 99.0), **settings):
     return w
 
 
-@pytest.mark.slow
 def test_a_column_bears_what_is_above(world):
     # A contact bears the weight of all discs above it, and the ground bears all. Loads are exact to rounding; nothing overlaps.
     mass = 2.0 + np.arange(10) % 2
@@ -187,7 +186,6 @@ def test_the_floor_bears_the_weight(world):
     assert left == pytest.approx(right, abs=36 * G * 1e-4)
 
 
-@pytest.mark.slow
 def test_loads_are_gone_with_what_bore_them(world):
     # When the ground goes, all discs fall. The discs above get the loads of at most one more substep, k g h. Rows of five and
     # four lie in each other's gaps, where they are stable. Of heaps from a square lattice without friction, one in fifty keeps

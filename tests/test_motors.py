@@ -149,7 +149,6 @@ def test_hinges_in_space_turn_for_ever(world):
     assert (turn + 5.0 + np.pi) % (2 * np.pi) == pytest.approx(np.pi, abs=1e-6) and abs(motor.load[0]) < 1e-3
 
 
-@pytest.mark.slow
 def test_a_servo_goes_to_its_angle_and_stays(world):
     # A servo takes the shorter way, through pi. Under a load, one pass lags by at most the violation that bears it,
     # 2 w m g r h^2.

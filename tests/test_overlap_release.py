@@ -137,7 +137,6 @@ def test_ropes_in_a_heap_gain_none_either(world):
     assert w.last.energy == pytest.approx(rest, rel=1e-2)
 
 
-@pytest.mark.slow
 def test_what_is_taken_out_does_not_depend_on_lists(world):
     # A clone builds its own neighbour list. For other paths, which have their own lists, see test_determinism.py.
     w = pile(world, lattice(5, 2), 0.3, 0.0, 2)

@@ -100,7 +100,6 @@ def test_no_pair_is_missed_whichever_image_is_near(world, name):
         assert twin.hash() == w.hash()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("contact", [True, False])
 def test_queries_find_the_nearest_image(world, contact):
     rng, length = np.random.default_rng(1), np.array([4.0, 3.0])
@@ -196,7 +195,6 @@ def test_a_ring_around_the_box_swings_as_a_periodic_chain(world):
     np.testing.assert_allclose(w.position[:, 1], 0.5, atol=1e-12)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("rigid", [True, False])
 def test_a_closed_chain_with_bends_rests_as_it_was_put(world, rigid):
     # A chain straight around the box: all lengths and angles are met, also across the boundary, so only its centre moves.

@@ -400,7 +400,7 @@ def test_starts_from_velocities_that_were_read_change_nothing(world, name):
 @pytest.mark.parametrize(
     ("dim", "solver", "settings"),
     [
-        (2, tv.Chebyshev(), [(1, 1), (20, 8), (100, 1)]),  # a single pass of Chebyshev is one of Jacobi
+        (2, tv.Chebyshev(), [(20, 8), (100, 1)]),  # a single pass of Chebyshev is one of Jacobi
         (2, tv.ConjugateGradient(), [(1, 1)]),
         (3, tv.Direct(), [(100, 1)]),
     ],

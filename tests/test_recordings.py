@@ -552,7 +552,6 @@ def test_a_picture_that_is_told_to_end_ends_its_viewer(falling, tmp_path, monkey
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-@pytest.mark.slow
 def test_a_picture_without_a_window(falling, tmp_path, monkeypatch):
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))

@@ -94,7 +94,6 @@ def test_a_sweep_finds_second_order_and_first(report):
         assert report.advantage(case, CASES[case].methods[0], cost="visits")[1] >= 100
 
 
-@pytest.mark.slow
 def test_a_report_can_be_read_by_people_and_machines(report, tmp_path):
     data = json.loads(report.json())
     assert len(data["points"]) == len(report.points) and not data["failures"] and data["machine"]

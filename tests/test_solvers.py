@@ -83,7 +83,6 @@ def test_conjugate_gradients_reach_the_direct_solution(world):
     assert abs(many.last.energy) < 2e-3  # of m g L = 9.81: SHAKE neither gains nor loses
 
 
-@pytest.mark.slow
 def test_converged_cloth_from_soft_to_rigid(world):
     # Springs in the same system as rigid links: the static stretch is alpha F after one iteration.
     n = 6

@@ -134,6 +134,7 @@ def test_edits_of_other_engines_are_timed(engine):
     assert {*engine(100, 3)} <= {*waits.FIRST, *waits.AIMS}
 
 
+@pytest.mark.slow
 def test_pile_in_c_does_the_same(report):
     # Two schemes for one scene: the mean overlap depends on the scheme, but is of the same order.
     pile = report.run("pile", 41, 1)
@@ -169,6 +170,7 @@ def test_yardstick_is_left_out_without_a_compiler(monkeypatch, tmp_path):
     assert session.program is None and session.notes == [f"Left out: the yardstick pile.c, since {why}."]
 
 
+@pytest.mark.slow
 def test_round_trip_and_tables(report, tmp_path):
     again = SpeedReport.of_json(report.json())
     assert again == report and again.markdown() == report.markdown()
@@ -180,6 +182,7 @@ def test_round_trip_and_tables(report, tmp_path):
         report.run("pile", 42, 1)
 
 
+@pytest.mark.slow
 def test_plots(report, tmp_path):
     pytest.importorskip("matplotlib")
     names = [pathlib.Path(path).name for path in report.plot(tmp_path)]
@@ -219,6 +222,7 @@ def test_scenes_are_sound():
                 assert (x >= np.array(box.lower) + r - 1e-9).all() and (x <= np.array(box.upper) - r + 1e-9).all()
 
 
+@pytest.mark.slow
 def test_what_is_stripped_runs_and_has_the_same_fields(report):
     # The copy has two features and the parts that the package itself needs.
     (absent,) = report.absent
@@ -330,7 +334,6 @@ def test_worlds_are_measured_or_left_out(batch):
     assert "Double pendulums" in str(batch) and "| pendulum |" in batch.markdown() and "tables" in json.loads(batch.json())
 
 
-@pytest.mark.slow
 def test_reference_of_double_pendulums():
     # The reference has the energy of its start, and half the step changes nothing.
     times = np.arange(1, 46) / 15

@@ -144,7 +144,6 @@ def test_what_a_pool_loses_is_done_by_other_processes(tmp_path, monkeypatch):
             tv.sweep(ball, {"speed": SPEEDS}, height, executor)
 
 
-@pytest.mark.slow
 def test_parameters_that_end_every_worker_are_named():
     make = functools.partial(ball, marker="any", always=True)
     told = r"parameters 2, make\(speed=2.0\) could not be done, because its worker died 3 times: .*exit code 3"

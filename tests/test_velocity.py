@@ -50,7 +50,6 @@ def test_what_is_let_go_flies_on_to_second_order(world, what):
     assert 1.9 <= order(errors) <= 2.1 and errors[0] <= 1e-4
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("what", ["spring", "force", "particle"])
 def test_forces_that_come_change_no_velocity_before_they_act(world, what):
     # A swinging chain, and a spring, a wind or a particle that comes, of which nothing is felt: what is read is of now. It lacked
@@ -271,7 +270,6 @@ def test_spins_and_throws_survive_what_comes_next(world):
     assert w.velocity[0] == pytest.approx([3, 4 - fallen]) and w.velocity[1] == pytest.approx([0, 0])
 
 
-@pytest.mark.slow
 def test_what_breaks_flies_on_with_the_velocity_that_is_read(world):
     # x + v t - g t^2 / 2, to rounding, also from the substep in which it breaks: half a kick of what broke is not to come.
     # A rigid link, a spring, an area and a cluster, each held by pinned particles.

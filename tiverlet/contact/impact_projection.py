@@ -64,7 +64,8 @@ class ImpactProjection:
     So a column leaves the floor as a whole, with e times its speed. The impulses p give it the energy sum p . (u + u') / 2,
     which is p (1 - e) u_wall / 2 < 0 at the wall and 0 in pairs. Pairs that parted before, or are more than GAP apart, bounce one
     after the other. So do nearly elastic pairs, e > ELASTIC: the wall takes hardly any energy from them, and errors in u_pair
-    could give them more. A pair that does not bounce, but rests with its slack, is struck as above if it closes fast.
+    could give them more. A pair that does not bounce, but rests with its slack, is struck as above if it closes fast and e > 0.
+    At e = 0, among others that bounce, it is left to the pass, which resolves its impact in time.
 
     Many passes find these displacements before others take back overlap. Together, positions would turn the normals in which
     masses are split; eigenvalues exceed 1 by a few %, and the polynomial of 64 passes multiplies such modes by 1000.
@@ -154,8 +155,12 @@ class ImpactProjection:
 
     @ti.func
     def is_inelastic(self, i, j):
-        """Whether a pair that closes fast, and rests, is struck."""
-        return not self.is_elastic(i, j)
+        """Whether a pair that closes fast is struck. Among pairs that bounce, those without restitution are not, see above."""
+        out = True
+        if ti.static(self.has_restitution):
+            e = self.restitution.table.of(i, j)[RESTITUTION]
+            out = e > 0 and e <= ti.static(ELASTIC)
+        return out
 
     @ti.func
     def joins(self, i, j):
