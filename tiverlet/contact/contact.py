@@ -218,7 +218,7 @@ class Contact(PairContact):
         if self.lands:
             dev.landing = ImpactProjection(
                 scene, dev.geometry, self.table, dev.push, dev.slip, dev.splitting, dev.move, reported, given,
-                dev.projection.ring, dev.restitution,
+                dev.projection.ring, dev.restitution, dev.spinning if dev.spins else None,
             )  # fmt: skip
         dev.once = self._solves_once(scene, team)
         return dev.search

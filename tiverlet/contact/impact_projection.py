@@ -47,6 +47,12 @@ class ImpactProjection:
     of a pair are opposite, so momentum is conserved. Positions change by about the overlap of an impact, v h. Of the energy
     m v^2 / 2 that an impact takes out, that is the part 2 g h / v. Particles pressed on a wall do not move into it or off it.
 
+    Friction. RUBS passes give pairs that go on together the friction that the impulse p of the impact can hold: an impulse t
+    across n, with |t| <= mu |p|, that takes back how far their surfaces slide past each other in the substep. They turn what
+    spins, see Spinning. Masses are split by the number of pairs, since t may have any direction. Overlap is taken back with
+    friction as well, or heaps would creep apart with each disc that lands. Walls push against what they pushed in the pass, and
+    so with the share of friction that they had there.
+
     A pair is struck if its overlap doubles, and it closes in the substep by s with
 
         s > SLOW f    and    s^2 > FALL (r_i + r_j) f,    f = h^2 (|a_i| + |a_j|),
@@ -72,22 +78,24 @@ class ImpactProjection:
 
     struck, any_struck: whether each particle, and any, was struck in this substep. ring: a scratch field, (n,): the ring of each
     particle around those that were struck. near: the particles in rings, `count` of them; `size` is the count that all threads
-    read. Their order depends on threads, but no result does. restitution: the Restitution of the pairs, or None. events, given:
-    the log of pairs that reports impulses, or None, and for it the push of a pair in a pass [kg m]. wall_logs, free: those of
-    walls, and for them how far a pass would move each particle without walls [m].
+    read. Their order depends on threads, but no result does. restitution: the Restitution of the pairs, or None. slip: pair data
+    whose old field holds the impulses p n + t [kg m], with friction. lifted: how far each particle was moved without velocity
+    [m]. events, given: the log of pairs that reports impulses, or None, and the push of a pair in a pass [kg m]. wall_logs, free:
+    those of walls, and for them how far a pass would move each particle without walls [m].
     """
 
     wall_logs: "list[WallLog]"
 
     def __init__(
         self, scene: "Scene", geometry: Any, table: Any, push: "PairData", slip: "PairData", splitting: "MassSplitting",
-        move: Any, events: Any, given: "PairData", ring: Any, restitution: Any,
+        move: Any, events: Any, given: "PairData", ring: Any, restitution: Any, spinning: Any,
     ):  # fmt: skip
         self.restitution, self.has_restitution, self.bounces = restitution, restitution is not None, scene.bounces
         self.around, self.passes, self.lifts, self.condition, self.gap = AROUND, PASSES, 0, CONDITION, 0.0
         if self.bounces:
             self.around, self.passes, self.lifts, self.condition, self.gap = FAR_AROUND, MANY_PASSES, LIFTS, LARGE_CONDITION, GAP
-        self.table, self.has_friction = table, table.has_friction and not scene.state.spins
+        self.table, self.has_friction, self.spinning = table, table.has_friction, spinning
+        self.axes = scene.particles.axes
         self.rubs = RUBS if self.has_friction else 0
         # Find what is struck, then what is around it, list pairs, and the passes.
         self.rounds = 1 + self.around + 1 + self.passes + self.lifts + self.rubs
@@ -315,9 +323,16 @@ class ImpactProjection:
         return self.w.of(i) * self.number[i] + self.w.of(j) * self.number[j]
 
     @ti.func
+    def spin_split_by_number(self, i, j):
+        """Return the same for how far surfaces slide past each other per push across the normal, see Spinning [1/kg]."""
+        own, other = self.w.of(i) * self.number[i], self.w.of(j) * self.number[j]
+        return (1 + self.spinning.spin.inverse_inertia.of(i)) * own + (1 + self.spinning.spin.inverse_inertia.of(j)) * other
+
+    @ti.func
     def rub(self, i):
         """Compute a pass of friction for particle i: pairs that go on together do so across n, too, as far as friction holds."""
         want, first, w = ti.zero(self.state.d[i]), self.list.first[i], self.w.of(i)
+        turned = ti.Vector.zero(self.state.real, ti.static(self.axes))
         for m in range(first, first + self.number[i]):
             e = self.list.old_neighbour[m]
             if e >= 0:
@@ -327,13 +342,21 @@ class ImpactProjection:
                 if length > 0:
                     n, shared, push = r / length, self.split_by_number(i, j), self.slip.old[e]
                     pressed, moved = push.dot(n), self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j)
-                    after = (pressed - moved.dot(n) / shared) * n
-                    after -= self.table.held(i, j, n, ti.max(pressed, 0), moved / shared - push)
+                    slip = moved / shared
+                    if ti.static(bool(self.spinning)):
+                        slip = self.spinning.slip(i, j, self.spinning.arm(i, j, n)) / self.spin_split_by_number(i, j)
+                    held = -self.table.held(i, j, n, ti.max(pressed, 0), slip - push)
+                    after = (pressed - moved.dot(n) / shared) * n + held
                     self.slip.old[e] = after
                     want += w * (after - push)
+                    if ti.static(bool(self.spinning)):
+                        change = held - (push - pressed * n)
+                        turned += w * self.spinning.turned(i, self.spinning.arm(i, j, n), change)
                     if ti.static(bool(self.events)):
                         self.events.record(i, j, e, n, after.dot(n) - pressed, 0)
         self.move[i], self.lift[i] = self.state.across_walls(i, want), ti.zero(want)
+        if ti.static(bool(self.spinning)):
+            self.spinning.change[i] = turned
         if ti.static(len(self.wall_logs) > 0):
             self.report_walls(i, self.move[i] - want)
 
@@ -356,6 +379,9 @@ class ImpactProjection:
             self.state.advance(i, self.lift[i])
             if ti.static(self.has_friction):
                 self.lifted[i] = self.lifted[i] + self.lift[i]
+            if ti.static(bool(self.spinning)):
+                if k >= self.rounds - self.rubs:
+                    self.spinning.spin.s[i] = self.spinning.spin.s[i] + self.spinning.change[i]
         if last:
             self.struck[i] = 0
         return last
