@@ -16,12 +16,11 @@ if patched:
     sharing.apply(timing.compiled)
     timing.apply()
     called: Any = calls.called
-    called_rarely: Any = calls.called_rarely
     called_with: Any = calls.called_with
 else:
-    called, called_rarely, called_with = copied, copied, copied_with
+    called, called_with = copied, copied_with
 from . import copies
 
 copies.apply()  # last, with and without patches: it wraps the final subscript function
 
-__all__ = ["at", "called", "called_rarely", "called_with", "inline", "record", "ti"]
+__all__ = ["at", "called", "called_with", "inline", "record", "ti"]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..contact.projection_times import ALWAYS, due
 from ..contact.velocity_projection import PASSES, RINGS
-from ..device import called, called_rarely, runtime, ti
+from ..device import called, runtime, ti
 from ..device.number import OnDevice, read_all
 from ..device.thread_team import LEAST, Team
 from ..features.feature import Batch, Scene
@@ -561,7 +561,7 @@ class Step:
         """One round of the impacts of discs."""
         self.push_struck_discs(now.thread, now.it)
 
-    @called_rarely
+    @called
     @ti.func
     def push_struck_discs(self, thread: ti.i32, it: ti.i32):
         """One round of project_discs()."""
@@ -588,7 +588,7 @@ class Step:
         """One round of the impacts of bodies."""
         self.push_struck_bodies(now.thread, now.it, now.tick)
 
-    @called_rarely
+    @called
     @ti.func
     def push_struck_bodies(self, thread: ti.i32, it: ti.i32, tick: ti.i32):
         """One round of project_bodies()."""
@@ -609,7 +609,7 @@ class Step:
         """One of these rounds."""
         self.find_projected(now.thread, now.it, self.rounds(now), now.damps)
 
-    @called_rarely
+    @called
     @ti.func
     def find_projected(self, thread: ti.i32, it: ti.i32, rounds: ti.i32, damps: ti.i32):
         """One round of find_projected_contacts()."""
@@ -620,7 +620,7 @@ class Step:
         """Damp sound in loaded contacts."""
         self.damp_sound(now.thread, now.it)
 
-    @called_rarely
+    @called
     @ti.func
     def damp_sound(self, thread: ti.i32, it: ti.i32):
         """One pass of project_contact_velocities()."""

@@ -87,11 +87,6 @@ class Compiler:
 
         Called functions cannot read which copy of a world is current, and their loops are not spread over threads.
         """
-        return self.calls_rarely and self.passes is BRIEF
-
-    @property
-    def calls_rarely(self) -> bool:
-        """Whether kernels call long functions that few substeps need."""
         return bool(self._host) and not (self.many or self.launches or self.thorough)
 
     def use_fields(self) -> None:
