@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.contact.impact_projection import CONDITION, FALL, PASSES
+from tiverlet.contact.impact_projection import CONDITION, FALL, LEFT, PASSES
 
 G, R = 10.0, 0.1
 
@@ -65,6 +65,20 @@ def test_what_strikes_at_an_angle_rubs_by_coulombs_law(world, dim, spins):
             assert w.velocity[1, 0] == pytest.approx(u - push, abs=off)
             if spins:
                 assert R * np.ravel(w.spin[1])[-1] == pytest.approx(-k * push, abs=k * off)
+
+
+@pytest.mark.parametrize("substeps", [4, 8, 30])
+def test_a_floor_rubs_all_that_stands_on_it(world, substeps):
+    # A column that falls at an angle slides on. The floor stops m v of each disc, and rubs the lowest one with mu n m v in all,
+    # which pairs pass on: the center of mass is slower by mu v, and then by mu g t. Without friction of the floor in the
+    # projection it was slower by half of that. Overlaps hold a part of the impulse, LEFT of it, until they are pushed out.
+    u, v, mu, n = 2.0, np.sqrt(2 * G), 0.1, 3
+    start = tv.Particles(lattice(1, n) + (0.0, 1.0), radius=R, velocity=(u, 0.0))
+    features = [tv.Gravity(G), tv.Contact(friction=mu), tv.HalfSpace((0, 1), friction=mu)]
+    w = world(start, features, substeps=substeps, precision="f64")
+    w.run(v / G + 2 / 60)
+    slower = mu * (v + G * (w.time - v / G))
+    assert w.velocity[:, 0].mean() == pytest.approx(u - slower, abs=slower * LEFT)
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from ..device import ti
-from ..features.material import RESTITUTION
+from ..features.material import RESTITUTION, limit_length
 from .eigenvalues import chebyshev, largest
 
 if TYPE_CHECKING:
@@ -49,9 +49,8 @@ class ImpactProjection:
 
     Friction. RUBS passes give pairs that go on together the friction that the impulse p of the impact can hold: an impulse t
     across n, with |t| <= mu |p|, that takes back how far their surfaces slide past each other in the substep. They turn what
-    spins, see Spinning. Masses are split by the number of pairs, since t may have any direction. Overlap is taken back with
-    friction as well, or heaps would creep apart with each disc that lands. Walls push against what they pushed in the pass, and
-    so with the share of friction that they had there.
+    spins, see Spinning. Walls rub by the same law. Masses are split by the number of pairs, since t may have any direction.
+    Overlap is taken back with friction as well, or heaps would creep apart with each disc that lands.
 
     A pair is struck if its overlap doubles, and it closes in the substep by s with
 
@@ -80,6 +79,7 @@ class ImpactProjection:
     particle around those that were struck. near: the particles in rings, `count` of them; `size` is the count that all threads
     read. Their order depends on threads, but no result does. restitution: the Restitution of the pairs, or None. slip: pair data
     whose old field holds the impulses p n + t [kg m], with friction. lifted: how far each particle was moved without velocity
+    [m]. pressed, pressing, rubbed: how far walls with friction pushed each particle in all passes and in this one, and rubbed it
     [m]. events, given: the log of pairs that reports impulses, or None, and the push of a pair in a pass [kg m]. wall_logs, free:
     those of walls, and for them how far a pass would move each particle without walls [m].
     """
@@ -114,8 +114,11 @@ class ImpactProjection:
             self.lifted = add("landing.lifted", n, width=scene.particles.dim)
         self.factors = add("landing.chebyshev", self.passes, values=chebyshev(self.passes, self.condition))
 
-    def report_to(self, scene: "Scene", wall_logs: "list[WallLog]") -> None:
-        """Report to the logs of walls what these take up. Call it before fields are placed."""
+    def meet_walls(self, scene: "Scene", wall_logs: "list[WallLog]") -> None:
+        """Declare what walls need, and report to their logs what they take up. Call it before fields are placed."""
+        if self.state.keeps_wall_grip:
+            self.pressed, self.pressing = (scene.memory.field(f"landing.{k}", scene.count) for k in ("pressed", "pressing"))
+            self.rubbed = scene.memory.field("landing.rubbed", scene.count, width=scene.particles.dim)
         self.wall_logs = wall_logs
         if wall_logs:
             self.free = scene.memory.field("landing.free", scene.count, width=scene.particles.dim)
@@ -253,6 +256,9 @@ class ImpactProjection:
         self.move[i] = ti.zero(self.state.d[i])
         if ti.static(self.has_friction):
             self.lifted[i] = ti.zero(self.state.d[i])
+        if ti.static(self.state.keeps_wall_grip):
+            self.pressed[i] = self.pressing[i] = ti.zero(w)
+            self.rubbed[i] = ti.zero(self.state.d[i])
         self.split[i] = ti.max(self.weight[i], w * largest(normals))
 
     @ti.func
@@ -303,6 +309,13 @@ class ImpactProjection:
                             self.given.field[e] = given
                             self.note_push(i, j, e, given, r / length, k)
         self.move[i] = gain * self.state.across_walls(i, want) + again * self.move[i]
+        if ti.static(self.state.keeps_wall_grip):
+            n = self.wall_normal(i)
+            if velocities:
+                self.pressing[i] = again * self.pressing[i] - gain * want.dot(n)
+                self.pressed[i] = self.pressed[i] + self.pressing[i]
+            pushed, grip = ti.max(-lift.dot(n), 0), self.state.wall_grip[i]
+            lift -= limit_length(lift - lift.dot(n) * n, grip[0] * pushed, grip[1] * pushed)
         self.lift[i] = ti.static(RELAXATION) * self.state.across_walls(i, lift)
         if ti.static(len(self.wall_logs) > 0):
             if velocities:
@@ -318,14 +331,31 @@ class ImpactProjection:
             self.events.record(i, j, e, n, given, 0)
 
     @ti.func
+    def wall_normal(self, i):
+        """Return the direction in which walls push particle i in this substep, or 0."""
+        push = self.state.wall_push[i]
+        size = push.norm()
+        if size > 0:
+            push /= size
+        return push
+
+    @ti.func
+    def parts(self, i):
+        """Return in how many parts friction splits the mass of particle i: one for each pair, and one for walls."""
+        out = self.number[i]
+        if ti.static(self.state.keeps_wall_grip):
+            out += ti.select((self.state.wall_push[i] != 0).any(), 1, 0)
+        return out
+
+    @ti.func
     def split_by_number(self, i, j):
         """Return the inverse mass of a pair, with masses split by the number of pairs, so that pushes may have any direction."""
-        return self.w.of(i) * self.number[i] + self.w.of(j) * self.number[j]
+        return self.w.of(i) * self.parts(i) + self.w.of(j) * self.parts(j)
 
     @ti.func
     def spin_split_by_number(self, i, j):
         """Return the same for how far surfaces slide past each other per push across the normal, see Spinning [1/kg]."""
-        own, other = self.w.of(i) * self.number[i], self.w.of(j) * self.number[j]
+        own, other = self.w.of(i) * self.parts(i), self.w.of(j) * self.parts(j)
         return (1 + self.spinning.spin.inverse_inertia.of(i)) * own + (1 + self.spinning.spin.inverse_inertia.of(j)) * other
 
     @ti.func
@@ -354,11 +384,30 @@ class ImpactProjection:
                         turned += w * self.spinning.turned(i, self.spinning.arm(i, j, n), change)
                     if ti.static(bool(self.events)):
                         self.events.record(i, j, e, n, after.dot(n) - pressed, 0)
+        if ti.static(self.state.keeps_wall_grip):
+            change = self.rub_wall(i, want)
+            want += change
+            if ti.static(bool(self.spinning)):
+                turned += self.spinning.turned(i, self.wall_normal(i), change)
         self.move[i], self.lift[i] = self.state.across_walls(i, want), ti.zero(want)
         if ti.static(bool(self.spinning)):
             self.spinning.change[i] = turned
         if ti.static(len(self.wall_logs) > 0):
             self.report_walls(i, self.move[i] - want)
+
+    @ti.func
+    def rub_wall(self, i, want):
+        """Return what the friction of walls adds to a pass, in which pairs move particle i by `want` [m]."""
+        n, grip, before = self.wall_normal(i), self.state.wall_grip[i], self.rubbed[i]
+        slip = self.state.d[i] - self.state.wall_moved[i]
+        slip -= slip.dot(n) * n
+        if ti.static(bool(self.spinning)):
+            slip -= self.spinning.spin.surface(self.spinning.spin.s[i], n)
+            slip /= 1 + self.spinning.spin.inverse_inertia.of(i)
+        pressed = ti.max(self.pressed[i], 0)
+        self.pressed[i] = self.pressed[i] - want.dot(n)
+        self.rubbed[i] = limit_length(before - slip / ti.max(self.parts(i), 1), grip[0] * pressed, grip[1] * pressed)
+        return self.rubbed[i] - before
 
     @ti.func
     def report_walls(self, i, push):

@@ -185,6 +185,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         bounces,
         bool(contact and (contact.projects or bodies) and walls),
         bodies,
+        bool(search and contact and contact.dev.landing and any(w.has_friction for w in walls)),
     )
     for feature in of(Batch):
         feature.scene = scene  # also for those that do nothing, because all of their particles are held

@@ -137,7 +137,7 @@ class Step:
         self.closes_late = self.contact_pass.closes_late
         self.landing_rounds = contact.dev.landing.rounds if self.projects_discs else 0
         if self.projects_discs:
-            contact.dev.landing.report_to(scene, self.wall_logs)
+            contact.dev.landing.meet_walls(scene, self.wall_logs)
         self.orients = self.state.spins and self.state.spin.orients
         keeps = self.contact_pass.remembers or bool(self.breakers)
         self.finishes = keeps or self.orients or bool(self.wall_logs) or bool(self.constraints.learners)
