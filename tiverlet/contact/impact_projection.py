@@ -96,9 +96,6 @@ class ImpactProjection:
             self.around, self.passes, self.lifts, self.condition, self.gap = FAR_AROUND, MANY_PASSES, LIFTS, LARGE_CONDITION, GAP
         self.table, self.has_friction, self.spinning = table, table.has_friction, spinning
         self.axes = scene.particles.axes
-        self.rubs = RUBS if self.has_friction else 0
-        # Find what is struck, then what is around it, list pairs, and the passes.
-        self.rounds = 1 + self.around + 1 + self.passes + self.lifts + self.rubs
         self.events, self.given, self.slip = events, given, slip
         self.state, self.w, self.slots = scene.state, scene.state.w, scene.slots
         self.geometry, self.list, self.push, self.move = geometry, geometry.list, push, move
@@ -116,6 +113,9 @@ class ImpactProjection:
 
     def meet_walls(self, scene: "Scene", wall_logs: "list[WallLog]") -> None:
         """Declare what walls need, and report to their logs what they take up. Call it before fields are placed."""
+        self.rubs = RUBS if self.has_friction or self.state.keeps_wall_grip else 0
+        # Find what is struck, then what is around it, list pairs, and the passes.
+        self.rounds = 1 + self.around + 1 + self.passes + self.lifts + self.rubs
         if self.state.keeps_wall_grip:
             self.pressed, self.pressing = (scene.memory.field(f"landing.{k}", scene.count) for k in ("pressed", "pressing"))
             self.rubbed = scene.memory.field("landing.rubbed", scene.count, width=scene.particles.dim)
@@ -211,7 +211,7 @@ class ImpactProjection:
             self.list_pairs(i)
         elif k < self.rounds - self.rubs:
             self.relax(i, k - self.around - 2)
-        elif ti.static(self.has_friction):
+        elif ti.static(self.rubs > 0):
             self.rub(i)
 
     @ti.func
@@ -361,6 +361,23 @@ class ImpactProjection:
     @ti.func
     def rub(self, i):
         """Compute a pass of friction for particle i: pairs that go on together do so across n, too, as far as friction holds."""
+        want, turned = ti.zero(self.state.d[i]), ti.Vector.zero(self.state.real, ti.static(self.axes))
+        if ti.static(self.has_friction):
+            want, turned = self.rub_pairs(i)
+        if ti.static(self.state.keeps_wall_grip):
+            change = self.rub_wall(i, want)
+            want += change
+            if ti.static(bool(self.spinning)):
+                turned += self.spinning.turned(i, self.wall_normal(i), change)
+        self.move[i], self.lift[i] = self.state.across_walls(i, want), ti.zero(want)
+        if ti.static(bool(self.spinning)):
+            self.spinning.change[i] = turned
+        if ti.static(len(self.wall_logs) > 0):
+            self.report_walls(i, self.move[i] - want)
+
+    @ti.func
+    def rub_pairs(self, i):
+        """Return how far its pairs move particle i in a pass of friction, and turn its surface [m]."""
         want, first, w = ti.zero(self.state.d[i]), self.list.first[i], self.w.of(i)
         turned = ti.Vector.zero(self.state.real, ti.static(self.axes))
         for m in range(first, first + self.number[i]):
@@ -384,16 +401,7 @@ class ImpactProjection:
                         turned += w * self.spinning.turned(i, self.spinning.arm(i, j, n), change)
                     if ti.static(bool(self.events)):
                         self.events.record(i, j, e, n, after.dot(n) - pressed, 0)
-        if ti.static(self.state.keeps_wall_grip):
-            change = self.rub_wall(i, want)
-            want += change
-            if ti.static(bool(self.spinning)):
-                turned += self.spinning.turned(i, self.wall_normal(i), change)
-        self.move[i], self.lift[i] = self.state.across_walls(i, want), ti.zero(want)
-        if ti.static(bool(self.spinning)):
-            self.spinning.change[i] = turned
-        if ti.static(len(self.wall_logs) > 0):
-            self.report_walls(i, self.move[i] - want)
+        return want, turned
 
     @ti.func
     def rub_wall(self, i, want):

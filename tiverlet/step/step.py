@@ -135,9 +135,9 @@ class Step:
         self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
         self.projects_bodies, self.projects_discs = self.contact_pass.projects_bodies, self.contact_pass.projects_discs
         self.closes_late = self.contact_pass.closes_late
-        self.landing_rounds = contact.dev.landing.rounds if self.projects_discs else 0
         if self.projects_discs:
             contact.dev.landing.meet_walls(scene, self.wall_logs)
+        self.landing_rounds = contact.dev.landing.rounds if self.projects_discs else 0
         self.orients = self.state.spins and self.state.spin.orients
         keeps = self.contact_pass.remembers or bool(self.breakers)
         self.finishes = keeps or self.orients or bool(self.wall_logs) or bool(self.constraints.learners)
