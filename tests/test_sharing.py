@@ -337,3 +337,13 @@ def test_many_worlds_one_after_the_other_take_no_more_than_a_few():
         if k % 2:
             one.close()
     assert runtime.trees <= trees + 6 and len(sharing._known) <= known + 6
+
+
+def test_a_world_with_more_fields_than_taichi_has_room_for_is_refused(world):
+    # 512 fields of 1 component are 1 + 2 * 512 nodes, one more than Taichi's 1024. Beyond that it would stop with an error of its
+    # own, and end the process at the next kernel.
+    with pytest.raises(ValueError, match=r"need 1025 fields and components, but Taichi has room for 1024"):
+        layout.Layout(tuple(layout.Declared(ti.f32, 0, 1, False) for _ in range(512)))
+    w = world(tv.Particles([(0.0, 0.0)]), [tv.Gravity()])
+    w.step(0.1)
+    assert w.velocity[0, 1] == pytest.approx(-0.981)

@@ -28,7 +28,8 @@ from .language import ti
 from .patches import patched, roots
 
 MAX_TREES = 400  # Taichi holds at most 511 trees, without a check; the rest is left to the user's own fields
-NODES = 900  # most nodes of a tree: one per field and one per component; Taichi's limit is 1024
+NODES = 900  # nodes of a tree from which it has no spare fields: one per field and one per component
+MOST_NODES = 1024  # Taichi's limit, beyond which it leaves its runtime in pieces
 MANY = 200  # shared trees, each for worlds of one kind; further trees serve all kinds
 FEW = 4  # a shared tree has 4, 8, 16, ... fields of each kind
 ROOMS = (1 << 24, 1 << 20, 1 << 17)  # elements reserved per field: the first with which the tree fits into NEAR
@@ -61,6 +62,12 @@ class Layout:
 
     def __init__(self, declared: tuple[Declared, ...], fields: list[Any] | None = None, shared: bool = False):
         check_trees()
+        nodes = 1 + sum(bool(d.length) + max(1, d.width) for d in declared)
+        if nodes > MOST_NODES:
+            raise ValueError(
+                f"World: its features need {nodes} fields and components, but Taichi has room for {MOST_NODES}. Leave out "
+                "features, or make a second world."
+            )
         self.serial, self.runtime, self.shared = next(self._serials), language.current(), shared
         self.fields = fields or [make_field(d.kind, d.width) for d in declared]
         builders: dict[bool, Any] = {d.apart: None for d in declared}
@@ -216,6 +223,8 @@ def _shared(need: Counter[Kind], length: int, held: list[Layout]) -> Layout:
     for layout in [layout for layout in _known if layout.runtime is not now]:
         del _known[layout]
     want = Counter({kind: max(FEW, 1 << (number - 1).bit_length()) for kind, number in need.items()})
+    if _nodes(want) > NODES:
+        want = need
     room = _room(want, length)
     for layout, has in _known.items():
         if has == want and layout.room == room and layout not in held:
@@ -224,7 +233,7 @@ def _shared(need: Counter[Kind], length: int, held: list[Layout]) -> Layout:
         for layout, has in _known.items():
             if need <= has and layout.room >= length and layout not in held:
                 return layout
-            if sum(number * (1 + max(1, kind[1])) for kind, number in (want | has).items()) <= NODES:
+            if _nodes(want | has) <= NODES:
                 want |= has
         room = _room(want, length)
     kinds = sorted(want.elements(), key=lambda kind: (kind[2], kind[1], str(kind[0])))
@@ -232,6 +241,11 @@ def _shared(need: Counter[Kind], length: int, held: list[Layout]) -> Layout:
     layout.numbers, layout.room = {kind: [k for k, one in enumerate(kinds) if one == kind] for kind in want}, room
     _known[layout] = want
     return layout
+
+
+def _nodes(want: Counter[Kind]) -> int:
+    """Return how many nodes a tree with so many fields of each kind has: one for each field and each component."""
+    return sum(number * (1 + max(1, width)) for (_, width, _), number in want.items())
 
 
 def _room(want: Counter[Kind], length: int) -> int:
