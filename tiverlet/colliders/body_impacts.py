@@ -290,11 +290,13 @@ class BodyImpacts:
 
         Where they are solved exactly, they have taken into account that the wall holds it, if the wall held it before.
         """
-        off = self.is_pulled(i)
-        if off:
-            self.log_push(i, self.release(i))
-            self.move(i, self.release(i))
-            self.pushed[i] = ti.zero(self.pushed[i])
+        off = False
+        if ti.static(self.exact):
+            off = self.is_pulled(i)
+            if off:
+                self.log_push(i, self.release(i))
+                self.move(i, self.release(i))
+                self.pushed[i] = ti.zero(self.pushed[i])
         if self.in_cluster(i):
             if ti.static(self.bends):
                 if self.struck[i] == STRUCK_BEFORE:  # it turns in a substep: second order is left
@@ -330,8 +332,7 @@ class BodyImpacts:
     def move(self, i, change):
         """Move particle i as a wall does."""
         self.state.shift(i, change)
-        if ti.static(self.state.keeps_wall_push):
-            self.state.wall_push[i] = self.state.wall_push[i] + change
+        self.state.note_wall_push(i, change)
 
     @ti.func
     def log_push(self, i, change):

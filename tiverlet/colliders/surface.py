@@ -185,8 +185,7 @@ class Surface:
                 if mode != BEFORE_CONTACTS:
                     self.log.record(i, depth, n, after - leaving, -leaving, moved, h, rise > 0)
             change = (after - leaving) * n
-            if ti.static(self.state.keeps_wall_push):
-                self.state.wall_push[i] = self.state.wall_push[i] + change
+            self.state.note_wall_push(i, change)
             if ti.static(self.state.keeps_wall_grip):
                 self.note_grip(i, moved)
             shift = (move + rise) * n

@@ -138,11 +138,10 @@ class BodyProjection:
     @ti.func
     def note_wall(self, i, tick):
         """As the substep `tick` begins: store the plane of the wall that pushed particle i in the last one."""
-        push = self.state.wall_push[i]
-        size = push.norm()
-        if size > 0:
-            self.wall_normal[i], self.wall_until[i] = push / size, tick + LASTS
-            self.wall_offset[i] = self.state.x[i].dot(push / size)
+        n = self.state.wall_normal(i)
+        if (n != 0).any():
+            self.wall_normal[i], self.wall_until[i] = n, tick + LASTS
+            self.wall_offset[i] = self.state.x[i].dot(n)
 
     @ti.func
     def begin(self, i, geometry: ti.template(), tick):  # type: ignore[valid-type]

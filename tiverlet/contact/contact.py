@@ -211,14 +211,13 @@ class Contact(PairContact):
         if dev.has_restitution:
             dev.restitution = Restitution(scene, dev.geometry, self.table, struck, dev.slack, dev.impulse, reported, bodies)
             dev.hit = dev.restitution.hit
-        if dev.spins:
-            dev.spinning = Spinning(scene, self.table, dev.splitting.weight, dev.turn)
+        dev.spinning = Spinning(scene, self.table, dev.splitting.weight, dev.turn) if dev.spins else None
         dev.projection = VelocityProjection(scene, dev.geometry, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
         dev.landing = None
         if self.lands:
             dev.landing = ImpactProjection(
                 scene, dev.geometry, self.table, dev.push, dev.slip, dev.splitting, dev.move, reported, given,
-                dev.projection.ring, dev.restitution, dev.spinning if dev.spins else None,
+                dev.projection.ring, dev.restitution, dev.spinning,
             )  # fmt: skip
         dev.once = self._solves_once(scene, team)
         return dev.search

@@ -310,7 +310,7 @@ class ImpactProjection:
                             self.note_push(i, j, e, given, r / length, k)
         self.move[i] = gain * self.state.across_walls(i, want) + again * self.move[i]
         if ti.static(self.state.keeps_wall_grip):
-            n = self.wall_normal(i)
+            n = self.state.wall_normal(i)
             if velocities:
                 self.pressing[i] = again * self.pressing[i] - gain * want.dot(n)
                 self.pressed[i] = self.pressed[i] + self.pressing[i]
@@ -329,15 +329,6 @@ class ImpactProjection:
             self.slip.old[e] = ti.select(k == 0, 0 * n, self.slip.old[e]) + given * n
         if ti.static(bool(self.events)):
             self.events.record(i, j, e, n, given, 0)
-
-    @ti.func
-    def wall_normal(self, i):
-        """Return the direction in which walls push particle i in this substep, or 0."""
-        push = self.state.wall_push[i]
-        size = push.norm()
-        if size > 0:
-            push /= size
-        return push
 
     @ti.func
     def parts(self, i):
@@ -368,7 +359,7 @@ class ImpactProjection:
             change = self.rub_wall(i, want)
             want += change
             if ti.static(bool(self.spinning)):
-                turned += self.spinning.turned(i, self.wall_normal(i), change)
+                turned += self.spinning.turned(i, self.state.wall_normal(i), change)
         self.move[i], self.lift[i] = self.state.across_walls(i, want), ti.zero(want)
         if ti.static(bool(self.spinning)):
             self.spinning.change[i] = turned
@@ -380,8 +371,8 @@ class ImpactProjection:
         """Return how far its pairs move particle i in a pass of friction, and turn its surface [m]."""
         want, first, w = ti.zero(self.state.d[i]), self.list.first[i], self.w.of(i)
         turned = ti.Vector.zero(self.state.real, ti.static(self.axes))
-        for m in range(first, first + self.number[i]):
-            e = self.list.old_neighbour[m]
+        for at in range(first, first + self.number[i]):
+            e = self.list.old_neighbour[at]
             if e >= 0:
                 j = self.list.neighbour[e]
                 r = self.state.separation(i, j)
@@ -389,16 +380,16 @@ class ImpactProjection:
                 if length > 0:
                     n, shared, push = r / length, self.split_by_number(i, j), self.slip.old[e]
                     pressed, moved = push.dot(n), self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j)
-                    slip = moved / shared
+                    slip, m = moved / shared, n
                     if ti.static(bool(self.spinning)):
-                        slip = self.spinning.slip(i, j, self.spinning.arm(i, j, n)) / self.spin_split_by_number(i, j)
+                        m = self.spinning.arm(i, j, n)
+                        slip = self.spinning.slip(i, j, m) / self.spin_split_by_number(i, j)
                     held = -self.table.held(i, j, n, ti.max(pressed, 0), slip - push)
                     after = (pressed - moved.dot(n) / shared) * n + held
                     self.slip.old[e] = after
                     want += w * (after - push)
                     if ti.static(bool(self.spinning)):
-                        change = held - (push - pressed * n)
-                        turned += w * self.spinning.turned(i, self.spinning.arm(i, j, n), change)
+                        turned += w * self.spinning.turned(i, m, held - (push - pressed * n))
                     if ti.static(bool(self.events)):
                         self.events.record(i, j, e, n, after.dot(n) - pressed, 0)
         return want, turned
@@ -406,7 +397,7 @@ class ImpactProjection:
     @ti.func
     def rub_wall(self, i, want):
         """Return what the friction of walls adds to a pass, in which pairs move particle i by `want` [m]."""
-        n, grip, before = self.wall_normal(i), self.state.wall_grip[i], self.rubbed[i]
+        n, grip, before = self.state.wall_normal(i), self.state.wall_grip[i], self.rubbed[i]
         slip = self.state.d[i] - self.state.wall_moved[i]
         slip -= slip.dot(n) * n
         if ti.static(bool(self.spinning)):

@@ -28,7 +28,7 @@ from .language import ti
 from .patches import patched, roots
 
 MAX_TREES = 400  # Taichi holds at most 511 trees, without a check; the rest is left to the user's own fields
-NODES = 900  # nodes of a tree from which it has no spare fields: one per field and one per component
+NODES = 900  # nodes of a tree from which it has no spare fields
 MOST_NODES = 1024  # Taichi's limit, beyond which it leaves its runtime in pieces
 MANY = 200  # shared trees, each for worlds of one kind; further trees serve all kinds
 FEW = 4  # a shared tree has 4, 8, 16, ... fields of each kind
@@ -48,6 +48,11 @@ class Declared:
     length: int  # elements; 0 for a single one of 0 dimensions
     apart: bool  # whether it goes into a second tree
 
+    @property
+    def sort(self) -> "Kind":
+        """Its kind in a shared tree."""
+        return self.kind, self.width, self.length > 0
+
 
 Kind = tuple[Any, int, bool]  # the kind of a field in a shared tree: its type, its width, whether it has many elements
 
@@ -62,7 +67,7 @@ class Layout:
 
     def __init__(self, declared: tuple[Declared, ...], fields: list[Any] | None = None, shared: bool = False):
         check_trees()
-        nodes = 1 + sum(bool(d.length) + max(1, d.width) for d in declared)
+        nodes = 1 + _nodes(Counter(d.sort for d in declared))
         if nodes > MOST_NODES:
             raise ValueError(
                 f"World: its features need {nodes} fields and components, but Taichi has room for {MOST_NODES}. Leave out "
@@ -207,7 +212,7 @@ def get_layout(declared: list[Declared], fields: list[Any], held: list[Layout], 
     if not shared:
         layout, which = Layout(tuple(declared), None if patched else fields), list(range(len(declared)))
     else:
-        kinds = [(d.kind, d.width, d.length > 0) for d in declared]
+        kinds = [d.sort for d in declared]
         layout = _shared(Counter(kinds), max(d.length for d in declared), held)
         numbers = {kind: iter(some) for kind, some in layout.numbers.items()}
         which = [next(numbers[kind]) for kind in kinds]
@@ -244,8 +249,8 @@ def _shared(need: Counter[Kind], length: int, held: list[Layout]) -> Layout:
 
 
 def _nodes(want: Counter[Kind]) -> int:
-    """Return how many nodes a tree with so many fields of each kind has: one for each field and each component."""
-    return sum(number * (1 + max(1, width)) for (_, width, _), number in want.items())
+    """Return how many nodes so many fields of each kind have: one for each component, and one for many elements."""
+    return sum(number * (many + max(1, width)) for (_, width, many), number in want.items())
 
 
 def _room(want: Counter[Kind], length: int) -> int:

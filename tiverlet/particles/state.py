@@ -206,6 +206,21 @@ class State:
             self.before = memory.field("displacement_at_start", self.number, width=self.dim)
 
     @ti.func
+    def note_wall_push(self, i, change):
+        """Note that a wall changed the displacement of particle i."""
+        if ti.static(self.keeps_wall_push):
+            self.wall_push[i] = self.wall_push[i] + change
+
+    @ti.func
+    def wall_normal(self, i):
+        """Return the direction in which walls push particle i in this substep, or 0."""
+        push = self.wall_push[i]
+        size = push.norm()
+        if size > 0:
+            push /= size
+        return push
+
+    @ti.func
     def across_walls(self, i, move):
         """Return a move of particle i without its part along the push of walls in this substep."""
         if ti.static(self.keeps_wall_push):

@@ -23,13 +23,12 @@ class ContactPass:
         self.impacts: Any = scene.impacts
         self.n, self.real, self.dim = scene.count, scene.real, scene.particles.dim
         self.has_restitution = bool(contact) and contact.has_restitution
-        self.remembers = bool(contact) and (
-            contact.has_friction or contact.has_restitution or contact.has_events or contact.shares_loads
-        )
         self.projects_discs = bool(contact and contact.dev.landing)
         self.closes_late = self.projects_discs and contact.dev.reports
-        self.notes_bounces = bool(contact and contact.dev.landing and contact.dev.landing.bounces)
-        self.remembers = self.remembers or self.notes_bounces
+        self.notes_bounces = self.projects_discs and contact.dev.landing.bounces
+        self.remembers = self.notes_bounces or bool(
+            contact and (contact.has_friction or contact.has_restitution or contact.has_events or contact.shares_loads)
+        )
         self.projects_velocities = bool(contact) and contact.projects
         self.projects_bodies = bool(contact and contact.dev.bodies)
         if self.has_restitution and team.launched:  # the host does not read whether any pair bounces in a round

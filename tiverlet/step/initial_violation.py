@@ -113,7 +113,7 @@ def tied(scene: Scene, batches: list[Batch], placed: int) -> np.ndarray:
     return (going[body] & (scene.inv_mass > 0)) | (np.arange(len(body)) >= placed)
 
 
-def put_on_curves(scene: Scene, batches: list[Batch], placed: int) -> tuple[np.ndarray, float] | None:
+def move_to_curves(scene: Scene, batches: list[Batch], placed: int) -> tuple[np.ndarray, float] | None:
     """Move placed particles on rigid curves that are off by more than SEEN to where the curve is nearest.
 
     placed: the first placed particle. Returns what remove() does.

@@ -203,7 +203,7 @@ class Runner:
                 clock.since = 0
             if first is not None:
                 ratio = h / (clock.h or h)
-                self._note_moved(initial_violation.put_on_curves(self.scene, self.batches, first))
+                self._note_moved(initial_violation.move_to_curves(self.scene, self.batches, first))
                 self._note_moved(initial_violation.remove(self.scene, self.batches, first, ratio, self.stop_at_walls))
                 bare = first < self.n and not any((b.indices >= first).any() for b in self.batches)
                 if self.scene.slots.system and not bare:  # particles added without constraints do not concern it

@@ -182,5 +182,4 @@ class ClusterImpact:
             push = sign * (self.impacts.pushed[i] * self.impacts.normal[i] - self.impacts.held[i])
             self.cluster.pull[e] = self.cluster.pull[e] - push
             self.impacts.log_push(i, push)
-            if ti.static(self.state.keeps_wall_push):
-                self.state.wall_push[i] = self.state.wall_push[i] + push
+            self.state.note_wall_push(i, push)
