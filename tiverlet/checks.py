@@ -170,7 +170,8 @@ def plain(who: str, name: str, value: Any) -> np.ndarray:
     """Return anything whose rows have equal lengths as an array."""
     if type(value) is np.ndarray and value.dtype.kind != "O":
         return value
-    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
+    # Importing numpy.ma takes 30 ms, and nothing is masked before somebody has imported it.
+    if "numpy.ma" in sys.modules and isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         raise ValueError(f"{who}: {name} has masked values, which would count as any other. Fill them, or leave their rows out.")
     try:
         array = np.asarray(value)

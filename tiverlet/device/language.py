@@ -72,6 +72,12 @@ def current() -> Any:
     return impl.get_runtime()
 
 
+def start(**options: Any) -> None:
+    """Start the compiler with options of ti.init, which prints its banner whatever the log level."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        ti.init(**options)
+
+
 def supports(arch: str) -> bool:
     """Whether this machine and this compiler support an architecture, by its name in Taichi."""
     with contextlib.suppress(Exception):

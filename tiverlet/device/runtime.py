@@ -2,7 +2,6 @@
 
 import contextlib
 import ctypes
-import io
 import numbers
 import os
 import threading
@@ -65,11 +64,9 @@ def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, see
     options: dict[str, Any] = {} if threads is None else {"cpu_max_num_threads": threads}
     if arch == "cpu":  # a kernel is one task there, and each compiling thread first loads what all kernels share
         options["num_compile_threads"] = 1  # 0: the calling thread, which ends the process if it did not start Taichi
-    with contextlib.redirect_stdout(io.StringIO()):  # ti.init prints its banner whatever the log level
-        ti.init(
-            arch=getattr(ti, arch), default_fp=ti.f32, fast_math=False, debug=debug, random_seed=seed,
-            log_level=ti.ERROR, **options,
-        )  # fmt: skip
+    language.start(
+        arch=getattr(ti, arch), default_fp=ti.f32, fast_math=False, debug=debug, random_seed=seed, log_level=ti.ERROR, **options
+    )
     if architecture() != arch:
         found = architecture()
         ti.reset()

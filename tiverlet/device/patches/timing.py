@@ -5,6 +5,7 @@ takes longer than the translation, whose measured time decides whether to print 
 """
 
 import contextlib
+import sys
 from collections.abc import Iterator
 from time import perf_counter
 from typing import Any
@@ -69,13 +70,12 @@ def compiled(kernel: Any, key: Any, name: str, translate: Any) -> None:
 @contextlib.contextmanager
 def _show_message(name: str, features: list[str]) -> Iterator[None]:
     """Show what is compiled in a line on the terminal, as long as the context lasts."""
-    from rich.console import Console  # noqa: PLC0415  # importing it takes 50 ms
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
+    if not (sys.stderr and sys.stderr.isatty()):
         yield
         return
-    with console.status(f"compiling {name}: {', '.join(sorted(features)) or 'motion'} (kept for the next time)"):
+    from rich.console import Console  # noqa: PLC0415  # importing it takes 50 ms
+
+    with Console(stderr=True).status(f"compiling {name}: {', '.join(sorted(features)) or 'motion'} (kept for the next time)"):
         yield
 
 
