@@ -244,7 +244,8 @@ def _read(path: pathlib.Path) -> bytes | None:
     with contextlib.suppress(OSError):
         content = path.read_bytes()
         if _digest(content[HEAD:]) == content[:HEAD]:
-            os.utime(path)  # see drop_old()
+            with contextlib.suppress(OSError):  # the file may be somebody else's
+                os.utime(path)  # see drop_old()
             return content[HEAD:]
         path.unlink()
     return None
