@@ -12,6 +12,7 @@ from .corners import components, corners_of
 from .direct import Direct
 from .elimination import plan
 from .jacobi import Jacobi
+from .redundancy import RIGID_MOTIONS, implied_links
 from .solver import Solver
 from .system import solvable
 
@@ -27,6 +28,7 @@ CG_STEPS = 5  # of conjugate gradients: at equal time, residuals of 5 to 20 step
 CHAIN = 2  # width of chains, trees, loops, joints of up to 3 rods
 BEAM = 5  # width of trusses, triangles on hinges, chains that bend: elimination takes two to three times as long as Jacobi
 RING = 8  # width of rings that bend: at 20 substeps Jacobi loses 0.5 to 60 % of their energy in 20 s, elimination 0 to 7 %
+BODY = 12  # width of rigid bodies with more links than hold them, such as a cube with all 28: their angles are not free
 MOST_TRIED = 2000  # constraints in a piece up to which it is tried as a beam: refusing a larger net would take long
 
 
@@ -87,7 +89,7 @@ class Pieces:
         owner, item = corners_of(links)
         free = w[item] > 0
         self.dim, self.count, self.owner, self.item = scene.particles.dim, sum(counts), owner[free], item[free]
-        self.piece = components(self.count, self.owner, self.item)
+        self.piece, self.implied = components(self.count, self.owner, self.item), implied_links(links, scene)
         self.acts = np.bincount(self.owner, minlength=self.count) > 0
         self.pair = np.concatenate([np.zeros((0, 2), dtype=np.int64), *(b.indices for b in links if b.arity == 2)])
         self.pair_of = np.flatnonzero(np.repeat([b.arity == 2 for b in links], counts))
@@ -108,17 +110,17 @@ class Pieces:
     def _is_determinate(self, owner: np.ndarray, item: np.ndarray) -> np.ndarray:
         """Return for each constraint, (m,), whether its piece is held in one place at most and is not overconstrained.
 
-        Springs of angles do not count as constraints here, because they bear any load. Any other piece may bear loads that no
-        constraint bears to first order: a beam between two walls, a braced box between contacts. (owner, item): corners that
-        cannot move; corners that constraints join are one place. A piece of n movable particles has dim n degrees of freedom,
-        minus the rigid motions of the piece.
+        Springs of angles do not count as constraints here, because they bear any load, nor do links that others imply, because
+        they bear none. Any other piece may bear loads that no constraint bears to first order, such as a beam between two walls.
+        (owner, item): corners that cannot move; corners that constraints join are one place. A piece of n movable particles has
+        dim n degrees of freedom, minus the rigid motions of the piece.
         """
         place = components(self.count, owner, item)
         pins, places = self._count_distinct(owner, item), self._count_distinct(owner, place[owner])
-        whole = np.array([3, 1, 0] if self.dim == 2 else [6, 3, 1, 0])  # rigid motions of a piece with 0, 1, 2, ... pins
+        whole = np.array(RIGID_MOTIONS[self.dim])
         n = self._count_distinct(self.owner, self.item)
         freedoms = np.where(n + pins > 2, self.dim * n - whole[np.minimum(pins, len(whole) - 1)], 1)
-        rows = np.bincount(self.piece[self.acts & self.is_counted], minlength=self.count)
+        rows = np.bincount(self.piece[self.acts & self.is_counted & ~self.implied], minlength=self.count)
         return ((places <= 1) & (rows <= freedoms))[self.piece]
 
     def _count_distinct(self, owner: np.ndarray, what: np.ndarray) -> np.ndarray:
@@ -133,7 +135,7 @@ class Pieces:
         it whips, up to 0.15 of m g times its length. A ring has one.
         """
         near: dict[tuple[int, int], set[int]] = defaultdict(set)
-        inside = np.isin(self.piece[self.pair_of], some) & self.acts[self.pair_of]
+        inside = np.isin(self.piece[self.pair_of], some) & (self.acts & ~self.implied)[self.pair_of]
         piece, pair = self.piece[self.pair_of[inside]], np.sort(self.pair[inside], axis=1)
         edges = distinct(np.column_stack([piece, pair]))[0]
         for k, i, j in edges.tolist():
@@ -151,8 +153,9 @@ class Pieces:
         """
         taken = np.zeros(self.count, dtype=bool)
         longest = np.bincount(self.piece[self.acts], minlength=1).max()
-        for width in ((CHAIN,) if longest > MOST_TRIED else (RING, BEAM, CHAIN)) if self.can_eliminate else ():
-            found = plan(self.count, self.owner, self.item, width)
+        for width in ((CHAIN,) if longest > MOST_TRIED else (BODY, RING, BEAM, CHAIN)) if self.can_eliminate else ():
+            needed = ~self.implied[self.owner]
+            found = plan(self.count, self.owner[needed], self.item[needed], width)
             first = found.rows[found.part_begin[:-1]]
             widths = np.array(found.widths, dtype=int)
             wide = widths > CHAIN
@@ -161,8 +164,10 @@ class Pieces:
             if not self.is_determinate[first[wide | self.has_angles[first]]].all():
                 continue
             loops, ring = self._count_open_loops(self.piece[first[wide]]), self.has_angles[first[wide]]
-            if np.where(widths[wide] > BEAM, ring & (loops == 1), loops <= ring).all():
+            fine = np.where(widths[wide] > RING, False, np.where(widths[wide] > BEAM, ring & (loops == 1), loops <= ring))
+            if (fine | self._any(self.implied)[first[wide]]).all():
                 taken[found.rows] = True
+                taken |= self.implied & self._any(taken)
                 crowd = np.bincount(self.item[(taken & self.solved)[self.owner]], minlength=1)
                 return (Direct(max([CHAIN, *found.widths])) if crowd.max() > 1 else None), taken
         return None, taken

@@ -11,6 +11,7 @@ from ..device.number import OnDevice
 from ..features.feature import Batch, Scene
 from .corners import corners_of
 from .elimination import Plan, plan
+from .redundancy import implied_links
 from .slots import TENSEST, Slots
 from .solver import WIDTH, Solver
 from .system import REDUNDANT, SLACK, System, solvable
@@ -65,8 +66,9 @@ class Direct(Solver):
     constraints are solved in which way.
 
     Ropes, spacers and limits take part by an active set: those whose multiplier has the wrong sign are switched off, and those
-    that are violated are switched on, until nothing changes. A constraint that others imply (a double link) gets no multiplier.
-    Elimination is in f64 in every world, because its pivots span the mass ratio.
+    that are violated are switched on, until nothing changes. A constraint that others imply gets no multiplier: a double link, or
+    the second diagonal of a square, whose other links hold it (implied_links()). Elimination is in f64 in every world, because
+    its pivots span the mass ratio.
 
     A load that cannot be borne to first order (a straight rope between two pins) leaves the tension undetermined with directions
     at the start of the substep: an arbitrary number, which adds energy. Such a system is detected by a pivot that is a small part
@@ -91,9 +93,12 @@ class Direct(Solver):
         slot = np.concatenate([slots.places(b).ravel() for b in scalars])
         owner, item = corners_of(scalars)
         alone = np.concatenate([b.relaxed_alone(scene) for b in scalars])
-        free = (slot >= 0) & ~alone[owner]
+        implied = implied_links(scalars, scene)
+        free = (slot >= 0) & ~(alone | implied)[owner]
         found = plan(len(alone), owner[free], item[free], self.width)
-        return Elimination(scene, batches, slots, scalars, found, slot[free], item[free]) if found.parts else None
+        if not found.parts:
+            return None
+        return Elimination(scene, batches, slots, scalars, found, slot[free], item[free], implied)
 
     def explain(self, batches: list[Batch], slots: Slots) -> str:
         """Return how many constraints are solved by elimination, and how many relaxed alone."""
@@ -101,29 +106,37 @@ class Direct(Solver):
         if not system:
             return f"{self!r}: no system; all are relaxed as by Jacobi (wider than {self.width}, or not one number)"
         alone = system.count_relaxed_alone(batches)
-        parts = f"{system.rows} constraints by elimination (systems: {system.parts}, width: {max(system.plan.widths)})"
+        parts = f"{system.solved} constraints by elimination (systems: {system.parts}, width: {max(system.plan.widths)})"
+        implied = system.rows - system.solved
+        implied = f"; {implied} that these imply" if implied else ""
         alone = f"; {alone} relaxed as by Jacobi (wider than {self.width}, or not one number)" if alone else ""
-        return f"{self!r}: {parts}{alone}"
+        return f"{self!r}: {parts}{implied}{alone}"
 
     def __repr__(self) -> str:
         return "Direct()" if self.width == WIDTH else f"Direct(width={self.width})"
 
 
 class Elimination(System):
-    """The systems of one world on the device. Rows are constraints in the order of elimination."""
+    """The systems of one world on the device. Rows are constraints in the order of elimination.
 
-    host_only = ("plan", "late")
+    solved: the number of rows that are solved. Behind them come those of links that others imply: they take no step.
+    """
+
+    host_only = ("plan", "late", "has_implied")
     late = (SOFTENED,)
     parts: Any = OnDevice()  # number of systems
     entries: Any = OnDevice()  # number of couplings of two rows
+    solved: Any = OnDevice()
 
     def __init__(
         self, scene: Scene, batches: list[Batch], slots: Slots, scalars: "list[Scalar]", found: Plan, slot: np.ndarray,
-        item: np.ndarray,
+        item: np.ndarray, implied: np.ndarray,
     ):  # fmt: skip
-        super().__init__(scene, batches, slots, scalars, found.rows)
+        rows, self._part = _with_implied(found, scalars, scene, implied)
+        super().__init__(scene, batches, slots, scalars, rows)
         self._scalars = scalars
         self.plan, self.parts, self.entries = found, self.memory.number(found.parts), self.memory.number(len(found.column))
+        self.solved, self.has_implied = self.memory.number(len(found.rows)), len(rows) > len(found.rows)
         # Of each part that gave way in the last substep: (h' / h)^2 for the substep h' that it is softened for, the sum of its
         # violations, and what it lost to longer substeps, in energy h^2 / tension for h' = h. Else 0. The first number is below
         # 0 where the part seems to have borne its load, until its violations are seen to be gone. The last is
@@ -131,21 +144,20 @@ class Elimination(System):
         self.softened = scene.memory.field(SOFTENED, found.parts, width=4, kind=ti.f64, state=True)
         product = found.product.copy()
         product[:, 1:] = slot[product[:, 1:]]
-        side = np.repeat([b.side for b in scalars], [b.count for b in scalars])[found.rows]
+        side = np.repeat([b.side for b in scalars], [b.count for b in scalars])[rows]
         self.one_sided = bool(side.any())
         ints, reals = self.ints, self.reals
         self.part_begin, self.column, self.update = (ints(k, getattr(found, k)) for k in ("part_begin", "column", "update"))
         self.entry_begin, self.product_begin = ints("entry_begin", found.entry_begin), ints("product_begin", found.product_begin)
         self.update_begin, self.product = ints("update_begin", found.update_begin), ints("product", product, 3)
         self.gradient = scene.memory.field("system.gradient", slots.total, width=self.dim)
-        self.value, self.diagonal = reals("value", self.rows + 2 * self.entries), reals("weight")
+        self.value, self.diagonal = reals("value", self.solved + 2 * self.entries), reals("weight")
         who = np.zeros(slots.total, dtype=np.int64)
         who[slot] = item
         self.particle_of, self.w, self.inverse_size = ints("who", who), scene.state.w, reals("close")
         self.refines = scene.order == 2 and not self.limits_steps and not self.has_shared_particles
         if self.refines:
-            parts = np.repeat(np.arange(found.parts), np.diff(found.part_begin))
-            self.part_of, self.newton = ints("part_of", parts), ints("newton", np.full(found.parts, UNKNOWN))
+            self.part_of, self.newton = ints("part_of", self._part), ints("newton", np.full(found.parts, UNKNOWN))
             near = np.zeros(len(scene.inv_mass))
             for b in scalars:
                 inside = self.row(b) >= 0
@@ -156,15 +168,15 @@ class Elimination(System):
         if self.sleeps:  # all particles of a system sleep, or none
             self.representative = ints("lead", self.representatives(scalars, slots)[found.part_begin[:-1]])
         parts = [scene.inv_mass[b.indices] * (b.gradients(b.start.position) ** 2).sum(axis=2) for b in scalars]
-        least = np.concatenate([np.where(p > 0, p, np.inf).min(axis=1, initial=np.inf) for p in parts])[found.rows]
+        least = np.concatenate([np.where(p > 0, p, np.inf).min(axis=1, initial=np.inf) for p in parts])[rows]
         small = np.where(np.isfinite(least), SMALL_PIVOT * least, 0.0)
         self.small_pivot = scene.memory.field("system.small", self.rows, kind=ti.f64, values=small)
         llvm = runtime.architecture() in runtime.LLVM  # LLVM has all functions in f64
         exact = [b.quantity.precise and scene.real == ti.f32 and (llvm or not b.quantity.transcends) for b in scalars]
         self.precise = [(k, b) for k, b in enumerate(scalars) if exact[k]]
         if self.precise:
-            batch = np.repeat(np.arange(len(scalars)), [b.count for b in scalars])[found.rows]
-            number = np.concatenate([np.arange(b.count) for b in scalars])[found.rows]
+            batch = np.repeat(np.arange(len(scalars)), [b.count for b in scalars])[rows]
+            number = np.concatenate([np.arange(b.count) for b in scalars])[rows]
             self.batch, self.number = ints("batch", batch), ints("number", number)
         if self.one_sided:
             self.side, self.active, self.remaining = ints("side", side), ints("active", 0 * side), reals("left")
@@ -211,7 +223,7 @@ class Elimination(System):
         C, corners, stored = np.zeros(self.plan.part_begin[-1]), [], 0.0
         for b in self._scalars:
             row, violation = self.row(b), b.violation(x)
-            some = (row >= 0) & ~b.broken
+            some = (row >= 0) & (row < len(C)) & ~b.broken
             C[row[some]] = (violation if b.side == 0 else np.maximum(b.side * violation, 0.0))[some]
             who = b.indices[some]
             corners.append((np.repeat(row[some], who.shape[1]), who.ravel(), b.gradients(x)[some].reshape(-1, x.shape[1])))
@@ -244,7 +256,7 @@ class Elimination(System):
     def gives_way(self, batch: Batch, stiffens: bool = False) -> np.ndarray:
         """Return a mask of the constraints of a batch in parts that give way, (m,). stiffens: only if they cannot stiffen."""
         soft = self.memory.read(self.softened)[:, 0] != 0
-        parts = np.repeat(soft & ~(stiffens & self._can_stiffen()), np.diff(self.plan.part_begin))
+        parts = (soft & ~(stiffens & self._can_stiffen()))[self._part]
         row = self.row(batch)
         return parts[row] & (row >= 0)
 
@@ -284,7 +296,7 @@ class Elimination(System):
 
         softness: added to the diagonal. at_end: whether directions are those at the end of the substep.
         """
-        rows, entries = self.rows, self.entries
+        rows, entries = self.solved, self.entries
         for r in range(begin, end):
             self.value[r] = 0
             for e in range(self.entry_begin[r], self.entry_begin[r + 1]):
@@ -337,7 +349,7 @@ class Elimination(System):
 
         A constraint that others imply gets no step. It contradicts them if its residual is larger than rounding.
         """
-        hard, rows, entries = 0, self.rows, self.entries
+        hard, rows, entries = 0, self.solved, self.entries
         for r in range(begin, end):
             first, last, pivot, step = self.entry_begin[r], self.entry_begin[r + 1], self.value[r], self.step[r]
             if ti.abs(pivot) <= REDUNDANT * self.diagonal[r]:
@@ -626,3 +638,18 @@ class Elimination(System):
                         least, inverse = softness, 1 / tension
                         new = ti.max(new, 1.1 * softness)
                     softness = new
+
+
+def _with_implied(found: Plan, scalars: "list[Scalar]", scene: Scene, implied: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows of a plan with the implied links of its systems behind them, and the system of each row, (rows,) both."""
+    part = np.repeat(np.arange(found.parts), np.diff(found.part_begin))
+    owner, item = corners_of(scalars)
+    free = scene.inv_mass[item] > 0
+    system, inside = np.full(len(scene.inv_mass), -1), np.full(len(implied), -1)
+    inside[found.rows] = part
+    held = free & (inside[owner] >= 0)
+    system[item[held]] = inside[owner[held]]
+    also = free & implied[owner] & (system[item] >= 0)
+    inside[owner[also]] = system[item[also]]
+    more = np.flatnonzero(implied & (inside >= 0))
+    return np.concatenate([found.rows, more]), np.concatenate([part, inside[more]])

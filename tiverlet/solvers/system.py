@@ -37,6 +37,7 @@ class System:
     refines = False  # whether parts may take a second Newton step in a pass, see takes_step() and is_unmet()
     can_stiffen: Any = False  # whether parts gave way in a longer substep, and may bear their loads in this one
     keeps_softness_of_longer: Any = False  # whether a part is softened for a longer substep, so that shorter ones do not help
+    has_implied = False  # whether rows are links that others imply, which take no step
     late: tuple[str, ...] = ()  # the names of fields in the state that are not hashed where they are 0
     team: Any  # the threads that share the loops of start(), iterate() and end(); set when kernels are built
     stride: int  # iterations of such a loop for each block of rows

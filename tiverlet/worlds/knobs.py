@@ -171,8 +171,8 @@ def _check_fits(feature: Feature, name: str, value: Any) -> None:
 
 def _refuse_other_kernels(feature: Feature) -> None:
     raise ValueError(
-        f"Worlds: a knob of {feature!r} asks for what these kernels do not have, such as friction where there was none. Give the "
-        "World that Worlds is made of a value other than 0 first."
+        f"Worlds: a knob of {feature!r} asks for what these kernels do not have. Friction where there was none: give the World "
+        "that Worlds is made of a value other than 0 first. Other lengths of links that imply others: give it solver=tv.Jacobi()."
     )
 
 

@@ -265,6 +265,12 @@ class Scalar(Batch):
         """The compliances in a world of order above 2, which is built for their values though its kernels are not; else None."""
         return self.compliance.tobytes() if self.scene and self.scene.order > 2 else None
 
+    @property
+    def _implying(self) -> bytes | None:
+        """The lengths and compliances for which links imply others; None where none does."""
+        system = self.scene.slots.system if self.scene and self.solvable_together else None
+        return self.compliance.tobytes() + self.goal.tobytes() if system and system.has_implied else None
+
     def acts_as_force(self, scene: Scene) -> np.ndarray:
         """Return which constraints act as forces, (m,): soft ones in substeps of an order above 2. See high_order.py."""
         return (self.compliance > 0) & (scene.order > 2)
@@ -282,13 +288,14 @@ class Scalar(Batch):
     def needs_other_kernels(self) -> bool:
         """Whether the world has to be rebuilt.
 
-        It has to be where other constraints than before must be relaxed alone, or where compliances differ in a world of order
-        above 2. The result depends on the current values of knobs, not on earlier ones.
+        It has to be where other constraints than before must be relaxed alone, where compliances differ in a world of order above
+        2, and where links imply others, with other lengths and compliances. The result depends on the current values of knobs,
+        not on earlier ones.
         """
         if not (self.scene and self.acts):
             return super().needs_other_kernels
         others = self.solvable_together and bool((self._alone != self.relaxed_alone(self.scene)).any())
-        return super().needs_other_kernels or others or self._made_for != self._strictly
+        return super().needs_other_kernels or others or self._made_for != (self._strictly, self._implying)
 
     def drive_of(self, scene: Scene) -> Drive:
         """Make the Drive that moves the rest values of a driven batch."""
@@ -339,8 +346,8 @@ class Scalar(Batch):
 
     def bind(self, scene: Scene) -> None:
         """Declare the fields, and note for which values the world is built."""
-        self._alone, self._made_for = self.relaxed_alone(scene), self._strictly
         super().bind(scene)
+        self._alone, self._made_for = self.relaxed_alone(scene), (self._strictly, self._implying)
         self._scene_sized = self.dev.limit.scene_sized or self.dev.equation.scene_sized
         self.changed = False
 
