@@ -158,12 +158,17 @@ class VelocityProjection:
         return out
 
     @ti.func
+    def can_list(self, i):
+        """Whether particle i can have loaded pairs of its own, to be listed."""
+        return self.weight[i] > 0 and self.state.awake(i)
+
+    @ti.func
     def list_loaded(self, i, every):
         """List the loaded pairs of particle i: all of them, or without those that part. Returns their number."""
         first, w = self.list.first[i], self.state.w.of(i)
         change, borne = ti.zero(w), ti.zero(w)
         at = first
-        if self.weight[i] > 0 and self.state.awake(i):
+        if self.can_list(i):
             for word in range(self.list.word_count(i)):
                 # Not touches(): the pair may have parted in this pass, and both of its particles have to agree.
                 bits = self.list.touching_bits(i, word)
@@ -188,50 +193,44 @@ class VelocityProjection:
     def find(self, piece, begin, end, k, rounds, damps):
         """Do round k of finding what is projected, of particles begin ... end - 1, a piece.
 
-        The first round lists all loaded pairs. The next ones take one ring after the other around restless particles. The last
-        two split masses by the present normals, and finish the lists.
+        The first round finds the centers of what is projected. The next ones list the loaded pairs of one ring after the other
+        around these, and split masses by the present normals. The last round finishes the lists.
         """
         if k == 0:
-            self.begin(piece, begin, end, damps)
+            for i in range(begin, end):
+                self.number[i], self.ring[i] = 0, self.first_ring(i, damps)
         elif k == rounds - 1:
             self.finish_list(piece, begin, end)
             self.find_restless(piece, begin, end, damps == ALWAYS)
         else:
-            for m in range(begin, begin + self.count[piece]):
-                if k < rounds - 2:
-                    self.spread(self.loaded[m], k - 1)
-                else:
-                    self.split_by_present_normals(self.loaded[m])
+            for i in range(begin, end):
+                if self.ring[i] == k - 1:
+                    self.number[i] = self.list_loaded(i, damps == ALWAYS)
+                    self.split_by_present_normals(i)
+                    if k < rounds - 2:
+                        self.spread(i, k)
 
     @ti.func
-    def begin(self, piece, begin, end, damps):
-        """List the loaded pairs of particles begin ... end - 1, a piece. Positions do not change: one list serves all passes.
+    def first_ring(self, i, damps):
+        """Return the ring of particle i before others spread theirs: 0 for all particles, or for restless ones, else FAR.
 
-        Where not all are projected, also note which particles are at the center of those that are.
+        Particles without pairs of their own also have ring 0: a pair with one that cannot move is never left out.
         """
-        count = 0
-        for i in range(begin, end):
-            number = self.list_loaded(i, damps == ALWAYS)
-            self.number[i], self.ring[i] = number, 0
-            if number > 0:
-                self.loaded[begin + count] = i
-                count += 1
-                if damps != ALWAYS:
-                    ring = ti.select(damps == MAYBE and self.restless[i] != 0, 0, FAR)
-                    if ti.static(self.unequal):
-                        if ring == FAR and self.struck[i] != 0:
-                            ring = ti.static(RINGS) - self.struck[i]
-                    self.ring[i] = ring
-        self.count[piece] = count
+        ring = 0
+        if damps != ALWAYS and self.can_list(i):
+            ring = ti.select(damps == MAYBE and self.restless[i] != 0, 0, FAR)
+            if ti.static(self.unequal):
+                if ring == FAR and self.struck[i] != 0:
+                    ring = ti.static(RINGS) - self.struck[i]
+        return ring
 
     @ti.func
-    def spread(self, i, k):
-        """Put what touches particle i, in ring k, into the next ring."""
-        if self.ring[i] == k:
-            for e in range(self.list.first[i], self.list.first[i] + self.number[i]):
-                j = self.list.old_neighbour[e]
-                if self.ring[j] == FAR or self.ring[j] > k + 1:
-                    self.ring[j] = k + 1  # whoever else does this writes the same
+    def spread(self, i, ring):
+        """Put what touches particle i into this ring, unless it is in one farther in."""
+        for e in range(self.list.first[i], self.list.first[i] + self.number[i]):
+            j = self.list.old_neighbour[e]
+            if self.ring[j] == FAR or self.ring[j] > ring:
+                self.ring[j] = ring  # whoever else does this writes the same
 
     @ti.func
     def split_by_present_normals(self, i):
@@ -240,25 +239,23 @@ class VelocityProjection:
         A particle that has turned around another one since the start of the substep, as a small one does that is pressed into a
         large one, would have eigenvalues above 1 by the normals there, and the polynomial multiplies these.
         """
-        if self.ring[i] != FAR:
-            normals = ti.Matrix.zero(self.state.real, self.state.dim, self.state.dim)
-            for e in range(self.list.first[i], self.list.first[i] + self.number[i]):
-                r = self.state.separation(i, self.list.old_neighbour[e])
-                normals += r.outer_product(r) / r.dot(r)
-            split = self.state.w.of(i) * largest(normals)
-            if split > ti.static(1 + 1 / CONDITION) * self.weight[i]:  # up to there the polynomial is below 1
-                self.weight[i] = split
+        normals = ti.Matrix.zero(self.state.real, self.state.dim, self.state.dim)
+        for e in range(self.list.first[i], self.list.first[i] + self.number[i]):
+            r = self.state.separation(i, self.list.old_neighbour[e])
+            normals += r.outer_product(r) / r.dot(r)
+        split = self.state.w.of(i) * largest(normals)
+        if split > ti.static(1 + 1 / CONDITION) * self.weight[i]:  # up to there the polynomial is below 1
+            self.weight[i] = split
 
     @ti.func
     def finish_list(self, piece, begin, end):
         """Leave out what is FAR, of particles begin ... end - 1, a piece: particles, and pairs with them. Store the factor of
         each other pair that all passes multiply by."""
         count = 0
-        for m in range(begin, begin + self.count[piece]):
-            i = self.loaded[m]
-            first = self.list.first[i]
-            at = first
-            if self.ring[i] != FAR:
+        for i in range(begin, end):
+            if self.number[i] > 0:
+                first = self.list.first[i]
+                at = first
                 for e in range(first, first + self.number[i]):
                     j = self.list.old_neighbour[e]
                     if self.ring[j] != FAR:
@@ -266,9 +263,9 @@ class VelocityProjection:
                         shared = self.weight[i] + self.weight[j]
                         self.list.old_neighbour[at], self.push.old[at] = j, self.state.w.of(i) / (r.dot(r) * shared)
                         at += 1
+                self.number[i] = at - first
                 self.loaded[begin + count] = i
                 count += 1
-            self.number[i] = at - first
         self.count[piece] = count
 
     @ti.func
