@@ -111,7 +111,8 @@ class Pieces:
         """Return for each constraint, (m,), whether its piece is held in one place at most and is not overconstrained.
 
         Springs of angles do not count as constraints here, because they bear any load, nor do links that others imply, because
-        they bear none. Any other piece may bear loads that no constraint bears to first order, such as a beam between two walls.
+        they bear none. A rigid body with such links may be held anywhere. Any other piece may bear loads that no constraint bears
+        to first order, such as a rope between two walls.
         (owner, item): corners that cannot move; corners that constraints join are one place. A piece of n movable particles has
         dim n degrees of freedom, minus the rigid motions of the piece.
         """
@@ -121,7 +122,7 @@ class Pieces:
         n = self._count_distinct(self.owner, self.item)
         freedoms = np.where(n + pins > 2, self.dim * n - whole[np.minimum(pins, len(whole) - 1)], 1)
         rows = np.bincount(self.piece[self.acts & self.is_counted & ~self.implied], minlength=self.count)
-        return ((places <= 1) & (rows <= freedoms))[self.piece]
+        return ((places <= 1) & (rows <= freedoms))[self.piece] | self._any(self.implied)
 
     def _count_distinct(self, owner: np.ndarray, what: np.ndarray) -> np.ndarray:
         """Return how many distinct values of `what` the constraints `owner` of each piece have, (m,)."""

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from ..features.feature import Scene
 
 CONSISTENT = 1e-5  # of its length: a link violated by more contradicts the others, which then imply nothing
-FIRM = 1e-3  # the least square of a link's direction across all links chosen before it, where an independent one has up to 2
+FIRM = 1e-10  # the least square of a row across all rows chosen before it; of a beam of 8 cells the last one has 1e-4
 MOST = 300  # links of a body up to which it is examined
 RIGID_MOTIONS = {2: (3, 1, 0), 3: (6, 3, 1, 0)}  # of a body with 0, 1, 2, ... fixed particles, by dimension
 
