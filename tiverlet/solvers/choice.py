@@ -101,18 +101,19 @@ class Pieces:
         stiff = np.concatenate([_stiff(b, degree * w) for b in links]) & self.solved
         self.is_counted = stiff | ~self.solved | np.repeat([b.arity == 2 for b in links], counts)
         self.stiff = stiff & ~self._any(off)
-        self.is_determinate = self._is_determinate(owner[~free], item[~free])
+        self.is_determinate, self.is_body = self._is_determinate(owner[~free], item[~free])
 
     def _any(self, some: np.ndarray) -> np.ndarray:
         """Return for each constraint, (m,), whether its piece has any constraint in the mask `some`, (m,)."""
         return np.bincount(self.piece, weights=some & self.acts, minlength=self.count)[self.piece] > 0
 
-    def _is_determinate(self, owner: np.ndarray, item: np.ndarray) -> np.ndarray:
+    def _is_determinate(self, owner: np.ndarray, item: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return for each constraint, (m,), whether its piece is held in one place at most and is not overconstrained.
 
+        And whether the piece is a rigid body with links that others imply, which may be held anywhere.
+
         Springs of angles do not count as constraints here, because they bear any load, nor do links that others imply, because
-        they bear none. A rigid body with such links may be held anywhere. Any other piece may bear loads that no constraint bears
-        to first order, such as a rope between two walls.
+        they bear none. Any other piece may bear loads that no constraint bears to first order, such as a rope between two walls.
         (owner, item): corners that cannot move; corners that constraints join are one place. A piece of n movable particles has
         dim n degrees of freedom, minus the rigid motions of the piece.
         """
@@ -122,7 +123,8 @@ class Pieces:
         n = self._count_distinct(self.owner, self.item)
         freedoms = np.where(n + pins > 2, self.dim * n - whole[np.minimum(pins, len(whole) - 1)], 1)
         rows = np.bincount(self.piece[self.acts & self.is_counted & ~self.implied], minlength=self.count)
-        return ((places <= 1) & (rows <= freedoms))[self.piece] | self._any(self.implied)
+        body = (rows == freedoms)[self.piece] & self._any(self.implied)
+        return ((places <= 1) & (rows <= freedoms))[self.piece] | body, body
 
     def _count_distinct(self, owner: np.ndarray, what: np.ndarray) -> np.ndarray:
         """Return how many distinct values of `what` the constraints `owner` of each piece have, (m,)."""
@@ -166,7 +168,7 @@ class Pieces:
                 continue
             loops, ring = self._count_open_loops(self.piece[first[wide]]), self.has_angles[first[wide]]
             fine = np.where(widths[wide] > RING, False, np.where(widths[wide] > BEAM, ring & (loops == 1), loops <= ring))
-            if (fine | self._any(self.implied)[first[wide]]).all():
+            if (fine | self.is_body[first[wide]]).all():
                 taken[found.rows] = True
                 taken |= self.implied & self._any(taken)
                 crowd = np.bincount(self.item[(taken & self.solved)[self.owner]], minlength=1)

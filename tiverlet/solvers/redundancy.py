@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .corners import components, corners_of
+from .corners import components
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
@@ -18,40 +18,102 @@ RIGID_MOTIONS = {2: (3, 1, 0), 3: (6, 3, 1, 0)}  # of a body with 0, 1, 2, ... f
 def implied_links(links: "list[Any]", scene: "Scene") -> np.ndarray:
     """Return which constraints of these batches others imply, numbered through, (m,).
 
-    These are rigid links of connected pieces that move as rigid bodies: links with directions u between n movable particles,
-    rows (u, -u) of J, of which rank J = dim n - (rigid motions) are independent. They hold all distances, so that any further
-    link has its length anyway. Solved with the others it would make a matrix without inverse. Of the rows, each next one is that
-    with the largest part orthogonal to those before (QR with pivots).
+    These are rigid links of bodies that move as one. Of the rows (u, -u) of J, with directions u of links between n movable
+    particles, rank J = dim n - (rigid motions) are independent. They hold all distances, so that any further link has its length
+    anyway. Solved with the others it would make a matrix without inverse. Of the rows, each next one is that with the largest
+    part orthogonal to those before (QR with pivots). What else holds or joins bodies does not matter.
     """
     counts = [b.count for b in links]
     out = np.zeros(sum(counts), dtype=bool)
-    owner, item = corners_of(links)
-    w = scene.inv_mass
-    acts = np.bincount(owner, w[item] > 0, len(out)) > 0
-    fit = np.concatenate([_may_be_implied(b, scene) for b in links])
-    piece = components(len(out), owner[w[item] > 0], item[w[item] > 0])
-    refused = np.bincount(piece, acts & ~fit, len(out)) > 0
-    sizes = np.bincount(piece, acts, len(out))
-    some = np.flatnonzero(acts & ~refused[piece] & (sizes[piece] <= MOST))
-    if not len(some):
-        return out
-    pair, along = np.full((len(out), 2), -1), np.zeros((len(out), scene.particles.dim))
+    dim, w = scene.particles.dim, scene.inv_mass
+    pair, along = np.full((len(out), 2), -1), np.zeros((len(out), dim))
     of_pairs = np.repeat([b.arity == 2 for b in links], counts)
+    if not of_pairs.any():
+        return out
     pair[of_pairs] = np.concatenate([b.indices for b in links if b.arity == 2])
     ends = np.concatenate([b.placed(b.start.position) for b in links if b.arity == 2])
     along[of_pairs] = ends[:, 0] - ends[:, 1]
-    same: dict[tuple[int, bytes], list[np.ndarray]] = {}  # the links of bodies of one structure
-    some = some[np.argsort(piece[some], kind="stable")]
-    for rows in np.split(some, np.flatnonzero(np.diff(piece[some])) + 1):
+    fit = np.concatenate([_may_be_implied(b, scene) for b in links])
+    some = _core(np.flatnonzero(fit & (w[pair] > 0).any(axis=1)), pair, w > 0, dim)
+    if not len(some):
+        return out
+    owner, item = np.repeat(np.arange(len(some)), 2), pair[some].ravel()
+    piece = components(len(some), owner[w[item] > 0], item[w[item] > 0])
+    order = np.argsort(piece, kind="stable")
+    same: dict[tuple[int, bytes], list[np.ndarray]] = {}  # the links of pieces of one structure
+    for rows in np.split(some[order], np.flatnonzero(np.diff(piece[order])) + 1):
         particles, local = np.unique(pair[rows], return_inverse=True)
-        if len(particles) > 2 and len(rows) > _most_independent(w[particles] > 0, scene.particles.dim):
+        if len(rows) <= MOST:
             key = (w[particles] > 0).tobytes() + local.astype(np.int32).tobytes()
             same.setdefault((len(particles), key), []).append(rows)
-    for bodies in same.values():
-        rows = np.stack(bodies)
-        particles, local = np.unique(pair[rows[0]], return_inverse=True)
-        out[rows[_implied_in(along[rows], local.reshape(-1, 2), w[particles] > 0)]] = True
+    for pieces in same.values():
+        rows = np.stack(pieces)
+        ground = _links_between_fixed(pair[rows[0]], w)
+        held = scene.particles.position[ground[:, 0]] - scene.particles.position[ground[:, 1]]
+        for body in _bodies(np.concatenate([pair[rows[0]], ground]), np.concatenate([along[rows[0]], held]), rows.shape[1]):
+            particles, local = np.unique(pair[rows[0, body]], return_inverse=True)
+            if len(body) > _most_independent(w[particles] > 0, dim):
+                some = rows[:, body]
+                out[some[_implied_in(along[some], local.reshape(-1, 2), w[particles] > 0)]] = True
     return out
+
+
+def _links_between_fixed(pair: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Return links that hold the fixed particles of a piece in their places, (k, 2): the ground is a body, too."""
+    fixed = np.unique(pair[w[pair] == 0])
+    links = [(i, j) for j in fixed for i in fixed[:3] if i < j]
+    return np.array(links, dtype=np.int64).reshape(-1, 2)
+
+
+def _bodies(pair: np.ndarray, along: np.ndarray, count: int) -> list[np.ndarray]:
+    """Return the links of each body that moves as one, of connected links `pair` along vectors `along`; of the first `count`.
+
+    With the motions that keep all lengths, J v = 0, a set of particles is a body if its part of them has no more dimensions than
+    rigid motions. It grows from each link.
+    """
+    dim, (particles, local) = along.shape[1], np.unique(pair, return_inverse=True)
+    local, n = local.reshape(-1, 2), len(particles)
+    motions = RIGID_MOTIONS[dim][0]
+    sizes, kept = np.linalg.svd(_rows(along[None], local, n)[0].reshape(len(pair), -1))[1:]
+    free = kept[(sizes**2 > FIRM).sum() :].reshape(-1, n, dim)
+    if len(free) == motions:
+        return [np.arange(count)]
+    out, left = [], np.ones(len(pair), dtype=bool)
+    while left.any():
+        body = np.isin(np.arange(n), local[np.argmax(left)])
+        grows = True
+        while grows:
+            grows = False
+            for k in np.unique(local[body[local].any(axis=1)]):
+                larger = body | (np.arange(n) == k)
+                if not body[k] and np.linalg.matrix_rank(free[:, larger].reshape(len(free), -1), tol=FIRM**0.5) <= motions:
+                    body, grows = larger, True
+        inside = body[local].all(axis=1)
+        out.append(np.flatnonzero(inside[:count]))
+        left &= ~inside
+    return out
+
+
+def _rows(along: np.ndarray, local: np.ndarray, particles: int) -> np.ndarray:
+    """Return the rows of J of bodies with links along these vectors, (bodies, links, particles, dim)."""
+    J, k = np.zeros((*along.shape[:2], particles, along.shape[2])), np.arange(along.shape[1])
+    size = np.linalg.norm(along, axis=2, keepdims=True)
+    J[:, k, local[:, 0]] = np.divide(along, size, out=np.zeros_like(along), where=size > 0)
+    J[:, k, local[:, 1]] = -J[:, k, local[:, 0]]
+    return J
+
+
+def _core(links: np.ndarray, pair: np.ndarray, movable: np.ndarray, dim: int) -> np.ndarray:
+    """Return those of some links that may imply each other: without particles that at most `dim` of them hold, one by one.
+
+    Such a particle follows the others, so that no row depends on those of its links.
+    """
+    while True:
+        degree = np.bincount(pair[links].ravel(), minlength=len(movable))
+        stays = ((degree > dim) | ~movable)[pair[links]].all(axis=1)
+        if stays.all():
+            return links
+        links = links[stays]
 
 
 def _implied_in(along: np.ndarray, local: np.ndarray, movable: np.ndarray) -> np.ndarray:
@@ -60,10 +122,7 @@ def _implied_in(along: np.ndarray, local: np.ndarray, movable: np.ndarray) -> np
     along: (bodies, links, dim), the links as vectors. local: (links, 2), their ends. movable: which particles can move.
     """
     count, m, dim = along.shape
-    J, k, body = np.zeros((count, m, len(movable), dim)), np.arange(m), np.arange(count)
-    J[:, k, local[:, 0]] = along / np.linalg.norm(along, axis=2, keepdims=True)
-    J[:, k, local[:, 1]] = -J[:, k, local[:, 0]]
-    J = J[:, :, movable].reshape(count, m, -1)
+    J, body = _rows(along, local, len(movable))[:, :, movable].reshape(count, m, -1), np.arange(count)
     chosen, is_rigid = np.zeros((count, m), dtype=bool), np.ones((count, 1), dtype=bool)
     for _ in range(_most_independent(movable, dim)):
         size = np.where(chosen, -1.0, (J**2).sum(axis=2))
@@ -77,7 +136,7 @@ def _implied_in(along: np.ndarray, local: np.ndarray, movable: np.ndarray) -> np
 
 
 def _most_independent(movable: np.ndarray, dim: int) -> int:
-    """Return how many links hold a body of three or more particles. movable: which of them can move."""
+    """Return how many links hold a body of more than two particles. movable: which of them can move."""
     motions, fixed = RIGID_MOTIONS[dim], int((~movable).sum())
     return dim * int(movable.sum()) - motions[min(fixed, len(motions) - 1)]
 
