@@ -124,11 +124,12 @@ def test_long_frames_of_a_team_and_of_high_order():
 def test_an_endless_frame_is_undone(w, endless):
     pin = w.features[-1]
     w.run(0.1)
-    start = checkpoint.keep(w)
+    start, before = checkpoint.keep(w), pin.target
     pin.target = [[0.05, 0.35]]
     w.run(0.1)
     expected = w.hash()
     checkpoint.put_back(w, start)
+    pin.target = before
     pin.target = [[0.05, 0.35]]
     for name, value in endless.items():
         setattr(w, name, value)

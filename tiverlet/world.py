@@ -217,18 +217,47 @@ class World:
         return any(f.changed and f.has_released_load for f in self._features)
 
     def _restart_for_new_forces(self, steps: bool) -> None:
-        """Where a force has changed, turn displacements into velocities by the old force before it is lost.
+        """Where a force has changed, keep the velocities that displacements give with the old force before it is lost.
 
-        The old force is lost when it is overwritten, or left out of a copy. steps: see _rebuild_for_knobs().
+        They are turned into velocities, unless displacements can be changed instead. The old force is lost when it is
+        overwritten, or left out of a copy. steps: see _rebuild_for_knobs().
         """
         changed = [f for f in self._features if f.changed]
         if any([f.has_released_load for f in changed]):
             if not steps:
                 self._runner.note_displacements()
             self._restart_with_reactions()
-        elif any([f.new_force or isinstance(f, Acceleration) for f in changed]):
+        elif any([f.new_force or isinstance(f, Acceleration) for f in changed]) and not self._goes_on_with(changed, steps):
             with self._runner.memory.compiler():
                 (self._runner.restart if steps else self._runner.restart_between)(self._iterations)
+
+    def _goes_on_with(self, changed: list[Feature], steps: bool = False) -> bool:
+        """Write changed forces to the device, and let particles go on with the velocities that they have.
+
+        A start would do so, too, but would disturb all that rests for as long as the user steers: contacts and walls find half of
+        their loads in it. Returns False, and does nothing, where a start is needed: where springs or drags change, or kernels.
+        changed: the features that have changed. steps: see _rebuild_for_knobs().
+        """
+        runner, clock = self._runner, self._clock
+        forces = [f for f in changed if isinstance(f, Acceleration)]
+        if not forces or clock.d_is_velocity or not impulse.has_enough_digits(runner):
+            return False
+        others = any([f.new_force or f.has_released_load or f.needs_other_kernels for f in changed])
+        if others or not impulse.has_same_drag(runner):
+            return False
+        clock.bound = CHANGED
+        runner.wake()
+        velocity = runner.velocity(self._iterations)
+        for watcher in () if steps else self._watchers:
+            watcher.before()
+        for force in forces:
+            force.changed = False
+            force.upload()
+        if not impulse.keep_velocities(runner, velocity, self._iterations):
+            self._start_from(velocity if clock.velocity_override is None else clock.velocity_override)
+        for watcher in () if steps else self._watchers:
+            watcher.broken_off()  # no step leads to this state: the forces may change again before the next one
+        return True
 
     def _restart_with_reactions(self) -> None:
         """Start from the present velocities, which include the reaction that is about to end."""

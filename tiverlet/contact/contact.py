@@ -163,8 +163,8 @@ class Contact(PairContact):
         self.table.bind(scene)
         # The push of the pair in the last substep, per inverse mass [kg m].
         dev.push = PairData("push", 0, persistent=True, only_touching=True)
-        dev.slip = PairData("slip", dim, persistent=True)
-        dev.turn = PairData("turn", dev.axes, persistent=True) if dev.turns else None
+        dev.slip = PairData("slip", dim, persistent=True, ends_with_touch=True)
+        dev.turn = PairData("turn", dev.axes, persistent=True, ends_with_touch=True) if dev.turns else None
         dev.slack = PairData(
             "slack", 0, persistent=True, only_touching=True
         )  # the part of the overlap that is not pushed out [m]

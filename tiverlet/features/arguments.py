@@ -21,7 +21,8 @@ TAKEN_BY = {"one_way": "Capsule, Polygon and Mesh"}  # arguments that only some 
 
 
 class Knob:
-    """A live setting: checked when assigned, written to the device before the next frame.
+    """A live setting: checked when assigned, written to the device before the next frame. Assigning the value that it has does
+    nothing.
 
     check: a function (feature, value) -> value that raises for an invalid value.
     force: the knob changes a force, so displacements are turned into velocities first, see World._restart_for_new_forces().
@@ -50,11 +51,24 @@ class Knob:
         return feature.__dict__[self.name]
 
     def __set__(self, feature, value) -> None:
-        value, own = self.check(feature, value), feature.__dict__
+        value = self.check(feature, value)
+        if self.name not in feature.__dict__ or not _is_same(feature.__dict__[self.name], value):
+            self.put(feature, value)
+
+    def put(self, feature, value) -> None:
+        """Set a checked value, and let it be written to the device, even if it is the present one."""
+        own = feature.__dict__
         own[self.name] = as_read_only(value, assign_whole_advice(type(feature).__name__, self.name))
         own["changed"] = True
         if self.force:
             own["new_force"] = True
+
+
+def _is_same(old: Any, new: Any) -> bool:
+    """Whether two values of a knob are the same, bit for bit: numbers, or arrays of one type and shape."""
+    if isinstance(old, np.ndarray) and isinstance(new, np.ndarray):
+        return old.dtype == new.dtype and old.shape == new.shape and old.tobytes() == new.tobytes()
+    return type(old) is type(new) and isinstance(old, (bool, int, float)) and repr(old) == repr(new)
 
 
 def record_arguments(kind: Any) -> None:

@@ -23,10 +23,10 @@ class PairData:
     """Data of each listed pair: a number, or a vector of `width`.
 
     persistent: it belongs to the state, beyond a substep. for_reports: it is for reports only. is_transferred: it is copied to
-    the next
-    list; other data is recomputed. only_touching: it is 0 except for pairs whose bit in NeighbourList.touching is set.
-    kind: type of the numbers; None for that of the world. field, old: the data of the present list, and of the old list while a
-    new one is built.
+    the next list; other data is recomputed. only_touching: it is 0 except for pairs whose bit in NeighbourList.touching is set.
+    ends_with_touch: with one pass per substep it is cleared where that bit goes, so a new list sets the bit of pairs that have
+    it. kind: type of the numbers; None for that of the world. field, old: the data of the present list, and of the old list while
+    a new one is built.
     """
 
     field: Any
@@ -34,11 +34,23 @@ class PairData:
 
     def __init__(
         self, name: str, width: int, persistent: bool, is_transferred: bool = True, only_touching: bool = False, kind: Any = None,
-        for_reports: bool = False,
+        for_reports: bool = False, ends_with_touch: bool = False,
     ):  # fmt: skip
         self.name, self.width, self.kind = name, width, kind
         self.persistent, self.is_transferred = persistent, is_transferred
         self.only_touching, self.for_reports = only_touching, for_reports
+        self.ends_with_touch = ends_with_touch or only_touching
+
+    @ti.func
+    def is_set(self, value):
+        """Return 1 if a value of these data is not 0."""
+        some = 0
+        if ti.static(self.width == 0):
+            some = ti.cast(value != 0, ti.i32)
+        else:
+            for k in ti.static(range(self.width)):
+                some |= ti.cast(value[k] != 0, ti.i32)
+        return some
 
 
 class Column:
@@ -291,11 +303,7 @@ class NeighbourList:
                 for piece in ti.static(self.transferred):
                     value = piece.field[e]
                     piece.old[at] = value
-                    if ti.static(piece.width == 0):
-                        some |= ti.cast(value != 0, ti.i32)
-                    else:
-                        for k in ti.static(range(piece.width)):
-                            some |= ti.cast(value[k] != 0, ti.i32)
+                    some |= piece.is_set(value)
                 at += some
         self.old_first[i], self.old_number[i] = first, at - first
 
@@ -303,7 +311,7 @@ class NeighbourList:
     def transfer_pair_data(self, i):
         """Copy the data of each pair of particle i from the old list. Both lists are sorted.
 
-        Returns a word of bits: which of the first entries received data other than 0 that is only_touching.
+        Returns a word of bits: which of the first entries received data other than 0 that ends with their touch.
         """
         first, number = self.first[i], self.number[i]
         for piece in ti.static(self.pair_data):
@@ -322,8 +330,8 @@ class NeighbourList:
                     some = 0
                     for piece in ti.static(self.transferred):
                         piece.field[first + at] = piece.old[old]
-                        if ti.static(piece.only_touching):
-                            some |= ti.cast(piece.old[old] != 0, ti.i32)
+                        if ti.static(piece.ends_with_touch):
+                            some |= piece.is_set(piece.old[old])
                     if some != 0 and at < WORD:
                         bits |= ti.u32(1) << ti.cast(at, ti.u32)
         return bits

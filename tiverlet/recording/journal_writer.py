@@ -90,7 +90,9 @@ class Journal:
         for k, feature in enumerate(self.world.features):
             if feature.changed:
                 now, known = scene.knobs(feature), self._known[k]
-                new = {name: v for name, v in now.items() if name not in known or not _same(v, known[name])}
+                # A force that was changed and changed back counts: what it acts on was started anew.
+                forced = {name for name in now if feature.new_force and getattr(type(feature), name).force}
+                new = {name: v for name, v in now.items() if name in forced or name not in known or not _same(v, known[name])}
                 changed[k] = {name: scene.encode(v, f"{k}.{name}", arrays, scene.Needs()) for name, v in new.items()}
                 known.update(copy.deepcopy(new))
         if changed:

@@ -130,7 +130,8 @@ def set_knobs(feature: Feature, values: Mapping[str, Any]) -> None:
         raise ValueError(f"replay: {feature!r} has no knob {sorted(wrong)[0]!r}.")
     vars(feature).update(values)
     for name, value in values.items():
-        setattr(feature, name, value)
+        knob = getattr(type(feature), name)
+        knob.put(feature, knob.check(feature, value))
     feature.changed = True
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from .integrator import FREE
+from .integrator import FREE, decay
 
 ROUNDS = 100  # evaluations of velocities, at most, where forces read them
 NOTHING = 2.0**-20  # smallest share of a velocity that drag leaves, in factor()
@@ -73,17 +73,19 @@ class Displacements:
             self.write(field, np.where(self.some, self.was[field] + more, self.was[field]))
 
     def give(
-        self, want: np.ndarray, velocity: Callable[[], np.ndarray], factor: np.ndarray, seen: np.ndarray | None = None
-    ) -> np.ndarray:
+        self, want: np.ndarray, velocity: Callable[[], np.ndarray], factor: np.ndarray, seen: np.ndarray | None = None,
+        change: float = 0.0,
+    ) -> np.ndarray:  # fmt: skip
         """Change displacements until they give velocities `want`, (worlds, ..., dim) [m/s]. Returns where they do, (worlds,).
 
         One round suffices, and a second removes the rounding of the first. Where forces read velocities, rounds are repeated
         until the error falls no further. velocity: computes the velocities of the present displacements. factor: of each world,
-        see factor(). seen: the first result of velocity(), if it is known.
+        see factor(). seen: the first result of velocity(), if it is known. change: the largest change of velocities [m/s], if the
+        error may be relative to that.
         """
         more = best = np.zeros(want.shape)
         least, factor = np.full(len(want), np.inf), factor.reshape(-1, 1, 1)
-        largest = np.abs(want).max(axis=(1, 2), initial=0.0)
+        largest = np.abs(want).max(axis=(1, 2), initial=change)
         enough = DIGITS * np.finfo(self.was[self.field].dtype).eps * largest if self.again else 0.0
         for _ in range(ROUNDS if self.again else 2):
             lack = np.where(self.some, want - (velocity() if seen is None else seen), 0.0)
@@ -197,6 +199,35 @@ def steer(
     return True
 
 
+def has_same_drag(runner: Any) -> bool:
+    """Whether the drag rates are those of the last substep."""
+    clock = runner.clock
+    return clock.drag == (decay(sum(f.rate for f in runner.drags), clock.h) if runner.drags else None)
+
+
+def keep_velocities(runner: Any, want: np.ndarray, iterations: int) -> bool:
+    """Let particles go on with velocities `want`, (n, dim) [m/s], after forces have changed from a to a'.
+
+    The velocity is d / h + h (a + reaction) / 2, so d grows by h^2 (a - a') / 2. With the next substep, which adds h^2 a', that
+    is half a kick of the old force and half of the new one, and reactions follow from it. Particles on which the same forces act
+    continue bit for bit. Returns whether displacements were found; if not, the caller must take a start.
+    """
+    rows = (0, runner.n) if runner.paths else None  # velocities of beads point along their wires if all of them are computed
+    with runner.memory.compiler():
+        seen = runner.velocity(iterations)
+        first, end, chosen = _movable(runner, (seen != want).any(axis=1))
+        if first == end:
+            return True
+        begin, last = rows or (first, end)
+
+        def velocity() -> np.ndarray:
+            """Return the velocities of the present displacements."""
+            return runner.velocity(iterations, begin, last)[None, first - begin : end - begin]
+
+        change, factor = float(np.abs(want - seen).max()), np.array([factor_of(runner.clock)])
+        return bool(_those(runner, first, chosen).give(want[None, first:end], velocity, factor, seen[None, first:end], change)[0])
+
+
 def restore_turn(runner: Any, first: int, share: np.ndarray, spun: np.ndarray | None = None) -> None:
     """Give particles from `first` on back the part of friction's turn in half a substep that has ended. share: (m, 1).
 
@@ -268,8 +299,17 @@ def _movable(runner: Any, some: np.ndarray) -> tuple[int, int, np.ndarray]:
 
 
 def _those(runner: Any, first: int, some: np.ndarray) -> Displacements:
-    """Return the Displacements of particles from index `first` on, for a single world (not one of many copies)."""
+    """Return the Displacements of particles from index `first` on, of a single world, or of the chosen one of many copies."""
     memory, rows = runner.memory, slice(first, first + len(some))
+
+    def write(field: Any, v: np.ndarray) -> None:
+        """Write rows of the chosen copy."""
+        values = memory.read(field)
+        values[rows] = v[0]
+        memory.write(field, values)
+
+    if memory.copies:
+        return Displacements(runner, some[None], lambda field: memory.read(field)[None, rows].copy(), write)
     return Displacements(
         runner,
         some[None],
