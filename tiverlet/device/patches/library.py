@@ -7,6 +7,7 @@ file beside Taichi's cached kernels.
 import contextlib
 import ctypes
 import functools
+import hashlib
 import json
 import mmap
 import os
@@ -91,10 +92,9 @@ def find(*names: bytes) -> list[int] | None:
     known, asked = _known(), [name.decode() for name in (*names, SEEN)]
     if not all(name in known for name in asked):
         known.update(_search(_path(), *names, SEEN))
-        where = folder()
         with contextlib.suppress(OSError):
-            if where:
-                replace_file(where / "addresses.json", json.dumps([stamp(), known]).encode())
+            if path := _file():
+                replace_file(path, json.dumps([stamp(), known]).encode())
     at = [known[name] for name in asked]
     if not all(at):
         return None
@@ -106,13 +106,18 @@ def _path() -> str:
     return str(sys.modules["taichi._lib.core.taichi_python"].__file__)
 
 
+def _file() -> pathlib.Path | None:
+    """Return the file with the addresses in this build of the library."""
+    where = folder()
+    return where / f"{hashlib.blake2b(str(stamp()).encode(), digest_size=8).hexdigest()}.json" if where else None
+
+
 @functools.cache
 def _known() -> dict[str, int]:
     """Return the addresses found before, by name and relative to the library; 0 for what the library lacks."""
-    where = folder()
     with contextlib.suppress(OSError, ValueError, TypeError):
-        if where:
-            build, found = json.loads((where / "addresses.json").read_bytes())
+        if path := _file():
+            build, found = json.loads(path.read_bytes())
             if build == stamp():
                 return {str(name): int(value) for name, value in found.items()}
     return {}
