@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-PARSE, RESET = b"LLVMParseCommandLineOptions", b"_ZN4llvm2cl25ResetAllOptionOccurrencesEv"
+SWITCHED = b"LLVMParseCommandLineOptions", b"_ZN4llvm2cl25ResetAllOptionOccurrencesEv"  # the functions of switches
 SEEN = b"PyInit_taichi_python"  # an exported function, as the reference address
 SYMBOL = np.dtype([("name", "<u4"), ("kind", "<u4"), ("value", "<u8"), ("size", "<u8")])  # ELF-64; kind includes the section
 TABLE = 2  # section type of a symbol table
@@ -77,7 +77,7 @@ class CommandLine:
 @functools.cache
 def command_line() -> CommandLine | None:
     """Return the command line of the LLVM in Taichi's library; None if it is not found."""
-    addresses = find(PARSE, RESET)
+    addresses = find(*SWITCHED)
     if addresses is None:
         return None
     parse, reset = addresses
@@ -138,9 +138,9 @@ def _search(path: str, *names: bytes) -> dict[str, int]:
         for _, kind, _, _, offset, length, link, _ in sections:
             if kind == TABLE:
                 begin, end = sections[link][4], sections[link][4] + sections[link][5]
-                table = np.frombuffer(image[offset : offset + length], SYMBOL)
-                text = image[begin:end]
-                places = [text.find(b"\0" + name + b"\0") + 1 for name in names]
-                found = [table["value"][table["name"] == place] if place else () for place in places]
+                table = np.frombuffer(image, SYMBOL, length // SYMBOL.itemsize, offset)
+                places = [image.find(b"\0" + name + b"\0", begin, end) + 1 - begin for name in names]
+                found = [table["value"][table["name"] == place] if place > 0 else () for place in places]
+                del table  # it holds the mapping open
                 return {name: int(at[0]) if len(at) == 1 else 0 for name, at in zip(none, found, strict=True)}
     return none

@@ -24,7 +24,7 @@ from typing import Any
 from .. import language
 from ..interrupts import deferred_signals
 from ..language import impl
-from .library import command_line, find, folder, replace_file, stamp
+from .library import SWITCHED, command_line, find, folder, replace_file, stamp
 
 # Tables of virtual functions, then functions.
 NAMES = (
@@ -186,8 +186,8 @@ def machine_code() -> MachineCode | None:
     """Replace LLVM's generator; None where this is not possible, and without patches."""
     if language.start is not _start or platform.machine() != "x86_64" or not _processor():
         return None
-    addresses = find(*NAMES)
-    made = MachineCode(addresses) if addresses else None
+    addresses = find(*NAMES, *SWITCHED)  # those of the switches, too, in one search
+    made = MachineCode(addresses[: len(NAMES)]) if addresses else None
     return made if made and made.replaced else None
 
 
