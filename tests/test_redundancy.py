@@ -163,3 +163,17 @@ def test_a_body_gets_other_lengths_and_copies_of_it_the_same_bits(world):
     x = w.position
     np.testing.assert_allclose(np.linalg.norm(x[links[:, 0]] - x[links[:, 1]], axis=1), rods.rest, rtol=1e-3)
     assert "these imply" not in w.explain()
+
+
+def test_single_and_double_links_imply_nothing(world):
+    # Links between two particles are no body of three, in 3D, too: a net whose particles have many links, some of them twice.
+    # Particles that a rigid cluster holds, too, are left to relaxation, which splits their masses between both.
+    grid = np.array([*product(range(3), repeat=3)], dtype=float)
+    near = np.array([(i, j) for i, j in all_pairs(27) if np.abs(grid[i] - grid[j]).sum() == 1])
+    for pins in ([], [0, 26], [*range(9)]):
+        with pytest.warns(UserWarning, match="duplicates"):
+            twice = tv.Distance(np.concatenate([near, near[::7]]))
+        w = world(tv.Particles(grid, pinned=pins), [twice], solver=tv.Jacobi())
+        assert not implied_links(w._runner.batches, w._runner.scene).any()
+    w = world(tv.Particles(SQUARE), [tv.Distance(all_pairs(4)), tv.ShapeMatch([np.arange(4)])])
+    assert "Solved by Jacobi" in w.explain()

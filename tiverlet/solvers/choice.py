@@ -44,7 +44,7 @@ def choose_solver(batches: "list[Batch]", scene: "Scene") -> Solver:
     links = solvable(batches)
     if not links:
         return Jacobi()
-    pieces = Pieces(links, scene)
+    pieces = Pieces(links, scene, [b for b in batches if b.clusters])
     direct, taken = pieces.choose_direct()
     if pieces.has_many_stiff(~taken) and all(_may_iterate(b, scene) for b in links):
         return ConjugateGradient(CG_STEPS)
@@ -84,13 +84,16 @@ def _may_iterate(b: "Scalar", scene: "Scene") -> bool:
 class Pieces:
     """Connected pieces: sets of constraints that share movable particles, among those that a System could solve."""
 
-    def __init__(self, links: "list[Scalar]", scene: "Scene"):
+    def __init__(self, links: "list[Scalar]", scene: "Scene", clusters: "list[Batch]"):
         w, counts = scene.inv_mass, [b.count for b in links]
         owner, item = corners_of(links)
         free = w[item] > 0
         self.dim, self.count, self.owner, self.item = scene.particles.dim, sum(counts), owner[free], item[free]
-        self.piece, self.implied = components(self.count, self.owner, self.item), implied_links(links, scene)
+        self.piece = components(self.count, self.owner, self.item)
         self.acts = np.bincount(self.owner, minlength=self.count) > 0
+        held = np.isin(self.item, np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in clusters)]))
+        twice = self._any(np.bincount(self.owner, held, self.count) > 0)  # pieces of particles that clusters hold, too
+        self.implied = implied_links(links, scene) & ~twice
         self.pair = np.concatenate([np.zeros((0, 2), dtype=np.int64), *(b.indices for b in links if b.arity == 2)])
         self.pair_of = np.flatnonzero(np.repeat([b.arity == 2 for b in links], counts))
         self.has_angles = self._any(np.repeat([b.arity > 2 for b in links], counts))

@@ -52,7 +52,7 @@ def implied_links(links: "list[Any]", scene: "Scene") -> np.ndarray:
         held = scene.particles.position[ground[:, 0]] - scene.particles.position[ground[:, 1]]
         for body in _bodies(np.concatenate([pair[rows[0]], ground]), np.concatenate([along[rows[0]], held]), rows.shape[1]):
             particles, local = np.unique(pair[rows[0, body]], return_inverse=True)
-            if len(body) > _most_independent(w[particles] > 0, dim):
+            if len(particles) > 2 and len(body) > _most_independent(w[particles] > 0, dim):
                 some = rows[:, body]
                 out[some[_implied_in(along[some], local.reshape(-1, 2), w[particles] > 0)]] = True
     return out
