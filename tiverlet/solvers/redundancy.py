@@ -1,5 +1,6 @@
 """Links that others imply: a body needs no more links than hold it."""
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -66,31 +67,38 @@ def _links_between_fixed(pair: np.ndarray, w: np.ndarray) -> np.ndarray:
 
 
 def _bodies(pair: np.ndarray, along: np.ndarray, count: int) -> list[np.ndarray]:
-    """Return the links of each body that moves as one, of connected links `pair` along vectors `along`; of the first `count`.
+    """Return the links of each body that moves as one, of connected links `pair` along vectors `along`; of the first `count`."""
+    local = np.unique(pair, return_inverse=True)[1].astype(np.int32)
+    return _found_bodies(local.tobytes(), along.tobytes(), along.shape[1], count)
 
-    With the motions that keep all lengths, J v = 0, a set of particles is a body if its part of them has no more dimensions than
-    rigid motions. It grows from each link.
+
+@lru_cache(maxsize=64)  # a world that is built anew or copied asks again
+def _found_bodies(local: bytes, along: bytes, dim: int, count: int) -> list[np.ndarray]:
+    """Return _bodies(), of links between particles that are numbered from 0, as bytes of i32 and f64.
+
+    A body grows from a link, in 3D from a triangle, whose motions are those of a rigid body. Of all motions v that keep lengths,
+    J v = 0, those in which the seed stays where it is leave just the particles of its body in their places.
     """
-    dim, (particles, local) = along.shape[1], np.unique(pair, return_inverse=True)
-    local, n = local.reshape(-1, 2), len(particles)
-    motions = RIGID_MOTIONS[dim][0]
-    sizes, kept = np.linalg.svd(_rows(along[None], local, n)[0].reshape(len(pair), -1))[1:]
+    pair, links = np.frombuffer(local, dtype=np.int32).reshape(-1, 2), np.frombuffer(along).reshape(-1, dim)
+    n, motions = int(pair.max()) + 1, RIGID_MOTIONS[dim][0]
+    sizes, kept = np.linalg.svd(_rows(links[None], pair, n)[0].reshape(len(pair), -1))[1:]
     free = kept[(sizes**2 > FIRM).sum() :].reshape(-1, n, dim)
     if len(free) == motions:
         return [np.arange(count)]
+    joined = np.zeros((n, n), dtype=bool)
+    joined[pair[:, 0], pair[:, 1]] = joined[pair[:, 1], pair[:, 0]] = True
     out, left = [], np.ones(len(pair), dtype=bool)
     while left.any():
-        body = np.isin(np.arange(n), local[np.argmax(left)])
-        grows = True
-        while grows:
-            grows = False
-            for k in np.unique(local[body[local].any(axis=1)]):
-                larger = body | (np.arange(n) == k)
-                if not body[k] and np.linalg.matrix_rank(free[:, larger].reshape(len(free), -1), tol=FIRM**0.5) <= motions:
-                    body, grows = larger, True
-        inside = body[local].all(axis=1)
-        out.append(np.flatnonzero(inside[:count]))
-        left &= ~inside
+        link = int(np.argmax(left))
+        left[link] = False
+        seed = [*pair[link], *np.flatnonzero(joined[pair[link, 0]] & joined[pair[link, 1]])[: dim - 2]]
+        if len(seed) == dim:
+            moves, size, _ = np.linalg.svd(free[:, seed].reshape(len(free), -1))
+            still = moves[:, (size**2 > FIRM).sum() :].T
+            body = (np.einsum("ij,jkl->ikl", still, free) ** 2).sum(axis=(0, 2)) <= FIRM
+            inside = body[pair].all(axis=1)
+            out.append(np.flatnonzero(inside[:count]))
+            left &= ~inside
     return out
 
 
