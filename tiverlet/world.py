@@ -227,11 +227,11 @@ class World:
             if not steps:
                 self._runner.note_displacements()
             self._restart_with_reactions()
-        elif any([f.new_force or isinstance(f, Acceleration) for f in changed]) and not self._goes_on_with(changed, steps):
+        elif any([f.new_force or isinstance(f, Acceleration) for f in changed]) and not self._take_forces(changed, steps):
             with self._runner.memory.compiler():
                 (self._runner.restart if steps else self._runner.restart_between)(self._iterations)
 
-    def _goes_on_with(self, changed: list[Feature], steps: bool = False) -> bool:
+    def _take_forces(self, changed: list[Feature], steps: bool = False) -> bool:
         """Write changed forces to the device, and let particles go on with the velocities that they have.
 
         A start would do so, too, but would disturb all that rests for as long as the user steers: contacts and walls find half of

@@ -28,7 +28,7 @@ CG_STEPS = 5  # of conjugate gradients: at equal time, residuals of 5 to 20 step
 CHAIN = 2  # width of chains, trees, loops, joints of up to 3 rods
 BEAM = 5  # width of trusses, triangles on hinges, chains that bend: elimination takes two to three times as long as Jacobi
 RING = 8  # width of rings that bend: at 20 substeps Jacobi loses 0.5 to 60 % of their energy in 20 s, elimination 0 to 7 %
-BODY = 12  # width of rigid bodies with more links than hold them, such as a cube with all 28: their angles are not free
+BODY = 12  # width of rigid bodies with more links than hold them, such as a cube with all 28, which has no angle that is free
 MOST_TRIED = 2000  # constraints in a piece up to which it is tried as a beam: refusing a larger net would take long
 
 
@@ -158,9 +158,8 @@ class Pieces:
         must satisfy _is_determinate(), and consist of triangles or of one loop with springs of angles.
         """
         taken = np.zeros(self.count, dtype=bool)
-        longest = np.bincount(self.piece[self.acts], minlength=1).max()
+        longest, needed = np.bincount(self.piece[self.acts], minlength=1).max(), ~self.implied[self.owner]
         for width in ((CHAIN,) if longest > MOST_TRIED else (BODY, RING, BEAM, CHAIN)) if self.can_eliminate else ():
-            needed = ~self.implied[self.owner]
             found = plan(self.count, self.owner[needed], self.item[needed], width)
             first = found.rows[found.part_begin[:-1]]
             widths = np.array(found.widths, dtype=int)
@@ -170,7 +169,7 @@ class Pieces:
             if not self.is_determinate[first[wide | self.has_angles[first]]].all():
                 continue
             loops, ring = self._count_open_loops(self.piece[first[wide]]), self.has_angles[first[wide]]
-            fine = np.where(widths[wide] > RING, False, np.where(widths[wide] > BEAM, ring & (loops == 1), loops <= ring))
+            fine = (widths[wide] <= RING) & np.where(widths[wide] > BEAM, ring & (loops == 1), loops <= ring)
             if (fine | self.is_body[first[wide]]).all():
                 taken[found.rows] = True
                 taken |= self.implied & self._any(taken)

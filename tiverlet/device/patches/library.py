@@ -94,7 +94,7 @@ def find(*names: bytes) -> list[int] | None:
         known.update(_search(_path(), *names, SEEN))
         with contextlib.suppress(OSError):
             if path := _file():
-                replace_file(path, json.dumps([stamp(), known]).encode())
+                replace_file(path, json.dumps(known).encode())
     at = [known[name] for name in asked]
     if not all(at):
         return None
@@ -115,11 +115,9 @@ def _file() -> pathlib.Path | None:
 @functools.cache
 def _known() -> dict[str, int]:
     """Return the addresses found before, by name and relative to the library; 0 for what the library lacks."""
-    with contextlib.suppress(OSError, ValueError, TypeError):
+    with contextlib.suppress(OSError, ValueError, TypeError, AttributeError):  # no such file, or a damaged one
         if path := _file():
-            build, found = json.loads(path.read_bytes())
-            if build == stamp():
-                return {str(name): int(value) for name, value in found.items()}
+            return {str(name): int(value) for name, value in json.loads(path.read_bytes()).items()}
     return {}
 
 

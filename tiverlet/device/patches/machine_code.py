@@ -40,7 +40,8 @@ NAMES = (
     b"LLVMParseIRInContext",
 )
 SLOTS = 5  # entries of the generator's table: two of C++, two destructors, the generator
-HEAD = 16  # bytes of a table before its functions; and of the hash before the code in a file
+HEAD = 16  # bytes of a table before its functions
+HASH = 16  # bytes of a hash, which names a file or stands in it before the code
 SAME = ("vendor_id", "cpu family", "model", "stepping", "flags")  # what two equal processors have in common
 MARKED, FAILED = 2, 1  # flags of a result of LLVM's: not examined yet; an error
 EMPTY = 1  # kind of a text of LLVM's
@@ -232,21 +233,21 @@ def _hash(bitcode: bytes) -> str:
     line = command_line()
     config: Any = impl.default_cfg()
     around = repr((stamp(), _processor(), line.given if line else (), config.fast_math))
-    return hashlib.blake2b(bitcode, digest_size=HEAD, key=hashlib.blake2b(around.encode(), digest_size=HEAD).digest()).hexdigest()
+    return hashlib.blake2b(bitcode, digest_size=HASH, key=_digest(around.encode())).hexdigest()
 
 
 def _digest(code: bytes) -> bytes:
-    return hashlib.blake2b(code, digest_size=HEAD).digest()
+    return hashlib.blake2b(code, digest_size=HASH).digest()
 
 
 def _read(path: pathlib.Path) -> bytes | None:
     """Return the machine code in a file; None if there is none. A damaged file is deleted."""
     with contextlib.suppress(OSError):
         content = path.read_bytes()
-        if _digest(content[HEAD:]) == content[:HEAD]:
+        if _digest(content[HASH:]) == content[:HASH]:
             with contextlib.suppress(OSError):  # the file may be somebody else's
                 os.utime(path)  # see drop_old()
-            return content[HEAD:]
+            return content[HASH:]
         path.unlink()
     return None
 
@@ -264,14 +265,13 @@ def drop_old(where: pathlib.Path) -> None:
     if not where.exists():
         return
     files = sorted((found.st_mtime, found.st_size, entry.path) for entry in os.scandir(where) for found in [entry.stat()])
-    most = impl.default_cfg().offline_cache_max_size_of_files
-    over = sum(size for _, size, _ in files) - most // 2
-    if over <= most - most // 2:
+    most, total = impl.default_cfg().offline_cache_max_size_of_files, sum(size for _, size, _ in files)
+    if total <= most:
         return
     for _, size, path in files:
-        if over > 0:
+        if total > most // 2:
             os.unlink(path)
-            over -= size
+            total -= size
 
 
 _start_anew: Any = language.start
