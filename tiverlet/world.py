@@ -281,6 +281,9 @@ class World:
     def _upload(self) -> None:
         """Write to the device what was changed in Python since the last frame."""
         constraints_changed = any(b.changed for b in self._runner.batches)
+        search = self._runner.search
+        if search and search.walls and any(isinstance(f, Collider) and f.changed for f in self._features):
+            search.list.invalidate()  # it lists the walls near particles
         for feature in self._features:
             if feature.moving:
                 feature.moving = False

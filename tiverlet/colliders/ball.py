@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import checks
-from ..device import ti
+from ..device import inline, ti
 from ..features.feature import Knob, Scene
 from ..geometry.intervals import ball, entry, exit_of, rounding
 from ..geometry.nearest import surface_normal
@@ -33,6 +33,7 @@ class Ball(Collider):
 
     center = Knob(lambda f, v: checks.vector("Ball", "center", v, f.dim or len(np.atleast_1d(v))), "Middle of the ball [m].")
 
+    shares_code = True
     radius = Knob(lambda f, v: f._size(v), "Of the ball [m].", device="size")
     widest = 0.0  # radius of a particle [m]
 
@@ -123,6 +124,51 @@ class Ball(Collider):
     def _middle(self) -> np.ndarray:
         """The present center [m]."""
         return self.center if self.scene is None else self.dev.center.now
+
+    @property
+    def has_bounds(self) -> bool:
+        """Whether particles are outside."""
+        return not self.inside
+
+    @property
+    def middle(self) -> np.ndarray:
+        """The center."""
+        return self.center
+
+    @ti.func
+    def bounds(self):
+        """Return the corners of the box around the ball at the start and the end of the frame."""
+        a, b, r = self.dev.center.ends[0], self.dev.center.ends[1], ti.cast(self.radius, self.dev.real)
+        return ti.min(a, b) - r, ti.max(a, b) + r
+
+    sides = 1  # type: ignore[assignment]
+    bends = True
+
+    @ti.func
+    def least_gap(self, face, i, radius):
+        """Return the gap at the last center, less how far it moves."""
+        depth, _n = self.nearest(self.dev.state.nearest(self.dev.state.place(i) - self.dev.center.ends[1]), self.own(), radius)
+        return -depth - (self.dev.center.ends[1] - self.dev.center.ends[0]).norm()
+
+    @inline
+    def own(self):
+        """Return the radius of the ball."""
+        return ti.cast(self.radius, self.dev.real)
+
+    @ti.func
+    def start_gap(self, face, i, radius, frame_fraction):
+        """Return the gap to the ball."""
+        r = self.dev.state.nearest(self.dev.state.place(i) - self.dev.center.at(frame_fraction[0])) - self.dev.state.d[i]
+        depth, n = self.nearest(r, self.own(), radius)
+        bend = ti.static(-1 if self.inside else 1) / ti.max(r.norm(), self.own() * TOUCH)
+        return -depth, n, bend, self.dev.center.step(frame_fraction)
+
+    @ti.func
+    def end_gap(self, face, i, radius, frame_fraction):
+        """Return the gap to the ball."""
+        r = self.dev.state.nearest(self.dev.state.place(i) - self.dev.center.at(frame_fraction[1]))
+        depth, n = self.nearest(r, self.own(), radius)
+        return -depth, n
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, mode):

@@ -42,7 +42,7 @@ class Box(Collider):
     One-sided: a particle cannot leave at any speed, and no force can pull it out.
     """
 
-    inside = poses = True
+    inside = poses = shares_code = True
     widest = 0.0
     lower = Knob(_corner("lower"), "Lower corner [m].")
     upper = Knob(_corner("upper"), "Upper corner [m].")
@@ -157,6 +157,56 @@ class Box(Collider):
             if a != b:
                 at, shift = a * (1 - frame_fraction[1]) + b * frame_fraction[1], (b - a) * (frame_fraction[1] - frame_fraction[0])
             self.dev.now[side] = ti.Vector([at, shift])
+
+    @property
+    def sides(self) -> int:
+        """Two for each axis."""
+        return 2 * self.dim
+
+    @ti.func
+    def side(self, face):
+        """Return the axis of a side, and the sign of its normal."""
+        upper = face >= self.dim
+        return ti.select(upper, face - self.dim, face), ti.select(upper, -1, 1)
+
+    @ti.func
+    def height(self, axis, sign, x, plane):
+        """Return how far x is inside of a plane across an axis."""
+        out = ti.zero(plane)
+        for k in ti.static(range(self.dim)):
+            if k == axis:
+                out = sign * (x[k] - plane)
+        return out
+
+    @ti.func
+    def normal(self, axis, sign):
+        """Return the normal of a side."""
+        n = ti.Vector.zero(self.dev.real, self.dim)
+        for k in ti.static(range(self.dim)):
+            if k == axis:
+                n[k] = sign
+        return n
+
+    @ti.func
+    def least_gap(self, face, i, radius):
+        """Return the gap at the inner one of the planes between which the side moves."""
+        axis, sign = self.side(face)
+        a, b, x = self.dev.sides[face][0], self.dev.sides[face][1], self.dev.state.place(i)
+        return ti.min(self.height(axis, sign, x, a), self.height(axis, sign, x, b)) - radius
+
+    @ti.func
+    def start_gap(self, face, i, radius, frame_fraction):
+        """Return the gap to a side."""
+        axis, sign = self.side(face)
+        n, now = self.normal(axis, sign), self.dev.now[face]
+        gap = self.height(axis, sign, self.dev.state.place(i), now[0]) - n.dot(self.dev.state.d[i]) + sign * now[1] - radius
+        return gap, n, 0 * gap, now[1] * sign * n
+
+    @ti.func
+    def end_gap(self, face, i, radius, frame_fraction):
+        """Return the gap to a side."""
+        axis, sign = self.side(face)
+        return self.height(axis, sign, self.dev.state.place(i), self.dev.now[face][0]) - radius, self.normal(axis, sign)
 
     @ti.func
     def may_touch(self, i, radius):

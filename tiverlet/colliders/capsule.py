@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import checks
-from ..device import ti
+from ..device import inline, ti
 from ..features.feature import Knob, Scene
 from ..geometry.intervals import capsule, entry, rounding
 from ..geometry.nearest import closest_segment_point, surface_normal
@@ -35,6 +35,7 @@ class Capsule(Collider):
     """
 
     code_size = 0.6
+    shares_code = has_bounds = True
     a, b = _end("a"), _end("b")
     radius = Knob(lambda f, v: checks.number("Capsule", "radius", v, above=0.0), "Of the rod [m].", device="size")
 
@@ -123,6 +124,58 @@ class Capsule(Collider):
         if 0 < t < 1:
             n -= axis * (n.dot(axis) / ti.max(axis.dot(axis), SHORT))
         return a * (1 - t) + b * t + n * (length / ti.max(n.norm(), TOUCH))
+
+    @property
+    def middle(self) -> np.ndarray:
+        """The middle of the axis."""
+        return (self.a + self.b) / 2
+
+    @ti.func
+    def bounds(self):
+        """Return the corners of the box around both ends, at the start and the end of the frame."""
+        low, high = ti.min(self.dev.a.ends[0], self.dev.b.ends[0]), ti.max(self.dev.a.ends[0], self.dev.b.ends[0])
+        low, high = ti.min(low, self.dev.a.ends[1], self.dev.b.ends[1]), ti.max(high, self.dev.a.ends[1], self.dev.b.ends[1])
+        r = ti.cast(self.radius, self.dev.real)
+        return low - r, high + r
+
+    sides = 1  # type: ignore[assignment]
+    bends = True
+
+    @ti.func
+    def least_gap(self, face, i, radius):
+        """Return the gap at the last ends, less how far these move."""
+        a, b = self.dev.a.ends[1], self.dev.b.ends[1]
+        x = self.dev.state.around(self.dev.state.place(i), (a + b) / 2)
+        _t, length, _n = self.nearest(x, a, b)
+        return length - self.reach(radius) - ti.max((a - self.dev.a.ends[0]).norm(), (b - self.dev.b.ends[0]).norm())
+
+    @inline
+    def reach(self, radius):
+        """Return the distance from the axis at which a particle touches."""
+        return ti.cast(self.radius, self.dev.real) + radius
+
+    @ti.func
+    def start_gap(self, face, i, radius, frame_fraction):
+        """Return the gap to the rod. Beside the axis it is flat, but for the corners of the cap that end in the substep."""
+        a, b = self.dev.a.at(frame_fraction[0]), self.dev.b.at(frame_fraction[0])
+        x = self.dev.state.around(self.dev.state.place(i), (a + b) / 2) - self.dev.state.d[i]
+        t, length, n = self.nearest(x, a, b)
+        bend = 1 / ti.max(length, self.reach(radius) * TOUCH)
+        if ti.static(self.dim == 2):
+            bend = ti.select(0 < t < 1, 0 * length, bend)
+        return (
+            length - self.reach(radius),
+            n,
+            bend,
+            self.dev.a.step(frame_fraction) * (1 - t) + self.dev.b.step(frame_fraction) * t,
+        )
+
+    @ti.func
+    def end_gap(self, face, i, radius, frame_fraction):
+        """Return the gap to the rod."""
+        a, b = self.dev.a.at(frame_fraction[1]), self.dev.b.at(frame_fraction[1])
+        _t, length, n = self.nearest(self.dev.state.around(self.dev.state.place(i), (a + b) / 2), a, b)
+        return length - self.reach(radius), n
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, mode):

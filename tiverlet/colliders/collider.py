@@ -24,8 +24,9 @@ class Collider(Feature):
     Where one correction may push a particle into a wall again (several walls, a box in whose corners particles bounce),
     corrections are repeated until none changes anything. The first rounds include friction and bounces. Later rounds leave both
     out, and are then projections of the displacement, which add no energy. A particle that is still not free, in a wedge, stays
-    where it was at the start of the substep. Where walls that move towards each other leave no room, the last of them in the list
-    prevails.
+    where it was at the start of the substep. Where walls that move towards each other leave no room, the last of them
+    prevails. Walls of one kind share code and act together, see WallGroup: kinds in the order of the first wall of each, walls of
+    a kind in the order of the list.
 
     friction: Coulomb, a number or (static, dynamic). The tangential displacement relative to the wall is removed, up to friction
     times the normal displacement from the wall, so neither coefficient depends on h. A sticking particle returns bit for bit to
@@ -61,7 +62,7 @@ class Collider(Feature):
     friction = Knob(lambda f, v: _friction(f, v), "A number, or (static, dynamic, rolling, twisting).")
     restitution = Knob(lambda f, v: _restitution(f, v), "0 to 1, or (normal, tangential).")
     active = Knob(lambda f, v: checks.flag(repr(f), "active", v), "Whether it is there.")
-    push_out = Knob(lambda f, v: checks.number(repr(f), "push_out", v, least=0.0), "[m/s].", compiled=True)
+    push_out = Knob(lambda f, v: checks.number(repr(f), "push_out", v, least=0.0), "[m/s].")
     events = Knob(lambda f, v: checks.flag(repr(f), "events", v), "Whether World.wall_events() tells of it.", compiled=True)
     surface_velocity = Knob(lambda f, v: _surface_velocity(f, v), "Of the surface relative to the wall, (dim,) [m/s].")
     compiled_for = ("has_friction", "has_restitution", "has_switch", "has_surface_velocity", "turns")
@@ -72,7 +73,10 @@ class Collider(Feature):
     needs_repeat = False  # after confine(), a particle with friction or a bounce may have to be confined again
     dim = 0  # 2 or 3; 0 while it is not known
     inside = False  # particles are kept inside of it
+    closed: Any = True  # encloses a volume
     poses = False  # has a pose(frame_fraction) to be computed once for each substep, before any confine()
+    shares_code = False  # walls of this very class with equal code_key differ only in what fields hold
+    has_bounds = False  # it has bounds(): no particle far from these touches it
 
     def set_surface(
         self, friction: Any, restitution: Any, push_out: float, active: bool | None, events: bool = False, one_way: Any = None,
@@ -144,6 +148,22 @@ class Collider(Feature):
         """Whether the wall can be switched off, by the compiled kernels or those to be compiled."""
         return self._switch or not self.active or "has_switch" in self.compiled_so_far
 
+    @property
+    def code_key(self) -> Any:
+        """What decides the code of its kernels, so that walls with equal keys form a WallGroup; None for code of its own.
+
+        The log of events has a row for each particle, so a wall with events is alone.
+        """
+        if self.events or not vars(type(self)).get("shares_code"):
+            return None
+        values = (getattr(self, name) for name in ("dim", "inside", "closed", *self.compiled_for))
+        return type(self), self.one_way is None, *values
+
+    @property
+    def middle(self) -> np.ndarray:
+        """A point about which it is, (dim,) [m]."""
+        raise NotImplementedError
+
     def bind(self, scene: Scene) -> None:
         """Store the state, and make the surface."""
         self.scene = scene
@@ -168,7 +188,7 @@ class Collider(Feature):
         """Write friction, restitution, `active` and the velocity of the surface to the device."""
         self.dev.surface.upload(
             friction_of(repr(self), "friction", self.friction), self._bounce, self.active,
-            self._velocity(self.scene.particles.dim),
+            self._velocity(self.scene.particles.dim), self.push_out,
         )  # fmt: skip
 
     def can_regroup(self, change: Regrouping) -> bool:
@@ -204,6 +224,46 @@ class Collider(Feature):
         freely.
         """
         raise NotImplementedError
+
+    @property
+    def sides(self) -> int:
+        """The number of its faces, each of which may press on a particle at the same time; 0 if it cannot tell gaps."""
+        return 0
+
+    bends = False  # whether its faces are curved
+
+    @ti.func
+    def bounds(self):
+        """Return the corners of a box in which it stays during the frame [m]."""
+        return ti.zero(self.dev.state.d[0]), ti.zero(self.dev.state.d[0])
+
+    has_facets = False  # its number of sides is no part of the code
+
+    @ti.func
+    def near_sides(self, i, reach):
+        """Return from where to where side_at() has the sides that may be within `reach` of particle i during the frame."""
+        return 0, self.sides
+
+    @ti.func
+    def side_at(self, place):
+        """Return the side at a place of near_sides(). Sides are in order."""
+        return place
+
+    @ti.func
+    def least_gap(self, face, i, radius):
+        """Return a bound from below on the gap of particle i at a face, wherever the wall is in the frame [m]."""
+        return 0 * radius
+
+    @ti.func
+    def start_gap(self, face, i, radius, frame_fraction):
+        """Return the gap of particle i at a face at the start of the substep, the normal, the curvature of the gap [1/m], and
+        how far the wall moves there in the substep [m]."""
+        return 0 * radius, ti.zero(self.dev.state.d[i]), 0 * radius, ti.zero(self.dev.state.d[i])
+
+    @ti.func
+    def end_gap(self, face, i, radius, frame_fraction):
+        """Return the gap of particle i at a face at the end of the substep [m], and the normal."""
+        return 0 * radius, ti.zero(self.dev.state.d[i])
 
     @ti.func
     def may_touch(self, i, radius):

@@ -12,7 +12,7 @@ from ..features.feature import Scene
 from ..particles import Particles
 from .facet_grid import FacetGrid
 from .facet_solid import FacetSolid
-from .shape import Shape
+from .shape import FAR, Shape
 from .surface import TOUCH
 
 NEWTON = 16  # steps to the time of a touch; only grazing paths need more than 3
@@ -44,6 +44,21 @@ class Facets:
     def _solid(self) -> FacetSolid:
         """The solid for host queries, made at the first query."""
         return FacetSolid(self)
+
+    @property
+    def sides(self) -> int:
+        """The number of facets."""
+        return len(self.corners)
+
+    @property
+    def limited(self) -> bool:
+        """Whether the solid is not all around."""
+        return not (self.closed and self.inside)
+
+    @property
+    def middle(self) -> np.ndarray:
+        """The middle of the box around the facets."""
+        return (self.corners.min(axis=(0, 1)) + self.corners.max(axis=(0, 1))) / 2
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """Return the distance of points of this frame to the facets, negative behind them, (k,) [m]."""
@@ -195,6 +210,37 @@ class FacetShape(Shape):
     def vector(self, numbers: ti.template()):  # type: ignore[valid-type]
         """Return a vector of Numbers."""
         return ti.Vector([number.now for number in ti.static(numbers)])
+
+    @ti.func
+    def facets_near(self, q, reach):
+        """Return the list of the cell of q, or of all facets where it may be too short."""
+        begin, end, clear = self.around(q)
+        if begin == end and clear <= reach or begin < end and self.reach < reach:
+            begin, end = self.begin[self.all], self.begin[self.all + 1]
+        return begin, end
+
+    @ti.func
+    def facet_gap(self, f, q):
+        """Return the distance of q from facet f, the normal and the curvature. Beside the facet it is round about its corners."""
+        distance, n, at = self.nearest(f, q)
+        bend = 0 * distance
+        if at < 0:
+            if ti.static(self.closed):
+                if n.dot(self.normal[f]) < 0:
+                    distance, n = -distance, -n
+        else:
+            bend = 1 / ti.max(distance, self.touch)
+            hidden = not self.is_nearest_feature(at, n)
+            if ti.static(self.closed):
+                hidden = hidden or n.dot(self.facing[at]) < 0
+            if hidden:
+                distance = ti.cast(FAR, self.real)
+        return distance, n, bend
+
+    @ti.func
+    def box(self):
+        """Return the corners of the box around the facets."""
+        return self.vector(self.low), self.vector(self.high)
 
     @ti.func
     def rounding(self, q):

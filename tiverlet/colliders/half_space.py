@@ -23,6 +23,7 @@ class HalfSpace(Collider):
     One-sided: a particle cannot pass at any speed, and no force can pull it through.
     """
 
+    shares_code = True
     offset = Knob(lambda f, v: checks.number("HalfSpace", "offset", v), "Of the plane along its normal [m].")
 
     def __init__(
@@ -91,6 +92,30 @@ class HalfSpace(Collider):
     def _plane(self) -> float:
         """The present offset of the plane [m]."""
         return float(self.offset if self.scene is None else self.scene.memory.read(self.dev.offset)[0, 1])  # type: ignore[arg-type]
+
+    sides = 1  # type: ignore[assignment]
+
+    @ti.func
+    def least_gap(self, face, i, radius):
+        """Return the gap at the higher one of the planes between which it moves."""
+        offset = self.dev.offset[None]
+        return self.dev.normal[None].dot(self.dev.state.place(i)) - ti.max(offset[0], offset[1]) - radius
+
+    @ti.func
+    def start_gap(self, face, i, radius, frame_fraction):
+        """Return the gap to the plane."""
+        n, offset = self.dev.normal[None], self.dev.offset[None]
+        before = offset[0] * (1 - frame_fraction[0]) + offset[1] * frame_fraction[0]
+        now = offset[0] * (1 - frame_fraction[1]) + offset[1] * frame_fraction[1]
+        gap = n.dot(self.dev.state.place(i)) - n.dot(self.dev.state.d[i]) - before - radius
+        return gap, n, 0 * gap, (now - before) * n
+
+    @ti.func
+    def end_gap(self, face, i, radius, frame_fraction):
+        """Return the gap to the plane."""
+        n, offset = self.dev.normal[None], self.dev.offset[None]
+        now = offset[0] * (1 - frame_fraction[1]) + offset[1] * frame_fraction[1]
+        return n.dot(self.dev.state.place(i)) - now - radius, n
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, mode):

@@ -30,6 +30,7 @@ class Mesh(Moving):
     """
 
     dim = 3
+    shares_code = True
 
     def __init__(
         self, vertices, faces, inside: bool = False, *, closed: bool = True, radius: float = 0.0, position: ArrayLike = 0.0,

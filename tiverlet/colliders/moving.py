@@ -45,9 +45,12 @@ class Moving(Collider):
     """
 
     code_size = 1.5
-    needs_start_position = poses = True
+    needs_start_position = poses = bends = has_facets = True
     radius: Any = Knob(
-        lambda f, v: checks.number(repr(f), "radius", v, least=0.0), "It is rounded by so much [m].", compiled=True
+        lambda f, v: checks.number(repr(f), "radius", v, least=0.0),
+        "Rounded by so much [m].",
+        built=True,
+        device="thickness",
     )
     position = Knob(_position, "Where the origin of the wall's frame is [m].")
     rotation = Knob(_rotation, "Angle (2D) or rotation vector (3D) [rad].")
@@ -69,6 +72,7 @@ class Moving(Collider):
         Collider.bind(self, scene)
         self.dev.pose = Pose(scene, repr(self), self.position, self.rotation, self.dev.surface.turns)
         self.dev.surface.poses = [self.dev.pose]
+        self.dev.thickness = scene.memory.field(f"{self!r}.radius", None, values=self.radius)
         self.dev.shape = self.host_shape(self.dim).on_device(scene, repr(self), self.radius)
         self.dev.shape.can_slide = type(self.dev.shape).can_slide and not self.dev.surface.has_restitution
         self.changed = False
@@ -110,6 +114,66 @@ class Moving(Collider):
         distance, normal = shape.cast((origin - position) @ turn, direction @ turn, self.radius + radius)
         return distance, normal @ turn.T
 
+    @property
+    def has_bounds(self) -> bool:
+        """Whether its shape is of a limited size."""
+        return self.host_shape(self.dim).limited
+
+    @property
+    def middle(self) -> np.ndarray:
+        """Where the middle of the shape is."""
+        return self.placed(self.host_shape(self.dim).middle)
+
+    @ti.func
+    def bounds(self):
+        """Return the corners of a box around the shape, wherever it is and however it turns in the frame."""
+        return self.dev.pose.bounds(*self.dev.shape.box(), ti.cast(self.radius, self.dev.real))
+
+    @property
+    def sides(self) -> int:
+        """The number of facets."""
+        return self.host_shape(self.dim).sides if self.dim else 0
+
+    @ti.func
+    def near_sides(self, i, reach):
+        """Return the list of facets around particle i."""
+        q = self.dev.pose.inward_at_end(self.dev.state.inside(self.dev.state.place(i)))
+        return self.dev.shape.facets_near(q, reach + ti.cast(self.radius, self.dev.real) + self.motion())
+
+    @ti.func
+    def side_at(self, place):
+        """Return the facet at a place of the lists."""
+        return self.dev.shape.list[place]
+
+    @ti.func
+    def motion(self):
+        """Return how far any point of the wall moves in the frame at most [m]."""
+        low, high = self.dev.shape.box()
+        return self.dev.pose.motion(ti.max(abs(low), abs(high)).norm())  # type: ignore[reportOptionalCall]
+
+    @ti.func
+    def least_gap(self, face, i, radius):
+        """Return the distance from a facet at the end of the frame, less how far the wall moves."""
+        q = self.dev.pose.inward_at_end(self.dev.state.inside(self.dev.state.place(i)))
+        distance, _n, _at = self.dev.shape.nearest(face, q)
+        return distance - ti.cast(self.radius, self.dev.real) - radius - self.motion()
+
+    @ti.func
+    def start_gap(self, face, i, radius, frame_fraction):
+        """Return the gap to a facet."""
+        x = self.dev.state.inside(self.dev.state.place(i) - self.dev.state.d[i])
+        q = self.dev.pose.inward(0, x - self.dev.pose.place[0])
+        distance, n, bend = self.dev.shape.facet_gap(face, q)
+        moved = self.dev.pose.place[2] + self.dev.pose.outward(2, q)
+        return distance - ti.cast(self.radius, self.dev.real) - radius, self.dev.pose.outward(0, n), bend, moved
+
+    @ti.func
+    def end_gap(self, face, i, radius, frame_fraction):
+        """Return the gap to a facet."""
+        x = self.dev.state.inside(self.dev.state.place(i))
+        distance, n, _bend = self.dev.shape.facet_gap(face, self.dev.pose.inward(1, x - self.dev.pose.place[1]))
+        return distance - ti.cast(self.radius, self.dev.real) - radius, self.dev.pose.outward(1, n)
+
     @ti.func
     def pose(self, frame_fraction):
         """Compute the pose of the wall in a substep."""
@@ -136,7 +200,7 @@ class Moving(Collider):
         a, going, touched, deferred = first, True, False, False
         for k in range(TOUCHES + 1):
             if going:
-                s, depth, n = self.dev.shape.find_first_touch(a, e, contact_distance, close, self.push_out * h)
+                s, depth, n = self.dev.shape.find_first_touch(a, e, contact_distance, close, self.dev.surface.push_out[None] * h)
                 if s > 1:
                     going = False
                 elif k < TOUCHES:

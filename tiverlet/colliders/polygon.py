@@ -26,6 +26,7 @@ class Polygon(Moving):
     """
 
     dim = 2
+    shares_code = True
 
     def __init__(
         self, vertices, inside: bool = False, *, closed: bool = True, radius: float = 0.0, position: ArrayLike = 0.0, rotation:

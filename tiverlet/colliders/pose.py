@@ -73,6 +73,29 @@ class Pose:
         return out
 
     @ti.func
+    def bounds(self, low, high, radius):
+        """Return the corners of a box in which all from low to high of the wall's frame, and a radius around it, stays."""
+        a, b = self.rotation.ends[0], self.rotation.ends[1]
+        middle, half = (low + high) / 2, (high - low) / 2
+        turn = ti.cast(self.matrix(b), self.real)
+        at, reach = turn @ middle, abs(turn) @ half
+        if (a != b).any():
+            at, reach = 0 * at, 0 * reach + ti.max(abs(low), abs(high)).norm()  # type: ignore[reportOptionalCall]
+        first, last, more = self.position.ends[0], self.position.ends[1], reach + radius
+        return ti.min(first, last) + at - more, ti.max(first, last) + at + more
+
+    @ti.func
+    def inward_at_end(self, x):
+        """Return where a point x of the world is in the wall's frame at the end of the frame."""
+        return ti.cast(self.matrix(self.rotation.ends[1]), self.real).transpose() @ (x - self.position.ends[1])  # type: ignore[reportOptionalCall]
+
+    @ti.func
+    def motion(self, size):
+        """Return how far a point within `size` of the origin moves in the frame at most [m]."""
+        turn = ti.cast((self.rotation.ends[1] - self.rotation.ends[0]).norm(), self.real)
+        return (self.position.ends[1] - self.position.ends[0]).norm() + turn * size
+
+    @ti.func
     def inward(self, k: ti.template(), v):  # type: ignore[valid-type]
         """Return R^T v: a vector of the world in the wall's frame, at the start (k = 0) or the end (1) of the substep."""
         out = 0 * v

@@ -279,6 +279,9 @@ class FunctionShape(Shape):
 class _Probe:
     """The function at many points, evaluated from Python in f64."""
 
+    limited = False
+    sides = 0
+
     def __init__(self, wall: Sdf, dim: int):
         self.compiler = Compiler(ti.f64)
         self.wall: Any = wall

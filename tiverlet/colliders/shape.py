@@ -1,6 +1,6 @@
 """The contracts of the shapes that moving colliders hold."""
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -10,18 +10,33 @@ if TYPE_CHECKING:
     from ..features.feature import Scene
     from ..particles import Particles
 
+FAR = 1e15  # [m] the distance of a facet that another one hides
+
 
 class HostShape(Protocol):
     """A shape in a frame of its own, for host queries.
 
-    who: the collider that holds it. radius: by what the shape is thickened [m].
+    who: the collider that holds it. radius: by what the shape is thickened [m]. limited: whether it ends anywhere, so that it has
+    a middle.
     """
+
+    @property
+    def limited(self) -> bool:
+        """Whether it ends anywhere."""
+        ...
+
+    sides: int  # the number of its facets; 0 if it has none
+
+    @property
+    def middle(self) -> np.ndarray:
+        """A point in the middle of it, (dim,) [m]."""
+        ...
 
     def check(self, who: str, particles: "Particles", radius: float) -> None:
         """Raise ValueError for particles that the shape cannot be a wall for."""
         ...
 
-    def on_device(self, scene: "Scene", who: str, radius: float) -> "Shape":
+    def on_device(self, scene: "Scene", who: str, radius: float) -> Any:
         """Return the shape on the device, in a world."""
         ...
 
@@ -54,6 +69,23 @@ class Shape:
         normal.
         """
         return 0 * contact_distance + 2, 0 * contact_distance, 0 * e
+
+    @ti.func
+    def facets_near(self, q, reach):
+        """Return begin and end in `list` of the facets that may be within `reach` of q."""
+        return 0, 0
+
+    @ti.func
+    def facet_gap(self, f, q):
+        """Return how far q is from facet f [m], negative behind it; the normal, and the curvature of that distance [1/m].
+
+        A facet that another one hides is far away."""
+        return 0 * q[0], q, 0 * q[0]
+
+    @ti.func
+    def box(self):
+        """Return the lower and the upper corner of a box around it."""
+        return 0, 0
 
     @ti.func
     def rounding(self, q):

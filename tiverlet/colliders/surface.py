@@ -36,7 +36,8 @@ class Surface:
     ):  # fmt: skip
         self.log: Any = log
         self.has_log = log is not None
-        self._memory, self.state, self.push_out, self.real = scene.memory, scene.state, push_out, scene.real
+        self._memory, self.state, self.real = scene.memory, scene.state, scene.real
+        self.push_out = scene.memory.field(f"{name}.push_out", None, values=push_out)
         self.has_friction, self.has_restitution = friction is not None, restitution is not None
         self.impacts: Any = scene.impacts
         # A particle with spin and friction bounces alone, since the extra passes do not change its spin.
@@ -64,8 +65,9 @@ class Surface:
         if self.has_switch:
             self.active = scene.memory.field(f"{name}.active", None, kind=ti.i32, values=float(active or 0))
 
-    def upload(self, friction: "Coefficients", restitution: "Bounce", active: bool, velocity: Any) -> None:
+    def upload(self, friction: "Coefficients", restitution: "Bounce", active: bool, velocity: Any, push_out: float) -> None:
         """Write these values to the device, as far as kernels read them."""
+        self._memory.write(self.push_out, push_out)
         if self.has_friction:
             self._memory.write(self.friction, friction[:2])
         if self.has_restitution:
@@ -161,11 +163,11 @@ class Surface:
         if self.is_deferred(i):
             depth = ti.min(depth, 0)
         if depth > ti.select(mode == ANY_DEPTH, 0, close):
-            move = ti.max(depth - ti.max(start_depth - self.push_out * h, 0), 0)
+            move = ti.max(depth - ti.max(start_depth - self.push_out[None] * h, 0), 0)
             # Normal displacement after the substep. A particle that bounced may be moved further than its displacement changes.
             after = leaving + move
             if not slides:
-                after = ti.min(after, ti.max(ti.abs(leaving), self.push_out * h))
+                after = ti.min(after, ti.max(ti.abs(leaving), self.push_out[None] * h))
             rise, left = 0 * depth, 1 + 0 * depth
             if ti.static(self.has_restitution or self.has_impacts):
                 # After an earlier bounce in this substep, the straight path to the present position begins at the height `gap`.

@@ -1,5 +1,6 @@
 """Contacts of discs and spheres."""
 
+import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -23,15 +24,22 @@ from .events import EventLog
 from .exclusions import excluded_pairs
 from .force_share import ForceShare
 from .impact_projection import ImpactProjection
+from .impulses import Impulses
+from .islands import Islands
 from .known_loads import KnownLoads
+from .limits import CRADLE
 from .mass_splitting import MassSplitting, lesser
 from .narrow_phase import DiscGeometry
 from .pair import Pair, PairSums
 from .pair_contact import PairContact
+from .places import Places
+from .responses import FreeParticles
 from .restitution import Restitution
+from .rows import Rows
 from .spinning import Spinning
 from .velocity_projection import VelocityProjection
 
+SWITCH = os.environ.get("TIVERLET_ROWS", "1") != "0"
 RELAXATION = 1.25  # below 4/3, see Contact
 CARRY = 0.4  # largest share of its last push that a pair keeps; below 1/2
 
@@ -104,7 +112,7 @@ class Contact(PairContact):
 
     def __init__(
         self, friction: ArrayLike | Mapping = 0.0, restitution: ArrayLike | Mapping = 0.0, *, skin: float | str = "auto",
-        groups=None, push_out: float = 1.0, events: bool = False, sensors=(), loads: bool = False,
+        groups=None, push_out: float | None = None, events: bool = False, sensors=(), loads: bool = False,
     ):  # fmt: skip
         self.groups, self.sensors, self.restitution, self.friction = groups, sensors, restitution, friction
         self.skin, self.push_out, self.events, self.loads = skin, push_out, events, loads
@@ -113,7 +121,22 @@ class Contact(PairContact):
     loads = Knob(lambda f, v: checks.flag("Contact", "loads", v), "Whether pairs know what they bear.", compiled=True)
     sensors: Any = Knob(lambda f, v: f._surface("sensors", v), "The pairs of groups of which the second senses.", built=True)
     groups: Any = Knob(lambda f, v: f._surface("groups", v), "The pairs of groups that touch; None for all.", built=True)
-    projects = can_keep_stiffness = True
+
+    @property
+    def solves_rows(self) -> bool:
+        """Whether pairs and walls are rows, see rows.py: private switch while it is new."""
+        linked = any(not f.is_kinematic for f in self.ties)
+        bounces = [self.restitution, *(w.restitution for w in self.walls)]
+        values = [e for v in bounces for e in (v.values() if isinstance(v, Mapping) else [v])]
+        cradle = any(float(np.ravel(e)[0]) > CRADLE for e in values)
+        return SWITCH and not cradle and not linked and all(w.sides and w.one_way is None for w in self.walls)
+
+    @property
+    def projects(self) -> bool:
+        """Whether it has a velocity projection of loaded pairs."""
+        return not self.solves_rows
+
+    can_keep_stiffness = projects
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Choose the skin, and refuse positions too far out for the cells."""
@@ -136,7 +159,9 @@ class Contact(PairContact):
         dev, now = self.dev, change.now
         if not self.can_touch:
             return not bool((now.radius > 0).any())
-        splits = dev.splitting.can_regroup(dev.list.team.piece_of(now.count)) and dev.projection.can_regroup(now.mass)
+        splits = (
+            not dev.rows and dev.splitting.can_regroup(dev.list.team.piece_of(now.count)) and dev.projection.can_regroup(now.mass)
+        )
         return splits and bool((now.radius > 0).any()) and dev.search.can_regroup(change, now.radius)
 
     def regroup(self, change: Regrouping) -> None:
@@ -158,6 +183,8 @@ class Contact(PairContact):
     def make_search(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields and the neighbour search, and return the search."""
         dim, dev = scene.particles.dim, self.dev
+        if self.solves_rows:
+            return self._make_rows(scene, batches, team)
         linked = excluded_pairs(batches, scene.particles.radius)
         dev.move = scene.memory.field("Contact.move", scene.count, width=dim)
         self.table.bind(scene)
@@ -194,7 +221,7 @@ class Contact(PairContact):
             pair_data.append(given)
         dev.search = NeighbourSearch(scene, self._present_skin, linked, self.table, pair_data, team, dev.move)
         dev.list = dev.search.list
-        dev.geometry = DiscGeometry(scene, dev.search, self.push_out, dev.impulse if dev.has_restitution else dev.push)
+        dev.geometry = DiscGeometry(scene, dev.search, self.speed_of_parting, dev.impulse if dev.has_restitution else dev.push)
         if dev.events:
             dev.events.bind(dev.list, dev.geometry)
         # With restitution relax() has to clear the last impacts, so no block is skipped.
@@ -220,6 +247,50 @@ class Contact(PairContact):
                 dev.projection.ring, dev.restitution, dev.spinning,
             )  # fmt: skip
         dev.once = self._solves_once(scene, team)
+        return dev.search
+
+    def _make_rows(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
+        """Declare the fields of contacts that are rows, and return the neighbour search."""
+        dev = self.dev
+        self.table.bind(scene)
+        face = 0
+        for group in scene.walls:
+            face = group.number_faces(scene, face)
+        friction = dev.has_friction or any(w.has_friction for w in self.walls)
+        if friction and not dev.has_friction:
+            self.table.bind(scene, True)
+        bounces = dev.has_restitution or any(w.has_restitution for w in self.walls)
+        if bounces and not dev.has_restitution:
+            self.table.bind(scene, True)
+        turns = scene.state.spins and friction and (dev.turns or any(w.turns for w in self.walls))
+        dev.rows = Rows(scene, self.table, friction, bounces, turns, list(scene.walls), team)
+        dev.responses = FreeParticles(scene, scene.state.spins and friction)
+        dev.responses.rows = dev.rows
+        dev.islands = Islands(scene, dev.rows, dev.responses)
+        dev.impulses = Impulses(scene, dev.rows, dev.responses, dev.islands, team)
+        dev.places = Places(scene, dev.rows, dev.responses, dev.impulses, team)
+        linked = excluded_pairs(batches, scene.particles.radius)
+        walls = list(scene.walls)
+        dev.events = EventLog(scene, self.table) if dev.has_events else None
+        pair_data = [
+            dev.rows.memory,
+            *([dev.rows.touched] if bounces else []),
+            *([dev.rows.borne_moment] if turns else []),
+            *([dev.events.touched] if dev.events else []),
+        ]
+        dev.search = NeighbourSearch(
+            scene, self._present_skin, linked, self.table, pair_data, team, dev.responses.push, walls=walls
+        )
+        dev.list = dev.search.list
+        dev.geometry = DiscGeometry(scene, dev.search, 0.0, dev.rows.memory)
+        dev.rows.push_out = -1.0 if self.push_out is None else self.push_out
+        if dev.events:
+            dev.events.bind(dev.list, dev.geometry)
+            dev.rows.events = dev.events if dev.reports else None
+        dev.rows.bind(dev.list, dev.geometry)
+        dev.fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
+        dev.bodies = dev.landing = dev.known = dev.restitution = dev.forces = dev.projection = dev.splitting = None
+        dev.has_loads, dev.once = False, False
         return dev.search
 
     def _solves_once(self, scene: Scene, team: Team) -> bool:
@@ -259,6 +330,10 @@ class Contact(PairContact):
     @ti.func
     def is_pressed(self, i, e):
         """Whether particle i and the particle at entry e of its list press on each other."""
+        if ti.static(bool(self.dev.rows)):
+            return self.dev.rows.is_set(self.dev.rows.memory.field[e]) or self.dev.geometry.push_each_other(
+                i, self.dev.list.neighbour[e], 0
+            )
         return self.dev.push.field[e] > 0 or self.dev.geometry.push_each_other(i, self.dev.list.neighbour[e], 0)
 
     @ti.func
@@ -618,7 +693,9 @@ class Contact(PairContact):
         KnownLoads.known_push().
         """
         total, w = 0 * self.dev.state.d[i], self.dev.w.of(i)
-        if self.dev.splitting.weight[i] > 0:
+        if ti.static(bool(self.dev.rows)):
+            total = self.dev.rows.borne[i]
+        elif self.dev.splitting.weight[i] > 0:
             for word in range(self.dev.list.word_count(i)):
                 bits = self.dev.list.touching_bits(i, word)
                 while bits != 0:
@@ -633,7 +710,7 @@ class Contact(PairContact):
                         if ti.static(self.dev.has_loads):
                             push -= self.dev.known.load.field[e] * h * h / soft
                         total += share * w * push * n
-        if ti.static(self.dev.has_friction):
+        if ti.static(self.dev.has_friction and not self.dev.rows):
             total += self.dev.forces.sum[i]
         return total
 

@@ -56,7 +56,8 @@ class EventLog:
     def bind(self, pairs: "NeighbourList", geometry: "DiscGeometry") -> None:
         """Store the list and the geometry, and have the columns declared with the list."""
         self.list, self.geometry = pairs, geometry
-        pairs.columns = [self.pair, self.when, self.impulse, self.speed, self.normal, self.point]
+        self.columns = [self.pair, self.when, self.impulse, self.speed, self.normal, self.point]
+        pairs.columns = [*pairs.columns, *self.columns]
 
     @ti.func
     def start(self, s, first):
@@ -195,7 +196,7 @@ class EventLog:
         memory, store = self.list.memory, self.list.store
         assert store
         count, substeps = int(memory.read(self.rows)[0]), int(memory.read(self.substep)[0])
-        pair, when, *values = (store.read(column.field)[:count] for column in self.list.columns)
+        pair, when, *values = (store.read(column.field)[:count] for column in self.columns)
         impulse, speed, normal, point = (value.astype(np.float64) for value in values)
         pairs = np.sort(pair, axis=1).astype(np.int64)
         normal[pair[:, 0] > pair[:, 1]] *= -1

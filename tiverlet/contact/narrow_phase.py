@@ -340,6 +340,9 @@ class DiscGeometry:
         r = self.scene.particles.radius
         pairs, at = self.list.entries()
         push = self.list.read(self.impulse, at)
+        if self.impulse.width:  # the whole impulse, on the side of its owner
+            n = between(x[pairs[:, 0]], x[pairs[:, 1]], self.scene.periodic)
+            push = np.abs((push * n).sum(axis=1)) / np.maximum(np.linalg.norm(n, axis=1), 1e-30)
         if self.search.has_static:
             # A static particle does not store its push, nor keep a far pair on its list. The other particle of the pair does.
             n = len(self.scene.particles)

@@ -116,22 +116,25 @@ class PairContact(Feature):
     friction = Knob(lambda f, v: f._surface("friction", v), "Of all pairs, or by pairs of groups.")
     restitution = Knob(lambda f, v: f._surface("restitution", v), "Of all pairs, or by pairs of groups.")
     skin = Knob(lambda f, v: _skin(v), "How far beyond touching pairs are listed [m].", built=True)
-    push_out = Knob(lambda f, v: checks.number("Contact", "push_out", v, least=0.0), "[m/s].", built=True)
+    push_out = Knob(
+        lambda f, v: None if v is None else checks.number("Contact", "push_out", v, least=0.0), "[m/s], or None.", built=True
+    )
     compiled_for = ("has_friction", "has_restitution", "turns", "uniform")
     _smallest_radius = _present_skin = 0.0  # the smallest radius, and the present skin [m]
     table: Table  # bound to one world
     bodies: Sequence[np.ndarray] = ()
-    host_only = ("ties",)
-    kept_by_world = (*Feature.kept_by_world, "ties")
+    host_only = ("ties", "walls")
+    kept_by_world = (*Feature.kept_by_world, "ties", "walls")
     ties: Sequence[Batch] = ()
+    walls: Sequence[Any] = ()  # the colliders of its world
     can_touch = True
     code_size = 3.0
     neighbours_per_particle = 0  # initial list entries per particle, if more than discs need
     stored_once = False  # whether one particle stores a contact, and others read it; else each particle of a pair stores its own
     detects = False  # whether each pass calls detect() for all particles, before contacts are counted
-    can_keep_stiffness = False  # whether keep_stiffness() works
+    can_keep_stiffness: Any = False  # whether keep_stiffness() works
     once = False  # whether a pair is solved once for both particles, see EachOnce
-    projects = False  # whether it has a velocity projection of loaded pairs, see velocity_projection.py
+    projects: Any = False  # whether it has a velocity projection of loaded pairs, see velocity_projection.py
 
     def _surface(self, name: str, value):
         """Check one setting of pairs together with the other settings."""
@@ -219,6 +222,16 @@ class PairContact(Feature):
         return self.dev.geometry.shrinks
 
     @property
+    def speed_of_parting(self) -> float:
+        """How fast what was placed in each other parts [m/s]; as fast as it likes where None was given."""
+        return 1.0 if self.push_out is None else self.push_out
+
+    @property
+    def solves_rows(self) -> bool:
+        """Whether contacts are rows, see rows.py."""
+        return False
+
+    @property
     def store(self) -> Any:
         """The Memory of the field that is declared only when it is needed, or None."""
         return self.dev.geometry.store if "geometry" in vars(self.dev) else None
@@ -239,6 +252,7 @@ class PairContact(Feature):
         dev.has_friction, dev.has_restitution, dev.turns = self.has_friction, self.has_restitution, self.turns
         self.table.set_columns(dev.has_friction, dev.has_restitution, dev.turns)
         # `reports`: whether pairs that push each other are recorded, not only sensors. `events`: an EventLog, or None.
+        dev.rows = None
         dev.has_events, dev.reports, dev.events = self.has_events, bool(vars(self).get("events")), None
 
     def build_values(self) -> dict[str, Any]:
@@ -284,6 +298,7 @@ class PairContact(Feature):
         """Unbind from the world, and forget its constraints."""
         super().release()
         self.__dict__.pop("ties", None)
+        self.__dict__.pop("walls", None)
 
     def enable_shrink(self) -> None:
         """Prepare for shrink(): from now on particles may be smaller than their radius."""
@@ -329,7 +344,8 @@ class PairContact(Feature):
     @ti.func
     def start_last_substep(self, i, scale):
         """Keep the displacement of particle i as the last substep of a frame begins. ForceShare needs it to tell impacts."""
-        self.dev.forces.start(i, scale)
+        if ti.static(bool(self.dev.forces)):
+            self.dev.forces.start(i, scale)
 
     @ti.func
     def reaction(self, i, h, soft):

@@ -252,7 +252,7 @@ class Polygons(PairContact):
         if dev.has_restitution:
             dev.restitution = PolygonRestitution(scene, dev.geometry, self.table)
             dev.hit = dev.restitution.hit
-        dev.landing = None
+        dev.rows = dev.landing = None
         dev.bodies = None if dev.has_restitution else BodyProjection.made(scene, batches, self.table, 3)
         linked = excluded_pairs(batches, scene.particles.radius, dev.outline.body)
         dev.known = KnownLoads(scene, True, dev.has_friction) if self.has_loads else None

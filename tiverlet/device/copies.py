@@ -74,10 +74,15 @@ class Copies:
 
 
 def _of_copy(builder: Any, value: Any, *indices: Any, **options: Any) -> Any:
-    """Evaluate field[indices] for the copy that the kernel works on."""
-    if plain_field(value) and "copies" in vars(value):
-        begin = vars(value)["copies"].begin(vars(value)["stride"])
-        indices = (begin + indices[0] if indices and indices[0] is not None else begin,)
+    """Evaluate field[indices] for the copy, and the member, that the kernel works on."""
+    if plain_field(value):
+        own = vars(value)
+        if "members" in own:
+            begin = own["members"].begin(own["pitch"])
+            indices = (begin + indices[0] if indices and indices[0] is not None else begin,)
+        if "copies" in own:
+            begin = own["copies"].begin(own["stride"])
+            indices = (begin + indices[0] if indices and indices[0] is not None else begin,)
     return _subscript(builder, value, *indices, **options)
 
 

@@ -19,6 +19,7 @@ from .copies import Copies
 from .host_copy import Entry, Transfer
 from .language import ti
 from .layout import Declared, Layout
+from .members import Members
 from .number import Number
 from .patches import patched
 from .patches.compiler import LEAN, Compiler
@@ -67,6 +68,9 @@ class Memory:
         self._owned: dict[Any, tuple[range, list[Number]]] = {}  # fields and numbers, by owner
         self._valued: set[int] = set()  # indices of fields declared with values
         self._redeclaration: Redeclaration | None = None  # set while owners declare their fields a second time
+        self._members: Members | None = None  # set while one of several members declares its fields
+        self._parts: dict[int, tuple[Any, int, slice]] = {}  # of members, by the id of a handle: it, its entry, its elements
+        self._of_members: list[Members] = []
         self._later: list[tuple[Entry, np.ndarray]] = []
         self._declared: list[Declared] = []
         self.numbers: dict[Any, tuple[Any, list[Number]]] = {}  # by type: the field, and the numbers that it holds
@@ -98,6 +102,8 @@ class Memory:
         state, for_reports, index_limit: see Entry.
         """
         kind, rows = self.real if kind is None else kind, None
+        if self._members:
+            return self._members.field(layout.field, name, length, width, kind, values, state)
         if self._redeclaration:
             return self._redeclaration.field(length, width, np.dtype(_NUMPY[kind]), values)
         if isinstance(length, Number):
@@ -133,6 +139,8 @@ class Memory:
         kind: the number's type, i32 by default.
         """
         kind = ti.i32 if kind is None else kind
+        if self._members:
+            return self._members.number(layout.field, value, kind)
         if kind not in self.numbers:
             self.numbers[kind] = layout.field(kind, 0), []
         field, known = self.numbers[kind]
@@ -152,6 +160,31 @@ class Memory:
         fields, numbers = len(self.entries), len(self._in_order)
         yield
         self._owned[owner] = range(fields, len(self.entries)), self._in_order[numbers:]
+
+    @contextlib.contextmanager
+    def member(self, members: Members) -> Iterator[None]:
+        """Within this context, declarations are those of the next of several members."""
+        members.begin_member()
+        self._members = members
+        try:
+            yield
+        finally:
+            self._members = None
+
+    def place_members(self, members: Members) -> None:
+        """Declare the fields of members, of which all have declared theirs."""
+        self._of_members.append(members)
+        for one in members.shared:
+            ends = np.cumsum(one.lengths)
+            begins, pitch = ends - one.lengths, one.lengths[0]
+            if any(length != pitch for length in one.lengths):
+                pitch = self.field(f"{one.name}.begins", len(begins), kind=ti.i32, values=begins)
+            one.pitch = pitch
+            self._declare(one.name, one.whole, int(ends[-1]), one.width, one.kind, one.state)
+            if (values := one.first_values) is not None:
+                self._later.append((self.entries[-1], values))
+            for handle, begin, end in zip(one.handles, begins.tolist(), ends.tolist(), strict=True):
+                self._parts[id(handle)] = handle, len(self.entries) - 1, slice(begin, end)
 
     @contextlib.contextmanager
     def redeclare(self, counts: dict[Number, int]) -> "Iterator[Redeclaration]":
@@ -196,7 +229,9 @@ class Memory:
 
     def set_number(self, number: Number) -> None:
         """Write a number to the device, if it is placed already. All copies get it, since they share kernels."""
-        if view := self._host_views():
+        if number.place is None:
+            self.write(number.field, number._value)
+        elif view := self._host_views():
             view[id(self._find(number.field))][..., number.place] = number._value
         elif self._layout:
             with self.copies.all() if self.copies else contextlib.nullcontext():
@@ -219,6 +254,8 @@ class Memory:
         for e in self.entries:
             if e.copies and self.copies:
                 self.copies.add(e.field, max(1, e.length))
+        for members in self._of_members:
+            members.place()
         address, room = self._layout.allocate()
         self._ends = weakref.finalize(self, _end, self._layout, address, self.compiler)
         self._ends.atexit = False
@@ -237,6 +274,11 @@ class Memory:
         self._views = {}
         self.entries = [e.of_length(length) for e in self.entries]
         return True
+
+    @property
+    def fields(self) -> list[Any]:
+        """All fields; those of members twice: whole, and as kernels see them that enter a member."""
+        return [*(e.field for e in self.entries), *(one.field for members in self._of_members for one in members.shared)]
 
     @property
     def elastic(self) -> bool:
@@ -351,7 +393,9 @@ class Memory:
         """Overwrite a whole field. Without a chosen copy, write to all: values are the same for all, or have one more axis."""
         self.check()
         array = np.asarray(values, dtype=np.float64)
-        if array.size:
+        if array.size and id(field) in self._parts:
+            self._write_part(field, array)
+        elif array.size:
             self._load([self._find(field)], [array])
 
     def write_from(self, field, first: int, values) -> None:
@@ -410,10 +454,30 @@ class Memory:
         Without a chosen copy, the array has one more axis, the first.
         """
         self.check()
+        if id(field) in self._parts:
+            return np.array(self._part(field), dtype=kind)
         entry, views = self._find(field), self._host_views()
         if views:
             return np.array(self._one(entry, views[id(entry)]), dtype=kind)
         return self._dump([entry])[0].astype(kind or entry.kind, copy=False)
+
+    def _part(self, field) -> np.ndarray:
+        """Return a member's elements of a field: the field itself where the host has access, otherwise a copy."""
+        _, k, some = self._parts[id(field)]
+        entry, views = self.entries[k], self._host_views()
+        whole = self._one(entry, views[id(entry)]) if views else self._dump([entry])[0]
+        return whole[:, some] if whole.ndim > len(entry.shape) else whole[some]
+
+    def _write_part(self, field, values: np.ndarray) -> None:
+        """Overwrite a member's elements of a field."""
+        _, k, some = self._parts[id(field)]
+        entry = self.entries[k]
+        if self._host_views():
+            self._part(field)[...] = values
+            return
+        (whole,) = self._dump([entry])
+        (whole[:, some] if whole.ndim > len(entry.shape) else whole[some])[...] = values
+        self._load([entry], [whole])
 
     def view(self, field) -> np.ndarray:
         """Return the field itself as an array, where the host has access; otherwise a copy."""
@@ -432,6 +496,11 @@ class Memory:
         self.check()
         chosen = [e for e in self.entries if e.state]
         return dict(zip((e.name for e in chosen), self._dump(chosen), strict=True))
+
+    def places_in_state(self) -> dict[int, tuple[str, slice]]:
+        """Return the names of the fields that make up the exact state, by the ids of fields and handles; and whose elements."""
+        out = {id(e.field): (e.name, ALL) for e in self.entries if e.state}
+        return out | {i: (self.entries[k].name, some) for i, (_, k, some) in self._parts.items() if self.entries[k].state}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Write back what state() returned, bit for bit. Fields not in it become 0."""

@@ -14,9 +14,12 @@ _read: tuple[Any, dict[int, Any]] = (None, {})
 
 
 class Number:
-    """One number in a field. While a kernel is translated, `now` is the field's element; on the host it is the number."""
+    """One number in a field. While a kernel is translated, `now` is the field's element; on the host it is the number.
 
-    def __init__(self, memory: Any, field: Any, place: int, value: float):
+    place: its index; None where it is all that the field holds.
+    """
+
+    def __init__(self, memory: Any, field: Any, place: int | None, value: float):
         self.field, self.place = field, place
         self._memory, self._value = memory, value
 

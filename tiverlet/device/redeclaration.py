@@ -76,5 +76,6 @@ class Redeclaration:
             self._memory.fill(k, length, 0 if values is None or not np.size(values) else values)
         for number in self.numbers:
             known = next(known for field, known in self._memory.numbers.values() if field is number.field)
+            assert number.place is not None
             known[number.place] = number
             number.set(number.now)

@@ -59,6 +59,7 @@ class Scene:
     slots: Any = None  # the slots into which constraints write corrections
     own_weight: Any = None  # the OwnWeight of particles, where loads become known loads, or discs land on others
     bounces: bool = False  # whether there are walls, and particles bounce off these or off each other
+    walls: Any = ()  # the colliders, as WallGroups
     impacts: Any = None  # the BodyImpacts, where linked particles may bounce off walls
     residuals: Any = None  # batch -> the residual of each of its violations after the last substep
     order: int = 2  # of the error in h

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import checks
-from ..device import ti
+from ..device import at, inline, ti
 from ..device.number import Number, OnDevice
 from ..device.thread_team import Team
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 CROWDED = 300  # near pairs per particle beyond which the user is warned
 STALE = 0.49  # of the skin: a list is valid until a particle has moved so far
 MOVED = 2  # value of NeighbourList.stale where the only cause is that particles moved
+WALL = 2**30  # in persistent data: the number of the first side of a wall, whatever the number of particles
 WORD, FULL = 32, 2**32 - 1  # entries that one word of bits covers, and a word with all bits set
 
 
@@ -25,8 +26,9 @@ class PairData:
     persistent: it belongs to the state, beyond a substep. for_reports: it is for reports only. is_transferred: it is copied to
     the next list; other data is recomputed. only_touching: it is 0 except for pairs whose bit in NeighbourList.touching is set.
     ends_with_touch: with one pass per substep it is cleared where that bit goes, so a new list sets the bit of pairs that have
-    it. kind: type of the numbers; None for that of the world. field, old: the data of the present list, and of the old list while
-    a new one is built.
+    it. has_owner: the first particle of a pair stores it, if it can move; another one only in another piece of the team, and with
+    the opposite sign if it is a vector. kind: type of the numbers; None for that of the world. field, old: the data of the
+    present list, and of the old list while a new one is built.
     """
 
     field: Any
@@ -34,8 +36,9 @@ class PairData:
 
     def __init__(
         self, name: str, width: int, persistent: bool, is_transferred: bool = True, only_touching: bool = False, kind: Any = None,
-        for_reports: bool = False, ends_with_touch: bool = False,
+        for_reports: bool = False, ends_with_touch: bool = False, has_owner: bool = False,
     ):  # fmt: skip
+        self.has_owner = has_owner
         self.name, self.width, self.kind = name, width, kind
         self.persistent, self.is_transferred = persistent, is_transferred
         self.only_touching, self.for_reports = only_touching, for_reports
@@ -90,6 +93,7 @@ class NeighbourList:
         add = memory.field
         self.first = add("grid.first", rooms, kind=ti.i32)
         self.number = add("grid.number", count, kind=ti.i32)
+        self.wall_number: Any = None  # of the entries of walls, which follow those of particles
         self.stale = add("grid.stale", None, kind=ti.i32, values=1)
         self.need = add("grid.need", None, kind=ti.i32)
         self.touching = add("grid.touching", count, kind=ti.u32)  # bits: which of the first 32 entries touched at the last test
@@ -100,10 +104,20 @@ class NeighbourList:
         self.old_neighbour: Any = None  # the pairs of the old list with data other than 0, while a new list is built
         self.store: Memory | None = None
         self.room = 0  # entries for which there is memory
+        self.movable: Any = None  # a function that returns which particles can move, (n,), where any pair data have owners
         self.columns: list[Column] = []  # columns of a table with as many rows
 
     def __repr__(self) -> str:
         return "neighbour list"
+
+    def list_walls(self) -> None:
+        """Let walls have entries, behind those of particles."""
+        self.wall_number = self.memory.field("grid.wall_number", self.n, kind=ti.i32)
+
+    @inline
+    def count(self, i):
+        """Return the number of entries of particle i, with those of walls."""
+        return at(self.number, i) if self.wall_number is None else at(self.number, i) + at(self.wall_number, i)
 
     def allocate(self, capacity: int) -> bool:
         """Allocate `capacity` entries in a tree of fields of their own, so that the list can grow. The old list is kept.
@@ -202,9 +216,11 @@ class NeighbourList:
             for field in (piece.field, piece.old) if self.saved else (piece.field,):
                 self.store.write(field, self.store.read(field) * factor)
 
-    def _entries(self, first, number) -> tuple[np.ndarray, np.ndarray]:
+    def _entries(self, first, number, with_walls: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Return the particle of every entry and the place of the entry, (m,) each."""
         first, number = self.memory.read(first)[: self.n], self.memory.read(number)[: self.n]
+        if with_walls:
+            number = number + self.memory.read(self.wall_number)[: self.n]
         i = np.repeat(np.arange(self.n), number)
         return i, np.repeat(first, number) + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)
 
@@ -217,9 +233,15 @@ class NeighbourList:
         seen = self.store.view if self.store.elastic else self.store.read
         saved = bool(self.memory.read(self.old_saved)[0])  # restored by restore(), and not yet transferred to a new list
         first, number = (self.old_first, self.old_number) if saved else (self.first, self.number)
-        i, at = self._entries(first, number)
+        i, at = self._entries(first, number, not saved and self.wall_number is not None)
         near = seen(self.old_neighbour if saved else self.neighbour).take(at)
         values = {piece.name: seen(piece.old if saved else piece.field).take(at, axis=0) for piece in self.persistent}
+        if self.movable is not None:
+            copies = (near < i) & self.movable()[np.minimum(near, self.n - 1)]
+            for piece in self.persistent:
+                if piece.has_owner:
+                    values[piece.name][copies] = 0
+            near = np.where(near < self.n, near, near - self.n + WALL)
         some = np.zeros(len(i), dtype=bool)
         for value in values.values():
             for column in value.T if value.ndim > 1 else [value]:  # any(axis=1) takes ten times as long
@@ -229,6 +251,8 @@ class NeighbourList:
 
     def restore(self, pairs: np.ndarray, values: dict[str, np.ndarray]) -> None:
         """Store the result of persistent_data() as the old list, from which the next build takes the data of pairs."""
+        if self.movable is not None:
+            pairs, values = self._with_copies(pairs, values)
         if len(pairs) > self.room:
             self.allocate(len(pairs))
         self._write_begin(self.old_neighbour, pairs[:, 1].astype(np.int32))
@@ -240,6 +264,21 @@ class NeighbourList:
         self.memory.write(self.old_number, counts)
         self.memory.write(self.old_saved, 1)
         self.invalidate()
+
+    def _with_copies(self, pairs: np.ndarray, values: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Return persistent data as the list stores them: with sides of walls behind particles, and in both pieces of a pair."""
+        pairs, movable = pairs.copy(), self.movable()
+        walls = pairs[:, 1] >= WALL
+        pairs[walls, 1] += self.n - WALL
+        i, j = pairs[:, 0], np.minimum(pairs[:, 1], self.n - 1)
+        both = np.flatnonzero(~walls & (i < j) & movable[i] & movable[j] & (i // self.team.piece != j // self.team.piece))
+        owned = {piece.name: -1 if piece.width else 1 for piece in self.persistent if piece.has_owner}
+        copies = {name: value[both] * owned.get(name, 0) for name, value in values.items()}
+        pairs, where = np.unique(np.concatenate([pairs, pairs[both, ::-1]]), axis=0, return_inverse=True)
+        out = {name: np.zeros((len(pairs), *value.shape[1:]), dtype=value.dtype) for name, value in values.items()}
+        for name, value in values.items():
+            np.add.at(out[name], where.ravel(), np.concatenate([value, copies[name]]))
+        return pairs, out
 
     @property
     def saved(self) -> bool:
@@ -313,7 +352,7 @@ class NeighbourList:
 
         Returns a word of bits: which of the first entries received data other than 0 that ends with their touch.
         """
-        first, number = self.first[i], self.number[i]
+        first, number = self.first[i], self.count(i)
         for piece in ti.static(self.pair_data):
             for e in range(first, first + number):
                 if ti.static(piece.width == 0):
@@ -344,12 +383,12 @@ class NeighbourList:
     @ti.func
     def word_count(self, i):
         """Return the number of words of bits that cover the entries of particle i."""
-        return (self.number[i] + (WORD - 1)) >> 5  # a division by WORD would test the sign
+        return (self.count(i) + (WORD - 1)) >> 5  # a division by WORD would test the sign
 
     @ti.func
     def all_bits(self, i, word):
         """Return a word with a bit set for each entry of particle i that it covers."""
-        left = self.number[i] - word * WORD
+        left = self.count(i) - word * WORD
         return ti.select(left < WORD, (ti.u32(1) << ti.cast(left & (WORD - 1), ti.u32)) - ti.u32(1), ti.u32(FULL))
 
     @ti.func

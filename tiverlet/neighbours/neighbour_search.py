@@ -52,8 +52,9 @@ class NeighbourSearch:
 
     def __init__(
         self, scene: "Scene", skin: float, linked: np.ndarray, table: Any, pair_data: list[PairData], team: Team, scratch: Any,
-        reach: np.ndarray | None = None, radius: np.ndarray | None = None,
+        reach: np.ndarray | None = None, radius: np.ndarray | None = None, walls: Sequence[Any] = (),
     ):  # fmt: skip
+        self.walls = list(walls)  # whose faces are listed, too
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.n, self.memory, self.real, self.team = scene.count, scene.memory, scene.real, team
         self.sums = Sums(n, team, capped=True)  # on the launched path it has a room of its own
@@ -62,6 +63,8 @@ class NeighbourSearch:
         rooms = self.sums.room if team.launched else scene.count
         self.list = NeighbourList(scene.memory, scene.count, rooms, pair_data, team, network_size)
         self.network = sorting_network(network_size)
+        if walls:
+            self.list.list_walls()
         self.dim, self.state, self.radius = dim, scene.state, scene.radius
         self.table = table
         number, real = scene.memory.number, scene.real
@@ -234,6 +237,10 @@ class NeighbourSearch:
             begin = used
             used = self.scan(i, FILL, start, ti.min(used, MOST))
             self.list.number[i] = ti.max(ti.min(used, room) - begin, 0)
+            if ti.static(len(self.walls) > 0):
+                begin = used
+                used = self.scan_walls(i, FILL, start, used)
+                self.list.wall_number[i] = ti.max(ti.min(used, room) - begin, 0)
         for i in range(block * size, ti.min((block + 1) * size, self.n)):
             self.finish_entries(i)
         ti.atomic_max(self.list.need[None], used)
@@ -258,6 +265,11 @@ class NeighbourSearch:
                 if what == COUNT:
                     self.make_room(thread)
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
+            if ti.static(len(self.walls) > 0):
+                end = self.list.number[i]
+                if self.list.need[None] <= self.list.capacity:
+                    end = self.scan_walls(i, FILL, self.list.first[i], end)
+                self.list.wall_number[i] = end - self.list.number[i]
             self.finish_entries(i)
 
     @ti.func
@@ -267,6 +279,8 @@ class NeighbourSearch:
             if what == COUNT or self.list.need[None] <= self.list.capacity:
                 used = self.scan(i, what, self.list.first[i], 0)
                 if what == COUNT:
+                    if ti.static(len(self.walls) > 0):  # room behind the entries of particles
+                        used = self.scan_walls(i, COUNT, 0, used)
                     add_to(self.list.number, i, used, self.serial)
                 elif ti.static(not self.several_levels):
                     self.list.number[i] = used
@@ -328,6 +342,9 @@ class NeighbourSearch:
                         used += listed
         for old in range(self.list.old_first[i], self.list.old_first[i] + self.list.old_number[i]):
             j = self.list.old_neighbour[old]
+            if ti.static(len(self.walls) > 0):
+                if j >= self.n:
+                    continue
             if self.is_list_member(i, j, self.state.separation(i, j)) == 0:
                 if ti.static(not self.counts_first):
                     self.list.neighbour[start + ti.min(used, self.list.capacity)] = j
@@ -338,6 +355,40 @@ class NeighbourSearch:
                     self.list.neighbour[start + at] = j
                 used += 1
         return used
+
+    @ti.func
+    def scan_walls(self, i, what, start, used):
+        """Find the faces of walls that are near particle i, or bore something on it. Arguments as those of scan()."""
+        if self.state.w.positive(i):
+            for group in ti.static(self.walls):
+                k = -1
+                while k < group.count():
+                    k = self.next_wall(group, k, i)
+                    if k < group.count():
+                        group.enter(k)
+                        begin, end = group.wall.near_sides(i, self.radius.of(i) + ti.cast(self.skin, self.real))
+                        for place in range(begin, end):
+                            side = group.wall.side_at(place)
+                            face = self.n + group.face(k, side)
+                            listed = group.wall.least_gap(side, i, self.radius.of(i)) < ti.cast(self.skin, self.real)
+                            for old in range(self.list.old_first[i], self.list.old_first[i] + self.list.old_number[i]):
+                                listed = listed or self.list.old_neighbour[old] == face
+                            if listed:
+                                if what != COUNT:
+                                    self.list.neighbour[start + ti.min(used, self.list.capacity)] = face
+                                used += 1
+        return used
+
+    @ti.func
+    def next_wall(self, group: ti.template(), last, i):  # type: ignore[valid-type]
+        """Return the first wall of a group behind the wall `last` that is near particle i or on its old list; `count` if none."""
+        out = group.next_within(last, i, self.radius.of(i) + ti.cast(self.skin, self.real))
+        if ti.static(bool(group.tree)):
+            for old in range(self.list.old_first[i], self.list.old_first[i] + self.list.old_number[i]):
+                k = group.wall_of(self.list.old_neighbour[old] - self.n)
+                if k > last and k < out:
+                    out = k
+        return out
 
     @ti.func
     def is_list_member(self, i, j, r):

@@ -87,6 +87,27 @@ class Strays:
                     out |= self.is_unlisted(i, j)
         for k in range(number):
             out |= self.is_unlisted(i, self.stray[k])
+        near = ti.static(1 - 2 * STALE) * ti.cast(self.search.skin, self.real)
+        for group in ti.static(self.search.walls):
+            k = -1
+            while k < group.count():
+                k = group.next_within(k, i, self.search.radius.of(i) + near)
+                if k < group.count():
+                    group.enter(k)
+                    begin, end = group.wall.near_sides(i, self.search.radius.of(i) + near)
+                    for place in range(begin, end):
+                        side = group.wall.side_at(place)
+                        if group.wall.least_gap(side, i, self.search.radius.of(i)) < near:
+                            out |= self.is_unlisted_wall(i, self.n + group.face(k, side))
+        return out
+
+    @ti.func
+    def is_unlisted_wall(self, i, face):
+        """Return 1 if a face of a wall is not on the list of stray i."""
+        out, begin = 1, self.list.first[i] + self.list.number[i]
+        for e in range(begin, begin + self.list.wall_number[i]):
+            if self.list.neighbour[e] == face:
+                out = 0
         return out
 
     @ti.func

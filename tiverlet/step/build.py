@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 from ..colliders.body_impacts import BodyImpacts, can_have_impacts, stops_bodies
 from ..colliders.collider import Collider
+from ..colliders.wall_group import grouped
 from ..constraints.core.anchored import refuse_held_twice
 from ..contact.pair_contact import PairContact
 from ..device import runtime, ti
@@ -97,6 +98,7 @@ def assemble(
     for feature, start in zip(features, starts, strict=True):
         if isinstance(feature, PairContact):
             feature.ties = [f for f in features if isinstance(f, Batch)]
+            feature.walls = [f for f in features if isinstance(f, Collider)]
         if start is None:
             feature.review(particles, inv_mass)
         else:
@@ -127,9 +129,9 @@ def assemble(
 def _passes(particles: Particles, features: tuple[Feature, ...], scale: Scale, copies: Copies | None) -> Mapping[str, Any]:
     """Return the settings by which kernels skip passes of Taichi's compiler, from the size of their code.
 
-    Each wall has code of its own; other features share code by kind.
+    Walls share code by group, other features by kind.
     """
-    code = {f if isinstance(f, Collider) else type(f): f.code_size for f in features}
+    code = {(f.code_key or f) if isinstance(f, Collider) else type(f): f.code_size for f in features}
     code_size = sum(code.values()) * (1.5 if particles.dim == 3 else 1.0)
     often = copies is not None and copies.count >= COPIES and code_size < MIDDLING
     if code_size > ENDLESS or (scale.particles < FEW and not often):
@@ -152,6 +154,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     contact = next((c for c in of(PairContact) if c.can_touch), None)
     if contact or walls:
         scene.radius = Radii(memory, particles.radius, scene.count)
+    scene.walls = grouped(walls)
     surfaces = [*walls, *([contact] if contact else [])]
     has_friction, bounces = any(f.has_friction for f in surfaces), any(f.has_restitution for f in surfaces)
     scene.bounces = bounces and bool(walls)
@@ -180,7 +183,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     bodies = bool(search and contact and contact.dev.bodies)
     state.remember(
         memory,
-        has_friction or any(w.needs_start_position for w in walls) or scene.bounces,
+        has_friction or bool(contact and contact.solves_rows) or any(w.needs_start_position for w in walls) or scene.bounces,
         bounces or bool(scene.impacts) or bodies,
         bounces,
         bool(contact and (contact.projects or bodies) and walls),
@@ -189,9 +192,11 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     )
     for feature in of(Batch):
         feature.scene = scene  # also for those that do nothing, because all of their particles are held
-    for feature in [*accelerations, *drivers, *batches, *walls]:
+    for feature in [*accelerations, *drivers, *batches]:
         with memory.owned(feature):
             feature.bind(scene)
+    for group in scene.walls:
+        group.bind(scene)
     searches = [(f.make_search(scene, team), f.neighbours_per_particle) for f in accelerations if f.pairwise]
     for feature in features:
         feature.new_force = False  # the force has been on the device from the start

@@ -7,9 +7,10 @@ import numpy as np
 
 from ..colliders.collider import Collider
 from ..contact.pair_contact import PairContact
-from ..device.memory import Memory
+from ..device.memory import ALL, Memory
 from ..features.extending import extended
 from ..features.feature import Acceleration, Batch, Feature
+from ..neighbours.neighbour_list import WALL
 from ..neighbours.periodic import Periodic
 from ..particles import Particles
 from ..solvers.direct import SOFTENED
@@ -112,25 +113,26 @@ class Rebuild:
     def _carried(self, memory: Memory) -> dict[str, np.ndarray]:
         """Return the state of the new world, with the rows of particles and constraints that remain carried over."""
         new = memory.state()
-        names = [{id(e.field): e.name for e in one.entries if e.state} for one in (self.world._runner.memory, memory)]
+        names = [one.places_in_state() for one in (self.world._runner.memory, memory)]
         owned: list[set[str]] = [set(), set()]
-        moves: list[tuple[str, str, tuple[np.ndarray, ...]]] = []
+        moves: list[tuple[tuple[str, slice], tuple[str, slice], tuple[np.ndarray, ...]]] = []
         for feature, before in self.attributes.items():
             pair = [_fields(values, known) for values, known in zip((before, vars(feature)), names, strict=True)]
             for known, found in zip(owned, pair, strict=True):
-                known.update(found.values())
+                known.update(name for name, _ in found.values())
             for key in pair[0].keys() & pair[1].keys():
                 per_particle = getattr(vars(feature.dev)[key[0]], "per_particle", False)  # not decided by the number of rows
                 moves.append((pair[0][key], pair[1][key], (self.some,) if per_particle else self.masks[feature]))
-        shared = (set(names[0].values()) - owned[0]) & (set(names[1].values()) - owned[1])
+        fields = [{name for name, _ in places.values()} for places in names]
+        shared = (fields[0] - owned[0]) & (fields[1] - owned[1])
         if SOFTENED in shared and (self.extending or len(self.old[SOFTENED]) != len(new[SOFTENED])):  # there are other parts
             shared.remove(SOFTENED)
-        moves += [(name, name, (self.some,)) for name in shared]
-        for before, after, choices in moves:
-            rows = self.old[before]
+        moves += [((name, ALL), (name, ALL), (self.some,)) for name in shared]
+        for (before, old), (after, place), choices in moves:
+            rows = self.old[before][old]
             mask = next((choice for choice in choices if len(choice) == len(rows)), None)
             rows = rows if mask is None else rows[mask]
-            new[after][: len(rows)] = rows
+            new[after][place][: len(rows)] = rows
         return new
 
     def _undo(self) -> None:
@@ -185,8 +187,10 @@ class Rebuild:
             for name in contact.late:
                 values[name][: self.some.sum()] = self.old[name][self.some]
             less.restore(values)
-        search, pairs = self.world._runner.search, self.number[self.old["Contact.pairs"]]
+        search, pairs = self.world._runner.search, self.old["Contact.pairs"].copy()
         assert search
+        some = pairs < WALL
+        pairs[some] = self.number[pairs[some]]
         both = (pairs >= 0).all(axis=1)
         # Data without an old value, of features that were just added, is 0.
         nothing = {p.name: np.zeros((len(pairs), p.width) if p.width else len(pairs)) for p in search.list.persistent}
@@ -194,8 +198,8 @@ class Rebuild:
         self.world._runner.carry_loads()
 
 
-def _fields(attributes: dict[str, Any], names: dict[int, str]) -> dict[tuple[str, str], str]:
-    """Return the names of the state fields that a feature's `dev` holds, or a part of it lists as `in_state`."""
+def _fields(attributes: dict[str, Any], names: dict[int, Any]) -> dict[tuple[str, str], Any]:
+    """Return the names and elements of the state fields that a feature's `dev` holds, or a part of it lists as `in_state`."""
     bound = vars(attributes["dev"]) if "dev" in attributes else {}
     parts = {key: getattr(value, "in_state", {"": value}) for key, value in bound.items()}
     fields = {(key, part): field for key, held in parts.items() for part, field in held.items()}

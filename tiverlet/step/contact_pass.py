@@ -6,6 +6,7 @@ from ..contact.each_once import ROUNDS, Turn, first_round
 from ..device import ti
 from ..device.number import OnDevice
 from ..device.thread_team import block, blocks
+from .row_pass import RowPass
 
 if TYPE_CHECKING:
     from ..device.thread_team import Team
@@ -22,13 +23,13 @@ class ContactPass:
         self.contacts, self.particles, self.team = particles.contacts, particles, team
         self.impacts: Any = scene.impacts
         self.n, self.real, self.dim = scene.count, scene.real, scene.particles.dim
-        self.has_restitution = bool(contact) and contact.has_restitution
+        self.rows: Any = RowPass(scene, contact, particles, team) if contact and contact.dev.rows else None
+        self.has_restitution = bool(contact) and contact.has_restitution and not contact.solves_rows
         self.projects_discs = bool(contact and contact.dev.landing)
         self.closes_late = self.projects_discs and contact.dev.reports
         self.notes_bounces = self.projects_discs and contact.dev.landing.bounces
-        self.remembers = self.notes_bounces or bool(
-            contact and (contact.has_friction or contact.has_restitution or contact.has_events or contact.shares_loads)
-        )
+        keeps = contact and (contact.has_friction or contact.has_restitution or contact.has_events or contact.shares_loads)
+        self.remembers = self.notes_bounces or bool(contact and contact.has_events if self.rows else keeps)
         self.projects_velocities = bool(contact) and contact.projects
         self.projects_bodies = bool(contact and contact.dev.bodies)
         if self.has_restitution and team.launched:  # the host does not read whether any pair bounces in a round
@@ -42,8 +43,12 @@ class ContactPass:
                 self.detect(c, now)
             if ti.static(c.dev.has_events):
                 self.start_events(now)
-            self.count(c, now)
-            self.relax(c, now)
+            if ti.static(bool(c.dev.rows)):
+                if now.first != 0:
+                    self.rows.solve(now)
+            else:
+                self.count(c, now)
+                self.relax(c, now)
             if ti.static(c.shares_loads):
                 self.store_pushes(c, now)
 
@@ -149,6 +154,13 @@ class ContactPass:
                 self.team.wait()
 
     @ti.func
+    def begin_events(self, now):
+        """Begin the events of a pass, if there are any."""
+        for c in ti.static(self.contacts):
+            if ti.static(c.dev.has_events):
+                self.start_events(now)
+
+    @ti.func
     def start_events(self, now):
         """Record the number of the substep, and at the start of a frame the pairs that touched before."""
         for c in ti.static(self.contacts):
@@ -185,7 +197,7 @@ class ContactPass:
         """Store the slip of friction and the slack of restitution, and log events."""
         thread = now.thread
         for c in ti.static(self.contacts):
-            if ti.static(c.has_friction or c.has_restitution or c.shares_loads):
+            if ti.static(not c.dev.rows and (c.has_friction or c.has_restitution or c.shares_loads)):
                 for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
                     if c.dev.state.awake(i):
                         c.finish_substep(i, now)
@@ -196,7 +208,7 @@ class ContactPass:
             if ti.static(c.dev.has_events):
                 self.finish_events(now)
             self.team.wait()
-            if ti.static(c.has_restitution):
+            if ti.static(self.has_restitution):
                 ti.loop_config(serialize=True)
                 for _ in range(self.team.one(1, thread)):
                     c.dev.hit[None] = 0

@@ -28,7 +28,7 @@ class ContactRows:
     def of(cls, runner: Any) -> "ContactRows | None":
         """Return the rows of a world at its present positions; None where it has no Contact."""
         contact = next(iter(runner.step.contacts), None)
-        if not contact:
+        if not contact or contact.solves_rows:
             return None
         runner.list_neighbours()
         return cls(contact.dev.geometry.candidates(runner.scene.state.get(runner.memory)), contact.start)

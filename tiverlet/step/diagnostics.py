@@ -424,8 +424,9 @@ class Reporter:
                 'precision="f32-compensated".'
             )
         need = np.ceil(substeps * overlap / UNCONVERGED)  # of order h after impacts, h^2 under loads
-        speed = max(c.push_out for c in self._step.contacts)
-        return f"Use up to {need:.7g} substeps, or more iterations; what was placed so parts at push_out = {speed:g} m/s."
+        given = [c.push_out for c in self._step.contacts if c.push_out is not None]
+        placed = f"; what was placed so parts at push_out = {max(given):g} m/s" if given else ""
+        return f"Use up to {need:.7g} substeps, or more iterations{placed}."
 
     def _note(self, flag, first, reach, overlap, moved, tension, stiff, released, residual, substeps) -> str:
         """Return the note of a flag: its meaning and a remedy, with the figures of this frame."""

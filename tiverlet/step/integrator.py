@@ -245,6 +245,11 @@ class Verlet:
         return small
 
     @ti.func
+    def dithered_move(self, x, d, tick):
+        """Return a displacement d with the dither of the substep `tick`, before it is added to a place x."""
+        return self.dithered(x, d, tick, DITHER[1])
+
+    @ti.func
     def integrate(self, i, now, pull, share, h2_effective):
         """Integrate particle i: d += h^2 a, x += d; at a start (d is v) x += h v + h^2 a / 2. Linear drag is exact in both.
 

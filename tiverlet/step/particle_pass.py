@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..colliders.surface import ANY_DEPTH, BEFORE_CONTACTS, BEYOND_ROUNDING, FRICTIONLESS
 from ..contact.force_share import accumulate
+from ..contact.limits import SLOP
 from ..contact.projection_times import ALWAYS
 from ..device import inline, ti
 from ..device.number import OnDevice
@@ -11,7 +12,7 @@ from ..device.thread_team import Team, block, blocks
 from ..features.feature import Batch, Scene
 
 if TYPE_CHECKING:
-    from ..colliders.collider import Collider
+    from ..colliders.wall_group import WallGroup
 
 TILE = 256  # particles that a thread takes through several loops at a time, so that their state stays in its cache
 SWEEPS = 8  # rounds over the walls, for particles that several walls push
@@ -31,7 +32,7 @@ class ParticlePass:
     tile: Any = OnDevice()
     each: Any = OnDevice()
 
-    def __init__(self, scene: Scene, integrator: Any, batches: list[Batch], contact, search, walls: "list[Collider]", team: Team):
+    def __init__(self, scene: Scene, integrator: Any, batches: list[Batch], contact, search, team: Team):
         self.integrator, self.forces, self.team = integrator, integrator.forces, team
         self.state, self.n, self.real = scene.state, scene.count, scene.real
         number = scene.memory.number
@@ -39,6 +40,11 @@ class ParticlePass:
         self.few = scene.memory.compiler.few
         self.whole = team.size == 1 and not team.launched  # all particles are one piece
         self.undivided = self.whole and self.few  # and one tile: no loop over tiles is compiled
+        self.rows: Any = contact.dev.rows if contact else None
+        self.groups: list[WallGroup] = scene.walls
+        walls = [] if self.rows else [group.wall for group in scene.walls]  # otherwise they keep inside what rows leave outside
+        self.alone = len(walls) == 1 and scene.walls[0].single and not walls[0].needs_repeat
+        self.several = len(walls) > 1 or any(not group.single for group in scene.walls)
         self.slots, self.search, self.walls, self.radius = scene.slots, search, walls, scene.radius
         self.applies_first = bool(batches) and (bool(contact) or scene.slots.refines)  # moves of constraints, before all others
         self.gathers = bool(batches) and not self.applies_first
@@ -251,7 +257,7 @@ class ParticlePass:
         if ti.static(self.leaves_walls_early):
             if now.first != 0:
                 self.undo_wall_moves(begin, end)
-        for c in ti.static(self.contacts):
+        for c in ti.static([] if self.rows else self.contacts):
             if now.it < now.span.iterations:  # further passes have no contacts, see BodyImpacts
                 for b in range(blocks(begin, end)):
                     low, high = block(b, begin, end)
@@ -287,6 +293,10 @@ class ParticlePass:
                 if self.near_walls(low, high) != 0:
                     for i in range(low, high):
                         self.confine(i, now.h, now.frame_fraction)
+        if ti.static(bool(self.rows) and len(self.groups) > 0):
+            for i in range(begin, end):
+                if self.search.list.wall_number[i] > 0 or self.search.moved_too_far(i) != 0:
+                    self.guard(i, now)
         for loads in ti.static(self.wall_loads):
             for i in range(begin, end):
                 loads.pushed[i] = loads.pushed[i] + self.state.d[i]
@@ -350,17 +360,17 @@ class ParticlePass:
         """Return 0 if no wall is near any of the particles from `begin` to `end` - 1."""
         near = 0
         for i in range(begin, end):
-            for f in ti.static(self.walls):
-                near |= f.may_touch(i, self.radius.of(i))
+            for group in ti.static(self.groups):
+                near |= group.may_touch(i, self.radius.of(i))
         return near
 
     @ti.func
     def confine(self, i, h, frame_fraction):
         """Apply the corrections of walls to particle i, in turn, until none changes anything, see Collider."""
         if self.state.moves(i):
-            if ti.static(len(self.walls) == 1 and not self.walls[0].needs_repeat):
+            if ti.static(self.alone):
                 for f in ti.static(self.walls):
-                    self.touch(f, i, h, frame_fraction, ANY_DEPTH)
+                    self.touch(f, i, self.radius.of(i), h, frame_fraction, ANY_DEPTH)
             else:
                 moving, mode = True, ANY_DEPTH
                 for k in range(SWEEPS + ROUNDS + 1):
@@ -370,16 +380,30 @@ class ParticlePass:
                         settled = self.touch_all(i, h, frame_fraction, mode)
                         # A round with friction or bounces may return to where it began, although the particle is in a wall there.
                         moving = not (settled and (mode == FRICTIONLESS or ti.static(not self.rough)))
-                        mode = ANY_DEPTH if ti.static(len(self.walls) > 1) else BEYOND_ROUNDING
+                        mode = ANY_DEPTH if ti.static(self.several) else BEYOND_ROUNDING
                         if settled or k + 1 >= SWEEPS:
                             mode = FRICTIONLESS
+
+    @ti.func
+    def guard(self, i, now):
+        """Keep particle i inside of walls, where their rows left it further outside than the slop. This gives no momentum."""
+        if self.state.moves(i):
+            d, moving = self.state.d[i], True
+            radius = ti.static(1 - 2 * SLOP) * self.radius.of(i)
+            for _ in range(SWEEPS):
+                if moving:
+                    x = self.state.x[i]
+                    for group in ti.static(self.groups):
+                        self.touch_group(group, i, radius, now.h, now.frame_fraction, FRICTIONLESS)
+                    moving = (self.state.x[i] != x).any()
+            self.state.d[i] = d
 
     @ti.func
     def touch_all(self, i, h, frame_fraction, mode):
         """Apply the correction of every wall once. Returns whether none changed anything."""
         x, d = self.state.x[i], self.state.d[i]
-        for f in ti.static(self.walls):
-            self.touch(f, i, h, frame_fraction, mode)
+        for group in ti.static(self.groups):
+            self.touch_group(group, i, self.radius.of(i), h, frame_fraction, mode)
         return (self.state.d[i] == d).all() and (self.state.x[i] == x).all()
 
     @ti.func
@@ -401,13 +425,26 @@ class ParticlePass:
             self.state.wall_push[i] = wall_push
 
     @ti.func
-    def touch(self, wall: ti.template(), i, h, frame_fraction, mode):  # type: ignore[valid-type]
+    def touch_group(self, group: ti.template(), i, radius, h, frame_fraction, mode):  # type: ignore[valid-type]
+        """Apply the corrections of the walls of a group that particle i may meet, in turn."""
+        if ti.static(group.single):
+            self.touch(group.wall, i, radius, h, frame_fraction, mode)
+        else:
+            k = -1
+            while k < group.count():
+                k = group.next_near(k, i, radius)
+                if k < group.count():
+                    group.enter(k)
+                    self.touch(group.wall, i, radius, h, frame_fraction, mode)
+
+    @ti.func
+    def touch(self, wall: ti.template(), i, radius, h, frame_fraction, mode):  # type: ignore[valid-type]
         """Apply the correction of one wall, if it is switched on."""
         if ti.static(wall.dev.surface.has_switch):
             if wall.dev.surface.active[None] != 0:
-                wall.confine(i, self.radius.of(i), h, frame_fraction, mode)
+                wall.confine(i, radius, h, frame_fraction, mode)
         else:
-            wall.confine(i, self.radius.of(i), h, frame_fraction, mode)
+            wall.confine(i, radius, h, frame_fraction, mode)
 
     @ti.func
     def stop(self, i, move):
@@ -465,8 +502,13 @@ class ParticlePass:
             v = self.state.d[i] / h
             load = (h * h * self.forces.accelerate(i, self.state.place(i), v, t, self.forces.pull(t)) + reaction).norm()
             limit, size = load, push.norm()
-            for f in ti.static([f for f in self.walls if f.has_friction]):  # the wall's push is load and friction together
-                limit = ti.max(limit, load * ti.sqrt(1 + f.dev.surface.static() ** 2))
+            for group in ti.static([g for g in self.groups if g.wall.has_friction]):  # its push is load and friction together
+                if ti.static(group.single):
+                    limit = ti.max(limit, load * ti.sqrt(1 + group.wall.dev.surface.static() ** 2))
+                elif size > limit:
+                    for k in range(group.count()):
+                        group.enter(k)
+                        limit = ti.max(limit, load * ti.sqrt(1 + group.wall.dev.surface.static() ** 2))
             if size > limit:
                 part = limit / size
             for impacts in ti.static(self.impacts):
@@ -480,7 +522,9 @@ class ParticlePass:
         """Return r omega of particle i at the end of the last substep: s / h plus half of what moments of forces added to it."""
         turned = 0 * self.state.spin.s[i]
         for c in ti.static(self.contacts):
-            if ti.static(c.has_friction):
+            if ti.static(bool(c.dev.rows)):
+                turned += c.dev.rows.turned[i]
+            elif ti.static(c.has_friction):
                 turned += c.dev.forces.turned[i]
         if ti.static(self.turned_by_walls):
             _reaction, part = self.reaction(i, h, t, firm, soft)

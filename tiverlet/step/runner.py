@@ -243,7 +243,7 @@ class Runner:
     def _sleep_on(self, who: np.ndarray, d: np.ndarray, ratio: float) -> None:
         """Scale what the last substep has left of the sleeping particles `who`, with displacements d, to one of `ratio` times the
         length. For them the coming frame is no start."""
-        memory, forces = self.memory, [contact.dev.forces for contact in self.step.contacts]
+        memory, forces = self.memory, [c.dev.forces for c in self.step.contacts if c.dev.forces]
         memory.write_rows(who, (self.scene.state.d, d * ratio))
         left = [(f.before, ratio) for f in forces] + [(f.sum, ratio**2) for f in forces if "sum" in f.in_state]
         left += [(self.step.particles.wall_displacement, ratio**2)] if self.step.walls else []
@@ -705,12 +705,16 @@ class Runner:
         Otherwise the frame would have to be compiled again. Only pairs with one of number `first` or more count.
         """
         for contact in self.step.contacts:
-            if not contact.shrinks and overlapping(self.scene, self.batches, contact.table, position, first):
+            if not (contact.shrinks or contact.solves_rows) and overlapping(
+                self.scene, self.batches, contact.table, position, first
+            ):
                 contact.enable_shrink()
 
     def shrink_overlapping(self, first: int, speed: float = np.inf) -> None:
         """Let particles from number `first` on that the user placed into others part gently, pairs at up to `speed` [m/s]."""
         contact, moved, x = self.step.contacts[0], self.clock.moved_mask, self.scene.state.get(self.memory)
+        if contact.solves_rows:
+            return
         if not contact.shrinks:
             loads = first or moved is not None  # what was there before may overlap under a load, which is no error of placing
             if loads and overlapping(self.scene, self.batches, contact.table, x, first, moved) is False:
@@ -718,7 +722,7 @@ class Runner:
             contact.enable_shrink()
             self.renew()
         candidates = contact.dev.geometry.candidates(x)
-        speeds = parting_speeds(self.scene, self.batches, candidates, x, first, contact.push_out)
+        speeds = parting_speeds(self.scene, self.batches, candidates, x, first, contact.speed_of_parting)
         self.step.shrink_overlapping(first, np.minimum(speeds, speed))
 
     def report(self, substeps: int = 1, iterations: int = 1) -> StepReport:

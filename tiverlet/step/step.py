@@ -105,6 +105,8 @@ class Step:
     and Taichi spreads the outermost loops of other kernels over threads.
     """
 
+    host_only = ("walls",)
+
     diagnostics: Any  # computes the report of a frame; set after construction
     sleep: Any = None  # the SleepPass, in worlds with Sleep
     n: Any = OnDevice()  # number of particles
@@ -116,14 +118,14 @@ class Step:
         self.scene, self.state, self.slots, self.team = scene, scene.state, scene.slots, team
         self.n, self.dim, self.real, self.numbers = scene.count, scene.particles.dim, scene.real, scene.memory.numbers
         self.integrator, self.search, self.walls, self.drivers, self.batches = integrator, search, walls, drivers, batches
-        self.posed = [w for w in walls if w.poses]
+        self.posed = [group for group in scene.walls if group.poses]
         self.wall_logs: list[Any] = [w.dev.log for w in walls if w.dev.log]
         self.sheared = bool(scene.state.images and scene.state.images.sheared)
         self.breakers: list[Any] = [b for b in batches if b.breaks]
         self.launched = team.launched
         # Loop iterations per piece of work in short loops: Taichi gives each CPU thread at least LEAST iterations.
         self.stride = LEAST if self.launched and runtime.architecture() == "cpu" else 1
-        self.particles = ParticlePass(scene, integrator, batches, contact, search, walls, team)
+        self.particles = ParticlePass(scene, integrator, batches, contact, search, team)
         self.constraints = ConstraintPass(scene, integrator, batches, team, self.stride)
         self.contact_pass = ContactPass(scene, contact, self.particles, team)
         self.contacts = self.particles.contacts
@@ -333,10 +335,10 @@ class Step:
             self.constraints.spring_forces(now.thread, now.h, 0 * now.h, 0)
             if now.s % self.integrator.stages == self.integrator.longest + 1:
                 self.constraints.note_turns(now.thread)
-        for w in ti.static(self.posed):
+        for group in ti.static(self.posed):
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, now.thread)):
-                w.pose(now.frame_fraction)
+                group.pose(now.frame_fraction, now.s == 0)
         for log in ti.static(self.wall_logs):
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, now.thread)):
@@ -506,6 +508,31 @@ class Step:
         self.contact_pass.solve(now)
 
     @ti.func
+    def start_events(self, now):
+        """On the launched path: begin the events of contacts that are rows."""
+        self.contact_pass.begin_events(now)
+
+    @ti.func
+    def find_rows(self, now):
+        """On the launched path: list the rows of contacts."""
+        self.contact_pass.rows.find_rows(now)
+
+    @ti.func
+    def relax_impulses(self, now):
+        """On the launched path: one pass of impulses."""
+        self.contact_pass.rows.relax_impulses(now.thread)
+
+    @ti.func
+    def finish_impulses(self, now):
+        """On the launched path: end the passes of impulses."""
+        self.contact_pass.rows.finish_impulses(now.thread, now.final, now.tick)
+
+    @ti.func
+    def relax_places(self, now):
+        """On the launched path: one pass of places."""
+        self.contact_pass.rows.relax_places(now.thread)
+
+    @ti.func
     def any_struck(self):
         """1 if a pair bounces in this substep."""
         return self.contact_pass.struck()
@@ -672,9 +699,9 @@ class Step:
     @ti.kernel
     def stop_moved(self, old: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
         """Stop particles at walls, posed as at the beginning of a frame, after the host moved them from `old`, (n, dim)."""
-        for w in ti.static(self.posed):
+        for group in ti.static(self.posed):
             for _ in range(1):
-                w.pose(ti.Vector([0, 0], self.real))
+                group.pose(ti.Vector([0, 0], self.real), True)
         for i in range(self.n):
             move = ti.zero(self.state.d[i])
             for k in ti.static(range(self.dim)):

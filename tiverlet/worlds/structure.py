@@ -83,7 +83,7 @@ def _written(world: "World") -> Any:
     """Return the source of a world's kernels, with numbers in place of its fields."""
     from ..device.patches.sharing import KernelInputs  # noqa: PLC0415
 
-    fields = [vars(e.field) for memory in world._runner.memories for e in memory.entries]
+    fields = [vars(field) for memory in world._runner.memories for field in memory.fields]
     before = [known.get("place_name") for known in fields]
     for k, known in enumerate(fields):
         known["place_name"] = "field", k

@@ -1,0 +1,424 @@
+"""Stage 1 of contacts: impulses.
+
+With x' = x + d, the gap C and c0 = min(C(x), 0) of each row:
+
+    C(x') >= c0,   p >= 0,   p (C(x') - c0) = 0,   |tangential impulse| <= friction p
+
+Normals are those at the start of the substep, and the gap is the true one at its end: SHAKE for inequalities, which is second
+order. Overlap c0 is no reason for an impulse; it is only kept from growing. So overlap stores no energy, whatever h does.
+
+Solved by projected Jacobi with split masses: among the rows of a particle, or without friction by the largest eigenvalue of the
+sum of n n^T over them. No eigenvalue of a pass exceeds RELAXATION. Passes are
+accelerated (Nesterov 1983) and restarted where they go uphill (O'Donoghue and Candes 2015). They start from what rows bore in the
+last substep, and stop where the mean square of what rows lack is below MET times the displacement by forces.
+
+Passes start with momentum, as if they had run before: what is at rest then needs a few, and landings half as many. A few passes
+at least run in each substep: through the start they continue over substeps, which brings a pile to rest.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from ..device import at, inline, ti
+from ..device.number import OnDevice
+from ..features.material import limit_length
+from .limits import (
+    ALONE,
+    BETA,
+    BLOCK,
+    BOUNCES,
+    FEW,
+    FORCE,
+    GAINS,
+    GOING,
+    HITS,
+    LACK,
+    LEAST,
+    LEFT,
+    LOAD,
+    MET,
+    MOMENTUM,
+    OWN,
+    PASSES,
+    RELAXATION,
+    RESTING,
+    ROUNDING,
+    ROWS,
+    SHARE,
+    SLOW,
+    SUMS,
+    THETA,
+    TOLERANCE,
+    TURN,
+    UPHILL,
+    WORK,
+)
+
+if TYPE_CHECKING:
+    from ..device.thread_team import Team
+    from ..features.feature import Scene
+    from .islands import Islands
+    from .responses import FreeParticles
+    from .rows import Rows
+
+
+class Impulses:
+    """Stage 1 of the contacts of one world."""
+
+    n: Any = OnDevice()
+    blocks: Any = OnDevice()
+
+    def __init__(self, scene: "Scene", rows: "Rows", bodies: "FreeParticles", islands: "Islands", team: "Team"):
+        self.rows, self.bodies, self.islands, self.team, self.state = rows, bodies, islands, team, scene.state
+        self.met, self.least = MET[rows.has_friction], LEAST[rows.has_friction]
+        self.n, self.real, self.dim, self.has_friction = scene.count, scene.real, scene.particles.dim, rows.has_friction
+        count, add = scene.particles.count, scene.memory.field
+        self.blocks = scene.memory.number(-(-count // BLOCK))
+        self.sums = add("Contact.sums", scene.count, width=len(SUMS))
+        self.each: Any = add("Contact.sums_of_particles", scene.count, width=len(SUMS)) if team.launched else None
+        self.numbers = add("Contact.passes", None, width=4)
+        self.flags = add("Contact.flags", None, width=3, kind=ti.i32)
+        self.last_h2 = add("Contact.last_h2", None, state=True)  # h^2 of what rows bore [s^2]; 0 before the first substep
+
+    def regroup(self, n: int) -> None:
+        """Set the number of particles to n."""
+        self.blocks = -(-n // BLOCK)
+
+    @inline
+    def going(self):
+        """Return 1 while passes go on, else 0."""
+        return at(at(self.flags, None), GOING)
+
+    @inline
+    def moving(self):
+        """Return 1 if the last pass of stage 2 moves anything, else 0."""
+        return at(at(self.flags, None), GAINS)
+
+    @ti.func
+    def note(self, i, k: ti.template(), value):  # type: ignore[valid-type]
+        """Note a sum over the block that begins at particle i; on the launched path, over particle i."""
+        if ti.static(self.team.launched):
+            self.each[i][k] = value
+        else:
+            self.sums[i // BLOCK][k] = value
+
+    @ti.func
+    def add_up(self, b, k: ti.template()):  # type: ignore[valid-type]
+        """Add up what the particles of block b have noted."""
+        out = ti.cast(0, self.real)
+        for i in range(b * BLOCK, ti.min((b + 1) * BLOCK, self.n)):
+            out += self.each[i][k]
+        self.sums[b][k] = out
+
+    @ti.func
+    def begin(self, now, h2):
+        """Begin a substep. h2: the square of its length [s^2], half of that at a start. One thread calls it."""
+        before = self.last_h2[None]
+        scale = ti.cast(0, self.real)
+        if before > 0:
+            scale = h2 / before
+        self.last_h2[None] = h2
+        self.rows.times[None] = [now.h, now.frame_fraction[0], now.frame_fraction[1], scale]
+        self.flags[None] = [1, 0, 0]
+
+    @ti.func
+    def prepare(self, i, part):
+        """Compute the effective masses of a part of the rows of particle i, and give particles what these rows bore."""
+        p_own, m_own = 0 * self.state.d[i], self.no_moment()
+        share, kept, pressed = self.rows.share[i], self.rows.kept[i], self.rows.pressed[i]
+        if ti.static(not self.has_friction):
+            share = self.rows.eigenvalue[i]
+        w_own, across_own = share * self.bodies.compliance(i), share * self.bodies.tangential_compliance(i)
+        for row in range(self.rows.first(i, part), self.rows.last(i, part)):
+            other, n = self.rows.other.field[row], self.rows.normal.field[row]
+            w, across, most = w_own, across_own, share
+            if row < pressed:
+                others = self.rows.share[other]
+                if ti.static(not self.has_friction):
+                    others = self.rows.eigenvalue[other]
+                w += others * self.bodies.compliance(other)
+                across += others * self.bodies.tangential_compliance(other)
+                if self.bodies.moves(other):
+                    most = ti.max(most, others)
+            step, move = ti.cast(RELAXATION, self.real), ti.cast(SHARE, self.real)
+            if most < ALONE:  # a row that shares its particles with none that it could disturb is solved in one pass
+                step, move = 1, 1
+            e = self.rows.eigenvalue[i] * self.bodies.compliance(i)
+            if row < pressed:
+                e += self.rows.eigenvalue[other] * self.bodies.compliance(other)
+            self.rows.firm.field[row] = move / e
+            p = self.rows.p.field[row]
+            if ti.static(self.has_friction):
+                self.rows.stiff.field[row] = [step / w, step / across]
+                p = self.cone(p.dot(n), p - p.dot(n) * n, self.rows.friction.field[row], n)
+            else:
+                self.rows.stiff.field[row] = step / w
+                p = ti.max(p, 0)
+            self.rows.p.field[row] = p
+            v = self.rows.vector(p, n)
+            p_own += v
+            if ti.static(self.bodies.spins):
+                m_own += self.bodies.spin.moment(n, v)
+            if part == OWN and row < kept:
+                self.bodies.give(other, n, v)
+            if ti.static(self.rows.turns):
+                self.prepare_turn(i, row, other, most < ALONE)
+                m_own += self.give_turn(row, other, part == OWN and row < kept)
+        self.take(i, part, p_own, m_own)
+
+    @ti.func
+    def prepare_turn(self, i, row, other, alone):
+        """Compute the effective masses of a row against rolling and twisting."""
+        arms = self.rows.arms.field[row]
+        each = self.rows.share[i] * arms[1] * arms[1] * self.bodies.turning_compliance(i)
+        if row < self.rows.pressed[i]:
+            each += self.rows.share[other] * arms[0] * arms[0] * self.bodies.turning_compliance(other)
+        step = ti.cast(RELAXATION, self.real)
+        self.rows.turn_stiff.field[row] = [step / ti.max(2 * each, FEW), step / ti.max(each, FEW)]
+
+    @ti.func
+    def give_turn(self, row, other, gives):
+        """Give the other particle of a row its moment. Returns that of its own."""
+        arms, f = self.rows.arms.field[row], self.rows.f.field[row]
+        if gives:
+            self.bodies.moment[other] = self.bodies.moment[other] + arms[0] * f
+        return -arms[1] * f
+
+    @ti.func
+    def relax_turn(self, i, row, other, n, load, beta):
+        """One pass over the moment of a row, which resists rolling and twisting by up to a part of the load. Returns how far it
+        goes uphill."""
+        arms, stiff, most = self.rows.arms.field[row], self.rows.turn_stiff.field[row], self.rows.rolling.field[row] * load
+        turn = arms[1] * self.bodies.s[i]
+        if row < self.rows.pressed[i]:
+            turn -= arms[0] * self.bodies.s[other]
+        before = self.rows.f.field[row]
+        y = before + beta * self.rows.f_step.field[row]
+        twist, about = self.bodies.spin.along(turn, n), self.bodies.spin.along(y, n)
+        new = limit_length(y - about - stiff[0] * (turn - twist), most[0], most[0])
+        new += limit_length(about - stiff[1] * twist, most[1], most[1])
+        self.rows.f.field[row], self.rows.f_step.field[row] = new, new - before
+        return (y - new).dot(new - before)
+
+    @ti.func
+    def no_moment(self):
+        """Return a moment of 0."""
+        return ti.Vector.zero(self.real, 3 if self.dim == 3 else 1)
+
+    @ti.func
+    def cone(self, normal, across, friction, n):
+        """Return the impulse in Coulomb's cone that is next to the one with these parts along the normal and across it."""
+        normal = ti.max(normal, 0)
+        size, most = across.dot(across), friction[0] * normal
+        if size > most * most:
+            across *= friction[1] * normal / ti.sqrt(size)
+        return normal * n + across
+
+    @ti.func
+    def take(self, i, part, p, m):
+        """Add impulses of sum p and moments of sum m to those of particle i; after its own rows, compute its answer."""
+        p += self.bodies.push[i]
+        if ti.static(self.bodies.spins):
+            m += self.bodies.moment[i]
+        if part == OWN:
+            self.bodies.answer(i, p, m)
+        else:
+            self.bodies.push[i] = p
+            if ti.static(self.bodies.spins):
+                self.bodies.moment[i] = m
+
+    @ti.func
+    def relax(self, i, part):
+        """One pass over a part of the rows of particle i. Returns what they lack, whether it goes uphill, and what they bear."""
+        beta = self.numbers[None][BETA]
+        v, p_own, m_own = self.bodies.v[i], 0 * self.state.d[i], self.no_moment()
+        s_own = self.no_moment()
+        if ti.static(self.bodies.spins):
+            s_own = self.bodies.s[i]
+        kept, pressed = self.rows.kept[i], self.rows.pressed[i]
+        lack, uphill, load = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
+        for row in range(self.rows.first(i, part), self.rows.last(i, part)):
+            other, n = self.rows.other.field[row], self.rows.normal.field[row]
+            u, s = v, s_own
+            if row < pressed:
+                u -= self.bodies.v[other]
+                if ti.static(self.bodies.spins):
+                    s += self.bodies.s[other]
+                if ti.static(bool(self.state.images)):
+                    u = self.state.relative_displacement(u, i, other)
+            elif ti.static(len(self.rows.walls) > 0):
+                u -= self.rows.moved.field[row]
+            un = u.dot(n)
+            t = u - un * n
+            # The true gap at the end, less that at the start where it was negative.
+            gap = self.rows.gap.field[row] + un + self.rows.rise(t.dot(t), un, self.rows.bend.field[row])
+            if ti.static(self.rows.bounces):
+                if self.rows.bounce.field[row] > 0:
+                    gap = un - self.rows.target.field[row]
+            before, stiff = self.rows.p.field[row], self.rows.stiff.field[row]
+            y = before + beta * self.rows.step.field[row]
+            new = y
+            if ti.static(self.has_friction):
+                if ti.static(self.bodies.spins):
+                    t -= self.bodies.spin.surface(s, n)
+                if ti.static(self.rows.turns):
+                    t -= self.rows.across.field[row]
+                yn = y.dot(n)
+                normal = ti.max(yn - gap * stiff[0], 0)
+                new = self.cone(normal, y - yn * n - stiff[1] * t, self.rows.friction.field[row], n)
+                miss = (normal - yn) / stiff[0]
+                lack += miss * miss
+                uphill += (y - new).dot(new - before)
+                load += normal
+            else:
+                new = ti.max(y - gap * stiff, 0)
+                miss = (new - y) / stiff
+                lack += miss * miss
+                uphill += (y - new) * (new - before)
+                load += new
+            self.rows.p.field[row] = new
+            self.rows.step.field[row] = new - before
+            p = self.rows.vector(new, n)
+            p_own += p
+            if ti.static(self.bodies.spins):
+                m_own += self.bodies.spin.moment(n, p)
+            if part == OWN and row < kept:
+                self.bodies.give(other, n, p)
+            if ti.static(self.rows.turns):
+                uphill += self.relax_turn(i, row, other, n, self.rows.along(new, n), beta)
+                m_own += self.give_turn(row, other, part == OWN and row < kept)
+        self.take(i, part, p_own, m_own)
+        return lack, uphill, load
+
+    @ti.func
+    def gain(self, i):
+        """Return the energy that impulses give particle i, 0 if they take some, times h^2 [kg m^2]."""
+        work, square = self.bodies.work(i)
+        return ti.max(ti.cast(work + square / 2 - self.rows.work_of_others(i), self.real), 0)
+
+    @ti.func
+    def start_passes(self):
+        """Before the first pass: no extrapolation, and what rows may lack. One thread calls it."""
+        rows, force = self.total(ROWS), self.total(FORCE)
+        mean = force / ti.max(ti.cast(self.n, self.real), 1)
+        self.numbers[None] = [0, ti.static(MOMENTUM), self.met * self.met * mean * rows, ti.static(SLOW) * ti.sqrt(mean)]
+        self.flags[None][GOING], self.flags[None][TURN] = ti.cast(rows > 0, ti.i32), 0
+
+    @ti.func
+    def decide(self):
+        """Decide after a pass whether another one follows, and how far it extrapolates. One thread calls it."""
+        lack, uphill = self.total(LACK), self.total(UPHILL)
+        turn = self.flags[None][TURN] + 1
+        if turn == 1:
+            self.numbers[None][TOLERANCE] = ti.max(self.numbers[None][TOLERANCE], ti.static(LEFT) * lack)
+        theta = self.numbers[None][THETA]
+        ahead = (1 + ti.sqrt(1 + 4 * theta * theta)) / 2
+        beta = (theta - 1) / ahead
+        if uphill > 0:
+            beta, ahead = 0 * beta, 1 + 0 * ahead
+        self.numbers[None][BETA], self.numbers[None][THETA] = beta, ahead
+        self.flags[None][TURN] = turn
+        most = ti.select(self.total(HITS) > 0, BOUNCES, PASSES)
+        goes_on = turn < most and lack > self.numbers[None][TOLERANCE]
+        self.flags[None][GOING] = ti.cast((goes_on or turn < self.least) and self.total(ROWS) > 0, ti.i32)
+
+    @ti.func
+    def start_places(self):
+        """Before the first pass of stage 2. One thread calls it."""
+        self.numbers[None] = [0, 1, 0, 0]
+        self.flags[None] = [ti.cast(self.total(ROWS) > 0, ti.i32), 0, 0]
+
+    @ti.func
+    def decide_places(self, most):
+        """Decide after a pass of stage 2 whether it moves anything, and whether another one follows. One thread calls it."""
+        theta, turn = self.numbers[None][THETA], self.flags[None][TURN] + 1
+        ahead = (1 + ti.sqrt(1 + 4 * theta * theta)) / 2
+        self.numbers[None][BETA], self.numbers[None][THETA] = (theta - 1) / ahead, ahead
+        moves = ti.cast(self.total(LACK) > 0, ti.i32)
+        self.flags[None] = [ti.select(turn < most, moves, 0), turn, moves]
+
+    @ti.func
+    def check_work(self):
+        """Find islands if any particle gains energy beyond rounding. One thread calls it."""
+        allowed = ti.static(ROUNDING) * ti.sqrt(self.numbers[None][TOLERANCE] / ti.max(self.total(ROWS), 1))
+        gains = self.total(WORK) > allowed * self.total(LOAD)
+        self.flags[None][GAINS] = ti.cast(gains, ti.i32)
+        if gains:
+            self.islands.find(allowed)
+
+    @ti.func
+    def total(self, k: ti.template()):  # type: ignore[valid-type]
+        """Return a sum over all particles, from those of blocks."""
+        out = ti.cast(0, self.real)
+        for b in range(self.blocks):
+            out += self.sums[b][k]
+        return out
+
+    @ti.func
+    def sum_impacts(self, i, part):
+        """Add up the part of the impulses on particle i that is none of a load, because its rows did not bear it before."""
+        p_own, m_own, scale = 0 * self.state.d[i], self.no_moment(), self.rows.times[None][3]
+        for row in range(self.rows.first(i, part), self.rows.last(i, part)):
+            n = self.rows.normal.field[row]
+            p, before = self.rows.p.field[row], self.rows.memory.field[self.rows.entry.field[row]]
+            size, load = self.rows.along(p, n), scale * self.rows.along(before, n)
+            if size > load:  # what came together no faster than forces move it is no impact
+                u = self.state.d[i]
+                if row < self.rows.pressed[i]:
+                    u -= self.state.d[self.rows.other.field[row]]
+                elif ti.static(len(self.rows.walls) > 0):
+                    u -= self.rows.moved.field[row]
+                if -u.dot(n) <= self.numbers[None][RESTING]:
+                    load = size
+            if ti.static(self.rows.bounces):
+                if self.rows.bounce.field[row] > 0:
+                    load = 0
+            if size > load:
+                impact = (1 - ti.max(load, 0) / size) * self.rows.vector(p, n)
+                p_own += impact
+                if ti.static(self.bodies.spins):
+                    m_own += self.bodies.spin.moment(n, impact)
+                if part == OWN and row < self.rows.kept[i]:
+                    self.bodies.give(self.rows.other.field[row], n, impact)
+        self.bodies.push[i] = self.bodies.push[i] + p_own
+        if ti.static(self.bodies.spins):
+            self.bodies.moment[i] = self.bodies.moment[i] + m_own
+
+    @ti.func
+    def remember(self, i, final):
+        """At the end: store what the rows of particle i bear, and note what touches for events.
+
+        `borne` is how far what bears moves the particle. Velocities contain half of it, see Verlet.velocity_after().
+        """
+        if final != 0:
+            w = self.bodies.compliance(i)
+            self.rows.borne[i] = self.bodies.new[i] - self.state.d[i] - w * self.bodies.push[i]
+            if ti.static(self.bodies.spins):
+                k = self.bodies.spin.inverse_inertia.of(i)
+                self.rows.turned[i] = self.bodies.new_s[i] - self.bodies.spin.s[i] + (w * k) * self.bodies.moment[i]
+        for row in range(self.rows.begin[i], self.rows.end[i]):
+            e, p = self.rows.entry.field[row], self.rows.p.field[row]
+            if ti.static(self.rows.bounces):
+                n = self.rows.normal.field[row]
+                load, size = self.rows.times[None][3] * self.rows.along(self.rows.memory.field[e], n), self.rows.along(p, n)
+                bounces = self.rows.bounce.field[row] > 0
+                self.rows.touched.field[e] = ti.cast(not bounces and (self.rows.gap.field[row] == 0 or size > 0), ti.i32)
+                if bounces:
+                    p = 0 * p
+                elif self.rows.when[i] > 0 and size > load:  # the rest came of the impact
+                    p *= ti.max(load, 0) / size
+            self.rows.memory.field[e] = p
+            if ti.static(self.rows.turns):
+                f = self.rows.f.field[row]
+                if ti.static(self.rows.bounces):
+                    if self.rows.bounce.field[row] > 0:
+                        f = 0 * f
+                self.rows.borne_moment.field[e] = f
+        if ti.static(self.rows.logs_pairs):
+            for row in range(self.rows.own[i], self.rows.pressed[i]):
+                n = self.rows.normal.field[row]
+                p = self.rows.along(self.rows.p.field[row], n)
+                if p > 0:
+                    self.rows.events.record(i, self.rows.other.field[row], self.rows.entry.field[row], n, p, final)
+        if ti.static(len(self.rows.logging) > 0):
+            for row in range(self.rows.pressed[i], self.rows.end[i]):
+                self.rows.log_wall(i, row)

@@ -1,0 +1,90 @@
+"""Stage 2 of contacts: places.
+
+What overlaps by more than SLOP, by its start or by what stage 1 left, is moved apart by some accelerated passes on positions
+alone. That gives no momentum, so overlap stores no energy. The slop keeps contacts closed: without it grains would fall into the
+gaps that open, and a pile would never rest.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from ..device import ti
+from ..device.number import OnDevice
+from .limits import BEYOND, OWN, SLOP, TURN
+
+if TYPE_CHECKING:
+    from ..device.thread_team import Team
+    from ..features.feature import Scene
+    from .impulses import Impulses
+    from .responses import FreeParticles
+    from .rows import Rows
+
+
+class Places:
+    """Stage 2 of the contacts of one world."""
+
+    n: Any = OnDevice()
+
+    def __init__(self, scene: "Scene", rows: "Rows", bodies: "FreeParticles", impulses: "Impulses", team: "Team"):
+        self.rows, self.bodies, self.impulses, self.team, self.state = rows, bodies, impulses, team, scene.state
+        self.n, self.real, self.dim, self.radius = scene.count, scene.real, scene.particles.dim, scene.radius
+
+    @ti.func
+    def begin(self, i):
+        """Begin the passes of particle i."""
+        self.bodies.last[i] = 0 * self.state.d[i]
+        self.bodies.push[i] = 0 * self.state.d[i]
+
+    @ti.func
+    def relax(self, i, part):
+        """Find how far a part of the rows of particle i want to move it. Returns by how much they overlap beyond the slop [m].
+
+        Rows of particles that have not moved since they were found apart are not tested again.
+        """
+        out, total = ti.cast(0, self.real), 0 * self.state.d[i]
+        kept, pressed, own = self.rows.kept[i], self.rows.pressed[i], self.radius.of(i)
+        again = self.impulses.flags[None][TURN] > 0
+        still = again and (self.bodies.last[i] == 0).all()
+        for row in range(self.rows.first(i, part), self.rows.last(i, part)):
+            other = self.rows.other.field[row]
+            gap, n, slop = ti.cast(1, self.real), 0 * total, own
+            if row < pressed:
+                if not (still and (self.bodies.last[other] == 0).all()):
+                    r = self.state.separation(i, other)
+                    distance = self.rows.geometry.contact_distance(i, other)
+                    slop = ti.min(slop, self.radius.of(other))
+                    near, rr = distance - ti.static(SLOP * BEYOND) * slop, r.dot(r)
+                    if rr < near * near:
+                        length = ti.sqrt(rr)
+                        gap, n = length - distance, r / length
+                        if not length > ti.static(2.0**-40) * distance:
+                            n = self.rows.geometry.fallback_normal(i, other, r)
+            elif ti.static(len(self.rows.walls) > 0):
+                if not still:
+                    gap, n = self.rows.wall_gap(i, other - self.n)
+            if gap < ti.static(-SLOP * BEYOND) * slop:
+                if not again:
+                    self.rows.gap.field[row] = gap + self.rows.most_parting(slop)
+                gap -= ti.min(self.rows.gap.field[row], ti.static(-SLOP) * slop)
+            else:
+                gap = 0 * gap
+            if gap < 0:
+                p = -gap * self.rows.firm.field[row] * n
+                total += p
+                out -= gap
+                if part == OWN and row < kept:
+                    self.bodies.push[other] = self.bodies.push[other] - p
+        if part == OWN:
+            self.bodies.v[i] = total
+        else:
+            self.bodies.push[i] = total
+        return out
+
+    @ti.func
+    def move(self, i, beta):
+        """Move particle i, and beta times as far as in the pass before."""
+        w = self.bodies.compliance(i)
+        if w > 0:
+            step = w * (self.bodies.v[i] + self.bodies.push[i]) + beta * self.bodies.last[i]
+            self.bodies.last[i] = step
+            self.state.advance(i, step)
+        self.bodies.push[i] = 0 * self.state.d[i]

@@ -1,0 +1,151 @@
+"""How bodies answer impulses. Contacts need nothing else of a body."""
+
+from typing import TYPE_CHECKING, Any
+
+from ..device import inline, ti
+
+if TYPE_CHECKING:
+    from ..features.feature import Scene
+
+
+class FreeParticles:
+    """Free particles under impulses: an impulse p [kg m] changes d by w p, and at -r n from the center s by -k w n x p.
+
+    w: inverse mass. k = m r^2 / I, see Spin. Particles that are pinned, driven or asleep keep their displacement.
+
+    v, s: displacements under the present impulses, which contacts read [m]. new, new_s: those under the impulses that a pass
+    computes; last, last_s: those of the pass before. push, moment: sums of impulses [kg m], 0 between passes.
+    """
+
+    def __init__(self, scene: "Scene", spins: bool):
+        n, dim, add = scene.count, scene.particles.dim, scene.memory.field
+        self.rows: Any = None  # the rows that give impulses
+        self.state, self.spins, self.real, self.dim = scene.state, spins, scene.real, dim
+        self.v, self.last, self.push = (add(f"Contact.{name}", n, width=dim) for name in ("v", "v_last", "push"))
+        self.new = add("Contact.v_new", n, width=dim, state=True)  # after a substep: its displacement, for the next one
+        if spins:
+            axes, self.spin = scene.particles.axes, scene.state.spin
+            self.s, self.new_s, self.last_s, self.moment = (
+                add(f"Contact.{name}", n, width=axes) for name in ("s", "s_new", "s_last", "moment")
+            )
+
+    @inline
+    def moves(self, i):
+        """Whether impulses move particle i."""
+        return self.state.moves(i)
+
+    @inline
+    def compliance(self, i):
+        """Return by how much a unit impulse along a normal moves particle i [1/kg]."""
+        return (
+            self.state.w.of(i)
+            if not self.state.sleepers
+            else ti.select(self.state.moves(i), self.state.w.of(i), 0 * self.state.w.of(i))
+        )
+
+    @ti.func
+    def tangential_compliance(self, i):
+        """Return by how much a unit tangential impulse moves the point of contact of particle i [1/kg]."""
+        w = self.compliance(i)
+        if ti.static(self.spins):  # moments against rolling share the spin
+            w *= 1 + ti.static(2 if self.rows.turns else 1) * self.spin.inverse_inertia.of(i)
+        return w
+
+    @ti.func
+    def turning_compliance(self, i):
+        """Return by how much a unit moment over the radius turns the surface of particle i [1/kg]."""
+        return self.compliance(i) * self.spin.inverse_inertia.of(i)
+
+    @ti.func
+    def begin(self, i):
+        """Begin a substep: no impulses."""
+        self.v[i] = self.state.d[i]
+        self.new[i] = self.state.d[i]
+        self.last[i] = self.state.d[i]
+        self.push[i] = 0 * self.state.d[i]
+        if ti.static(self.spins):
+            s = self.spin.s[i]
+            self.s[i], self.new_s[i], self.last_s[i], self.moment[i] = s, s, s, 0 * s
+
+    @ti.func
+    def give(self, i, n, p):
+        """Give particle i the opposite of an impulse p at the other particle of a pair with the normal n."""
+        self.push[i] = self.push[i] - p
+        if ti.static(self.spins):
+            self.moment[i] = self.moment[i] + self.spin.moment(n, p)
+
+    @ti.func
+    def forget_sums(self, i):
+        """Set the sums of impulses of particle i to 0."""
+        self.push[i] = 0 * self.push[i]
+        if ti.static(self.spins):
+            self.moment[i] = 0 * self.moment[i]
+
+    @ti.func
+    def answer(self, i, p, m):
+        """Compute the displacements of particle i under impulses whose sum is p, with moments of sum m [kg m]."""
+        w = self.compliance(i)
+        self.new[i] = self.state.d[i] + w * p
+        if ti.static(self.spins):
+            self.new_s[i] = self.spin.s[i] - (w * self.spin.inverse_inertia.of(i)) * m
+
+    @ti.func
+    def extrapolate(self, i, beta):
+        """Let contacts read displacements further along the last step of the passes, by beta of it (Nesterov)."""
+        new = self.new[i]
+        self.v[i] = new + beta * (new - self.last[i])
+        self.last[i] = new
+        self.push[i] = 0 * new
+        if ti.static(self.spins):
+            s = self.new_s[i]
+            self.s[i] = s + beta * (s - self.last_s[i])
+            self.last_s[i] = s
+            self.moment[i] = 0 * s
+
+    @ti.func
+    def work(self, i):
+        """Return m v0 . (v - v0) and m (v - v0)^2 of particle i, times h^2 [kg m^2].
+
+        The work of its impulses is the first and half of the second.
+        """
+        work, square = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+        d, w = self.state.d[i], self.compliance(i)
+        if w > 0:
+            change = self.new[i] - d
+            work += d.dot(change) / w
+            square += change.dot(change) / w
+            if ti.static(self.spins):
+                k, s = self.spin.inverse_inertia.of(i), self.spin.s[i]
+                if k > 0:
+                    turn = self.new_s[i] - s
+                    work += s.dot(turn) / (w * k)
+                    square += turn.dot(turn) / (w * k)
+        return work, square
+
+    @ti.func
+    def scale(self, i, scale):
+        """Multiply the impulses on particle i by a number."""
+        d = self.state.d[i]
+        self.new[i] = d + scale * (self.new[i] - d)
+        if ti.static(self.spins):
+            s = self.spin.s[i]
+            self.new_s[i] = s + scale * (self.new_s[i] - s)
+
+    @ti.func
+    def finish(self, i, step):
+        """Move particle i as impulses want, from where it was at the start. step: its new displacement, with a dither in f32."""
+        if self.state.moves(i):
+            new = self.new[i]
+            if (new != self.state.d[i]).any():
+                self.state.d[i] = new
+                if ti.static(self.state.carries):
+                    self.state.d_low[i] = 0 * new
+                if ti.static(self.state.sums):
+                    self.state.restart(i)
+                else:
+                    self.state.x[i] = self.state.x0[i] + step
+                if ti.static(self.rows.bounces):  # impacts act from their time on
+                    if self.rows.when[i] > 0:
+                        self.state.advance(i, -self.rows.when[i] * self.compliance(i) * self.push[i])
+            if ti.static(self.spins):
+                self.spin.s[i] = self.new_s[i]

@@ -1,0 +1,508 @@
+"""The rows of contacts: pairs and walls that may press on a particle in a substep, with what they bore in the last one.
+
+Rows live at the entries of the neighbour list. Entries of walls stand behind those of particles; their number is that of the
+particles plus that of the wall's face. In each substep those that may press are listed as rows, particle by particle, so that
+passes run through memory in order.
+
+A row of two particles that both move belongs to the first of them, which gives the other one its impulse. Where the two are in
+different pieces of a team, or on a GPU, each has a row, with the same numbers: then each particle only gathers. A particle adds
+up the impulses of its rows in the same order either way, so results have the same bits on any number of threads.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from ..device import at, inline, ti
+from ..device.language import impl
+from ..device.number import OnDevice
+from ..features.material import DYNAMIC, RESTITUTION, ROLLING, STATIC, TANGENTIAL, TOUCH, TOUCHES, TWISTING
+from ..neighbours.neighbour_list import Column, PairData
+from .limits import FEW, FOREIGN, NOISE, OWN, QUARTER, SLOP, SLOW
+
+if TYPE_CHECKING:
+    from ..device.thread_team import Team
+    from ..features.feature import Scene
+    from .narrow_phase import DiscGeometry
+
+
+class Rows:
+    """The rows of one world.
+
+    The rows of a particle: from `begin` those that particles of lower pieces have, too; from `own` those that give the other
+    particle its impulse; from `kept` other pairs; from `pressed` walls, up to `end`. share: among how many rows the mass of a
+    particle is divided.
+    Columns by row: `other` the other particle, or n + the side of a wall; `entry` in the neighbour list; `normal`; `gap` at the
+    start of the substep where it was open [m]; `bend` the curvature of the gap [1/m]; `stiff` the effective mass in a pass of
+    impulses, along the normal and across it, and `firm` in one of places [kg]; `friction` static and dynamic; `moved` the motion
+    of a wall in the substep [m]; `p` the impulse and `step` its change in the last pass [kg m].
+    The normal is that at the start of the substep, or that of the time at which a pair meets.
+    """
+
+    n: Any = OnDevice()
+    push_out: Any = OnDevice()  # largest speed at which pairs part that overlap [m/s]; negative for QUARTER
+
+    def __init__(
+        self, scene: "Scene", table: Any, has_friction: bool, bounces: bool, turns: bool, walls: list[Any], team: "Team"
+    ):
+        n, add = scene.count, scene.memory.field
+        self.n, self.scene, self.state, self.table, self.team = n, scene, scene.state, table, team
+        self.has_friction, self.real, self.dim, self.radius = has_friction, scene.real, scene.particles.dim, scene.radius
+        self.walls, self.width = walls, scene.particles.dim if has_friction else 0
+        self.begin, self.own, self.kept, self.pressed, self.end = (
+            add(f"Contact.rows_{name}", n, kind=ti.i32) for name in ("begin", "own", "kept", "pressed", "end")
+        )
+        self.share, self.eigenvalue = add("Contact.share", n), add("Contact.eigenvalue", n)
+        self.spread = add("Contact.spread", n, width=3 if self.dim == 2 else 6, kind=ti.i32)  # sum of n n^T, in 2^-20
+        # How far rows that bear a load moved each particle in the last substep, and turned its surface [m].
+        self.borne = add("Contact.borne", n, width=self.dim, state=True)
+        if scene.state.spins:
+            self.turned = add("Contact.turned", n, width=scene.particles.axes, state=True)
+        # What each pair and wall bore in the last substep [kg m]: along the normal, or with friction the whole vector.
+        self.memory = PairData("impulse", self.width, persistent=True, has_owner=True)
+        self.other, self.entry = Column("row_other", kind=ti.i32), Column("row_entry", kind=ti.i32)
+        self.normal, self.gap, self.bend = Column("row_normal", self.dim), Column("row_gap"), Column("row_bend")
+        self.stiff, self.firm = Column("row_stiff", 2 if has_friction else 0), Column("row_firm")
+        self.p, self.step = Column("row_p", self.width), Column("row_step", self.width)
+        self.columns = [self.other, self.entry, self.normal, self.gap, self.bend, self.stiff, self.firm, self.p, self.step]
+        self.moved: Any = None
+        self.friction: Any = None
+        if walls:
+            self.moved = Column("row_moved", self.dim)
+            self.columns.append(self.moved)
+        if has_friction:
+            self.friction = Column("row_friction", 2)
+            self.columns.append(self.friction)
+        self.push_out = scene.memory.number(-1.0, scene.real)
+        self.bounces, self.rounding = bounces, NOISE * (2.0**-52 if scene.real == ti.f64 else 2.0**-23)
+        self.touched: Any = None
+        if bounces:
+            # Whether a pair touched in the last substep: then it goes on together instead of bouncing.
+            self.touched = PairData("touches", 0, persistent=True, kind=ti.i32, has_owner=True)
+            self.bounce, self.time, self.target = Column("row_bounce"), Column("row_time"), Column("row_target")
+            self.columns += [self.bounce, self.time, self.target]
+            self.kick = add("Contact.kick", n, width=self.dim)  # displacement by forces in the substep
+            self.when = add("Contact.when", n)  # the part of the substep before the impact of the island of a particle
+        self.logging = [group for group in walls if group.wall.events]  # each has a log of its own
+        self.events: Any = None
+        self.turns, self.axes = turns, scene.particles.axes
+        if turns:
+            # Moments against rolling and twisting, over the radius of the pair [kg m]; what was borne of them.
+            self.borne_moment = PairData("moment", self.axes, persistent=True, has_owner=True)
+            self.f, self.f_step = Column("row_moment", self.axes), Column("row_moment_step", self.axes)
+            self.arms, self.rolling, self.turn_stiff = (Column(f"row_{name}", 2) for name in ("arms", "rolling", "turn_stiff"))
+            self.across = Column("row_across", self.dim)  # tangential displacement that the points which touch aim at [m]
+            self.columns += [self.f, self.f_step, self.arms, self.rolling, self.turn_stiff, self.across]
+        self.divided = team.size > 1 or team.launched
+        self.has_still = bool((scene.inv_mass == 0).any()) or bool(scene.state.sleepers)  # particles that impulses do not move
+        # The substep [s], the fractions of the frame at its ends, and by how much what rows bore is scaled.
+        self.times = add("Contact.times", None, width=4)
+        self.list: Any = None
+        self.geometry: Any = None
+
+    def bind(self, listed: Any, geometry: "DiscGeometry") -> None:
+        """Add the columns to the neighbour list, before it is allocated."""
+        self.list, self.geometry = listed, geometry
+        listed.columns = [*listed.columns, *self.columns]
+        listed.movable = lambda: self.scene.inv_mass > 0
+
+    @property
+    def logs_pairs(self) -> bool:
+        """Whether pairs that press are recorded for events."""
+        return self.events is not None
+
+    @inline
+    def zero(self):
+        """Return an impulse of 0."""
+        return ti.Vector.zero(self.real, self.dim) if self.has_friction else ti.cast(0, self.real)
+
+    @ti.func
+    def along(self, p, n):
+        """Return the part of an impulse along the normal n."""
+        out = ti.cast(0, self.real)
+        if ti.static(self.has_friction):
+            out = p.dot(n)
+        else:
+            out = p
+        return out
+
+    @ti.func
+    def vector(self, p, n):
+        """Return an impulse as a vector."""
+        out = 0 * n
+        if ti.static(self.has_friction):
+            out = p
+        else:
+            out = p * n
+        return out
+
+    @ti.func
+    def is_set(self, p):
+        """Whether an impulse is not 0."""
+        out = False
+        if ti.static(self.has_friction):
+            out = (p != 0).any()
+        else:
+            out = p != 0
+        return out
+
+    @inline
+    def h(self):
+        """Return the length of the substep [s]."""
+        return at(at(self.times, None), 0)
+
+    @inline
+    def first(self, i, part):
+        """Return the first row of a part of the rows of particle i: FOREIGN, those that lower pieces have, too, or OWN."""
+        return ti.select(part == FOREIGN, at(self.begin, i), at(self.own, i)) if self.divided else at(self.own, i)
+
+    @inline
+    def last(self, i, part):
+        """Return the row behind the last of a part."""
+        return ti.select(part == FOREIGN, at(self.own, i), at(self.end, i)) if self.divided else at(self.end, i)
+
+    @inline
+    def parts(self):
+        """Return the first part that there may be."""
+        return FOREIGN if self.divided else OWN
+
+    @ti.func
+    def frame_fraction(self):
+        """Return the fractions of the frame at the start and the end of the substep."""
+        return ti.Vector([self.times[None][1], self.times[None][2]])
+
+    @ti.func
+    def clear(self, i):
+        """Clear the sums of particle i, to which its rows and those of others add."""
+        self.share[i] = 0
+        self.spread[i] = 0 * self.spread[i]
+
+    @ti.func
+    def begin_empty(self, i, row):
+        """Let particle i have no rows, before `row`."""
+        self.begin[i], self.own[i], self.kept[i], self.pressed[i], self.end[i] = row, row, row, row, row
+
+    @ti.func
+    def find(self, i, begin, end, row):
+        """List the rows of particle i from `row` on. begin, end: of its piece. Returns the row behind the last."""
+        scale = self.times[None][3]
+        self.begin[i] = row
+        first, number = self.list.first[i], self.list.number[i]
+        if ti.static(self.divided):
+            for e in range(first, first + number):
+                j = self.list.neighbour[e]
+                if j < begin:
+                    if self.state.moves(j):
+                        row = self.find_pair(i, j, e, row, scale)
+        self.own[i] = row
+        for e in range(first, first + number):
+            j = self.list.neighbour[e]
+            if i < j < end:
+                if self.state.moves(j):
+                    before = row
+                    row = self.find_pair(i, j, e, row, scale)
+                    if row > before:
+                        self.share[j] = self.share[j] + 1
+                        self.spread[j] = self.spread[j] + self.square(self.normal.field[before])
+        self.kept[i] = row
+        if ti.static(self.divided):
+            for e in range(first, first + number):
+                j = self.list.neighbour[e]
+                if j >= end:
+                    if self.state.moves(j):
+                        row = self.find_pair(i, j, e, row, scale)
+        if ti.static(self.has_still):
+            for e in range(first, first + number):
+                j = self.list.neighbour[e]
+                if not self.state.moves(j):
+                    row = self.find_pair(i, j, e, row, scale)
+        self.pressed[i] = row
+        if ti.static(len(self.walls) > 0):
+            for e in range(first + number, first + number + self.list.wall_number[i]):
+                row = self.find_wall(i, e, row, scale)
+        self.end[i] = row
+        self.share[i] = self.share[i] + ti.cast(row - self.begin[i], self.real)
+        spread = self.spread[i]
+        for k in range(self.begin[i], row):
+            spread += self.square(self.normal.field[k])
+        self.spread[i] = spread
+        return row
+
+    @ti.func
+    def square(self, n):
+        """Return the different entries of n n^T in integers, whose sums have the same bits in any order."""
+        out = ti.Vector.zero(ti.i32, ti.static(3 if self.dim == 2 else 6))
+        if ti.static(self.dim == 2):
+            out = ti.cast(ti.Vector([n[0] * n[0], n[1] * n[1], n[0] * n[1]]) * ti.static(2.0**20), ti.i32)
+        else:
+            products = [n[0] * n[0], n[1] * n[1], n[2] * n[2], n[0] * n[1], n[1] * n[2], n[2] * n[0]]
+            out = ti.cast(ti.Vector(products) * ti.static(2.0**20), ti.i32)
+        return out
+
+    @ti.func
+    def find_eigenvalue(self, i):
+        """Compute the largest eigenvalue of the sum of n n^T over the rows of particle i; in 3D a bound of it."""
+        s = ti.cast(self.spread[i], self.real) * ti.static(2.0**-20)
+        if ti.static(self.dim == 2):
+            half = (s[0] - s[1]) / 2
+            self.eigenvalue[i] = (s[0] + s[1]) / 2 + ti.sqrt(half * half + s[2] * s[2])
+        else:  # lambda <= m + sqrt(2/3) |S - m 1| with m = tr S / 3 (Wolkowicz and Styan 1980)
+            m = (s[0] + s[1] + s[2]) / 3
+            a, b, c = s[0] - m, s[1] - m, s[2] - m
+            size = a * a + b * b + c * c + 2 * (s[3] * s[3] + s[4] * s[4] + s[5] * s[5])
+            self.eigenvalue[i] = m + ti.sqrt(size * ti.static(2 / 3))
+
+    @ti.func
+    def work_of_others(self, i):
+        """Return the work of the rows of particle i on what nothing moves, as walls and driven particles, times h^2 [kg m^2]."""
+        out, pressed = ti.cast(0, ti.f64), self.pressed[i]
+        if ti.static(self.has_still):
+            for row in range(self.kept[i], pressed):
+                other = self.other.field[row]
+                if not self.state.moves(other):
+                    out += self.vector(self.p.field[row], self.normal.field[row]).dot(self.state.d[other])
+        if ti.static(len(self.walls) > 0):
+            for row in range(pressed, self.end[i]):
+                out += self.vector(self.p.field[row], self.normal.field[row]).dot(self.moved.field[row])
+        return out
+
+    @ti.func
+    def find_pair(self, i, j, e, row, scale):
+        """List the pair at entry e of particle i if it may press. Returns the next free row."""
+        r = self.state.separation(i, j)
+        u = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j)
+        p, distance = self.memory.field[e], self.geometry.contact_distance(i, j)
+        rr, near = r.dot(r), distance + ti.static(SLOP) * ti.min(self.radius.of(i), self.radius.of(j))
+        # Nearest on the way: what passes each other within the substep touches there.
+        uu, ru, start = u.dot(u), r.dot(u), r - u
+        passes = ru > 0 and ru < uu and rr * uu - ru * ru < distance * distance * uu
+        lists = rr < near * near or self.is_set(p) or passes
+        if ti.static(not self.table.uniform):
+            lists = lists and ti.cast(self.table.of(i, j)[TOUCH], ti.i32) == TOUCHES
+        if lists:
+            length = start.norm()
+            bend, gap = 1 / length, ti.max(length - distance, 0)
+            n = bend * start
+            if length > distance and uu > 0:  # a pair that meets in this substep has the normal of the time when it does
+                before, closing = length * length - distance * distance, -start.dot(u)
+                root = closing * closing - uu * before
+                if root >= 0 and closing > 0 and before <= closing + ti.sqrt(root):
+                    s = before / (closing + ti.sqrt(root))
+                    n, bend = (start + s * u) / distance, 1 / distance
+                    gap = -s * u.dot(n)
+            if not length > ti.static(2.0**-40) * distance:
+                n, bend = self.geometry.fallback_normal(i, j, r), 1 / distance
+            if ti.static(self.bounces):
+                c = self.table.of(i, j)
+                f, f_own = self.kick[i], self.kick[i]
+                if self.state.moves(j):
+                    f -= self.kick[j]
+                    f_own = ti.select(f_own.dot(f_own) > self.kick[j].dot(self.kick[j]), f_own, self.kick[j])
+                hit, s, m = self.strike(length - distance, start / length, 1 / length, u, f, f_own, c[RESTITUTION], e, rr)
+                self.bounce.field[row], self.time.field[row] = 0, 1
+                if hit:
+                    n, self.bounce.field[row], self.time.field[row] = m, c[RESTITUTION], s
+            self.put(row, j, e, n, gap, bend, p * scale)
+            if ti.static(self.has_friction):
+                c = self.table.of(i, j)
+                self.friction.field[row] = [c[STATIC], c[DYNAMIC]]
+            if ti.static(self.turns):
+                c, a, b = self.table.of(i, j), self.radius.of(i), self.radius.of(j)
+                rolling, twisting, back = 0 * a, 0 * a, 0 * a
+                if ti.static(self.table.turns):
+                    rolling, twisting, back = c[ROLLING], c[TWISTING], c[TANGENTIAL]
+                self.put_turn(row, e, a / ti.max(a + b, FEW), b / ti.max(a + b, FEW), rolling, twisting, back, scale)
+            row += 1
+        else:
+            self.forget(e)
+        return row
+
+    @ti.func
+    def forget(self, e):
+        """Forget what the pair or wall at entry e bore: it does not press."""
+        self.memory.field[e] = self.zero()
+        if ti.static(self.bounces):
+            self.touched.field[e] = 0
+        if ti.static(self.turns):
+            self.borne_moment.field[e] = ti.Vector.zero(self.real, self.axes)
+
+    @ti.func
+    def strike(self, gap, n, bend, u, f, f_own, e, entry, size):
+        """Return whether a row bounces in this substep, the part of the substep before its impact, and the normal then.
+
+        gap, n, bend: at the start. u: relative displacement. f: by forces in the substep, f_own: of the particle that has more.
+        e: restitution. The path is u s - f s (1 - s) / 2 after the part s. In a frame with its origin in the center of curvature,
+        |r0 + path| = |1 / bend - gap| is solved for: without forces in closed form, then by Newton's method.
+        What touched goes on together, so that what stands on each other bounces as a whole. What comes back within the substep
+        rests.
+        """
+        hit, s, m = False, ti.cast(0, self.real), n
+        v = u - f / 2
+        if e > 0 and not (gap <= 0 and self.touched.field[entry] != 0):
+            if gap > 0:
+                if bend == 0:
+                    a, p = -v.dot(n), -f.dot(n)
+                    root = a * a + 2 * p * gap
+                    s = ti.cast(2, self.real)
+                    if root >= 0 and a + ti.sqrt(ti.max(root, 0)) > 0:
+                        s = 2 * gap / (a + ti.sqrt(root))
+                else:
+                    start, c = n / bend, gap * (2 / bend - gap)
+                    b, uu = start.dot(u), u.dot(u)
+                    root = b * b - uu * c
+                    s = ti.cast(2, self.real)
+                    if root >= 0 and uu > 0:
+                        if c < 0:
+                            s = (ti.sqrt(root) - b) / uu
+                        elif b < 0:
+                            s = c / (ti.sqrt(root) - b)
+                    if s <= 2:
+                        for _ in range(4):
+                            way, speed = v * s + f * (s * s / 2), v + f * s
+                            slope = 2 * (start + way).dot(speed)
+                            if slope != 0:
+                                s -= (c + 2 * start.dot(way) + way.dot(way)) / slope
+                        m = ti.select(bend < 0, -1, 1) * (start + v * s + f * (s * s / 2)).normalized()
+            met = -(v + f * s).dot(m)
+            least = ti.static(SLOW) * ti.abs(f_own.dot(m)) + self.rounding * (u.norm() + ti.sqrt(size) * ti.static(2.0**-7))
+            rests = e * met <= ti.max(-f.dot(m), 0) * (1 - s) / 2
+            hit = 0 <= s <= 1 and gap >= -met and met > least and not rests
+        return hit, s, m
+
+    @ti.func
+    def count_hits(self, i):
+        """Return how many rows of particle i bounce in this substep."""
+        out = ti.cast(0, self.real)
+        for row in range(self.begin[i], self.end[i]):
+            if self.bounce.field[row] > 0:
+                out += 1
+        return out
+
+    @ti.func
+    def aim(self, i, when):
+        """Set what the bouncing rows of particle i aim at. when: the part of the substep before the impact of its island.
+
+        They leave at e times their approach at that time; displacements are those in the middle of the substep.
+        """
+        self.when[i] = when
+        for row in range(self.begin[i], self.end[i]):
+            if ti.static(self.turns):
+                if self.bounce.field[row] == 0:
+                    self.across.field[row] = 0 * self.across.field[row]
+            if self.bounce.field[row] > 0:
+                other, n = self.other.field[row], self.normal.field[row]
+                u, f = self.state.d[i], self.kick[i]
+                if row < self.pressed[i]:
+                    u = self.state.relative_displacement(u - self.state.d[other], i, other)
+                    if self.state.moves(other):
+                        f -= self.kick[other]
+                elif ti.static(len(self.walls) > 0):
+                    u -= self.moved.field[row]
+                if ti.static(self.turns):  # the points that touch leave across n at -e_t times their velocity then
+                    s = self.state.spin.s[i]
+                    if row < self.pressed[i]:
+                        s += self.state.spin.s[other]
+                    shift = (when - 0.5) * (f - f.dot(n) * n)
+                    slip = u - u.dot(n) * n - self.state.spin.surface(s, n) + shift
+                    self.across.field[row] = -self.across.field[row][0] * slip - shift
+                later = (when - 0.5) * f.dot(n)
+                self.target.field[row] = ti.max(-u.dot(n) - later, 0) * self.bounce.field[row] - later
+
+    @inline
+    def rise(self, tt, un, bend):
+        """Return by how much a gap with this curvature opens where the particle moves by sqrt(tt) across its normal and by un
+        along it: sqrt((1 / bend + un)^2 + tt) - (1 / bend + un), to fourth order [m]."""
+        q = impl.expr_init(bend * tt)
+        return q * (0.5 - ti.min(ti.abs(bend * q), 1) / 8 - ti.min(ti.max(bend * un, -0.5), 0.5) / 2)
+
+    @ti.func
+    def put(self, row, other, e, n, gap, bend, p):
+        """Write a row. p: the impulse that it bore; what is left of it along the normal and within friction is kept."""
+        self.other.field[row], self.entry.field[row] = other, e
+        self.normal.field[row], self.gap.field[row], self.bend.field[row] = n, gap, bend
+        self.p.field[row], self.step.field[row] = p, 0 * p
+
+    @ti.func
+    def put_turn(self, row, e, arm, other_arm, rolling, twisting, back, scale):
+        """Write what a row needs against rolling. back: tangential restitution, kept in `across` until aim()."""
+        self.arms.field[row], self.rolling.field[row] = [arm, other_arm], [rolling, twisting]
+        f = scale * self.borne_moment.field[e]
+        self.f.field[row], self.f_step.field[row] = f, 0 * f
+        across = ti.Vector.zero(self.real, self.dim)
+        across[0] = back
+        self.across.field[row] = across
+
+    @ti.func
+    def find_wall(self, i, e, row, scale):
+        """List the wall at entry e of particle i if it may press. Returns the next free row."""
+        face, p = self.list.neighbour[e] - self.n, self.memory.field[e]
+        lists = False
+        for group, w in ti.static([(g, g.wall) for g in self.walls]):
+            if group.has_face(face):
+                group.enter(group.wall_of(face))
+                gap, n, bend, moved = w.start_gap(group.side_of(face), i, self.radius.of(i), self.frame_fraction())
+                u = self.state.d[i] - moved
+                un = u.dot(n)
+                ahead = gap + un
+                if ti.static(w.bends):
+                    ahead += self.rise(u.dot(u) - un * un, un, bend)
+                lists = ahead < ti.static(SLOP) * self.radius.of(i) or self.is_set(p)
+                if ti.static(w.dev.surface.has_switch):
+                    lists = lists and w.dev.surface.active[None] != 0
+                if lists:
+                    if ti.static(self.bounces):
+                        self.bounce.field[row], self.time.field[row] = 0, 1
+                        if ti.static(w.dev.surface.has_restitution):
+                            f, reach = self.kick[i], self.state.place(i)
+                            size, e_wall = reach.dot(reach), w.dev.surface.restitution[None]
+                            hit, s, m = self.strike(gap, n, bend, u, f, f, e_wall, e, size)
+                            if hit:
+                                n, self.bounce.field[row], self.time.field[row] = m, e_wall, s
+                    self.put(row, face + self.n, e, n, ti.max(gap, 0), bend, p * scale)
+                    if ti.static(w.dev.surface.has_velocity):
+                        belt = w.dev.surface.velocity[None]
+                        moved += self.h() * (belt - belt.dot(n) * n)
+                    self.moved.field[row] = moved
+                    if ti.static(self.has_friction):
+                        self.friction.field[row] = [0, 0]
+                        if ti.static(w.dev.surface.has_friction):
+                            self.friction.field[row] = [w.dev.surface.static(), w.dev.surface.dynamic()]
+                    if ti.static(self.turns):
+                        turning, one = ti.Vector.zero(self.real, 3), ti.cast(1, self.real)
+                        if ti.static(w.dev.surface.turns):
+                            turning = w.dev.surface.rolling[None]
+                        self.put_turn(row, e, 0 * one, one, turning[0], turning[1], turning[2], scale)
+        if lists:
+            row += 1
+        else:
+            self.forget(e)
+        return row
+
+    @ti.func
+    def log_wall(self, i, row):
+        """Record the impulse of a wall in its log of events, if it presses."""
+        n, side = self.normal.field[row], self.other.field[row] - self.n
+        p = self.along(self.p.field[row], n)
+        if p > 0:
+            moved = self.moved.field[row]
+            ahead = (self.state.d[i] - moved).dot(n)
+            for group in ti.static(self.logging):
+                if group.has_face(side):
+                    push = p * self.state.w.of(i)
+                    group.wall.dev.log.record(i, -(self.gap.field[row] + ahead), n, push, -ahead, moved, self.h(), False)
+
+    @ti.func
+    def most_parting(self, radius):
+        """Return by how much a pair with this smaller radius, that overlaps, may part in the substep [m]."""
+        most = self.push_out * self.h()
+        if self.push_out < 0:
+            most = ti.static(QUARTER) * radius
+        return most
+
+    @ti.func
+    def wall_gap(self, i, face):
+        """Return the gap of particle i at a wall at the end of the substep [m], and its normal."""
+        gap, n = ti.cast(1, self.real), 0 * self.state.x[i]
+        for group, w in ti.static([(g, g.wall) for g in self.walls]):
+            if group.has_face(face):
+                group.enter(group.wall_of(face))
+                gap, n = w.end_gap(group.side_of(face), i, self.radius.of(i), self.frame_fraction())
+        return gap, n

@@ -1,0 +1,227 @@
+"""The loops over the rows of contacts: stage 1, impulses, and stage 2, places."""
+
+from typing import TYPE_CHECKING, Any
+
+from ..contact.limits import BETA, BLOCK, FORCE, GAINS, GOING, HITS, LACK, LOAD, MOVES, OWN, ROWS, UPHILL, WORK
+from ..device import called, inline, ti
+from ..device.number import OnDevice
+
+if TYPE_CHECKING:
+    from ..device.thread_team import Team
+    from ..features.feature import Scene
+    from .particle_pass import ParticlePass
+
+
+class RowPass:
+    """The contacts of one world as rows, see Rows."""
+
+    n: Any = OnDevice()  # particles
+
+    def __init__(self, scene: "Scene", contact: Any, particles: "ParticlePass", team: "Team"):
+        self.particles: Any = particles
+        self.team, self.state = team, scene.state
+        self.n, self.real, self.dim = scene.count, scene.real, scene.particles.dim
+        dev = contact.dev
+        self.rows, self.bodies, self.impulses, self.places = dev.rows, dev.responses, dev.impulses, dev.places
+        self.islands = dev.islands
+
+    @ti.func
+    def solve(self, now):
+        """Find the impulses of a substep, and correct places. On the launched path, the Launcher does this."""
+        self.find_rows(now)
+        self.solve_rows(now.thread, now.final, now.tick)
+
+    @called
+    @ti.func
+    def solve_rows(self, thread: ti.i32, final: ti.i32, tick: ti.i32):
+        """Stages 1 and 2."""
+        while self.impulses.flags[None][GOING] != 0:
+            self.relax_impulses(thread)
+        self.finish_impulses(thread, final, tick)
+        while self.impulses.flags[None][GOING] != 0:
+            self.relax_places(thread)
+
+    @inline
+    def begin_of(self, n, thread):
+        """Return where a thread's share of a loop begins."""
+        return self.team.chunk_begin(n, thread)
+
+    @inline
+    def end_of(self, n, thread):
+        """Return where a thread's share of a loop ends."""
+        return self.team.chunk_end(n, thread)
+
+    @inline
+    def going(self):
+        """Return 1 while passes go on, else 0: how often a loop of a pass runs."""
+        return self.impulses.going() if self.team.launched else 1
+
+    @ti.func
+    def find_rows(self, now):
+        """List the rows of contacts, and begin the passes over them."""
+        h2 = self.particles.integrator.h2_effective(now.h, now.fresh)
+        pull = h2 * self.particles.forces.pull(now.time)
+        ti.loop_config(serialize=True)
+        for _ in range(self.team.one(1, now.thread)):
+            self.impulses.begin(now, h2)
+        for i in range(self.begin_of(self.n, now.thread), self.end_of(self.n, now.thread)):
+            self.rows.clear(i)
+            if ti.static(self.rows.bounces):
+                self.rows.when[i] = 0
+                self.rows.kick[i] = ti.select(now.fresh != 0, 2 * pull, self.state.d[i] - self.bodies.new[i])
+        self.team.wait()
+        for k in range(self.particles.piece_count(now.thread)):
+            begin, end = self.particles.piece(k, now.thread)
+            row = self.rows.list.first[begin]
+            for b in range((end - begin + (BLOCK - 1)) // BLOCK):
+                low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
+                count, force, hits = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
+                for i in range(low, high):
+                    kick = ti.select(now.fresh != 0, pull, self.state.d[i] - self.bodies.new[i])
+                    self.bodies.begin(i)
+                    self.rows.begin_empty(i, row)
+                    if self.bodies.moves(i):
+                        row = self.rows.find(i, begin, end, row)
+                        count += ti.cast(row - self.rows.own[i], self.real)
+                        force += kick.dot(kick)  # type: ignore[reportOptionalCall]
+                    if ti.static(self.rows.bounces):
+                        hits += self.rows.count_hits(i)
+                self.impulses.note(low, HITS, hits)
+                self.impulses.note(low, ROWS, count)
+                self.impulses.note(low, FORCE, force)
+        self.team.wait()
+        for i in range(self.begin_of(self.n, now.thread), self.end_of(self.n, now.thread)):
+            self.rows.find_eigenvalue(i)
+        self.add_up(now.thread, ROWS)
+        self.add_up(now.thread, FORCE)
+        self.add_up(now.thread, HITS)
+        self.team.wait()
+        if ti.static(self.rows.bounces):
+            self.aim(now.thread)
+        for k in range(self.particles.piece_count(now.thread)):
+            begin, end = self.particles.piece(k, now.thread)
+            for part in range(self.rows.parts(), OWN + 1):
+                for i in range(begin, end):
+                    self.impulses.prepare(i, part)
+        ti.loop_config(serialize=True)
+        for _ in range(self.team.one(1, now.thread)):
+            self.impulses.start_passes()
+        self.team.wait()
+        for i in range(self.begin_of(self.n, now.thread), self.end_of(self.n, now.thread)):
+            self.bodies.extrapolate(i, ti.cast(0, self.real))
+        self.team.wait()
+
+    @ti.func
+    def aim(self, thread):
+        """Find the times of impacts, and what bouncing rows aim at."""
+        ti.loop_config(serialize=True)
+        for _ in range(self.team.one(1, thread)):
+            if self.impulses.total(HITS) > 0:
+                self.islands.find_times()
+        self.team.wait()
+        n = self.n * ti.cast(self.impulses.total(HITS) > 0, ti.i32)
+        for i in range(self.begin_of(n, thread), self.end_of(n, thread)):
+            self.rows.aim(i, self.islands.scale[self.islands.root_of(i)])
+        self.team.wait()
+
+    @ti.func
+    def add_up(self, thread, k: ti.template()):  # type: ignore[valid-type]
+        """On the launched path, where each particle has noted its own: add up sums over blocks."""
+        if ti.static(self.team.launched):
+            for b in range(self.impulses.blocks * self.going()):
+                self.impulses.add_up(b, k)
+
+    @ti.func
+    def relax_impulses(self, thread):
+        """One pass of stage 1."""
+        for k in range(self.particles.piece_count(thread) * self.going()):
+            begin, end = self.particles.piece(k, thread)
+            for part in range(self.rows.parts(), OWN + 1):
+                for b in range((end - begin + (BLOCK - 1)) // BLOCK):
+                    low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
+                    lack, uphill, load = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
+                    for i in range(low, high):
+                        some_lack, some_uphill, some_load = self.impulses.relax(i, part)
+                        lack += some_lack
+                        uphill += some_uphill
+                        load += some_load
+                    if part == OWN:
+                        self.impulses.note(low, LACK, lack)
+                        self.impulses.note(low, UPHILL, uphill)
+                        self.impulses.note(low, LOAD, load)
+        self.team.wait()
+        self.add_up(thread, LACK)
+        self.add_up(thread, UPHILL)
+        self.add_up(thread, LOAD)
+        ti.loop_config(serialize=True)
+        for _ in range(self.team.one(1, thread) * self.going()):
+            self.impulses.decide()
+        self.team.wait()
+        n = self.n * self.impulses.going()
+        for i in range(self.begin_of(n, thread), self.end_of(n, thread)):
+            self.bodies.extrapolate(i, self.impulses.numbers[None][BETA])
+        self.team.wait()
+
+    @ti.func
+    def finish_impulses(self, thread, final, tick):
+        """End stage 1: take back energy that impulses gave, store what rows bear, move particles, and begin stage 2."""
+        blocks = self.impulses.blocks
+        for b in range(self.begin_of(blocks, thread), self.end_of(blocks, thread)):
+            work = ti.cast(0, self.real)
+            for i in range(b * BLOCK, ti.min((b + 1) * BLOCK, self.n)):
+                work += self.impulses.gain(i)
+                self.bodies.forget_sums(i)
+            self.impulses.sums[b][WORK] = work
+        self.team.wait()
+        ti.loop_config(serialize=True)
+        for _ in range(self.team.one(1, thread)):
+            self.impulses.check_work()
+        self.team.wait()
+        n = self.n * self.impulses.flags[None][GAINS]
+        for i in range(self.begin_of(n, thread), self.end_of(n, thread)):
+            self.islands.apply(i)
+        self.team.wait()
+        sums = ti.cast(final != 0 or self.impulses.total(HITS) > 0, ti.i32)
+        for k in range(self.particles.piece_count(thread) * sums):
+            begin, end = self.particles.piece(k, thread)
+            for part in range(self.rows.parts(), OWN + 1):
+                for i in range(begin, end):
+                    self.impulses.sum_impacts(i, part)
+        self.team.wait()
+        for i in range(self.begin_of(self.n, thread), self.end_of(self.n, thread)):
+            self.impulses.remember(i, final)
+        self.team.wait()
+        for i in range(self.begin_of(self.n, thread), self.end_of(self.n, thread)):
+            new = self.bodies.new[i]
+            if ti.static(not self.state.sums):
+                new = self.particles.integrator.dithered_move(self.state.x0[i], new, tick)
+            self.bodies.finish(i, new)
+            self.places.begin(i)
+        ti.loop_config(serialize=True)
+        for _ in range(self.team.one(1, thread)):
+            self.impulses.start_places()
+        self.team.wait()
+
+    @ti.func
+    def relax_places(self, thread):
+        """One pass of stage 2."""
+        for k in range(self.particles.piece_count(thread) * self.going()):
+            begin, end = self.particles.piece(k, thread)
+            for part in range(self.rows.parts(), OWN + 1):
+                for b in range((end - begin + (BLOCK - 1)) // BLOCK):
+                    low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
+                    lack = ti.cast(0, self.real)
+                    for i in range(low, high):
+                        lack += self.places.relax(i, part)
+                    if part == OWN:
+                        self.impulses.note(low, LACK, lack)
+        self.team.wait()
+        self.add_up(thread, LACK)
+        ti.loop_config(serialize=True)
+        for _ in range(self.team.one(1, thread) * self.going()):
+            self.impulses.decide_places(MOVES)
+        self.team.wait()
+        n = self.n * self.impulses.moving()
+        for i in range(self.begin_of(n, thread), self.end_of(n, thread)):
+            self.places.move(i, self.impulses.numbers[None][BETA])
+        self.team.wait()
