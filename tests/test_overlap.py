@@ -32,6 +32,22 @@ def test_overlap_is_what_comparing_all_pairs_finds():
     assert min(seen) > 30
 
 
+def test_what_rounding_makes_overlap_is_known_too(world):
+    """Find overlap that comes from rounding, too, so that frames are compiled once.
+
+    At 0.1 k in f32, neighbours are more than 0.1 m apart (0.3 - 0.2) or less (0.4 - 0.3).
+    """
+    row = np.stack([np.arange(5) * 0.1, np.zeros(5)], axis=1)
+    apart = np.diff(row[:, 0].astype(np.float32))
+    assert min(apart) < np.float32(0.05) * 2 <= max(apart)
+    w = world(tv.Particles(row, radius=0.05), [tv.Contact()])
+    assert "Contact.shrunk" in w.fields
+    step = w._runner.step
+    assert w.step(1e-3).clean and w._runner.step is step
+    wide = world(tv.Particles(row * 1.001, radius=0.05), [tv.Contact()])
+    assert "Contact.shrunk" not in wide.fields
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("what", ["another radius", "contacts"])
 def test_a_rebuilt_world_is_compiled_once_for_what_overlaps_in_it(what, world):

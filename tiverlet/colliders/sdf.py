@@ -135,7 +135,7 @@ class Sdf(Moving):
         if "probe" not in vars(self.dev) or self.dev.probe.dim != dim:
             runtime.ensure_started()
             self.dev.probe = _Probe(self, dim)
-        return self.dev.probe
+        return self.dev.probe  # type: ignore[reportReturnType]  # it has no middle, since it is not limited
 
 
 class FunctionShape(Shape):

@@ -25,7 +25,10 @@ class HostShape(Protocol):
         """Whether it ends anywhere."""
         ...
 
-    sides: int  # the number of its facets; 0 if it has none
+    @property
+    def sides(self) -> int:
+        """The number of its facets; 0 if it has none."""
+        ...
 
     @property
     def middle(self) -> np.ndarray:

@@ -39,7 +39,7 @@ from .rows import Rows
 from .spinning import Spinning
 from .velocity_projection import VelocityProjection
 
-SWITCH = os.environ.get("TIVERLET_ROWS", "1") != "0"
+SWITCH = os.environ.get("TIVERLET_ROWS", "0") == "1"
 RELAXATION = 1.25  # below 4/3, see Contact
 CARRY = 0.4  # largest share of its last push that a pair keeps; below 1/2
 

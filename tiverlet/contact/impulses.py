@@ -370,6 +370,8 @@ class Impulses:
                 if -u.dot(n) <= self.numbers[None][RESTING]:
                     load = size
             if ti.static(self.rows.bounces):
+                if self.rows.when[i] > 0:  # in an island with an impact, what is more than before came of that
+                    load = ti.max(scale * self.rows.along(before, n), 0)
                 if self.rows.bounce.field[row] > 0:
                     load = 0
             if size > load:

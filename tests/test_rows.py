@@ -1,0 +1,144 @@
+"""Contacts as rows, see tiverlet/contact/rows.py: the law, behind its switch while it is new."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.contact.limits import BEYOND, MET, SLOP
+from tiverlet.device.thread_team import launching
+
+G, R = 9.81, 0.1
+
+
+@pytest.fixture(autouse=True)
+def rows(monkeypatch):
+    """Let contacts be rows."""
+    monkeypatch.setattr("tiverlet.contact.contact.SWITCH", True)
+
+
+def column(n, nx=1):
+    """Return places of nx columns of n discs that touch, 1 m above a floor."""
+    return np.array([(2.1 + 2 * R * i, 1.0 + R + 2 * R * j) for j in range(n) for i in range(nx)])
+
+
+def angles(world, substeps, dim, friction):
+    """Return the angle and the gap of a disc that slides, or rolls, off a fixed one, after half a second."""
+    x = np.zeros((2, dim))
+    x[1, :2] = np.sin(0.2), np.cos(0.2)
+    start = tv.Particles(x, mass=[np.inf, 1.0], radius=0.5, spin=0)
+    w = world(start, [tv.Gravity(G), tv.Contact(friction=friction)], substeps=substeps, precision="f64")
+    assert w._runner.step.contacts[0].dev.rows
+    w.run(0.5)
+    r = w.position[1] - w.position[0]
+    return np.arctan2(r[0], r[1]), np.linalg.norm(r) - 1.0
+
+
+@pytest.mark.parametrize("friction", [1e-9, 1.0])
+def test_what_slides_and_rolls_is_second_order(world, friction):
+    ends = [angles(world, k, 2, friction) for k in (10, 20, 40, 320)]
+    errors = np.abs([a - ends[-1][0] for a, _ in ends[:-1]])
+    np.testing.assert_allclose(errors[:-1] / errors[1:], 4, rtol=0.03)
+    assert errors[0] < 1e-6 and all(abs(gap) < 1e-9 for _, gap in ends)
+
+
+@pytest.mark.parametrize("substeps", [2, 8, 60])
+def test_a_bounce_keeps_e_squared(world, substeps):
+    # The height over the floor that the energy along the normal would reach, after each bounce e^2 of the one before.
+    e = 0.8
+    features = [tv.Gravity(G), tv.Contact(restitution=e), tv.HalfSpace((0, 1), restitution=e)]
+    w = world(tv.Particles([(0, 1 + R), (5, 1)], radius=R), features, substeps=substeps, precision="f64")
+    heights = [1.0]
+    for _ in range(200):
+        w.step(1 / 60)
+        height = w.position[0, 1] - R + w.velocity[0, 1] ** 2 / (2 * G)
+        if abs(height - heights[-1]) > 1e-9:
+            heights.append(height)
+    np.testing.assert_allclose(heights[1:6], e ** (2 * np.arange(1, 6)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("n, nx", [(3, 1), (7, 1), (6, 6)])
+@pytest.mark.parametrize("e", [0.0, 0.5])
+def test_what_touches_bounces_as_a_whole(world, n, nx, e):
+    # The center of mass falls by 1 m and comes back to e^2 of it: Newton's law for impacts at the same time.
+    x = column(n, nx)
+    features = [tv.Gravity(G), tv.Contact(restitution=e), tv.Box((0, 0), (10, 50), restitution=e)]
+    w = world(tv.Particles(x, radius=R), features, substeps=8)
+    heights = [w.position[:, 1].mean() for _ in range(60 + int(54 * e)) if w.step(1 / 60)]
+    assert max(heights[29:]) - x[:, 1].mean() + 1.0 == pytest.approx(e * e, abs=2e-3)
+
+
+def test_rolling_resistance_is_a_constant_moment(world):
+    # A rolling disc of mass m and I = m r^2 / 2 is braked by a = c g / (1 + 1 / 2).
+    c, v = 0.02, 2.0
+    start = tv.Particles([(0.0, 0.5)], velocity=[(v, 0)], radius=0.5, spin=-v / 0.5)
+    floor = tv.HalfSpace((0, 1), friction=(0.5, 0.5, c, 0.0))
+    w = world(start, [tv.Gravity(G), tv.Contact(friction=0.5), floor], substeps=8, precision="f64")
+    w.run(1.0)
+    a = c * G / 1.5
+    np.testing.assert_allclose(w.velocity[0], (v - a, 0), atol=1e-7)
+    assert w.position[0, 0] == pytest.approx(v - a / 2, abs=1e-6) and w.spin[0] == pytest.approx(-(v - a) / 0.5, abs=1e-6)
+
+
+@pytest.mark.parametrize("substeps", [1, 2, 8, 60])
+def test_a_column_bears_its_weight_whatever_the_substep(world, substeps):
+    # The k-th contact from the top bears k m g, at each substep that the column is changed to; energy never grows by it.
+    n = 10
+    x = np.stack([np.full(n, 0.5), 0.5 + np.arange(n) * 1.0], axis=1)
+    w = world(
+        tv.Particles(x, radius=0.5), [tv.Gravity(G), tv.Contact(), tv.Box((0, 0), (1, 99))], substeps=substeps, precision="f64"
+    )
+    start = w.run(5.0).energy
+    for changed in (substeps, 3, 20):
+        w.substeps = changed
+        w.run(1.0)
+        np.testing.assert_allclose(w.contacts.impulse * 60 * changed, np.arange(n - 1, 0, -1) * G, rtol=2 * MET[0])
+        assert w.contacts.overlap.max() < SLOP * BEYOND * 0.5 and w.last.energy <= start * (1 + 1e-4)
+
+
+def test_overlap_stores_no_energy(world):
+    # Discs placed in each other part by moves alone, at push_out, whatever the substep.
+    speed = 0.25
+    w = world(tv.Particles([[0.0, 0], [0.05, 0]], radius=0.1), [tv.Contact(push_out=speed)], substeps=10, precision="f64")
+    for k, x in ((10, [[0.0, 0], [0.05, 0]]), (80, [[0.0, 0], [0.0, 0.05]])):
+        w.position, w.velocity, w.substeps = x, np.zeros((2, 2)), k
+        w.run(0.2)
+        assert 0.8 * speed < (np.linalg.norm(w.position[1] - w.position[0]) - 0.05) / 0.2 < 1.3 * speed
+        w.run(1.0)
+        assert 0.2 - SLOP * BEYOND * 0.1 <= np.linalg.norm(w.position[1] - w.position[0]) <= 0.2 + 1e-12
+        np.testing.assert_array_equal(w.velocity, 0)
+
+
+def pile(world, path, n=160, friction=0.3, e=0.0, **settings):
+    """Return a world of discs of sizes 1 : 2.8 that fall in a box."""
+    k = np.arange(n)
+    r = 0.03 * (1 + 1.8 * tv.golden(k))
+    x = np.stack([k % 12 * 0.18 + 0.1, k // 12 * 0.18 + 0.1], axis=1) + 0.01 * tv.golden(k, dim=2)
+    box = tv.Box((0, 0), (2.2, np.inf), friction=friction, restitution=e)
+    start = tv.Particles(x, radius=r, mass=r**2, spin=0)
+    return world(start, [tv.Gravity(G), tv.Contact(friction=friction, restitution=e), box], path=path, **settings)
+
+
+@pytest.mark.parametrize("e", [0.0, 0.5])
+def test_all_paths_have_the_same_bits(world, e):
+    ends = [pile(world, path, e=e, substeps=2) for path in ("fused", "parallel")]
+    with launching():
+        launched = pile(world, "parallel", e=e, substeps=2)
+        launched.run(1.5)
+    for w in ends:
+        w.run(1.5)
+    assert ends[0].hash() == ends[1].hash() == launched.hash()
+    with ends[0].clone() as twin:
+        assert twin.step(1 / 60) == ends[0].step(1 / 60) and twin.hash() == ends[0].hash()
+
+
+@pytest.mark.parametrize("e, substeps", [(0.0, 2), (0.0, 8), (0.5, 4)])
+def test_a_pile_adds_no_energy_and_rests(world, e, substeps):
+    # Frames are 0.5 to 2 times as long as 1/60 s. Impulses do no work; places lift what they part by a little.
+    w, rng = pile(world, "fused", e=e, substeps=substeps), np.random.default_rng(0)
+    lowest = start = w.step(1 / 60).energy
+    for _ in range(300):
+        report = w.step(rng.uniform(0.5, 2.0) / 60)
+        assert report.energy <= lowest + 2e-3 * start
+        lowest = min(lowest, report.energy)
+    w.run(5.0)
+    assert w.last.overlap < 1.5 * SLOP * BEYOND and tv.measure.kinetic_energy(w) < 1e-5 * start
