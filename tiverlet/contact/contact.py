@@ -263,14 +263,13 @@ class Contact(PairContact):
         if bounces and not dev.has_restitution:
             self.table.bind(scene, True)
         turns = scene.state.spins and friction and (dev.turns or any(w.turns for w in self.walls))
-        dev.rows = Rows(scene, self.table, friction, bounces, turns, list(scene.walls), team)
+        dev.rows = Rows(scene, self.table, friction, bounces, turns, scene.walls, team)
         dev.responses = FreeParticles(scene, scene.state.spins and friction)
         dev.responses.rows = dev.rows
         dev.islands = Islands(scene, dev.rows, dev.responses)
         dev.impulses = Impulses(scene, dev.rows, dev.responses, dev.islands, team)
         dev.places = Places(scene, dev.rows, dev.responses, dev.impulses, team)
         linked = excluded_pairs(batches, scene.particles.radius)
-        walls = list(scene.walls)
         dev.events = EventLog(scene, self.table) if dev.has_events else None
         pair_data = [
             dev.rows.memory,
@@ -279,7 +278,7 @@ class Contact(PairContact):
             *([dev.events.touched] if dev.events else []),
         ]
         dev.search = NeighbourSearch(
-            scene, self._present_skin, linked, self.table, pair_data, team, dev.responses.push, walls=walls
+            scene, self._present_skin, linked, self.table, pair_data, team, dev.responses.push, walls=scene.walls
         )
         dev.list = dev.search.list
         dev.geometry = DiscGeometry(scene, dev.search, 0.0, dev.rows.memory)

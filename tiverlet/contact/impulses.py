@@ -79,10 +79,6 @@ class Impulses:
         self.flags = add("Contact.flags", None, width=3, kind=ti.i32)
         self.last_h2 = add("Contact.last_h2", None, state=True)  # h^2 of what rows bore [s^2]; 0 before the first substep
 
-    def regroup(self, n: int) -> None:
-        """Set the number of particles to n."""
-        self.blocks = -(-n // BLOCK)
-
     @inline
     def going(self):
         """Return 1 while passes go on, else 0."""
@@ -161,12 +157,12 @@ class Impulses:
             if part == OWN and row < kept:
                 self.bodies.give(other, n, v)
             if ti.static(self.rows.turns):
-                self.prepare_turn(i, row, other, most < ALONE)
+                self.prepare_turn(i, row, other)
                 m_own += self.give_turn(row, other, part == OWN and row < kept)
         self.take(i, part, p_own, m_own)
 
     @ti.func
-    def prepare_turn(self, i, row, other, alone):
+    def prepare_turn(self, i, row, other):
         """Compute the effective masses of a row against rolling and twisting."""
         arms = self.rows.arms.field[row]
         each = self.rows.share[i] * arms[1] * arms[1] * self.bodies.turning_compliance(i)
@@ -304,15 +300,20 @@ class Impulses:
         self.flags[None][GOING], self.flags[None][TURN] = ti.cast(rows > 0, ti.i32), 0
 
     @ti.func
+    def momentum(self):
+        """Return how far the next pass extrapolates, and the theta after it (Nesterov)."""
+        theta = self.numbers[None][THETA]
+        ahead = (1 + ti.sqrt(1 + 4 * theta * theta)) / 2
+        return (theta - 1) / ahead, ahead
+
+    @ti.func
     def decide(self):
         """Decide after a pass whether another one follows, and how far it extrapolates. One thread calls it."""
         lack, uphill = self.total(LACK), self.total(UPHILL)
         turn = self.flags[None][TURN] + 1
         if turn == 1:
             self.numbers[None][TOLERANCE] = ti.max(self.numbers[None][TOLERANCE], ti.static(LEFT) * lack)
-        theta = self.numbers[None][THETA]
-        ahead = (1 + ti.sqrt(1 + 4 * theta * theta)) / 2
-        beta = (theta - 1) / ahead
+        beta, ahead = self.momentum()
         if uphill > 0:
             beta, ahead = 0 * beta, 1 + 0 * ahead
         self.numbers[None][BETA], self.numbers[None][THETA] = beta, ahead
@@ -330,9 +331,8 @@ class Impulses:
     @ti.func
     def decide_places(self, most):
         """Decide after a pass of stage 2 whether it moves anything, and whether another one follows. One thread calls it."""
-        theta, turn = self.numbers[None][THETA], self.flags[None][TURN] + 1
-        ahead = (1 + ti.sqrt(1 + 4 * theta * theta)) / 2
-        self.numbers[None][BETA], self.numbers[None][THETA] = (theta - 1) / ahead, ahead
+        turn = self.flags[None][TURN] + 1
+        self.numbers[None][BETA], self.numbers[None][THETA] = self.momentum()
         moves = ti.cast(self.total(LACK) > 0, ti.i32)
         self.flags[None] = [ti.select(turn < most, moves, 0), turn, moves]
 

@@ -42,16 +42,6 @@ class RowPass:
             self.relax_places(thread)
 
     @inline
-    def begin_of(self, n, thread):
-        """Return where a thread's share of a loop begins."""
-        return self.team.chunk_begin(n, thread)
-
-    @inline
-    def end_of(self, n, thread):
-        """Return where a thread's share of a loop ends."""
-        return self.team.chunk_end(n, thread)
-
-    @inline
     def going(self):
         """Return 1 while passes go on, else 0: how often a loop of a pass runs."""
         return self.impulses.going() if self.team.launched else 1
@@ -64,7 +54,7 @@ class RowPass:
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, now.thread)):
             self.impulses.begin(now, h2)
-        for i in range(self.begin_of(self.n, now.thread), self.end_of(self.n, now.thread)):
+        for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
             self.rows.clear(i)
             if ti.static(self.rows.bounces):
                 self.rows.when[i] = 0
@@ -90,7 +80,7 @@ class RowPass:
                 self.impulses.note(low, ROWS, count)
                 self.impulses.note(low, FORCE, force)
         self.team.wait()
-        for i in range(self.begin_of(self.n, now.thread), self.end_of(self.n, now.thread)):
+        for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
             self.rows.find_eigenvalue(i)
         self.add_up(now.thread, ROWS)
         self.add_up(now.thread, FORCE)
@@ -107,7 +97,7 @@ class RowPass:
         for _ in range(self.team.one(1, now.thread)):
             self.impulses.start_passes()
         self.team.wait()
-        for i in range(self.begin_of(self.n, now.thread), self.end_of(self.n, now.thread)):
+        for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
             self.bodies.extrapolate(i, ti.cast(0, self.real))
         self.team.wait()
 
@@ -120,7 +110,7 @@ class RowPass:
                 self.islands.find_times()
         self.team.wait()
         n = self.n * ti.cast(self.impulses.total(HITS) > 0, ti.i32)
-        for i in range(self.begin_of(n, thread), self.end_of(n, thread)):
+        for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
             self.rows.aim(i, self.islands.scale[self.islands.root_of(i)])
         self.team.wait()
 
@@ -158,7 +148,7 @@ class RowPass:
             self.impulses.decide()
         self.team.wait()
         n = self.n * self.impulses.going()
-        for i in range(self.begin_of(n, thread), self.end_of(n, thread)):
+        for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
             self.bodies.extrapolate(i, self.impulses.numbers[None][BETA])
         self.team.wait()
 
@@ -166,7 +156,7 @@ class RowPass:
     def finish_impulses(self, thread, final, tick):
         """End stage 1: take back energy that impulses gave, store what rows bear, move particles, and begin stage 2."""
         blocks = self.impulses.blocks
-        for b in range(self.begin_of(blocks, thread), self.end_of(blocks, thread)):
+        for b in range(self.team.chunk_begin(blocks, thread), self.team.chunk_end(blocks, thread)):
             work = ti.cast(0, self.real)
             for i in range(b * BLOCK, ti.min((b + 1) * BLOCK, self.n)):
                 work += self.impulses.gain(i)
@@ -178,7 +168,7 @@ class RowPass:
             self.impulses.check_work()
         self.team.wait()
         n = self.n * self.impulses.flags[None][GAINS]
-        for i in range(self.begin_of(n, thread), self.end_of(n, thread)):
+        for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
             self.islands.apply(i)
         self.team.wait()
         sums = ti.cast(final != 0 or self.impulses.total(HITS) > 0, ti.i32)
@@ -188,10 +178,10 @@ class RowPass:
                 for i in range(begin, end):
                     self.impulses.sum_impacts(i, part)
         self.team.wait()
-        for i in range(self.begin_of(self.n, thread), self.end_of(self.n, thread)):
+        for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             self.impulses.remember(i, final)
         self.team.wait()
-        for i in range(self.begin_of(self.n, thread), self.end_of(self.n, thread)):
+        for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             new = self.bodies.new[i]
             if ti.static(not self.state.sums):
                 new = self.particles.integrator.dithered_move(self.state.x0[i], new, tick)
@@ -222,6 +212,6 @@ class RowPass:
             self.impulses.decide_places(MOVES)
         self.team.wait()
         n = self.n * self.impulses.moving()
-        for i in range(self.begin_of(n, thread), self.end_of(n, thread)):
+        for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
             self.places.move(i, self.impulses.numbers[None][BETA])
         self.team.wait()
