@@ -83,7 +83,7 @@ add(5)
 """
     ours, as_ever = (python(code.replace("COUNT", count), TI_OFFLINE_CACHE="0") for count in ("3", "0"))
     copies = [[part.count("by a factor of") for part in done.stderr.split("theirs")] for done in (ours, as_ever)]
-    assert ours.stdout == as_ever.stdout and copies[0][0] == 0 and copies[1][0] > 10
+    assert ours.stdout == as_ever.stdout and copies[0][0] <= 1 and copies[1][0] > 10
     assert copies[0][1] == copies[1][1] > 0
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
+from tiverlet.contact.limits import BEYOND, MET, SLOP
 from tiverlet.step import checkpoint
 
 from .test_pairs import roomy
@@ -34,8 +35,8 @@ def test_a_heap_comes_to_rest_without_overlap(world):
     )
     w.run(4.0)
     assert w.last.overlap < 0.02 and w.last.contacts > n
-    x, r = w.position, radius[:, None]
-    assert (x - r >= -1e-6).all() and (x + r <= np.array([3.4, 14]) + 1e-6).all()
+    x, r, slop = w.position, radius[:, None], SLOP * BEYOND * radius[:, None]  # in which contacts rest
+    assert (x - r >= -slop - 1e-6).all() and (x + r <= np.array([3.4, 14]) + slop + 1e-6).all()
     assert x[:, 1].max() < 4.0
 
 
@@ -68,17 +69,17 @@ def test_coincident_particles_part_gently(world, dim):
         assert np.linalg.norm(v, axis=1).max() <= speed * width
 
 
-def test_deep_overlap_leaves_at_no_more_than_push_out(world):
-    speed = 0.25  # kernels are compiled for this value, as above
-    x = [[0.0, 0], [0.05, 0]]
-    w = world(tv.Particles(x, radius=0.1), [tv.Contact(push_out=speed)], substeps=10, precision="f64")
-    w.run(1.0)
-    apart = w.velocity[1] - w.velocity[0]
-    assert 0.9 * speed <= apart[0] <= speed * (1 + 1e-12) and w.position[1, 0] - w.position[0, 0] >= 0.2 - 1e-12
-    # The same speed after the user has placed them inside each other.
-    w.position, w.velocity = [[0.0, 0], [0.0, 0.02]], np.zeros((2, 2))
-    w.run(1.0)
-    assert 0.9 * speed <= (w.velocity[1] - w.velocity[0])[1] <= speed * (1 + 1e-12)
+def test_deep_overlap_leaves_at_push_out_without_velocity(world):
+    # Positions part at push_out, by push_out h in each substep, until what is left is the overlap in which contacts rest.
+    speed, slop = 0.25, SLOP * BEYOND * 0.1
+    w = world(tv.Particles([[0.0, 0], [0.05, 0]], radius=0.1), [tv.Contact(push_out=speed)], substeps=10, precision="f64")
+    for x in ([[0.0, 0], [0.05, 0]], [[0.0, 0], [0.0, 0.05]]):  # at the start, and after the user has placed them so
+        w.position, w.velocity = x, np.zeros((2, 2))
+        w.run(0.2)
+        assert 0.8 * speed < (np.linalg.norm(w.position[1] - w.position[0]) - 0.05) / 0.2 < 1.3 * speed  # as passes overshoot
+        w.run(1.0)
+        assert 0.2 - slop <= np.linalg.norm(w.position[1] - w.position[0]) <= 0.2 + 1e-12
+        np.testing.assert_array_equal(w.velocity, 0)
 
 
 def test_linked_particles_do_not_touch(world):
@@ -89,25 +90,20 @@ def test_linked_particles_do_not_touch(world):
     assert np.linalg.norm(w.position[1] - w.position[2]) >= 0.2 - 1e-6
 
 
-def test_a_column_obeys_the_overlap_law(world):
-    # R21: one mass-split pass per substep acts like springs m / (4 h^2): the k-th contact from the top would overlap by
-    # 4 k g h^2. With over-relaxation by 5/4 and 0.4 of pushes carried over, it would overlap by 0.48 of that, or of 3 k g h^2 at
-    # the ends. But a pair carries no more than leaves it at 2 k g h^2, where its push, k m g h^2, would part it alone. Drag
-    # scales h^2 by phi. The load itself is k m g, to rounding.
-    n, h = 10, 1 / 600
+@pytest.mark.parametrize("substeps", [1, 2, 10, 60])
+def test_a_column_bears_its_weight(world, substeps):
+    # The k-th contact from the top bears k m g, and no load makes contacts overlap by more than that in which they rest.
+    n, h = 10, 1 / 60 / substeps
     x = np.stack([np.full(n, 0.5), 0.5 + np.arange(n) * 1.0], axis=1)
-    w = smooth(world, tv.Particles(x, radius=0.5), (1, np.inf), rate=8.0, substeps=10)
-    w.run(6.0)
-    overlap = 1 - np.diff(w.position[:, 1])
-    k = np.arange(n - 1, 0, -1)
-    phi = (1 - np.exp(-8 * h)) / (8 * h)
-    np.testing.assert_allclose(w.contacts.impulse / h, k * 9.81 * phi, rtol=1e-6)
-    np.testing.assert_allclose(overlap, 2 * k * 9.81 * h**2 * phi, rtol=1e-6)
+    w = smooth(world, tv.Particles(x, radius=0.5), (1, np.inf), substeps=substeps)
+    w.run(3.0)
+    assert (1 - np.diff(w.position[:, 1])).max() < SLOP * BEYOND * 0.5
+    np.testing.assert_allclose(w.contacts.impulse / h, np.arange(n - 1, 0, -1) * 9.81, rtol=2 * MET[0])
 
 
 @pytest.mark.slow
 def test_settled_piles_are_quiet(world):
-    # No jitter: the kinetic energy of a settled pile falls below 1e-6 m g r per particle, also with friction or restitution.
+    # No jitter: the kinetic energy of a settled pile falls below 1e-9 m g r per particle, also with friction or restitution.
     k = np.arange(300)
     x = np.stack([k % 15 * 1.02 + 0.5 + 0.01 * tv.golden(k), k // 15 * 1.02 + 0.5], axis=1)
     for friction, restitution in ((0.0, 0.0), (0.4, 0.0), (0.0, 0.5)):
@@ -116,8 +112,8 @@ def test_settled_piles_are_quiet(world):
             w = rough(world, start, (15.5, 60), friction, restitution, substeps=8)
         else:
             w = smooth(world, start, (15.5, 60), substeps=8)
-        w.run(12.0)
-        assert tv.measure.kinetic_energy(w) / len(k) <= 1e-6 * 9.81 * 0.5
+        w.run(24.0)
+        assert tv.measure.kinetic_energy(w) / len(k) <= 1e-9 * 9.81 * 0.5
         # The contacts across a height carry the weight above it, apart from the sound that is left: a velocity of
         # sqrt(2e-6 g r) = 3 mm/s at 30 rad/s is 1 % of g.
         height = w.position[:, 1]
@@ -363,32 +359,16 @@ def test_discs_in_the_same_place_have_the_normal_along_which_they_part(world, di
     np.testing.assert_allclose(apart / np.linalg.norm(apart), found.normal[0], atol=1e-9)
 
 
-def test_masses_are_split_as_often_however_deep_pairs_are(world):
-    # Four discs overlap with a fifth by c from left and right, and by a little from above and below. The sum of n n^T is 2 I for
-    # the middle disc, so its mass is split by 2 and those of the others by 1; each outer disc moves out by r c / 3 with r = 5/4.
-    # If all pairs counted as deep as the deepest, masses would be split by up to 1 / (1 - c)^2 more, and by four at most. All
-    # fall with g = 1 meanwhile, by g h^2 / 2: beside such a force, none of them is fast enough for the projection of an impact.
-    out = np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]])
-    low = (-99.0, -99.0)
-    for c, off in ((0.05, 0.04), (0.2, 1e-5), (0.45, 1e-5)):
-        deep = np.array([c, c, 0.01, 0.01])[:, None]
-        start = tv.Particles(np.vstack([[0, 0], 1.01 * out]), velocity=np.vstack([[0, 0], -(deep + 0.01) * out]), radius=0.5)
-        w = smooth(world, start, g=1.0, low=low, precision="f32", substeps=1)
-        w.step(1.0)
-        x = w.position + (0.0, 0.5)
-        np.testing.assert_allclose(x[1:], (1 - deep + 1.25 * deep / 3) * out, atol=off * c)
-        np.testing.assert_allclose(x[0], 0, atol=1e-6)
-
-
-def test_a_column_that_is_too_heavy_for_the_substep_is_flagged(world):
-    # The k-th contact from the top overlaps by 2 k g h^2: the lowest of 60 discs by 0.8 radii at 2 substeps, by 0.05 at 8.
+def test_a_column_of_60_stands(world):
     x = np.stack([np.full(60, 0.1), 0.1 + 0.2001 * np.arange(60)], axis=1)
     w = smooth(world, tv.Particles(x, radius=0.1), (0.2, 20), precision="f32", substeps=2)
     for substeps in (2, 8):
         w.position, w.velocity, w.substeps = x, 0 * x, substeps
-        report = w.run(1.0)
-        assert report.flags == ({"compressed"} if substeps == 2 else set())
-        assert "Use up to " in " ".join(report.notes) or report.clean
+        report = w.run(2.0)  # a load needs as many passes as there are discs to reach the floor
+        assert report.clean and report.overlap < (0.05 if substeps == 2 else SLOP * BEYOND)
+
+
+def test_overlap_that_rounding_makes_is_flagged(world):
     # At 1e5 m f32 tells places 8 mm apart, which no substep makes less.
     near = tv.Particles([[1e5 + 0.1, 0.1], [1e5 + 0.126, 0.1]], radius=0.02)
     report = smooth(world, near, (1e5 + 1, 20), precision="f32", push_out=0.0).step(1 / 60)
@@ -396,8 +376,7 @@ def test_a_column_that_is_too_heavy_for_the_substep_is_flagged(world):
 
 
 def test_a_point_in_the_middle_of_a_disc_that_is_to_stay_there(world):
-    # At push_out = 0 the disc acts as if it had shrunk to nothing, and by rounding to less. Without a guard, friction would
-    # hold a slip of 0 up to a negative length, and 0 times infinity is NaN.
+    # At push_out = 0 nothing that overlaps parts.
     w = world(tv.Particles([(0.5, 1)] * 2, radius=[0.1, 0]), [tv.Contact(friction=0.3, push_out=0.0)])
     w.run(0.1)
     np.testing.assert_array_equal(w.position, [(0.5, 1)] * 2)

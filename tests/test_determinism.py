@@ -140,7 +140,8 @@ def apart(r):
 @pytest.mark.parametrize("acting", [True, False], ids=["forces and contacts", "constraints"])
 def test_all_paths_have_the_same_bits(world, acting):
     # Two scenes, since compile time grows faster than the number of features. Three dimensions are tested by the fuzzer; spins,
-    # events, sleep and bodies of loops in test_sleep.py. A column on the first disc learns its known loads.
+    # events, sleep and bodies of loops in test_sleep.py. A column
+    # stands on the first disc.
     n = 160
     x = tv.golden(np.arange(n), dim=2) * [4, 1.6]
     x[:4] = [1.0, 7.0] + np.outer(np.arange(4), [0.0, 0.16])
@@ -150,7 +151,7 @@ def test_all_paths_have_the_same_bits(world, acting):
         if acting:
             features = [
                 tv.Gravity(9.81), tv.Drag(0.1), tv.Force(wild), tv.Hand((1.0, 1.0), 7), tv.PairForce(apart, 0.2),
-                tv.Contact(loads=True), tv.Box((0, 0), (4, 9)), tv.HalfSpace((0.2, 1), 0.1),
+                tv.Contact(), tv.Box((0, 0), (4, 9)), tv.HalfSpace((0.2, 1), 0.1),
             ]  # fmt: skip
         else:
             features = [
@@ -166,7 +167,7 @@ def test_all_paths_have_the_same_bits(world, acting):
         w.run(0.5)
         made.append((w.hash(), w.last.energy, w.last.residual, w.last.overlap))
         if acting:
-            assert w.last.contacts > 60 and (w._runner.search.list.persistent_data()[1]["load"] > 0).any()
+            assert w.last.contacts > 60 and (w._runner.search.list.persistent_data()[1]["push"] > 0).any()
         else:
             assert 0 < features[1].broken.sum() < len(pairs)
     assert made[0] == made[1] == made[2]

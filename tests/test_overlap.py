@@ -8,6 +8,7 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.contact.initial_overlap import overlapping
+from tiverlet.contact.limits import SLOP
 from tiverlet.contact.parting import diameters
 from tiverlet.step import checkpoint
 
@@ -32,31 +33,16 @@ def test_overlap_is_what_comparing_all_pairs_finds():
     assert min(seen) > 30
 
 
-def test_what_rounding_makes_overlap_is_known_too(world):
-    """Find overlap that comes from rounding, too, so that frames are compiled once.
-
-    At 0.1 k in f32, neighbours are more than 0.1 m apart (0.3 - 0.2) or less (0.4 - 0.3).
-    """
-    row = np.stack([np.arange(5) * 0.1, np.zeros(5)], axis=1)
-    apart = np.diff(row[:, 0].astype(np.float32))
-    assert min(apart) < np.float32(0.05) * 2 <= max(apart)
-    w = world(tv.Particles(row, radius=0.05), [tv.Contact()])
-    assert "Contact.shrunk" in w.fields
-    step = w._runner.step
-    assert w.step(1e-3).clean and w._runner.step is step
-    wide = world(tv.Particles(row * 1.001, radius=0.05), [tv.Contact()])
-    assert "Contact.shrunk" not in wide.fields
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("what", ["another radius", "contacts"])
 def test_a_rebuilt_world_is_compiled_once_for_what_overlaps_in_it(what, world):
-    row = np.stack([np.arange(5) * 0.2, np.zeros(5)], axis=1)
+    row, link = np.stack([np.arange(5) * 0.2, np.zeros(5)], axis=1), tv.Distance([[5, 6]])  # contacts without links are rows
+    row = np.vstack([row, [[50.0, 0.0], [51.0, 0.0]]])
     if what == "contacts":
-        w = world(tv.Particles(row * 0.4, radius=0.05))
+        w = world(tv.Particles(row * 0.4, radius=0.05), [link])
         w.add(features=[tv.Contact()])
     else:
-        w = world(tv.Particles(row, radius=0.05), [tv.Contact()])
+        w = world(tv.Particles(row, radius=0.05), [tv.Contact(), link])
         w.step(1e-3)
         w.add(tv.Particles([[0.03, 0.0]], radius=0.04))
     step = w._runner.step
@@ -69,25 +55,27 @@ def test_a_rebuilt_world_is_compiled_once_for_what_overlaps_in_it(what, world):
 
 @pytest.mark.slow
 def test_only_scenes_that_start_with_overlap_have_the_field_for_it(world):
-    x = np.array([[0.0, 0.0], [0.19, 0.0], [0.5, 0.0], [0.75, 0.0]])
+    # Contacts of worlds without constraints are rows, which need no such field: so two discs far away are linked.
+    x = np.array([[50.0, 0.0], [51.0, 0.0], [0.0, 0.0], [0.19, 0.0], [0.5, 0.0], [0.75, 0.0]])
     for features, start, want in (
         ([tv.Contact()], x, True),
-        ([tv.Contact(), tv.Distance([[1, 0]])], x, False),  # linked, so not in contact
+        ([tv.Contact(), tv.Distance([[3, 2]])], x, False),  # linked, so not in contact
         ([tv.Contact()], x * 1.1, False),
-        ([tv.Contact()], np.zeros((2, 2)), True),  # all in one place
+        ([tv.Contact()], x[[0, 1, 2, 2]], True),  # in one place
         ([tv.Contact(groups=[(0, 1), (0, 2)])], x, True),
         ([tv.Contact(groups=[(0, 2)])], x, False),
         ([tv.Contact(friction={(0, 1): 0.5})], x, True),
         ([tv.Contact(sensors=[(0, 1)])], x, False),
     ):
-        w = world(tv.Particles(start, radius=0.1, group=[0, 1, 2, 2][: len(start)]), features)
+        linked = [*features, tv.Distance([[0, 1]])]
+        w = world(tv.Particles(start, radius=0.1, group=[3, 3, 0, 1, 2, 2][: len(start)]), linked)
         assert ("Contact.shrunk" in w.fields) == want
         if want and features[0].groups:
             step = w._runner.step
             assert w.step(1e-3).clean and w._runner.step is step  # compiled once
-        if not want and len(features) == 1:  # a checkpoint without the field sets it back
+        if not want and len(features) == 1 and len(start) == 6:  # a checkpoint without the field sets it back
             begin, before = checkpoint.keep(w), w.hash()
-            w.position = 0.1 * x
+            w.position = np.where(np.arange(6)[:, None] < 2, x, 0.1 * x)
             w.step(1e-3)
             assert "Contact.shrunk" in checkpoint.keep(w).values and w.hash() != before
             checkpoint.put_back(w, begin)
@@ -137,6 +125,7 @@ def test_diameters_are_those_of_all_distances():
 def test_what_overlaps_in_a_row_parts_at_push_out(kind, world):
     # Ten in a row, each in the next one by a fifth: if each pair parted at push_out, the ends would part at 9 push_out. A pair
     # leaves by up to twice the speed at which its contact distance grows: pushes are over-relaxed.
+    # Rows part what overlaps by moves, without velocity, each pair at push_out.
     push_out, row = 0.5, np.arange(10) * 0.16
     if kind == "boxes":
         x = np.concatenate([np.array([[0.0, 0.0], [0.2, 0.0], [0.2, 0.2], [0.0, 0.2]]) + [0, y] for y in row])
@@ -149,21 +138,20 @@ def test_what_overlaps_in_a_row_parts_at_push_out(kind, world):
     w = world(tv.Particles(x, radius=0.0 if kind == "boxes" else 0.1), features, precision="f64", substeps=8)
     middle, fastest = x.mean(axis=0), 0.0
     for _ in range(90):
-        report = w.step(1 / 60)
-        v = w.velocity
-        fastest = max(fastest, np.ptp(v[:, 1]))
-    assert push_out / 2 < fastest < 2 * push_out
-    assert report.overlap < 1e-6 and abs(w.position.mean(axis=0) - middle).max() < 1e-9
+        before, report = w.position[:, 1], w.step(1 / 60)
+        fastest = max(fastest, np.ptp(w.velocity[:, 1] if kind == "boxes" else 60 * (w.position[:, 1] - before)))
+    assert push_out / 2 < fastest < (2 if kind == "boxes" else 9) * push_out
+    assert report.overlap < (1e-6 if kind == "boxes" else 3 * SLOP) and abs(w.position.mean(axis=0) - middle).max() < 1e-9
 
 
 @pytest.mark.slow
 def test_what_goes_to_a_free_place_compiles_nothing(world):
     # Six discs rest on each other, and overlap as their loads make them. One is carried off, twice before it is seen: the others
     # still bear loads, which are no error of placing. The first disc of a group that is named, but had no particles, is not
-    # another structure either. Where a disc is put into another one, both shrink.
-    x = np.stack([np.zeros(6), 0.1 + 0.201 * np.arange(6)], axis=1)
-    contact = tv.Contact(groups=[(0, 0), (0, 1)], friction={(0, 1): 0.5})
-    w = world(tv.Particles(x, radius=0.1), [tv.Gravity(), contact, tv.HalfSpace((0, 1), 0.0)], substeps=8)
+    # another structure either. Where a disc is put into another one, both shrink. Two far away are linked, else they are rows.
+    x = np.vstack([np.stack([np.zeros(6), 0.1 + 0.201 * np.arange(6)], axis=1), [[50.0, 0.1], [51.0, 0.1]]])
+    contact, link = tv.Contact(groups=[(0, 0), (0, 1)], friction={(0, 1): 0.5}), tv.Distance([[6, 7]])
+    w = world(tv.Particles(x, radius=0.1), [tv.Gravity(), contact, link, tv.HalfSpace((0, 1), 0.0)], substeps=8)
     w.run(1.0)
     assert w.last.overlap > 1e-4 and "Contact.shrunk" not in w.fields
     w.position, w.velocity = w.position, w.velocity  # the kernels of a start
@@ -181,7 +169,7 @@ def test_what_goes_to_a_free_place_compiles_nothing(world):
         w.run(0.5)
     assert names == [] and "Contact.shrunk" not in w.fields
     x = w.position.copy()
-    x[5] = x[6] + [0.05, 0.05]
+    x[5] = x[8] + [0.05, 0.05]
     w.position = x
     w.run(0.5)
-    assert "Contact.shrunk" in w.fields and np.linalg.norm(w.position[5] - w.position[6]) > 0.2 * (1 - 1e-3)
+    assert "Contact.shrunk" in w.fields and np.linalg.norm(w.position[5] - w.position[8]) > 0.2 * (1 - 1e-3)

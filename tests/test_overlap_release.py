@@ -18,28 +18,6 @@ def lattice(n, dim, height=1.05):
     return x + rng.uniform(0, 0.03, x.shape)
 
 
-def test_a_column_is_lifted_to_the_overlap_of_the_shorter_substep(world):
-    # The k-th contact from the top overlaps by 2 k g h^2. The top rises by the overlap that they all lose; then nothing moves.
-    n = 12
-    column = np.stack([np.zeros(n), R + np.arange(n)], axis=1)
-    w = world(tv.Particles(column, radius=R), [tv.Gravity(G), tv.Contact(), tv.HalfSpace((0, 1))], substeps=4, precision="f64")
-    w.run(6.0)
-    k = np.arange(n - 1, 0, -1)
-    for substeps in (8, 12):
-        before = w.position[:, 1]
-        overlap = 2 * k * G / (60 * w.substeps) ** 2
-        np.testing.assert_allclose(2 * R - np.diff(before), overlap, rtol=1e-3)
-        rise = overlap * (1 - (w.substeps / substeps) ** 2)
-        w.substeps = substeps
-        w.step(1 / 60)
-        # 1 % of the energy that the overlap would release is left. That is on average a tenth of each overlap, and a tenth of the
-        # velocity that its work on the column would bring.
-        left = 0.1 * n**0.5 * np.linalg.norm(rise)
-        np.testing.assert_allclose(w.position[:, 1] - before, np.append(0, np.cumsum(rise)), atol=left)
-        assert np.abs(w.velocity).max() < 0.2 * np.sqrt(G * rise.sum())
-        w.run(2.0)
-
-
 def pile(world, x, friction, restitution, substeps, **settings):
     """Return a world with discs or spheres in an open box; those in the plane share kernels with friction and restitution."""
     dim = x.shape[1]
@@ -91,19 +69,14 @@ def test_frames_much_shorter_than_the_last_throw_nothing(world):
     assert w.last.energy < start + lift + 9.0 * G and np.abs(w.velocity).max() < 1.0
 
 
-def test_frames_that_a_loop_measures_do_not_wait(world, monkeypatch):
-    # Frames are up to a tenth longer or shorter than 1/60 s. Contacts keep the stiffness that they had, so nothing is released by
-    # moves on the host, which took 0.3 s a frame for 500 discs. The k-th contact from the top of a column overlaps by 2 k g h^2,
-    # and at most this sag is lifted again. h^2 changes by a tenth on average, which leaves a hundredth of that energy to shake.
+def test_frames_that_a_loop_measures_add_no_energy(world):
+    # Frames are up to a tenth longer or shorter than 1/60 s.
     n, substeps = 12, 4
     column = np.stack([np.zeros(n), R + np.arange(n)], axis=1)
     gravity = tv.Gravity(G)
     features = [gravity, tv.Contact(), tv.HalfSpace((0, 1))]
     w = world(tv.Particles(column, radius=R), features, substeps=substeps, precision="f64")
-    start = w.run(6.0).energy
-    monkeypatch.setattr("tiverlet.step.runner.release", None)
-    sag = 2 * np.arange(n) * G * (1.1 / 60 / substeps) ** 2  # of the k-th contact below the top
-    lift = G * (np.arange(n) * sag).sum() * (1 - (0.9 / 1.1) ** 2)
+    start, lift = w.run(6.0).energy, 1e-4 * n * n * G * R
     rng, kinetic = np.random.default_rng(0), []
     for _ in range(600):
         report = w.step(rng.uniform(0.9, 1.1) / 60)

@@ -252,7 +252,8 @@ def test_a_recording_begins_after_what_came_and_went(world, tmp_path):
 def test_a_clone_parts_what_came_into_others_as_the_world_does(world):
     # Not stepped since: overlap depends on where particles are, not on where they were when the world began.
     x = np.stack(np.meshgrid(np.arange(4.0), np.arange(4.0)), axis=-1).reshape(-1, 2) * 1.05 + [0.6, 3.0]
-    w = world(tv.Particles(x, radius=0.5), [tv.Gravity(9.81), tv.Contact(friction=0.4), tv.Box((0, 0), (4.5, 9))], substeps=4)
+    contact = tv.Contact(friction=0.4, push_out=1.0)
+    w = world(tv.Particles(x, radius=0.5), [tv.Gravity(9.81), contact, tv.Box((0, 0), (4.5, 9))], substeps=4)
     w.run(1.5)
     w.add(tv.Particles(w.position[5:6] + 0.3, radius=0.5))
     twin = w.clone()

@@ -10,12 +10,6 @@ from tiverlet.device.thread_team import launching
 G, R = 9.81, 0.1
 
 
-@pytest.fixture(autouse=True)
-def rows(monkeypatch):
-    """Let contacts be rows."""
-    monkeypatch.setattr("tiverlet.contact.contact.SWITCH", True)
-
-
 def column(n, nx=1):
     """Return places of nx columns of n discs that touch, 1 m above a floor."""
     return np.array([(2.1 + 2 * R * i, 1.0 + R + 2 * R * j) for j in range(n) for i in range(nx)])

@@ -136,13 +136,13 @@ def test_edits_of_other_engines_are_timed(engine):
 
 @pytest.mark.slow
 def test_pile_in_c_does_the_same(report):
-    # Two schemes for one scene: the mean overlap depends on the scheme, but is of the same order.
+    # Two schemes for one scene: ours overlaps less, since its contacts are no springs.
     pile = report.run("pile", 41, 1)
     if pile.yardstick is None:
         assert any(note.startswith("Left out: the yardstick") for note in report.notes)
         pytest.skip("no C compiler")
     assert pile.ratio == pytest.approx(pile.yardstick / pile.seconds) and pile.ratio > 0
-    assert 0.2 < pile.yardstick_overlap / pile.overlap < 5
+    assert 0 < pile.overlap < 5 * pile.yardstick_overlap
 
 
 def test_yardstick_starts_where_the_scene_does(tmp_path):

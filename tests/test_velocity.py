@@ -148,7 +148,10 @@ def test_a_pile_goes_on_to_the_bit_beside_what_is_driven_on_a_rough_floor(world,
         free.step(1 / 60)
         steered.step(1 / 60)
         if how != "sleep":
-            np.testing.assert_array_equal(steered.position[..., :-1, :] - free.position[:-1], 0)
+            # How many passes there are is decided for all islands together, so in f32 last digits differ, 6e-8 m in a frame.
+            np.testing.assert_allclose(
+                steered.position[..., :-1, :] - free.position[:-1], 0, atol=0 if precision == "f64" else 1e-6
+            )
         if how != "spin":
             v = steered.velocity.copy()
             v[..., -1, 0] = 0.3 * np.sin(k / 5)

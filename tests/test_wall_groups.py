@@ -6,7 +6,6 @@ import pytest
 import tiverlet as tv
 from tiverlet.colliders.collider import Collider
 from tiverlet.colliders.wall_tree import MEMBER, SKIP, tree_nodes
-from tiverlet.contact import contact
 from tiverlet.device import layout
 from tiverlet.device.memory import Memory
 
@@ -91,8 +90,6 @@ def test_walls_that_share_code_act_as_walls_with_code_of_their_own(kind, dim, op
 @pytest.mark.parametrize(("kind", "dim"), KINDS)
 @pytest.mark.parametrize("n", [40, 1200])
 def test_contacts_with_walls_that_share_code_are_the_same_rows(kind, dim, n, monkeypatch):
-    monkeypatch.setattr(contact, "SWITCH", True)
-
     def heap():
         walls = pegs(kind, dim, 4, friction=0.3)
         features = [tv.Gravity((0, -9.81, 0)[:dim]), tv.Box(np.zeros(dim), np.ones(dim)), *walls, tv.Contact(friction=0.4)]
@@ -108,8 +105,7 @@ def test_contacts_with_walls_that_share_code_are_the_same_rows(kind, dim, n, mon
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_a_seam_between_facets_in_a_plane_is_no_step(dim, monkeypatch):
-    monkeypatch.setattr(contact, "SWITCH", True)
+def test_a_seam_between_facets_in_a_plane_is_no_step(dim):
     if dim == 2:
         xs = np.linspace(0, 2, 21)
         floor = tv.Polygon([*np.stack([xs, 0 * xs], 1), (2, -1), (0, -1)])
@@ -130,9 +126,8 @@ def test_a_seam_between_facets_in_a_plane_is_no_step(dim, monkeypatch):
             assert abs(world.position[0, 1] - height) < 1e-3
 
 
-def test_discs_at_rest_in_a_trough_of_facets_as_rows(monkeypatch):
+def test_discs_at_rest_in_a_trough_of_facets_as_rows():
     # The weight of a disc that lies in a rectangular valley, on two facets of one polygon; and beside it one on a corner.
-    monkeypatch.setattr(contact, "SWITCH", True)
     trough = tv.Polygon([(-1, 1), (0, 0), (1, 1), (3, -1), (-3, -1)])
     features = [tv.Gravity((0, -9.81)), trough, tv.Contact()]
     with tv.World(tv.Particles([[0.001, 0.15 * np.sqrt(2)]], radius=0.15), features, substeps=10) as world:
@@ -141,8 +136,7 @@ def test_discs_at_rest_in_a_trough_of_facets_as_rows(monkeypatch):
         assert np.abs(world.velocity).max() < 1e-3
 
 
-def test_a_wall_that_moves_meets_a_particle_at_rest_as_a_row(monkeypatch):
-    monkeypatch.setattr(contact, "SWITCH", True)
+def test_a_wall_that_moves_meets_a_particle_at_rest_as_a_row():
     rod = tv.Capsule((-1, -1.0), (-1, 1), 0.1)
     with tv.World(tv.Particles([[0.0, 0.0], [3, 3]], radius=0.1), [rod, tv.Contact()], substeps=10) as world:
         for _ in range(60):

@@ -38,8 +38,8 @@ class Ball(Collider):
     widest = 0.0  # radius of a particle [m]
 
     def __init__(
-        self, center, radius, inside: bool = False, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float =
-        1.0, active: bool | None = None, events: bool = False, surface_velocity=None,
+        self, center, radius, inside: bool = False, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float
+        | None = None, active: bool | None = None, events: bool = False, surface_velocity=None,
     ):  # fmt: skip
         self.center = center
         self.inside = bool(inside)

@@ -48,8 +48,8 @@ class Box(Collider):
     upper = Knob(_corner("upper"), "Upper corner [m].")
 
     def __init__(
-        self, lower, upper, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
-        None = None, events: bool = False, surface_velocity=None,
+        self, lower, upper, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float | None = None, active:
+        bool | None = None, events: bool = False, surface_velocity=None,
     ):  # fmt: skip
         self.lower = lower
         self.upper = upper
@@ -69,10 +69,11 @@ class Box(Collider):
         out = np.maximum(self.lower - x, x - self.upper)
         out[inv_mass == 0] = 0
         if (out > 1e-6 * particles.size).any():
+            given = "" if self.push_out is None else f" = {self.push_out:g} m/s"
             (i, k), number = np.unravel_index(int(np.argmax(out)), out.shape), int((out.max(axis=1) > 0).sum())
             checks.warn(
                 f"Box: particle {i} starts {out[i, k]:.3g} m outside along axis {k} ({number} such in all); "
-                f"push_out = {self.push_out:g} m/s brings it in. Move it, or make the box larger."
+                f"push_out{given} brings it in. Move it, or make the box larger."
             )
 
     @property

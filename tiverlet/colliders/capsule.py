@@ -40,8 +40,8 @@ class Capsule(Collider):
     radius = Knob(lambda f, v: checks.number("Capsule", "radius", v, above=0.0), "Of the rod [m].", device="size")
 
     def __init__(
-        self, a, b, radius, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
-        None = None, events: bool = False, surface_velocity=None, one_way=None,
+        self, a, b, radius, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float | None = None, active:
+        bool | None = None, events: bool = False, surface_velocity=None, one_way=None,
     ):  # fmt: skip
         self.a, self.b = a, b
         self.radius = radius

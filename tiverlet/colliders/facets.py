@@ -220,8 +220,8 @@ class FacetShape(Shape):
         return begin, end
 
     @ti.func
-    def facet_gap(self, f, q):
-        """Return the distance of q from facet f, the normal and the curvature. Beside the facet it is round about its corners."""
+    def facet_gap(self, f, q, e, contact_distance):
+        """Return the gap at q to facet f, the normal and the curvature. Beside the facet it is round about its corners."""
         distance, n, at = self.nearest(f, q)
         bend = 0 * distance
         if at < 0:
@@ -235,7 +235,7 @@ class FacetShape(Shape):
                 hidden = hidden or n.dot(self.facing[at]) < 0
             if hidden:
                 distance = ti.cast(FAR, self.real)
-        return distance, n, bend
+        return distance - contact_distance, n, bend
 
     @ti.func
     def box(self):

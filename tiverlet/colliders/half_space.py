@@ -27,8 +27,8 @@ class HalfSpace(Collider):
     offset = Knob(lambda f, v: checks.number("HalfSpace", "offset", v), "Of the plane along its normal [m].")
 
     def __init__(
-        self, normal, offset: ArrayLike = 0.0, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0,
-        active: bool | None = None, events: bool = False, surface_velocity=None,
+        self, normal, offset: ArrayLike = 0.0, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float |
+        None = None, active: bool | None = None, events: bool = False, surface_velocity=None,
     ):  # fmt: skip
         normal = np.asarray(normal, dtype=np.float64)
         normal = checks.vector("HalfSpace", "normal", normal, normal.size)

@@ -34,8 +34,8 @@ class Mesh(Moving):
 
     def __init__(
         self, vertices, faces, inside: bool = False, *, closed: bool = True, radius: float = 0.0, position: ArrayLike = 0.0,
-        rotation: ArrayLike = 0.0, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
-        None = None, events: bool = False, surface_velocity=None, one_way=None,
+        rotation: ArrayLike = 0.0, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float | None = None,
+        active: bool | None = None, events: bool = False, surface_velocity=None, one_way=None,
     ):  # fmt: skip
         vertices = checks.points("Mesh", "vertices", vertices, dim=3)
         faces = checks.indices("Mesh", "faces", faces, len(vertices), arity=3).astype(int)

@@ -163,16 +163,23 @@ class Moving(Collider):
         """Return the gap to a facet."""
         x = self.dev.state.inside(self.dev.state.place(i) - self.dev.state.d[i])
         q = self.dev.pose.inward(0, x - self.dev.pose.place[0])
-        distance, n, bend = self.dev.shape.facet_gap(face, q)
         moved = self.dev.pose.place[2] + self.dev.pose.outward(2, q)
-        return distance - ti.cast(self.radius, self.dev.real) - radius, self.dev.pose.outward(0, n), bend, moved
+        e = self.dev.pose.inward(0, self.dev.state.d[i] - moved)
+        gap, n, bend = self.dev.shape.facet_gap(face, q, e, ti.cast(self.radius, self.dev.real) + radius)
+        return gap, self.dev.pose.outward(0, n), bend, moved
 
     @ti.func
     def end_gap(self, face, i, radius, frame_fraction):
         """Return the gap to a facet."""
         x = self.dev.state.inside(self.dev.state.place(i))
-        distance, n, _bend = self.dev.shape.facet_gap(face, self.dev.pose.inward(1, x - self.dev.pose.place[1]))
-        return distance - ti.cast(self.radius, self.dev.real) - radius, self.dev.pose.outward(1, n)
+        q = self.dev.pose.inward(1, x - self.dev.pose.place[1])
+        gap, n, _bend = self.dev.shape.facet_gap(face, q, 0 * q, ti.cast(self.radius, self.dev.real) + radius)
+        return gap, self.dev.pose.outward(1, n)
+
+    @ti.func
+    def in_frame_of_one_way(self, n):
+        """Return a normal in the frame of the wall."""
+        return self.dev.pose.inward(0, n)
 
     @ti.func
     def pose(self, frame_fraction):
@@ -200,7 +207,7 @@ class Moving(Collider):
         a, going, touched, deferred = first, True, False, False
         for k in range(TOUCHES + 1):
             if going:
-                s, depth, n = self.dev.shape.find_first_touch(a, e, contact_distance, close, self.dev.surface.push_out[None] * h)
+                s, depth, n = self.dev.shape.find_first_touch(a, e, contact_distance, close, self.dev.surface.most_parting(h))
                 if s > 1:
                     going = False
                 elif k < TOUCHES:

@@ -30,7 +30,7 @@ class Polygon(Moving):
 
     def __init__(
         self, vertices, inside: bool = False, *, closed: bool = True, radius: float = 0.0, position: ArrayLike = 0.0, rotation:
-        ArrayLike = 0.0, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
+        ArrayLike = 0.0, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float | None = None, active: bool |
         None = None, events: bool = False, surface_velocity=None, one_way=None,
     ):  # fmt: skip
         vertices = checks.points("Polygon", "vertices", vertices, dim=2)

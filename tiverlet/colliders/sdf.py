@@ -55,8 +55,8 @@ class Sdf(Moving):
 
     def __init__(
         self, function, gradient=None, *, radius: float = 0.0, position: ArrayLike = 0.0, rotation: ArrayLike = 0.0, friction:
-        ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
-        None = None, events: bool = False, surface_velocity=None,
+        ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float | None = None, active: bool | None = None, events: bool
+        = False, surface_velocity=None,
     ):  # fmt: skip
         check_function("Sdf", "function", function, ("p",), (1,))
         if gradient is not None:
@@ -137,6 +137,24 @@ class Sdf(Moving):
             self.dev.probe = _Probe(self, dim)
         return self.dev.probe  # type: ignore[reportReturnType]  # it has no middle, since it is not limited
 
+    has_facets = False
+
+    @ti.func
+    def near_sides(self, i, reach):
+        """Return its only side."""
+        return 0, 1
+
+    @ti.func
+    def side_at(self, place):
+        """Return its only side."""
+        return place
+
+    @ti.func
+    def least_gap(self, face, i, radius):
+        """Return the function at the end of the frame, less how far the wall moves there."""
+        q = self.dev.pose.inward_at_end(self.dev.state.inside(self.dev.state.place(i)))
+        return self.dev.shape.function(q) - ti.cast(self.radius, self.dev.real) - radius - self.dev.pose.motion(q.norm())
+
 
 class FunctionShape(Shape):
     """The shape where a function of the position is negative, on the device."""
@@ -210,6 +228,19 @@ class FunctionShape(Shape):
         return out
 
     @ti.func
+    def facet_gap(self, f, q, e, contact_distance):
+        """Return the gap, the normal and the curvature: that of the function on the way e across the normal, or on a step of
+        differences if that is longer, so that rounding does not matter."""
+        n, size = self.normal(q, contact_distance)
+        value, t, bend, steep = self.function(q), e - e.dot(n) * n, 0 * contact_distance, ti.max(size, LEAST)
+        length = t.norm()
+        if length > 0:
+            step = ti.max(length, self.difference(q, contact_distance))
+            t *= step / length
+            bend = 2 * (self.function(q + t) - value - size * n.dot(t)) / (steep * step * step)
+        return (value - contact_distance) / steep, n, bend
+
+    @ti.func
     def find_first_touch(self, a, e, contact_distance, close, limit):
         """Find the first touch on the way from a to a + e, see Shape.find_first_touch().
 
@@ -280,7 +311,7 @@ class _Probe:
     """The function at many points, evaluated from Python in f64."""
 
     limited = False
-    sides = 0
+    sides = 1
 
     def __init__(self, wall: Sdf, dim: int):
         self.compiler = Compiler(ti.f64)

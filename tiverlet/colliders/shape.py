@@ -79,8 +79,8 @@ class Shape:
         return 0, 0
 
     @ti.func
-    def facet_gap(self, f, q):
-        """Return how far q is from facet f [m], negative behind it; the normal, and the curvature of that distance [1/m].
+    def facet_gap(self, f, q, e, contact_distance):
+        """Return the gap at q to facet f [m], the normal, and the curvature of the gap [1/m] along a displacement e.
 
         A facet that another one hides is far away."""
         return 0 * q[0], q, 0 * q[0]

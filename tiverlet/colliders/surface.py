@@ -18,26 +18,27 @@ TOUCH = 2.0**-20  # of the size of a wall: a start no deeper inside than this co
 SLOW = 8.0  # a linked particle does not bounce if it approaches by less than this times what forces and links of a substep add
 NEAR = 1 / 64  # of its displacement: a particle that starts closer to a surface than this lies on it, and may slide along it
 ALONG = 0.9  # cosine of the largest angle by which a surface turns along a displacement that counts as a slide: 26 degrees
+PUSH_OUT = 1.0  # [m/s] at which particles leave walls that give no speed
 ON = 1e-3  # of its distance from the middle of a wall: a particle no deeper inside than this lies on the wall
 
 
 class Surface:
     """The response of the surface of one collider on the device: friction, restitution, push_out; Collider defines them.
 
-    friction: coefficients, or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s]. active: whether the wall
-    is present, or None for a wall without a switch. turns: whether it resists rolling, or bounces across the normal. poses: the
-    Pose of a wall that may turn; else none. log: of events, or None. one_way: unit vector along which the wall lets particles
-    pass, or None. velocity: of the surface relative to the wall [m/s], or None.
+    friction: coefficients, or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s], or None. active: whether
+    the wall is present, or None for a wall without a switch. turns: whether it resists rolling, or bounces across the normal.
+    poses: the Pose of a wall that may turn; else none. log: of events, or None. one_way: unit vector along which the wall lets
+    particles pass, or None. velocity: of the surface relative to the wall [m/s], or None.
     """
 
     def __init__(
-        self, scene: "Scene", name: str, friction: "Coefficients | None", restitution: "Bounce | None", push_out: float, active:
-        bool | None, turns: bool, log: "WallLog | None", one_way: Any, velocity: Any,
+        self, scene: "Scene", name: str, friction: "Coefficients | None", restitution: "Bounce | None", push_out: float | None,
+        active: bool | None, turns: bool, log: "WallLog | None", one_way: Any, velocity: Any,
     ):  # fmt: skip
         self.log: Any = log
         self.has_log = log is not None
         self._memory, self.state, self.real = scene.memory, scene.state, scene.real
-        self.push_out = scene.memory.field(f"{name}.push_out", None, values=push_out)
+        self.push_out = scene.memory.field(f"{name}.push_out", None, values=-1.0 if push_out is None else push_out)
         self.has_friction, self.has_restitution = friction is not None, restitution is not None
         self.impacts: Any = scene.impacts
         # A particle with spin and friction bounces alone, since the extra passes do not change its spin.
@@ -65,9 +66,11 @@ class Surface:
         if self.has_switch:
             self.active = scene.memory.field(f"{name}.active", None, kind=ti.i32, values=float(active or 0))
 
-    def upload(self, friction: "Coefficients", restitution: "Bounce", active: bool, velocity: Any, push_out: float) -> None:
+    def upload(
+        self, friction: "Coefficients", restitution: "Bounce", active: bool, velocity: Any, push_out: float | None
+    ) -> None:
         """Write these values to the device, as far as kernels read them."""
-        self._memory.write(self.push_out, push_out)
+        self._memory.write(self.push_out, -1.0 if push_out is None else push_out)
         if self.has_friction:
             self._memory.write(self.friction, friction[:2])
         if self.has_restitution:
@@ -83,6 +86,12 @@ class Surface:
     def was_active(self) -> bool:
         """Whether the wall was present in the last frame."""
         return not self.has_switch or bool(self._memory.read(self.active))
+
+    @inline
+    def most_parting(self, h):
+        """Return how far a particle that was inside moves out in a substep at most [m]."""
+        speed = at(self.push_out, None)
+        return ti.select(speed < 0, ti.cast(PUSH_OUT, self.real), speed) * h
 
     @inline
     def static(self):
@@ -163,11 +172,11 @@ class Surface:
         if self.is_deferred(i):
             depth = ti.min(depth, 0)
         if depth > ti.select(mode == ANY_DEPTH, 0, close):
-            move = ti.max(depth - ti.max(start_depth - self.push_out[None] * h, 0), 0)
+            move = ti.max(depth - ti.max(start_depth - self.most_parting(h), 0), 0)
             # Normal displacement after the substep. A particle that bounced may be moved further than its displacement changes.
             after = leaving + move
             if not slides:
-                after = ti.min(after, ti.max(ti.abs(leaving), self.push_out[None] * h))
+                after = ti.min(after, ti.max(ti.abs(leaving), self.most_parting(h)))
             rise, left = 0 * depth, 1 + 0 * depth
             if ti.static(self.has_restitution or self.has_impacts):
                 # After an earlier bounce in this substep, the straight path to the present position begins at the height `gap`.

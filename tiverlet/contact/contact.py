@@ -1,6 +1,5 @@
 """Contacts of discs and spheres."""
 
-import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -39,7 +38,6 @@ from .rows import Rows
 from .spinning import Spinning
 from .velocity_projection import VelocityProjection
 
-SWITCH = os.environ.get("TIVERLET_ROWS", "0") == "1"
 RELAXATION = 1.25  # below 4/3, see Contact
 CARRY = 0.4  # largest share of its last push that a pair keeps; below 1/2
 
@@ -47,67 +45,27 @@ CARRY = 0.4  # largest share of its last push that a pair keeps; below 1/2
 class Contact(PairContact):
     """Contacts of discs and spheres: no two of them overlap.
 
-    C(x) = |x_i - x_j| - (r_i + r_j) >= 0 for all pairs, grad_i C = n = (x_i - x_j) / |x_i - x_j|.
+    C(x) = |x_i - x_j| - (r_i + r_j) >= 0 for all pairs, with Coulomb friction and restitution. See README.md in contact for the
+    law, and for where worlds still use an older one: with constraints, and with restitution above 0.97.
 
-    friction: Coulomb friction, a number or (static, dynamic), or a mapping from pairs of groups to these: {(0, 1): 0.5}.
-    restitution: 0 to 1, or such a mapping.
+    friction: Coulomb friction, a number, (static, dynamic) or (static, dynamic, rolling, twisting), or a mapping from pairs of
+    groups to these: {(0, 1): 0.5}. Friction turns particles that spin. rolling, twisting: against rolling, a moment of up to
+    rolling * r times the normal force with r = r_i r_j / (r_i + r_j), and against spinning about the normal (Luding 2008).
+    restitution: 0 to 1, (normal, tangential), or such a mapping. A bounce keeps the square of it of the energy along the normal,
+    whatever the substep. tangential: points that touch leave across the normal at -tangential times their velocity, as far as
+    friction holds it; 0 grips, 1 is a super ball (Walton 1993).
     groups: the pairs of groups that touch, None for all.
     skin: how far beyond contact distance pairs are listed [m], "auto" for 0.75 of the median radius. It affects speed only, never
     the result.
-    push_out: largest speed [m/s] at which two particles part that overlap at the start, or after positions were assigned. They
-    act as if they were small enough to fit, and grow back. In a cluster each pair parts at about that speed, so the rim moves
-    as many times faster as there are pairs on the way to it.
+    push_out: largest speed [m/s] at which two particles part that overlap; None, the default, for a quarter of the smaller radius
+    in a substep. In a cluster the rim moves as many times faster as there are pairs on the way to it.
     events: whether World.events() reports which pairs met and parted.
     sensors: pairs of groups that do not touch. World.events() reports which particles of the second group, the sensors, overlap
     particles of the first group. It costs least where sensors are few.
-    loads: whether pairs store the load that they bear at rest, and hold it without overlap; see known_loads.py.
+    loads: in worlds with constraints, whether pairs store the load that they bear at rest; see known_loads.py. Elsewhere they do.
 
-    Jacobi pass: each pair takes C back along n, split by mass, p = C / (m_i w_i + m_j w_j). This conserves momentum, and angular
-    momentum with n at the start of the substep, see DiscGeometry.impact(). The mass of a particle is split m times, where m
-    bounds the eigenvalues of S, the sum of n n^T over its overlapping pairs. Then sum w J J^T <= diag(sum w m) for the rows J of
-    its pairs, and no eigenvalue of a pass exceeds 1. m is 3 for a disc among six neighbours (counting pairs gives 6) and 4 for a
-    sphere among twelve. Friction corrects tangents, too; n n^T and t t^T sum up to the number of pairs. So with
-    friction, and for up to two pairs, m is that number. m is computed anew when the set of touching pairs changes, where i moves
-    by a 64th of its radius, and every 8 substeps because pairs slide. m rises at once and decays by 1/32 of its excess per pass;
-    otherwise the stiffness would jump whenever a contact opens, and keep pairs moving.
-
-    Over-relaxation: pushes are over-relaxed by r = 5/4, and a pair that overlapped in the last substep keeps a part of its push.
-    With M = m_i w_i + m_j w_j, p = r C / M + c p_last, but no more than separates the pair alone, C / (w_i + w_j). For a mode
-    with eigenvalue L of a pass, stepping has the characteristic polynomial (z - 1)^2 (z - c) + r L z (2 z - 1). It is stable if
-    and only if c < 1/2 and r L < 4 (1 + c) / 3. A load needs (1 - c) / r of the overlap that it would need otherwise. c is 0.4,
-    or less where p would exceed that bound at rest. So the k-th contact below the top of a stack overlaps by 2 k g h^2. Sound
-    (waves through loaded contacts) is removed now and then, see velocity_projection.py.
-
-    Two particles in the same place part in a direction computed from their indices, a different one for each pair. Linked
-    particles (Distance, Rope, Spacer) do not touch, nor do particles that a chain of links holds closer than the sum of their
-    radii, see exclusions.py.
-
-    Friction takes back the slip s of a pair, up to friction times the overlap. s is the tangential displacement since the pair
-    touched, kept as long as it touches (Cundall and Strack 1979). Restitution gives the pair, from the time of impact on, -e
-    times its normal velocity at that time, with the force in that substep. Neither depends on h: a bounce keeps e^2 of the energy
-    along the normal, to rounding under uniform forces, and to second order under others.
-
-    Particles that spin (see Particles): the slip is that of the points that touch, and friction there turns the particles.
-    friction = (static, dynamic, rolling, twisting) also resists rolling, by a moment of up to rolling * r times the normal force,
-    with r = r_i r_j / (r_i + r_j). It resists spinning about the normal by up to twisting * r times that force (Luding 2008).
-    restitution = (normal, tangential): in an impact the points that touch leave across the normal at -tangential times their
-    velocity, as far as friction holds it; 0 grips, 1 is a super ball (Walton 1993). Friction of particles without spin does not
-    turn them.
-
-    Bodies of rigid links, and rigid clusters (ShapeMatch), that meet at restitution > 0 leave by Newton's law for rigid bodies,
-    see BodyImpacts. With 0, the default, bodies that meet go on together, see BodyProjection.
-
-    Several impacts of one disc in a substep are resolved one after the other. A round takes the struck pairs that come first
-    for both of their particles; the next round takes the next pairs, on the new paths. Each impact is between two particles, so
-    it conserves momentum, and energy if e = 1, however many impacts there are. Unless e > 0.97, what touches others when a wall
-    strikes it leaves the wall with them, see ImpactProjection.
-
-    Slack is the overlap left after an impact. It is not pushed out, which would add energy, because pushes act like springs and
-    no spring was there when the pair was thrown together. It is removed from positions only, an eighth per substep. Other overlap
-    of pairs that bounce is pushed out: overlap that arose while pushes acted, or in the substep in which the pair comes to rest.
-    A pair with slack rests unless it comes together by more than the slack in a substep, or e is 1; otherwise it bounces again,
-    or separates freely. Unless e is 1, a pair also rests if it comes together no faster than two substeps of forces make it. A
-    pair of bodies rests if e times its approach would not end its overlap, and its slack is pushed out, see kept_slack().
+    Two particles in the same place part in a direction computed from their indices. Linked particles (Distance, Rope, Spacer) do
+    not touch, nor do particles that a chain of links holds closer than the sum of their radii, see exclusions.py.
     """
 
     def __init__(
@@ -124,12 +82,12 @@ class Contact(PairContact):
 
     @property
     def solves_rows(self) -> bool:
-        """Whether pairs and walls are rows, see rows.py: private switch while it is new."""
+        """Whether pairs and walls are rows, see rows.py. README.md in step says where they are not."""
         linked = any(not f.is_kinematic for f in self.ties)
         bounces = [self.restitution, *(w.restitution for w in self.walls)]
         values = [e for v in bounces for e in (v.values() if isinstance(v, Mapping) else [v])]
         cradle = any(float(np.ravel(e)[0]) > CRADLE for e in values)
-        return SWITCH and not cradle and not linked and all(w.sides and w.one_way is None for w in self.walls)
+        return not cradle and not linked
 
     @property
     def projects(self) -> bool:
@@ -159,10 +117,10 @@ class Contact(PairContact):
         dev, now = self.dev, change.now
         if not self.can_touch:
             return not bool((now.radius > 0).any())
-        splits = (
-            not dev.rows and dev.splitting.can_regroup(dev.list.team.piece_of(now.count)) and dev.projection.can_regroup(now.mass)
+        splits = dev.rows or (
+            dev.splitting.can_regroup(dev.list.team.piece_of(now.count)) and dev.projection.can_regroup(now.mass)
         )
-        return splits and bool((now.radius > 0).any()) and dev.search.can_regroup(change, now.radius)
+        return bool(splits) and bool((now.radius > 0).any()) and dev.search.can_regroup(change, now.radius)
 
     def regroup(self, change: Regrouping) -> None:
         """Resize the fields after particles came and went. The thread team already has the new number."""
@@ -172,6 +130,9 @@ class Contact(PairContact):
         self._measure(change.now.radius)
         self.table.regroup(self.scene, change.now.group)
         dev.search.regroup(change, self._present_skin, change.now.radius)
+        if dev.rows:
+            dev.impulses.regroup(n)
+            return
         dev.splitting.regroup(n)
         dev.projection.regroup(n, dev.list.team)
 

@@ -40,11 +40,11 @@ from .limits import (
     OWN,
     PASSES,
     RELAXATION,
-    RESTING,
     ROUNDING,
     ROWS,
     SHARE,
     SLOW,
+    STEADY,
     SUMS,
     THETA,
     TOLERANCE,
@@ -71,13 +71,18 @@ class Impulses:
         self.rows, self.bodies, self.islands, self.team, self.state = rows, bodies, islands, team, scene.state
         self.met, self.least = MET[rows.has_friction], LEAST[rows.has_friction]
         self.n, self.real, self.dim, self.has_friction = scene.count, scene.real, scene.particles.dim, rows.has_friction
-        count, add = scene.particles.count, scene.memory.field
-        self.blocks = scene.memory.number(-(-count // BLOCK))
-        self.sums = add("Contact.sums", scene.count, width=len(SUMS))
+        add = scene.memory.field
+        self.blocks = scene.memory.number(-(-scene.particles.count // BLOCK))
+        self.memory, self.sums = scene.memory, add("Contact.sums", max(1, self.blocks), width=len(SUMS))
         self.each: Any = add("Contact.sums_of_particles", scene.count, width=len(SUMS)) if team.launched else None
-        self.numbers = add("Contact.passes", None, width=4)
+        self.numbers = add("Contact.passes", None, width=3)
         self.flags = add("Contact.flags", None, width=3, kind=ti.i32)
         self.last_h2 = add("Contact.last_h2", None, state=True)  # h^2 of what rows bore [s^2]; 0 before the first substep
+
+    def regroup(self, n: int) -> None:
+        """Adapt to a new number of particles."""
+        self.blocks = -(-n // BLOCK)
+        self.memory.resize(self.sums, max(1, self.blocks))
 
     @inline
     def going(self):
@@ -107,13 +112,14 @@ class Impulses:
 
     @ti.func
     def begin(self, now, h2):
-        """Begin a substep. h2: the square of its length [s^2], half of that at a start. One thread calls it."""
+        """Begin a substep. h2: what an acceleration of 1 m/s^2 adds to a displacement in it [s^2]. One thread calls it."""
         before = self.last_h2[None]
         scale = ti.cast(0, self.real)
         if before > 0:
             scale = h2 / before
         self.last_h2[None] = h2
-        self.rows.times[None] = [now.h, now.frame_fraction[0], now.frame_fraction[1], scale]
+        whole, shares = h2 / (now.h * now.h), self.rows.spin_shares()
+        self.rows.times[None] = [now.h, now.frame_fraction[0], now.frame_fraction[1], scale, whole, shares]
         self.flags[None] = [1, 0, 0]
 
     @ti.func
@@ -261,8 +267,8 @@ class Impulses:
                 yn = y.dot(n)
                 normal = ti.max(yn - gap * stiff[0], 0)
                 new = self.cone(normal, y - yn * n - stiff[1] * t, self.rows.friction.field[row], n)
-                miss = (normal - yn) / stiff[0]
-                lack += miss * miss
+                miss, slip = (normal - yn) / stiff[0], (new - y - (normal - yn) * n) / stiff[1]
+                lack += miss * miss + slip.dot(slip)
                 uphill += (y - new).dot(new - before)
                 load += normal
             else:
@@ -296,7 +302,7 @@ class Impulses:
         """Before the first pass: no extrapolation, and what rows may lack. One thread calls it."""
         rows, force = self.total(ROWS), self.total(FORCE)
         mean = force / ti.max(ti.cast(self.n, self.real), 1)
-        self.numbers[None] = [0, ti.static(MOMENTUM), self.met * self.met * mean * rows, ti.static(SLOW) * ti.sqrt(mean)]
+        self.numbers[None] = [0, ti.static(MOMENTUM), self.met * self.met * mean * rows]
         self.flags[None][GOING], self.flags[None][TURN] = ti.cast(rows > 0, ti.i32), 0
 
     @ti.func
@@ -325,7 +331,7 @@ class Impulses:
     @ti.func
     def start_places(self):
         """Before the first pass of stage 2. One thread calls it."""
-        self.numbers[None] = [0, 1, 0, 0]
+        self.numbers[None] = [0, 1, 0]
         self.flags[None] = [ti.cast(self.total(ROWS) > 0, ti.i32), 0, 0]
 
     @ti.func
@@ -354,28 +360,36 @@ class Impulses:
         return out
 
     @ti.func
+    def weight(self, i):
+        """Return the impulse of the forces on particle i in this substep [kg m]."""
+        out, w = ti.cast(0, self.real), self.bodies.compliance(i)
+        if w > 0:
+            out = self.rows.kick(i).norm() / w
+        return out
+
+    @ti.func
     def sum_impacts(self, i, part):
-        """Add up the part of the impulses on particle i that is none of a load, because its rows did not bear it before."""
+        """Add up the part of the impulses on particle i that is none of a load.
+
+        A load is what a row bore before, but for what forces may change in a substep and a small part; an impact passes.
+        """
         p_own, m_own, scale = 0 * self.state.d[i], self.no_moment(), self.rows.times[None][3]
         for row in range(self.rows.first(i, part), self.rows.last(i, part)):
             n = self.rows.normal.field[row]
             p, before = self.rows.p.field[row], self.rows.memory.field[self.rows.entry.field[row]]
-            size, load = self.rows.along(p, n), scale * self.rows.along(before, n)
-            if size > load:  # what came together no faster than forces move it is no impact
-                u = self.state.d[i]
-                if row < self.rows.pressed[i]:
-                    u -= self.state.d[self.rows.other.field[row]]
-                elif ti.static(len(self.rows.walls) > 0):
-                    u -= self.rows.moved.field[row]
-                if -u.dot(n) <= self.numbers[None][RESTING]:
-                    load = size
+            size, borne = self.rows.along(p, n), ti.max(scale * self.rows.along(before, n), 0)
+            load, slight = size, self.weight(i)
+            if row < self.rows.pressed[i]:
+                slight += self.weight(self.rows.other.field[row])
+            if ti.abs(size - borne) > ti.static(SLOW) * slight + ti.static(STEADY) * size:
+                load = ti.static(SLOW) * slight
             if ti.static(self.rows.bounces):
                 if self.rows.when[i] > 0:  # in an island with an impact, what is more than before came of that
-                    load = ti.max(scale * self.rows.along(before, n), 0)
+                    load = borne
                 if self.rows.bounce.field[row] > 0:
                     load = 0
             if size > load:
-                impact = (1 - ti.max(load, 0) / size) * self.rows.vector(p, n)
+                impact = (1 - load / size) * self.rows.vector(p, n)
                 p_own += impact
                 if ti.static(self.bodies.spins):
                     m_own += self.bodies.spin.moment(n, impact)

@@ -11,6 +11,7 @@ MOMENTUM = 10.0  # Nesterov's theta of the first pass, after about twice as many
 LEFT = 1e-6  # share of the mean square of what rows lack in the first pass that may be left, where no forces act
 ROUNDING = 0.1  # of what rows may lack: times the impulses, the work that they may do
 SLOW = 2.0  # times the displacement by forces: what comes together no faster does not bounce, but rests
+STEADY = 1 / 16  # of an impulse: it may change by so much in a substep, beside what forces change, and be a load
 CRADLE = 0.97  # coefficient of restitution above which pairs bounce one after the other
 NOISE = 64.0  # times the rounding of a displacement: what comes together no faster is at rest
 SLOP = 0.003  # overlap that places leave, in radii of the smaller particle: contacts stay closed
@@ -22,5 +23,5 @@ BLOCK = 64  # particles whose sums are added up first, so that sums have the sam
 
 FOREIGN, OWN = range(2)  # parts of the rows of a particle: those that a particle of a lower piece has, too, and its own
 LACK, UPHILL, WORK, LOAD, ROWS, FORCE, HITS = SUMS = range(7)  # sums over rows and particles
-BETA, THETA, TOLERANCE, RESTING = range(4)  # numbers of the passes; RESTING: the approach of what rests, at most [m]
+BETA, THETA, TOLERANCE = range(3)  # numbers of the passes
 GOING, TURN, GAINS = range(3)  # whether another pass follows, its number, whether any particle gains energy

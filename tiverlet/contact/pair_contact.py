@@ -199,7 +199,7 @@ class PairContact(Feature):
     @property
     def has_loads(self) -> bool:
         """Whether pairs store the loads that they bear, see known_loads.py."""
-        return bool(vars(self).get("loads"))
+        return bool(vars(self).get("loads")) and not self.solves_rows
 
     @property
     def lands(self) -> bool:

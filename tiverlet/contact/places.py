@@ -5,10 +5,10 @@ alone. That gives no momentum, so overlap stores no energy. The slop keeps conta
 gaps that open, and a pile would never rest.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..device import ti
-from ..device.number import OnDevice
+from ..neighbours.neighbour_list import WALL
 from .limits import BEYOND, OWN, SLOP, TURN
 
 if TYPE_CHECKING:
@@ -22,11 +22,9 @@ if TYPE_CHECKING:
 class Places:
     """Stage 2 of the contacts of one world."""
 
-    n: Any = OnDevice()
-
     def __init__(self, scene: "Scene", rows: "Rows", bodies: "FreeParticles", impulses: "Impulses", team: "Team"):
         self.rows, self.bodies, self.impulses, self.team, self.state = rows, bodies, impulses, team, scene.state
-        self.n, self.real, self.dim, self.radius = scene.count, scene.real, scene.particles.dim, scene.radius
+        self.radius = scene.radius
 
     @ti.func
     def begin(self, i):
@@ -40,13 +38,13 @@ class Places:
 
         Rows of particles that have not moved since they were found apart are not tested again.
         """
-        out, total = ti.cast(0, self.real), 0 * self.state.d[i]
+        out, total = ti.zero(self.radius.of(i)), 0 * self.state.d[i]
         kept, pressed, own = self.rows.kept[i], self.rows.pressed[i], self.radius.of(i)
         again = self.impulses.flags[None][TURN] > 0
         still = again and (self.bodies.last[i] == 0).all()
         for row in range(self.rows.first(i, part), self.rows.last(i, part)):
             other = self.rows.other.field[row]
-            gap, n, slop = ti.cast(1, self.real), 0 * total, own
+            gap, n, slop, push_out = 0 * own + 1, 0 * total, own, self.rows.push_out
             if row < pressed:
                 if not (still and (self.bodies.last[other] == 0).all()):
                     r = self.state.separation(i, other)
@@ -60,10 +58,10 @@ class Places:
                             n = self.rows.geometry.fallback_normal(i, other, r)
             elif ti.static(len(self.rows.walls) > 0):
                 if not still:
-                    gap, n = self.rows.wall_gap(i, other - self.n)
+                    gap, n, push_out = self.rows.wall_gap(i, other - WALL)
             if gap < ti.static(-SLOP * BEYOND) * slop:
                 if not again:
-                    self.rows.gap.field[row] = gap + self.rows.most_parting(slop)
+                    self.rows.gap.field[row] = gap + self.rows.most_parting(slop, push_out)
                 gap -= ti.min(self.rows.gap.field[row], ti.static(-SLOP) * slop)
             else:
                 gap = 0 * gap

@@ -22,7 +22,7 @@ class FreeParticles:
         self.rows: Any = None  # the rows that give impulses
         self.state, self.spins, self.real, self.dim = scene.state, spins, scene.real, dim
         self.v, self.last, self.push = (add(f"Contact.{name}", n, width=dim) for name in ("v", "v_last", "push"))
-        self.new = add("Contact.v_new", n, width=dim, state=True)  # after a substep: its displacement, for the next one
+        self.new = add("Contact.v_new", n, width=dim)
         if spins:
             axes, self.spin = scene.particles.axes, scene.state.spin
             self.s, self.new_s, self.last_s, self.moment = (
@@ -48,7 +48,7 @@ class FreeParticles:
         """Return by how much a unit tangential impulse moves the point of contact of particle i [1/kg]."""
         w = self.compliance(i)
         if ti.static(self.spins):  # moments against rolling share the spin
-            w *= 1 + ti.static(2 if self.rows.turns else 1) * self.spin.inverse_inertia.of(i)
+            w *= 1 + self.rows.times[None][5] * self.spin.inverse_inertia.of(i)
         return w
 
     @ti.func

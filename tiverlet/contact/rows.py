@@ -1,7 +1,7 @@
 """The rows of contacts: pairs and walls that may press on a particle in a substep, with what they bore in the last one.
 
-Rows live at the entries of the neighbour list. Entries of walls stand behind those of particles; their number is that of the
-particles plus that of the wall's face. In each substep those that may press are listed as rows, particle by particle, so that
+Rows live at the entries of the neighbour list. Entries of walls stand behind those of particles; their number is WALL plus
+that of the wall's face. In each substep those that may press are listed as rows, particle by particle, so that
 passes run through memory in order.
 
 A row of two particles that both move belongs to the first of them, which gives the other one its impulse. Where the two are in
@@ -15,8 +15,8 @@ from ..device import at, inline, ti
 from ..device.language import impl
 from ..device.number import OnDevice
 from ..features.material import DYNAMIC, RESTITUTION, ROLLING, STATIC, TANGENTIAL, TOUCH, TOUCHES, TWISTING
-from ..neighbours.neighbour_list import Column, PairData
-from .limits import FEW, FOREIGN, NOISE, OWN, QUARTER, SLOP, SLOW
+from ..neighbours.neighbour_list import WALL, Column, PairData
+from .limits import BEYOND, FEW, FOREIGN, NOISE, OWN, QUARTER, SLOP, SLOW
 
 if TYPE_CHECKING:
     from ..device.thread_team import Team
@@ -30,15 +30,15 @@ class Rows:
     The rows of a particle: from `begin` those that particles of lower pieces have, too; from `own` those that give the other
     particle its impulse; from `kept` other pairs; from `pressed` walls, up to `end`. share: among how many rows the mass of a
     particle is divided.
-    Columns by row: `other` the other particle, or n + the side of a wall; `entry` in the neighbour list; `normal`; `gap` at the
-    start of the substep where it was open [m]; `bend` the curvature of the gap [1/m]; `stiff` the effective mass in a pass of
+    Columns by row: `other` the other particle, or WALL + the face of a wall; `entry` in the neighbour list; `normal`; `gap` at
+    the start of the substep where it was open [m]; `bend` the curvature of the gap [1/m]; `stiff` the effective mass in a pass of
     impulses, along the normal and across it, and `firm` in one of places [kg]; `friction` static and dynamic; `moved` the motion
     of a wall in the substep [m]; `p` the impulse and `step` its change in the last pass [kg m].
     The normal is that at the start of the substep, or that of the time at which a pair meets.
     """
 
     n: Any = OnDevice()
-    push_out: Any = OnDevice()  # largest speed at which pairs part that overlap [m/s]; negative for QUARTER
+    push_out: Any = OnDevice()  # largest speed at which pairs part that overlap [m/s]; negative for QUARTER of the radius
 
     def __init__(
         self, scene: "Scene", table: Any, has_friction: bool, bounces: bool, turns: bool, walls: list[Any], team: "Team"
@@ -57,7 +57,7 @@ class Rows:
         if scene.state.spins:
             self.turned = add("Contact.turned", n, width=scene.particles.axes, state=True)
         # What each pair and wall bore in the last substep [kg m]: along the normal, or with friction the whole vector.
-        self.memory = PairData("impulse", self.width, persistent=True, has_owner=True)
+        self.memory = PairData("impulse" if has_friction else "push", self.width, persistent=True, has_owner=True)
         self.other, self.entry = Column("row_other", kind=ti.i32), Column("row_entry", kind=ti.i32)
         self.normal, self.gap, self.bend = Column("row_normal", self.dim), Column("row_gap"), Column("row_bend")
         self.stiff, self.firm = Column("row_stiff", 2 if has_friction else 0), Column("row_firm")
@@ -79,7 +79,6 @@ class Rows:
             self.touched = PairData("touches", 0, persistent=True, kind=ti.i32, has_owner=True)
             self.bounce, self.time, self.target = Column("row_bounce"), Column("row_time"), Column("row_target")
             self.columns += [self.bounce, self.time, self.target]
-            self.kick = add("Contact.kick", n, width=self.dim)  # displacement by forces in the substep
             self.when = add("Contact.when", n)  # the part of the substep before the impact of the island of a particle
         self.logging = [group for group in walls if group.wall.events]  # each has a log of its own
         self.events: Any = None
@@ -93,8 +92,9 @@ class Rows:
             self.columns += [self.f, self.f_step, self.arms, self.rolling, self.turn_stiff, self.across]
         self.divided = team.size > 1 or team.launched
         self.has_still = bool((scene.inv_mass == 0).any()) or bool(scene.state.sleepers)  # particles that impulses do not move
-        # The substep [s], the fractions of the frame at its ends, and by how much what rows bore is scaled.
-        self.times = add("Contact.times", None, width=4)
+        # The substep [s], the fractions of the frame at its ends, by how much what rows bore is scaled, the part of State.kick()
+        # that the substep adds to displacements, and spin_shares().
+        self.times = add("Contact.times", None, width=6)
         self.list: Any = None
         self.geometry: Any = None
 
@@ -103,6 +103,11 @@ class Rows:
         self.list, self.geometry = listed, geometry
         listed.columns = [*listed.columns, *self.columns]
         listed.movable = lambda: self.scene.inv_mass > 0
+
+    @property
+    def sheared(self) -> bool:
+        """Whether images of particles move relative to each other."""
+        return bool(self.state.images and self.state.images.sheared)
 
     @property
     def logs_pairs(self) -> bool:
@@ -168,6 +173,27 @@ class Rows:
     def frame_fraction(self):
         """Return the fractions of the frame at the start and the end of the substep."""
         return ti.Vector([self.times[None][1], self.times[None][2]])
+
+    @ti.func
+    def kick(self, i):
+        """Return the displacement that forces add to particle i in the substep [m]."""
+        return self.times[None][4] * self.state.kick(i)
+
+    @ti.func
+    def spin_shares(self):
+        """Return among how many kinds of moments each row divides the spin of its particles: 2 if any resists rolling."""
+        out = 1
+        if ti.static(self.turns and self.table.turns):
+            for k in range(ti.static(1 if self.table.uniform else self.table.groups**2)):
+                c = self.table.entries[k]
+                if c[ROLLING] + c[TWISTING] > 0:
+                    out = 2
+        for group, w in ti.static([(g, g.wall) for g in self.walls if self.turns and g.wall.turns]):
+            for k in range(group.count()):
+                group.enter(k)
+                if w.dev.surface.rolling[None][0] + w.dev.surface.rolling[None][1] > 0:
+                    out = 2
+        return out
 
     @ti.func
     def clear(self, i):
@@ -252,13 +278,19 @@ class Rows:
 
     @ti.func
     def work_of_others(self, i):
-        """Return the work of the rows of particle i on what nothing moves, as walls and driven particles, times h^2 [kg m^2]."""
+        """Return the work of the rows of particle i on what they do not move: walls, driven particles, a periodic box sheared.
+
+        It is times h^2 [kg m^2]."""
         out, pressed = ti.cast(0, ti.f64), self.pressed[i]
         if ti.static(self.has_still):
             for row in range(self.kept[i], pressed):
                 other = self.other.field[row]
                 if not self.state.moves(other):
                     out += self.vector(self.p.field[row], self.normal.field[row]).dot(self.state.d[other])
+        if ti.static(self.sheared):
+            for row in range(self.own[i], pressed):
+                sheared = self.state.relative_displacement(0 * self.state.d[i], i, self.other.field[row])
+                out -= self.vector(self.p.field[row], self.normal.field[row]).dot(sheared)
         if ti.static(len(self.walls) > 0):
             for row in range(pressed, self.end[i]):
                 out += self.vector(self.p.field[row], self.normal.field[row]).dot(self.moved.field[row])
@@ -274,14 +306,16 @@ class Rows:
         # Nearest on the way: what passes each other within the substep touches there.
         uu, ru, start = u.dot(u), r.dot(u), r - u
         passes = ru > 0 and ru < uu and rr * uu - ru * ru < distance * distance * uu
-        lists = rr < near * near or self.is_set(p) or passes
+        # Where one of them is stopped, the other one goes on.
+        ahead = 2 * ti.max(-start.dot(self.state.d[i]), start.dot(self.state.d[j]))
+        lists = rr < near * near or self.is_set(p) or passes or start.dot(start) - distance * distance < ahead
         if ti.static(not self.table.uniform):
             lists = lists and ti.cast(self.table.of(i, j)[TOUCH], ti.i32) == TOUCHES
         if lists:
             length = start.norm()
             bend, gap = 1 / length, ti.max(length - distance, 0)
             n = bend * start
-            if length > distance and uu > 0:  # a pair that meets in this substep has the normal of the time when it does
+            if length > near and uu > 0:  # a pair that meets in this substep has the normal of the time when it does
                 before, closing = length * length - distance * distance, -start.dot(u)
                 root = closing * closing - uu * before
                 if root >= 0 and closing > 0 and before <= closing + ti.sqrt(root):
@@ -292,10 +326,11 @@ class Rows:
                 n, bend = self.geometry.fallback_normal(i, j, r), 1 / distance
             if ti.static(self.bounces):
                 c = self.table.of(i, j)
-                f, f_own = self.kick[i], self.kick[i]
+                f, f_own = self.state.kick(i), self.state.kick(i)
                 if self.state.moves(j):
-                    f -= self.kick[j]
-                    f_own = ti.select(f_own.dot(f_own) > self.kick[j].dot(self.kick[j]), f_own, self.kick[j])
+                    f_other = self.state.kick(j)
+                    f -= f_other
+                    f_own = ti.select(f_own.dot(f_own) > f_other.dot(f_other), f_own, f_other)
                 hit, s, m = self.strike(length - distance, start / length, 1 / length, u, f, f_own, c[RESTITUTION], e, rr)
                 self.bounce.field[row], self.time.field[row] = 0, 1
                 if hit:
@@ -362,7 +397,8 @@ class Rows:
                                 s -= (c + 2 * start.dot(way) + way.dot(way)) / slope
                         m = ti.select(bend < 0, -1, 1) * (start + v * s + f * (s * s / 2)).normalized()
             met = -(v + f * s).dot(m)
-            least = ti.static(SLOW) * ti.abs(f_own.dot(m)) + self.rounding * (u.norm() + ti.sqrt(size) * ti.static(2.0**-7))
+            blur = self.rounding * (u.norm() + ti.sqrt(size) * ti.static(2.0**-7))
+            least = ti.static(SLOW) * ti.max(self.times[None][4], 1) * ti.abs(f_own.dot(m)) + blur
             rests = e * met <= ti.max(-f.dot(m), 0) * (1 - s) / 2
             hit = 0 <= s <= 1 and gap >= -met and met > least and not rests
         return hit, s, m
@@ -389,11 +425,11 @@ class Rows:
                     self.across.field[row] = 0 * self.across.field[row]
             if self.bounce.field[row] > 0:
                 other, n = self.other.field[row], self.normal.field[row]
-                u, f = self.state.d[i], self.kick[i]
+                u, f = self.state.d[i], self.state.kick(i)
                 if row < self.pressed[i]:
                     u = self.state.relative_displacement(u - self.state.d[other], i, other)
                     if self.state.moves(other):
-                        f -= self.kick[other]
+                        f -= self.state.kick(other)
                 elif ti.static(len(self.walls) > 0):
                     u -= self.moved.field[row]
                 if ti.static(self.turns):  # the points that touch leave across n at -e_t times their velocity then
@@ -433,7 +469,7 @@ class Rows:
     @ti.func
     def find_wall(self, i, e, row, scale):
         """List the wall at entry e of particle i if it may press. Returns the next free row."""
-        face, p = self.list.neighbour[e] - self.n, self.memory.field[e]
+        face, p = self.list.neighbour[e] - WALL, self.memory.field[e]
         lists = False
         for group, w in ti.static([(g, g.wall) for g in self.walls]):
             if group.has_face(face):
@@ -444,19 +480,24 @@ class Rows:
                 ahead = gap + un
                 if ti.static(w.bends):
                     ahead += self.rise(u.dot(u) - un * un, un, bend)
-                lists = ahead < ti.static(SLOP) * self.radius.of(i) or self.is_set(p)
+                # What it bore, it may still bear; but an open side, which is nowhere, has no row.
+                lists = ahead < ti.select(self.is_set(p), 1, ti.cast(SLOP, self.real)) * self.radius.of(i)
                 if ti.static(w.dev.surface.has_switch):
                     lists = lists and w.dev.surface.active[None] != 0
+                if ti.static(w.dev.surface.is_one_way):
+                    depth = ti.select(self.bore(i, group, face), 0 * gap, -gap - ti.static(SLOP * BEYOND) * self.radius.of(i))
+                    reach = self.radius.of(i) + ti.cast(w.radius, self.real)
+                    lists = lists and not w.dev.surface.lets_through(i, w.in_frame_of_one_way(n), depth, reach)
                 if lists:
                     if ti.static(self.bounces):
                         self.bounce.field[row], self.time.field[row] = 0, 1
                         if ti.static(w.dev.surface.has_restitution):
-                            f, reach = self.kick[i], self.state.place(i)
+                            f, reach = self.state.kick(i), self.state.place(i)
                             size, e_wall = reach.dot(reach), w.dev.surface.restitution[None]
                             hit, s, m = self.strike(gap, n, bend, u, f, f, e_wall, e, size)
                             if hit:
                                 n, self.bounce.field[row], self.time.field[row] = m, e_wall, s
-                    self.put(row, face + self.n, e, n, ti.max(gap, 0), bend, p * scale)
+                    self.put(row, face + WALL, e, n, ti.max(gap, 0), bend, p * scale)
                     if ti.static(w.dev.surface.has_velocity):
                         belt = w.dev.surface.velocity[None]
                         moved += self.h() * (belt - belt.dot(n) * n)
@@ -477,9 +518,19 @@ class Rows:
         return row
 
     @ti.func
+    def bore(self, i, group: ti.template(), face):  # type: ignore[valid-type]
+        """Whether the wall with this face bore particle i in the last substep, by any of its faces."""
+        out, begin = False, self.list.first[i] + self.list.number[i]
+        for e in range(begin, begin + self.list.wall_number[i]):
+            other = self.list.neighbour[e] - WALL
+            if group.has_face(other):
+                out = out or (self.is_set(self.memory.field[e]) and group.wall_of(other) == group.wall_of(face))
+        return out
+
+    @ti.func
     def log_wall(self, i, row):
         """Record the impulse of a wall in its log of events, if it presses."""
-        n, side = self.normal.field[row], self.other.field[row] - self.n
+        n, side = self.normal.field[row], self.other.field[row] - WALL
         p = self.along(self.p.field[row], n)
         if p > 0:
             moved = self.moved.field[row]
@@ -490,19 +541,17 @@ class Rows:
                     group.wall.dev.log.record(i, -(self.gap.field[row] + ahead), n, push, -ahead, moved, self.h(), False)
 
     @ti.func
-    def most_parting(self, radius):
-        """Return by how much a pair with this smaller radius, that overlaps, may part in the substep [m]."""
-        most = self.push_out * self.h()
-        if self.push_out < 0:
-            most = ti.static(QUARTER) * radius
-        return most
+    def most_parting(self, radius, push_out):
+        """Return by how much what overlaps may part in the substep [m]. radius: the smaller one."""
+        return ti.select(push_out < 0, ti.static(QUARTER) * radius, push_out * self.h())
 
     @ti.func
     def wall_gap(self, i, face):
-        """Return the gap of particle i at a wall at the end of the substep [m], and its normal."""
-        gap, n = ti.cast(1, self.real), 0 * self.state.x[i]
+        """Return the gap of particle i at a wall at the end of the substep [m], its normal, and at what speed it lets out."""
+        gap, n, push_out = ti.cast(1, self.real), 0 * self.state.x[i], ti.cast(-1, self.real)
         for group, w in ti.static([(g, g.wall) for g in self.walls]):
             if group.has_face(face):
                 group.enter(group.wall_of(face))
                 gap, n = w.end_gap(group.side_of(face), i, self.radius.of(i), self.frame_fraction())
-        return gap, n
+                push_out = w.dev.surface.push_out[None]
+        return gap, n, push_out

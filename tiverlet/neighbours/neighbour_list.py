@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 CROWDED = 300  # near pairs per particle beyond which the user is warned
 STALE = 0.49  # of the skin: a list is valid until a particle has moved so far
 MOVED = 2  # value of NeighbourList.stale where the only cause is that particles moved
-WALL = 2**30  # in persistent data: the number of the first side of a wall, whatever the number of particles
+WALL = 2**30  # the number of the first face of a wall, behind those of particles
 WORD, FULL = 32, 2**32 - 1  # entries that one word of bits covers, and a word with all bits set
 
 
@@ -110,9 +110,9 @@ class NeighbourList:
     def __repr__(self) -> str:
         return "neighbour list"
 
-    def list_walls(self) -> None:
-        """Let walls have entries, behind those of particles."""
-        self.wall_number = self.memory.field("grid.wall_number", self.n, kind=ti.i32)
+    def list_walls(self, count: Number) -> None:
+        """Let walls have entries, behind those of particles. count: of the particles."""
+        self.wall_number = self.memory.field("grid.wall_number", count, kind=ti.i32)
 
     @inline
     def count(self, i):
@@ -227,7 +227,7 @@ class NeighbourList:
     def persistent_data(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Return the listed pairs (i, j) with persistent data other than 0, sorted, and their data by name.
 
-        The result does not depend on the layout of the list.
+        The result does not depend on the layout of the list. Data that have an owner are those of the lower particle of a pair.
         """
         assert self.store
         seen = self.store.view if self.store.elastic else self.store.read
@@ -236,23 +236,18 @@ class NeighbourList:
         i, at = self._entries(first, number, not saved and self.wall_number is not None)
         near = seen(self.old_neighbour if saved else self.neighbour).take(at)
         values = {piece.name: seen(piece.old if saved else piece.field).take(at, axis=0) for piece in self.persistent}
-        if self.movable is not None:
-            copies = (near < i) & self.movable()[np.minimum(near, self.n - 1)]
-            for piece in self.persistent:
-                if piece.has_owner:
-                    values[piece.name][copies] = 0
-            near = np.where(near < self.n, near, near - self.n + WALL)
-        some = np.zeros(len(i), dtype=bool)
-        for value in values.values():
-            for column in value.T if value.ndim > 1 else [value]:  # any(axis=1) takes ten times as long
-                some |= column != 0
-        kept = np.flatnonzero(some)
-        return np.stack([i[kept], near[kept]], axis=1), {name: value.take(kept, axis=0) for name, value in values.items()}
+        pairs, values = _set(np.stack([i, near], axis=1), values)
+        if self.movable is None:
+            return pairs, values
+        (first, second), lower = self._can_move(pairs), pairs[:, 0] < pairs[:, 1]
+        return _set(*self._given(pairs, values, lower & first, ~lower & ~second))
 
     def restore(self, pairs: np.ndarray, values: dict[str, np.ndarray]) -> None:
         """Store the result of persistent_data() as the old list, from which the next build takes the data of pairs."""
         if self.movable is not None:
-            pairs, values = self._with_copies(pairs, values)
+            first, second = self._can_move(pairs)
+            pieces = pairs // self.team.piece
+            pairs, values = self._given(pairs, values, first, second & ~(first & (pieces[:, 0] == pieces[:, 1])))
         if len(pairs) > self.room:
             self.allocate(len(pairs))
         self._write_begin(self.old_neighbour, pairs[:, 1].astype(np.int32))
@@ -265,20 +260,32 @@ class NeighbourList:
         self.memory.write(self.old_saved, 1)
         self.invalidate()
 
-    def _with_copies(self, pairs: np.ndarray, values: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Return persistent data as the list stores them: with sides of walls behind particles, and in both pieces of a pair."""
-        pairs, movable = pairs.copy(), self.movable()
-        walls = pairs[:, 1] >= WALL
-        pairs[walls, 1] += self.n - WALL
-        i, j = pairs[:, 0], np.minimum(pairs[:, 1], self.n - 1)
-        both = np.flatnonzero(~walls & (i < j) & movable[i] & movable[j] & (i // self.team.piece != j // self.team.piece))
-        owned = {piece.name: -1 if piece.width else 1 for piece in self.persistent if piece.has_owner}
-        copies = {name: value[both] * owned.get(name, 0) for name, value in values.items()}
-        pairs, where = np.unique(np.concatenate([pairs, pairs[both, ::-1]]), axis=0, return_inverse=True)
-        out = {name: np.zeros((len(pairs), *value.shape[1:]), dtype=value.dtype) for name, value in values.items()}
+    def replace(self, pairs: np.ndarray, values: dict[str, np.ndarray]) -> None:
+        """Forget the list, and store the result of persistent_data() for the next one."""
+        for number in (self.number, *([] if self.wall_number is None else [self.wall_number])):
+            self.memory.write(number, 0)
+        self.restore(pairs, values)
+
+    def _can_move(self, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return whether the first and the second particle of each pair can move, (m,) each. Walls cannot."""
+        movable, walls = self.movable(), pairs[:, 1] >= WALL
+        return movable[pairs[:, 0]], movable[np.where(walls, 0, pairs[:, 1])] & ~walls
+
+    def _given(
+        self, pairs: np.ndarray, values: dict[str, np.ndarray], kept: np.ndarray, other: np.ndarray
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Return pairs and their data where data that have an owner stay in the pairs `kept`, and are also given to the other
+        particle of the pairs `other`, (m,) each."""
+        i, j = np.concatenate([pairs, pairs[other, ::-1]]).T
+        keys, where = np.unique(i * (2 * WALL) + j, return_inverse=True)
+        owned, out = {piece.name: -1 if piece.width else 1 for piece in self.persistent if piece.has_owner}, {}
         for name, value in values.items():
-            np.add.at(out[name], where.ravel(), np.concatenate([value, copies[name]]))
-        return pairs, out
+            out[name] = np.zeros((len(keys), *value.shape[1:]), dtype=value.dtype)
+            out[name][where[: len(pairs)]] = value
+            if name in owned:
+                out[name][where[: len(pairs)][~kept]] = 0
+                out[name][where[len(pairs) :]] = owned[name] * value[other]
+        return np.stack([keys // (2 * WALL), keys % (2 * WALL)], axis=1), out
 
     @property
     def saved(self) -> bool:
@@ -293,9 +300,11 @@ class NeighbourList:
         """
         assert self.store
         first, count, touching = (self.memory.view(field) for field in (self.first, self.number, self.touching))
-        i, at = self._entries(self.first, self.number)
+        i, at = self._entries(self.first, self.number, self.wall_number is not None)
         near = self.store.view(self.neighbour)
-        new = number.take(near.take(at))
+        new = near.take(at)
+        some = new < WALL
+        new[some] = number.take(new[some])
         near[at] = new
         fewer = np.flatnonzero(np.bincount(i, new < 0, self.n))
         if not len(fewer):
@@ -312,7 +321,39 @@ class NeighbourList:
         bit = np.where(before < WORD, touching[i] >> np.minimum(before, WORD - 1) & 1, 1)  # 1 behind the first word: unknown
         some = place < WORD
         np.bitwise_or.at(bits, i[some], (bit[some] << place[some]).astype(np.uint32))
-        touching[fewer], count[fewer] = bits[fewer], np.bincount(i, minlength=self.n)[fewer]
+        touching[fewer], count[fewer] = bits[fewer], np.bincount(i, near.take(first[i] + place) < WALL, self.n)[fewer]
+
+    def settle_owners(self, some: np.ndarray | None = None) -> None:
+        """Give data that have an owner to it, after pieces of the team changed, or which particles can move.
+
+        some: (k,) particles for whose pairs this is done; None for all. For an elastic list that is not saved.
+        """
+        assert self.store
+        near, movable, piece = self.store.view(self.neighbour), self.movable(), self.team.piece
+        if some is None:
+            i, at = self._entries(self.first, self.number)
+            j = near[at]
+            lower = (i < j).nonzero()[0]
+        else:
+            first: Any = self.memory.view(self.first)
+            number: Any = self.memory.view(self.number)
+            around = movable & False
+            around[some] = True
+            for c in some:
+                around[near[first[c] : first[c] + number[c]]] = True
+            i = around.nonzero()[0]
+            at = np.concatenate([first[c] + np.arange(number[c]) for c in i])
+            i, j = i.repeat(number[i]), near[at]
+            lower = (around[j] & (i < j)).nonzero()[0]
+        there = at[(i * WALL + j).searchsorted(j[lower].astype(np.int64) * WALL + i[lower])]
+        here, i, j = at[lower], i[lower], j[lower]
+        own, other = movable[i], movable[j] & ~(movable[i] & (i // piece == j // piece))
+        for data in self.pair_data:
+            if data.has_owner:
+                rows, sign = self.store.view(data.field), -1 if data.width else 1
+                value = rows[here]
+                value += (value == 0) * sign * rows[there]
+                rows[here], rows[there] = (value.T * own).T, (sign * value.T * other).T
 
     @ti.func
     def save_old_list(self, thread):
@@ -395,6 +436,16 @@ class NeighbourList:
     def touching_bits(self, i, word):
         """Return the bits of entries that touched at the last test. Words beyond the first are not stored: all bits are set."""
         return ti.select(word == 0, self.touching[i], self.all_bits(i, word))
+
+
+def _set(pairs: np.ndarray, values: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return the pairs with data other than 0, and these data."""
+    some = np.zeros(len(pairs), dtype=bool)
+    for value in values.values():
+        for column in value.T if value.ndim > 1 else [value]:  # any(axis=1) takes ten times as long
+            some |= column != 0
+    kept = np.flatnonzero(some)
+    return pairs.take(kept, axis=0), {name: value.take(kept, axis=0) for name, value in values.items()}
 
 
 @ti.func

@@ -21,7 +21,7 @@ from ..features.regrouping import Regrouping
 from ..geometry.ordered import distinct
 from .cell_list import CellList, add_to
 from .images import FLOW, GRADIENT
-from .neighbour_list import MOVED, STALE, NeighbourList, PairData
+from .neighbour_list import MOVED, STALE, WALL, NeighbourList, PairData
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
@@ -64,7 +64,7 @@ class NeighbourSearch:
         self.list = NeighbourList(scene.memory, scene.count, rooms, pair_data, team, network_size)
         self.network = sorting_network(network_size)
         if walls:
-            self.list.list_walls()
+            self.list.list_walls(scene.count)
         self.dim, self.state, self.radius = dim, scene.state, scene.radius
         self.table = table
         number, real = scene.memory.number, scene.real
@@ -146,6 +146,8 @@ class NeighbourSearch:
             room = self.list.room  # the old list uses this memory
             self.list.blocks = self._blocks(n)
             self.list.allocate(room)
+        if self.list.movable is not None and self.team.size > 1 and not self.list.saved:
+            self.list.settle_owners()
         if self.has_excluded:
             begin = self.memory.view(self.excluded_begin)[change.first]
             self.memory.resize(self.excluded_begin, n + 1)
@@ -343,7 +345,7 @@ class NeighbourSearch:
         for old in range(self.list.old_first[i], self.list.old_first[i] + self.list.old_number[i]):
             j = self.list.old_neighbour[old]
             if ti.static(len(self.walls) > 0):
-                if j >= self.n:
+                if j >= WALL:
                     continue
             if self.is_list_member(i, j, self.state.separation(i, j)) == 0:
                 if ti.static(not self.counts_first):
@@ -369,7 +371,7 @@ class NeighbourSearch:
                         begin, end = group.wall.near_sides(i, self.radius.of(i) + ti.cast(self.skin, self.real))
                         for place in range(begin, end):
                             side = group.wall.side_at(place)
-                            face = self.n + group.face(k, side)
+                            face = WALL + group.face(k, side)
                             listed = group.wall.least_gap(side, i, self.radius.of(i)) < ti.cast(self.skin, self.real)
                             for old in range(self.list.old_first[i], self.list.old_first[i] + self.list.old_number[i]):
                                 listed = listed or self.list.old_neighbour[old] == face
@@ -385,7 +387,7 @@ class NeighbourSearch:
         out = group.next_within(last, i, self.radius.of(i) + ti.cast(self.skin, self.real))
         if ti.static(bool(group.tree)):
             for old in range(self.list.old_first[i], self.list.old_first[i] + self.list.old_number[i]):
-                k = group.wall_of(self.list.old_neighbour[old] - self.n)
+                k = group.wall_of(self.list.old_neighbour[old] - WALL)
                 if k > last and k < out:
                     out = k
         return out

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 from ..device import ti
 from ..device.number import OnDevice
 from ..device.thread_team import block, blocks
-from .neighbour_list import MOVED, STALE
+from .neighbour_list import MOVED, STALE, WALL
 
 if TYPE_CHECKING:
     from ..device.thread_team import Team
@@ -98,7 +98,7 @@ class Strays:
                     for place in range(begin, end):
                         side = group.wall.side_at(place)
                         if group.wall.least_gap(side, i, self.search.radius.of(i)) < near:
-                            out |= self.is_unlisted_wall(i, self.n + group.face(k, side))
+                            out |= self.is_unlisted_wall(i, WALL + group.face(k, side))
         return out
 
     @ti.func

@@ -205,6 +205,11 @@ class State:
         if before:
             self.before = memory.field("displacement_at_start", self.number, width=self.dim)
 
+    @inline
+    def kick(self, i):
+        """Return the displacement of particle i by forces in the substep, twice that at a start, where `before` is kept [m]."""
+        return at(self.d, i) - at(self.before, i)
+
     @ti.func
     def note_wall_push(self, i, change):
         """Note that a wall changed the displacement of particle i."""

@@ -184,7 +184,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     state.remember(
         memory,
         has_friction or bool(contact and contact.solves_rows) or any(w.needs_start_position for w in walls) or scene.bounces,
-        bounces or bool(scene.impacts) or bodies,
+        bounces or bool(scene.impacts) or bodies or bool(contact and contact.solves_rows),
         bounces,
         bool(contact and (contact.projects or bodies) and walls),
         bodies,

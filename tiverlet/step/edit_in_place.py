@@ -18,6 +18,7 @@ from ..constraints.pin import Pin
 from ..device.memory import Rows, rows_of
 from ..features.feature import Batch, Feature
 from ..features.regrouping import Regrouping
+from ..neighbours.neighbour_list import WALL
 from ..particles import Particles
 from .bind_again import Bound, bind, bound_again
 from .scale import Scale
@@ -128,8 +129,7 @@ def regroup(world: Any, edit: Edit, added: Particles | None) -> None:
     for log in runner.logs:
         log.forget()
     if pairs:
-        memory.write(search.list.number, 0)
-        search.list.restore(*pairs)
+        search.list.replace(*pairs)
     runner.carry_loads()
 
 
@@ -186,8 +186,15 @@ def grab(world: Any, change: Grab) -> None:
     runner, pins = world._runner, change.pins
     scene, memory, particles = runner.scene, runner.memory, world._particles
     if change.inv_mass is not scene.inv_mass:
+        owned: Any = runner.search.list if runner.search and runner.search.list.movable else None
+        pairs = owned.persistent_data() if owned and owned.saved else None
         scene.inv_mass = change.inv_mass
         scene.state.set_inverse_mass(memory, particles, change.inv_mass, change.before, change.after)
+        if pairs:  # other particles own what pairs bear
+            owned.restore(*pairs)
+        elif owned:
+            numbers = np.arange(len(change.inv_mass))
+            owned.settle_owners(np.concatenate([numbers[change.before], numbers[change.after]]))
         if runner.immovable > 1:  # lists lack pairs in which neither particle can move
             runner.invalidate()
     if change.soft:
@@ -209,6 +216,7 @@ def _joined(some: list[np.ndarray]) -> Rows:
 def _pairs(near: Any, change: Regrouping) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return the persistent pairs between particles that remain, (m, 2) by their new indices, and their data by name."""
     pairs, values = near.persistent_data()
-    pairs = change.number[pairs]
+    some = pairs < WALL
+    pairs[some] = change.number[pairs[some]]
     both = np.flatnonzero((pairs[:, 0] >= 0) & (pairs[:, 1] >= 0))
     return pairs.take(both, axis=0), {name: value.take(both, axis=0) for name, value in values.items()}

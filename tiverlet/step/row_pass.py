@@ -49,8 +49,7 @@ class RowPass:
     @ti.func
     def find_rows(self, now):
         """List the rows of contacts, and begin the passes over them."""
-        h2 = self.particles.integrator.h2_effective(now.h, now.fresh)
-        pull = h2 * self.particles.forces.pull(now.time)
+        h2 = self.particles.integrator.h2_rigid(now.h, now.fresh, ti.cast(now.span.owed, self.real))
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, now.thread)):
             self.impulses.begin(now, h2)
@@ -58,7 +57,6 @@ class RowPass:
             self.rows.clear(i)
             if ti.static(self.rows.bounces):
                 self.rows.when[i] = 0
-                self.rows.kick[i] = ti.select(now.fresh != 0, 2 * pull, self.state.d[i] - self.bodies.new[i])
         self.team.wait()
         for k in range(self.particles.piece_count(now.thread)):
             begin, end = self.particles.piece(k, now.thread)
@@ -67,13 +65,13 @@ class RowPass:
                 low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
                 count, force, hits = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
                 for i in range(low, high):
-                    kick = ti.select(now.fresh != 0, pull, self.state.d[i] - self.bodies.new[i])
+                    kick = self.rows.kick(i)
                     self.bodies.begin(i)
                     self.rows.begin_empty(i, row)
                     if self.bodies.moves(i):
                         row = self.rows.find(i, begin, end, row)
                         count += ti.cast(row - self.rows.own[i], self.real)
-                        force += kick.dot(kick)  # type: ignore[reportOptionalCall]
+                        force += kick.dot(kick)
                     if ti.static(self.rows.bounces):
                         hits += self.rows.count_hits(i)
                 self.impulses.note(low, HITS, hits)

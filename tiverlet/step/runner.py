@@ -81,6 +81,7 @@ class Runner:
         self.asks_velocities = any(wall.has_switch for wall in step.walls)
         self.asks_release = any(isinstance(f, Pin) for f in step.drivers)
         self.bounces = any(f.has_restitution for f in (*step.walls, *step.contacts))
+        self.solves_rows = any(c.dev.rows for c in step.contacts)
         self.launcher = Launcher(self)
         self._prepare()
 
@@ -186,14 +187,14 @@ class Runner:
                     self.scene.slots.system.keep_softness(h / clock.h)
                 if softens or (h == clock.h and clock.softness > 1):
                     softness.keep(self, h / clock.h, dt)
-                elif h < clock.longest and not self.probe:
+                elif h < clock.longest and not (self.probe or self.solves_rows):
                     x = self.scene.state.get(self.memory) if self.springs else None
                     keeps = self._project(h, dt, substeps * iterations, keeps)
                     if x is not None:
                         self._forget_springs(x, self.scene.state.get(self.memory))
                 if not (h == clock.h or softens):
                     softness.end(self, h)
-                for contact in self.step.contacts if keeps else []:
+                for contact in self.step.contacts if keeps and not self.solves_rows else []:
                     contact.keep_stiffness(h / clock.h)
                 if asleep is not None and keeps:
                     self._sleep_on(*asleep, h / clock.h)
@@ -216,8 +217,10 @@ class Runner:
 
     def _is_slightly_uneven(self, h: float, dt: float) -> bool:
         """Whether the coming frame of dt [s], with substeps h [s], is only a little longer or shorter than the last one, as where
-        a loop measures dt, and contacts can keep their stiffness."""
+        a loop measures dt, and contacts can keep their stiffness. Rows have none, and bear any change."""
         clock = self.clock
+        if self.solves_rows:
+            return clock.first_moved != 0
         can = clock.first_moved != 0 and not self.probe and any(contact.can_keep_stiffness for contact in self.step.contacts)
         return can and dt != clock.frame[1] and SLIGHTLY * max(clock.h, clock.longest) <= h <= clock.h / SLIGHTLY
 
@@ -246,7 +249,8 @@ class Runner:
         memory, forces = self.memory, [c.dev.forces for c in self.step.contacts if c.dev.forces]
         memory.write_rows(who, (self.scene.state.d, d * ratio))
         left = [(f.before, ratio) for f in forces] + [(f.sum, ratio**2) for f in forces if "sum" in f.in_state]
-        left += [(self.step.particles.wall_displacement, ratio**2)] if self.step.walls else []
+        left += [(self.step.particles.wall_displacement, ratio**2)] if self.step.particles.walls else []
+        left += [(c.dev.rows.borne, ratio**2) for c in self.step.contacts if c.dev.rows]
         for field, factor in left:
             memory.write_rows(who, (field, memory.rows(who, field)[0] * factor))
 
@@ -424,11 +428,11 @@ class Runner:
 
         d / h of a particle at rest stands for -g h / 2 without its support. Without restitution the next substep stops it all the
         same. With restitution it would leave at e g h / 2, which a shorter substep does not take for rest. So in worlds with
-        restitution the velocities are those that users read.
+        restitution, but for those of rows, the velocities are those that users read.
         """
         clock = self.clock
         if not clock.d_is_velocity:
-            if clock.velocity_override is not None or self.bounces:
+            if clock.velocity_override is not None or (self.bounces and not self.solves_rows):
                 held, seen = (self.scene.inv_mass == 0)[:, None], clock.velocity_override
                 seen = self.velocity(iterations) if seen is None else seen
                 self.start(np.where(held, self.memory.read(self.scene.state.d)[: self.n] / clock.h, seen))
