@@ -26,7 +26,7 @@ from .impact_projection import ImpactProjection
 from .impulses import Impulses
 from .islands import Islands
 from .known_loads import KnownLoads
-from .limits import CRADLE
+from .limits import AHEAD, CRADLE
 from .mass_splitting import MassSplitting, lesser
 from .narrow_phase import DiscGeometry
 from .pair import Pair, PairSums
@@ -110,6 +110,7 @@ class Contact(PairContact):
         some = radius[radius > 0]
         auto = 0.75 * median(some) if len(some) else 1.0
         self._present_skin = auto if self.skin == "auto" else float(self.skin)
+        self._ahead = AHEAD * median(some) if len(some) else 0.0
         self._smallest_radius = float(radius.min(initial=np.inf))
 
     def can_regroup(self, change: Regrouping) -> bool:
@@ -129,10 +130,12 @@ class Contact(PairContact):
         dev, n = self.dev, change.now.count
         self._measure(change.now.radius)
         self.table.regroup(self.scene, change.now.group)
-        dev.search.regroup(change, self._present_skin, change.now.radius)
         if dev.rows:
+            dev.search.regroup(change, self._present_skin, change.now.radius, ahead=self._ahead)
             dev.impulses.regroup(n)
+            dev.rows.ahead = self._ahead
             return
+        dev.search.regroup(change, self._present_skin, change.now.radius)
         dev.splitting.regroup(n)
         dev.projection.regroup(n, dev.list.team)
 
@@ -239,8 +242,10 @@ class Contact(PairContact):
             *([dev.events.touched] if dev.events else []),
         ]
         dev.search = NeighbourSearch(
-            scene, self._present_skin, linked, self.table, pair_data, team, dev.responses.push, walls=scene.walls
-        )
+            scene, self._present_skin, linked, self.table, pair_data, team, dev.responses.push, walls=scene.walls,
+            ahead=self._ahead,
+        )  # fmt: skip
+        dev.rows.ahead = self._ahead
         dev.list = dev.search.list
         dev.geometry = DiscGeometry(scene, dev.search, 0.0, dev.rows.memory)
         dev.rows.push_out = -1.0 if self.push_out is None else self.push_out

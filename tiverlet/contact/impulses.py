@@ -32,6 +32,8 @@ from .limits import (
     GOING,
     HITS,
     LACK,
+    LANDING,
+    LANDS,
     LEAST,
     LEFT,
     LOAD,
@@ -75,7 +77,7 @@ class Impulses:
         self.blocks = scene.memory.number(-(-scene.particles.count // BLOCK))
         self.memory, self.sums = scene.memory, add("Contact.sums", max(1, self.blocks), width=len(SUMS))
         self.each: Any = add("Contact.sums_of_particles", scene.count, width=len(SUMS)) if team.launched else None
-        self.numbers = add("Contact.passes", None, width=3)
+        self.numbers = add("Contact.passes", None, width=4)
         self.flags = add("Contact.flags", None, width=3, kind=ti.i32)
         self.last_h2 = add("Contact.last_h2", None, state=True)  # h^2 of what rows bore [s^2]; 0 before the first substep
 
@@ -267,8 +269,8 @@ class Impulses:
                 yn = y.dot(n)
                 normal = ti.max(yn - gap * stiff[0], 0)
                 new = self.cone(normal, y - yn * n - stiff[1] * t, self.rows.friction.field[row], n)
-                miss, slip = (normal - yn) / stiff[0], (new - y - (normal - yn) * n) / stiff[1]
-                lack += miss * miss + slip.dot(slip)
+                miss = (normal - yn) / stiff[0]
+                lack += miss * miss
                 uphill += (y - new).dot(new - before)
                 load += normal
             else:
@@ -302,7 +304,7 @@ class Impulses:
         """Before the first pass: no extrapolation, and what rows may lack. One thread calls it."""
         rows, force = self.total(ROWS), self.total(FORCE)
         mean = force / ti.max(ti.cast(self.n, self.real), 1)
-        self.numbers[None] = [0, ti.static(MOMENTUM), self.met * self.met * mean * rows]
+        self.numbers[None] = [0, ti.static(MOMENTUM), self.met * self.met * mean * rows, ti.static(LANDS * LANDS) * mean * rows]
         self.flags[None][GOING], self.flags[None][TURN] = ti.cast(rows > 0, ti.i32), 0
 
     @ti.func
@@ -324,14 +326,14 @@ class Impulses:
             beta, ahead = 0 * beta, 1 + 0 * ahead
         self.numbers[None][BETA], self.numbers[None][THETA] = beta, ahead
         self.flags[None][TURN] = turn
-        most = ti.select(self.total(HITS) > 0, BOUNCES, PASSES)
+        most = ti.select(self.total(HITS) > 0 or lack > self.numbers[None][LANDING], BOUNCES, PASSES)
         goes_on = turn < most and lack > self.numbers[None][TOLERANCE]
         self.flags[None][GOING] = ti.cast((goes_on or turn < self.least) and self.total(ROWS) > 0, ti.i32)
 
     @ti.func
     def start_places(self):
         """Before the first pass of stage 2. One thread calls it."""
-        self.numbers[None] = [0, 1, 0]
+        self.numbers[None] = [0, 1, 0, 0]
         self.flags[None] = [ti.cast(self.total(ROWS) > 0, ti.i32), 0, 0]
 
     @ti.func

@@ -5,10 +5,11 @@ FEW = 1e-30  # keeps divisors from being 0
 ALONE = 1.001  # by what masses are split where a row shares its particles with none, to rounding
 MET = 0.01, 0.02  # of the displacement by forces in a substep: what rows may lack, without and with friction
 PASSES = 20  # most passes of impulses in a substep
-BOUNCES = 100  # most passes in a substep in which anything bounces: the impulse has to reach the other end of what touches
+LANDS = 0.2  # of the displacement by forces: where rows lack more after PASSES, something lands
+BOUNCES = 100  # most of them where anything bounces or lands: the impulse has to reach the other end of what touches
 LEAST = 6, 3  # fewest of them, without and with friction
 MOMENTUM = 10.0  # Nesterov's theta of the first pass, after about twice as many
-LEFT = 1e-6  # share of the mean square of what rows lack in the first pass that may be left, where no forces act
+LEFT = 1e-7  # share of the mean square of what rows lack in the first pass that may be left, where no forces act
 ROUNDING = 0.1  # of what rows may lack: times the impulses, the work that they may do
 SLOW = 2.0  # times the displacement by forces: what comes together no faster does not bounce, but rests
 STEADY = 1 / 16  # of an impulse: it may change by so much in a substep, beside what forces change, and be a load
@@ -17,11 +18,12 @@ NOISE = 64.0  # times the rounding of a displacement: what comes together no fas
 SLOP = 0.003  # overlap that places leave, in radii of the smaller particle: contacts stay closed
 BEYOND = 3.0  # times the slop: overlap from which on places are corrected. A pile rests in between, and is not stirred
 MOVES = 8  # most passes of places in a substep
+AHEAD = 0.15  # of the smaller radius, or the median: pairs so near are rows already where one of them may be stopped
 QUARTER = 0.25  # of the smaller radius: by how much a pair that overlaps parts in a substep at most
 SHARE = 1.2  # of an overlap that a pass of places moves, by masses split by the largest eigenvalue; below 4/3
 BLOCK = 64  # particles whose sums are added up first, so that sums have the same order on any number of threads
 
 FOREIGN, OWN = range(2)  # parts of the rows of a particle: those that a particle of a lower piece has, too, and its own
 LACK, UPHILL, WORK, LOAD, ROWS, FORCE, HITS = SUMS = range(7)  # sums over rows and particles
-BETA, THETA, TOLERANCE = range(3)  # numbers of the passes
+BETA, THETA, TOLERANCE, LANDING = range(4)  # numbers of the passes; LANDING: what rows lack in impacts
 GOING, TURN, GAINS = range(3)  # whether another pass follows, its number, whether any particle gains energy

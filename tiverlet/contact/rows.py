@@ -16,7 +16,7 @@ from ..device.language import impl
 from ..device.number import OnDevice
 from ..features.material import DYNAMIC, RESTITUTION, ROLLING, STATIC, TANGENTIAL, TOUCH, TOUCHES, TWISTING
 from ..neighbours.neighbour_list import WALL, Column, PairData
-from .limits import BEYOND, FEW, FOREIGN, NOISE, OWN, QUARTER, SLOP, SLOW
+from .limits import AHEAD, BEYOND, FEW, FOREIGN, NOISE, OWN, QUARTER, SLOP, SLOW
 
 if TYPE_CHECKING:
     from ..device.thread_team import Team
@@ -38,6 +38,7 @@ class Rows:
     """
 
     n: Any = OnDevice()
+    ahead: Any = OnDevice()  # gap up to which pairs are rows where one of them may be stopped [m]
     push_out: Any = OnDevice()  # largest speed at which pairs part that overlap [m/s]; negative for QUARTER of the radius
 
     def __init__(
@@ -71,7 +72,7 @@ class Rows:
         if has_friction:
             self.friction = Column("row_friction", 2)
             self.columns.append(self.friction)
-        self.push_out = scene.memory.number(-1.0, scene.real)
+        self.push_out, self.ahead = scene.memory.number(-1.0, scene.real), scene.memory.number(0.0, scene.real)
         self.bounces, self.rounding = bounces, NOISE * (2.0**-52 if scene.real == ti.f64 else 2.0**-23)
         self.touched: Any = None
         if bounces:
@@ -302,13 +303,16 @@ class Rows:
         r = self.state.separation(i, j)
         u = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j)
         p, distance = self.memory.field[e], self.geometry.contact_distance(i, j)
-        rr, near = r.dot(r), distance + ti.static(SLOP) * ti.min(self.radius.of(i), self.radius.of(j))
+        least = ti.min(self.radius.of(i), self.radius.of(j))
+        rr, near = r.dot(r), distance + ti.static(SLOP) * least
         # Nearest on the way: what passes each other within the substep touches there.
         uu, ru, start = u.dot(u), r.dot(u), r - u
         passes = ru > 0 and ru < uu and rr * uu - ru * ru < distance * distance * uu
-        # Where one of them is stopped, the other one goes on.
-        ahead = 2 * ti.max(-start.dot(self.state.d[i]), start.dot(self.state.d[j]))
-        lists = rr < near * near or self.is_set(p) or passes or start.dot(start) - distance * distance < ahead
+        # Where one of them is stopped, the other one goes on. Only pairs that a valid list has for sure.
+        goes = ti.max(-start.dot(self.state.d[i]), start.dot(self.state.d[j]))
+        reach = distance + ti.min(ti.static(AHEAD) * least, self.ahead)
+        ahead = start.dot(start) - distance * distance < 2 * goes and rr < reach * reach
+        lists = rr < near * near or self.is_set(p) or passes or ahead
         if ti.static(not self.table.uniform):
             lists = lists and ti.cast(self.table.of(i, j)[TOUCH], ti.i32) == TOUCHES
         if lists:

@@ -38,13 +38,15 @@ def _in_both_orders(linked: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]
 class NeighbourSearch:
     """The search that fills `list`, the neighbour list, from `cells`, a hash of cells.
 
-    skin: the gap up to which pairs are listed, beyond the contact distance [m]. linked: (m, 2) pairs that are never listed.
-    table: the contact distance of each pair, see Table. pair_data: the data of each pair. scratch: a field of vectors, (n,), for
-    use while the list is built. reach: (n,) extra distance, beyond its radius, at which a particle must be found [m], see
-    CellList. radius: (n,) [m], where it differs from that of the particles.
+    skin: by how much particles may come nearer before the list is stale [m]. ahead: the gap up to which valid lists have all
+    pairs [m]; pairs are listed up to the sum of both. linked: (m, 2) pairs that are never listed. table: the contact distance of
+    each pair, see Table. pair_data: the data of each pair. scratch: a field of vectors, (n,), for use while the list is built.
+    reach: (n,) extra distance, beyond its radius, at which a particle must be found [m], see CellList. radius: (n,) [m], where it
+    differs from that of the particles.
     """
 
-    skin: Any = OnDevice()
+    skin: Any = OnDevice()  # the gap up to which pairs are listed [m]
+    sure: Any = OnDevice()  # the gap up to which all pairs are on a valid list [m]
     too_far: Any = OnDevice()  # the square of the displacement beyond which the list is stale [m^2]
     farthest: Any = OnDevice()  # the largest distance of listed pairs [m]
     n: Any = OnDevice()  # number of particles
@@ -53,6 +55,7 @@ class NeighbourSearch:
     def __init__(
         self, scene: "Scene", skin: float, linked: np.ndarray, table: Any, pair_data: list[PairData], team: Team, scratch: Any,
         reach: np.ndarray | None = None, radius: np.ndarray | None = None, walls: Sequence[Any] = (),
+        ahead: float = 0.0,
     ):  # fmt: skip
         self.walls = list(walls)  # whose faces are listed, too
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
@@ -72,8 +75,9 @@ class NeighbourSearch:
         reach = 0 * radius if reach is None else reach
         self.sheared = bool(self.state.images and self.state.images.sheared)
         self._scene = scene
-        skin = self._skin(skin, radius, reach)
-        self.skin, self.too_far = number(skin, real), number((STALE * skin) ** 2, real)
+        skin = max(0.0, self._skin(skin + ahead, radius, reach) - ahead)
+        self.skin, self.sure, self.too_far = (number(value, real) for value in self._margins(skin, ahead))
+        skin += ahead
         self._extent: Sequence[float] = [-1.0] * dim
         self.cells = CellList(scene, radius, reach, skin, team, scratch)
         self.several_levels = self.cells.levels > 1
@@ -105,6 +109,11 @@ class NeighbourSearch:
             return skin
         return min(skin, float(self._scene.periodic.lengths[GRADIENT]) / 2 - 2 * radius.max(initial=0.0) - reach.max(initial=0.0))
 
+    @staticmethod
+    def _margins(skin: float, ahead: float) -> tuple[float, float, float]:
+        """Return `skin`, `sure` and `too_far`."""
+        return skin + ahead, ahead + (1 - 2 * STALE) * skin, (STALE * skin) ** 2
+
     def _blocks(self, n: int) -> int:
         """Return the number of blocks of a list of n particles."""
         return max(1, -(-n // self.team.piece)) if self.team.size > 1 and not self.counts_first else 1
@@ -124,7 +133,9 @@ class NeighbourSearch:
             and self.cells.can_regroup(radius, reach)
         )
 
-    def regroup(self, change: Regrouping, skin: float, radius: np.ndarray, reach: np.ndarray | None = None) -> None:
+    def regroup(
+        self, change: Regrouping, skin: float, radius: np.ndarray, reach: np.ndarray | None = None, ahead: float = 0.0
+    ) -> None:
         """Adapt the list to added and removed particles, after the team was adapted.
 
         The list is kept without the pairs of removed particles, unless skin or cells change. Added particles are not listed: they
@@ -135,9 +146,11 @@ class NeighbourSearch:
         if change.has_removed and not self.list.saved:
             self.list.remove_particles(change.number)
             self.cells.remove_particles(change.number)
-        skin = self._skin(skin, radius, reach)
-        stays = self.finds_all_neighbours and not self.list.saved and stale != 1 and skin == self.skin
-        self.skin, self.too_far = skin, (STALE * skin) ** 2
+        skin = max(0.0, self._skin(skin + ahead, radius, reach) - ahead)
+        margins = self._margins(skin, ahead)
+        stays = self.finds_all_neighbours and not self.list.saved and stale != 1 and margins[0] == self.skin
+        self.skin, self.sure, self.too_far = margins
+        skin += ahead
         stays &= self.cells.regroup(radius, reach, skin, np.array(change.now.extent))
         if self.sheared:
             self.farthest = float(self.cells.sizes.max())
@@ -199,8 +212,8 @@ class NeighbourSearch:
             # The mean strain is not counted as motion. It moves listed pairs apart by at most strain * farthest.
             strain = ti.cast(self.state.images.strain[None] - self.strain_at_build[None], self.real)
             r[FLOW] -= strain * self.position_at_build[i][GRADIENT]
-            left = ti.max(self.skin - ti.abs(strain) * self.farthest, 0)
-            limit = ti.static(STALE**2) * left * left
+            left = ti.max(self.skin - self.sure - ti.abs(strain) * self.farthest, 0) / 2
+            limit = left * left
         return ti.select(r.dot(r) <= limit, 0, 1)  # 1 for NaN
 
     @ti.func

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 from ..device import ti
 from ..device.number import OnDevice
 from ..device.thread_team import block, blocks
-from .neighbour_list import MOVED, STALE, WALL
+from .neighbour_list import MOVED, WALL
 
 if TYPE_CHECKING:
     from ..device.thread_team import Team
@@ -87,7 +87,7 @@ class Strays:
                     out |= self.is_unlisted(i, j)
         for k in range(number):
             out |= self.is_unlisted(i, self.stray[k])
-        near = ti.static(1 - 2 * STALE) * ti.cast(self.search.skin, self.real)
+        near = ti.cast(self.search.sure, self.real)
         for group in ti.static(self.search.walls):
             k = -1
             while k < group.count():
@@ -113,9 +113,7 @@ class Strays:
     @ti.func
     def is_unlisted(self, i, j):
         """Return 1 if a pair belongs on the list, is nearer than any unlisted pair of a valid list can be, and is not listed."""
-        near = self.search.table.cutoff(self.search.radius, i, j) + ti.static(1 - 2 * STALE) * ti.cast(
-            self.search.skin, self.real
-        )
+        near = self.search.table.cutoff(self.search.radius, i, j) + ti.cast(self.search.sure, self.real)
         r, out = self.state.separation(i, j), 0
         if r.dot(r) < near * near:
             out = self.search.is_list_member(i, j, r)

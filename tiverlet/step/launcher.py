@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from ..contact.limits import BOUNCES, MOVES, PASSES
+from ..contact.limits import BOUNCES, GOING, MOVES, PASSES
 from ..contact.projection_times import ALWAYS, MAYBE, due
 from ..contact.velocity_projection import RINGS
 from ..device.language import template
@@ -32,7 +32,6 @@ class Launcher:
         self.has_pair_forces, self.lists_pairs = step.has_pair_forces, bool(step.listed_forces)
         self.systems, self.steps = bool(step.constraints.systems), step.constraints.steps
         self.solves_rows = bool(step.contact_pass.rows)
-        self.bounces_rows = self.solves_rows and step.contact_pass.rows.rows.bounces
         self.impacts, self.has_pair_impacts = step.impacts, step.has_pair_impacts
         self.looks, self.applies_first = step.looks, step.particles.applies_first
         self.needs_more = True  # whether extra passes of this substep may be needed, see BodyImpacts
@@ -172,20 +171,27 @@ class Launcher:
         return now.span.iterations == 1 and now.it == 0
 
     def solve_contacts(self, now: Moment) -> None:
-        """Add the phase solve_contacts, if there are contacts. Passes over rows are launches; some do nothing."""
+        """Add the phase solve_contacts, if there are contacts. Passes over rows are launches; some do nothing.
+
+        The host waits once for the answer whether anything bounces or lands, which takes more of them.
+        """
         self.put(now, "solve_contacts", self.touches and not self.solves_rows)
         if self.solves_rows and now.it == 0:
             self.put(now, "start_events")
             self.put(now, "find_rows")
-            for name, times in (
-                ("relax_impulses", BOUNCES if self.bounces_rows else PASSES),
-                ("finish_impulses", 1),
-                ("relax_places", MOVES),
-            ):
-                for _ in range(times):
-                    self.flush()
-                    self.put(now, name)
+            self.repeat(now, "relax_impulses", PASSES)
+            flags = self.runner.step.contact_pass.rows.impulses.flags
+            if self.runner.memory.read(flags)[..., GOING].any():
+                self.repeat(now, "relax_impulses", BOUNCES - PASSES)
+            self.repeat(now, "finish_impulses", 1)
+            self.repeat(now, "relax_places", MOVES)
+
+    def repeat(self, now: Moment, name: str, times: int) -> None:
+        """Launch a phase so many times."""
+        for _ in range(times):
             self.flush()
+            self.put(now, name)
+        self.flush()
 
     def any_struck(self) -> bool:
         """Always true. The host does not read whether a pair bounces; a round without a bounce does nothing."""
