@@ -452,3 +452,27 @@ def test_what_slides_and_bounces_at_once_is_read_to_second_order(world):
     for _ in range(60):
         w.step(1 / 60)
         np.testing.assert_allclose(w.velocity[0], [3 - 0.2 * 9.81 * w.time, 0], atol=1e-11)
+
+
+@ti.func
+def hump(p):
+    return ti.math.length(p) - 1.0
+
+
+@ti.func
+def hollow(p):
+    return 1.0 - ti.math.length(p)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "function, inside, x", [(hump, False, (0.05, 1.1)), (hollow, True, (0.6, -0.65))], ids=["hump", "hollow"]
+)
+def test_what_slides_on_a_function_does_so_as_on_a_ball(world, function, inside, x):
+    # Both are second order: the curvature of a function along the path is that of the circle, up to its differences.
+    ends = []
+    for wall in (tv.Sdf(function), tv.Ball((0, 0), 1.0, inside)):
+        w = world(tv.Particles([x], radius=0.1), [tv.Gravity(9.81), wall, tv.Contact()], substeps=8, precision="f64")
+        w.run(1.0)
+        ends.append(w.position)
+    np.testing.assert_allclose(*ends, atol=1e-6)

@@ -424,7 +424,7 @@ class Impulses:
                     p = 0 * p
                 elif self.rows.when[i] > 0 and size > load:  # the rest came of the impact
                     p *= ti.max(load, 0) / size
-            self.rows.memory.field[e] = p
+            self.rows.memory.field[e] = self.rows.marked(i, row, p)
             if ti.static(self.rows.turns):
                 f = self.rows.f.field[row]
                 if ti.static(self.rows.bounces):

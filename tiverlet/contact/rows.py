@@ -81,6 +81,7 @@ class Rows:
             self.bounce, self.time, self.target = Column("row_bounce"), Column("row_time"), Column("row_target")
             self.columns += [self.bounce, self.time, self.target]
             self.when = add("Contact.when", n)  # the part of the substep before the impact of the island of a particle
+        self.one_way = [group for group in walls if group.wall.one_way is not None]
         self.logging = [group for group in walls if group.wall.events]  # each has a log of its own
         self.events: Any = None
         self.turns, self.axes = turns, scene.particles.axes
@@ -245,6 +246,12 @@ class Rows:
         if ti.static(len(self.walls) > 0):
             for e in range(first + number, first + number + self.list.wall_number[i]):
                 row = self.find_wall(i, e, row, scale)
+            pressing = self.pressed[i]
+            for e in range(first + number, first + number + self.list.wall_number[i]):
+                if pressing < row and self.entry.field[pressing] == e:
+                    pressing += 1
+                else:
+                    self.forget(e)
         self.end[i] = row
         self.share[i] = self.share[i] + ti.cast(row - self.begin[i], self.real)
         spread = self.spread[i]
@@ -517,13 +524,23 @@ class Rows:
                         self.put_turn(row, e, 0 * one, one, turning[0], turning[1], turning[2], scale)
         if lists:
             row += 1
-        else:
-            self.forget(e)
         return row
 
     @ti.func
+    def marked(self, i, row, p):
+        """Return the impulse p of a row, to remember; other than 0 at a one-way wall that holds particle i, for bore()."""
+        for group in ti.static(self.one_way):
+            if row >= self.pressed[i] and not self.is_set(p):
+                if group.has_face(self.other.field[row] - WALL):
+                    if ti.static(self.has_friction):
+                        p = ti.static(FEW) * self.normal.field[row]
+                    else:
+                        p += ti.static(FEW)
+        return p
+
+    @ti.func
     def bore(self, i, group: ti.template(), face):  # type: ignore[valid-type]
-        """Whether the wall with this face bore particle i in the last substep, by any of its faces."""
+        """Whether the wall with this face held particle i in the last substep, by any of its faces."""
         out, begin = False, self.list.first[i] + self.list.number[i]
         for e in range(begin, begin + self.list.wall_number[i]):
             other = self.list.neighbour[e] - WALL
