@@ -53,7 +53,8 @@ class Collider(Feature):
     one_way: a direction along which particles pass, for platforms: (0, 1) holds particles from above, and lets particles from
     below through. Particles are held where they touch with a normal to that side. A particle that was inside of the wall at the
     start of the substep, for whatever reason, is let through until it is free. Fixed, and turned with the wall. Only the position
-    of a particle decides; nothing else is remembered. Capsule, Polygon and Mesh take it; None is a wall for both sides.
+    of a particle decides, and among contacts what the wall held in the last substep. Capsule, Polygon and Mesh take it; None is a
+    wall for both sides.
 
     surface_velocity: (dim,) [m/s], of the surface relative to the wall, for conveyor belts: the wall stays where it is, and
     friction carries along what lies on it. In the axes of the world; the part along the normal is left out. Live; 0 is a belt at

@@ -50,7 +50,7 @@ class Sdf(Moving):
     that changes faster than distance would break this. One that changes more slowly at the surface would keep particles too far
     away. So the gradient is checked where particles start and around, and ValueError names the place. A particle that slides in a
     hollow is second order in the substep, as in a Ball, and conserves energy; on a hump, or with restitution, it is first order
-    and loses some.
+    and loses some; among contacts it is second order on humps, too.
     """
 
     def __init__(
