@@ -201,7 +201,7 @@ def _passing() -> Finding:
 def _deep() -> Finding:
     x = np.random.default_rng(0).uniform(0, 0.5, (200, 2))
     with world(Particles(x, radius=0.1), [Contact(push_out=0.5)]) as w:
-        w.run(2.0)
+        w.run(4.0)
         energy, limit = kinetic_energy(w), 0.5 * 200 * (4 * 0.5) ** 2
         return Finding(
             f"{energy:.0f} J (limit {limit:.0f})",
