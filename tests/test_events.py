@@ -110,7 +110,7 @@ def brute(x, old, v, gravity, h, particles, before):
     i, j, R = i[some], j[some], R[some]
     least = np.minimum(particles.radius[i], particles.radius[j])
     r, d = x[i] - x[j], (ahead - x)[i] - (ahead - x)[j]
-    # |r + s d| = R gives the time of impact of a pair that was apart, and its normal then. Pairs that touch have that of the start,
+    # |r + s d| = R gives the time of impact of a pair that was apart, and its normal then. Pairs that touch have that of before,
     # and in 2D, where nothing bounces, those that nearly do.
     near = SLOP if x.shape[1] == 2 else 0.0
     a, b, c = (d**2).sum(1), (r * d).sum(1), (r**2).sum(1) - R**2
