@@ -18,8 +18,13 @@ TOUCH = 2.0**-20  # of the size of a wall: a start no deeper inside than this co
 SLOW = 8.0  # a linked particle does not bounce if it approaches by less than this times what forces and links of a substep add
 NEAR = 1 / 64  # of its displacement: a particle that starts closer to a surface than this lies on it, and may slide along it
 ALONG = 0.9  # cosine of the largest angle by which a surface turns along a displacement that counts as a slide: 26 degrees
-PUSH_OUT = 1.0  # [m/s] at which particles leave walls that give no speed
+PUSH_OUT = 1.0  # [m/s] at which particles leave walls, and each other, that give no speed
 ON = 1e-3  # of its distance from the middle of a wall: a particle no deeper inside than this lies on the wall
+
+
+def speed_of_parting(push_out: float | None) -> float:
+    """Return at which speed what overlaps parts, where contacts are no rows [m/s]. push_out: as it was given."""
+    return PUSH_OUT if push_out is None else push_out
 
 
 class Surface:

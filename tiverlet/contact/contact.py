@@ -80,6 +80,8 @@ class Contact(PairContact):
     sensors: Any = Knob(lambda f, v: f._surface("sensors", v), "The pairs of groups of which the second senses.", built=True)
     groups: Any = Knob(lambda f, v: f._surface("groups", v), "The pairs of groups that touch; None for all.", built=True)
 
+    can_keep_stiffness = True
+
     @property
     def solves_rows(self) -> bool:
         """Whether pairs and walls are rows, see rows.py. README.md in step says where they are not."""
@@ -93,8 +95,6 @@ class Contact(PairContact):
     def projects(self) -> bool:
         """Whether it has a velocity projection of loaded pairs."""
         return not self.solves_rows
-
-    can_keep_stiffness = projects
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Choose the skin, and refuse positions too far out for the cells."""
@@ -216,20 +216,15 @@ class Contact(PairContact):
     def _make_rows(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields of contacts that are rows, and return the neighbour search."""
         dev = self.dev
-        self.table.bind(scene)
         face = 0
         for group in scene.walls:
             face = group.number_faces(scene, face)
         friction = dev.has_friction or any(w.has_friction for w in self.walls)
-        if friction and not dev.has_friction:
-            self.table.bind(scene, True)
         bounces = dev.has_restitution or any(w.has_restitution for w in self.walls)
-        if bounces and not dev.has_restitution:
-            self.table.bind(scene, True)
+        self.table.bind(scene, friction or bounces)
         turns = scene.state.spins and friction and (dev.turns or any(w.turns for w in self.walls))
-        dev.rows = Rows(scene, self.table, friction, bounces, turns, scene.walls, team)
-        dev.responses = FreeParticles(scene, scene.state.spins and friction)
-        dev.responses.rows = dev.rows
+        dev.rows = Rows(scene, self.table, friction, bounces, turns, scene.walls, team, self.push_out, self._ahead)
+        dev.responses = FreeParticles(scene, dev.rows, scene.state.spins and friction)
         dev.islands = Islands(scene, dev.rows, dev.responses)
         dev.impulses = Impulses(scene, dev.rows, dev.responses, dev.islands, team)
         dev.places = Places(scene, dev.rows, dev.responses, dev.impulses, team)
@@ -245,10 +240,8 @@ class Contact(PairContact):
             scene, self._present_skin, linked, self.table, pair_data, team, dev.responses.push, walls=scene.walls,
             ahead=self._ahead,
         )  # fmt: skip
-        dev.rows.ahead = self._ahead
         dev.list = dev.search.list
         dev.geometry = DiscGeometry(scene, dev.search, 0.0, dev.rows.memory)
-        dev.rows.push_out = -1.0 if self.push_out is None else self.push_out
         if dev.events:
             dev.events.bind(dev.list, dev.geometry)
             dev.rows.events = dev.events if dev.reports else None

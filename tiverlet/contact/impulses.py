@@ -44,6 +44,7 @@ from .limits import (
     RELAXATION,
     ROUNDING,
     ROWS,
+    SCALE,
     SHARE,
     SLOW,
     STEADY,
@@ -242,15 +243,10 @@ class Impulses:
         lack, uphill, load = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
         for row in range(self.rows.first(i, part), self.rows.last(i, part)):
             other, n = self.rows.other.field[row], self.rows.normal.field[row]
-            u, s = v, s_own
-            if row < pressed:
-                u -= self.bodies.v[other]
-                if ti.static(self.bodies.spins):
+            u, s = self.rows.relative(v, self.bodies.v, i, other, row, pressed), s_own
+            if ti.static(self.bodies.spins):
+                if row < pressed:
                     s += self.bodies.s[other]
-                if ti.static(bool(self.state.images)):
-                    u = self.state.relative_displacement(u, i, other)
-            elif ti.static(len(self.rows.walls) > 0):
-                u -= self.rows.moved.field[row]
             un = u.dot(n)
             t = u - un * n
             # The true gap at the end, less that at the start where it was negative.
@@ -375,12 +371,13 @@ class Impulses:
 
         A load is what a row bore before, but for what forces may change in a substep and a small part; an impact passes.
         """
-        p_own, m_own, scale = 0 * self.state.d[i], self.no_moment(), self.rows.times[None][3]
+        p_own, m_own = 0 * self.state.d[i], self.no_moment()
+        scale, weight = self.rows.times[None][SCALE], self.weight(i)
         for row in range(self.rows.first(i, part), self.rows.last(i, part)):
             n = self.rows.normal.field[row]
             p, before = self.rows.p.field[row], self.rows.memory.field[self.rows.entry.field[row]]
             size, borne = self.rows.along(p, n), ti.max(scale * self.rows.along(before, n), 0)
-            load, slight = size, self.weight(i)
+            load, slight = size, weight
             if row < self.rows.pressed[i]:
                 slight += self.weight(self.rows.other.field[row])
             if ti.abs(size - borne) > ti.static(SLOW) * slight + ti.static(STEADY) * size:
@@ -417,7 +414,7 @@ class Impulses:
             e, p = self.rows.entry.field[row], self.rows.p.field[row]
             if ti.static(self.rows.bounces):
                 n = self.rows.normal.field[row]
-                load, size = self.rows.times[None][3] * self.rows.along(self.rows.memory.field[e], n), self.rows.along(p, n)
+                load, size = self.rows.times[None][SCALE] * self.rows.along(self.rows.memory.field[e], n), self.rows.along(p, n)
                 bounces = self.rows.bounce.field[row] > 0
                 self.rows.touched.field[e] = ti.cast(not bounces and (self.rows.gap.field[row] == 0 or size > 0), ti.i32)
                 if bounces:

@@ -96,11 +96,7 @@ class Islands:
             load += self.rows.along(p, n)
             if ti.static(self.rows.bounces):  # displacements are those in the middle of the substep, and impacts are not there
                 if self.rows.bounce.field[row] > 0:
-                    f = self.rows.state.kick(i)
-                    if row < self.rows.pressed[i]:
-                        if self.bodies.moves(self.rows.other.field[row]):
-                            f -= self.rows.state.kick(self.rows.other.field[row])
-                    work += (self.rows.when[i] - 0.5) * self.rows.along(p, n) * f.dot(n)
+                    work += (self.rows.when[i] - 0.5) * self.rows.along(p, n) * self.rows.relative_kick(i, row).dot(n)
         work -= self.rows.work_of_others(i)
         return ti.Vector([work, square, load])
 

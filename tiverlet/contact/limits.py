@@ -1,7 +1,7 @@
 """The numbers of the law of contacts."""
 
 RELAXATION = 1.3  # of split masses in a pass of impulses; beyond 1.6 passes diverge
-FEW = 1e-30  # keeps divisors from being 0
+FEW = 1e-30  # keeps divisors from being 0, and marks what presses with none
 ALONE = 1.001  # by what masses are split where a row shares its particles with none, to rounding
 MET = 0.01, 0.02  # of the displacement by forces in a substep: what rows may lack, without and with friction
 PASSES = 20  # most passes of impulses in a substep
@@ -26,4 +26,5 @@ BLOCK = 64  # particles whose sums are added up first, so that sums have the sam
 FOREIGN, OWN = range(2)  # parts of the rows of a particle: those that a particle of a lower piece has, too, and its own
 LACK, UPHILL, WORK, LOAD, ROWS, FORCE, HITS = SUMS = range(7)  # sums over rows and particles
 BETA, THETA, TOLERANCE, LANDING = range(4)  # numbers of the passes; LANDING: what rows lack in impacts
+H, BEGIN, END, SCALE, WHOLE, SHARES = TIMES = range(6)  # what rows know of a substep, see Rows.times
 GOING, TURN, GAINS = range(3)  # whether another pass follows, its number, whether any particle gains energy

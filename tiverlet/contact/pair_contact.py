@@ -6,6 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from .. import checks
+from ..colliders.surface import speed_of_parting
 from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Feature, Knob, Scene
@@ -132,7 +133,7 @@ class PairContact(Feature):
     neighbours_per_particle = 0  # initial list entries per particle, if more than discs need
     stored_once = False  # whether one particle stores a contact, and others read it; else each particle of a pair stores its own
     detects = False  # whether each pass calls detect() for all particles, before contacts are counted
-    can_keep_stiffness: Any = False  # whether keep_stiffness() works
+    can_keep_stiffness = False  # whether keep_stiffness() works
     once = False  # whether a pair is solved once for both particles, see EachOnce
     projects: Any = False  # whether it has a velocity projection of loaded pairs, see velocity_projection.py
 
@@ -223,8 +224,8 @@ class PairContact(Feature):
 
     @property
     def speed_of_parting(self) -> float:
-        """How fast what was placed in each other parts [m/s]; as fast as it likes where None was given."""
-        return 1.0 if self.push_out is None else self.push_out
+        """How fast what was placed in each other parts, where contacts are no rows [m/s]."""
+        return speed_of_parting(self.push_out)
 
     @property
     def solves_rows(self) -> bool:

@@ -23,7 +23,7 @@ class Places:
     """Stage 2 of the contacts of one world."""
 
     def __init__(self, scene: "Scene", rows: "Rows", bodies: "FreeParticles", impulses: "Impulses", team: "Team"):
-        self.rows, self.bodies, self.impulses, self.team, self.state = rows, bodies, impulses, team, scene.state
+        self.rows, self.bodies, self.impulses, self.state = rows, bodies, impulses, scene.state
         self.radius = scene.radius
 
     @ti.func

@@ -1,11 +1,13 @@
 """How bodies answer impulses. Contacts need nothing else of a body."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..device import inline, ti
+from .limits import SHARES
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
+    from .rows import Rows
 
 
 class FreeParticles:
@@ -17,9 +19,9 @@ class FreeParticles:
     computes; last, last_s: those of the pass before. push, moment: sums of impulses [kg m], 0 between passes.
     """
 
-    def __init__(self, scene: "Scene", spins: bool):
+    def __init__(self, scene: "Scene", rows: "Rows", spins: bool):
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
-        self.rows: Any = None  # the rows that give impulses
+        self.rows = rows
         self.state, self.spins, self.real, self.dim = scene.state, spins, scene.real, dim
         self.v, self.last, self.push = (add(f"Contact.{name}", n, width=dim) for name in ("v", "v_last", "push"))
         self.new = add("Contact.v_new", n, width=dim)
@@ -48,7 +50,7 @@ class FreeParticles:
         """Return by how much a unit tangential impulse moves the point of contact of particle i [1/kg]."""
         w = self.compliance(i)
         if ti.static(self.spins):  # moments against rolling share the spin
-            w *= 1 + self.rows.times[None][5] * self.spin.inverse_inertia.of(i)
+            w *= 1 + self.rows.times[None][SHARES] * self.spin.inverse_inertia.of(i)
         return w
 
     @ti.func

@@ -16,7 +16,23 @@ from ..device.language import impl
 from ..device.number import OnDevice
 from ..features.material import DYNAMIC, RESTITUTION, ROLLING, STATIC, TANGENTIAL, TOUCH, TOUCHES, TWISTING
 from ..neighbours.neighbour_list import WALL, Column, PairData
-from .limits import AHEAD, BEYOND, FEW, FOREIGN, NOISE, OWN, QUARTER, SLOP, SLOW
+from .limits import (
+    AHEAD,
+    BEGIN,
+    BEYOND,
+    END,
+    FEW,
+    FOREIGN,
+    NOISE,
+    OWN,
+    QUARTER,
+    SCALE,
+    SLOP,
+    SLOW,
+    TIMES,
+    WHOLE,
+    H,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from ..device.thread_team import Team
@@ -37,15 +53,15 @@ class Rows:
     The normal is that at the start of the substep, or that of the time at which a pair meets.
     """
 
-    n: Any = OnDevice()
     ahead: Any = OnDevice()  # gap up to which pairs are rows where one of them may be stopped [m]
     push_out: Any = OnDevice()  # largest speed at which pairs part that overlap [m/s]; negative for QUARTER of the radius
 
     def __init__(
-        self, scene: "Scene", table: Any, has_friction: bool, bounces: bool, turns: bool, walls: list[Any], team: "Team"
-    ):
+        self, scene: "Scene", table: Any, has_friction: bool, bounces: bool, turns: bool, walls: list[Any], team: "Team",
+        push_out: float | None, ahead: float,
+    ):  # fmt: skip
         n, add = scene.count, scene.memory.field
-        self.n, self.scene, self.state, self.table, self.team = n, scene, scene.state, table, team
+        self.scene, self.state, self.table = scene, scene.state, table
         self.has_friction, self.real, self.dim, self.radius = has_friction, scene.real, scene.particles.dim, scene.radius
         self.walls, self.width = walls, scene.particles.dim if has_friction else 0
         self.begin, self.own, self.kept, self.pressed, self.end = (
@@ -72,7 +88,8 @@ class Rows:
         if has_friction:
             self.friction = Column("row_friction", 2)
             self.columns.append(self.friction)
-        self.push_out, self.ahead = scene.memory.number(-1.0, scene.real), scene.memory.number(0.0, scene.real)
+        number = scene.memory.number
+        self.push_out, self.ahead = number(-1.0 if push_out is None else push_out, scene.real), number(ahead, scene.real)
         self.bounces, self.rounding = bounces, NOISE * (2.0**-52 if scene.real == ti.f64 else 2.0**-23)
         self.touched: Any = None
         if bounces:
@@ -94,9 +111,9 @@ class Rows:
             self.columns += [self.f, self.f_step, self.arms, self.rolling, self.turn_stiff, self.across]
         self.divided = team.size > 1 or team.launched
         self.has_still = bool((scene.inv_mass == 0).any()) or bool(scene.state.sleepers)  # particles that impulses do not move
-        # The substep [s], the fractions of the frame at its ends, by how much what rows bore is scaled, the part of State.kick()
-        # that the substep adds to displacements, and spin_shares().
-        self.times = add("Contact.times", None, width=6)
+        # H: the substep [s]. BEGIN, END: the fractions of the frame at its ends. SCALE: by how much what rows bore is scaled.
+        # WHOLE: the part of State.kick() that the substep adds to displacements. SHARES: spin_shares().
+        self.times = add("Contact.times", None, width=len(TIMES))
         self.list: Any = None
         self.geometry: Any = None
 
@@ -154,7 +171,7 @@ class Rows:
     @inline
     def h(self):
         """Return the length of the substep [s]."""
-        return at(at(self.times, None), 0)
+        return at(at(self.times, None), H)
 
     @inline
     def first(self, i, part):
@@ -174,12 +191,31 @@ class Rows:
     @ti.func
     def frame_fraction(self):
         """Return the fractions of the frame at the start and the end of the substep."""
-        return ti.Vector([self.times[None][1], self.times[None][2]])
+        return ti.Vector([self.times[None][BEGIN], self.times[None][END]])
 
     @ti.func
     def kick(self, i):
         """Return the displacement that forces add to particle i in the substep [m]."""
-        return self.times[None][4] * self.state.kick(i)
+        return self.times[None][WHOLE] * self.state.kick(i)
+
+    @ti.func
+    def relative(self, u, d: ti.template(), i, other, row, pressed):  # type: ignore[valid-type]
+        """Return the displacement u of particle i, relative to that of what a row presses on; d: displacements of particles."""
+        if row < pressed:
+            u = self.state.relative_displacement(u - d[other], i, other)
+        elif ti.static(len(self.walls) > 0):
+            u -= self.moved.field[row]
+        return u
+
+    @ti.func
+    def relative_kick(self, i, row):
+        """Return State.kick() of particle i, relative to that of what a row presses on."""
+        f = self.state.kick(i)
+        if row < self.pressed[i]:
+            other = self.other.field[row]
+            if self.state.moves(other):
+                f -= self.state.kick(other)
+        return f
 
     @ti.func
     def spin_shares(self):
@@ -211,7 +247,7 @@ class Rows:
     @ti.func
     def find(self, i, begin, end, row):
         """List the rows of particle i from `row` on. begin, end: of its piece. Returns the row behind the last."""
-        scale = self.times[None][3]
+        scale = self.times[None][SCALE]
         self.begin[i] = row
         first, number = self.list.first[i], self.list.number[i]
         if ti.static(self.divided):
@@ -409,7 +445,7 @@ class Rows:
                         m = ti.select(bend < 0, -1, 1) * (start + v * s + f * (s * s / 2)).normalized()
             met = -(v + f * s).dot(m)
             blur = self.rounding * (u.norm() + ti.sqrt(size) * ti.static(2.0**-7))
-            least = ti.static(SLOW) * ti.max(self.times[None][4], 1) * ti.abs(f_own.dot(m)) + blur
+            least = ti.static(SLOW) * ti.max(self.times[None][WHOLE], 1) * ti.abs(f_own.dot(m)) + blur
             rests = e * met <= ti.max(-f.dot(m), 0) * (1 - s) / 2
             hit = 0 <= s <= 1 and gap >= -met and met > least and not rests
         return hit, s, m
@@ -436,13 +472,8 @@ class Rows:
                     self.across.field[row] = 0 * self.across.field[row]
             if self.bounce.field[row] > 0:
                 other, n = self.other.field[row], self.normal.field[row]
-                u, f = self.state.d[i], self.state.kick(i)
-                if row < self.pressed[i]:
-                    u = self.state.relative_displacement(u - self.state.d[other], i, other)
-                    if self.state.moves(other):
-                        f -= self.state.kick(other)
-                elif ti.static(len(self.walls) > 0):
-                    u -= self.moved.field[row]
+                f = self.relative_kick(i, row)
+                u = self.relative(self.state.d[i], self.state.d, i, other, row, self.pressed[i])
                 if ti.static(self.turns):  # the points that touch leave across n at -e_t times their velocity then
                     s = self.state.spin.s[i]
                     if row < self.pressed[i]:

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..colliders.collider import Collider
-from ..colliders.surface import PUSH_OUT
+from ..colliders.surface import speed_of_parting
 from ..constraints.core.anchored import Anchored
 from ..constraints.core.scalar import Scalar
 from ..features.feature import Acceleration, Batch
@@ -213,7 +213,7 @@ def inside(world: "World", reach: float) -> bool:
 
 def let_out(world: "World") -> float:
     """Return the most energy that a wall gives a particle in the frame in which the particle gets free of it [J]."""
-    push = max([PUSH_OUT if wall.push_out is None else wall.push_out for wall in _walls(world)], default=0.0)
+    push = max([speed_of_parting(wall.push_out) for wall in _walls(world)], default=0.0)
     lift = float(np.linalg.norm(_pull(world))) * world._clock.frame[1]
     return float(_masses(world).max()) * push * (lift + push / 2)
 
