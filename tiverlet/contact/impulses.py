@@ -72,7 +72,7 @@ class Impulses:
 
     def __init__(self, scene: "Scene", rows: "Rows", bodies: "FreeParticles", islands: "Islands", team: "Team"):
         self.rows, self.bodies, self.islands, self.team, self.state = rows, bodies, islands, team, scene.state
-        self.met, self.least = MET[rows.has_friction], LEAST[rows.has_friction]
+        self.least = LEAST[rows.has_friction]
         self.n, self.real, self.dim, self.has_friction = scene.count, scene.real, scene.particles.dim, rows.has_friction
         add = scene.memory.field
         self.blocks = scene.memory.number(-(-scene.particles.count // BLOCK))
@@ -250,7 +250,7 @@ class Impulses:
             un = u.dot(n)
             t = u - un * n
             # The true gap at the end, less that at the start where it was negative.
-            gap = self.rows.gap.field[row] + un + self.rows.rise(t.dot(t), un, self.rows.bend.field[row])
+            gap = self.rows.gap.field[row] + un + self.rows.rise(u.dot(u) - un * un, un, self.rows.bend.field[row])
             if ti.static(self.rows.bounces):
                 if self.rows.bounce.field[row] > 0:
                     gap = un - self.rows.target.field[row]
@@ -300,7 +300,7 @@ class Impulses:
         """Before the first pass: no extrapolation, and what rows may lack. One thread calls it."""
         rows, force = self.total(ROWS), self.total(FORCE)
         mean = force / ti.max(ti.cast(self.n, self.real), 1)
-        self.numbers[None] = [0, ti.static(MOMENTUM), self.met * self.met * mean * rows, ti.static(LANDS * LANDS) * mean * rows]
+        self.numbers[None] = [0, ti.static(MOMENTUM), ti.static(MET * MET) * mean * rows, ti.static(LANDS * LANDS) * mean * rows]
         self.flags[None][GOING], self.flags[None][TURN] = ti.cast(rows > 0, ti.i32), 0
 
     @ti.func
@@ -316,7 +316,8 @@ class Impulses:
         lack, uphill = self.total(LACK), self.total(UPHILL)
         turn = self.flags[None][TURN] + 1
         if turn == 1:
-            self.numbers[None][TOLERANCE] = ti.max(self.numbers[None][TOLERANCE], ti.static(LEFT) * lack)
+            left = ti.select(self.total(HITS) > 0, ti.static(LEFT[1]), ti.static(LEFT[0])) * lack
+            self.numbers[None][TOLERANCE] = ti.max(self.numbers[None][TOLERANCE], left)
         beta, ahead = self.momentum()
         if uphill > 0:
             beta, ahead = 0 * beta, 1 + 0 * ahead

@@ -3,13 +3,13 @@
 RELAXATION = 1.3  # of split masses in a pass of impulses; beyond 1.6 passes diverge
 FEW = 1e-30  # keeps divisors from being 0, and marks what presses with none
 ALONE = 1.001  # by what masses are split where a row shares its particles with none, to rounding
-MET = 0.01, 0.02  # of the displacement by forces in a substep: what rows may lack, without and with friction
+MET = 0.0005  # of the displacement by forces in a substep: what rows may lack. It adds up over the height of a pile
 PASSES = 20  # most passes of impulses in a substep
 LANDS = 0.2  # of the displacement by forces: where rows lack more after PASSES, something lands
 BOUNCES = 100  # most of them where anything bounces or lands: the impulse has to reach the other end of what touches
-LEAST = 6, 3  # fewest of them, without and with friction
+LEAST = 6, 3  # fewest of them, without and with friction: what rests comes to rest down to rounding
 MOMENTUM = 10.0  # Nesterov's theta of the first pass, after about twice as many
-LEFT = 1e-7  # share of the mean square of what rows lack in the first pass that may be left, where no forces act
+LEFT = 1e-3, 1e-7  # of the mean square of what rows lack in the first pass: what may be left of impacts, without and with bounces
 ROUNDING = 0.1  # of what rows may lack: times the impulses, the work that they may do
 SLOW = 2.0  # times the displacement by forces: what comes together no faster does not bounce, but rests
 STEADY = 1 / 16  # of an impulse: it may change by so much in a substep, beside what forces change, and be a load

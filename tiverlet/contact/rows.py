@@ -594,8 +594,8 @@ class Rows:
 
     @ti.func
     def most_parting(self, radius, push_out):
-        """Return by how much what overlaps may part in the substep [m]. radius: the smaller one."""
-        return ti.select(push_out < 0, ti.static(QUARTER) * radius, push_out * self.h())
+        """Return by how much what overlaps may part in the substep [m]. radius: the smaller one; a point has none."""
+        return ti.select(push_out < 0, ti.select(radius > 0, ti.static(QUARTER) * radius, self.ahead), push_out * self.h())
 
     @ti.func
     def wall_gap(self, i, face):

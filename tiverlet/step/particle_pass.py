@@ -386,7 +386,10 @@ class ParticlePass:
 
     @ti.func
     def guard(self, i, now):
-        """Keep particle i inside of walls, where their rows left it further outside than the slop. This gives no momentum."""
+        """Keep particle i inside of walls, where their rows let it out further than the slop. This gives no momentum.
+
+        What was out before is for stage 2 to bring back, so no time passes here.
+        """
         if self.state.moves(i):
             d, moving = self.state.d[i], True
             radius = ti.static(1 - 2 * SLOP) * self.radius.of(i)
@@ -394,7 +397,7 @@ class ParticlePass:
                 if moving:
                     x = self.state.x[i]
                     for group in ti.static(self.groups):
-                        self.touch_group(group, i, radius, now.h, now.frame_fraction, FRICTIONLESS)
+                        self.touch_group(group, i, radius, 0 * now.h, now.frame_fraction, FRICTIONLESS)
                     moving = (self.state.x[i] != x).any()
             self.state.d[i] = d
 
