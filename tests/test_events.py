@@ -111,11 +111,10 @@ def brute(x, old, v, gravity, h, particles, before):
     least = np.minimum(particles.radius[i], particles.radius[j])
     r, d = x[i] - x[j], (ahead - x)[i] - (ahead - x)[j]
     # |r + s d| = R gives the time of impact of a pair that was apart, and its normal then. Pairs that touch have that of before,
-    # and in 2D, where nothing bounces, those that nearly do.
-    near = SLOP if x.shape[1] == 2 else 0.0
+    # and those that nearly do.
     a, b, c = (d**2).sum(1), (r * d).sum(1), (r**2).sum(1) - R**2
     with np.errstate(all="ignore"):
-        s = np.where(np.linalg.norm(r, axis=1) > R + near * least, (-b - np.sqrt(b**2 - a * c)) / a, 0.0)
+        s = np.where(np.linalg.norm(r, axis=1) > R + SLOP * least, (-b - np.sqrt(b**2 - a * c)) / a, 0.0)
     s[[pair in before for pair in zip(i.tolist(), j.tolist(), strict=True)]] = 0.0
     n = r + s[:, None] * d
     n /= np.linalg.norm(n, axis=1)[:, None]

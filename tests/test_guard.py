@@ -492,7 +492,7 @@ def test_wrong_aims_are_refused(world):
             w.step(1 / 60, tolerance=wrong)
         with pytest.raises(ValueError, match="budget"):
             w.step(1 / 60, budget=wrong)
-    with pytest.raises(ValueError, match="substeps = 'adaptive', but it must be an integer of at least 1, or \"auto\""):
+    with pytest.raises(ValueError, match="substeps = 'adaptive', but it must be an integer of at least 1, \"auto\" or None"):
         w.substeps = "adaptive"
 
 

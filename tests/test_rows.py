@@ -50,8 +50,9 @@ def test_a_bounce_keeps_e_squared(world, substeps):
     np.testing.assert_allclose(heights[1:6], e ** (2 * np.arange(1, 6)), rtol=1e-12)
 
 
-@pytest.mark.parametrize("n, nx", [(3, 1), (7, 1), (10, 1), (6, 6)])
-@pytest.mark.parametrize("e", [0.0, 0.5])
+@pytest.mark.parametrize(
+    "n, nx, e", [(3, 1, 0.0), (20, 1, 0.0), (6, 6, 0.0), (3, 1, 0.5), (7, 1, 0.5), (40, 1, 0.5), (6, 6, 0.5), (16, 16, 0.5)]
+)
 def test_what_touches_bounces_as_a_whole(world, n, nx, e):
     # The center of mass falls by 1 m and comes back to e^2 of it: Newton's law for impacts at the same time.
     x = column(n, nx)
@@ -218,3 +219,36 @@ def test_what_pins_take_and_let_go_keeps_what_pairs_bear(world):
         w.step(1 / 60)
         assert np.abs(w.velocity[:5]).max() < 0.05 * G / 240
     assert np.abs(w.position[:5] - x).max() < SLOP * BEYOND * R
+
+
+@pytest.mark.parametrize("of_wall", [False, True])
+def test_restitution_changes_the_law_of_a_running_world(world, of_wall):
+    # Above 0.97 pairs bounce one after the other, below they are rows. A clone, which is built anew, goes on as what runs.
+    contact, floor = tv.Contact(restitution=0.5), tv.HalfSpace((0, 1), restitution=0.5)
+    w = world(tv.Particles([[0, 1.0], [0.02, 2.0], [0, 3.5]], radius=0.4), [tv.Gravity(G), contact, floor], substeps=8)
+    for e in (0.5, 1.0, 0.5):
+        (floor if of_wall else contact).restitution = e
+        w.run(0.3)
+        again = w.clone()
+        assert contact.solves_rows == (e < 0.97)
+        for one in (w, again):
+            one.run(0.1)
+        assert w.hash() == again.hash()
+
+
+def test_grains_need_fewer_substeps(world):
+    # Where nothing but contacts acts between free falls, 4 are the default. A constraint, or a force that changes, takes 20.
+    x, link = [[0.0, 0.0], [1.0, 0.0]], tv.Distance([[0, 1]])
+    w = tv.World(tv.Particles(x, radius=0.1), [tv.Gravity(G), tv.Contact(), tv.Drag(0.1)])
+    assert w.substeps == 4
+    w.add(features=[link])
+    assert w.substeps == 20
+    w.remove(features=[link])
+    assert w.substeps == 4
+    w.substeps = 7
+    w.add(features=[link])
+    assert w.substeps == 7
+    w.substeps = None
+    assert w.substeps == 20
+    for features in ([tv.Gravity(G)], [tv.Contact(), tv.Attractor((0, 0), 1.0)], [tv.Contact(restitution=1.0)]):
+        assert tv.World(tv.Particles(x, radius=0.1), features).substeps == 20

@@ -25,7 +25,7 @@ from .solvers.jacobi import Jacobi
 from .solvers.solver import Solver
 from .step import checkpoint, edit_scene, energy_bound, impulse, initial_violation
 from .step.adaptive import StepController
-from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver
+from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver, usual_substeps
 from .step.build_again import Rebuild
 from .step.clock import CHANGED, Clock
 from .step.diagnostics import KINETIC
@@ -43,9 +43,10 @@ class World:
 
     particles: Particles. features: forces, constraints, contacts and walls, in any order; at most one Contact. A feature that is
     not in the list costs nothing.
-    substeps: substeps per frame, or "auto" for as many as each frame needs (see StepController); springs of omega dt > 50, dt the
-    frame, are not resolved, and lose what they vibrate with (flag "energy-loss"). iterations: passes over the constraints in each
-    substep. Both may change at any time, without compiling.
+    substeps: substeps per frame; None for as many as such scenes usually need: 20, or 4 where particles fall freely but for
+    contacts; or "auto" for as many as each frame needs (see StepController); springs of omega dt > 50, dt the frame, are not
+    resolved, and lose what they vibrate with (flag "energy-loss"). iterations: passes over the constraints in each substep. Both
+    may change at any time, without compiling.
     solver: how constraints are solved: Direct for chains, trees and loops; Jacobi, Chebyshev or ConjugateGradient for cloth. None
     chooses ConjugateGradient(5) where elimination would leave many stiff links to Jacobi, as in cloth; else Direct where
     constraints are connected like chains or beams; else Jacobi. explain() reports the choice and its reason.
@@ -64,7 +65,7 @@ class World:
     _copies: Copies | None = None
 
     def __init__(
-        self, particles: Particles, features: Iterable[Feature] = (), *, substeps: int | str = 20, iterations: int = 1,
+        self, particles: Particles, features: Iterable[Feature] = (), *, substeps: int | str | None = None, iterations: int = 1,
         solver: Solver | None = None, precision: str = "f32", path: str = "auto", order: int = 2,
     ):  # fmt: skip
         if not isinstance(particles, Particles):
@@ -111,7 +112,7 @@ class World:
 
     def _install(self, particles: Particles, features: tuple[Feature, ...], parts: Assembly) -> None:
         """Make these the parts of the world."""
-        self._particles, self._features = particles, features
+        self._particles, self._features, self._usual_substeps = particles, features, usual_substeps(features)
         self._runner, self._solver, self._scale = Runner(parts, self._clock), parts.solver, parts.scale
         self._search: PointSearch | None = None  # compiled at the first query
         parts.scene.residuals = self._runner.residuals
@@ -152,7 +153,7 @@ class World:
             try:
                 self._find_stiffened()
                 guarded = self._controller.auto or tolerance is not None or budget is not None
-                if guarded or self._substeps * self._iterations > self._runner.passes_at_once:
+                if guarded or self.substeps * self._iterations > self._runner.passes_at_once:
                     self._undo = checkpoint.keep(self), checkpoint.flags(self)
                 self._upload_parameters()
                 self._runner.interruptible = self._undo is not None
@@ -160,8 +161,8 @@ class World:
                     with self._runner.memory.compiler():
                         report = self._controller.advance(self, dt, tolerance, budget)
                 else:
-                    self._runner.begin(dt, self._substeps, self._iterations)
-                    report = self._runner.advance(dt, self._substeps, self._iterations)
+                    self._runner.begin(dt, self.substeps, self._iterations)
+                    report = self._runner.advance(dt, self.substeps, self._iterations)
             except BaseException:
                 self._handle_failed_step()
                 raise
@@ -275,6 +276,9 @@ class World:
         steps: whether a frame follows at once, so that residuals of the last frame are not read before it.
         """
         self._restart_for_new_forces(steps)
+        if any([f.changed and isinstance(f, Collider) for f in self._features]):
+            for contact in self._runner.step.contacts:  # restitution of walls decides whether these are rows
+                contact.changed = contact.changed or contact.needs_other_kernels
         if any([f.needs_other_kernels for f in self._features if f.changed]):
             edit_scene.renew(self)
 
@@ -617,17 +621,17 @@ class World:
 
     @property
     def substeps(self) -> int:
-        """Substeps per frame; with "auto", those of the next frame. Assign a number, or "auto"."""
-        return self._controller.substeps if self._controller.auto else self._substeps
+        """Substeps per frame; with "auto", those of the next frame. Assign a number, "auto", or None for the usual number."""
+        return self._controller.substeps if self._controller.auto else self._substeps or self._usual_substeps
 
     @substeps.setter
-    def substeps(self, value: int | str) -> None:
-        """Set the substeps from the next frame on: at least 1, or "auto"."""
+    def substeps(self, value: int | str | None) -> None:
+        """Set the substeps from the next frame on: at least 1, "auto", or None."""
         if isinstance(value, str) and value != "auto":
-            raise ValueError(f'World: substeps = {value!r}, but it must be an integer of at least 1, or "auto".')
+            raise ValueError(f'World: substeps = {value!r}, but it must be an integer of at least 1, "auto" or None.')
         self._controller.auto = value == "auto"
         if not self._controller.auto:
-            self._substeps = checks.integer("World", "substeps", value, least=1)
+            self._substeps = None if value is None else checks.integer("World", "substeps", value, least=1)
 
     @property
     def iterations(self) -> int:

@@ -81,6 +81,7 @@ class Contact(PairContact):
     groups: Any = Knob(lambda f, v: f._surface("groups", v), "The pairs of groups that touch; None for all.", built=True)
 
     can_keep_stiffness = True
+    compiled_for = (*PairContact.compiled_for, "solves_rows")
 
     @property
     def solves_rows(self) -> bool:

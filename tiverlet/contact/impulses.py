@@ -10,7 +10,9 @@ order. Overlap c0 is no reason for an impulse; it is only kept from growing. So 
 Solved by projected Jacobi with split masses: among the rows of a particle, or without friction by the largest eigenvalue of the
 sum of n n^T over them. No eigenvalue of a pass exceeds RELAXATION. Passes are
 accelerated (Nesterov 1983) and restarted where they go uphill (O'Donoghue and Candes 2015). They start from what rows bore in the
-last substep, and stop where the mean square of what rows lack is below MET times the displacement by forces.
+last substep, and stop where the mean square of what rows lack is below MET times the displacement by forces. Where anything
+bounces they go on until the energy that is wrong, the sum of p C beyond loads, is below ERROR of the kinetic energy, too: in a
+column of N each row lacks little, but N of them add up.
 
 Passes start with momentum, as if they had run before: what is at rest then needs a few, and landings half as many. A few passes
 at least run in each substep: through the start they continue over substeps, which brings a pile to rest.
@@ -26,11 +28,13 @@ from .limits import (
     BETA,
     BLOCK,
     BOUNCES,
+    ERROR,
     FEW,
     FORCE,
     GAINS,
     GOING,
     HITS,
+    KINETIC,
     LACK,
     LANDING,
     LANDS,
@@ -54,6 +58,7 @@ from .limits import (
     TURN,
     UPHILL,
     WORK,
+    WRONG,
 )
 
 if TYPE_CHECKING:
@@ -159,6 +164,9 @@ class Impulses:
                 self.rows.stiff.field[row] = step / w
                 p = ti.max(p, 0)
             self.rows.p.field[row] = p
+            if ti.static(self.rows.bounces):
+                if self.rows.bounce.field[row] == 0:
+                    self.rows.target.field[row] = self.rows.along(p, n)
             v = self.rows.vector(p, n)
             p_own += v
             if ti.static(self.bodies.spins):
@@ -233,14 +241,15 @@ class Impulses:
 
     @ti.func
     def relax(self, i, part):
-        """One pass over a part of the rows of particle i. Returns what they lack, whether it goes uphill, and what they bear."""
+        """One pass over a part of the rows of particle i. Returns what they lack, how far they go uphill, what they
+        bear, and wrong()."""
         beta = self.numbers[None][BETA]
         v, p_own, m_own = self.bodies.v[i], 0 * self.state.d[i], self.no_moment()
         s_own = self.no_moment()
         if ti.static(self.bodies.spins):
             s_own = self.bodies.s[i]
         kept, pressed = self.rows.kept[i], self.rows.pressed[i]
-        lack, uphill, load = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
+        lack, uphill, load, wrong = ti.Vector.zero(self.real, 4)
         for row in range(self.rows.first(i, part), self.rows.last(i, part)):
             other, n = self.rows.other.field[row], self.rows.normal.field[row]
             u, s = self.rows.relative(v, self.bodies.v, i, other, row, pressed), s_own
@@ -269,12 +278,14 @@ class Impulses:
                 lack += miss * miss
                 uphill += (y - new).dot(new - before)
                 load += normal
+                wrong += self.wrong(row, normal, gap)
             else:
                 new = ti.max(y - gap * stiff, 0)
                 miss = (new - y) / stiff
                 lack += miss * miss
                 uphill += (y - new) * (new - before)
                 load += new
+                wrong += self.wrong(row, new, gap)
             self.rows.p.field[row] = new
             self.rows.step.field[row] = new - before
             p = self.rows.vector(new, n)
@@ -287,7 +298,20 @@ class Impulses:
                 uphill += self.relax_turn(i, row, other, n, self.rows.along(new, n), beta)
                 m_own += self.give_turn(row, other, part == OWN and row < kept)
         self.take(i, part, p_own, m_own)
-        return lack, uphill, load
+        return lack, uphill, load, wrong
+
+    @ti.func
+    def wrong(self, row, p, gap):
+        """Return the energy that is wrong by what a row lacks, times h^2, if anything bounces [kg m^2].
+
+        p: what it presses with. Its work would be 0 with a gap of 0. A load does none, as it was there before.
+        """
+        out = 0 * p
+        if ti.static(self.rows.bounces):
+            if p > 0:
+                before = ti.select(self.rows.bounce.field[row] > 0, 0, self.rows.target.field[row])
+                out = ti.abs((p - before) * gap)
+        return out
 
     @ti.func
     def gain(self, i):
@@ -316,15 +340,17 @@ class Impulses:
         lack, uphill = self.total(LACK), self.total(UPHILL)
         turn = self.flags[None][TURN] + 1
         if turn == 1:
-            left = ti.select(self.total(HITS) > 0, ti.static(LEFT[1]), ti.static(LEFT[0])) * lack
-            self.numbers[None][TOLERANCE] = ti.max(self.numbers[None][TOLERANCE], left)
+            self.numbers[None][TOLERANCE] = ti.max(self.numbers[None][TOLERANCE], ti.static(LEFT) * lack)
         beta, ahead = self.momentum()
         if uphill > 0:
             beta, ahead = 0 * beta, 1 + 0 * ahead
         self.numbers[None][BETA], self.numbers[None][THETA] = beta, ahead
         self.flags[None][TURN] = turn
-        most = ti.select(self.total(HITS) > 0 or lack > self.numbers[None][LANDING], BOUNCES, PASSES)
+        most = ti.select(lack > self.numbers[None][LANDING], BOUNCES, PASSES)
         goes_on = turn < most and lack > self.numbers[None][TOLERANCE]
+        if ti.static(self.rows.bounces):
+            if self.total(HITS) > 0 and self.total(WRONG) > ti.static(ERROR) * self.total(KINETIC):
+                goes_on = turn < BOUNCES
         self.flags[None][GOING] = ti.cast((goes_on or turn < self.least) and self.total(ROWS) > 0, ti.i32)
 
     @ti.func

@@ -6,10 +6,11 @@ ALONE = 1.001  # by what masses are split where a row shares its particles with 
 MET = 0.0005  # of the displacement by forces in a substep: what rows may lack. It adds up over the height of a pile
 PASSES = 20  # most passes of impulses in a substep
 LANDS = 0.2  # of the displacement by forces: where rows lack more after PASSES, something lands
-BOUNCES = 100  # most of them where anything bounces or lands: the impulse has to reach the other end of what touches
+BOUNCES = 200  # most of them where anything bounces or lands: the impulse has to reach the other end of what touches
 LEAST = 6, 3  # fewest of them, without and with friction: what rests comes to rest down to rounding
 MOMENTUM = 10.0  # Nesterov's theta of the first pass, after about twice as many
-LEFT = 1e-3, 1e-7  # of the mean square of what rows lack in the first pass: what may be left of impacts, without and with bounces
+LEFT = 1e-7  # share of the mean square of what rows lack in the first pass that may be left, where no forces act
+ERROR = 0.002  # of the kinetic energy of all: the energy that may be wrong after a bounce
 ROUNDING = 0.1  # of what rows may lack: times the impulses, the work that they may do
 SLOW = 2.0  # times the displacement by forces: what comes together no faster does not bounce, but rests
 STEADY = 1 / 16  # of an impulse: it may change by so much in a substep, beside what forces change, and be a load
@@ -24,7 +25,7 @@ SHARE = 1.2  # of an overlap that a pass of places moves, by masses split by the
 BLOCK = 64  # particles whose sums are added up first, so that sums have the same order on any number of threads
 
 FOREIGN, OWN = range(2)  # parts of the rows of a particle: those that a particle of a lower piece has, too, and its own
-LACK, UPHILL, WORK, LOAD, ROWS, FORCE, HITS = SUMS = range(7)  # sums over rows and particles
+LACK, UPHILL, WORK, LOAD, ROWS, FORCE, HITS, WRONG, KINETIC = SUMS = range(9)  # sums over rows and particles
 BETA, THETA, TOLERANCE, LANDING = range(4)  # numbers of the passes; LANDING: what rows lack in impacts
 H, BEGIN, END, SCALE, WHOLE, SHARES = TIMES = range(6)  # what rows know of a substep, see Rows.times
 GOING, TURN, GAINS = range(3)  # whether another pass follows, its number, whether any particle gains energy

@@ -125,6 +125,14 @@ class FreeParticles:
         return work, square
 
     @ti.func
+    def kinetic(self, i):
+        """Return m d^2 of particle i at the start of the passes, twice its kinetic energy times h^2 [kg m^2]."""
+        out, w = ti.cast(0, self.real), self.compliance(i)
+        if w > 0:
+            out = self.state.d[i].dot(self.state.d[i]) / w
+        return out
+
+    @ti.func
     def scale(self, i, scale):
         """Multiply the impulses on particle i by a number."""
         d = self.state.d[i]

@@ -47,6 +47,8 @@ CROSSOVER = 1000
 # without the search for equal expressions; frames then take 1 to 3 % longer. Discs, ropes and soft balls (5.6) take 8.2 and
 # 3.1 s, but frames 6 to 11 % longer; a pile (3.6) takes 1.9 s, and frames 8 % longer: these two are compiled with the search.
 LONG, ENDLESS = 5.8, 10.0
+USUAL = 20  # substeps of a frame in scenes with constraints, or forces that change
+GRAINS = 4  # where contacts are rows, and particles fall freely between them, which is exact
 MANY = 4 * FEW  # particles from which frames take so long that the search pays for long kernels
 # From so many copies of a small world on, its kernels are simplified if they are smaller than MIDDLING, since they run so often.
 # Frames of a double pendulum (1.3) take 8 to 13 % less, of 100 discs (3.6) 5 to 17 %, of discs, ropes and soft balls (6) 5 %;
@@ -243,6 +245,13 @@ def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
     if sum(isinstance(f, Sleep) for f in features) > 1:
         raise ValueError("World: more than one Sleep; one is for all particles.")
     return features
+
+
+def usual_substeps(features: tuple[Feature, ...]) -> int:
+    """Return how many substeps frames have where the user does not say."""
+    rows = any(isinstance(f, PairContact) and f.solves_rows for f in features)
+    free = all((f.common and f.steady) or not f.accelerates for f in features if isinstance(f, Acceleration))
+    return GRAINS if rows and free else USUAL
 
 
 def listed(who: str, features: Any) -> tuple[Feature, ...]:

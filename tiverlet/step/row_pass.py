@@ -2,7 +2,23 @@
 
 from typing import TYPE_CHECKING, Any
 
-from ..contact.limits import BETA, BLOCK, FORCE, GAINS, GOING, HITS, LACK, LOAD, MOVES, OWN, ROWS, UPHILL, WORK
+from ..contact.limits import (
+    BETA,
+    BLOCK,
+    FORCE,
+    GAINS,
+    GOING,
+    HITS,
+    KINETIC,
+    LACK,
+    LOAD,
+    MOVES,
+    OWN,
+    ROWS,
+    UPHILL,
+    WORK,
+    WRONG,
+)  # fmt: skip
 from ..device import called, inline, ti
 from ..device.number import OnDevice
 
@@ -63,7 +79,7 @@ class RowPass:
             row = self.rows.list.first[begin]
             for b in range((end - begin + (BLOCK - 1)) // BLOCK):
                 low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
-                count, force, hits = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
+                count, force, hits, kinetic = ti.Vector.zero(self.real, 4)
                 for i in range(low, high):
                     kick = self.rows.kick(i)
                     self.bodies.begin(i)
@@ -74,7 +90,10 @@ class RowPass:
                         force += kick.dot(kick)
                     if ti.static(self.rows.bounces):
                         hits += self.rows.count_hits(i)
+                        kinetic += self.bodies.kinetic(i)
                 self.impulses.note(low, HITS, hits)
+                if ti.static(self.rows.bounces):
+                    self.impulses.note(low, KINETIC, kinetic)
                 self.impulses.note(low, ROWS, count)
                 self.impulses.note(low, FORCE, force)
         self.team.wait()
@@ -83,6 +102,8 @@ class RowPass:
         self.add_up(now.thread, ROWS)
         self.add_up(now.thread, FORCE)
         self.add_up(now.thread, HITS)
+        if ti.static(self.rows.bounces):
+            self.add_up(now.thread, KINETIC)
         self.team.wait()
         if ti.static(self.rows.bounces):
             self.aim(now.thread)
@@ -127,20 +148,25 @@ class RowPass:
             for part in range(self.rows.parts(), OWN + 1):
                 for b in range((end - begin + (BLOCK - 1)) // BLOCK):
                     low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
-                    lack, uphill, load = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
+                    lack, uphill, load, wrong = ti.Vector.zero(self.real, 4)
                     for i in range(low, high):
-                        some_lack, some_uphill, some_load = self.impulses.relax(i, part)
+                        some_lack, some_uphill, some_load, some_wrong = self.impulses.relax(i, part)
                         lack += some_lack
                         uphill += some_uphill
                         load += some_load
+                        wrong += some_wrong
                     if part == OWN:
                         self.impulses.note(low, LACK, lack)
                         self.impulses.note(low, UPHILL, uphill)
                         self.impulses.note(low, LOAD, load)
+                        if ti.static(self.rows.bounces):
+                            self.impulses.note(low, WRONG, wrong)
         self.team.wait()
         self.add_up(thread, LACK)
         self.add_up(thread, UPHILL)
         self.add_up(thread, LOAD)
+        if ti.static(self.rows.bounces):
+            self.add_up(thread, WRONG)
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread) * self.going()):
             self.impulses.decide()
