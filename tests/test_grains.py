@@ -51,13 +51,14 @@ def test_a_silo_bears_its_grains():
 
 @pytest.mark.slow
 def test_flow_out_of_a_silo_obeys_beverloo():
-    # W = C rho sqrt(g) (D - k d)^1.5 with k between 1 and 2 in 2D, so W(8.5) / W(5.5) is between 2.15 and 2.53; +- 20 % here.
+    # W = C rho sqrt(g) (D - k d)^1.5 with k between 1 and 2 in 2D, so W(9.5) / W(6.5) is between 1.92 and 2.15; +- 20 % here.
+    # Through 5.5 d so few grains may jam.
     rates = []
-    for opening in (5.0, 8.0):
+    for opening in (6.0, 9.0):
         found = grains.flow(Silo(500, 20 * SIZE), opening, 4.0, settle=1.0)
         assert found["opening"] == pytest.approx(opening + 0.5)
         rates.append(found["rate"])
-    assert 2.15 / 1.2 <= rates[1] / rates[0] <= 2.53 * 1.2
+    assert 1.92 / 1.2 <= rates[1] / rates[0] <= 2.15 * 1.2
 
 
 def test_fits_find_what_they_are_given():
