@@ -51,7 +51,8 @@ def test_a_bounce_keeps_e_squared(world, substeps):
 
 
 @pytest.mark.parametrize(
-    "n, nx, e", [(3, 1, 0.0), (20, 1, 0.0), (6, 6, 0.0), (3, 1, 0.5), (7, 1, 0.5), (40, 1, 0.5), (6, 6, 0.5), (16, 16, 0.5)]
+    "n, nx, e",
+    [*((n, nx, e) for n, nx in ((3, 1), (7, 1), (10, 1), (6, 6)) for e in (0.0, 0.5)), (20, 1, 0.0), (40, 1, 0.5), (16, 16, 0.5)],
 )
 def test_what_touches_bounces_as_a_whole(world, n, nx, e):
     # The center of mass falls by 1 m and comes back to e^2 of it: Newton's law for impacts at the same time.

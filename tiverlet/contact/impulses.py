@@ -165,7 +165,9 @@ class Impulses:
                 p = ti.max(p, 0)
             self.rows.p.field[row] = p
             if ti.static(self.rows.bounces):
-                if self.rows.bounce.field[row] == 0:
+                if (
+                    self.rows.bounce.field[row] == 0
+                ):  # it aims at nothing: its column keeps what it bears at the start, for wrong()
                     self.rows.target.field[row] = self.rows.along(p, n)
             v = self.rows.vector(p, n)
             p_own += v
