@@ -428,17 +428,29 @@ class Impulses:
             self.bodies.moment[i] = self.bodies.moment[i] + m_own
 
     @ti.func
+    def excess(self, u, limit):
+        """Return the part of u by which it is longer than `limit`."""
+        size, most, out = u.norm(), limit.norm(), 0 * u
+        if size > most:
+            out = (1 - most / size) * u
+        return out
+
+    @ti.func
     def remember(self, i, final):
         """At the end: store what the rows of particle i bear, and note what touches for events.
 
-        `borne` is how far what bears moves the particle. Velocities contain half of it, see Verlet.velocity_after().
+        `borne` is how far what bears moves the particle. Velocities contain half of it, see Verlet.velocity_after(). With forces
+        it changes the motion by no more than all that happened in the substep: what lies still under a blow of something heavy is
+        told to lie still, though its rows take different parts of the blow for a load.
         """
         if final != 0:
-            w = self.bodies.compliance(i)
-            self.rows.borne[i] = self.bodies.new[i] - self.state.d[i] - w * self.bodies.push[i]
+            w, kick = self.bodies.compliance(i), self.rows.kick(i)
+            push, change = w * self.bodies.push[i], self.bodies.new[i] - self.state.d[i]
+            self.rows.borne[i] = change - push - self.excess(change - push + kick, change + kick)
             if ti.static(self.bodies.spins):
-                k = self.bodies.spin.inverse_inertia.of(i)
-                self.rows.turned[i] = self.bodies.new_s[i] - self.bodies.spin.s[i] + (w * k) * self.bodies.moment[i]
+                turn = self.bodies.new_s[i] - self.bodies.spin.s[i]
+                blow = -(w * self.bodies.spin.inverse_inertia.of(i)) * self.bodies.moment[i]
+                self.rows.turned[i] = turn - blow - self.excess(turn - blow, turn)
         for row in range(self.rows.begin[i], self.rows.end[i]):
             e, p = self.rows.entry.field[row], self.rows.p.field[row]
             if ti.static(self.rows.bounces):
