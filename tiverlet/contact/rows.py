@@ -447,7 +447,8 @@ class Rows:
             blur = self.rounding * (u.norm() + ti.sqrt(size) * ti.static(2.0**-7))
             least = ti.static(SLOW) * ti.max(self.times[None][WHOLE], 1) * ti.abs(f_own.dot(m)) + blur
             rests = e * met <= ti.max(-f.dot(m), 0) * (1 - s) / 2
-            hit = 0 <= s <= 1 and gap >= -met and met > least and not rests
+            hit = 0 <= s and (s - 1) * met <= blur and gap >= -met and met > least and not rests
+            s = ti.min(s, 1)
         return hit, s, m
 
     @ti.func
