@@ -10,7 +10,7 @@ ABOUT = "speed, memory and starts; beside a pile in C, and other engines"
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument(
-        "scenes", nargs="*", help="pile, settled, loaded, spheres, cloth, ropes, rope, mixed; none: all; or worlds"
+        "scenes", nargs="*", help="pile, settled, rough, spheres, cloth, ropes, rope, mixed; none: all; or worlds"
     )
     parser.add_argument("--sizes", type=int, nargs="+", metavar="N", help="numbers of particles; default: a ladder of each scene")
     parser.add_argument("--threads", type=int, nargs="+", metavar="T", help="numbers of CPU threads; default 1, 2, 4, ... all")

@@ -171,7 +171,7 @@ def drum(n: int, friction: float, resistance: float, turn: float = 0.8, seconds:
 class Silo:
     """Grains in a silo of `width` [m] on a floor of fixed discs with a radius of a fourth of SIZE.
 
-    The floor has no friction by default. loads: whether contacts learn their loads.
+    The floor has no friction by default.
     """
 
     n: int
@@ -181,7 +181,6 @@ class Silo:
     rolling: float = 0.05
     floor_friction: float = 0.0
     seed: int = 0
-    loads: bool = False
 
     def build(self) -> tuple[World, list[Polygon]]:
         """Return the world and its two walls."""
@@ -203,7 +202,7 @@ class Silo:
             (0, 1): (self.floor_friction, self.floor_friction, self.rolling),
         }
         ground = HalfSpace((0, 1), -2.5, friction=(0.5, 0.5, 0.0))
-        return World(start, [Gravity(G), Contact(friction=grip, loads=self.loads), *walls, ground], substeps=SUBSTEPS), walls
+        return World(start, [Gravity(G), Contact(friction=grip), *walls, ground], substeps=SUBSTEPS), walls
 
 
 def pinned_load(world: World) -> float:
@@ -220,8 +219,7 @@ def janssen(
     """Return the height of the fill H [m], its weight [N] and the load on the floor [N].
 
     Walls rise at `rise` [m/s], so that wall friction is fully mobilised and holds the grains up. The load is the mean over the
-    second half of `seconds`. The k-th contact below the top overlaps by 2 k g h^2. So before grains slide, a column of k layers
-    grows with its walls by about k^2 g h^2: 7 diameters in 200 layers with 16 substeps, 0.8 with 48.
+    second half of `seconds`.
     """
     world, walls = silo.build()
     world.substeps = substeps
@@ -377,10 +375,10 @@ def silos(counts: Sequence[int]) -> Table:
     """Return the table of loads on the floor of silos. counts: numbers of grains."""
     table = Table("H / width", title="Load on the floor over the weight, silo of 10 diameters, friction 0.5 between grains")
     columns, heights = [], []
-    for friction, loads in ((0.0, False), (0.25, False), (0.5, False), (0.5, True)):
-        name = f"wall {friction}" + (", known loads" if loads else "")
+    for friction in (0.0, 0.25, 0.5):
+        name = f"wall {friction}"
         table.add_column(name, justify="right")
-        found = np.array([janssen(Silo(n, 10 * SIZE, wall_friction=friction, loads=loads)) for n in counts])
+        found = np.array([janssen(Silo(n, 10 * SIZE, wall_friction=friction)) for n in counts])
         heights, shares = found[:, 0] / (10 * SIZE), found[:, 2] / found[:, 1]
         columns.append([f"{share:.3f}" for share in shares])
         if friction:

@@ -46,21 +46,18 @@ def main(job: dict[str, Any], imported: float) -> None:
     first = perf_counter() - clock
     n = len(particles)
     say({"import": imported, "start": started, "first": first, "particles": n, "package": tv.__file__})
-    flags, done = set(report.flags), 1
+    flags = set(report.flags)
     for line in sys.stdin:
         word, *number = line.split()
         if word == "run":
             clock = perf_counter()
             for _ in range(int(number[0])):
-                if scene.settling:
-                    world.substeps = scene.settling if done <= scene.settles else scene.substeps
                 report = world.step(DT)
-                flags, done = flags | report.flags, done + 1
+                flags |= report.flags
             say(perf_counter() - clock)
         elif word == "restart":
             world.position, world.velocity = particles.position, particles.velocity
             world.step(DT)
-            done = 1
             say(0.0)
         elif word == "look":
             with launches() as count:

@@ -13,9 +13,8 @@ class SpeedScene:
     """A scene of any size: build(n) -> (particles, features), of about n particles if a scene cannot have any number.
 
     sizes, quick: numbers of particles in a full and in a quick report. needs: the files of features that the scene uses; a copy
-    of the package with these alone must run it (None: not tried). settles: untimed frames before the timed ones, each of
-    `settling` substeps (0: as many as the timed ones). in_c: substeps of pile.c, which is the same scene without friction; 0: not
-    run.
+    of the package with these alone must run it (None: not tried). settles: untimed frames before the timed ones. in_c:
+    substeps of pile.c, which is the same scene without friction; 0: not run.
     """
 
     title: str
@@ -25,7 +24,6 @@ class SpeedScene:
     quick: tuple[int, ...]
     needs: frozenset[str] | None = None
     settles: int = 0
-    settling: int = 0
     in_c: int = 0
 
 
@@ -53,12 +51,12 @@ def pile(n: int, dim: int = 2):
     return tv.Particles(x, radius=0.5), [tv.Gravity(9.81), box, tv.Contact()]
 
 
-def loaded(n: int):
-    """Build the pile with friction and contacts that know their loads."""
+def rough(n: int):
+    """Build the pile with friction."""
     import tiverlet as tv
 
     particles, (gravity, box, _) = pile(n)
-    return particles, [gravity, tv.Box(box.lower, box.upper, friction=0.5), tv.Contact(friction=0.5, loads=True)]
+    return particles, [gravity, tv.Box(box.lower, box.upper, friction=0.5), tv.Contact(friction=0.5)]
 
 
 def cloth(n: int):
@@ -131,15 +129,8 @@ TEN = tuple(10**k for k in range(1, 7))
 SCENES = {
     "pile": SpeedScene("discs that fall into a box", pile, 8, TEN, (100, 1000), frozenset({"gravity", "box", "contact"}), in_c=8),
     "settled": SpeedScene("the same discs at rest, after 400 frames", pile, 8, TEN[1:5], (100,), settles=400, in_c=8),
-    "loaded": SpeedScene(
-        "the same with friction, which knew their loads after 1500 frames of 20 substeps; C has none, and takes 8",
-        loaded,
-        2,
-        TEN[1:4],
-        (100,),
-        settles=1500,
-        settling=20,
-        in_c=8,
+    "rough": SpeedScene(
+        "the same with friction, after 1500 frames; C has none, and takes 8", rough, 2, TEN[1:4], (100,), settles=1500, in_c=8
     ),
     "spheres": SpeedScene("spheres that fall into a box", lambda n: pile(n, 3), 8, TEN, (100, 1000)),
     "cloth": SpeedScene("a cloth that is held here and there", cloth, 20, TEN[1:5], (100, 400)),
