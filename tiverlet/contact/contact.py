@@ -226,8 +226,8 @@ class Contact(PairContact):
         turns = scene.state.spins and friction and (dev.turns or any(w.turns for w in self.walls))
         dev.rows = Rows(scene, self.table, friction, bounces, turns, scene.walls, team, self.push_out, self._ahead)
         dev.responses = FreeParticles(scene, dev.rows, scene.state.spins and friction)
-        dev.islands = Islands(scene, dev.rows, dev.responses)
-        dev.impulses = Impulses(scene, dev.rows, dev.responses, dev.islands, team)
+        dev.islands = Islands(scene, dev.rows, dev.responses, team)
+        dev.impulses = Impulses(scene, dev.rows, dev.responses, team)
         dev.places = Places(scene, dev.rows, dev.responses, dev.impulses, team)
         linked = excluded_pairs(batches, scene.particles.radius)
         dev.events = EventLog(scene, self.table) if dev.has_events else None

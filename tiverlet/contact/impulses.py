@@ -24,6 +24,7 @@ from ..device import at, inline, ti
 from ..device.number import OnDevice
 from ..features.material import limit_length
 from .limits import (
+    ALLOWED,
     ALONE,
     BETA,
     BLOCK,
@@ -33,6 +34,7 @@ from .limits import (
     FORCE,
     GAINS,
     GOING,
+    GROUP,
     HITS,
     KINETIC,
     LACK,
@@ -52,6 +54,7 @@ from .limits import (
     SHARE,
     SLOW,
     STEADY,
+    STRUCK,
     SUMS,
     THETA,
     TOLERANCE,
@@ -64,7 +67,6 @@ from .limits import (
 if TYPE_CHECKING:
     from ..device.thread_team import Team
     from ..features.feature import Scene
-    from .islands import Islands
     from .responses import FreeParticles
     from .rows import Rows
 
@@ -75,16 +77,19 @@ class Impulses:
     n: Any = OnDevice()
     blocks: Any = OnDevice()
 
-    def __init__(self, scene: "Scene", rows: "Rows", bodies: "FreeParticles", islands: "Islands", team: "Team"):
-        self.rows, self.bodies, self.islands, self.team, self.state = rows, bodies, islands, team, scene.state
+    def __init__(self, scene: "Scene", rows: "Rows", bodies: "FreeParticles", team: "Team"):
+        self.rows, self.bodies, self.team, self.state = rows, bodies, team, scene.state
         self.least = LEAST[rows.has_friction]
         self.n, self.real, self.dim, self.has_friction = scene.count, scene.real, scene.particles.dim, rows.has_friction
         add = scene.memory.field
         self.blocks = scene.memory.number(-(-scene.particles.count // BLOCK))
         self.memory, self.sums = scene.memory, add("Contact.sums", max(1, self.blocks), width=len(SUMS))
         self.each: Any = add("Contact.sums_of_particles", scene.count, width=len(SUMS)) if team.launched else None
-        self.numbers = add("Contact.passes", None, width=4)
-        self.flags = add("Contact.flags", None, width=3, kind=ti.i32)
+        self.groups: Any = (
+            add("Contact.sums_of_groups", -(-max(1, self.blocks) // GROUP), width=len(SUMS)) if team.launched else None
+        )
+        self.numbers = add("Contact.passes", None, width=5)
+        self.flags = add("Contact.flags", None, width=4, kind=ti.i32)
         self.last_h2 = add("Contact.last_h2", None, state=True)  # h^2 of what rows bore [s^2]; 0 before the first substep
 
     def regroup(self, n: int) -> None:
@@ -128,7 +133,7 @@ class Impulses:
         self.last_h2[None] = h2
         whole, shares = h2 / (now.h * now.h), self.rows.spin_shares()
         self.rows.times[None] = [now.h, now.frame_fraction[0], now.frame_fraction[1], scale, whole, shares]
-        self.flags[None] = [1, 0, 0]
+        self.flags[None] = [1, 0, 0, 0]
 
     @ti.func
     def prepare(self, i, part):
@@ -326,7 +331,8 @@ class Impulses:
         """Before the first pass: no extrapolation, and what rows may lack. One thread calls it."""
         rows, force = self.total(ROWS), self.total(FORCE)
         mean = force / ti.max(ti.cast(self.n, self.real), 1)
-        self.numbers[None] = [0, ti.static(MOMENTUM), ti.static(MET * MET) * mean * rows, ti.static(LANDS * LANDS) * mean * rows]
+        met, lands = ti.static(MET * MET) * mean * rows, ti.static(LANDS * LANDS) * mean * rows
+        self.numbers[None] = [0, ti.static(MOMENTUM), met, lands, 0]
         self.flags[None][GOING], self.flags[None][TURN] = ti.cast(rows > 0, ti.i32), 0
 
     @ti.func
@@ -351,15 +357,15 @@ class Impulses:
         most = ti.select(lack > self.numbers[None][LANDING], BOUNCES, PASSES)
         goes_on = turn < most and lack > self.numbers[None][TOLERANCE]
         if ti.static(self.rows.bounces):
-            if self.total(HITS) > 0 and self.total(WRONG) > ti.static(ERROR) * self.total(KINETIC):
+            if self.flags[None][STRUCK] != 0 and self.total(WRONG) > ti.static(ERROR) * self.total(KINETIC):
                 goes_on = turn < BOUNCES
         self.flags[None][GOING] = ti.cast((goes_on or turn < self.least) and self.total(ROWS) > 0, ti.i32)
 
     @ti.func
     def start_places(self):
         """Before the first pass of stage 2. One thread calls it."""
-        self.numbers[None] = [0, 1, 0, 0]
-        self.flags[None] = [ti.cast(self.total(ROWS) > 0, ti.i32), 0, 0]
+        self.numbers[None] = [0, 1, 0, 0, 0]
+        self.flags[None] = [ti.cast(self.total(ROWS) > 0, ti.i32), 0, 0, 0]
 
     @ti.func
     def decide_places(self, most):
@@ -367,24 +373,43 @@ class Impulses:
         turn = self.flags[None][TURN] + 1
         self.numbers[None][BETA], self.numbers[None][THETA] = self.momentum()
         moves = ti.cast(self.total(LACK) > 0, ti.i32)
-        self.flags[None] = [ti.select(turn < most, moves, 0), turn, moves]
+        self.flags[None] = [ti.select(turn < most, moves, 0), turn, moves, 0]
 
     @ti.func
     def check_work(self):
-        """Find islands if any particle gains energy beyond rounding. One thread calls it."""
+        """Find whether any particle gains energy beyond rounding. One thread calls it."""
         allowed = ti.static(ROUNDING) * ti.sqrt(self.numbers[None][TOLERANCE] / ti.max(self.total(ROWS), 1))
-        gains = self.total(WORK) > allowed * self.total(LOAD)
-        self.flags[None][GAINS] = ti.cast(gains, ti.i32)
-        if gains:
-            self.islands.find(allowed)
+        self.numbers[None][ALLOWED] = allowed
+        self.flags[None][GAINS] = ti.cast(self.total(WORK) > allowed * self.total(LOAD), ti.i32)
+
+    @ti.func
+    def check_hits(self):
+        """Find whether anything bounces. One thread calls it."""
+        self.flags[None][STRUCK] = ti.cast(self.total(HITS) > 0, ti.i32)
 
     @ti.func
     def total(self, k: ti.template()):  # type: ignore[valid-type]
-        """Return a sum over all particles, from those of blocks."""
+        """Return a sum over all particles, from those of groups of blocks."""
         out = ti.cast(0, self.real)
-        for b in range(self.blocks):
+        for g in range((self.blocks + (GROUP - 1)) // GROUP):
+            if ti.static(self.team.launched):
+                out += self.groups[g][k]
+            else:
+                out += self.total_of_group(g, k)
+        return out
+
+    @ti.func
+    def total_of_group(self, g, k: ti.template()):  # type: ignore[valid-type]
+        """Return a sum over the particles of a group of blocks."""
+        out = ti.cast(0, self.real)
+        for b in range(g * GROUP, ti.min((g + 1) * GROUP, self.blocks)):
             out += self.sums[b][k]
         return out
+
+    @ti.func
+    def add_up_group(self, g, k: ti.template()):  # type: ignore[valid-type]
+        """Add up the sums of the blocks of group g."""
+        self.groups[g][k] = self.total_of_group(g, k)
 
     @ti.func
     def weight(self, i):

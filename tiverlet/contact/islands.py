@@ -4,87 +4,179 @@ Constraints that do not move do no work: sum p . J (v0 + v) / 2 <= 0. Passes tha
 over, may break that. Then all impulses of the island are multiplied by the s <= 1 for which their work is 0: with
 P = sum p . J v0 and Q = sum p . J (v - v0) >= 0 the work of s p is s P + s^2 Q / 2, which is 0 at s = -2 P / Q.
 
-An island is a set of particles that rows which press join, through particles that move.
+An island is a set of particles that rows which press join, through particles that move. All threads find islands together: each
+particle points at one of its island with a lower number, and joining two islands lets the higher root point at the lower one
+(Anderson and Woll 1991), so that the root is the first particle in the end, whatever the order. Sums over an island are sums of
+integers, whose unit is a part of the largest term: they have the same bits in any order.
 """
 
 from typing import TYPE_CHECKING, Any
 
-from ..device import ti
+from ..device import runtime, ti
 from ..device.number import OnDevice
+from .limits import BLOCK
 
 if TYPE_CHECKING:
+    from ..device.thread_team import Team
     from ..features.feature import Scene
     from .responses import FreeParticles
     from .rows import Rows
 
 WORK, SQUARE, LOAD = range(3)  # sums over an island: P, Q, and the impulses along normals
+BITS = 40  # of the largest term of a sum, in units: sums of 2^22 terms fit into 63 bits
+BIAS, MANTISSA, LEAST = 1023, 52, 64  # exponents of f64: of 1, its first bit, and the lowest whose unit is a normal number
 
 
 class Islands:
     """The islands of one world. They are found only where some particle gains more energy than rounding explains.
 
-    root: a particle of the island of each particle, the first one. sums: of the island of each root, times h^2. scale: s.
+    root: a particle of the island of each particle, at last the first one. sums: of the island of each root, times h^2, in
+    units; largest: exponents of their largest terms. scale: s, or the time of the first impact, of each root.
     """
 
     n: Any = OnDevice()
 
-    def __init__(self, scene: "Scene", rows: "Rows", bodies: "FreeParticles"):
+    def __init__(self, scene: "Scene", rows: "Rows", bodies: "FreeParticles", team: "Team"):
         self.rows, self.bodies, self.real = rows, bodies, scene.real
         self.n, add = scene.count, scene.memory.field
+        # One thread needs no atomic operations, which SPIR-V does not have for 64 bits.
+        self.serial = runtime.architecture() not in runtime.LLVM or (team.size == 1 and not team.launched)
         self.root = add("Contact.island", scene.count, kind=ti.i32)
-        self.sums = add("Contact.island_sums", scene.count, width=3, kind=ti.f64)
+        self.sums = add("Contact.island_sums", scene.count, width=3, kind=ti.i64)
+        self.largest = add("Contact.island_largest", scene.count, width=3, kind=ti.i32)
         self.scale = add("Contact.island_scale", scene.count)
+
+    @ti.func
+    def begin(self, i):
+        """Let particle i be an island."""
+        self.root[i], self.scale[i] = i, 2
+        for k in ti.static(range(3)):
+            self.sums[i][k], self.largest[i][k] = 0, LEAST
+
+    @ti.func
+    def lower(self, i, root):
+        """Let particle i point at `root`, unless it points at a lower one. Returns at which it pointed."""
+        before = self.root[i]
+        if ti.static(self.serial):
+            self.root[i] = ti.min(before, root)
+        else:
+            before = ti.atomic_min(self.root[i], root)
+        return before
 
     @ti.func
     def root_of(self, i):
         """Return the root of the island of particle i."""
-        while self.root[i] != i:
-            self.root[i] = self.root[self.root[i]]
-            i = self.root[i]
+        parent = self.root[i]
+        while parent != i:
+            above = self.root[parent]
+            if above != parent:
+                self.lower(i, above)
+            i = parent
+            parent = above
         return i
 
     @ti.func
-    def join(self, all_rows):
-        """Find the islands, of all rows or of those that press. One thread calls it."""
-        for i in range(self.n):
-            self.root[i] = i
-        for i in range(self.n):
-            for row in range(self.rows.own[i], self.rows.pressed[i]):
-                other = self.rows.other.field[row]
-                if (all_rows or self.rows.is_set(self.rows.p.field[row])) and self.bodies.moves(other):
-                    a, b = self.root_of(i), self.root_of(other)
-                    self.root[ti.max(a, b)] = ti.min(a, b)
+    def join(self, i, all_rows):
+        """Join the islands of particle i and those behind it that its rows press on; all_rows: of all its rows."""
+        for row in range(self.rows.own[i], self.rows.pressed[i]):
+            other = self.rows.other.field[row]
+            if (all_rows or self.rows.is_set(self.rows.p.field[row])) and self.bodies.moves(other):
+                a, b = self.root_of(i), self.root_of(other)
+                while a != b:
+                    high, low = ti.max(a, b), ti.min(a, b)
+                    before = self.lower(high, low)
+                    a = low
+                    b = low
+                    if before != high:  # another thread was faster: join what it pointed at
+                        b = self.root_of(before)
 
     @ti.func
-    def find_times(self):
-        """Find the first impact of each island, as a part of the substep, in `scale`; 0 without one. One thread calls it."""
-        self.join(True)
-        for i in range(self.n):
-            self.scale[i] = 2
-        for i in range(self.n):
-            root = self.root_of(i)
-            for row in range(self.rows.own[i], self.rows.end[i]):
-                if self.rows.bounce.field[row] > 0:
+    def find_time(self, i):
+        """Find the first impact of the island of particle i, as a part of the substep, in `scale`; 2 without one."""
+        root = self.root_of(i)
+        for row in range(self.rows.own[i], self.rows.end[i]):
+            if self.rows.bounce.field[row] > 0:
+                if ti.static(self.serial):
                     self.scale[root] = ti.min(self.scale[root], self.rows.time.field[row])
-        for i in range(self.n):
-            if self.scale[i] > 1:
-                self.scale[i] = 0
+                else:
+                    ti.atomic_min(self.scale[root], self.rows.time.field[row])
 
     @ti.func
-    def find(self, allowed):
-        """Find the islands and their scales. allowed: work per impulse that is rounding [m]. One thread calls it."""
-        self.join(False)
-        for i in range(self.n):
-            self.sums[i] = [0, 0, 0]
-        for i in range(self.n):
-            root = self.root_of(i)
-            self.sums[root] = self.sums[root] + self.sums_of(i)
-        for i in range(self.n):
-            work, square, load = self.sums[i][WORK], self.sums[i][SQUARE], self.sums[i][LOAD]
-            scale = ti.cast(1, ti.f64)
-            if work + square / 2 > allowed * load and square > 0:
-                scale = ti.max(ti.min(-2 * work / square, 1), 0)
-            self.scale[i] = scale
+    def time_of(self, i):
+        """Return the first impact of the island of particle i, as a part of the substep; 0 without one."""
+        time = self.scale[self.root_of(i)]
+        return ti.select(time > 1, 0 * time, time)
+
+    @ti.func
+    def find_largest(self, block):
+        """Find the largest terms of sums. Particles of a block that follow each other are mostly of one island."""
+        root, most = -1, ti.Vector.zero(ti.i32, 3)
+        for i in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.n)):
+            own = self.root_of(i)
+            if own != root:
+                self.note_largest(root, most)
+                root = own
+                most = ti.Vector.zero(ti.i32, 3)
+            terms = self.sums_of(i)
+            for k in ti.static(range(3)):
+                bits = ti.bit_cast(ti.abs(terms[k]), ti.i64)
+                most[k] = ti.max(most[k], ti.cast(bits >> MANTISSA, ti.i32))
+        self.note_largest(root, most)
+
+    @ti.func
+    def note_largest(self, root, most):
+        """Raise the exponents of the largest terms of an island to these."""
+        if root >= 0:
+            for k in ti.static(range(3)):
+                if most[k] > self.largest[root][k]:
+                    if ti.static(self.serial):
+                        self.largest[root][k] = most[k]
+                    else:
+                        ti.atomic_max(self.largest[root][k], most[k])
+
+    @ti.func
+    def power(self, exponent):
+        """Return 2^exponent in f64."""
+        return ti.bit_cast(ti.cast(exponent + BIAS, ti.i64) << MANTISSA, ti.f64)
+
+    @ti.func
+    def add_up(self, block):
+        """Add the terms of the particles of a block to the sums of their islands."""
+        root, sums = -1, ti.Vector.zero(ti.i64, 3)
+        for i in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.n)):
+            own = self.root_of(i)
+            if own != root:
+                self.add(root, sums)
+                root = own
+                sums = ti.Vector.zero(ti.i64, 3)
+            terms = self.sums_of(i)
+            for k in ti.static(range(3)):
+                sums[k] += ti.cast(terms[k] * self.power(BITS + BIAS - 1 - self.largest[root][k]), ti.i64)
+        self.add(root, sums)
+
+    @ti.func
+    def add(self, root, sums):
+        """Add numbers to the sums of an island."""
+        if root >= 0:
+            for k in ti.static(range(3)):
+                if ti.static(self.serial):
+                    self.sums[root][k] = self.sums[root][k] + sums[k]
+                else:
+                    ti.atomic_add(self.sums[root][k], sums[k])
+
+    @ti.func
+    def total(self, root, k: ti.template()):  # type: ignore[valid-type]
+        """Return a sum over an island."""
+        return ti.cast(self.sums[root][k], ti.f64) * self.power(self.largest[root][k] - (BITS + BIAS - 1))
+
+    @ti.func
+    def find_scale(self, root, allowed):
+        """Find the scale of an island. allowed: work per impulse that is rounding [m]."""
+        work, square, load = self.total(root, WORK), self.total(root, SQUARE), self.total(root, LOAD)
+        scale = ti.cast(1, ti.f64)
+        if work + square / 2 > allowed * load and square > 0:
+            scale = ti.max(ti.min(-2 * work / square, 1), 0)
+        self.scale[root] = ti.cast(scale, self.real)
 
     @ti.func
     def sums_of(self, i):

@@ -26,6 +26,8 @@ BLOCK = 64  # particles whose sums are added up first, so that sums have the sam
 
 FOREIGN, OWN = range(2)  # parts of the rows of a particle: those that a particle of a lower piece has, too, and its own
 LACK, UPHILL, WORK, LOAD, ROWS, FORCE, HITS, WRONG, KINETIC = SUMS = range(9)  # sums over rows and particles
-BETA, THETA, TOLERANCE, LANDING = range(4)  # numbers of the passes; LANDING: what rows lack in impacts
+# Numbers of the passes. LANDING: what rows lack in impacts. ALLOWED: work per impulse that is rounding [m]
+BETA, THETA, TOLERANCE, LANDING, ALLOWED = range(5)
 H, BEGIN, END, SCALE, WHOLE, SHARES = TIMES = range(6)  # what rows know of a substep, see Rows.times
-GOING, TURN, GAINS = range(3)  # whether another pass follows, its number, whether any particle gains energy
+GOING, TURN, GAINS, STRUCK = range(4)  # whether another pass follows, its number, whether any particle gains energy, or bounces
+GROUP = 64  # blocks whose sums are added up first

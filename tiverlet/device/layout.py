@@ -31,6 +31,7 @@ MAX_TREES = 400  # Taichi holds at most 511 trees, without a check; the rest is 
 NODES = 900  # nodes of a tree from which it has no spare fields
 MOST_NODES = 1024  # Taichi's limit, beyond which it leaves its runtime in pieces
 MANY = 200  # shared trees, each for worlds of one kind; further trees serve all kinds
+WIDE = ti.f64, ti.i64  # of 8 bytes
 FEW = 4  # a shared tree has 4, 8, 16, ... fields of each kind
 ROOMS = (1 << 24, 1 << 20, 1 << 17)  # elements reserved per field: the first with which the tree fits into NEAR
 NEAR = 1 << 31  # [bytes] offsets up to this fit into a processor instruction, without an extra register
@@ -260,7 +261,7 @@ def _room(want: Counter[Kind], length: int) -> int:
 
 
 def _size(kind: Any, width: int) -> int:
-    return (8 if kind == ti.f64 else 4) * max(1, width)
+    return (8 if kind in WIDE else 4) * max(1, width)
 
 
 def _with_room(kind: Any, width: int, many: bool, room: int) -> Declared:

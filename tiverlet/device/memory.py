@@ -18,7 +18,7 @@ from . import language, layout, runtime
 from .copies import Copies
 from .host_copy import Entry, Transfer
 from .language import ti
-from .layout import Declared, Layout
+from .layout import WIDE, Declared, Layout
 from .members import Members
 from .number import Number
 from .patches import patched
@@ -124,7 +124,7 @@ class Memory:
         in_all = max(1, length) * copies if copies else length
         if in_all >= 2**31:
             raise MemoryError(f"{name} would have {in_all} elements, and can have {2**31 - 1}. Make fewer worlds at a time.")
-        self._declared.append(Declared(kind, width, in_all, self._apart and kind == ti.f64))
+        self._declared.append(Declared(kind, width, in_all, self._apart and kind in WIDE))
         self._named[name] += 1
         same = self._named[name]
         name = f"{name} #{same}" if same > 1 else name  # several batches of a kind
@@ -598,7 +598,7 @@ def _part(entry: Entry, values: np.ndarray, copy: int) -> np.ndarray:
     return values[copy] if np.ndim(values) > len(entry.shape) else values
 
 
-_NUMPY = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u32: np.uint32}
+_NUMPY = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u32: np.uint32, ti.i64: np.int64}
 
 
 def aligned() -> bool:

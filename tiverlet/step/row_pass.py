@@ -3,11 +3,13 @@
 from typing import TYPE_CHECKING, Any
 
 from ..contact.limits import (
+    ALLOWED,
     BETA,
     BLOCK,
     FORCE,
     GAINS,
     GOING,
+    GROUP,
     HITS,
     KINETIC,
     LACK,
@@ -15,6 +17,7 @@ from ..contact.limits import (
     MOVES,
     OWN,
     ROWS,
+    STRUCK,
     UPHILL,
     WORK,
     WRONG,
@@ -26,6 +29,8 @@ if TYPE_CHECKING:
     from ..device.thread_team import Team
     from ..features.feature import Scene
     from .particle_pass import ParticlePass
+
+OF_ROWS, OF_PASS, OF_PLACES, OF_WORK = range(4)  # which sums are added up, see RowPass.noted
 
 
 class RowPass:
@@ -40,6 +45,8 @@ class RowPass:
         dev = contact.dev
         self.rows, self.bodies, self.impulses, self.places = dev.rows, dev.responses, dev.impulses, dev.places
         self.islands = dev.islands
+        some = [HITS, KINETIC] if self.rows.bounces else []
+        self.noted = [ROWS, FORCE, *some], [LACK, UPHILL, LOAD, *([WRONG] if self.rows.bounces else [])], [LACK], [WORK]
 
     @ti.func
     def solve(self, now):
@@ -91,19 +98,15 @@ class RowPass:
                     if ti.static(self.rows.bounces):
                         hits += self.rows.count_hits(i)
                         kinetic += self.bodies.kinetic(i)
-                self.impulses.note(low, HITS, hits)
                 if ti.static(self.rows.bounces):
+                    self.impulses.note(low, HITS, hits)
                     self.impulses.note(low, KINETIC, kinetic)
                 self.impulses.note(low, ROWS, count)
                 self.impulses.note(low, FORCE, force)
         self.team.wait()
         for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
             self.rows.find_eigenvalue(i)
-        self.add_up(now.thread, ROWS)
-        self.add_up(now.thread, FORCE)
-        self.add_up(now.thread, HITS)
-        if ti.static(self.rows.bounces):
-            self.add_up(now.thread, KINETIC)
+        self.add_up(now.thread, OF_ROWS)
         self.team.wait()
         if ti.static(self.rows.bounces):
             self.aim(now.thread)
@@ -125,20 +128,72 @@ class RowPass:
         """Find the times of impacts, and what bouncing rows aim at."""
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
-            if self.impulses.total(HITS) > 0:
-                self.islands.find_times()
+            self.impulses.check_hits()
         self.team.wait()
-        n = self.n * ti.cast(self.impulses.total(HITS) > 0, ti.i32)
+        n = self.n * self.impulses.flags[None][STRUCK]
+        self.find_islands(thread, n, True)
+        ti.loop_config(serialize=self.islands.serial)
         for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-            self.rows.aim(i, self.islands.scale[self.islands.root_of(i)])
+            self.islands.find_time(i)
+        self.team.wait()
+        ti.loop_config(serialize=self.islands.serial)
+        for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+            self.rows.aim(i, self.islands.time_of(i))
         self.team.wait()
 
     @ti.func
-    def add_up(self, thread, k: ti.template()):  # type: ignore[valid-type]
-        """On the launched path, where each particle has noted its own: add up sums over blocks."""
+    def find_islands(self, thread, n, all_rows):
+        """Find the islands of the first n particles, either all or none; of all rows or of those that press."""
+        for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+            self.islands.begin(i)
+        self.team.wait()
+        ti.loop_config(serialize=self.islands.serial)
+        for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+            self.islands.join(i, all_rows)
+        self.team.wait()
+
+    @ti.func
+    def scale_islands(self, thread):
+        """Scale the impulses of islands that gain energy, if any particle does."""
+        n = self.n * self.impulses.flags[None][GAINS]
+        blocks = self.impulses.blocks * self.impulses.flags[None][GAINS]
+        self.find_islands(thread, n, False)
+        ti.loop_config(serialize=self.islands.serial)
+        for b in range(self.team.chunk_begin(blocks, thread), self.team.chunk_end(blocks, thread)):
+            self.islands.find_largest(b)
+        self.team.wait()
+        ti.loop_config(serialize=self.islands.serial)
+        for b in range(self.team.chunk_begin(blocks, thread), self.team.chunk_end(blocks, thread)):
+            self.islands.add_up(b)
+        self.team.wait()
+        for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+            self.islands.find_scale(i, self.impulses.numbers[None][ALLOWED])
+        self.team.wait()
+        ti.loop_config(serialize=self.islands.serial)
+        for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+            self.islands.apply(i)
+        self.team.wait()
+
+    @ti.func
+    def add_up(self, thread, what: ti.template()):  # type: ignore[valid-type]
+        """On the launched path, where each particle has noted its own: add up sums over blocks, and those over groups."""
         if ti.static(self.team.launched):
-            for b in range(self.impulses.blocks * self.going()):
-                self.impulses.add_up(b, k)
+            blocks = self.impulses.blocks * self.going()
+            for b in range(self.team.chunk_begin(blocks, thread), self.team.chunk_end(blocks, thread)):
+                for k in ti.static(self.noted[what]):
+                    self.impulses.add_up(b, k)
+            self.team.wait()
+            self.add_up_groups(thread, what)
+
+    @ti.func
+    def add_up_groups(self, thread, what: ti.template()):  # type: ignore[valid-type]
+        """On the launched path: add up sums over groups of blocks."""
+        if ti.static(self.team.launched):
+            groups = (self.impulses.blocks + (GROUP - 1)) // GROUP
+            for g in range(self.team.chunk_begin(groups, thread), self.team.chunk_end(groups, thread)):
+                for k in ti.static(self.noted[what]):
+                    self.impulses.add_up_group(g, k)
+            self.team.wait()
 
     @ti.func
     def relax_impulses(self, thread):
@@ -162,11 +217,7 @@ class RowPass:
                         if ti.static(self.rows.bounces):
                             self.impulses.note(low, WRONG, wrong)
         self.team.wait()
-        self.add_up(thread, LACK)
-        self.add_up(thread, UPHILL)
-        self.add_up(thread, LOAD)
-        if ti.static(self.rows.bounces):
-            self.add_up(thread, WRONG)
+        self.add_up(thread, OF_PASS)
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread) * self.going()):
             self.impulses.decide()
@@ -187,15 +238,13 @@ class RowPass:
                 self.bodies.forget_sums(i)
             self.impulses.sums[b][WORK] = work
         self.team.wait()
+        self.add_up_groups(thread, OF_WORK)
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
             self.impulses.check_work()
         self.team.wait()
-        n = self.n * self.impulses.flags[None][GAINS]
-        for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-            self.islands.apply(i)
-        self.team.wait()
-        sums = ti.cast(final != 0 or self.impulses.total(HITS) > 0, ti.i32)
+        self.scale_islands(thread)
+        sums = ti.cast(final != 0 or self.impulses.flags[None][STRUCK] != 0, ti.i32)
         for k in range(self.particles.piece_count(thread) * sums):
             begin, end = self.particles.piece(k, thread)
             for part in range(self.rows.parts(), OWN + 1):
@@ -230,7 +279,7 @@ class RowPass:
                     if part == OWN:
                         self.impulses.note(low, LACK, lack)
         self.team.wait()
-        self.add_up(thread, LACK)
+        self.add_up(thread, OF_PLACES)
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread) * self.going()):
             self.impulses.decide_places(MOVES)
