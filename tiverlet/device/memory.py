@@ -386,7 +386,7 @@ class Memory:
     def choose(self, copy: int | None) -> None:
         """Choose one of the copies, or all (None), see Copies."""
         assert self.copies
-        if not self.copies.choose(copy):
+        if not self.copies.choose(copy) and id(self.copies.number) in self._at:
             self.write(self.copies.number, copy)
 
     def write(self, field, values) -> None:
