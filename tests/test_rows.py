@@ -1,10 +1,13 @@
 """Contacts as rows, see tiverlet/contact/rows.py."""
 
+import contextlib
+
 import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.contact.limits import BEYOND, MET, SLOP
+from tiverlet.contact.limits import BEYOND, BLOCK, GROUP, LEAST, MET, SLOP
+from tiverlet.device.patches.tracing import launches
 from tiverlet.device.thread_team import launching
 
 G, R = 9.81, 0.1
@@ -118,12 +121,12 @@ def test_overlap_stores_no_energy(world):
         np.testing.assert_array_equal(w.velocity, 0)
 
 
-def pile(world, path, n=160, friction=0.3, e=0.0, ratio=1, **settings):
+def pile(world, path, n=160, friction=0.3, e=0.0, ratio=1, columns=12, **settings):
     """Return a world of discs of sizes 1 : 2.8 that fall in a box, with densities of 1 : ratio."""
     k = np.arange(n)
     r = 0.03 * (1 + 1.8 * tv.golden(k))
-    x = np.stack([k % 12 * 0.18 + 0.1, k // 12 * 0.18 + 0.1], axis=1) + 0.01 * tv.golden(k, dim=2)
-    box = tv.Box((0, 0), (2.2, np.inf), friction=friction, restitution=e)
+    x = np.stack([k % columns * 0.18 + 0.1, k // columns * 0.18 + 0.1], axis=1) + 0.01 * tv.golden(k, dim=2)
+    box = tv.Box((0, 0), (0.18 * columns + 0.04, np.inf), friction=friction, restitution=e)
     start = tv.Particles(x, radius=r, mass=r**2 * ratio ** tv.golden(k + n), spin=0)
     return world(start, [tv.Gravity(G), tv.Contact(friction=friction, restitution=e), box], path=path, **settings)
 
@@ -280,3 +283,26 @@ def test_grains_need_fewer_substeps(world):
     assert w.substeps == 20
     for features in ([tv.Gravity(G)], [tv.Contact(), tv.Attractor((0, 0), 1.0)], [tv.Contact(restitution=1.0)]):
         assert tv.World(tv.Particles(x, radius=0.1), features).substeps == 20
+
+
+def test_sums_over_several_groups_have_the_same_bits_on_all_paths(world):
+    n, ends = BLOCK * GROUP + 200, []
+    for path in ("fused", "parallel", "launched"):
+        with launching() if path == "launched" else contextlib.nullcontext():
+            w = pile(world, "parallel" if path == "launched" else path, n=n, columns=n // 2, substeps=2)
+            w.run(0.25)
+            ends.append(w.position)
+    assert (w.contacts.pairs > BLOCK * GROUP).any()
+    np.testing.assert_array_equal(ends[1], ends[0])
+    np.testing.assert_array_equal(ends[2], ends[0])
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_what_rests_takes_few_launches(world, friction):
+    # The least number of passes in each substep; then the answer is that no further one is needed.
+    with launching():
+        w = pile(world, "parallel", n=4, friction=friction, substeps=3)
+    w.run(3.0)
+    with launches() as count:
+        w.step(1 / 60)
+    assert count["relax_impulses"] == LEAST[friction > 0] * 3 and count["relax_places"] == 2 * 3

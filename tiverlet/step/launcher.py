@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from ..contact.limits import BOUNCES, GOING, MOVES, PASSES
+from ..contact.limits import BOUNCES, GOING, MOVES
 from ..contact.projection_times import ALWAYS, MAYBE, due
 from ..contact.velocity_projection import RINGS
 from ..device.language import template
@@ -10,6 +10,8 @@ from .span import Moment, Span
 
 if TYPE_CHECKING:
     from .runner import Runner
+
+STIRRED = 2  # passes of places before the host asks whether more are needed: mostly none, or one and a look after it
 
 
 class Launcher:
@@ -173,25 +175,32 @@ class Launcher:
     def solve_contacts(self, now: Moment) -> None:
         """Add the phase solve_contacts, if there are contacts. Passes over rows are launches; some do nothing.
 
-        The host waits once for the answer whether anything bounces or lands, which takes more of them.
+        The host asks whether more of them are needed, see repeat().
         """
         self.put(now, "solve_contacts", self.touches and not self.solves_rows)
         if self.solves_rows and now.it == 0:
             self.put(now, "start_events")
             self.put(now, "find_rows")
-            self.repeat(now, "relax_impulses", PASSES)
-            flags = self.runner.step.contact_pass.rows.impulses.flags
-            if self.runner.memory.read(flags)[..., GOING].any():
-                self.repeat(now, "relax_impulses", BOUNCES - PASSES)
-            self.repeat(now, "finish_impulses", 1)
-            self.repeat(now, "relax_places", MOVES)
+            impulses = self.runner.step.contact_pass.rows.impulses
+            self.repeat(now, "relax_impulses", impulses.least, BOUNCES)
+            self.put(now, "finish_impulses")
+            self.repeat(now, "relax_places", STIRRED, MOVES)
 
-    def repeat(self, now: Moment, name: str, times: int) -> None:
-        """Launch a phase so many times."""
-        for _ in range(times):
+    def repeat(self, now: Moment, name: str, least: int, most: int) -> None:
+        """Launch passes until no further one is needed: the least number, and then each time as many as there were before.
+
+        An answer takes the host as long as a few launches, so at most half of them do nothing for it.
+        """
+        flags, done, more = self.runner.step.contact_pass.rows.impulses.flags, 0, least
+        while more:
+            for _ in range(more):
+                self.flush()
+                self.put(now, name)
             self.flush()
-            self.put(now, name)
-        self.flush()
+            done += more
+            more = min(done, most - done)
+            if more and not self.runner.memory.read(flags)[..., GOING].any():
+                return
 
     def any_struck(self) -> bool:
         """Always true. The host does not read whether a pair bounces; a round without a bounce does nothing."""
