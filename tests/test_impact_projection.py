@@ -192,18 +192,3 @@ def test_the_impulses_of_what_bounces_sum_up_to_its_momentum(world):
     gained = w.velocity[:, 1] - before + 0.1 * G
     assert by_floor == pytest.approx(gained.sum(), rel=0.03)
     assert by_pair == pytest.approx(gained[1:].sum(), rel=0.03)
-
-
-def test_particles_of_constraints_take_no_part(world):
-    # A rope of discs does not know of the projection. One that falls on the floor, side by side with free discs, has the bits
-    # that it has alone.
-    rope = lattice(1, 6) * (1.2, 1.2)
-    links = tv.Distance([(k, k + 1) for k in range(5)])
-    out = []
-    for more in (0, 3):
-        free = lattice(1, 3)[:more] + (3.0, 0.0)
-        start = tv.Particles(np.concatenate([rope, free]) + (0.0, 1.0), radius=R)
-        w = world(start, [tv.Gravity(G), tv.Contact(), links.copy(), tv.HalfSpace((0, 1))], substeps=8)
-        w.run(1.0)
-        out.append(w.position[:6])
-    assert (out[0] == out[1]).all()

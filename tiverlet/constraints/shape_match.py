@@ -52,6 +52,7 @@ class ShapeMatch(Batch):
     """
 
     clusters = True
+    answers_alone = True
     each = ("compliance", "damping", "creep", "yield_strain", "break_at")
     index_name = "clusters"
     compliance: Any = Knob(lambda f, v: f._setting("compliance", v), "Inverse stiffness [m/N], (m,).", force=True)

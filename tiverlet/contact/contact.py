@@ -16,6 +16,7 @@ from ..geometry.ordered import median
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
+from .answers import Answers
 from .body_projection import BodyProjection
 from .body_restitution import BodyRestitution
 from .each_once import ROUNDS, EachOnce
@@ -62,7 +63,7 @@ class Contact(PairContact):
     events: whether World.events() reports which pairs met and parted.
     sensors: pairs of groups that do not touch. World.events() reports which particles of the second group, the sensors, overlap
     particles of the first group. It costs least where sensors are few.
-    loads: in worlds with constraints, whether pairs store the load that they bear at rest; see known_loads.py. Elsewhere they do.
+    loads: whether pairs store the load that they bear at rest. They do, unless restitution is above 0.97, see known_loads.py.
 
     Two particles in the same place part in a direction computed from their indices. Linked particles (Distance, Rope, Spacer) do
     not touch, nor do particles that a chain of links holds closer than the sum of their radii, see exclusions.py.
@@ -86,11 +87,10 @@ class Contact(PairContact):
     @property
     def solves_rows(self) -> bool:
         """Whether pairs and walls are rows, see rows.py. README.md in step says where they are not."""
-        linked = any(not f.is_kinematic for f in self.ties)
         bounces = [self.restitution, *(w.restitution for w in self.walls)]
         values = [e for v in bounces for e in (v.values() if isinstance(v, Mapping) else [v])]
         cradle = any(float(np.ravel(e)[0]) > CRADLE for e in values)
-        return not cradle and not linked
+        return not cradle
 
     @property
     def projects(self) -> bool:
@@ -225,7 +225,8 @@ class Contact(PairContact):
         self.table.bind(scene, friction or bounces)
         turns = scene.state.spins and friction and (dev.turns or any(w.turns for w in self.walls))
         dev.rows = Rows(scene, self.table, friction, bounces, turns, scene.walls, team, self.push_out, self._ahead)
-        dev.responses = FreeParticles(scene, dev.rows, scene.state.spins and friction)
+        dev.answers = Answers(scene, batches, dev.rows) if batches else None
+        dev.responses = FreeParticles(scene, dev.rows, scene.state.spins and friction, dev.answers)
         dev.islands = Islands(scene, dev.rows, dev.responses, team)
         dev.impulses = Impulses(scene, dev.rows, dev.responses, team)
         dev.places = Places(scene, dev.rows, dev.responses, dev.impulses, team)

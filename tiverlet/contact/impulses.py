@@ -53,7 +53,6 @@ from .limits import (
     SCALE,
     SHARE,
     SLOW,
-    STEADY,
     STRUCK,
     SUMS,
     THETA,
@@ -142,7 +141,7 @@ class Impulses:
         share, kept, pressed = self.rows.share[i], self.rows.kept[i], self.rows.pressed[i]
         if ti.static(not self.has_friction):
             share = self.rows.eigenvalue[i]
-        w_own, across_own = share * self.bodies.compliance(i), share * self.bodies.tangential_compliance(i)
+        w_own, across_own = self.bodies.split(i), self.bodies.split_tangential(i)
         for row in range(self.rows.first(i, part), self.rows.last(i, part)):
             other, n = self.rows.other.field[row], self.rows.normal.field[row]
             w, across, most = w_own, across_own, share
@@ -150,16 +149,16 @@ class Impulses:
                 others = self.rows.share[other]
                 if ti.static(not self.has_friction):
                     others = self.rows.eigenvalue[other]
-                w += others * self.bodies.compliance(other)
-                across += others * self.bodies.tangential_compliance(other)
+                w += self.bodies.split(other)
+                across += self.bodies.split_tangential(other)
                 if self.bodies.moves(other):
                     most = ti.max(most, others)
             step, move = ti.cast(RELAXATION, self.real), ti.cast(SHARE, self.real)
             if most < ALONE:  # a row that shares its particles with none that it could disturb is solved in one pass
                 step, move = 1, 1
-            e = self.rows.eigenvalue[i] * self.bodies.compliance(i)
+            e = self.bodies.split_place(i)
             if row < pressed:
-                e += self.rows.eigenvalue[other] * self.bodies.compliance(other)
+                e += self.bodies.split_place(other)
             self.rows.firm.field[row] = move / e
             p = self.rows.p.field[row]
             if ti.static(self.has_friction):
@@ -304,6 +303,11 @@ class Impulses:
             if ti.static(self.rows.turns):
                 uphill += self.relax_turn(i, row, other, n, self.rows.along(new, n), beta)
                 m_own += self.give_turn(row, other, part == OWN and row < kept)
+        if ti.static(bool(self.bodies.answers)):
+            if part == OWN:
+                lack += self.bodies.answers.links.sum_of(self.bodies.answers.links.lack, i)
+                uphill += self.bodies.answers.links.sum_of(self.bodies.answers.links.uphill, i)
+                wrong += self.bodies.answers.links.sum_of(self.bodies.answers.links.wrong, i)
         self.take(i, part, p_own, m_own)
         return lack, uphill, load, wrong
 
@@ -434,7 +438,7 @@ class Impulses:
             load, slight = size, weight
             if row < self.rows.pressed[i]:
                 slight += self.weight(self.rows.other.field[row])
-            if ti.abs(size - borne) > ti.static(SLOW) * slight + ti.static(STEADY) * size:
+            if not self.rows.is_steady(ti.abs(size - borne), size, slight):
                 load = ti.static(SLOW) * slight
             if ti.static(self.rows.bounces):
                 if self.rows.when[i] > 0:  # in an island with an impact, what is more than before came of that
@@ -470,7 +474,8 @@ class Impulses:
         """
         if final != 0:
             w, kick = self.bodies.compliance(i), self.rows.kick(i)
-            push, change = w * self.bodies.push[i], self.bodies.new[i] - self.state.d[i]
+            push = w * self.bodies.push[i]
+            change = self.bodies.new[i] - self.state.d[i] - self.bodies.answer_of_constraints(i)
             self.rows.borne[i] = change - push - self.excess(change - push + kick, change + kick)
             if ti.static(self.bodies.spins):
                 turn = self.bodies.new_s[i] - self.bodies.spin.s[i]

@@ -81,14 +81,26 @@ class Islands:
         for row in range(self.rows.own[i], self.rows.pressed[i]):
             other = self.rows.other.field[row]
             if (all_rows or self.rows.is_set(self.rows.p.field[row])) and self.bodies.moves(other):
-                a, b = self.root_of(i), self.root_of(other)
-                while a != b:
-                    high, low = ti.max(a, b), ti.min(a, b)
-                    before = self.lower(high, low)
-                    a = low
-                    b = low
-                    if before != high:  # another thread was faster: join what it pointed at
-                        b = self.root_of(before)
+                self.join_two(i, other)
+
+    @ti.func
+    def join_body(self, c):
+        """Join the islands of the particles that constraint c connects."""
+        begin, end = self.bodies.answers.begin[c], self.bodies.answers.begin[c + 1]
+        for k in range(begin + 1, end):
+            self.join_two(self.bodies.answers.particle[begin], self.bodies.answers.particle[k])
+
+    @ti.func
+    def join_two(self, i, j):
+        """Join the islands of particles i and j."""
+        a, b = self.root_of(i), self.root_of(j)
+        while a != b:
+            high, low = ti.max(a, b), ti.min(a, b)
+            before = self.lower(high, low)
+            a = low
+            b = low
+            if before != high:  # another thread was faster: join what it pointed at
+                b = self.root_of(before)
 
     @ti.func
     def find_time(self, i):

@@ -22,6 +22,7 @@ MOVES = 8  # most passes of places in a substep
 AHEAD = 0.15  # of the smaller radius, or the median: pairs so near are rows already where one of them may be stopped
 QUARTER = 0.25  # of the smaller radius: by how much a pair that overlaps parts in a substep at most
 SHARE = 1.2  # of an overlap that a pass of places moves, by masses split by the largest eigenvalue; below 4/3
+CLOSE = 2.0**-7  # of AHEAD radii: by how much links may be violated before places move them together
 BLOCK = 64  # particles whose sums are added up first, so that sums have the same order on any number of threads
 
 FOREIGN, OWN = range(2)  # parts of the rows of a particle: those that a particle of a lower piece has, too, and its own

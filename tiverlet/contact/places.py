@@ -31,6 +31,9 @@ class Places:
         """Begin the passes of particle i."""
         self.bodies.last[i] = 0 * self.state.d[i]
         self.bodies.push[i] = 0 * self.state.d[i]
+        if ti.static(bool(self.bodies.answers)):  # how far places have moved it
+            self.bodies.new[i] = 0 * self.state.d[i]
+            self.bodies.answers.begin_particle(i)
 
     @ti.func
     def relax(self, i, part):
@@ -72,6 +75,8 @@ class Places:
                 if part == OWN and row < kept:
                     self.bodies.push[other] = self.bodies.push[other] - p
         if part == OWN:
+            if ti.static(bool(self.bodies.answers)):
+                out += self.bodies.answers.links.sum_of(self.bodies.answers.links.lack, i)
             self.bodies.v[i] = total
         else:
             self.bodies.push[i] = total
@@ -82,7 +87,20 @@ class Places:
         """Move particle i, and beta times as far as in the pass before."""
         w = self.bodies.compliance(i)
         if w > 0:
-            step = w * (self.bodies.v[i] + self.bodies.push[i]) + beta * self.bodies.last[i]
+            push = self.bodies.v[i] + self.bodies.push[i]
+            if ti.static(bool(self.bodies.answers)):
+                push += self.bodies.answers.links.along(self.bodies.answers.links.step, i)
+            step = w * push + beta * self.bodies.last[i]
             self.bodies.last[i] = step
+            if ti.static(bool(self.bodies.answers)):
+                self.bodies.new[i] = self.bodies.new[i] + step
             self.state.advance(i, step)
         self.bodies.push[i] = 0 * self.state.d[i]
+
+    @ti.func
+    def follow(self, i):
+        """Move particle i as its system, cluster or place wants after a pass."""
+        if self.bodies.compliance(i) > 0:
+            step = self.bodies.answers.hold(i)
+            self.bodies.new[i] = self.bodies.new[i] + step
+            self.state.advance(i, step)

@@ -1,12 +1,13 @@
 """How bodies answer impulses. Contacts need nothing else of a body."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..device import inline, ti
 from .limits import SHARES
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
+    from .answers import Answers
     from .rows import Rows
 
 
@@ -19,8 +20,9 @@ class FreeParticles:
     computes; last, last_s: those of the pass before. push, moment: sums of impulses [kg m], 0 between passes.
     """
 
-    def __init__(self, scene: "Scene", rows: "Rows", spins: bool):
+    def __init__(self, scene: "Scene", rows: "Rows", spins: bool, answers: "Answers | None"):
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
+        self.answers: Any = answers
         self.rows = rows
         self.state, self.spins, self.real, self.dim = scene.state, spins, scene.real, dim
         self.v, self.last, self.push = (add(f"Contact.{name}", n, width=dim) for name in ("v", "v_last", "push"))
@@ -46,12 +48,37 @@ class FreeParticles:
         )
 
     @ti.func
-    def tangential_compliance(self, i):
-        """Return by how much a unit tangential impulse moves the point of contact of particle i [1/kg]."""
+    def mobility(self, i):
+        """Return by how much a unit impulse on particle i moves it at most, with the body that it belongs to [1/kg]."""
         w = self.compliance(i)
-        if ti.static(self.spins):  # moments against rolling share the spin
-            w *= 1 + self.rows.times[None][SHARES] * self.spin.inverse_inertia.of(i)
+        if ti.static(bool(self.answers)):
+            if ti.static(self.answers.has_clusters):
+                if w > 0:
+                    w = self.answers.mobility[i]
         return w
+
+    @ti.func
+    def split(self, i):
+        """Return the same, with masses split among the rows of the body [1/kg]."""
+        out = self.mobility(i)
+        if ti.static(self.rows.has_friction):
+            out *= self.rows.share[i]
+        else:
+            out *= self.rows.eigenvalue[i]
+        return out
+
+    @ti.func
+    def split_place(self, i):
+        """Return the same for places, which have no friction [1/kg]."""
+        return self.rows.eigenvalue[i] * self.mobility(i)
+
+    @ti.func
+    def split_tangential(self, i):
+        """Return the same for tangential impulses at the point of contact of particle i [1/kg]."""
+        out = self.split(i)
+        if ti.static(self.spins):  # moments against rolling share the spin
+            out += self.rows.share[i] * (self.compliance(i) * self.rows.times[None][SHARES] * self.spin.inverse_inertia.of(i))
+        return out
 
     @ti.func
     def turning_compliance(self, i):
@@ -65,6 +92,8 @@ class FreeParticles:
         self.new[i] = self.state.d[i]
         self.last[i] = self.state.d[i]
         self.push[i] = 0 * self.state.d[i]
+        if ti.static(bool(self.answers)):
+            self.answers.begin_particle(i)
         if ti.static(self.spins):
             s = self.spin.s[i]
             self.s[i], self.new_s[i], self.last_s[i], self.moment[i] = s, s, s, 0 * s
@@ -87,9 +116,24 @@ class FreeParticles:
     def answer(self, i, p, m):
         """Compute the displacements of particle i under impulses whose sum is p, with moments of sum m [kg m]."""
         w = self.compliance(i)
+        if ti.static(bool(self.answers)):
+            p += self.answers.links.along(self.answers.links.mu, i)
         self.new[i] = self.state.d[i] + w * p
+        if ti.static(bool(self.answers)):
+            if ti.static(self.answers.answer_later):
+                self.new[i] = self.new[i] + self.answers.held[i]
         if ti.static(self.spins):
             self.new_s[i] = self.spin.s[i] - (w * self.spin.inverse_inertia.of(i)) * m
+
+    @ti.func
+    def answer_of_constraints(self, i):
+        """Return how far constraints move particle i in answer to contacts [m]."""
+        out = 0 * self.state.d[i]
+        if ti.static(bool(self.answers)):
+            out += self.compliance(i) * self.answers.links.along(self.answers.links.mu, i)
+            if ti.static(self.answers.answer_later):
+                out += self.answers.held[i]
+        return out
 
     @ti.func
     def extrapolate(self, i, beta):
@@ -116,6 +160,8 @@ class FreeParticles:
             change = self.new[i] - d
             work += d.dot(change) / w
             square += change.dot(change) / w
+            if ti.static(bool(self.answers)):  # links that turn do no work, nor do those that rows complete
+                work += self.answers.links.completing_work(i) - d.dot(self.answer_of_constraints(i)) / w
             if ti.static(self.spins):
                 k, s = self.spin.inverse_inertia.of(i), self.spin.s[i]
                 if k > 0:
@@ -137,6 +183,8 @@ class FreeParticles:
         """Multiply the impulses on particle i by a number."""
         d = self.state.d[i]
         self.new[i] = d + scale * (self.new[i] - d)
+        if ti.static(bool(self.answers)):
+            self.answers.scale(i, scale)
         if ti.static(self.spins):
             s = self.spin.s[i]
             self.new_s[i] = s + scale * (self.new_s[i] - s)
@@ -145,8 +193,8 @@ class FreeParticles:
     def finish(self, i, step):
         """Move particle i as impulses want, from where it was at the start. step: its new displacement, with a dither in f32."""
         if self.state.moves(i):
-            new = self.new[i]
-            if (new != self.state.d[i]).any():
+            new, d = self.new[i], self.state.d[i]
+            if (new != d).any():
                 self.state.d[i] = new
                 if ti.static(self.state.carries):
                     self.state.d_low[i] = 0 * new
@@ -156,6 +204,10 @@ class FreeParticles:
                     self.state.x[i] = self.state.x0[i] + step
                 if ti.static(self.rows.bounces):  # impacts act from their time on
                     if self.rows.when[i] > 0:
-                        self.state.advance(i, -self.rows.when[i] * self.compliance(i) * self.push[i])
+                        change = self.compliance(i) * self.push[i]
+                        if ti.static(bool(self.answers)):
+                            if self.answers.holds(i):  # bodies answer with all of their particles
+                                change = new - d
+                        self.state.advance(i, -self.rows.when[i] * change)
             if ti.static(self.spins):
                 self.spin.s[i] = self.new_s[i]

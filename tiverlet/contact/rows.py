@@ -29,6 +29,7 @@ from .limits import (
     SCALE,
     SLOP,
     SLOW,
+    STEADY,
     TIMES,
     WHOLE,
     H,
@@ -174,6 +175,11 @@ class Rows:
         return at(at(self.times, None), H)
 
     @inline
+    def scale(self):
+        """Return by how much impulses of the last substep are scaled to be loads in this one."""
+        return at(at(self.times, None), SCALE)
+
+    @inline
     def first(self, i, part):
         """Return the first row of a part of the rows of particle i: FOREIGN, those that lower pieces have, too, or OWN."""
         return ti.select(part == FOREIGN, at(self.begin, i), at(self.own, i)) if self.divided else at(self.own, i)
@@ -206,6 +212,22 @@ class Rows:
         elif ti.static(len(self.walls) > 0):
             u -= self.moved.field[row]
         return u
+
+    @ti.func
+    def when_of(self, i):
+        """Return the part of the substep before the impact of the island of particle i, 0 without one."""
+        out = ti.cast(0, self.real)
+        if ti.static(self.bounces):
+            out = self.when[i]
+        return out
+
+    @ti.func
+    def is_steady(self, change, size, slight):
+        """Whether an impulse of this size, which has changed by `change`, is a load. slight: what forces can change.
+
+        An impact passes. All three are in one unit.
+        """
+        return change <= ti.static(SLOW) * slight + ti.static(STEADY) * size
 
     @ti.func
     def relative_kick(self, i, row):

@@ -306,6 +306,7 @@ class Batch(Feature):
     clusters = False  # preserves shapes, see members_of() and shape_of()
     can_extend = False  # can be extended by more constraints, see extend()
     is_kinematic = False  # prescribes positions of its particles instead of relaxing them
+    answers_alone = False  # answers impulses of contacts by itself, see Passes.answer(); others do by a system or as rows
     solvable_together = False  # the System of a solver may solve its constraints with others; see Scalar
     driven = False  # rest values change by themselves, by the Drive of drive_of()
     transcends = False  # computes angles, cube roots or exponentials, which SPIR-V has for f32 only

@@ -76,6 +76,23 @@ def solve_3x3(H, r):
 
 
 @ti.func
+def turning_compliance(S, r):
+    """Return by how much a unit impulse at r moves that point at most by turning a body, tr((r x)^T I^-1 (r x)) [1/kg].
+
+    S: sum m r r^T about the centre, with the moment of inertia I = tr S - S.
+    """
+    out = 0 * S[0, 0]
+    if ti.static(S.n == 2):
+        if S.trace() > 0:
+            out = r.dot(r) / S.trace()
+    else:
+        for k in ti.static(range(3)):
+            arm = r.cross(ti.Vector([float(k == 0), float(k == 1), float(k == 2)]))
+            out += arm.dot(turn_rate(S, arm))
+    return out
+
+
+@ti.func
 def rigid_rotation(S, X):
     """Return the rotation, as a matrix, of a body whose parts move by y: S = sum m r r^T, X = sum m r y^T, about its centre."""
     return skew(turn_rate(S, axial(X.transpose())), S)

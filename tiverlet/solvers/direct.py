@@ -152,6 +152,14 @@ class Elimination(System):
         self.update_begin, self.product = ints("update_begin", found.update_begin), ints("product", product, 3)
         self.gradient = scene.memory.field("system.gradient", slots.total, width=self.dim)
         self.value, self.diagonal = reals("value", self.solved + 2 * self.entries), reals("weight")
+        self.answers = slots.answers
+        if self.answers:
+            self.slots = slots
+            self.answer, self.change, self.solution, self.gap = (reals(k) for k in ("answer", "change", "solution", "gap"))
+            self.added = scene.memory.field("system.added", found.parts, kind=ti.f64)
+            inside = self.row_slots(scalars, slots)
+            self.corner_begin = ints("corner_begin", np.searchsorted(inside[:, 0], np.arange(len(rows) + 1)))
+            self.corner = ints("corner", inside[:, 1])
         who = np.zeros(slots.total, dtype=np.int64)
         who[slot] = item
         self.particle_of, self.w, self.inverse_size = ints("who", who), scene.state.w, reals("close")
@@ -355,7 +363,7 @@ class Elimination(System):
             if ti.abs(pivot) <= REDUNDANT * self.diagonal[r]:
                 if (ti.abs(step) - CONTRADICTION * ti.abs(self.violation[r])) * self.inverse_size[r] > 8 * self.epsilon:
                     hard = 2
-                self.value[r] = 1
+                self.value[r], self.diagonal[r] = 1, 0
                 self.step[r] = 0
                 for e in range(first, last):
                     self.value[rows + e] = 0
@@ -377,6 +385,86 @@ class Elimination(System):
                 rest -= self.value[rows + e] * self.step[self.column[e]]
             self.step[r] = rest / self.value[r]
         return hard
+
+    @ti.func
+    def corner_particle(self, q):
+        """Return the particle at corner q, in the order of rows."""
+        return self.particle_of[self.corner[q]]
+
+    @ti.func
+    def begin_answer(self, b, rows: ti.template()):  # type: ignore[valid-type]
+        """Before contacts are solved: part b has answered nothing. After an impact, directions are those at its time."""
+        when = ti.cast(0, self.real)
+        for q in range(self.corner_begin[self.part_begin[b]], self.corner_begin[self.part_begin[b + 1]]):
+            when = ti.max(when, rows.when_of(self.corner_particle(q)))
+        for r in range(self.part_begin[b], self.part_begin[b + 1]):
+            self.answer[r], self.solution[r], self.gap[r] = 0, self.lam[r] + self.step[r], 0
+            if ti.static(self.one_sided):
+                if self.side[r] != 0:
+                    self.gap[r] = self.violation[r] + self.remaining[r] + self.alpha[r] * self.step[r]
+        if when > 0:
+            for q in range(self.corner_begin[self.part_begin[b]], self.corner_begin[self.part_begin[b + 1]]):
+                s = self.corner[q]
+                self.move[s] = self.move[s] + when * (self.move_at_end(s) - self.move[s])
+            self.assemble(self.part_begin[b], self.part_begin[b + 1], self.added[b], 0)
+            self.eliminate(self.part_begin[b], self.part_begin[b + 1])
+
+    @ti.func
+    def answer_part(self, b, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]
+        """Answer moves of the particles of part b, `moved` - d, by multipliers `answer`, with the matrix of the last solution.
+
+        With the moves A u + (alpha' + softness) answer = 0 again, where u is how far they have changed f.
+        """
+        begin, end, any_change, switched = self.part_begin[b], self.part_begin[b + 1], False, False
+        rows, entries = self.solved, self.entries
+        for r in range(begin, end):
+            change = ti.cast(0, ti.f64)
+            for q in range(self.corner_begin[r], self.corner_begin[r + 1]):
+                s = self.corner[q]
+                i = self.particle_of[s]
+                u = self.gradient[s].dot(moved[i] - d[i])
+                if ti.static(self.has_shared_particles):
+                    u /= self.blocks_of[i]
+                change -= self.scale[r] * u
+            if ti.static(self.one_sided):
+                if self.side[r] != 0 and self.scale[r] != 0:
+                    change -= self.gap[r]
+                    acts = ti.select(
+                        self.active[r] != 0, self.side[r] * (self.solution[r] + self.answer[r]) < 0, self.side[r] * change < 0
+                    )
+                    if acts != (self.active[r] != 0):
+                        self.active[r], switched = 1 - self.active[r], True
+                        if not acts:
+                            self.answer[r] = -self.solution[r]
+            if self.is_active(r):
+                change -= (self.alpha[r] + self.added[b]) * self.answer[r]
+            else:
+                change = 0
+            self.change[r] = change
+            any_change = any_change or change != 0
+        if switched:
+            self.assemble(begin, end, self.added[b], 0)
+            self.eliminate(begin, end)
+        for r in range(begin, end):
+            if self.diagonal[r] == 0:
+                self.change[r] = 0
+        if any_change or switched:
+            for r in range(begin, end):
+                part = self.change[r] / self.value[r]
+                for e in range(self.entry_begin[r], self.entry_begin[r + 1]):
+                    later = self.column[e]
+                    self.change[later] = self.change[later] - self.value[rows + entries + e] * part
+            for k in range(end - begin):
+                r = end - 1 - k
+                rest = self.change[r]
+                for e in range(self.entry_begin[r], self.entry_begin[r + 1]):
+                    rest -= self.value[rows + e] * self.change[self.column[e]]
+                self.change[r] = ti.select(self.diagonal[r] != 0, rest / self.value[r], 0 * rest)
+            for r in range(begin, end):
+                self.answer[r] = self.answer[r] + self.change[r]
+                for q in range(self.corner_begin[r], self.corner_begin[r + 1]):
+                    s = self.corner[q]
+                    self.slots.answer[s] = ti.cast(self.answer[r] * ti.cast(self.move[s], ti.f64), self.real)
 
     @ti.func
     def update_active_set(self, begin, end, at_end):
@@ -587,6 +675,8 @@ class Elimination(System):
             stage = DONE
         while stage != DONE:
             hard = self.solve_active_set(begin, end, softness, ti.cast(stage >= COMPARE, ti.i32))
+            if ti.static(self.answers):
+                self.added[b] = softness
             tension, total, stiffness, most = self.tensions(begin, end, ti.cast(stage >= COMPARE, ti.i32), longer)
             if ti.static(self.limits_steps):
                 if stage <= FORWARD and self.limit_steps(begin, end) != 0:

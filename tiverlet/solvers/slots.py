@@ -42,6 +42,7 @@ class Slots:
     The slots of a particle are adjacent, in the order of batches and constraints, so a particle always sums them in the same
     order. Corners that cannot move have no slot.
 
+    answers: whether constraints answer the impulses of contacts; `answer` is how far each moves its corner then [m].
     loads: whether constraints that are relaxed by themselves learn their loads, see KnownLoad. body_load: if so, the largest load
     in each body at the end of a window, in weights of a particle. split: the mass-split weight n w of each particle, for the n
     blocks of constraints that it belongs to. A block is a system, or a constraint that is relaxed by itself.
@@ -51,7 +52,7 @@ class Slots:
 
     host_only = ("total", "exact")
 
-    def __init__(self, scene: Scene, batches: list[Batch], solver):
+    def __init__(self, scene: Scene, batches: list[Batch], solver, answers: bool):
         memory, state, inv_mass = scene.memory, scene.state, scene.inv_mass
         self._places, degree = assign_slots(batches, inv_mass)
         self.total, begin = int(degree.sum()), np.concatenate([[0], np.cumsum(degree)])
@@ -59,7 +60,9 @@ class Slots:
         self.move = memory.field("slots.move", self.total, width=state.dim)
         self.begin = memory.field("slots.begin", len(begin), kind=ti.i32, values=begin)
         self.semi_iteration = solver.semi_iteration(scene)
-        self.converges, self.loads = solver.converges, solver.loads
+        self.converges, self.loads, self.answers = solver.converges, solver.loads, answers
+        if answers:
+            self.answer = memory.field("slots.answer", self.total, width=state.dim)
         if self.converges:
             self.tension = memory.field("slots.tension", None, kind=ti.f64)
         self.turned = memory.field("slots.turned", None, kind=ti.i32)  # the worst turn since the last diagnostics
@@ -175,6 +178,11 @@ class Slots:
     def rows(self, batch: Batch) -> np.ndarray:
         """Return the row of each constraint of a batch in the system, (m,), -1 for constraints that are relaxed alone."""
         return self.system.row(batch) if self.system else np.full(batch.count, -1)
+
+    @ti.func
+    def most_tense(self, geometric_stiffness):
+        """Return the largest multiplier that the substep can stand, with (omega h)^2 = geometric_stiffness |multiplier|."""
+        return TENSEST / geometric_stiffness
 
     @ti.func
     def limit_multiplier(self, wanted, geometric_stiffness):

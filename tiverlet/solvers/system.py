@@ -33,6 +33,7 @@ class System:
 
     rows: Any = OnDevice()
     parts: Any = 1  # number of independent systems
+    answers = False  # whether parts answer the impulses of contacts, see Elimination.answer_part()
     steps = 0  # iterations of a pass, by start(), iterate() and end(); 0 for a solution by solve()
     refines = False  # whether parts may take a second Newton step in a pass, see takes_step() and is_unmet()
     can_stiffen: Any = False  # whether parts gave way in a longer substep, and may bear their loads in this one
@@ -106,6 +107,17 @@ class System:
             free = (slots.places(b) >= 0) & (row >= 0)
             out[row[free]] = b.indices[free]
         return out
+
+    def row_slots(self, scalars: "list[Scalar]", slots: "Slots") -> np.ndarray:
+        """Return the row and the slot of each corner that can move, in the order of rows, (k, 2)."""
+        each = []
+        for b in scalars:
+            slot = slots.places(b)
+            row = np.broadcast_to(self.row(b)[:, None], slot.shape)
+            some = (slot >= 0) & (row >= 0)
+            each.append(np.stack([row[some], slot[some]], axis=1))
+        out = np.concatenate(each)
+        return out[np.argsort(out[:, 0], kind="stable")]
 
     def count_relaxed_alone(self, batches: "list[Batch]") -> int:
         """Return how many constraints with a movable particle are relaxed by themselves."""

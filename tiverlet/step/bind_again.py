@@ -54,6 +54,8 @@ def bound_again(
         return None
     if not batches or any(f.changed and f not in drivers for f in bound):
         return None
+    if scene.slots.answers:  # contacts have tables of all corners
+        return None
     structure = runner.structure = runner.structure or _structure(scene, bound)
     objects = [scene, scene.slots, *bound]
     before, exact = [dict(vars(one)) for one in objects], scene.slots.exact
@@ -73,7 +75,7 @@ def bound_again(
         with memory.redeclare({scene.count: now.count}) as again:
             system = scene.slots.system
             with memory.owned("slots"):
-                scene.slots.__init__(scene, batches, world._solver)
+                scene.slots.__init__(scene, batches, world._solver, scene.slots.answers)
             if scene.slots.system and system:
                 scene.slots.system.team, scene.slots.system.stride = system.team, system.stride
             for f in bound:

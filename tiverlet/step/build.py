@@ -165,7 +165,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         scene.own_weight = OwnWeight(scene)
     if batches:
         with memory.owned("slots"):
-            scene.slots = Slots(scene, batches, solver)
+            scene.slots = Slots(scene, batches, solver, bool(contact and contact.solves_rows))
         # Rounding errors are carried along where they are all that constraints leave, and where rest values move by themselves,
         # whose steady loads would otherwise tremble by m ulp(x) / h^2.
         carries = sums_exactly() and (scene.slots.exact or any(b.driven for b in batches))
@@ -177,7 +177,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     team = Team(memory, size, len(particles), path == "parallel" and size == 1, pieces=PIECES if contact else size)
     if contact:
         contact.enter(scene)
-    if can_have_impacts(scene, batches):
+    if can_have_impacts(scene, batches) and not (contact and contact.solves_rows):
         pairs = bool(contact and contact.strikes_bodies)
         if pairs or any(w.has_restitution for w in walls) or (walls and stops_bodies(scene, batches)):
             scene.impacts = BodyImpacts(scene, batches, bool(contact), pairs)
@@ -250,8 +250,9 @@ def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
 def usual_substeps(features: tuple[Feature, ...]) -> int:
     """Return how many substeps frames have where the user does not say."""
     rows = any(isinstance(f, PairContact) and f.solves_rows for f in features)
+    linked = any(isinstance(f, Batch) and not f.is_kinematic for f in features)
     free = all((f.common and f.steady) or not f.accelerates for f in features if isinstance(f, Acceleration))
-    return GRAINS if rows and free else USUAL
+    return GRAINS if rows and free and not linked else USUAL
 
 
 def listed(who: str, features: Any) -> tuple[Feature, ...]:

@@ -3,8 +3,8 @@
 from typing import Any
 
 from ..colliders.body_impacts import holding_bodies
-from ..constraints.core.equation import RESTARTED
 from ..constraints.core.known_load import WINDOW
+from ..constraints.core.spring import RESTARTED
 from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Scene

@@ -200,6 +200,9 @@ def grab(world: Any, change: Grab) -> None:
     if change.soft:
         scene.particles = particles.placed(scene.state.get(memory))
         scene.slots.reassign(memory, change.inv_mass, runner.batches)
+        rows = runner.step.contact_pass.rows
+        if rows and rows.answers:
+            rows.answers.reassign(memory, change.inv_mass)
         runner.find_bodies(everything=True)
     for f in pins:
         f.grab(scene)

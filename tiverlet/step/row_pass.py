@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+from ..constraints.core.spring import RESTARTED
 from ..contact.limits import (
     ALLOWED,
     BETA,
@@ -47,6 +48,15 @@ class RowPass:
         self.islands = dev.islands
         some = [HITS, KINETIC] if self.rows.bounces else []
         self.noted = [ROWS, FORCE, *some], [LACK, UPHILL, LOAD, *([WRONG] if self.rows.bounces else [])], [LACK], [WORK]
+        self.answers: Any = dev.answers
+        self.answers_later = bool(dev.answers) and dev.answers.answer_later
+        self.linked: list[Any] = []
+        self.in_systems: list[Any] = []
+        if dev.answers:
+            self.linked = list(zip(dev.answers.links.batches, dev.answers.links.first, strict=True))
+            if dev.answers.systems:
+                solved = [b for b in dev.answers.batches if b.solvable_together]
+                self.in_systems = [b for b in solved if (scene.slots.rows(b) >= 0).any()]
 
     @ti.func
     def solve(self, now):
@@ -95,6 +105,8 @@ class RowPass:
                         row = self.rows.find(i, begin, end, row)
                         count += ti.cast(row - self.rows.own[i], self.real)
                         force += kick.dot(kick)
+                        if ti.static(bool(self.answers)):
+                            count += self.answers.links.sum_of(self.answers.links.open, i)
                     if ti.static(self.rows.bounces):
                         hits += self.rows.count_hits(i)
                         kinetic += self.bodies.kinetic(i)
@@ -106,10 +118,14 @@ class RowPass:
         self.team.wait()
         for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
             self.rows.find_eigenvalue(i)
+            if ti.static(bool(self.answers)):
+                self.rows.share[i] = self.rows.share[i] + self.answers.links.degree[i]
+                self.rows.eigenvalue[i] = self.rows.eigenvalue[i] + self.answers.links.degree[i]
         self.add_up(now.thread, OF_ROWS)
         self.team.wait()
         if ti.static(self.rows.bounces):
             self.aim(now.thread)
+        self.begin_answers(now)
         for k in range(self.particles.piece_count(now.thread)):
             begin, end = self.particles.piece(k, now.thread)
             for part in range(self.rows.parts(), OWN + 1):
@@ -119,9 +135,70 @@ class RowPass:
         for _ in range(self.team.one(1, now.thread)):
             self.impulses.start_passes()
         self.team.wait()
+        self.answer(now.thread, self.n)
         for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
             self.bodies.extrapolate(i, ti.cast(0, self.real))
         self.team.wait()
+
+    @ti.func
+    def begin_answers(self, now):
+        """Prepare constraints to answer impulses."""
+        if ti.static(bool(self.answers)):
+            fresh = now.fresh if ti.static(self.particles.integrator.half_kick) else 0
+            h2_effective, share = (
+                self.particles.integrator.h2_effective(now.h, fresh),
+                now.frame_fraction[1] - now.frame_fraction[0],
+            )
+            if fresh != 0 and now.span.owed > 0:
+                fresh = RESTARTED
+            for system in ti.static(self.answers.systems):
+                for b in range(self.team.chunk_begin(system.parts, now.thread), self.team.chunk_end(system.parts, now.thread)):
+                    system.begin_answer(b, self.rows)
+            for f in ti.static(self.answers.alone):
+                for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
+                    f.dev.begin_answer(c, now.h, h2_effective, fresh, self.bodies)
+            self.team.wait()
+            for f, first in ti.static(self.linked):
+                for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
+                    self.answers.links.prepare(f, c, first.now + c, now.h, h2_effective, share, fresh, self.bodies)
+            self.team.wait()
+
+    @ti.func
+    def answer(self, thread, n):
+        """Let systems, clusters and places answer the impulses of a pass to n particles: all, or none where no passes go on."""
+        if ti.static(self.answers_later):
+            self.move_answers(thread, self.going() if ti.static(self.team.launched) else 1, True)
+            for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                self.bodies.new[i] = self.bodies.new[i] + self.answers.hold(i)
+            self.team.wait()
+
+    @ti.func
+    def move_answers(self, thread, going, from_d: ti.template()):  # type: ignore[valid-type]
+        """Let systems, clusters and places answer moves `new` of particles; from_d: beyond their displacements."""
+        for system in ti.static(self.answers.systems):
+            n = system.parts * going
+            for b in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                system.answer_part(b, self.bodies.new, self.state.d if ti.static(from_d) else self.answers.nothing)
+        for f in ti.static(self.answers.alone):
+            n = f.count * going
+            for c in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                f.dev.answer(c, self.bodies.new, self.state.d if ti.static(from_d) else self.answers.nothing)
+        self.team.wait()
+
+    @ti.func
+    def end_answers(self, thread):
+        """Add answers to multipliers."""
+        if ti.static(bool(self.answers)):
+            for f in ti.static(self.in_systems):
+                for c in range(self.team.chunk_begin(f.count, thread), self.team.chunk_end(f.count, thread)):
+                    f.dev.end_answer(c, self.rows)
+            for f in ti.static(self.answers.alone):
+                for c in range(self.team.chunk_begin(f.count, thread), self.team.chunk_end(f.count, thread)):
+                    f.dev.end_answer(c, self.rows)
+            for f, first in ti.static(self.linked):
+                for c in range(self.team.chunk_begin(f.count, thread), self.team.chunk_end(f.count, thread)):
+                    self.answers.links.end_impulses(f, c, first.now + c, self.bodies)
+            self.team.wait()
 
     @ti.func
     def aim(self, thread):
@@ -151,6 +228,12 @@ class RowPass:
         for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
             self.islands.join(i, all_rows)
         self.team.wait()
+        if ti.static(bool(self.answers)):
+            bodies = self.answers.n * ti.cast(n > 0, ti.i32)
+            ti.loop_config(serialize=self.islands.serial)
+            for c in range(self.team.chunk_begin(bodies, thread), self.team.chunk_end(bodies, thread)):
+                self.islands.join_body(c)
+            self.team.wait()
 
     @ti.func
     def scale_islands(self, thread):
@@ -198,6 +281,11 @@ class RowPass:
     @ti.func
     def relax_impulses(self, thread):
         """One pass of stage 1."""
+        if ti.static(bool(self.answers)):
+            n = self.answers.links.n * self.going()
+            for r in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                self.answers.links.relax(r, self.bodies, self.impulses.numbers[None][BETA])
+            self.team.wait()
         for k in range(self.particles.piece_count(thread) * self.going()):
             begin, end = self.particles.piece(k, thread)
             for part in range(self.rows.parts(), OWN + 1):
@@ -217,6 +305,7 @@ class RowPass:
                         if ti.static(self.rows.bounces):
                             self.impulses.note(low, WRONG, wrong)
         self.team.wait()
+        self.answer(thread, self.n * self.going())
         self.add_up(thread, OF_PASS)
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread) * self.going()):
@@ -254,6 +343,7 @@ class RowPass:
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             self.impulses.remember(i, final)
         self.team.wait()
+        self.end_answers(thread)
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             new = self.bodies.new[i]
             if ti.static(not self.state.sums):
@@ -268,6 +358,11 @@ class RowPass:
     @ti.func
     def relax_places(self, thread):
         """One pass of stage 2."""
+        if ti.static(bool(self.answers)):
+            n = self.answers.links.n * self.going()
+            for r in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                self.answers.links.relax_place(r, self.bodies)
+            self.team.wait()
         for k in range(self.particles.piece_count(thread) * self.going()):
             begin, end = self.particles.piece(k, thread)
             for part in range(self.rows.parts(), OWN + 1):
@@ -288,3 +383,8 @@ class RowPass:
         for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
             self.places.move(i, self.impulses.numbers[None][BETA])
         self.team.wait()
+        if ti.static(self.answers_later):
+            self.move_answers(thread, self.impulses.moving(), False)
+            for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                self.places.follow(i)
+            self.team.wait()

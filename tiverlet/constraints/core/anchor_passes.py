@@ -57,6 +57,11 @@ class AnchorPasses(Passes):
             self.lam = scene.memory.field(f"{name}.multiplier", batch.count, width=scene.particles.dim, state=True)
             compliance, damping = (batch.compliance, batch.damping) if batch.soft else (None, None)
             self.spring = Spring(scene, name, compliance, damping, start)
+            if scene.slots.answers:
+                dim = scene.particles.dim
+                self.law_now = scene.memory.field(f"{name}.answering", batch.count, width=2)  # A and alpha' in this substep
+                self.answered = scene.memory.field(f"{name}.answered", batch.count, width=dim, state=True)  # in the last substep
+                self.blow = scene.memory.field(f"{name}.blow", batch.count, width=dim, state=True)  # part of lam that is over
         self.place = batch.place_of(scene, self)
 
     @ti.func
@@ -90,6 +95,38 @@ class AnchorPasses(Passes):
         self.corners.write_move(c, 0, self.w.of(self.corners.member(c, 0)) * (new - lam))
 
     @ti.func
+    def begin_answer(self, c, h, h2_effective, fresh, bodies: ti.template()):  # type: ignore[valid-type]
+        """Store the law of this substep."""
+        w = self.w.of(self.corners.member(c, 0))
+        alpha, A = 0 * w, 1 + 0 * w
+        if ti.static(self.spring.soft):
+            alpha = self.spring.alpha[c] / h2_effective
+            A, _now, _last = self.spring.law(c, h, w, fresh)
+        self.law_now[c] = [A, alpha]
+
+    @ti.func
+    def answer(self, c, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]
+        """Hold the particle against a move: A (its move) + alpha' (answer / w) = 0."""
+        i, place = self.corners.member(c, 0), self.corners.places[c][0]
+        if place >= 0:
+            A, alpha, w, before = self.law_now[c][0], self.law_now[c][1], self.w.of(i), self.slots.answer[place]
+            change = (A * w * (moved[i] - d[i]) + alpha * before) / (A * self.slots.split[i] + alpha)
+            self.slots.answer[place] = before - change
+
+    @ti.func
+    def end_answer(self, c, rows: ti.template()):  # type: ignore[valid-type]
+        """Add the answer to the multiplier. Unless it is steady, it came of a blow."""
+        i, place = self.corners.member(c, 0), self.corners.places[c][0]
+        if place >= 0:
+            answer = self.slots.answer[place]
+            change = (answer - rows.scale() * self.answered[c]).norm()
+            self.answered[c] = answer
+            self.blow[c] = ti.select(
+                rows.is_steady(change, answer.norm(), rows.kick(i).norm()), 0 * answer, answer / self.w.of(i)
+            )
+            self.lam[c] = self.lam[c] + answer / self.w.of(i)
+
+    @ti.func
     def push_spring_force(self, c, h, soft, alone):
         """Push h^2 times the spring acceleration, as in CornerPasses, for each axis."""
         move = ti.Vector.zero(self.real, self.state.dim)
@@ -105,11 +142,14 @@ class AnchorPasses(Passes):
     def push_reaction(self, c, h, firm, soft):
         """Push the reaction, as in CornerPasses, for each axis."""
         i = self.corners.member(c, 0)
-        w, pull = self.w.of(i), firm * self.lam[c]
+        w, lam = self.w.of(i), self.lam[c]
+        if ti.static(self.slots.answers):
+            lam -= self.blow[c]
+        pull = firm * lam
         if ti.static(self.spring.soft):
             if w > 0 and self.spring.alpha[c] > 0:
                 grown = self.place.offset_now(c, 0) - self.spring.last[c]
-                pull = soft * self.lam[c] + self.spring.force_change(c, grown, h, w, self.slots.split[i])
+                pull = soft * lam + self.spring.force_change(c, grown, h, w, self.slots.split[i])
         self.corners.write_move(c, 0, w * pull)
 
     @ti.func

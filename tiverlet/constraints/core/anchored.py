@@ -32,6 +32,7 @@ class Anchored(Batch):
     """
 
     arity = 1
+    answers_alone = True
     each = ("compliance", "damping")
     uploads_all = True
     exclusive = False  # no other feature may hold its particles

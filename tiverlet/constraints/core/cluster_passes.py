@@ -62,6 +62,10 @@ class ClusterPasses(Passes):
             self.fit = add(f"{name}.fit", m, width=dim * dim, kind=ti.f64, state=for_reports)
             self.middle = add(f"{name}.middle", m, width=dim, kind=ti.f64)
             self.mean = add(f"{name}.mean", m, width=dim, kind=ti.f64, state=for_reports)
+        if scene.slots.answers:  # the middle, sum m r r^T about it, A, alpha', the mass, and when, see begin_answer()
+            self.answering = add(f"{name}.answering", m, width=dim * dim + dim + 4, kind=ti.f64)
+            self.answered = add(f"{name}.answered", total, width=dim, state=True)  # in the last substep
+            self.blow = add(f"{name}.blow", total, width=dim, state=True)  # the part of `pull` that is over
         self.impacts: Any = scene.impacts
         self.impact: Any = ClusterImpact(self, scene.impacts) if scene.impacts else None
         if self.plastic:
@@ -248,6 +252,94 @@ class ClusterPasses(Passes):
                 self.write_matrix(self.fit, c, R)
 
     @ti.func
+    def begin_answer(self, c, h, h2_effective, fresh, bodies: ti.template()):  # type: ignore[valid-type]
+        """Find how cluster c moves as a rigid body, at the start of the substep or at the time of an impact.
+
+        A cluster that shares no particle divides its mass among all rows that press on it.
+        """
+        begin, end, i0 = self.corners.starts[c], self.corners.starts[c + 1], self.corners.reference_particle(c)
+        n = ti.static(self.state.dim)
+        total, middle, own = ti.cast(0, ti.f64), self.zero_vector(), self.is_body(c) and self.strength.is_intact(c)
+        back = 1 - bodies.rows.when_of(self.corners.members[begin])
+        S = middle.outer_product(middle)
+        for e in range(begin, end):
+            m, r = self.mass_in_fit(e, c), self.relative_position(e, i0, back)
+            total += m
+            middle += m * r
+            S += m * r.outer_product(r)
+        middle /= total
+        S -= total * middle.outer_product(middle)
+        rigid, soft, _now, _last, alpha_prime = self.law(c, h, h2_effective, fresh)
+        for j in ti.static(range(n)):
+            self.answering[c][j] = middle[j]
+            for k in ti.static(range(n)):
+                self.answering[c][n + n * j + k] = S[j, k]
+        self.answering[c][n + n * n], self.answering[c][n + n * n + 1] = rigid + soft, alpha_prime
+        self.answering[c][n + n * n + 2], self.answering[c][n + n * n + 3] = total, back
+        if own and self.mass[c] > 0:
+            share, eigenvalue = 0 * rigid, 0 * rigid
+            for e in range(begin, end):
+                share += bodies.rows.share[self.corners.members[e]]
+                eigenvalue += bodies.rows.eigenvalue[self.corners.members[e]]
+            give = alpha_prime / (rigid + soft + alpha_prime)
+            for e in range(begin, end):
+                i, r = self.corners.members[e], self.relative_position(e, i0, back) - middle
+                w = self.w.of(i)
+                body = ti.cast(1 / total + rotation.turning_compliance(S, r), self.real)
+                bodies.answers.mobility[i] = give * w + (1 - give) * ti.min(body, w)
+                bodies.rows.share[i], bodies.rows.eigenvalue[i] = share, eigenvalue
+
+    @ti.func
+    def answer(self, c, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]
+        """Move corners to a rigid motion of the cluster, as far as it is stiff: A (C of the moves) + alpha' answer = 0."""
+        begin, end, i0 = self.corners.starts[c], self.corners.starts[c + 1], self.corners.reference_particle(c)
+        n = ti.static(self.state.dim)
+        if self.mass[c] > 0 and self.strength.is_intact(c):
+            middle, mean, some = self.zero_vector(), self.zero_vector(), False
+            S = middle.outer_product(middle)
+            X = 0 * S
+            for j in ti.static(range(n)):
+                middle[j] = self.answering[c][j]
+                for k in ti.static(range(n)):
+                    S[j, k] = self.answering[c][n + n * j + k]
+            A, alpha, total = self.answering[c][n + n * n], self.answering[c][n + n * n + 1], self.answering[c][n + n * n + 2]
+            back = self.answering[c][n + n * n + 3]
+            for e in range(begin, end):
+                i = self.corners.members[e]
+                m, move = self.mass_in_fit(e, c), ti.cast(moved[i] - d[i], ti.f64)
+                some = some or (move != 0).any()
+                mean += m * move
+                X += m * (self.relative_position(e, i0, back) - middle).outer_product(move)
+            if some:
+                mean /= total
+                spin = rotation.rigid_rotation(S, X)
+                for e in range(begin, end):
+                    i, place = self.corners.members[e], self.corners.places[e]
+                    if place >= 0:
+                        C = ti.cast(moved[i] - d[i], ti.f64) - mean - spin @ (self.relative_position(e, i0, back) - middle)
+                        before = ti.cast(self.slots.answer[place], ti.f64)
+                        change = (A * C + alpha * before) / (A * self.slots.split[i] / self.w.of(i) + alpha)
+                        self.slots.answer[place] = ti.cast(before - change, self.real)
+
+    @ti.func
+    def end_answer(self, c, rows: ti.template()):  # type: ignore[valid-type]
+        """Add the answer to the moves of the corners. Unless it is steady, it came of a blow."""
+        change, size, slight = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
+        for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+            i, place = self.corners.members[e], self.corners.places[e]
+            if place >= 0:
+                answer, m = self.slots.answer[place], 1 / self.w.of(i)
+                change += m * (answer - rows.scale() * self.answered[e]).norm()
+                size += m * answer.norm()
+                slight += m * rows.kick(i).norm()
+        for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+            place = self.corners.places[e]
+            if place >= 0:
+                answer = self.slots.answer[place]
+                self.pull[e], self.answered[e] = self.pull[e] + answer, answer
+                self.blow[e] = ti.select(rows.is_steady(change, size, slight), 0 * answer, answer)
+
+    @ti.func
     def push_spring_force(self, c, h, soft, alone):
         """Compute the present position and rotation of the cluster.
 
@@ -297,11 +389,14 @@ class ClusterPasses(Passes):
 
         It is 0 if its cluster has broken. middle, center, R: see best_fit().
         """
-        move = firm * ti.cast(self.pull[e], ti.f64)
+        pull = ti.cast(self.pull[e], ti.f64)
+        if ti.static(self.slots.answers):
+            pull -= ti.cast(self.blow[e], ti.f64)
+        move = firm * pull
         if ti.static(self.spring.soft):
             w, mass = self.w.of(self.corners.members[e]), self.mass[c]
             if self.spring.alpha[c] > 0:
-                move = soft * ti.cast(self.pull[e], ti.f64)
+                move = soft * pull
                 if w > 0 and self.strength.is_intact(c):
                     C = self.relative_position(e, self.corners.reference_particle(c), 0) - middle - R @ (self.shape[e] - center)
                     grown = ti.cast(C - R @ ti.cast(self.spring.last[e], ti.f64), self.real)

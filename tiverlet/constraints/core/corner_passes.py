@@ -140,6 +140,20 @@ class CornerPasses(Passes):
         return violation, A, alpha, lam, W, n, g, turn * ti.cast(self.quantity.direction_reliable(f, f0), ti.i32), f - f0
 
     @ti.func
+    def end_answer(self, c, rows: ti.template()):  # type: ignore[valid-type]
+        """Add what the system answered to the impulses of contacts to the multiplier."""
+        if self.row[c] >= 0:
+            weight, slight = ti.cast(0, self.real), ti.cast(0, self.real)
+            for k in ti.static(range(self.arity)):
+                i, place = self.corners.member(c, k), self.corners.places[c][k]
+                if place >= 0:
+                    g = self.slots.system.gradient[place]
+                    weight += self.w.of(i) * g.dot(g)
+                    slight += g.norm() * rows.kick(i).norm()
+            mu = ti.cast(self.slots.system.answer[self.row[c]], self.real)
+            self.equation.take_answer(c, mu, rows.scale() * self.equation.answered[c], weight, slight, rows)
+
+    @ti.func
     def motion(self, c, n, together):
         """Return, for constraint c along n, the motion u, the weight W, the largest move of a corner, and its largest motion.
 

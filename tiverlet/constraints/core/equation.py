@@ -6,11 +6,10 @@ import numpy as np
 
 from ...device import ti
 from .ramp import Ramp
-from .spring import Spring, stiff
+from .spring import RESTARTED, Spring, stiff
 from .step_limit import StepLimit
 from .strength import Strength
 
-RESTARTED = 2  # `fresh` at a start from velocities that displacements were turned into, see Equation.spring_force()
 SMALLEST = 1e-6  # of the size of the scene: a longer length is not rounding; of the size of f at a constraint: nor is a larger f
 ROUNDING = 1e-9  # of the size of the scene: a longer rest length is not rounding
 
@@ -53,13 +52,23 @@ class Equation:
         self.driven = batch.driven
         self.drive: Any = batch.drive_of(scene) if batch.driven else None
         self.lam = add(f"{name}.multiplier", m, state=True)
+        self.answers = scene.slots.answers
+        if self.answers:  # the violation that contacts left, for places to remove
+            self.touched = add(f"{name}.touched", m, kind=ti.i32, state=True)  # whether contacts moved it in the last substep
+            self.left = add(f"{name}.left", m, state=True)  # what they left it violated by: no reason for an impulse
+            self.answered = add(f"{name}.answered", m, state=True)  # the part of lam by contacts in the last substep
+            self.blow = add(f"{name}.blow", m, state=True)  # the part of lam that is over
         compliance, damping = batch.compliance if batch.soft else None, batch.damping if batch.damped else None
         self.spring = Spring(scene, name, compliance, damping, start, restarts=not self.forces)
         self.strength = Strength(scene, name, batch)
         self.limit = StepLimit(scene, name, batch)
         self.cusp, self.ramp = batch.cusp, Ramp(scene.memory, batch)
         self.quantity = batch.quantity.bind(scene, batch, self)
-        self.in_state = {"lam": self.lam} | ({"rest": self.rest} if batch.driven else {})
+        self.in_state = (
+            {"lam": self.lam}
+            | ({"touched": self.touched} if self.answers else {})
+            | ({"rest": self.rest} if batch.driven else {})
+        )
 
     @ti.func
     def clip_to_side(self, value):
@@ -89,6 +98,10 @@ class Equation:
             if not self.spring.is_rigid(c):
                 W = 0
         C, A = self.quantity.excess(c, f), ti.cast(1, self.real)
+        if ti.static(self.answers):
+            if first != 0:
+                self.left[c] = ti.select(self.touched[c] != 0, self.earlier_violation(c, f0, 1), 0 * f0)
+            C -= self.left[c]
         B, alpha = ti.cast(0, self.real), ti.cast(0, self.real)
         lam = self.lam[c]
         if first != 0:
@@ -172,6 +185,17 @@ class Equation:
         return size
 
     @ti.func
+    def take_answer(self, c, mu, before, weight, slight, rows: ti.template()):  # type: ignore[valid-type]
+        """Add the answer mu to impulses of contacts to the multiplier. Unless it is steady, it came of a blow, which is over.
+
+        before: of the last substep. weight: by how much a multiplier of 1 changes f. slight: by how much forces change it.
+        """
+        self.lam[c] = self.lam[c] + mu
+        self.answered[c] = mu
+        steady = rows.is_steady(weight * ti.abs(mu - before), weight * ti.abs(mu), slight)
+        self.blow[c] = ti.select(steady, 0 * mu, mu)
+
+    @ti.func
     def spring_force(self, c, f, f0, w, W, h, soft):
         """Return the force of a spring at x_n, for starts: 1 - theta of that of the last substep, and its change since.
 
@@ -217,10 +241,13 @@ class Equation:
 
         f: now. w, W: as in Spring.force_change(). firm, soft: as in Passes.push_reaction().
         """
-        pull = firm * self.lam[c]
+        lam = self.lam[c]
+        if ti.static(self.answers):
+            lam -= self.blow[c]
+        pull = firm * lam
         if ti.static(self.spring.soft):
             if not self.spring.is_rigid(c):
-                pull = soft * self.lam[c]
+                pull = soft * lam
                 if w > 0 and self.strength.is_intact(c):
                     pull += self.spring.force_change(c, self.growth(c, f), h, w, W)
                     if ti.static(self.side != 0):

@@ -69,6 +69,25 @@ class OutlinePasses(Passes):
         return sums[0] / self.dim, sums[1] / self.dim, sums[2], W, turn, sums[6], sums[7]
 
     @ti.func
+    def linearise(self, c, h, h2_effective, share, fresh):
+        """Return the violation A C + B + alpha' lam, A, alpha', lam and the weight W, where the solver has left constraint c.
+
+        share: of the frame, of the substep.
+        """
+        i0 = self.corners.reference_particle(c)
+        f, f0, w, W = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
+        for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+            i, g, n = self.corners.members[e], self.quantity.slope(e, 0), self.start[e]
+            f += self.corners.relative_position(e, i0, 0).dot(g) / self.dim
+            f0 += self.corners.relative_position(e, i0, 1).dot(n) / self.dim
+            w += self.w.of(i) * g.dot(g)
+            W += self.slots.split[i] * g.dot(g if self.use_current_gradient[c] != 0 else n)
+        violation, A, alpha, lam, W = self.equation.terms(c, f, f0, w, W, h, h2_effective, 0, fresh)
+        if ti.static(self.limit.acts):
+            violation -= A * self.equation.postpone(c, f0, W, share, 0)
+        return violation, A, alpha, lam, W
+
+    @ti.func
     def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
         """Compute dlam; scatter_corner() moves the corners."""
         if ti.static(self.equation.ramp.is_allocated):

@@ -58,6 +58,18 @@ class Passes:
         """For VariableCorners, after relax() and push_spring_force(): give corner e its move."""
 
     @ti.func
+    def begin_answer(self, c, h, h2_effective, fresh, bodies: ti.template()):  # type: ignore[valid-type]
+        """Before contacts are solved, where constraint c answers their impulses by itself: prepare for that."""
+
+    @ti.func
+    def answer(self, c, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]
+        """Answer moves of its corners by impulses of contacts, `moved` - d: add to Slots.answer how far it moves them."""
+
+    @ti.func
+    def end_answer(self, c, rows: ti.template()):  # type: ignore[valid-type]
+        """Add the answer of constraint c to its multiplier, and tell the part that came of a blow."""
+
+    @ti.func
     def break_overloaded(self, c, h2_rigid, h2_effective, tick):
         """Where the batch `breaks`: break constraint c if its load in this substep was too large.
 

@@ -10,6 +10,7 @@ from ...device import ti
 if TYPE_CHECKING:
     from ...features.feature import Scene
 
+RESTARTED = 2  # `fresh` at a start from velocities that displacements were turned into, see Equation.spring_force()
 FIRM = 0.99  # theta from which on a spring is rigid in an impact
 SOFTEST = 1e24  # the largest compliance, of a spring that does nothing: beyond it, compliance / h^2 may overflow in f32
 
