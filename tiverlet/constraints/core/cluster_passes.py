@@ -307,7 +307,7 @@ class ClusterPasses(Passes):
             for e in range(begin, end):
                 i = self.corners.members[e]
                 m, move = self.mass_in_fit(e, c), ti.cast(moved[i] - d[i], ti.f64)
-                some = some or (move != 0).any()
+                some = some or (moved[i] - d[i]).norm_sqr() > 0
                 mean += m * move
                 X += m * (self.relative_position(e, i0, back) - middle).outer_product(move)
             if some:
