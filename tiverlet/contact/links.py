@@ -51,8 +51,8 @@ class Links:
         values = self._tables(len(scene.inv_mass))
         self.row_of = add("links.row", total, kind=ti.i32, values=values["row_of"])
         self.degree = add("links.degree", scene.count, values=values["degree"])
-        self.begin, self.slot, self.particle, self.is_row = (
-            add(f"links.{k}", len(values[k]), kind=ti.i32, values=values[k]) for k in ("begin", "slot", "particle", "is_row")
+        self.begin, self.slot, self.particle = (
+            add(f"links.{k}", len(values[k]), kind=ti.i32, values=values[k]) for k in ("begin", "slot", "particle")
         )
         self.normal, self.gradient = (add(f"links.{k}", total, width=dim) for k in ("normal", "gradient"))
         self.mu = add("links.multiplier", m, state=True)
@@ -76,8 +76,7 @@ class Links:
         row_of = np.full(self.slots.total, -1)
         row_of[place] = owner
         begin = np.searchsorted(owner, np.arange(len(is_row) + 1))
-        out = {"row_of": row_of, "degree": np.bincount(item, minlength=n), "begin": begin}
-        return out | {"slot": place, "particle": item, "is_row": is_row}
+        return {"row_of": row_of, "degree": np.bincount(item, minlength=n), "begin": begin, "slot": place, "particle": item}
 
     def reassign(self, memory: "Memory", n: int) -> None:
         """Follow constraints that moved to other particles."""
@@ -160,7 +159,7 @@ class Links:
             weight += split * n.dot(self.gradient[self.slot[e]])
             firm += eigenvalue * n.dot(self.gradient[self.slot[e]])
             size += split * ti.sqrt(n.dot(n))
-        acts = W > 0 and weight > 0 and self.is_row[r] != 0
+        acts = W > 0 and weight > 0  # a link of a system has no corners here, and no weight
         self.stiff[r] = ti.select(acts, ti.static(RELAXATION) / ti.max(A * weight + alpha, FEW), 0 * W)
         self.firm[r] = ti.select(acts, 1 / ti.max(A * firm + alpha, FEW), 0 * W)
         self.factor[r], self.alpha[r], self.size[r] = A, alpha, size / ti.static(RELAXATION)

@@ -156,6 +156,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     contact = next((c for c in of(PairContact) if c.can_touch), None)
     if contact or walls:
         scene.radius = Radii(memory, particles.radius, scene.count)
+    rows = bool(contact and contact.solves_rows)  # whether contacts are rows
     scene.walls = grouped(walls)
     surfaces = [*walls, *([contact] if contact else [])]
     has_friction, bounces = any(f.has_friction for f in surfaces), any(f.has_restitution for f in surfaces)
@@ -165,7 +166,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         scene.own_weight = OwnWeight(scene)
     if batches:
         with memory.owned("slots"):
-            scene.slots = Slots(scene, batches, solver, bool(contact and contact.solves_rows))
+            scene.slots = Slots(scene, batches, solver, rows)
         # Rounding errors are carried along where they are all that constraints leave, and where rest values move by themselves,
         # whose steady loads would otherwise tremble by m ulp(x) / h^2.
         carries = sums_exactly() and (scene.slots.exact or any(b.driven for b in batches))
@@ -177,7 +178,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     team = Team(memory, size, len(particles), path == "parallel" and size == 1, pieces=PIECES if contact else size)
     if contact:
         contact.enter(scene)
-    if can_have_impacts(scene, batches) and not (contact and contact.solves_rows):
+    if can_have_impacts(scene, batches) and not rows:
         pairs = bool(contact and contact.strikes_bodies)
         if pairs or any(w.has_restitution for w in walls) or (walls and stops_bodies(scene, batches)):
             scene.impacts = BodyImpacts(scene, batches, bool(contact), pairs)
@@ -185,8 +186,8 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     bodies = bool(search and contact and contact.dev.bodies)
     state.remember(
         memory,
-        has_friction or bool(contact and contact.solves_rows) or any(w.needs_start_position for w in walls) or scene.bounces,
-        bounces or bool(scene.impacts) or bodies or bool(contact and contact.solves_rows),
+        has_friction or rows or any(w.needs_start_position for w in walls) or scene.bounces,
+        bounces or bool(scene.impacts) or bodies or rows,
         bounces,
         bool(contact and (contact.projects or bodies) and walls),
         bodies,

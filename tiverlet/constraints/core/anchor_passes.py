@@ -118,13 +118,11 @@ class AnchorPasses(Passes):
         """Add the answer to the multiplier. Unless it is steady, it came of a blow."""
         i, place = self.corners.member(c, 0), self.corners.places[c][0]
         if place >= 0:
-            answer = self.slots.answer[place]
+            answer, impulse = self.slots.answer[place], self.slots.answer[place] / self.w.of(i)
             change = (answer - rows.scale() * self.answered[c]).norm()
             self.answered[c] = answer
-            self.blow[c] = ti.select(
-                rows.is_steady(change, answer.norm(), rows.kick(i).norm()), 0 * answer, answer / self.w.of(i)
-            )
-            self.lam[c] = self.lam[c] + answer / self.w.of(i)
+            self.blow[c] = ti.select(rows.is_steady(change, answer.norm(), rows.kick(i).norm()), 0 * impulse, impulse)
+            self.lam[c] = self.lam[c] + impulse
 
     @ti.func
     def push_spring_force(self, c, h, soft, alone):

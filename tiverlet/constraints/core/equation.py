@@ -53,7 +53,7 @@ class Equation:
         self.drive: Any = batch.drive_of(scene) if batch.driven else None
         self.lam = add(f"{name}.multiplier", m, state=True)
         self.answers = scene.slots.answers
-        if self.answers:  # the violation that contacts left, for places to remove
+        if self.answers:
             self.touched = add(f"{name}.touched", m, kind=ti.i32, state=True)  # whether contacts moved it in the last substep
             self.left = add(f"{name}.left", m, state=True)  # what they left it violated by: no reason for an impulse
             self.answered = add(f"{name}.answered", m, state=True)  # the part of lam by contacts in the last substep
