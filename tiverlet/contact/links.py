@@ -55,15 +55,12 @@ class Links:
             add(f"links.{k}", len(values[k]), kind=ti.i32, values=values[k]) for k in ("begin", "slot", "particle")
         )
         self.normal, self.gradient = (add(f"links.{k}", total, width=dim) for k in ("normal", "gradient"))
-        self.mu = add("links.multiplier", m, state=True)
-        self.step, self.stiff, self.firm, self.factor, self.alpha, self.least, self.most, self.size, self.start = (
-            add(f"links.{k}", m) for k in ("step", "stiff", "firm", "factor", "alpha", "least", "most", "size", "start")
+        self.mu, self.step, self.stiff, self.firm, self.factor, self.alpha, self.least, self.most, self.size, self.start = (
+            add(f"links.{k}", m) for k in ("multiplier", "step", "stiff", "firm", "factor", "alpha", "least", "most", "size", "start")
         )
         self.violation = add("links.violation", m)
         self.lack, self.uphill, self.wrong = (add(f"links.{k}", m) for k in ("lack", "uphill", "wrong"))
-        # 1 where passes are needed: for links that are relaxed alone, which passes complete, and that contacts left violated.
-        alone = np.concatenate([np.zeros(0, dtype=bool), *(slots.rows(b) < 0 for b in self.batches)])
-        self.open = add("links.open", m, values=alone.astype(float), state=True)
+        self.open = add("links.open", m)  # 1 where passes are needed, else 0
 
     def _tables(self, n: int) -> dict[str, np.ndarray]:
         """Return the arrays of rows and their corners, by name, from the present corners. n: number of particles."""
@@ -125,6 +122,11 @@ class Links:
         return out
 
     @ti.func
+    def note_open(self, batch: ti.template(), c, r):  # type: ignore[valid-type]
+        """Note whether row r needs passes: those of links that are relaxed alone are completed, others were touched by contacts."""
+        self.open[r] = ti.cast(batch.dev.equation.touched[c] != 0 or self.is_alone(batch, c), self.real)
+
+    @ti.func
     def prepare(self, batch: ti.template(), c, r, h, h2_effective, share, fresh, bodies: ti.template()):  # type: ignore[valid-type]
         """Write row r, of constraint c of a batch, where its solver has left it."""
         if ti.static(batch.arity > 0):
@@ -174,7 +176,7 @@ class Links:
             self.most[r] = ti.min(-lam, self.most[r])
         elif ti.static(batch.side < 0):
             self.least[r] = ti.max(-lam, self.least[r])
-        mu = self.mu[r] * self.rows.scale()
+        mu = batch.dev.equation.answered[c] * self.rows.scale()
         if self.is_alone(batch, c):
             mu -= lam
         mu = ti.min(ti.max(mu, self.least[r]), self.most[r])
@@ -224,11 +226,12 @@ class Links:
                 touched = 1
         self.violation[r] = (left + u + self.violation[r]) * touched
         batch.dev.equation.touched[c] = touched
-        self.open[r] = ti.select(touched != 0 or self.is_alone(batch, c), 1, 0 * left)
         if self.stiff[r] > 0:
             batch.dev.equation.take_answer(c, mu, self.start[r], weight, slight, self.rows)
             if self.is_alone(batch, c):
-                self.mu[r] = lam + mu
+                batch.dev.equation.answered[c] = lam + mu
+        elif self.begin[r] < self.begin[r + 1]:
+            batch.dev.equation.answered[c] = 0 * mu
 
     @ti.func
     def gap(self, r, bodies: ti.template()):  # type: ignore[valid-type]

@@ -90,6 +90,9 @@ class RowPass:
             self.rows.clear(i)
             if ti.static(self.rows.bounces):
                 self.rows.when[i] = 0
+        for f, first in ti.static(self.linked):
+            for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
+                self.answers.links.note_open(f, c, first.now + c)
         self.team.wait()
         for k in range(self.particles.piece_count(now.thread)):
             begin, end = self.particles.piece(k, now.thread)

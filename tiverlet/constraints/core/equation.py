@@ -56,7 +56,7 @@ class Equation:
         if self.answers:
             self.touched = add(f"{name}.touched", m, kind=ti.i32, state=True)  # whether contacts moved it in the last substep
             self.left = add(f"{name}.left", m, state=True)  # what they left it violated by: no reason for an impulse
-            self.answered = add(f"{name}.answered", m, state=True)  # the part of lam by contacts in the last substep
+            self.answered = add(f"{name}.answered", m, state=True)  # the answer of the last substep, with lam where relaxed alone
             self.blow = add(f"{name}.blow", m, state=True)  # the part of lam that is over
         compliance, damping = batch.compliance if batch.soft else None, batch.damping if batch.damped else None
         self.spring = Spring(scene, name, compliance, damping, start, restarts=not self.forces)
@@ -66,7 +66,7 @@ class Equation:
         self.quantity = batch.quantity.bind(scene, batch, self)
         self.in_state = (
             {"lam": self.lam}
-            | ({"touched": self.touched} if self.answers else {})
+            | ({key: vars(self)[key] for key in ("touched", "left", "answered", "blow")} if self.answers else {})
             | ({"rest": self.rest} if batch.driven else {})
         )
 
