@@ -27,7 +27,7 @@ from .impact_projection import ImpactProjection
 from .impulses import Impulses
 from .islands import Islands
 from .known_loads import KnownLoads
-from .limits import AHEAD, CRADLE
+from .limits import AHEAD, CRADLE, THROWN
 from .mass_splitting import MassSplitting, lesser
 from .narrow_phase import DiscGeometry
 from .pair import Pair, PairSums
@@ -82,15 +82,19 @@ class Contact(PairContact):
     groups: Any = Knob(lambda f, v: f._surface("groups", v), "The pairs of groups that touch; None for all.", built=True)
 
     can_keep_stiffness = True
-    compiled_for = (*PairContact.compiled_for, "solves_rows")
+    compiled_for = (*PairContact.compiled_for, "in_turn")
+
+    @property
+    def in_turn(self) -> bool:
+        """Whether impacts pass on from particle to particle, see impacts.py."""
+        bounces = [self.restitution, *(w.restitution for w in self.walls)]
+        values = [e for v in bounces for e in (v.values() if isinstance(v, Mapping) else [v])]
+        return any(float(np.ravel(e)[0]) > CRADLE for e in values)
 
     @property
     def solves_rows(self) -> bool:
         """Whether pairs and walls are rows, see rows.py. README.md in step says where they are not."""
-        bounces = [self.restitution, *(w.restitution for w in self.walls)]
-        values = [e for v in bounces for e in (v.values() if isinstance(v, Mapping) else [v])]
-        cradle = any(float(np.ravel(e)[0]) > CRADLE for e in values)
-        return not cradle
+        return True
 
     @property
     def projects(self) -> bool:
@@ -111,7 +115,7 @@ class Contact(PairContact):
         some = radius[radius > 0]
         auto = 0.75 * median(some) if len(some) else 1.0
         self._present_skin = auto if self.skin == "auto" else float(self.skin)
-        self._ahead = AHEAD * median(some) if len(some) else 0.0
+        self._ahead = (THROWN if self.in_turn else AHEAD) * median(some) if len(some) else 0.0
         self._smallest_radius = float(radius.min(initial=np.inf))
 
     def can_regroup(self, change: Regrouping) -> bool:
@@ -224,7 +228,7 @@ class Contact(PairContact):
         bounces = dev.has_restitution or any(w.has_restitution for w in self.walls)
         self.table.bind(scene, friction or bounces)
         turns = scene.state.spins and friction and (dev.turns or any(w.turns for w in self.walls))
-        dev.rows = Rows(scene, self.table, friction, bounces, turns, scene.walls, team, self.push_out, self._ahead)
+        dev.rows = Rows(scene, self.table, friction, bounces, self.in_turn, turns, scene.walls, team, self.push_out, self._ahead)
         dev.answers = Answers(scene, batches, dev.rows) if batches else None
         dev.responses = FreeParticles(scene, dev.rows, scene.state.spins and friction, dev.answers)
         dev.islands = Islands(scene, dev.rows, dev.responses, team)

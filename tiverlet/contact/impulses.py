@@ -163,7 +163,7 @@ class Impulses:
             p = self.rows.p.field[row]
             if ti.static(self.has_friction):
                 self.rows.stiff.field[row] = [step / w, step / across]
-                p = self.cone(p.dot(n), p - p.dot(n) * n, self.rows.friction.field[row], n)
+                p = self.cone(ti.max(p.dot(n), 0), p - p.dot(n) * n, self.rows.friction.field[row], n, self.rows.hit(row))
             else:
                 self.rows.stiff.field[row] = step / w
                 p = ti.max(p, 0)
@@ -224,12 +224,15 @@ class Impulses:
         return ti.Vector.zero(self.real, 3 if self.dim == 3 else 1)
 
     @ti.func
-    def cone(self, normal, across, friction, n):
-        """Return the impulse in Coulomb's cone that is next to the one with these parts along the normal and across it."""
-        normal = ti.max(normal, 0)
-        size, most = across.dot(across), friction[0] * normal
+    def cone(self, normal, across, friction, n, hit):
+        """Return the impulse in Coulomb's cone that is next to the one with these parts along the normal and across it.
+
+        hit: the impulse of impacts in turn, which has friction, too.
+        """
+        load = normal + hit
+        size, most = across.dot(across), friction[0] * load
         if size > most * most:
-            across *= friction[1] * normal / ti.sqrt(size)
+            across *= friction[1] * load / ti.sqrt(size)
         return normal * n + across
 
     @ti.func
@@ -271,26 +274,26 @@ class Impulses:
                     gap = un - self.rows.target.field[row]
             before, stiff = self.rows.p.field[row], self.rows.stiff.field[row]
             y = before + beta * self.rows.step.field[row]
-            new = y
+            new, hit = y, self.rows.hit(row)
             if ti.static(self.has_friction):
                 if ti.static(self.bodies.spins):
                     t -= self.bodies.spin.surface(s, n)
                 if ti.static(self.rows.turns):
                     t -= self.rows.across.field[row]
                 yn = y.dot(n)
-                normal = ti.max(yn - gap * stiff[0], 0)
-                new = self.cone(normal, y - yn * n - stiff[1] * t, self.rows.friction.field[row], n)
+                normal = ti.max(yn - gap * stiff[0], -self.rows.most_taken(row))
+                new = self.cone(normal, y - yn * n - stiff[1] * t, self.rows.friction.field[row], n, hit)
                 miss = (normal - yn) / stiff[0]
                 lack += miss * miss
                 uphill += (y - new).dot(new - before)
-                load += normal
+                load += ti.abs(normal)
                 wrong += self.wrong(row, normal, gap)
             else:
-                new = ti.max(y - gap * stiff, 0)
+                new = ti.max(y - gap * stiff, -self.rows.most_taken(row))
                 miss = (new - y) / stiff
                 lack += miss * miss
                 uphill += (y - new) * (new - before)
-                load += new
+                load += ti.abs(new)
                 wrong += self.wrong(row, new, gap)
             self.rows.p.field[row] = new
             self.rows.step.field[row] = new - before
@@ -301,7 +304,7 @@ class Impulses:
             if part == OWN and row < kept:
                 self.bodies.give(other, n, p)
             if ti.static(self.rows.turns):
-                uphill += self.relax_turn(i, row, other, n, self.rows.along(new, n), beta)
+                uphill += self.relax_turn(i, row, other, n, self.rows.along(new, n) + hit, beta)
                 m_own += self.give_turn(row, other, part == OWN and row < kept)
         if ti.static(bool(self.bodies.answers)):
             if part == OWN:
@@ -319,7 +322,7 @@ class Impulses:
         """
         out = 0 * p
         if ti.static(self.rows.bounces):
-            if p > 0:
+            if p != 0:
                 before = ti.select(self.rows.bounce.field[row] > 0, 0, self.rows.target.field[row])
                 out = ti.abs((p - before) * gap)
         return out
@@ -360,7 +363,7 @@ class Impulses:
         self.flags[None][TURN] = turn
         most = ti.select(lack > self.numbers[None][LANDING], BOUNCES, PASSES)
         goes_on = turn < most and lack > self.numbers[None][TOLERANCE]
-        if ti.static(self.rows.bounces):
+        if ti.static(self.rows.bounces and (not self.rows.impacts or bool(self.bodies.answers))):  # else rounds have done it
             if self.flags[None][STRUCK] != 0 and self.total(WRONG) > ti.static(ERROR) * self.total(KINETIC):
                 goes_on = turn < BOUNCES
         self.flags[None][GOING] = ti.cast((goes_on or turn < self.least) and self.total(ROWS) > 0, ti.i32)
@@ -389,7 +392,23 @@ class Impulses:
     @ti.func
     def check_hits(self):
         """Find whether anything bounces. One thread calls it."""
-        self.flags[None][STRUCK] = ti.cast(self.total(HITS) > 0, ti.i32)
+        hits = ti.cast(self.total(HITS) > 0, ti.i32)
+        self.flags[None][STRUCK], self.flags[None][GOING], self.flags[None][TURN] = hits, hits, 0
+        self.numbers[None][TOLERANCE] = 0
+
+    @ti.func
+    def decide_round(self):
+        """Decide after a round of impacts in turn whether another one follows, and whether any of them share particles.
+
+        What is left where energy is lost, and is little beside all before, is left to the passes. One thread calls it.
+        """
+        turn = self.flags[None][TURN] + 1
+        work = self.total(WORK)
+        done = self.numbers[None][TOLERANCE] + work
+        goes_on = work > ti.static(ERROR) * done or self.total(LACK) > 0
+        self.numbers[None][TOLERANCE] = done
+        self.flags[None][GOING], self.flags[None][TURN] = ti.cast(goes_on and turn < BOUNCES, ti.i32), turn
+        self.flags[None][GAINS] = ti.cast(self.total(UPHILL) > 0, ti.i32)
 
     @ti.func
     def total(self, k: ti.template()):  # type: ignore[valid-type]
@@ -443,7 +462,7 @@ class Impulses:
             if ti.static(self.rows.bounces):
                 if self.rows.when[i] > 0:  # in an island with an impact, what is more than before came of that
                     load = borne
-                if self.rows.bounce.field[row] > 0:
+                if self.rows.bounced(row):
                     load = 0
             if size > load:
                 impact = (1 - load / size) * self.rows.vector(p, n)
@@ -475,7 +494,7 @@ class Impulses:
         if final != 0:
             w, kick = self.bodies.compliance(i), self.rows.kick(i)
             push = w * self.bodies.push[i]
-            change = self.bodies.new[i] - self.state.d[i] - self.bodies.answer_of_constraints(i)
+            change = self.bodies.new[i] - self.bodies.base(i) - self.bodies.answer_of_constraints(i)
             self.rows.borne[i] = change - push - self.excess(change - push + kick, change + kick)
             if ti.static(self.bodies.spins):
                 turn = self.bodies.new_s[i] - self.bodies.spin.s[i]
@@ -486,9 +505,9 @@ class Impulses:
             if ti.static(self.rows.bounces):
                 n = self.rows.normal.field[row]
                 load, size = self.rows.times[None][SCALE] * self.rows.along(self.rows.memory.field[e], n), self.rows.along(p, n)
-                bounces = self.rows.bounce.field[row] > 0
+                bounces = self.rows.bounced(row)
                 self.rows.touched.field[e] = ti.cast(not bounces and (self.rows.gap.field[row] == 0 or size > 0), ti.i32)
-                if bounces:
+                if bounces or size <= 0:  # impacts in turn leave friction, and what is taken back of them
                     p = 0 * p
                 elif self.rows.when[i] > 0 and size > load:  # the rest came of the impact
                     p *= ti.max(load, 0) / size
@@ -496,13 +515,13 @@ class Impulses:
             if ti.static(self.rows.turns):
                 f = self.rows.f.field[row]
                 if ti.static(self.rows.bounces):
-                    if self.rows.bounce.field[row] > 0:
+                    if self.rows.bounced(row):
                         f = 0 * f
                 self.rows.borne_moment.field[e] = f
         if ti.static(self.rows.logs_pairs):
             for row in range(self.rows.own[i], self.rows.pressed[i]):
                 n = self.rows.normal.field[row]
-                p = self.rows.along(self.rows.p.field[row], n)
+                p = self.rows.along(self.rows.p.field[row], n) + self.rows.hit(row)
                 if p > 0:
                     self.rows.events.record(i, self.rows.other.field[row], self.rows.entry.field[row], n, p, final)
         if ti.static(len(self.rows.logging) > 0):

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .rows import Rows
 
 WORK, SQUARE, LOAD = range(3)  # sums over an island: P, Q, and the impulses along normals
+ALL, PRESSING, BOUNCING = range(3)  # which rows join particles
 BITS = 40  # of the largest term of a sum, in units: sums of 2^22 terms fit into 63 bits
 BIAS, MANTISSA, LEAST = 1023, 52, 64  # exponents of f64: of 1, its first bit, and the lowest whose unit is a normal number
 
@@ -76,11 +77,15 @@ class Islands:
         return i
 
     @ti.func
-    def join(self, i, all_rows):
-        """Join the islands of particle i and those behind it that its rows press on; all_rows: of all its rows."""
+    def join(self, i, which: ti.template()):  # type: ignore[valid-type]
+        """Join the islands of particle i and those behind it on its rows: on all, those that press, or that bounce in a round."""
         for row in range(self.rows.own[i], self.rows.pressed[i]):
-            other = self.rows.other.field[row]
-            if (all_rows or self.rows.is_set(self.rows.p.field[row])) and self.bodies.moves(other):
+            other, joins = self.rows.other.field[row], True
+            if ti.static(which == PRESSING):
+                joins = self.rows.is_set(self.rows.p.field[row])
+            elif ti.static(which == BOUNCING):
+                joins = self.rows.impacts.blow.field[row] > 0
+            if joins and self.bodies.moves(other):
                 self.join_two(i, other)
 
     @ti.func
@@ -120,7 +125,7 @@ class Islands:
         return ti.select(time > 1, 0 * time, time)
 
     @ti.func
-    def find_largest(self, block):
+    def find_largest(self, block, which: ti.template()):  # type: ignore[valid-type]
         """Find the largest terms of sums. Particles of a block that follow each other are mostly of one island."""
         root, most = -1, ti.Vector.zero(ti.i32, 3)
         for i in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.n)):
@@ -129,7 +134,7 @@ class Islands:
                 self.note_largest(root, most)
                 root = own
                 most = ti.Vector.zero(ti.i32, 3)
-            terms = self.sums_of(i)
+            terms = self.terms(i, which)
             for k in ti.static(range(3)):
                 bits = ti.bit_cast(ti.abs(terms[k]), ti.i64)
                 most[k] = ti.max(most[k], ti.cast(bits >> MANTISSA, ti.i32))
@@ -152,7 +157,7 @@ class Islands:
         return ti.bit_cast(ti.cast(exponent + BIAS, ti.i64) << MANTISSA, ti.f64)
 
     @ti.func
-    def add_up(self, block):
+    def add_up(self, block, which: ti.template()):  # type: ignore[valid-type]
         """Add the terms of the particles of a block to the sums of their islands."""
         root, sums = -1, ti.Vector.zero(ti.i64, 3)
         for i in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.n)):
@@ -161,7 +166,7 @@ class Islands:
                 self.add(root, sums)
                 root = own
                 sums = ti.Vector.zero(ti.i64, 3)
-            terms = self.sums_of(i)
+            terms = self.terms(i, which)
             for k in ti.static(range(3)):
                 sums[k] += ti.cast(terms[k] * self.power(BITS + BIAS - 1 - self.largest[root][k]), ti.i64)
         self.add(root, sums)
@@ -182,22 +187,34 @@ class Islands:
         return ti.cast(self.sums[root][k], ti.f64) * self.power(self.largest[root][k] - (BITS + BIAS - 1))
 
     @ti.func
-    def find_scale(self, root, allowed):
+    def find_scale(self, root, allowed, which: ti.template()):  # type: ignore[valid-type]
         """Find the scale of an island. allowed: work per impulse that is rounding [m]."""
         work, square, load = self.total(root, WORK), self.total(root, SQUARE), self.total(root, LOAD)
         scale = ti.cast(1, ti.f64)
-        if work + square / 2 > allowed * load and square > 0:
+        if ti.static(which == BOUNCING):
+            scale = self.rows.impacts.scale_of(work, square, load)
+        elif work + square / 2 > allowed * load + ti.static(2.0 ** (4 - BITS)) * square and square > 0:  # sums have BITS
             scale = ti.max(ti.min(-2 * work / square, 1), 0)
         self.scale[root] = ti.cast(scale, self.real)
 
     @ti.func
-    def sums_of(self, i):
+    def terms(self, i, which: ti.template()):  # type: ignore[valid-type]
         """Return the part of particle i in the sums of its island."""
+        out = ti.Vector.zero(ti.f64, 3)
+        if ti.static(which == BOUNCING):
+            out = self.rows.impacts.terms(i, self.bodies)
+        else:
+            out = self.terms_of_work(i)
+        return out
+
+    @ti.func
+    def terms_of_work(self, i):
+        """Return the part of particle i in the work of impulses, its square, and the impulses along normals."""
         work, square = self.bodies.work(i)
         load = ti.cast(0, ti.f64)
         for row in range(self.rows.own[i], self.rows.end[i]):
             p, n = self.rows.p.field[row], self.rows.normal.field[row]
-            load += self.rows.along(p, n)
+            load += ti.abs(self.rows.along(p, n))
             if ti.static(self.rows.bounces):  # displacements are those in the middle of the substep, and impacts are not there
                 if self.rows.bounce.field[row] > 0:
                     work += (self.rows.when[i] - 0.5) * self.rows.along(p, n) * self.rows.relative_kick(i, row).dot(n)

@@ -14,7 +14,7 @@ ERROR = 0.002  # of the kinetic energy of all: the energy that may be wrong afte
 ROUNDING = 0.1  # of what rows may lack: times the impulses, the work that they may do
 SLOW = 2.0  # times the displacement by forces: what comes together no faster does not bounce, but rests
 STEADY = 1 / 16  # of an impulse: it may change by so much in a substep, beside what forces change, and be a load
-CRADLE = 0.97  # coefficient of restitution above which pairs bounce one after the other
+CRADLE = 0.97  # coefficient of restitution above which a world lets impacts pass on one after the other
 NOISE = 64.0  # times the rounding of a displacement: what comes together no faster is at rest
 SLOP = 0.003  # overlap that places leave, in radii of the smaller particle: contacts stay closed
 BEYOND = 3.0  # times the slop: overlap from which on places are corrected. A pile rests in between, and is not stirred
@@ -31,4 +31,8 @@ LACK, UPHILL, WORK, LOAD, ROWS, FORCE, HITS, WRONG, KINETIC = SUMS = range(9)  #
 BETA, THETA, TOLERANCE, LANDING, ALLOWED = range(5)
 H, BEGIN, END, SCALE, WHOLE, SHARES = TIMES = range(6)  # what rows know of a substep, see Rows.times
 GOING, TURN, GAINS, STRUCK = range(4)  # whether another pass follows, its number, whether any particle gains energy, or bounces
+ROUNDS = 2  # rounds of impacts that the host launches before it asks whether there are more
+THROWN = 0.5  # of the median radius: how far impacts in turn may throw something in a substep and it still meets others
+NEVER = 3.0  # a time after the substep
+APART, NEAR, TOGETHER = range(3)  # what rows are before impacts in turn: near ones go on together, unless they meet by themselves
 GROUP = 64  # blocks whose sums are added up first

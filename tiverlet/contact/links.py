@@ -56,7 +56,8 @@ class Links:
         )
         self.normal, self.gradient = (add(f"links.{k}", total, width=dim) for k in ("normal", "gradient"))
         self.mu, self.step, self.stiff, self.firm, self.factor, self.alpha, self.least, self.most, self.size, self.start = (
-            add(f"links.{k}", m) for k in ("multiplier", "step", "stiff", "firm", "factor", "alpha", "least", "most", "size", "start")
+            add(f"links.{k}", m)
+            for k in ("multiplier", "step", "stiff", "firm", "factor", "alpha", "least", "most", "size", "start")
         )
         self.violation = add("links.violation", m)
         self.lack, self.uphill, self.wrong = (add(f"links.{k}", m) for k in ("lack", "uphill", "wrong"))
@@ -123,7 +124,7 @@ class Links:
 
     @ti.func
     def note_open(self, batch: ti.template(), c, r):  # type: ignore[valid-type]
-        """Note whether row r needs passes: those of links that are relaxed alone are completed, others were touched by contacts."""
+        """Note whether row r needs passes: as its link is relaxed alone, which passes complete, or was touched by contacts."""
         self.open[r] = ti.cast(batch.dev.equation.touched[c] != 0 or self.is_alone(batch, c), self.real)
 
     @ti.func

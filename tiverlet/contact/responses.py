@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from ..device import inline, ti
+from ..device import at, inline, ti
 from .limits import SHARES
 
 if TYPE_CHECKING:
@@ -112,13 +112,18 @@ class FreeParticles:
         if ti.static(self.spins):
             self.moment[i] = 0 * self.moment[i]
 
+    @inline
+    def base(self, i):
+        """Return the displacement of particle i before the passes, after impacts in turn [m]."""
+        return at(self.rows.impacts.thrown, i) if self.rows.impacts else at(self.state.d, i)
+
     @ti.func
     def answer(self, i, p, m):
         """Compute the displacements of particle i under impulses whose sum is p, with moments of sum m [kg m]."""
         w = self.compliance(i)
         if ti.static(bool(self.answers)):
             p += self.answers.links.along(self.answers.links.mu, i)
-        self.new[i] = self.state.d[i] + w * p
+        self.new[i] = self.base(i) + w * p
         if ti.static(bool(self.answers)):
             if ti.static(self.answers.answer_later):
                 self.new[i] = self.new[i] + self.answers.held[i]
@@ -155,7 +160,7 @@ class FreeParticles:
         The work of its impulses is the first and half of the second.
         """
         work, square = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
-        d, w = self.state.d[i], self.compliance(i)
+        d, w = self.base(i), self.compliance(i)
         if w > 0:
             change = self.new[i] - d
             work += d.dot(change) / w
@@ -181,7 +186,7 @@ class FreeParticles:
     @ti.func
     def scale(self, i, scale):
         """Multiply the impulses on particle i by a number."""
-        d = self.state.d[i]
+        d = self.base(i)
         self.new[i] = d + scale * (self.new[i] - d)
         if ti.static(bool(self.answers)):
             self.answers.scale(i, scale)
@@ -194,7 +199,10 @@ class FreeParticles:
         """Move particle i as impulses want, from where it was at the start. step: its new displacement, with a dither in f32."""
         if self.state.moves(i):
             new, d = self.new[i], self.state.d[i]
-            if (new != d).any():
+            moved = (new != d).any()
+            if ti.static(bool(self.rows.impacts)):
+                moved = moved or self.rows.impacts.turn[i] > 0
+            if moved:
                 self.state.d[i] = new
                 if ti.static(self.state.carries):
                     self.state.d_low[i] = 0 * new
@@ -207,7 +215,10 @@ class FreeParticles:
                         change = self.compliance(i) * self.push[i]
                         if ti.static(bool(self.answers)):
                             if self.answers.holds(i):  # bodies answer with all of their particles
-                                change = new - d
-                        self.state.advance(i, -self.rows.when[i] * change)
+                                change = new - self.base(i)
+                        if ti.static(bool(self.rows.impacts)):
+                            self.state.advance(i, self.rows.impacts.shift[i] - self.rows.when[i] * change)
+                        else:
+                            self.state.advance(i, -self.rows.when[i] * change)
             if ti.static(self.spins):
                 self.spin.s[i] = self.new_s[i]

@@ -16,6 +16,7 @@ from ..device.language import impl
 from ..device.number import OnDevice
 from ..features.material import DYNAMIC, RESTITUTION, ROLLING, STATIC, TANGENTIAL, TOUCH, TOUCHES, TWISTING
 from ..neighbours.neighbour_list import WALL, Column, PairData
+from .impacts import Impacts
 from .limits import (
     AHEAD,
     BEGIN,
@@ -31,9 +32,11 @@ from .limits import (
     SLOW,
     STEADY,
     TIMES,
+    TOGETHER,
     WHOLE,
     H,
 )  # fmt: skip
+from .meeting import meeting
 
 if TYPE_CHECKING:
     from ..device.thread_team import Team
@@ -58,8 +61,8 @@ class Rows:
     push_out: Any = OnDevice()  # largest speed at which pairs part that overlap [m/s]; negative for QUARTER of the radius
 
     def __init__(
-        self, scene: "Scene", table: Any, has_friction: bool, bounces: bool, turns: bool, walls: list[Any], team: "Team",
-        push_out: float | None, ahead: float,
+        self, scene: "Scene", table: Any, has_friction: bool, bounces: bool, in_turn: bool, turns: bool, walls: list[Any],
+        team: "Team", push_out: float | None, ahead: float,
     ):  # fmt: skip
         n, add = scene.count, scene.memory.field
         self.scene, self.state, self.table = scene, scene.state, table
@@ -99,6 +102,10 @@ class Rows:
             self.bounce, self.time, self.target = Column("row_bounce"), Column("row_time"), Column("row_target")
             self.columns += [self.bounce, self.time, self.target]
             self.when = add("Contact.when", n)  # the part of the substep before the impact of the island of a particle
+        self.impacts: Any = Impacts(scene, self) if in_turn else None
+        self.belts = bool(self.impacts) and self.impacts.belts
+        if self.impacts:
+            self.columns += self.impacts.columns
         self.one_way = [group for group in walls if group.wall.one_way is not None]
         self.logging = [group for group in walls if group.wall.events]  # each has a log of its own
         self.events: Any = None
@@ -158,6 +165,16 @@ class Rows:
         else:
             out = p * n
         return out
+
+    @inline
+    def hit(self, row):
+        """Return the impulse of impacts in turn of a row along its normal [kg m], which is no part of p."""
+        return at(self.impacts.hit.field, row) if self.impacts else ti.cast(0, self.real)
+
+    @inline
+    def most_taken(self, row):
+        """Return by how much p may be less than 0: what impacts in turn gave too much of [kg m]."""
+        return ti.select(at(self.bounce.field, row) > 0, self.hit(row), 0) if self.impacts else ti.cast(0, self.real)
 
     @ti.func
     def is_set(self, p):
@@ -377,6 +394,9 @@ class Rows:
         goes = ti.max(-start.dot(self.state.d[i]), start.dot(self.state.d[j]))
         reach = distance + ti.min(ti.static(AHEAD) * least, self.ahead)
         ahead = start.dot(start) - distance * distance < 2 * goes and rr < reach * reach
+        if ti.static(bool(self.impacts)):  # what is struck may go anywhere
+            reach = distance + self.ahead
+            ahead = rr < reach * reach
         lists = rr < near * near or self.is_set(p) or passes or ahead
         if ti.static(not self.table.uniform):
             lists = lists and ti.cast(self.table.of(i, j)[TOUCH], ti.i32) == TOUCHES
@@ -395,15 +415,18 @@ class Rows:
                 n, bend = self.geometry.fallback_normal(i, j, r), 1 / distance
             if ti.static(self.bounces):
                 c = self.table.of(i, j)
-                f, f_own = self.state.kick(i), self.state.kick(i)
-                if self.state.moves(j):
-                    f_other = self.state.kick(j)
-                    f -= f_other
-                    f_own = ti.select(f_own.dot(f_own) > f_other.dot(f_other), f_own, f_other)
-                hit, s, m = self.strike(length - distance, start / length, 1 / length, u, f, f_own, c[RESTITUTION], e, rr)
                 self.bounce.field[row], self.time.field[row] = 0, 1
-                if hit:
-                    n, self.bounce.field[row], self.time.field[row] = m, c[RESTITUTION], s
+                if ti.static(bool(self.impacts)):
+                    self.impacts.begin(row, c[RESTITUTION], length - distance, 1 / length, start, least, self.is_set(p))
+                else:
+                    f, f_own = self.state.kick(i), self.state.kick(i)
+                    if self.state.moves(j):
+                        f_other = self.state.kick(j)
+                        f -= f_other
+                        f_own = ti.select(f_own.dot(f_own) > f_other.dot(f_other), f_own, f_other)
+                    hit, s, m = self.strike(length - distance, start, 1 / length, u, f, f_own, c[RESTITUTION], e, rr)
+                    if hit:
+                        n, self.bounce.field[row], self.time.field[row] = m, c[RESTITUTION], s
             self.put(row, j, e, n, gap, bend, p * scale)
             if ti.static(self.has_friction):
                 c = self.table.of(i, j)
@@ -429,42 +452,17 @@ class Rows:
             self.borne_moment.field[e] = ti.Vector.zero(self.real, self.axes)
 
     @ti.func
-    def strike(self, gap, n, bend, u, f, f_own, e, entry, size):
+    def strike(self, gap, way, bend, u, f, f_own, e, entry, size):
         """Return whether a row bounces in this substep, the part of the substep before its impact, and the normal then.
 
-        gap, n, bend: at the start. u: relative displacement. f: by forces in the substep, f_own: of the particle that has more.
-        e: restitution. The path is u s - f s (1 - s) / 2 after the part s. In a frame with its origin in the center of curvature,
-        |r0 + path| = |1 / bend - gap| is solved for: without forces in closed form, then by Newton's method.
+        gap, way, bend: see meeting(). u: relative displacement. f: by forces in the substep, f_own: of the particle that has
+        more. e: restitution. The path is u s - f s (1 - s) / 2 after the part s.
         What touched goes on together, so that what stands on each other bounces as a whole. What comes back within the substep
         rests.
         """
-        hit, s, m = False, ti.cast(0, self.real), n
-        v = u - f / 2
+        hit, v, s, m = False, u - f / 2, ti.cast(1, self.real), way
         if e > 0 and not (gap <= 0 and self.touched.field[entry] != 0):
-            if gap > 0:
-                if bend == 0:
-                    a, p = -v.dot(n), -f.dot(n)
-                    root = a * a + 2 * p * gap
-                    s = ti.cast(2, self.real)
-                    if root >= 0 and a + ti.sqrt(ti.max(root, 0)) > 0:
-                        s = 2 * gap / (a + ti.sqrt(root))
-                else:
-                    start, c = n / bend, gap * (2 / bend - gap)
-                    b, uu = start.dot(u), u.dot(u)
-                    root = b * b - uu * c
-                    s = ti.cast(2, self.real)
-                    if root >= 0 and uu > 0:
-                        if c < 0:
-                            s = (ti.sqrt(root) - b) / uu
-                        elif b < 0:
-                            s = c / (ti.sqrt(root) - b)
-                    if s <= 2:
-                        for _ in range(4):
-                            way, speed = v * s + f * (s * s / 2), v + f * s
-                            slope = 2 * (start + way).dot(speed)
-                            if slope != 0:
-                                s -= (c + 2 * start.dot(way) + way.dot(way)) / slope
-                        m = ti.select(bend < 0, -1, 1) * (start + v * s + f * (s * s / 2)).normalized()
+            s, m = meeting(gap, bend, way, 0 * u, v, f, ti.cast(1, self.real), ti.cast(0, self.real))
             met = -(v + f * s).dot(m)
             blur = self.rounding * (u.norm() + ti.sqrt(size) * ti.static(2.0**-7))
             least = ti.static(SLOW) * ti.max(self.times[None][WHOLE], 1) * ti.abs(f_own.dot(m)) + blur
@@ -472,6 +470,14 @@ class Rows:
             hit = 0 <= s and (s - 1) * met <= blur and gap >= -met and met > least and not rests
             s = ti.min(s, 1)
         return hit, s, m
+
+    @ti.func
+    def bounced(self, row):
+        """Whether a row bounced that bears no load."""
+        out = self.bounce.field[row] > 0
+        if ti.static(bool(self.impacts)):
+            out = out and self.impacts.joined.field[row] != TOGETHER
+        return out
 
     @ti.func
     def count_hits(self, i):
@@ -486,7 +492,8 @@ class Rows:
     def aim(self, i, when):
         """Set what the bouncing rows of particle i aim at. when: the part of the substep before the impact of its island.
 
-        They leave at e times their approach at that time; displacements are those in the middle of the substep.
+        They leave at e times their approach at that time, or as impacts in turn have thrown them; displacements are those in
+        the middle of the substep.
         """
         self.when[i] = when
         for row in range(self.begin[i], self.end[i]):
@@ -494,18 +501,23 @@ class Rows:
                 if self.bounce.field[row] == 0:
                     self.across.field[row] = 0 * self.across.field[row]
             if self.bounce.field[row] > 0:
-                other, n = self.other.field[row], self.normal.field[row]
+                other, n, then = self.other.field[row], self.normal.field[row], when
+                if ti.static(bool(self.impacts)):
+                    then = self.time.field[row]
                 f = self.relative_kick(i, row)
                 u = self.relative(self.state.d[i], self.state.d, i, other, row, self.pressed[i])
                 if ti.static(self.turns):  # the points that touch leave across n at -e_t times their velocity then
                     s = self.state.spin.s[i]
                     if row < self.pressed[i]:
                         s += self.state.spin.s[other]
-                    shift = (when - 0.5) * (f - f.dot(n) * n)
+                    shift = (then - 0.5) * (f - f.dot(n) * n)
                     slip = u - u.dot(n) * n - self.state.spin.surface(s, n) + shift
                     self.across.field[row] = -self.across.field[row][0] * slip - shift
-                later = (when - 0.5) * f.dot(n)
-                self.target.field[row] = ti.max(-u.dot(n) - later, 0) * self.bounce.field[row] - later
+                if ti.static(bool(self.impacts)):
+                    self.impacts.aim(i, row)
+                else:
+                    later = (then - 0.5) * f.dot(n)
+                    self.target.field[row] = ti.max(-u.dot(n) - later, 0) * self.bounce.field[row] - later
 
     @inline
     def rise(self, tt, un, bend):
@@ -545,6 +557,8 @@ class Rows:
                 ahead = gap + un
                 if ti.static(w.bends):
                     ahead += self.rise(u.dot(u) - un * un, un, bend)
+                if ti.static(bool(self.impacts)):  # what is struck may go anywhere
+                    ahead = ti.min(ahead, gap + un - self.ahead)
                 # What it bore, it may still bear; but an open side, which is nowhere, has no row.
                 lists = ahead < ti.select(self.is_set(p), 1, ti.cast(SLOP, self.real)) * self.radius.of(i)
                 if ti.static(w.dev.surface.has_switch):
@@ -556,16 +570,27 @@ class Rows:
                 if lists:
                     if ti.static(self.bounces):
                         self.bounce.field[row], self.time.field[row] = 0, 1
+                        e_wall, way = 0 * gap, n
+                        if bend != 0:
+                            way = n / bend
                         if ti.static(w.dev.surface.has_restitution):
+                            e_wall = w.dev.surface.restitution[None]
+                        if ti.static(bool(self.impacts)):
+                            self.impacts.begin(row, e_wall, gap, bend, way, self.radius.of(i), self.is_set(p))
+                        else:
                             f, reach = self.state.kick(i), self.state.place(i)
-                            size, e_wall = reach.dot(reach), w.dev.surface.restitution[None]
-                            hit, s, m = self.strike(gap, n, bend, u, f, f, e_wall, e, size)
+                            hit, s, m = self.strike(gap, way, bend, u, f, f, e_wall, e, reach.dot(reach))
                             if hit:
                                 n, self.bounce.field[row], self.time.field[row] = m, e_wall, s
                     self.put(row, face + WALL, e, n, ti.max(gap, 0), bend, p * scale)
                     if ti.static(w.dev.surface.has_velocity):
                         belt = w.dev.surface.velocity[None]
-                        moved += self.h() * (belt - belt.dot(n) * n)
+                        along = self.h() * (belt - belt.dot(n) * n)
+                        moved += along
+                        if ti.static(self.belts):
+                            self.impacts.belt.field[row] = along
+                    elif ti.static(self.belts):
+                        self.impacts.belt.field[row] = 0 * n
                     self.moved.field[row] = moved
                     if ti.static(self.has_friction):
                         self.friction.field[row] = [0, 0]
@@ -606,7 +631,7 @@ class Rows:
     def log_wall(self, i, row):
         """Record the impulse of a wall in its log of events, if it presses."""
         n, side = self.normal.field[row], self.other.field[row] - WALL
-        p = self.along(self.p.field[row], n)
+        p = self.along(self.p.field[row], n) + self.hit(row)
         if p > 0:
             moved = self.moved.field[row]
             ahead = (self.state.d[i] - moved).dot(n)

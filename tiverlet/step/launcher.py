@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from ..contact.limits import BOUNCES, GOING, MOVES
+from ..contact.limits import BOUNCES, GOING, MOVES, ROUNDS
 from ..contact.projection_times import ALWAYS, MAYBE, due
 from ..contact.velocity_projection import RINGS
 from ..device.language import template
@@ -181,6 +181,9 @@ class Launcher:
         if self.solves_rows and now.it == 0:
             self.put(now, "start_events")
             self.put(now, "find_rows")
+            if self.runner.step.contact_pass.rows.in_turn:
+                self.repeat(now, "strike", ROUNDS, BOUNCES)
+                self.put(now, "begin_impulses")
             impulses = self.runner.step.contact_pass.rows.impulses
             self.repeat(now, "relax_impulses", impulses.least, BOUNCES)
             self.put(now, "finish_impulses")

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from ..constraints.core.spring import RESTARTED
+from ..contact.islands import ALL, BOUNCING, PRESSING
 from ..contact.limits import (
     ALLOWED,
     BETA,
@@ -19,6 +20,7 @@ from ..contact.limits import (
     OWN,
     ROWS,
     STRUCK,
+    TURN,
     UPHILL,
     WORK,
     WRONG,
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
     from ..features.feature import Scene
     from .particle_pass import ParticlePass
 
-OF_ROWS, OF_PASS, OF_PLACES, OF_WORK = range(4)  # which sums are added up, see RowPass.noted
+OF_ROWS, OF_PASS, OF_LACK, OF_WORK, OF_ROUND = range(5)  # which sums are added up, see RowPass.noted
 
 
 class RowPass:
@@ -45,9 +47,11 @@ class RowPass:
         self.n, self.real, self.dim = scene.count, scene.real, scene.particles.dim
         dev = contact.dev
         self.rows, self.bodies, self.impulses, self.places = dev.rows, dev.responses, dev.impulses, dev.places
-        self.islands = dev.islands
+        self.islands, self.impacts = dev.islands, dev.rows.impacts
+        self.in_turn = bool(self.impacts)
         some = [HITS, KINETIC] if self.rows.bounces else []
-        self.noted = [ROWS, FORCE, *some], [LACK, UPHILL, LOAD, *([WRONG] if self.rows.bounces else [])], [LACK], [WORK]
+        passes = [LACK, UPHILL, LOAD, *([WRONG] if self.rows.bounces else [])]
+        self.noted = [ROWS, FORCE, *some], passes, [LACK], [WORK], [WORK, LACK, UPHILL]
         self.answers: Any = dev.answers
         self.answers_later = bool(dev.answers) and dev.answers.answer_later
         self.linked: list[Any] = []
@@ -62,6 +66,9 @@ class RowPass:
     def solve(self, now):
         """Find the impulses of a substep, and correct places. On the launched path, the Launcher does this."""
         self.find_rows(now)
+        if ti.static(self.in_turn):
+            self.strike_all(now.thread)
+        self.begin_impulses(now)
         self.solve_rows(now.thread, now.final, now.tick)
 
     @called
@@ -90,6 +97,8 @@ class RowPass:
             self.rows.clear(i)
             if ti.static(self.rows.bounces):
                 self.rows.when[i] = 0
+            if ti.static(self.in_turn):
+                self.impacts.clear(i)
         for f, first in ti.static(self.linked):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                 self.answers.links.note_open(f, c, first.now + c)
@@ -111,7 +120,10 @@ class RowPass:
                         if ti.static(bool(self.answers)):
                             count += self.answers.links.sum_of(self.answers.links.open, i)
                     if ti.static(self.rows.bounces):
-                        hits += self.rows.count_hits(i)
+                        if ti.static(self.in_turn):
+                            hits += self.impacts.count(i)
+                        else:
+                            hits += self.rows.count_hits(i)
                         kinetic += self.bodies.kinetic(i)
                 if ti.static(self.rows.bounces):
                     self.impulses.note(low, HITS, hits)
@@ -126,6 +138,64 @@ class RowPass:
                 self.rows.eigenvalue[i] = self.rows.eigenvalue[i] + self.answers.links.degree[i]
         self.add_up(now.thread, OF_ROWS)
         self.team.wait()
+        if ti.static(self.rows.bounces):
+            ti.loop_config(serialize=True)
+            for _ in range(self.team.one(1, now.thread)):
+                self.impulses.check_hits()
+            self.team.wait()
+
+    @ti.func
+    def strike(self, thread):
+        """One round of impacts in turn."""
+        for k in range(self.particles.piece_count(thread) * self.going()):
+            begin, end = self.particles.piece(k, thread)
+            for part in range(self.rows.parts(), OWN + 1):
+                for i in range(begin, end):
+                    self.impacts.look(i, part, self.impulses.flags[None][TURN])
+        self.team.wait()
+        for k in range(self.particles.piece_count(thread) * self.going()):
+            begin, end = self.particles.piece(k, thread)
+            for part in range(self.rows.parts(), OWN + 1):
+                for b in range((end - begin + (BLOCK - 1)) // BLOCK):
+                    low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
+                    work, kept, shared = ti.Vector.zero(self.real, 3)
+                    for i in range(low, high):
+                        some_work, some_kept, some_shared = self.impacts.strike(i, part, self.bodies)
+                        work += some_work
+                        kept += some_kept
+                        shared += some_shared
+                    if part == OWN:
+                        self.impulses.note(low, WORK, work)
+                        self.impulses.note(low, LACK, kept)
+                        self.impulses.note(low, UPHILL, shared)
+        self.team.wait()
+        n = self.n * self.going()
+        self.add_up(thread, OF_ROUND)
+        ti.loop_config(serialize=True)
+        for _ in range(self.team.one(1, thread) * self.going()):
+            self.impulses.decide_round()
+        self.team.wait()
+        shared = self.impulses.flags[None][GAINS]
+        self.find_islands(thread, n * shared, BOUNCING)
+        self.find_scales(thread, n * shared, self.impulses.blocks * ti.cast(n > 0, ti.i32) * shared, BOUNCING)
+        ti.loop_config(serialize=self.islands.serial)
+        for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+            scale = ti.cast(2, self.real)
+            if self.impulses.flags[None][GAINS] != 0:
+                scale = self.islands.scale[self.islands.root_of(i)]
+            self.impacts.apply(i, self.impulses.flags[None][TURN], scale, self.bodies)
+        self.team.wait()
+
+    @called
+    @ti.func
+    def strike_all(self, thread: ti.i32):
+        """All rounds of impacts in turn."""
+        while self.impulses.flags[None][GOING] != 0:
+            self.strike(thread)
+
+    @ti.func
+    def begin_impulses(self, now):
+        """Begin the passes of stage 1."""
         if ti.static(self.rows.bounces):
             self.aim(now.thread)
         self.begin_answers(now)
@@ -206,12 +276,12 @@ class RowPass:
     @ti.func
     def aim(self, thread):
         """Find the times of impacts, and what bouncing rows aim at."""
-        ti.loop_config(serialize=True)
-        for _ in range(self.team.one(1, thread)):
-            self.impulses.check_hits()
-        self.team.wait()
         n = self.n * self.impulses.flags[None][STRUCK]
-        self.find_islands(thread, n, True)
+        if ti.static(self.in_turn):
+            for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                self.impacts.settle(i)
+            self.team.wait()
+        self.find_islands(thread, n, ALL)
         ti.loop_config(serialize=self.islands.serial)
         for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
             self.islands.find_time(i)
@@ -222,16 +292,16 @@ class RowPass:
         self.team.wait()
 
     @ti.func
-    def find_islands(self, thread, n, all_rows):
-        """Find the islands of the first n particles, either all or none; of all rows or of those that press."""
+    def find_islands(self, thread, n, which: ti.template()):  # type: ignore[valid-type]
+        """Find the islands of the first n particles, either all or none. which: of the rows that join them."""
         for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
             self.islands.begin(i)
         self.team.wait()
         ti.loop_config(serialize=self.islands.serial)
         for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-            self.islands.join(i, all_rows)
+            self.islands.join(i, which)
         self.team.wait()
-        if ti.static(bool(self.answers)):
+        if ti.static(bool(self.answers) and which != BOUNCING):
             bodies = self.answers.n * ti.cast(n > 0, ti.i32)
             ti.loop_config(serialize=self.islands.serial)
             for c in range(self.team.chunk_begin(bodies, thread), self.team.chunk_end(bodies, thread)):
@@ -239,22 +309,27 @@ class RowPass:
             self.team.wait()
 
     @ti.func
+    def find_scales(self, thread, n, blocks, which: ti.template()):  # type: ignore[valid-type]
+        """Find the sums over islands, and their scales."""
+        ti.loop_config(serialize=self.islands.serial)
+        for b in range(self.team.chunk_begin(blocks, thread), self.team.chunk_end(blocks, thread)):
+            self.islands.find_largest(b, which)
+        self.team.wait()
+        ti.loop_config(serialize=self.islands.serial)
+        for b in range(self.team.chunk_begin(blocks, thread), self.team.chunk_end(blocks, thread)):
+            self.islands.add_up(b, which)
+        self.team.wait()
+        for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+            self.islands.find_scale(i, self.impulses.numbers[None][ALLOWED], which)
+        self.team.wait()
+
+    @ti.func
     def scale_islands(self, thread):
         """Scale the impulses of islands that gain energy, if any particle does."""
         n = self.n * self.impulses.flags[None][GAINS]
         blocks = self.impulses.blocks * self.impulses.flags[None][GAINS]
-        self.find_islands(thread, n, False)
-        ti.loop_config(serialize=self.islands.serial)
-        for b in range(self.team.chunk_begin(blocks, thread), self.team.chunk_end(blocks, thread)):
-            self.islands.find_largest(b)
-        self.team.wait()
-        ti.loop_config(serialize=self.islands.serial)
-        for b in range(self.team.chunk_begin(blocks, thread), self.team.chunk_end(blocks, thread)):
-            self.islands.add_up(b)
-        self.team.wait()
-        for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-            self.islands.find_scale(i, self.impulses.numbers[None][ALLOWED])
-        self.team.wait()
+        self.find_islands(thread, n, PRESSING)
+        self.find_scales(thread, n, blocks, PRESSING)
         ti.loop_config(serialize=self.islands.serial)
         for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
             self.islands.apply(i)
@@ -377,7 +452,7 @@ class RowPass:
                     if part == OWN:
                         self.impulses.note(low, LACK, lack)
         self.team.wait()
-        self.add_up(thread, OF_PLACES)
+        self.add_up(thread, OF_LACK)
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread) * self.going()):
             self.impulses.decide_places(MOVES)

@@ -516,6 +516,18 @@ class Step:
     def find_rows(self, now):
         """On the launched path: list the rows of contacts."""
         self.contact_pass.rows.find_rows(now)
+        if ti.static(not self.contact_pass.rows.in_turn):
+            self.contact_pass.rows.begin_impulses(now)
+
+    @ti.func
+    def strike(self, now):
+        """On the launched path: one round of impacts in turn."""
+        self.contact_pass.rows.strike(now.thread)
+
+    @ti.func
+    def begin_impulses(self, now):
+        """On the launched path: begin the passes of impulses."""
+        self.contact_pass.rows.begin_impulses(now)
 
     @ti.func
     def relax_impulses(self, now):
