@@ -202,8 +202,6 @@ class Surface:
                     self.log.record(i, depth, n, after - leaving, -leaving, moved, h, rise > 0)
             change = (after - leaving) * n
             self.state.note_wall_push(i, change)
-            if ti.static(self.state.keeps_wall_grip):
-                self.note_grip(i, moved)
             shift = (move + rise) * n
             stuck = False
             if ti.static(self.spins):
@@ -236,14 +234,6 @@ class Surface:
             if not stuck:
                 self.state.advance(i, shift)
         return shift
-
-    @ti.func
-    def note_grip(self, i, moved):
-        """Note the friction of this wall, and how far its surface moved, for what lands on particle i in this substep."""
-        static = dynamic = ti.cast(0, self.real)
-        if ti.static(self.has_friction):
-            static, dynamic = self.static(), self.dynamic()
-        self.state.wall_grip[i], self.state.wall_moved[i] = [static, dynamic], moved
 
     @ti.func
     def is_linked(self, i):

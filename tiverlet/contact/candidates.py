@@ -4,10 +4,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from ..neighbours.queries import between
-
 if TYPE_CHECKING:
-    from ..neighbours.periodic import Periodic
+    pass
 
 
 class Candidates(Protocol):
@@ -27,18 +25,14 @@ class Candidates(Protocol):
         ...
 
 
-class DiscCandidates:
-    """Pairs of discs or spheres, who (m, 2). reach: (m,) [m], the contact distance of each pair. box: the Periodic, or None."""
+class NoCandidates:
+    """No possible contacts: particles touch nothing but walls."""
 
-    def __init__(self, who: np.ndarray, reach: np.ndarray, box: "Periodic | None"):
-        self.who, self.reach, self.box, self.size = who, reach, box, reach / 2
+    who, size = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
 
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the overlaps (m,) [m] and the gradients (m, 2, dim) of C = |x_i - x_j| - (r_i + r_j)."""
-        r = between(x[self.who[:, 0]], x[self.who[:, 1]], self.box)
-        length = np.linalg.norm(r, axis=1)
-        n = np.divide(r, length[:, None], out=np.zeros_like(r), where=length[:, None] > 0)
-        return self.reach - length, np.stack([n, -n], axis=1)
+        """Return no overlaps and no gradients."""
+        return self.size, np.zeros((0, 2, x.shape[1]))
 
 
 class EdgeCandidates:

@@ -219,13 +219,14 @@ class Impacts:
     @ti.func
     def terms(self, i, bodies: ti.template()):  # type: ignore[valid-type]
         """Return the part of particle i in the sums over what bounces together: work, its square, and how many rows."""
-        push, work, rows = ti.cast(bodies.push[i], ti.f64), ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+        push, w = ti.cast(bodies.push[i], ti.f64), bodies.compliance(i)
+        work, rows = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         for row in range(self.rows.own[i], self.rows.end[i]):
             blow = self.blow.field[row]
             if blow > 0:
                 work += self.part(row) * blow * self.closing.field[row]
                 rows += 1
-        return ti.Vector([work, bodies.compliance(i) * push.dot(push), rows])
+        return ti.Vector([work, w * push.dot(push), rows])
 
     @ti.func
     def scale_of(self, work, square, rows):

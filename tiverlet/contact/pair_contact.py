@@ -16,76 +16,16 @@ from ..neighbours.neighbour_list import MOVED
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.queries import Contacts
 from ..particles import Particles
-from .candidates import Candidates
 
 
 class Geometry(Protocol):
-    """The geometry of contacts in one world: which particles take part, the overlap, the normal, and the share of each particle.
-
-    DiscGeometry and PolygonGeometry also give their feature the overlap, normal and inverse masses of each contact. They give
-    the neighbour list the distance up to which two particles may take part in a contact.
-    """
-
-    shrinks: bool  # whether particles may shrink for a while, or are allowed to overlap
-    store: Any  # the Memory of fields that are declared only when they are needed, or None
-    late: tuple[str, ...]  # the names of its fields in the state
+    """The geometry of contacts in one world. DiscGeometry and PolygonGeometry also give their feature overlaps and normals."""
 
     def overshoots(self, i) -> Any:
         """Return 1 if particle i moves so far in one substep that a contact may be missed."""
 
-    def enable_shrink(self) -> None:
-        """Prepare for shrink(): from now on overlap may be allowed for a while."""
-
-    def shrink(self, i, first, speed) -> None:
-        """Allow the overlap that particle i has with particles of index `first` or more; pairs part at up to `speed` [m/s]."""
-
-    def restore(self, i, h) -> None:
-        """Reduce the allowed overlap of particle i after a substep h, at push_out [m/s] or more slowly."""
-
-    def is_shrunk(self, i) -> Any:
-        """Whether particle i is allowed to overlap."""
-
     def worst_overlap(self, i) -> Any:
         """Return the number of contacts that particle i counts for the report, and its worst overlap relative to its size."""
-
-    def near_contact(self, i, e, near) -> Any:
-        """Return the place t, the normal and the gap [m] of the contact of particle i at entry e of its list, for BodyProjection.
-
-        t is the place on an edge, at most 0 without one; NONE if the gap is wider than `near` times the size of the contact.
-        """
-
-    def ends(self, i, e, t) -> Any:
-        """Return the particles v, a and b of that contact: v touches the point t between a and b."""
-
-    def entry_of(self, i, e, role) -> Any:
-        """Return the entry that stores the contact in which particle i has a role, with the particle at entry e, or -1.
-
-        The roles are 0 for v, 1 for a, 2 for b; discs have the first one only.
-        """
-
-    def part_of(self, t, role) -> Any:
-        """Return the part of a particle in a contact with place t, by its role: 1, -(1 - t) or -t, the factor of its gradient."""
-
-    def relative(self, d, v, a, b, t) -> Any:
-        """Return the displacement of v relative to the point t between a and b [m], where d is the field of displacements."""
-
-    def add_push(self, e, push) -> None:
-        """Add the push of an impact of bodies to those of the contact at entry e [kg m], if it keeps any."""
-
-    def members(self, pairs: np.ndarray) -> np.ndarray:
-        """Return the particles of the contacts of these listed pairs (m, 2), (m, k), for KnownLoads."""
-        ...
-
-    def gradients(self, x: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-        """Return the gradients of C of these listed pairs at x (n, dim) [m], (m, k, dim), as far as they store loads for them."""
-        ...
-
-    def candidates(self, x: np.ndarray) -> Candidates:
-        """Return the contacts that are possible around positions x (n, dim) [m], for the host to move particles apart.
-
-        x has to be the positions of the last diagnosis.
-        """
-        ...
 
     def found(self, x: np.ndarray, h: float) -> Contacts:
         """Return the contacts of particles at x (n, dim) [m] after a substep h [s], for world.contacts."""
@@ -97,13 +37,12 @@ class PairContact(Feature):
 
     bodies: arrays of particles that sleep and wake together. ties: the constraints of its world.
 
-    A subclass defines prepare() and make_search(), which makes `dev.geometry` and `dev.forces`. In a pass of a substep its
-    methods are called in this order:
+    A subclass defines prepare() and make_search(), which makes `dev.geometry`. Contacts that are rows are solved by RowPass.
+    Else, methods are called in a pass of a substep in this order:
 
     - detect(i, first), if it `detects`
-    - count(begin, end, now) and busy(begin), by blocks of particles
-    - begin(i, now), if pairs are solved `once`
-    - relax(i, turn, now)
+    - count(begin, end, now), by blocks of particles
+    - relax(i, now)
     - store_pushes(i, now), if its contacts are `stored_once` and know loads
     - choose(i) and apply(i) of its `dev.restitution`, in rounds while `dev.hit` is set, if any pair has restitution
     - apply_corrections(i, first)
@@ -132,10 +71,8 @@ class PairContact(Feature):
     code_size = 3.0
     neighbours_per_particle = 0  # initial list entries per particle, if more than discs need
     stored_once = False  # whether one particle stores a contact, and others read it; else each particle of a pair stores its own
+    solves_rows = False  # whether contacts are rows, see rows.py
     detects = False  # whether each pass calls detect() for all particles, before contacts are counted
-    can_keep_stiffness = False  # whether keep_stiffness() works
-    once = False  # whether a pair is solved once for both particles, see EachOnce
-    projects: Any = False  # whether it has a velocity projection of loaded pairs, see velocity_projection.py
 
     def _surface(self, name: str, value):
         """Check one setting of pairs together with the other settings."""
@@ -203,11 +140,6 @@ class PairContact(Feature):
         return bool(vars(self).get("loads")) and not self.solves_rows
 
     @property
-    def lands(self) -> bool:
-        """Whether single particles have inelastic impacts, see impact_projection.py."""
-        return self.projects
-
-    @property
     def shares_loads(self) -> bool:
         """Whether particles read the loads of contacts that other particles store."""
         return self.stored_once and self.has_loads
@@ -218,29 +150,9 @@ class PairContact(Feature):
         return vars(self.dev).get("known")
 
     @property
-    def shrinks(self) -> bool:
-        """Whether the present kernels have code for particles that shrink."""
-        return self.dev.geometry.shrinks
-
-    @property
     def speed_of_parting(self) -> float:
         """How fast what was placed in each other parts, where contacts are no rows [m/s]."""
         return speed_of_parting(self.push_out)
-
-    @property
-    def solves_rows(self) -> bool:
-        """Whether contacts are rows, see rows.py."""
-        return False
-
-    @property
-    def store(self) -> Any:
-        """The Memory of the field that is declared only when it is needed, or None."""
-        return self.dev.geometry.store if "geometry" in vars(self.dev) else None
-
-    @property
-    def late(self) -> tuple[str, ...]:
-        """The names of state fields that enable_shrink() declares. Their values are 0 before."""
-        return self.dev.geometry.late
 
     def make_search(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields and the neighbour search, and return the search. enter() comes before."""
@@ -301,13 +213,6 @@ class PairContact(Feature):
         self.__dict__.pop("ties", None)
         self.__dict__.pop("walls", None)
 
-    def enable_shrink(self) -> None:
-        """Prepare for shrink(): from now on particles may be smaller than their radius."""
-        self.dev.geometry.enable_shrink()
-
-    def keep_stiffness(self, ratio: float) -> None:
-        """Push as hard as before where the next substep is `ratio` times as long as the last one, if can_keep_stiffness."""
-
     def found(self, x: np.ndarray, h: float) -> Contacts:
         """Return the contacts of particles at x (n, dim) [m] after a substep h [s], for world.contacts."""
         return self.dev.geometry.found(x, h)
@@ -328,14 +233,13 @@ class PairContact(Feature):
                 self.dev.fast[None] = 1
 
     @ti.func
-    def shrink(self, i, first, speed):
-        """Allow the overlap that particle i has with particles of index `first` or more."""
-        self.dev.geometry.shrink(i, first, speed)
+    def restore(self, i, h):
+        """Reduce the overlap that particle i is allowed, after a substep h [s]. Rows allow none."""
 
     @ti.func
-    def restore(self, i, h):
-        """Reduce the allowed overlap of particle i after a substep h [s]."""
-        self.dev.geometry.restore(i, h)
+    def is_shrunk(self, i):
+        """Whether particle i is allowed to overlap for a while."""
+        return False
 
     @ti.func
     def worst_overlap(self, i):
@@ -347,22 +251,6 @@ class PairContact(Feature):
         """Keep the displacement of particle i as the last substep of a frame begins. ForceShare needs it to tell impacts."""
         if ti.static(bool(self.dev.forces)):
             self.dev.forces.start(i, scale)
-
-    @ti.func
-    def reaction(self, i, h, soft):
-        """Return how far contact forces moved particle i in the last substep of a frame, h [s] long [m]. It needs a list. soft:
-        see Passes.push_reaction()."""
-        return self.dev.forces.sum[i]
-
-    @ti.func
-    def may_project(self, now):
-        """Whether displacements may be projected after this substep, so that the pushes of walls have to be known."""
-        return True
-
-    @ti.func
-    def busy(self, begin):
-        """Return 0 if no particle in the block that begins at `begin` is in contact. Here always 1."""
-        return 1
 
 
 def _skin(value):

@@ -12,7 +12,7 @@ from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.queries import Contacts
 from .candidates import EdgeCandidates
-from .narrow_phase import NONE, DiscGeometry
+from .narrow_phase import DiscGeometry
 
 # Lengths relative to an edge.
 SLACK = 1 / 512  # extension of an edge at its ends, so that bodies of the same width stand on each other
@@ -28,6 +28,7 @@ RATE = 0.4  # at which the usual depth of a contact approaches its depth, see Po
 DISCS = -1  # the place on an edge where there is no edge: two discs touch
 OVER_EDGE = 1  # what tips_cross() returns if the way out is over the edge of the second corner
 VERTEX, START, END = range(3)  # the role of a particle in a contact with a listed particle
+NONE = -2.0  # in near_contact(): the place on an edge where there is no contact
 
 
 class Outline(NamedTuple):
@@ -58,8 +59,6 @@ class PolygonGeometry:
     C(x) = (x_v - (1 - t) x_a - t x_b) . n - (r_v + (1 - t) r_a + t r_b) of a vertex v and the edge from a to b of another body,
     or C of two discs, see DiscGeometry, of which one may be a corner. push_out: speed at which overlap from the start ends [m/s].
     """
-
-    shrinks, store, late = True, None, ()  # the field of allowed overlaps exists from the start
 
     push_out: Any = OnDevice()
     step: Any = OnDevice()  # how far a vertex may move in a substep without missing an edge [m]
@@ -566,9 +565,6 @@ class PolygonGeometry:
         if self.after(i) < 0:
             limit = ti.min(limit, self.radius.stride(i) if ti.static(self.radius.discs) else limit)
         return ti.select(d.dot(d) <= limit * limit, 0, 1)
-
-    def enable_shrink(self) -> None:
-        """Do nothing: the field of allowed overlaps exists from the start."""
 
     @ti.func
     def shrink(self, i, first, speed):

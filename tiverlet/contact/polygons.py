@@ -20,17 +20,17 @@ from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from .body_projection import BodyProjection
-from .body_restitution import AIM
 from .exclusions import excluded_pairs
 from .force_share import ForceShare
 from .known_loads import WINDOW, KnownLoads
 from .loops import checked, flat, laid, refuse_deep
 from .pair_contact import PairContact
 from .polygon_narrow_phase import VERTEX, EdgePairTable, Outline, PolygonGeometry
-from .restitution import SLOW, under_force
 from .wall_loads import WallLoads
 
 SKIN = 0.15  # skin of a vertex, relative to its longer edge
+SLOW = 2.0  # a contact rests if this many substeps of forces account for its speed
+AIM = 2.0**-40  # [m] the least displacement with which a contact leaves after an impact, so that its normal can be told from it
 
 
 @record
@@ -252,7 +252,7 @@ class Polygons(PairContact):
         if dev.has_restitution:
             dev.restitution = PolygonRestitution(scene, dev.geometry, self.table)
             dev.hit = dev.restitution.hit
-        dev.rows = dev.landing = None
+        dev.rows = None
         dev.bodies = None if dev.has_restitution else BodyProjection.made(scene, batches, self.table, 3)
         linked = excluded_pairs(batches, scene.particles.radius, dev.outline.body)
         dev.known = KnownLoads(scene, True, dev.has_friction) if self.has_loads else None
@@ -288,6 +288,27 @@ class Polygons(PairContact):
     def bodies(self) -> list[np.ndarray]:  # type: ignore[override]
         """The particles of each body, which sleep and wake together."""
         return self.loops
+
+    @ti.func
+    def reaction(self, i, h, soft):
+        """Return how far contact forces moved particle i in the last substep of a frame, h [s] long [m]. It needs a list. soft:
+        see Passes.push_reaction()."""
+        return self.dev.forces.sum[i]
+
+    @ti.func
+    def shrink(self, i, first, speed):
+        """Allow the overlap that particle i has with particles of index `first` or more; pairs part at up to `speed` [m/s]."""
+        self.dev.geometry.shrink(i, first, speed)
+
+    @ti.func
+    def restore(self, i, h):
+        """Reduce the overlap that particle i is allowed, after a substep h [s]."""
+        self.dev.geometry.restore(i, h)
+
+    @ti.func
+    def is_shrunk(self, i):
+        """Whether particle i is allowed to overlap for a while."""
+        return self.dev.geometry.is_shrunk(i)
 
     @ti.func
     def detect(self, i, first):
@@ -365,7 +386,7 @@ class Polygons(PairContact):
                         self.dev.restitution.split[i] = parts
 
     @ti.func
-    def relax(self, i, turn, now):
+    def relax(self, i, now):
         """Compute the corrections of particle i by its contacts.
 
         For each contact in which it has a role: find the overlap; compute what this pass takes back along the normal, then across
@@ -792,3 +813,26 @@ class PolygonRestitution:
             else:
                 self.state.shift(i, total)
             self.impacts.reached[i] = 1
+
+
+@ti.func
+def under_force(impact, left, closing, approach, overlap, e):
+    """Return the impact of a pair in a substep in which a force acts, and the fraction of the substep after the impact.
+
+    The impact is the change of displacement from approach to separation [m]. Returns `impact` and `left` if no force acts, or
+    if the pair would not be free of overlap at the end.
+
+    In units of the substep, the pair approaches by `closing`, of which forces added f = closing - approach. At time s it has
+    moved by u s + f s^2 / 2, u = closing - f / 2, with the velocity u + f s. It meets at s = 2 gap / (u + sqrt(u^2 + 2 f gap)),
+    gap = closing - overlap. It leaves at e times its velocity at that time, and falls back by f (1 - s)^2 / 2. So energy is
+    conserved at e = 1, whatever s is: a change J of the velocity at s changes the energy of d and x at the end by
+    J (J / 2 - u - f s).
+    """
+    f, gap = closing - approach, closing - overlap
+    u = closing - f / 2
+    if f != 0 and gap > 0 and u > 0:
+        s = ti.min(2 * gap / (u + ti.sqrt(ti.max(u * u + 2 * f * gap, 0))), 1)
+        met = closing + (s - 0.5) * f
+        if e * met > ti.max((1 - s) * f / 2, 0):
+            impact, left = (1 + e) * met, 1 - s
+    return impact, left

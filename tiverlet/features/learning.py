@@ -10,6 +10,7 @@ if TYPE_CHECKING:
 STEADY = 0.2  # relative difference of the missing load between two windows, at most
 SWING = 0.1  # acceleration in a window, relative to its own weight, above which a body learns no load
 GAIN = 0.8  # largest share of the missing load that is learnt at once
+WEIGHED = 32  # substeps from one look at own weights to the next
 LAG = 64  # least number of substeps in which a load is learnt
 
 

@@ -33,7 +33,7 @@ class State:
         self.two_digits = 2.0**-50 if self.double else 2.0**-21  # the size of the last two binary digits of 1
         self.count, self.dim = n, dim
         self.starts = self.befores = self.lifts = self.carries = self.spins = False
-        self.keeps_wall_push = self.keeps_wall_grip = False
+        self.keeps_wall_push = False
         self.images: Any = None  # set in a periodic box, see neighbours/periodic.py
         self.sleepers: Any = None  # set if particles may sleep, see step/sleep.py
         self.number = memory.number(n)  # of particles
@@ -182,19 +182,13 @@ class State:
             x += self.low0[i]
         return x
 
-    def remember(
-        self, memory: "Memory", start: bool, before: bool, lifts: bool, wall_push: bool, lasts: bool, wall_grip: bool
-    ) -> None:
+    def remember(self, memory: "Memory", start: bool, before: bool, lifts: bool, wall_push: bool, lasts: bool) -> None:
         """Declare what friction, swept walls and impacts need.
 
         start, before: position and displacement at the start of the substep. lifts: whether particles that bounced may not be
         where their displacement says. wall_push: how far walls have pushed since then. lasts: whether the next substep needs
-        that. wall_grip: the friction of the wall that pushed last, and how far it moved.
+        that.
         """
-        self.keeps_wall_grip = wall_grip
-        if wall_grip:
-            self.wall_grip = memory.field("wall_grip", self.number, width=2)
-            self.wall_moved = memory.field("wall_moved", self.number, width=self.dim)
         self.starts, self.befores, self.lifts, self.keeps_wall_push = start, before, lifts, wall_push
         if wall_push:
             self.wall_push = memory.field("wall_push", self.number, width=self.dim, state=lasts)

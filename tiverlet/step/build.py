@@ -162,7 +162,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     has_friction, bounces = any(f.has_friction for f in surfaces), any(f.has_restitution for f in surfaces)
     scene.bounces = bounces and bool(walls)
     solver = solver or (choose_solver(batches, scene) if scene.order == 2 else Direct())
-    if (batches and solver.loads) or (contact and (contact.has_loads or contact.lands)):
+    if (batches and solver.loads) or (contact and (contact.has_loads)):
         scene.own_weight = OwnWeight(scene)
     if batches:
         with memory.owned("slots"):
@@ -189,9 +189,8 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         has_friction or rows or any(w.needs_start_position for w in walls) or scene.bounces,
         bounces or bool(scene.impacts) or bodies or rows,
         bounces,
-        bool(contact and (contact.projects or bodies) and walls),
+        bool(bodies and walls),
         bodies,
-        bool(search and contact and contact.dev.landing and any(w.has_friction for w in walls)),
     )
     for feature in of(Batch):
         feature.scene = scene  # also for those that do nothing, because all of their particles are held

@@ -161,7 +161,7 @@ class Rebuild:
                 runner.memory.put_scratch(f, rows, self.masks[f])
         runner.wake()
         if contact and contact in runner.step.contacts:
-            self._give_contacts(contact)
+            self._give_contacts()
         drag, world._clock.drag = world._clock.drag, None
         if runner.integrator.decays:
             runner.set_substep(world._clock.h, drag)
@@ -172,21 +172,11 @@ class Rebuild:
         for f, values in self.rests.items():
             if f.ramp:  # rest values continue to the assigned ones; those of added constraints begin at their own
                 f.ramp.put([np.append(rows, now[len(rows) :]) for rows, now in zip(values, f.ramp.now(), strict=True)])
-        first = int(self.some.sum())
         if any(isinstance(f, PairContact) for f in self.new_features):
-            world._clock.first_moved = first = 0
-        if first < len(self.particles):
-            runner.expect_overlap(runner.scene.state.get(runner.memory), first)
+            world._clock.first_moved = 0
 
-    def _give_contacts(self, contact: PairContact) -> None:
-        """Carry over the data of pairs in contact, and by how much radii are shrunk."""
-        if "Contact.shrunk" in self.old:
-            contact.enable_shrink()
-            less: Any = contact.store
-            values = less.state()
-            for name in contact.late:
-                values[name][: self.some.sum()] = self.old[name][self.some]
-            less.restore(values)
+    def _give_contacts(self) -> None:
+        """Carry over the data of pairs in contact."""
         search, pairs = self.world._runner.search, self.old["Contact.pairs"].copy()
         assert search
         some = pairs < WALL

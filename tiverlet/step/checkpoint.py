@@ -83,11 +83,9 @@ def _hashed(world: "World", values: dict[str, np.ndarray]) -> dict[str, np.ndarr
 
 
 def _late(world: "World") -> set[str]:
-    """Return the names of fields that are not hashed where they are 0: those that are allocated when first needed, and count as 0
-    before, and those of systems."""
+    """Return the names of fields that are not hashed where they are 0: those of systems."""
     slots = world._runner.scene.slots
-    parts = [*world._runner.step.contacts, *([slots.system] if slots and slots.system else [])]
-    return {name for part in parts for name in part.late}
+    return set(slots.system.late) if slots and slots.system else set()
 
 
 def _pieces(world: "World") -> dict[str, Any]:
@@ -104,9 +102,6 @@ def put_back(world: "World", kept: Checkpoint) -> None:
     """Return to an earlier state, bit for bit."""
     world._runner.set_substep(kept.clock.h, kept.clock.drag)
     search, stores = world._runner.search, list(map(id, world._runner.memories))
-    for contact in world._runner.step.contacts:
-        if any(name in kept.values for name in contact.late):
-            contact.enable_shrink()
     for memory in world._runner.memories:
         memory.restore(kept.values)
     if search:

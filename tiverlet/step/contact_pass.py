@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING, Any
 
-from ..contact.each_once import ROUNDS, Turn, first_round
 from ..device import ti
 from ..device.number import OnDevice
 from ..device.thread_team import block, blocks
@@ -25,12 +24,8 @@ class ContactPass:
         self.n, self.real, self.dim = scene.count, scene.real, scene.particles.dim
         self.rows: Any = RowPass(scene, contact, particles, team) if contact and contact.dev.rows else None
         self.has_restitution = bool(contact) and contact.has_restitution and not contact.solves_rows
-        self.projects_discs = bool(contact and contact.dev.landing)
-        self.closes_late = self.projects_discs and contact.dev.reports
-        self.notes_bounces = self.projects_discs and contact.dev.landing.bounces
         keeps = contact and (contact.has_friction or contact.has_restitution or contact.has_events or contact.shares_loads)
-        self.remembers = self.notes_bounces or bool(contact and contact.has_events if self.rows else keeps)
-        self.projects_velocities = bool(contact) and contact.projects
+        self.remembers = bool(contact and contact.has_events if self.rows else keeps)
         self.projects_bodies = bool(contact and contact.dev.bodies)
         if self.has_restitution and team.launched:  # the host does not read whether any pair bounces in a round
             self.bounces = scene.memory.field("Contact.bounces", None, kind=ti.i32)
@@ -74,29 +69,10 @@ class ContactPass:
         """Compute the moves of all particles, and the new pushes of their contacts."""
         for k in range(self.particles.piece_count(now.thread)):
             begin, end = self.particles.piece(k, now.thread)
-            if ti.static(c.once):
-                for i in range(begin, end):
-                    c.begin(i, now)
-            for r in range(first_round(c, begin), ROUNDS):
-                for b in range(blocks(begin, end)):
-                    low, high = block(b, begin, end)
-                    self.relax_block(c, low, high, Turn(begin, end, r), now)
-        self.team.wait()
-
-    @ti.func
-    def relax_block(self, c: ti.template(), low, high, turn, now):  # type: ignore[valid-type]
-        """Relax the contacts of particles low ... high - 1. Without any, only clear what friction did in earlier frames."""
-        if c.busy(low) != 0:
-            for i in range(low, high):
+            for i in range(begin, end):
                 if c.dev.state.awake(i):
-                    c.relax(i, turn, now)
-        elif now.final != 0:
-            if ti.static(c.has_friction and not c.once):
-                for i in range(low, high):
-                    if c.dev.state.awake(i):
-                        c.dev.forces.add(i, ti.Vector.zero(self.real, self.dim), now.first)
-                        if ti.static(c.dev.forces.spins):
-                            c.dev.forces.add_turn(i, 0 * c.dev.forces.turned[i], now.first)
+                    c.relax(i, now)
+        self.team.wait()
 
     @ti.func
     def store_pushes(self, c: ti.template(), now):  # type: ignore[valid-type]
@@ -176,18 +152,11 @@ class ContactPass:
 
     @ti.func
     def finish_events(self, now):
-        """Record what sensors overlap, and at the end of a frame the pairs that touch, unless discs may still land."""
+        """Record what sensors overlap, and at the end of a frame the pairs that touch."""
         for c in ti.static(self.contacts):
             if ti.static(c.dev.events.senses):
                 for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                     c.dev.events.sense(i, now.final)
-            if ti.static(not self.closes_late):
-                self.close_events(now)
-
-    @ti.func
-    def close_events(self, now):
-        """At the end of a frame: record the pairs that touch. After that, no impulse can be added to a pair."""
-        for c in ti.static(self.contacts):
             n = self.n * now.final
             for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
                 c.dev.events.close(i)
@@ -201,10 +170,6 @@ class ContactPass:
                 for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
                     if c.dev.state.awake(i):
                         c.finish_substep(i, now)
-            if ti.static(self.notes_bounces):
-                for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-                    if c.dev.state.awake(i):
-                        c.dev.landing.note_bounce(i, now.h)
             if ti.static(c.dev.has_events):
                 self.finish_events(now)
             self.team.wait()
@@ -212,35 +177,6 @@ class ContactPass:
                 ti.loop_config(serialize=True)
                 for _ in range(self.team.one(1, thread)):
                     c.dev.hit[None] = 0
-
-    @ti.func
-    def has_struck_discs(self):
-        """Whether discs struck each other in this substep."""
-        out = False
-        for c in ti.static(self.contacts):
-            out = c.dev.landing.any_struck[None] != 0
-        return out
-
-    @ti.func
-    def project_discs(self, thread, k):
-        """Do round k of the impacts of discs, see ImpactProjection."""
-        for c in ti.static(self.contacts):
-            n = ti.select(k == 0, self.n, 0)
-            for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-                c.dev.landing.begin(i)
-            size = ti.select(k == 0, 0, c.dev.landing.size[None])
-            begin, end = self.team.chunk_begin(size, thread), self.team.chunk_end(size, thread)
-            for m in range(begin, end):
-                c.dev.landing.find(c.dev.landing.near[m], k)
-            self.team.wait()
-            for m in range(begin, end):
-                i = c.dev.landing.near[m]
-                if c.dev.landing.apply(i, k):
-                    c.note_motion(c.dev.search.moved_too_far(i), 0)
-            ti.loop_config(serialize=True)
-            for _ in range(self.team.one(1, thread)):
-                c.dev.landing.end_round(k)
-            self.team.wait()
 
     @ti.func
     def has_struck_bodies(self):
@@ -282,38 +218,3 @@ class ContactPass:
             for _ in range(self.team.one(ti.cast(k == 0, ti.i32), thread)):
                 c.dev.bodies.any_struck[None] = 0
             self.team.wait()
-
-    @ti.func
-    def find_projected(self, thread, k, rounds, damps):
-        """Do round k of finding what is projected, see VelocityProjection.find()."""
-        for c in ti.static(self.contacts):
-            for p in range(self.particles.piece_count(thread)):
-                begin, end = self.particles.piece(p, thread)
-                c.dev.projection.find(self.team.dealt_index(p, 1, thread), begin, end, k, rounds, damps)
-            self.team.wait()
-
-    @ti.func
-    def project_velocities(self, thread, k):
-        """Do pass k of the projection that damps sound in loaded contacts."""
-        for c in ti.static(self.contacts):
-            for p in range(self.particles.piece_count(thread)):
-                begin, end = self.particles.piece(p, thread)
-                for m in range(begin, begin + c.dev.projection.count[self.team.dealt_index(p, 1, thread)]):
-                    c.dev.projection.relax(c.dev.projection.loaded[m], k)
-            self.team.wait()
-            for p in range(self.particles.piece_count(thread)):
-                begin, end = self.particles.piece(p, thread)
-                for m in range(begin, begin + c.dev.projection.count[self.team.dealt_index(p, 1, thread)]):
-                    c.dev.projection.apply(c.dev.projection.loaded[m])
-            ti.loop_config(serialize=True)
-            for _ in range(self.team.one(ti.cast(k == 0, ti.i32), thread)):
-                c.dev.projection.sum_up(self.particles.pieces)
-            self.team.wait()
-
-    @ti.func
-    def needs_projection(self, now):
-        """Whether sound is damped after this substep, anywhere."""
-        out = False
-        for c in ti.static(self.contacts):
-            out = c.dev.projection.is_needed(now)
-        return out

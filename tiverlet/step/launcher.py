@@ -3,8 +3,6 @@
 from typing import TYPE_CHECKING, Any
 
 from ..contact.limits import BOUNCES, GOING, MOVES, ROUNDS
-from ..contact.projection_times import ALWAYS, MAYBE, due
-from ..contact.velocity_projection import RINGS
 from ..device.language import template
 from .span import Moment, Span
 
@@ -25,9 +23,7 @@ class Launcher:
     def __init__(self, runner: "Runner"):
         self.runner, step = runner, runner.step
         self.halves, self.newton_steps, self.has_restitution = step.halves, step.newton_steps, step.has_restitution
-        self.finishes, self.projects_velocities = step.finishes, step.projects_velocities
-        self.projects_bodies, self.projects_discs = step.projects_bodies, step.projects_discs
-        self.landing_rounds, self.closes_late = step.landing_rounds, step.closes_late
+        self.finishes, self.projects_bodies = step.finishes, step.projects_bodies
         self.drives, self.constrains, self.touches, self.acts = map(
             bool, (step.drivers, step.batches, step.contacts, step.particles.acts)
         )
@@ -67,7 +63,7 @@ class Launcher:
 
     def moment(self, span: Span, s: int) -> Moment:
         """Return the Moment of substep s, with the values that the host needs."""
-        return Moment(span, s, damps=due(span.since + s))
+        return Moment(span, s)
 
     def pass_of(self, now: Moment, half: int) -> Moment:
         """Return the Moment of one half of a pass."""
@@ -87,10 +83,6 @@ class Launcher:
         return now.s < now.span.substeps
 
     ends_substep = has_pass
-
-    def ends_passes(self, now: Moment) -> bool:
-        """Whether this is a substep, and the frame did not stop after its passes."""
-        return self.has_pass(now) and self.first_half(now) <= self.last_half(now)
 
     def ends_frame(self, now: Moment) -> bool:
         """Whether all substeps are done."""
@@ -223,28 +215,6 @@ class Launcher:
         """Add the last phase of a pass, if particles have corrections to apply."""
         self.put(now, "apply_corrections", self.acts)
 
-    def has_struck_discs(self, now: Moment) -> bool:
-        """Whether discs struck each other in this substep. The host has to wait for the answer."""
-        self.flush()
-        return bool(self.runner.memory.read(self.runner.step.contacts[0].dev.landing.any_struck))
-
-    def list_what_touches(self, now: Moment) -> None:
-        """Check the neighbour list. The frame may stop here until the list is rebuilt."""
-        now = now.of(0, half=self.last_half(now) + 1)
-        self.put(now, "check_list")
-        self.put(now, "ask_for_list")
-
-    def project_discs(self, now: Moment) -> None:
-        """Add one round of the impacts of discs, in a launch of its own."""
-        self.flush()
-        self.put(now.of(now.it, half=now.it * self.halves), "project_discs")
-
-    def close_events(self, now: Moment) -> None:
-        """Add this phase, in a launch of its own."""
-        self.flush()
-        self.put(now.of(0, half=self.last_half(now) - 1), "close_events")
-        self.flush()
-
     def has_struck_bodies(self, now: Moment) -> bool:
         """Whether bodies struck each other in this substep. The host has to wait for the answer."""
         self.flush()
@@ -262,30 +232,6 @@ class Launcher:
     def finish_substep(self, now: Moment) -> None:
         """Add the phase finish_substep, after the last pass."""
         self.put(self.now if self.waiting else now, "finish_substep")
-
-    def needs_projection(self, now: Moment) -> bool:
-        """Whether sound is damped after this substep. Where that depends on the contacts, the host has to wait for the answer."""
-        projection, memory = self.runner.step.contacts[0].dev.projection, self.runner.memory
-        asks = now.damps == MAYBE or projection.unequal
-        if now.damps == ALWAYS or not asks:
-            return now.damps == ALWAYS
-        self.flush()
-        restless = now.damps == MAYBE and memory.read(projection.any_restless)
-        return bool(restless or (projection.unequal and memory.read(projection.any_struck)))
-
-    def rounds(self, now: Moment) -> int:
-        """How many rounds find the contacts in which sound is damped: three if these are all."""
-        return 3 if now.damps == ALWAYS else 3 + RINGS
-
-    def find_projected_contacts(self, now: Moment) -> None:
-        """Add one of these rounds, in a launch of its own."""
-        self.flush()
-        self.put(now.of(now.it, half=now.it * self.halves), "find_projected_contacts")
-
-    def project_contact_velocities(self, now: Moment) -> None:
-        """Add one pass of project_contact_velocities, in a launch of its own."""
-        self.flush()
-        self.put(now.of(now.it, half=now.it * self.halves), "project_contact_velocities")
 
     def diagnose(self, now: Moment) -> None:
         """Launch the diagnostics, the last launch of a frame."""

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from ..constraints.core.scalar import Scalar
-from ..contact.candidates import Candidates, DiscCandidates
+from ..contact.candidates import Candidates, NoCandidates
 from .cluster_rows import cluster_rows
 from .contact_rows import stored_by
 from .free_bodies import FreeBodies
@@ -35,7 +35,6 @@ from .solids import Solids
 SOFT, SOFTEST = 1e-2, 1e-5  # mu of the first round, and the least
 ROUNDS = 16  # of moves, at most, each with the contacts into which the last one led
 LEFT = 0.01  # of the energy that overlaps store: what may be left of it in the shorter substep
-GROWTH = 64  # of the longest substeps: in so many, discs that shrank grow back
 
 
 def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
@@ -46,7 +45,7 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
     """
     state, memory, step, ratio = runner.scene.state, runner.memory, runner.step, h / longest
     x, contact = state.get(memory), next(iter(step.contacts), None)
-    if (contact and contact.solves_rows) or not (contact or step.walls) or not np.isfinite(x).all():
+    if runner.solves_rows or not (contact or step.walls) or not np.isfinite(x).all():
         return False
     solids = Solids.loaded(runner, x, ratio)
     if not (contact or solids.count):
@@ -54,13 +53,11 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
     energy, overlap = seen_before(runner)
     if not small and not would_vibrate(max(overlap, solids.worst), ratio):
         return False
-    pairs: Candidates = DiscCandidates(np.zeros((0, 2), dtype=np.int64), np.zeros(0), None)
+    pairs: Candidates = NoCandidates()
     if contact:
         runner.invalidate()  # so that the result does not depend on when pairs were listed last
         runner.diagnose_state()
         pairs = contact.dev.geometry.candidates(x)
-    overlaps, gradient = pairs.at(x)
-    runner.pressed = stored_by(overlaps, gradient, runner.scene.inv_mass[pairs.who])
     jacobian = part(runner, pairs, solids, x, ratio)
     if jacobian:
         v, now = memory.read(state.d).astype(np.float64), state.get(memory)
@@ -74,19 +71,6 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
             v[: len(x)] = take_energy(jacobian, v[: len(x)], bodies.unturned(now - x), due)
             memory.write(state.d, v)
     return True
-
-
-def shrink_left(runner: Any, h: float, longest: float) -> None:
-    """After release() and projections: shrink discs if overlaps would store more energy in the substep h than they did."""
-    contact = next(iter(runner.step.contacts), None)
-    if not (contact and contact.late and runner.pressed):
-        return
-    runner.list_neighbours()
-    x = runner.scene.state.get(runner.memory)
-    pairs = contact.dev.geometry.candidates(x)
-    overlap, gradient = pairs.at(x)
-    if stored_by(overlap, gradient, runner.scene.inv_mass[pairs.who]) > (h / longest) ** 2 * runner.pressed:
-        runner.shrink_overlapping(0, float(overlap.max()) / (GROWTH * longest))
 
 
 def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: float) -> Jacobian | None:

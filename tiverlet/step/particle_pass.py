@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Any
 from ..colliders.surface import ANY_DEPTH, BEFORE_CONTACTS, BEYOND_ROUNDING, FRICTIONLESS
 from ..contact.force_share import accumulate
 from ..contact.limits import SLOP
-from ..contact.projection_times import ALWAYS
 from ..device import inline, ti
 from ..device.number import OnDevice
 from ..device.thread_team import Team, block, blocks
 from ..features.feature import Batch, Scene
+from ..features.learning import WEIGHED
 
 if TYPE_CHECKING:
     from ..colliders.wall_group import WallGroup
@@ -134,11 +134,10 @@ class ParticlePass:
                     self.state.low0[i] = self.state.low[i]
         if ti.static(self.state.keeps_wall_push):
             for c in ti.static(self.contacts):
-                if c.may_project(now):
-                    for i in range(first, end):
-                        if ti.static(bool(c.dev.bodies)):
-                            c.dev.bodies.note_wall(i, now.tick)
-                        self.state.wall_push[i] = ti.zero(self.state.x[i])
+                for i in range(first, end):
+                    if ti.static(bool(c.dev.bodies)):
+                        c.dev.bodies.note_wall(i, now.tick)
+                    self.state.wall_push[i] = ti.zero(self.state.x[i])
         if ti.static(self.state.spins):
             if now.fresh != 0:
                 for i in range(first, end):
@@ -151,7 +150,7 @@ class ParticlePass:
                     impacts.rigid[i] = 0
         self.integrator.advance(first, end, now)
         for weights in ti.static(self.weights):
-            if now.damps == ALWAYS or now.fresh != 0:
+            if (now.span.since + now.s + 1) % ti.static(WEIGHED) == 0 or now.fresh != 0:
                 for i in range(first, end):
                     weights.store_weight(i, now)
         for loads in ti.static(self.wall_loads):

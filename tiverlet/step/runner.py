@@ -9,8 +9,6 @@ import numpy as np
 from ..constraints.core.scalar import Scalar
 from ..constraints.path import Path
 from ..constraints.pin import Pin
-from ..contact.initial_overlap import overlapping
-from ..contact.mass_splitting import still_soft
 from ..contact.parting import parting_speeds
 from ..contact.rigid_bodies import rigid_bodies
 from ..device.interrupts import deferred_signals
@@ -26,7 +24,7 @@ from .frames import Frames
 from .impulse import factor_of
 from .integrator import FREE, decay, h2_effective_of, h2_rigid_of, shares_of
 from .launcher import Launcher
-from .overlap_release import release, shrink_left
+from .overlap_release import release
 from .projection import project, stiffen
 from .span import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Span
 from .step import frame
@@ -34,7 +32,6 @@ from .step_report import StepReport
 
 NONE = np.zeros(0, dtype=np.int64)
 KEPT = 100_000  # particles up to which the array for velocities is kept; above, allocating it costs next to nothing
-SLIGHTLY = 0.4  # of the substep: contacts that are still as soft as those of longer substeps may gain energy as they stiffen
 LONG = 10_000_000  # (particles + constraints) x passes in one launch at most: it takes about a second
 
 
@@ -60,7 +57,6 @@ class Runner:
         self.jumped = False  # whether any such move was longer than the radius of its particle
         self.sleepers, self.sleep = parts.scene.state.sleepers, parts.step.sleep
         self.released = 0.0  # the violation that a shorter substep would turn into energy, relative to the constraint's size
-        self.pressed = 0.0  # the energy of overlaps before they were released, up to the factor of stored_by()
         self.ramping: list[Any] = []  # batches whose rest values change in the coming frame
         self.ramps: list[Any] = []  # the memories of ramps
         self.structure: Any = None  # a digest of all that kernels can read of constraints, once computed
@@ -167,7 +163,7 @@ class Runner:
                 with self.memory.compiler():
                     softness.keep(self, 1.0, dt)
             return clock.energy is None
-        keeps, goes_on = self._is_slightly_uneven(h, dt), not clock.d_is_velocity
+        keeps, goes_on = self.solves_rows and clock.first_moved != 0, not clock.d_is_velocity
         asleep = self._sleeping() if keeps and goes_on and clock.first_moved is None else None
         if asleep is None:
             self.wake()
@@ -189,13 +185,11 @@ class Runner:
                     softness.keep(self, h / clock.h, dt)
                 elif h < clock.longest and not (self.probe or self.solves_rows):
                     x = self.scene.state.get(self.memory) if self.springs else None
-                    keeps = self._project(h, dt, substeps * iterations, keeps)
+                    self._project(h, dt)
                     if x is not None:
                         self._forget_springs(x, self.scene.state.get(self.memory))
                 if not (h == clock.h or softens):
                     softness.end(self, h)
-                for contact in self.step.contacts if keeps and not self.solves_rows else []:
-                    contact.keep_stiffness(h / clock.h)
                 if asleep is not None and keeps:
                     self._sleep_on(*asleep, h / clock.h)
                 elif asleep is not None:
@@ -214,15 +208,6 @@ class Runner:
                     system.forget(left)
             self.set_substep(h, drag)
         return True
-
-    def _is_slightly_uneven(self, h: float, dt: float) -> bool:
-        """Whether the coming frame of dt [s], with substeps h [s], is only a little longer or shorter than the last one, as where
-        a loop measures dt, and contacts can keep their stiffness. Rows have none, and bear any change."""
-        clock = self.clock
-        if self.solves_rows:
-            return clock.first_moved != 0
-        can = clock.first_moved != 0 and not self.probe and any(contact.can_keep_stiffness for contact in self.step.contacts)
-        return can and dt != clock.frame[1] and SLIGHTLY * max(clock.h, clock.longest) <= h <= clock.h / SLIGHTLY
 
     def set_softness(self, times: float) -> None:
         """Make links `times` as soft as passes make them, see softness.py."""
@@ -254,20 +239,14 @@ class Runner:
         for field, factor in left:
             memory.write_rows(who, (field, memory.rows(who, field)[0] * factor))
 
-    def _project(self, h: float, dt: float, passes: int, keeps: bool) -> bool:
+    def _project(self, h: float, dt: float) -> None:
         """Remove the energy that violations and overlaps would store in a shorter substep h [s], of a frame dt [s].
 
-        keeps: whether contacts may keep their stiffness instead, which they do unless links press on them. passes: in the frame.
-        Returns whether they do. Where a loop measures dt, it must not wait long.
+        Where a loop measures dt, it must not wait long.
         """
         clock, longest = self.clock, self.clock.longest
         measured = dt != clock.frame[1] and clock.first_moved != 0
         stiffen(self, h, dt, longest, measured)
-        projected = project(self, h, dt, longest, measured=measured) if keeps else None
-        if keeps and projected is not None:
-            clock.longest = h if self.linked else still_soft(h, longest, passes)
-            return True
-        self.pressed = 0.0
         released = release(self, h, longest)
         projected = project(self, h, dt, longest, measured=measured)
         # Links and contacts must move together. With frames of slightly uneven length, stacks would creep sideways.
@@ -275,10 +254,8 @@ class Runner:
             projected = project(self, h, dt, longest, ContactRows.of(self), measured=measured)
         if projected is None and not released:
             released = release(self, h, longest, small=True)
-        shrink_left(self, h, longest)
         if projected or projected is None or released:
             clock.longest = h
-        return False
 
     def _note_moved(self, removed: tuple[np.ndarray, float] | None) -> None:
         """Note how far particles were moved to meet their constraints, (n,) [m], and the violation that was removed, if any."""
@@ -703,31 +680,14 @@ class Runner:
             else:
                 self.memory.write_some(search.list.stale, 1, some)
 
-    def expect_overlap(self, position: np.ndarray, first: int = 0) -> None:
-        """Before anything is compiled: let particles shrink if some at these positions, (n, dim) [m], overlap.
-
-        Otherwise the frame would have to be compiled again. Only pairs with one of number `first` or more count.
-        """
-        for contact in self.step.contacts:
-            if not (contact.shrinks or contact.solves_rows) and overlapping(
-                self.scene, self.batches, contact.table, position, first
-            ):
-                contact.enable_shrink()
-
-    def shrink_overlapping(self, first: int, speed: float = np.inf) -> None:
-        """Let particles from number `first` on that the user placed into others part gently, pairs at up to `speed` [m/s]."""
-        contact, moved, x = self.step.contacts[0], self.clock.moved_mask, self.scene.state.get(self.memory)
-        if contact.solves_rows:
-            return
-        if not contact.shrinks:
-            loads = first or moved is not None  # what was there before may overlap under a load, which is no error of placing
-            if loads and overlapping(self.scene, self.batches, contact.table, x, first, moved) is False:
-                return
-            contact.enable_shrink()
-            self.renew()
-        candidates = contact.dev.geometry.candidates(x)
-        speeds = parting_speeds(self.scene, self.batches, candidates, x, first, contact.speed_of_parting)
-        self.step.shrink_overlapping(first, np.minimum(speeds, speed))
+    def shrink_overlapping(self, first: int) -> None:
+        """Let bodies part gently of which particles from number `first` on were placed into others. Rows do so by themselves."""
+        contact = self.step.contacts[0]
+        if not contact.solves_rows:
+            x = self.scene.state.get(self.memory)
+            candidates = contact.dev.geometry.candidates(x)
+            speeds = parting_speeds(self.scene, self.batches, candidates, x, first, contact.speed_of_parting)
+            self.step.shrink_overlapping(first, speeds)
 
     def report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
         """The StepReport of the last diagnostics."""
@@ -757,6 +717,6 @@ class Runner:
 
     @property
     def memories(self) -> list[Any]:
-        """All trees of fields: the first one, and those of lists, contacts and ramps that were added later."""
-        grown = [*(search.list.store for search in self.step.searches), *(c.store for c in self.step.contacts)]
+        """All trees of fields: the first one, and those of lists and ramps that were added later."""
+        grown = [*(search.list.store for search in self.step.searches)]
         return [self.memory, *(m for m in grown if m), *self.ramps]

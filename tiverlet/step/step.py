@@ -8,8 +8,6 @@ the integrator.
 
 from typing import TYPE_CHECKING, Any
 
-from ..contact.projection_times import ALWAYS, due
-from ..contact.velocity_projection import PASSES, RINGS
 from ..device import called, runtime, ti
 from ..device.number import OnDevice, read_all
 from ..device.thread_team import LEAST, Team
@@ -74,27 +72,12 @@ def substep(do, now):
                         do.push_bodies(this_pass)
                 do.apply_corrections(this_pass)
     if ti.static(do.projects_bodies):
-        if do.ends_passes(now) and do.has_struck_bodies(now):
+        if do.ends_substep(now) and do.has_struck_bodies(now):
             for k in range(do.body_rounds(now)):
                 do.project_bodies(now.of(k))
     if ti.static(do.finishes):
-        if do.ends_passes(now):
-            do.finish_substep(now)
-    if ti.static(do.projects_velocities):
-        if do.ends_passes(now) and do.needs_projection(now):
-            for k in range(do.rounds(now)):
-                do.find_projected_contacts(now.of(k))
-            for k in range(PASSES):
-                do.project_contact_velocities(now.of(k))
-    if ti.static(do.projects_discs):
-        if do.ends_substep(now) and do.has_struck_discs(now):
-            do.list_what_touches(now)
-            if do.ends_substep(now):
-                for k in range(do.landing_rounds):
-                    do.project_discs(now.of(k))
-    if ti.static(do.closes_late):
         if do.ends_substep(now):
-            do.close_events(now)
+            do.finish_substep(now)
 
 
 @ti.data_oriented
@@ -134,12 +117,7 @@ class Step:
         self.has_impacts = bool(scene.impacts)
         self.has_pair_impacts = self.has_impacts and self.impacts.pairs
         self.newton_steps = 2 if scene.slots and scene.slots.refines else 1  # most of them in a pass
-        self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
-        self.projects_bodies, self.projects_discs = self.contact_pass.projects_bodies, self.contact_pass.projects_discs
-        self.closes_late = self.contact_pass.closes_late
-        if self.projects_discs:
-            contact.dev.landing.meet_walls(scene, self.wall_logs)
-        self.landing_rounds = contact.dev.landing.rounds if self.projects_discs else 0
+        self.has_restitution, self.projects_bodies = self.contact_pass.has_restitution, self.contact_pass.projects_bodies
         self.orients = self.state.spins and self.state.spin.orients
         keeps = self.contact_pass.remembers or bool(self.breakers)
         self.finishes = keeps or self.orients or bool(self.wall_logs) or bool(self.constraints.learners)
@@ -198,7 +176,7 @@ class Step:
         """The Moment of substep s of a frame; s = span.substeps is the round after the last substep."""
         h, last, time, frame_fraction = self.integrator.times(span, s)
         tick, fresh, final = span.tick + s, ti.select(s == 0, span.fresh, 0), ti.cast(s == span.substeps - 1, ti.i32)
-        return Moment(span, s, h, last, time, tick, frame_fraction, fresh, due(span.since + s), final)
+        return Moment(span, s, h, last, time, tick, frame_fraction, fresh, final)
 
     @ti.func
     def pass_of(self, now, half):
@@ -271,11 +249,6 @@ class Step:
     def ends_substep(self, now):
         """Whether all passes of the substep are done."""
         return now.s < now.span.substeps and now.span.part == now.span.iterations and self.halted() == 0
-
-    @ti.func
-    def ends_passes(self, now):
-        """Whether all passes of the substep are done, and the frame did not stop after them."""
-        return self.ends_substep(now) and self.first_half(now) <= self.last_half(now)
 
     @ti.func
     def ends_frame(self, now):
@@ -395,23 +368,6 @@ class Step:
                 self.list_particles(now.thread)
                 if self.search.list.need[None] > self.search.list.capacity:
                     self.halt[None] = [1, now.s, half]  # all write the same
-
-    @ti.func
-    def list_what_touches(self, now):
-        """At the end of a substep: rebuild the neighbour list if it may lack pairs that touch now.
-
-        If it has no room for all pairs, the frame stops, and goes on here.
-        """
-        self.check_list(now)
-        self.rebuild_stale(now, self.last_half(now) + 1)
-
-    @ti.func
-    def check_list(self, now):
-        """Mark the neighbour list of contacts as stale if a particle has moved too far."""
-        for c in ti.static(self.contacts):
-            for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
-                c.note_motion(self.search.moved_too_far(i), 0)
-        self.team.wait()
 
     @called
     @ti.func
@@ -591,28 +547,6 @@ class Step:
         self.team.wait()
 
     @ti.func
-    def has_struck_discs(self, now):
-        """Whether discs struck each other in this substep."""
-        return self.contact_pass.has_struck_discs()
-
-    @ti.func
-    def project_discs(self, now):
-        """One round of the impacts of discs."""
-        self.push_struck_discs(now.thread, now.it)
-
-    @called
-    @ti.func
-    def push_struck_discs(self, thread: ti.i32, it: ti.i32):
-        """One round of project_discs()."""
-        self.contact_pass.project_discs(thread, it)
-
-    @ti.func
-    def close_events(self, now):
-        """At the end of a frame: record the pairs that touch."""
-        self.contact_pass.close_events(now)
-        self.team.wait()
-
-    @ti.func
     def has_struck_bodies(self, now):
         """Whether bodies struck each other in this substep."""
         return self.contact_pass.has_struck_bodies()
@@ -632,38 +566,6 @@ class Step:
     def push_struck_bodies(self, thread: ti.i32, it: ti.i32, tick: ti.i32):
         """One round of project_bodies()."""
         self.contact_pass.project_bodies(thread, it, tick)
-
-    @ti.func
-    def needs_projection(self, now):
-        """Whether sound is damped after this substep, anywhere."""
-        return self.contact_pass.needs_projection(now)
-
-    @ti.func
-    def rounds(self, now):
-        """How many rounds find the contacts in which sound is damped: three if these are all."""
-        return ti.select(now.damps == ALWAYS, 3, 3 + RINGS)
-
-    @ti.func
-    def find_projected_contacts(self, now):
-        """One of these rounds."""
-        self.find_projected(now.thread, now.it, self.rounds(now), now.damps)
-
-    @called
-    @ti.func
-    def find_projected(self, thread: ti.i32, it: ti.i32, rounds: ti.i32, damps: ti.i32):
-        """One round of find_projected_contacts()."""
-        self.contact_pass.find_projected(thread, it, rounds, damps)
-
-    @ti.func
-    def project_contact_velocities(self, now):
-        """Damp sound in loaded contacts."""
-        self.damp_sound(now.thread, now.it)
-
-    @called
-    @ti.func
-    def damp_sound(self, thread: ti.i32, it: ti.i32):
-        """One pass of project_contact_velocities()."""
-        self.contact_pass.project_velocities(thread, it)
 
     @ti.func
     def diagnose(self, now):

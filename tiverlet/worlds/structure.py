@@ -14,23 +14,14 @@ if TYPE_CHECKING:
 def with_equal_kernels(worlds: "list[World]") -> "list[World]":
     """Return the worlds, with clones in place of those that were compiled differently.
 
-    A world is cloned if it was compiled for a team of threads, if its knobs need other kernels now, or if it lacks shrinking
-    contacts that another world has.
+    A world is cloned if it was compiled for a team of threads, or if its knobs need other kernels now.
     """
-    shrinks = [any(contact.shrinks for contact in world._runner.step.contacts) for world in worlds]
-    out = []
-    for world, has in zip(worlds, shrinks, strict=True):
-        lacks = any(shrinks) and not has
-        outdated = any(
-            f.changed and f.needs_other_kernels for f in world.features
-        )  # knobs need other kernels, which a clone gets
-        if lacks or outdated or world.path != "fused":
-            world = world.clone(path="fused")
-        if lacks:
-            world._runner.step.contacts[0].enable_shrink()
-            world._runner.renew()
-        out.append(world)
-    return out
+    return [
+        world.clone(path="fused")
+        if world.path != "fused" or any(f.changed and f.needs_other_kernels for f in world.features)
+        else world
+        for world in worlds
+    ]
 
 
 def check_structure(worlds: "Sequence[World]") -> None:
