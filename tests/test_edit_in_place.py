@@ -181,16 +181,17 @@ def test_in_place_is_to_the_bit_as_built_anew(scene, briefly):
 
 
 def ropes(solver, precision="f32", only=False):
-    """Three ropes, the last of which breaks, between discs, with pins of both kinds; edits add a rope and links of discs.
+    """Three ropes, the last of which breaks, between discs that pass through each other, with pins of both kinds; edits add a rope
+    and links of discs. With Contact such edits build anew.
 
-    only: links alone, between discs that pass through each other.
+    only: links alone.
     """
     hung = [tv.shapes.rope((0.1 + 0.6 * k, 2.4), (0.5 + 0.6 * k, 2.4), points=5) for k in range(3)]
     position = np.concatenate([overlapping(20), *(rope.position for rope in hung)])
     pairs = np.concatenate([rope.links + 20 + 5 * k for k, rope in enumerate(hung)])
     link = tv.Distance(pairs, compliance=np.where(pairs.min(axis=1) < 30, 1e-5, 0.0), break_at=20.0)
     bend = tv.Bend(np.stack([pairs[:-1, 0], pairs[:-1, 1], pairs[1:, 1]], axis=1)[[0, 1, 2, 4, 5, 6]], compliance=1e-2)
-    beside = [tv.HalfSpace((0, 1), 0.0), tv.Contact(0.2), tv.Pin([20]), tv.Pin([34, 29], compliance=1e-4), bend]
+    beside = [tv.HalfSpace((0, 1), 0.0), tv.Pin([20]), tv.Pin([34, 29], compliance=1e-4), bend]
     features = [tv.Gravity(), link, *(beside if not only else [])]
     particles = tv.Particles(position, radius=0.09, pinned=[20] if only else ())
     w = tv.World(particles, features, substeps=5, solver=solver, precision=precision)
@@ -217,7 +218,7 @@ def bodies(*extra, solver=None):
     position = np.concatenate([ring + (0.5, 0.5), ring + (1.3, 0.5), square + (2.0, 0.3), square + (2.5, 0.3)])
     links = tv.Distance(np.concatenate([around, around + 8]), compliance=1e-4, damping=1.0)
     area, clusters = tv.Area([np.arange(8), np.arange(8, 16)]), tv.ShapeMatch([np.arange(16, 20), np.arange(20, 24)])
-    features = [tv.Gravity(), tv.HalfSpace((0, 1), 0.0), tv.Contact(0.2), links, area, clusters, *extra]
+    features = [tv.Gravity(), tv.HalfSpace((0, 1), 0.0), links, area, clusters, *extra]
     w = tv.World(tv.Particles(position, radius=0.08), features, substeps=5, solver=solver)
 
     def add(k: int):
