@@ -228,12 +228,13 @@ def test_launches_count_what_the_scene_needs(world):
             "launched",
             {
                 "integrate ask_for_list solve_constraints apply_constraints": 5,
-                "ask_for_list solve_contacts": 5,
-                "rebound": 40,
+                "ask_for_list start_events find_rows": 5,
+                "relax_impulses": 15,  # three and two at least, after which the host asks whether more are needed
+                "finish_impulses": 5,
+                "relax_places": 10,
                 "apply_corrections": 5,
                 "ask_for_list solve_constraints apply_constraints": 5,
-                "ask_for_list solve_contacts apply_corrections": 5,
-                "finish_substep": 5,  # the host first asks whether linked particles struck each other
+                "ask_for_list apply_corrections": 5,
                 "ask_for_list": 1,
                 "measure": 1,
             },

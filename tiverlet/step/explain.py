@@ -13,6 +13,7 @@ from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.periodic import Periodic
 from ..shapes.shape import morton
 from ..solvers.choice import explain_choice
+from .launcher import STIRRED
 from .sleep import Sleep
 from .step import REBOUNDS
 
@@ -87,11 +88,15 @@ def _launches(world: "World") -> str:
     solved = world.iterations * (step.constraints.steps + 1) if step.constraints.steps else 0
     rounds = REBOUNDS + 1 if step.has_restitution else 0
     each = (world.iterations * step.halves if step.particles.acts else 1) + solved + rounds
-    waits = "one"
+    waits, least = "one", ""
     if step.has_impacts:  # after each substep the host reads whether linked particles struck anything
         each, waits = each + step.finishes, str(world.substeps + 1)
+    if step.contact_pass.rows:  # after the fewest passes of both stages the host reads whether more are needed
+        fewest = step.contact_pass.rows.impulses.least + STIRRED
+        each, waits, least = each + fewest + 2, str(2 * world.substeps + 1), "at least "
     more = ", and those behind a stale list again, once it was built" if step.searches else ""
-    return f"{world.substeps * each + 1 + bool(step.searches)} launches per frame, of which the host waits for {waits}{more}"
+    total = world.substeps * each + 1 + bool(step.searches)
+    return f"{least}{total} launches per frame, of which the host waits for {waits}{more}"
 
 
 def _present(world: "World") -> list[str]:
