@@ -481,7 +481,8 @@ def test_a_surface_and_a_cluster(world):
             one._runner.sleep.rests = False  # compute frames in which nothing moves
             one.step(1 / 60)
             assert (one.position[YARD] == state).all() and one.last.asleep == 38
-            assert one.last.residual == residual and one.last.energy == energy
+            # The disc that stays awake is at rest to what rows may lack, g h^2 / 2000, over which its weight does 2e-7 J.
+            assert one.last.residual == residual and one.last.energy == pytest.approx(energy, abs=2e-7)
         assert w.hash() == other.hash()
 
 
