@@ -474,6 +474,7 @@ class CornerPasses(Passes):
             W += self.slots.split[i] * gg
             free += self.w.of(i)
         violation, A, alpha, lam, W = self.equation.terms(c, f, f, w, W, h, h2_effective, 0, fresh)
+        violation = self.equation.all_violation(c, violation, A)
         left = self.equation.removable_violation(c, violation, A, alpha, lam, W)
         if g.norm_sqr() == 0 and free > 0 and self.strength.is_intact(c):
             if ti.static(self.quantity.collapses > 0) or self.spring.is_rigid(c):

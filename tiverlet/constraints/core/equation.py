@@ -128,6 +128,13 @@ class Equation:
         return A * C + B + alpha * lam, A, alpha, lam, W
 
     @ti.func
+    def all_violation(self, c, violation, A):
+        """Return what terms() returns, with what contacts left: no reason for an impulse, but part of the residual."""
+        if ti.static(self.answers):
+            violation += A * self.left[c]
+        return violation
+
+    @ti.func
     def earlier_violation(self, c, f, ago: ti.template()):  # type: ignore[valid-type]
         """Return f - rest with the rest value of `ago` substeps ago."""
         C = f - self.rest[c]

@@ -153,6 +153,7 @@ class OutlinePasses(Passes):
         """Return the violation that is left, as in CornerPasses."""
         f, f0, w, W, turn, extent, move = self.sum_blocks(c)
         violation, A, alpha, lam, W = self.equation.terms(c, f, f0, w, W, h, h2_effective, 0, fresh)
+        violation = self.equation.all_violation(c, violation, A)
         left = self.equation.removable_violation(c, violation, A, alpha, lam, W)
         if w == 0:  # collapsed, or static
             for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
