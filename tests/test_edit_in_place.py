@@ -181,8 +181,9 @@ def test_in_place_is_to_the_bit_as_built_anew(scene, briefly):
 
 
 def ropes(solver, precision="f32", only=False):
-    """Three ropes, the last of which breaks, between discs that pass through each other, with pins of both kinds; edits add a rope
-    and links of discs. With Contact such edits build anew.
+    """Three ropes, the last of which breaks, between discs that pass through each other, with pins of both kinds.
+
+    Edits add a rope and links of discs. With Contact they would build anew.
 
     only: links alone.
     """

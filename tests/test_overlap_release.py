@@ -267,9 +267,9 @@ def test_planks_on_a_hinge_go_where_their_load_needs_them(world, hold):
 
 @pytest.mark.slow
 def test_what_is_lifted_does_not_end_inside_of_what_was_far(world):
-    # A bob of 20 kg on a rope rests 0.7 m lower at 2 substeps than at 20, which lift it by m g 0.7 = 144 J: beside Polygons, links
-    # do not answer contacts. A bead, on no neighbour list of the bob, is pinned where the bob ends up. The bob must not end inside
-    # of the bead, which would bring up to 3000 J.
+    # A bob of 20 kg on a rope rests 0.7 m lower at 2 substeps than at 20, which lift it by m g 0.7 = 144 J: beside Polygons,
+    # links do not answer contacts. A bead, on no neighbour list of the bob, is pinned where the bob ends up. The bob must not end
+    # inside of the bead, which would bring up to 3000 J.
     n = 8
     rope = np.stack([np.zeros(n), 3 - 0.2 * np.arange(n)], axis=1)
     told = []

@@ -219,7 +219,7 @@ class Links:
             weight += self.state.w.of(i) * g.dot(g)
             slight += g.norm() * self.rows.kick(i).norm()
         left, rigid = batch.dev.equation.left[c], True
-        if ti.static(batch.soft):
+        if ti.static(batch.dev.spring.soft):
             rigid = batch.dev.spring.is_rigid(c)
         touched = 0
         if rigid and self.stiff[r] > 0 and (u != 0 or mu != 0 or left != 0):

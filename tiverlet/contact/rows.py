@@ -265,7 +265,7 @@ class Rows:
                 c = self.table.entries[k]
                 if c[ROLLING] + c[TWISTING] > 0:
                     out = 2
-        for group, w in ti.static([(g, g.wall) for g in self.walls if self.turns and g.wall.turns]):
+        for group, w in ti.static([(g, g.wall) for g in self.walls if self.turns and g.wall.dev.surface.turns]):
             for k in range(group.count()):
                 group.enter(k)
                 if w.dev.surface.rolling[None][0] + w.dev.surface.rolling[None][1] > 0:
