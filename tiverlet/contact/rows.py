@@ -348,16 +348,17 @@ class Rows:
 
     @ti.func
     def find_eigenvalue(self, i):
-        """Compute the largest eigenvalue of the sum of n n^T over the rows of particle i; in 3D a bound of it."""
+        """Compute the largest eigenvalue of the sum of n n^T over the rows of particle i."""
         s = ti.cast(self.spread[i], self.real) * ti.static(2.0**-20)
         if ti.static(self.dim == 2):
             half = (s[0] - s[1]) / 2
             self.eigenvalue[i] = (s[0] + s[1]) / 2 + ti.sqrt(half * half + s[2] * s[2])
-        else:  # lambda <= m + sqrt(2/3) |S - m 1| with m = tr S / 3 (Wolkowicz and Styan 1980)
+        else:  # m + 2 p cos(phi), cos(3 phi) = det((S - m) / p) / 2 with m = tr S / 3, 6 p^2 = |S - m|^2 (Smith 1961)
             m = (s[0] + s[1] + s[2]) / 3
-            a, b, c = s[0] - m, s[1] - m, s[2] - m
-            size = a * a + b * b + c * c + 2 * (s[3] * s[3] + s[4] * s[4] + s[5] * s[5])
-            self.eigenvalue[i] = m + ti.sqrt(size * ti.static(2 / 3))
+            B = ti.Matrix([[s[0] - m, s[3], s[5]], [s[3], s[1] - m, s[4]], [s[5], s[4], s[2] - m]])
+            p = ti.sqrt(B.norm_sqr() / 6)
+            turn = ti.min(ti.max((B / ti.max(p, FEW)).determinant() / 2, -1), 1)
+            self.eigenvalue[i] = m + 2 * p * ti.cos(ti.acos(turn) / 3)
 
     @ti.func
     def work_of_others(self, i):
