@@ -8,9 +8,8 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.contact.initial_overlap import overlapping
-from tiverlet.contact.limits import SLOP
+from tiverlet.contact.limits import BEYOND, SLOP
 from tiverlet.contact.parting import diameters
-from tiverlet.step import checkpoint
 
 from .conftest import compiled
 
@@ -36,7 +35,7 @@ def test_overlap_is_what_comparing_all_pairs_finds():
 @pytest.mark.slow
 @pytest.mark.parametrize("what", ["another radius", "contacts"])
 def test_a_rebuilt_world_is_compiled_once_for_what_overlaps_in_it(what, world):
-    row, link = np.stack([np.arange(5) * 0.2, np.zeros(5)], axis=1), tv.Distance([[5, 6]])  # contacts without links are rows
+    row, link = np.stack([np.arange(5) * 0.2, np.zeros(5)], axis=1), tv.Distance([[5, 6]])
     row = np.vstack([row, [[50.0, 0.0], [51.0, 0.0]]])
     if what == "contacts":
         w = world(tv.Particles(row * 0.4, radius=0.05), [link])
@@ -46,55 +45,26 @@ def test_a_rebuilt_world_is_compiled_once_for_what_overlaps_in_it(what, world):
         w.step(1e-3)
         w.add(tv.Particles([[0.03, 0.0]], radius=0.04))
     step = w._runner.step
-    assert "Contact.shrunk" in w.fields
     w.step(1e-3)
     assert w._runner.step is step  # not compiled for another structure
     w.run(1.0)
-    assert w.step(1e-3).overlap < 1e-3
-
-
-@pytest.mark.slow
-def test_only_scenes_that_start_with_overlap_have_the_field_for_it(world):
-    # Contacts of worlds without constraints are rows, which need no such field: so two discs far away are linked.
-    x = np.array([[50.0, 0.0], [51.0, 0.0], [0.0, 0.0], [0.19, 0.0], [0.5, 0.0], [0.75, 0.0]])
-    for features, start, want in (
-        ([tv.Contact()], x, True),
-        ([tv.Contact(), tv.Distance([[3, 2]])], x, False),  # linked, so not in contact
-        ([tv.Contact()], x * 1.1, False),
-        ([tv.Contact()], x[[0, 1, 2, 2]], True),  # in one place
-        ([tv.Contact(groups=[(0, 1), (0, 2)])], x, True),
-        ([tv.Contact(groups=[(0, 2)])], x, False),
-        ([tv.Contact(friction={(0, 1): 0.5})], x, True),
-        ([tv.Contact(sensors=[(0, 1)])], x, False),
-    ):
-        linked = [*features, tv.Distance([[0, 1]])]
-        w = world(tv.Particles(start, radius=0.1, group=[3, 3, 0, 1, 2, 2][: len(start)]), linked)
-        assert ("Contact.shrunk" in w.fields) == want
-        if want and features[0].groups:
-            step = w._runner.step
-            assert w.step(1e-3).clean and w._runner.step is step  # compiled once
-        if not want and len(features) == 1 and len(start) == 6:  # a checkpoint without the field sets it back
-            begin, before = checkpoint.keep(w), w.hash()
-            w.position = np.where(np.arange(6)[:, None] < 2, x, 0.1 * x)
-            w.step(1e-3)
-            assert "Contact.shrunk" in checkpoint.keep(w).values and w.hash() != before
-            checkpoint.put_back(w, begin)
-            assert "Contact.shrunk" in checkpoint.keep(w).values and w.hash() == before
+    assert w.step(1e-3).overlap < 1.1 * SLOP * BEYOND  # what places leave, to rounding
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pinned", [(), (0, 1)], ids=["linked", "pinned"])
 def test_what_starts_between_others_is_not_shot_out(world, pinned):
     # A disc y away from the middle between two others, d away from each: d^2 = y^2 + (L / 2)^2, so y' = d' d / y, which has no
-    # limit where contact distances grow at push_out. It left at 7 m/s with 20 substeps, and at 13 to 25 m/s with 200.
+    # limit where d grows at push_out. Places move it, and give no velocity. A link that is moved far turns, and what one tangent
+    # leaves of it is pulled back.
     for y, substeps, precision in ((-0.01, 20, "f32"), (-0.01, 200, "f64"), (-0.001, 200, "f32")):
         x = np.array([[0.0, 0.0], [0.3, 0.0], [0.15, y]])
         features = [tv.Distance([(0, 1)]), tv.Contact(push_out=1.0)]
         w = world(tv.Particles(x, radius=0.1, pinned=pinned), features, substeps=substeps, precision=precision)
         fastest = max(np.linalg.norm(w.velocity, axis=1).max() for _ in range(30) if w.step(1 / 60))
-        assert fastest < 4.0
+        assert fastest < (1e-6 if pinned else 4.0)
         r = w.position[2] - w.position[:2]
-        assert np.linalg.norm(r, axis=1).min() > 0.2 * (1 - 1e-3)  # it is out, with its whole radius
+        assert np.linalg.norm(r, axis=1).min() > 0.2 - 0.1 * SLOP * BEYOND - 1e-6  # it is out, but for what places leave
 
 
 def test_diameters_are_those_of_all_distances():
@@ -145,15 +115,13 @@ def test_what_overlaps_in_a_row_parts_at_push_out(kind, world):
 
 
 @pytest.mark.slow
-def test_what_goes_to_a_free_place_compiles_nothing(world):
-    # Six discs rest on each other, and overlap as their loads make them. One is carried off, twice before it is seen: the others
-    # still bear loads, which are no error of placing. The first disc of a group that is named, but had no particles, is not
-    # another structure either. Where a disc is put into another one, both shrink. Two far away are linked, else they are rows.
+def test_what_goes_to_another_place_compiles_nothing(world):
+    # Six discs rest on each other. One is carried off, twice before it is seen. The first disc of a group that is named, but had
+    # no particles, is not another structure either, nor is a disc that is put into another one. They part.
     x = np.vstack([np.stack([np.zeros(6), 0.1 + 0.201 * np.arange(6)], axis=1), [[50.0, 0.1], [51.0, 0.1]]])
     contact, link = tv.Contact(groups=[(0, 0), (0, 1)], friction={(0, 1): 0.5}), tv.Distance([[6, 7]])
     w = world(tv.Particles(x, radius=0.1), [tv.Gravity(), contact, link, tv.HalfSpace((0, 1), 0.0)], substeps=8)
     w.run(1.0)
-    assert w.last.overlap > 1e-4 and "Contact.shrunk" not in w.fields
     w.position, w.velocity = w.position, w.velocity  # the kernels of a start
     w.step(1 / 60)
     with compiled() as names:
@@ -167,9 +135,8 @@ def test_what_goes_to_a_free_place_compiles_nothing(world):
             assert twin.hash() == w.hash()
         w.add(tv.Particles([[1.0, 3.0]], radius=0.1, group=1))
         w.run(0.5)
-    assert names == [] and "Contact.shrunk" not in w.fields
-    x = w.position.copy()
-    x[5] = x[8] + [0.05, 0.05]
-    w.position = x
-    w.run(0.5)
-    assert "Contact.shrunk" in w.fields and np.linalg.norm(w.position[5] - w.position[8]) > 0.2 * (1 - 1e-3)
+        x = w.position.copy()
+        x[5] = x[8] + [0.05, 0.05]
+        w.position = x
+        w.run(0.5)
+    assert names == [] and np.linalg.norm(w.position[5] - w.position[8]) > 0.2 - 0.1 * SLOP * BEYOND - 1e-6
