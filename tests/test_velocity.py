@@ -77,7 +77,8 @@ def test_forces_that_come_change_no_velocity_before_they_act(world, what):
 @pytest.mark.parametrize("precision", ["f32", "f32-compensated"])  # the pile below: f64
 def test_what_keeps_its_velocity_goes_on_to_the_bit(world, precision):
     # A swinging chain, spinning discs that roll and touch, and one disc far away that is steered by velocity and spin: an impulse
-    # acts on that disc alone. Writing back what was read changes nothing.
+    # acts on that disc alone. Writing back what was read changes nothing. How many passes there are is decided for all islands
+    # together, so what touches may differ by what rows may lack, g h^2 / 2000 in a substep, and the chain by no bit.
     rope = tv.shapes.rope((0, 3), (1, 3.2), points=6)
     x = np.concatenate([rope.position, [(3, 0.1), (3.21, 0.1), (3.1, 0.28), (9, 0.5)]])
     features = [
@@ -99,7 +100,8 @@ def test_what_keeps_its_velocity_goes_on_to_the_bit(world, precision):
         steered.velocity, steered.spin = v, s
         np.testing.assert_array_equal(steered.velocity, v)
         np.testing.assert_allclose(steered.spin, s, atol=1e-5)
-        np.testing.assert_array_equal(steered.position[:-1], free.position[:-1])
+        np.testing.assert_array_equal(steered.position[:6], free.position[:6])
+        np.testing.assert_allclose(steered.position[6:9], free.position[6:9], atol=6 * (k + 1) * 9.81 / 360**2 / 2000)
     assert back.hash() == free.hash() and steered.position[-1, 1] > free.position[-1, 1] + 0.1
 
 
