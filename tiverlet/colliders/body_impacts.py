@@ -134,11 +134,6 @@ class BodyImpacts:
         return self.rigid[i] >= LINKED
 
     @ti.func
-    def is_held_rigidly(self, i):
-        """Whether rigid constraints hold particle i."""
-        return self.rigid[i] != 0
-
-    @ti.func
     def in_cluster(self, i):
         """Whether a rigid cluster holds particle i, and nothing else."""
         return self.rigid[i] == IN_CLUSTER

@@ -8,7 +8,7 @@ from ..device import ti
 from ..device.number import OnDevice
 from ..geometry import rotation
 from ..neighbours.neighbour_list import PairData
-from .polygon_narrow_phase import NONE
+from .candidates import NONE
 from .rigid_bodies import rigid_bodies
 
 if TYPE_CHECKING:

@@ -7,6 +7,8 @@ import numpy as np
 if TYPE_CHECKING:
     pass
 
+NONE = -2.0  # in near_contact(): the place on an edge where there is no contact
+
 
 class Candidates(Protocol):
     """m possible contacts: some overlap, others may overlap once particles have moved.

@@ -24,7 +24,7 @@ from .limits import AHEAD, CRADLE, THROWN
 from .narrow_phase import DiscGeometry
 from .pair_contact import PairContact
 from .places import Places
-from .responses import FreeParticles
+from .responses import Responses
 from .rows import Rows
 
 
@@ -123,7 +123,7 @@ class Contact(PairContact):
         turns = scene.state.spins and friction and (dev.turns or any(w.turns for w in self.walls))
         dev.rows = Rows(scene, self.table, friction, bounces, self.in_turn, turns, scene.walls, team, self.push_out, self._ahead)
         dev.answers = Answers(scene, batches, dev.rows) if batches else None
-        dev.responses = FreeParticles(scene, dev.rows, scene.state.spins and friction, dev.answers)
+        dev.responses = Responses(scene, dev.rows, scene.state.spins and friction, dev.answers)
         dev.islands = Islands(scene, dev.rows, dev.responses, team)
         dev.impulses = Impulses(scene, dev.rows, dev.responses, team)
         dev.places = Places(scene, dev.rows, dev.responses, dev.impulses, team)
@@ -131,7 +131,7 @@ class Contact(PairContact):
         dev.events = EventLog(scene, self.table) if dev.has_events else None
         pair_data = [
             dev.rows.memory,
-            *([dev.rows.touched] if bounces else []),
+            *([dev.rows.touched, dev.rows.given] if bounces else []),
             *([dev.rows.borne_moment] if turns else []),
             *([dev.events.touched] if dev.events else []),
         ]
@@ -140,7 +140,7 @@ class Contact(PairContact):
             ahead=self._ahead,
         )  # fmt: skip
         dev.list = dev.search.list
-        dev.geometry = DiscGeometry(scene, dev.search, dev.rows.memory)
+        dev.geometry = DiscGeometry(scene, dev.search, dev.rows.given if bounces else dev.rows.memory)
         if dev.events:
             dev.events.bind(dev.list, dev.geometry)
             dev.rows.events = dev.events if dev.reports else None

@@ -30,8 +30,8 @@ class Impacts:
 
     Columns by row: `restitution`; `joined`, see begin(); `open` the gap at the start, `arc` its curvature and `way` the vector
     from its center, or the normal of a plane; `time` of the next impact, a part of the substep, or NEVER; `facing` the normal
-    then; `closing` the approach [m]; `blow` the impulse of a round before it is scaled, and `hit` the sum of all [kg m]; `belt`
-    how far the surface of a wall moves along itself [m].
+    then; `closing` the approach [m]; `blow` the impulse of a round before it is scaled, and `hit` the sum of all [kg m];
+    `approach` the largest [m]; `belt` how far the surface of a wall moves along itself [m].
     By particle: `thrown` the displacement after impacts, and `shift` what is added to its start so that this leads to where it
     is [m]; `since` the time of the last impact, `first` that of the next, `turn` the round of the last, 0 without one.
     """
@@ -42,10 +42,10 @@ class Impacts:
         self.restitution, self.joined = Column("row_restitution"), Column("row_joined", kind=ti.i32)
         self.open, self.arc, self.way = Column("row_open"), Column("row_arc"), Column("row_way", self.dim)
         self.time, self.facing, self.closing = Column("row_next"), Column("row_facing", self.dim), Column("row_closing")
-        self.blow, self.hit = Column("row_blow"), Column("row_hit")
+        self.blow, self.hit, self.approach = Column("row_blow"), Column("row_hit"), Column("row_approach")
         self.columns = [
             self.restitution, self.joined, self.open, self.arc, self.way, self.time, self.facing, self.closing, self.blow,
-            self.hit,
+            self.hit, self.approach,
         ]  # fmt: skip
         self.belts = any(group.wall.has_surface_velocity for group in rows.walls)
         self.belt: Any = Column("row_belt", self.dim) if self.belts else None
@@ -73,7 +73,7 @@ class Impacts:
             joined = TOGETHER
         self.restitution.field[row], self.joined.field[row] = e, joined
         self.open.field[row], self.arc.field[row], self.way.field[row] = gap, arc, way
-        self.time.field[row], self.blow.field[row], self.hit.field[row] = NEVER, 0, 0
+        self.time.field[row], self.blow.field[row], self.hit.field[row], self.approach.field[row] = NEVER, 0, 0, 0
 
     @ti.func
     def part(self, row):
@@ -219,14 +219,13 @@ class Impacts:
     @ti.func
     def terms(self, i, bodies: ti.template()):  # type: ignore[valid-type]
         """Return the part of particle i in the sums over what bounces together: work, its square, and how many rows."""
-        push, w = ti.cast(bodies.push[i], ti.f64), bodies.compliance(i)
-        work, rows = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+        work, rows, push = ti.cast(0, ti.f64), ti.cast(0, ti.f64), bodies.push[i]
         for row in range(self.rows.own[i], self.rows.end[i]):
             blow = self.blow.field[row]
             if blow > 0:
                 work += self.part(row) * blow * self.closing.field[row]
                 rows += 1
-        return ti.Vector([work, w * push.dot(push), rows])
+        return ti.Vector([work, bodies.compliance(i) * push.dot(push), rows], ti.f64)
 
     @ti.func
     def scale_of(self, work, square, rows):
@@ -246,6 +245,7 @@ class Impacts:
                 before, s = self.hit.field[row], self.time.field[row]
                 self.hit.field[row] = before + blow
                 self.rows.normal.field[row] = self.facing.field[row]
+                self.approach.field[row] = ti.max(self.approach.field[row], self.closing.field[row])
                 if before > 0:  # the time of all of them, for what forces do between
                     s = (before * self.rows.time.field[row] + blow * s) / (before + blow)
                 self.rows.time.field[row] = ti.max(s, ti.static(FEW))

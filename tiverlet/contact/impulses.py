@@ -66,7 +66,7 @@ from .limits import (
 if TYPE_CHECKING:
     from ..device.thread_team import Team
     from ..features.feature import Scene
-    from .responses import FreeParticles
+    from .responses import Responses
     from .rows import Rows
 
 
@@ -76,7 +76,7 @@ class Impulses:
     n: Any = OnDevice()
     blocks: Any = OnDevice()
 
-    def __init__(self, scene: "Scene", rows: "Rows", bodies: "FreeParticles", team: "Team"):
+    def __init__(self, scene: "Scene", rows: "Rows", bodies: "Responses", team: "Team"):
         self.rows, self.bodies, self.team, self.state = rows, bodies, team, scene.state
         self.least = LEAST[rows.has_friction]
         self.n, self.real, self.dim, self.has_friction = scene.count, scene.real, scene.particles.dim, rows.has_friction
@@ -506,6 +506,7 @@ class Impulses:
                 n = self.rows.normal.field[row]
                 load, size = self.rows.times[None][SCALE] * self.rows.along(self.rows.memory.field[e], n), self.rows.along(p, n)
                 bounces = self.rows.bounced(row)
+                self.rows.given.field[e] = size + self.rows.hit(row)
                 self.rows.touched.field[e] = ti.cast(not bounces and (self.rows.gap.field[row] == 0 or size > 0), ti.i32)
                 if bounces or size <= 0:  # impacts in turn leave friction, and what is taken back of them
                     p = 0 * p
@@ -524,6 +525,8 @@ class Impulses:
                 p = self.rows.along(self.rows.p.field[row], n) + self.rows.hit(row)
                 if p > 0:
                     self.rows.events.record(i, self.rows.other.field[row], self.rows.entry.field[row], n, p, final)
+                    if ti.static(bool(self.rows.impacts)):
+                        self.rows.events.note_impact(self.rows.entry.field[row], 0 * p, self.rows.impacts.approach.field[row])
         if ti.static(len(self.rows.logging) > 0):
             for row in range(self.rows.pressed[i], self.rows.end[i]):
                 self.rows.log_wall(i, row)

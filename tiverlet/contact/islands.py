@@ -19,7 +19,7 @@ from .limits import BLOCK
 if TYPE_CHECKING:
     from ..device.thread_team import Team
     from ..features.feature import Scene
-    from .responses import FreeParticles
+    from .responses import Responses
     from .rows import Rows
 
 WORK, SQUARE, LOAD = range(3)  # sums over an island: P, Q, and the impulses along normals
@@ -37,7 +37,7 @@ class Islands:
 
     n: Any = OnDevice()
 
-    def __init__(self, scene: "Scene", rows: "Rows", bodies: "FreeParticles", team: "Team"):
+    def __init__(self, scene: "Scene", rows: "Rows", bodies: "Responses", team: "Team"):
         self.rows, self.bodies, self.real = rows, bodies, scene.real
         self.n, add = scene.count, scene.memory.field
         # One thread needs no atomic operations, which SPIR-V does not have for 64 bits.

@@ -41,9 +41,7 @@ class LearntLoad:
 
     def __init__(self, names: tuple[str, str, str], pushes: bool):
         self.pushes = pushes
-        self.load, self.borne, self.earlier = self.pair_data = [
-            PairData(name, 0, persistent=True, only_touching=True) for name in names
-        ]
+        self.load, self.borne, self.earlier = self.pair_data = [PairData(name, 0, persistent=True) for name in names]
 
 
 class KnownLoads:
@@ -169,13 +167,6 @@ class KnownLoads:
             of.load.field[e] = load
         of.borne.field[e] = borne
         return load
-
-    @ti.func
-    def push_back(self, j, e, other, load):
-        """Let particle j bear the opposite of a load (a vector) [N]. e, other: the entries of the pair in both lists."""
-        self.carried.field[j] = self.carried.field[j] - self.state.w.of(j) * load
-        for piece in ti.static(self.pair_data):
-            piece.field[other] = piece.field[e]
 
     @ti.func
     def share(self, own, k):

@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from ..device.thread_team import Team
     from ..features.feature import Scene
     from .impulses import Impulses
-    from .responses import FreeParticles
+    from .responses import Responses
     from .rows import Rows
 
 
 class Places:
     """Stage 2 of the contacts of one world."""
 
-    def __init__(self, scene: "Scene", rows: "Rows", bodies: "FreeParticles", impulses: "Impulses", team: "Team"):
+    def __init__(self, scene: "Scene", rows: "Rows", bodies: "Responses", impulses: "Impulses", team: "Team"):
         self.rows, self.bodies, self.impulses, self.state = rows, bodies, impulses, scene.state
         self.radius = scene.radius
 

@@ -11,7 +11,7 @@ from ..features.material import Table
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.queries import Contacts
-from .candidates import EdgeCandidates
+from .candidates import NONE, EdgeCandidates
 from .narrow_phase import DiscGeometry
 
 # Lengths relative to an edge.
@@ -28,7 +28,6 @@ RATE = 0.4  # at which the usual depth of a contact approaches its depth, see Po
 DISCS = -1  # the place on an edge where there is no edge: two discs touch
 OVER_EDGE = 1  # what tips_cross() returns if the way out is over the edge of the second corner
 VERTEX, START, END = range(3)  # the role of a particle in a contact with a listed particle
-NONE = -2.0  # in near_contact(): the place on an edge where there is no contact
 
 
 class Outline(NamedTuple):

@@ -242,7 +242,7 @@ class Polygons(PairContact):
     def make_search(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields and the neighbour search, and return the search."""
         n, add, dev = scene.count, scene.memory.field, self.dev
-        dev.forces = ForceShare(scene, sums=True, lasting=False)
+        dev.forces = ForceShare(scene)
         dev.geometry = PolygonGeometry(scene, dev.outline, self.push_out)
         dev.move = add("Contact.move", n, width=2)
         dev.depths = add("Contact.depths", n)  # S_i: the usual depths of the contacts of i, see PolygonGeometry.share()

@@ -11,8 +11,9 @@ if TYPE_CHECKING:
     from .rows import Rows
 
 
-class FreeParticles:
-    """Free particles under impulses: an impulse p [kg m] changes d by w p, and at -r n from the center s by -k w n x p.
+class Responses:
+    """Particles under impulses: an impulse p [kg m] changes d by w p, and at -r n from the center s by -k w n x p. What holds
+    them answers, too, see Answers.
 
     w: inverse mass. k = m r^2 / I, see Spin. Particles that are pinned, driven or asleep keep their displacement.
 
@@ -198,7 +199,7 @@ class FreeParticles:
     def finish(self, i, step):
         """Move particle i as impulses want, from where it was at the start. step: its new displacement, with a dither in f32."""
         if self.state.moves(i):
-            new, d = self.new[i], self.state.d[i]
+            new, d, base = self.new[i], self.state.d[i], self.base(i)
             moved = (new != d).any()
             if ti.static(bool(self.rows.impacts)):
                 moved = moved or self.rows.impacts.turn[i] > 0
@@ -215,7 +216,7 @@ class FreeParticles:
                         change = self.compliance(i) * self.push[i]
                         if ti.static(bool(self.answers)):
                             if self.answers.holds(i):  # bodies answer with all of their particles
-                                change = new - self.base(i)
+                                change = new - base
                         if ti.static(bool(self.rows.impacts)):
                             self.state.advance(i, self.rows.impacts.shift[i] - self.rows.when[i] * change)
                         else:

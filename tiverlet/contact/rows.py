@@ -97,6 +97,8 @@ class Rows:
         self.bounces, self.rounding = bounces, NOISE * (2.0**-52 if scene.real == ti.f64 else 2.0**-23)
         self.touched: Any = None
         if bounces:
+            # What each pair gave along the normal in the last substep, with impacts [kg m].
+            self.given = PairData("given", 0, persistent=True, for_reports=True, has_owner=True)
             # Whether a pair touched in the last substep: then it goes on together instead of bouncing.
             self.touched = PairData("touches", 0, persistent=True, kind=ti.i32, has_owner=True)
             self.bounce, self.time, self.target = Column("row_bounce"), Column("row_time"), Column("row_target")
@@ -353,12 +355,16 @@ class Rows:
         if ti.static(self.dim == 2):
             half = (s[0] - s[1]) / 2
             self.eigenvalue[i] = (s[0] + s[1]) / 2 + ti.sqrt(half * half + s[2] * s[2])
-        else:  # m + 2 p cos(phi), cos(3 phi) = det((S - m) / p) / 2 with m = tr S / 3, 6 p^2 = |S - m|^2 (Smith 1961)
+        else:  # m + p (1 + e), e^2 (3 + e) = 2 + det((S - m) / p), with m = tr S / 3, 6 p^2 = |S - m|^2: by Newton's method
             m = (s[0] + s[1] + s[2]) / 3
-            B = ti.Matrix([[s[0] - m, s[3], s[5]], [s[3], s[1] - m, s[4]], [s[5], s[4], s[2] - m]])
-            p = ti.sqrt(B.norm_sqr() / 6)
-            turn = ti.min(ti.max((B / ti.max(p, FEW)).determinant() / 2, -1), 1)
-            self.eigenvalue[i] = m + 2 * p * ti.cos(ti.acos(turn) / 3)
+            a, b, c = s[0] - m, s[1] - m, s[2] - m
+            det = a * (b * c - s[4] * s[4]) - s[3] * (s[3] * c - s[4] * s[5]) + s[5] * (s[3] * s[4] - b * s[5])
+            p = ti.sqrt((a * a + b * b + c * c + 2 * (s[3] * s[3] + s[4] * s[4] + s[5] * s[5])) / 6)
+            q = ti.max(2 + det / ti.max(p * p * p, FEW), 0)
+            e = ti.sqrt(q / 3.5)
+            for _ in range(4):
+                e -= (e * e * (3 + e) - q) / ti.max(3 * e * (2 + e), FEW)
+            self.eigenvalue[i] = m + p * (1 + e)
 
     @ti.func
     def work_of_others(self, i):
@@ -449,6 +455,7 @@ class Rows:
         self.memory.field[e] = self.zero()
         if ti.static(self.bounces):
             self.touched.field[e] = 0
+            self.given.field[e] = 0
         if ti.static(self.turns):
             self.borne_moment.field[e] = ti.Vector.zero(self.real, self.axes)
 

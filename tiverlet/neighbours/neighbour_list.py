@@ -17,32 +17,26 @@ CROWDED = 300  # near pairs per particle beyond which the user is warned
 STALE = 0.49  # of the skin: a list is valid until a particle has moved so far
 MOVED = 2  # value of NeighbourList.stale where the only cause is that particles moved
 WALL = 2**30  # the number of the first face of a wall, behind those of particles
-WORD, FULL = 32, 2**32 - 1  # entries that one word of bits covers, and a word with all bits set
 
 
 class PairData:
     """Data of each listed pair: a number, or a vector of `width`.
 
     persistent: it belongs to the state, beyond a substep. for_reports: it is for reports only. is_transferred: it is copied to
-    the next list; other data is recomputed. only_touching: it is 0 except for pairs whose bit in NeighbourList.touching is set.
-    ends_with_touch: with one pass per substep it is cleared where that bit goes, so a new list sets the bit of pairs that have
-    it. has_owner: the first particle of a pair stores it, if it can move; another one only in another piece of the team, and with
-    the opposite sign if it is a vector. kind: type of the numbers; None for that of the world. field, old: the data of the
-    present list, and of the old list while a new one is built.
+    the next list; other data is recomputed. has_owner: the first particle of a pair stores it, if it can move; another one only
+    in another piece of the team, and with the opposite sign if it is a vector. kind: type of the numbers; None for that of the
+    world. field, old: the data of the present list, and of the old list while a new one is built.
     """
 
     field: Any
     old: Any
 
     def __init__(
-        self, name: str, width: int, persistent: bool, is_transferred: bool = True, only_touching: bool = False, kind: Any = None,
-        for_reports: bool = False, ends_with_touch: bool = False, has_owner: bool = False,
+        self, name: str, width: int, persistent: bool, is_transferred: bool = True, kind: Any = None, for_reports: bool = False,
+        has_owner: bool = False,
     ):  # fmt: skip
-        self.has_owner = has_owner
-        self.name, self.width, self.kind = name, width, kind
-        self.persistent, self.is_transferred = persistent, is_transferred
-        self.only_touching, self.for_reports = only_touching, for_reports
-        self.ends_with_touch = ends_with_touch or only_touching
+        self.name, self.width, self.kind, self.has_owner = name, width, kind, has_owner
+        self.persistent, self.is_transferred, self.for_reports = persistent, is_transferred, for_reports
 
     @ti.func
     def is_set(self, value):
@@ -89,14 +83,12 @@ class NeighbourList:
         self.capacity, self.pitch = memory.number(0), memory.number(0)
         self.pair_data = pair_data
         self.persistent, self.transferred = [p for p in pair_data if p.persistent], [p for p in pair_data if p.is_transferred]
-        self.only_touching = all(p.only_touching for p in self.transferred)
         add = memory.field
         self.first = add("grid.first", rooms, kind=ti.i32)
         self.number = add("grid.number", count, kind=ti.i32)
         self.wall_number: Any = None  # of the entries of walls, which follow those of particles
         self.stale = add("grid.stale", None, kind=ti.i32, values=1)
         self.need = add("grid.need", None, kind=ti.i32)
-        self.touching = add("grid.touching", count, kind=ti.u32)  # bits: which of the first 32 entries touched at the last test
         self.old_first = add("grid.old_first", count, kind=ti.i32)
         self.old_number = add("grid.old_number", count, kind=ti.i32)
         self.old_saved = add("grid.kept", None, kind=ti.i32)  # 1: the old list is saved for the one that is being built
@@ -299,7 +291,7 @@ class NeighbourList:
         are, or move up among the entries of their particle.
         """
         assert self.store
-        first, count, touching = (self.memory.view(field) for field in (self.first, self.number, self.touching))
+        first, count = self.memory.view(self.first), self.memory.view(self.number)
         i, at = self._entries(self.first, self.number, self.wall_number is not None)
         near = self.store.view(self.neighbour)
         new = near.take(at)
@@ -313,15 +305,11 @@ class NeighbourList:
         loses[fewer] = True
         stay = np.flatnonzero(loses[i] & (new >= 0))
         i, at = i[stay], at[stay]
-        place, before = np.arange(len(i)) - np.searchsorted(i, i), at - first[i]
+        place = np.arange(len(i)) - np.searchsorted(i, i)
         for field in (self.neighbour, *(piece.field for piece in self.pair_data)):
             rows = self.store.view(field)
             rows[first[i] + place] = rows[at]
-        bits = np.zeros(self.n, dtype=np.uint32)
-        bit = np.where(before < WORD, touching[i] >> np.minimum(before, WORD - 1) & 1, 1)  # 1 behind the first word: unknown
-        some = place < WORD
-        np.bitwise_or.at(bits, i[some], (bit[some] << place[some]).astype(np.uint32))
-        touching[fewer], count[fewer] = bits[fewer], np.bincount(i, near.take(first[i] + place) < WALL, self.n)[fewer]
+        count[fewer] = np.bincount(i, near.take(first[i] + place) < WALL, self.n)[fewer]
 
     def settle_owners(self, some: np.ndarray | None = None) -> None:
         """Give data that have an owner to it, after pieces of the team changed, or which particles can move.
@@ -373,26 +361,19 @@ class NeighbourList:
         """Save the pairs of particle i that have data other than 0."""
         first = self.first[i]
         at = first
-        for word in range(self.word_count(i)):
-            bits = self.touching_bits(i, word) if ti.static(self.only_touching) else self.all_bits(i, word)
-            while bits != 0:
-                e = first + word * WORD + lowest_bit(bits)
-                bits &= bits - ti.u32(1)
-                some = 0
-                self.old_neighbour[at] = self.neighbour[e]
-                for piece in ti.static(self.transferred):
-                    value = piece.field[e]
-                    piece.old[at] = value
-                    some |= piece.is_set(value)
-                at += some
+        for e in range(first, first + self.count(i)):
+            some = 0
+            self.old_neighbour[at] = self.neighbour[e]
+            for piece in ti.static(self.transferred):
+                value = piece.field[e]
+                piece.old[at] = value
+                some |= piece.is_set(value)
+            at += some
         self.old_first[i], self.old_number[i] = first, at - first
 
     @ti.func
     def transfer_pair_data(self, i):
-        """Copy the data of each pair of particle i from the old list. Both lists are sorted.
-
-        Returns a word of bits: which of the first entries received data other than 0 that ends with their touch.
-        """
+        """Copy the data of each pair of particle i from the old list. Both lists are sorted."""
         first, number = self.first[i], self.count(i)
         for piece in ti.static(self.pair_data):
             for e in range(first, first + number):
@@ -401,41 +382,14 @@ class NeighbourList:
                 else:
                     for k in ti.static(range(piece.width)):
                         piece.field[e][k] = 0
-        bits, at = ti.u32(0), 0
+        at = 0
         for old in range(self.old_first[i], self.old_first[i] + self.old_number[i]):
             while at < number and self.neighbour[first + at] < self.old_neighbour[old]:
                 at += 1
             if at < number:
                 if self.neighbour[first + at] == self.old_neighbour[old]:
-                    some = 0
                     for piece in ti.static(self.transferred):
                         piece.field[first + at] = piece.old[old]
-                        if ti.static(piece.ends_with_touch):
-                            some |= piece.is_set(piece.old[old])
-                    if some != 0 and at < WORD:
-                        bits |= ti.u32(1) << ti.cast(at, ti.u32)
-        return bits
-
-    @ti.func
-    def entry(self, i, word, bits):
-        """Return the place in the list of the entry of particle i that belongs to the lowest set bit of a word."""
-        return self.first[i] + word * WORD + lowest_bit(bits)
-
-    @ti.func
-    def word_count(self, i):
-        """Return the number of words of bits that cover the entries of particle i."""
-        return (self.count(i) + (WORD - 1)) >> 5  # a division by WORD would test the sign
-
-    @ti.func
-    def all_bits(self, i, word):
-        """Return a word with a bit set for each entry of particle i that it covers."""
-        left = self.count(i) - word * WORD
-        return ti.select(left < WORD, (ti.u32(1) << ti.cast(left & (WORD - 1), ti.u32)) - ti.u32(1), ti.u32(FULL))
-
-    @ti.func
-    def touching_bits(self, i, word):
-        """Return the bits of entries that touched at the last test. Words beyond the first are not stored: all bits are set."""
-        return ti.select(word == 0, self.touching[i], self.all_bits(i, word))
 
 
 def _set(pairs: np.ndarray, values: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -446,9 +400,3 @@ def _set(pairs: np.ndarray, values: dict[str, np.ndarray]) -> tuple[np.ndarray, 
             some |= column != 0
     kept = np.flatnonzero(some)
     return pairs.take(kept, axis=0), {name: value.take(kept, axis=0) for name, value in values.items()}
-
-
-@ti.func
-def lowest_bit(bits):
-    """Return the index of the lowest set bit."""
-    return ti.math.popcnt((bits - ti.u32(1)) & ~bits)

@@ -321,7 +321,7 @@ class NeighbourSearch:
     def finish_entries(self, i):
         """Sort the entries of particle i, and transfer the data of its pairs from the old list."""
         self.sort_entries(self.list.first[i], self.list.number[i])
-        self.list.touching[i] = self.list.transfer_pair_data(i)
+        self.list.transfer_pair_data(i)
 
     @ti.func
     def scan(self, i, what: ti.template(), start, used):  # type: ignore[valid-type]

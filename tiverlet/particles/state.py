@@ -220,16 +220,6 @@ class State:
         return push
 
     @ti.func
-    def across_walls(self, i, move):
-        """Return a move of particle i without its part along the push of walls in this substep."""
-        if ti.static(self.keeps_wall_push):
-            wall_push = self.wall_push[i]
-            size = wall_push.dot(wall_push)
-            if size > 0:
-                move -= move.dot(wall_push) / size * wall_push
-        return move
-
-    @ti.func
     def digits(self, i):
         """Return the size of the last two binary digits of the coordinates of particle i [m]."""
         x = self.x[i]

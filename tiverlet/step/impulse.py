@@ -234,8 +234,7 @@ def restore_turn(runner: Any, first: int, share: np.ndarray, spun: np.ndarray | 
     spun: the result of Runner.spin(), if it is known.
     """
     state, memory, step = runner.scene.state, runner.memory, runner.step
-    turned = [c.dev.forces.turned for c in step.contacts if c.dev.forces and c.dev.forces.spins]
-    turned += [c.dev.rows.turned for c in step.contacts if c.dev.rows and state.spins]
+    turned = [c.dev.rows.turned for c in step.contacts if c.dev.rows and state.spins]
     turned += [step.particles.wall_turn] if step.particles.turned_by_walls else []
     if not (state.spins and turned and share.any()):
         return

@@ -52,7 +52,6 @@ class ParticlePass:
         self.contacts = [contact] if contact else []
         self.acts = self.gathers or bool(contact or walls)
         self.knows_loads = bool(contact) and contact.has_loads
-        self.leaves_walls_early = bool(walls) and self.knows_loads and not contact.shares_loads
         self.wall_loads = [contact.make_wall_loads()] if walls and contact and contact.shares_loads else []
         self.impacts = [scene.impacts] if scene.impacts else []
         self.weights = [scene.own_weight] if scene.own_weight else []
@@ -156,8 +155,6 @@ class ParticlePass:
         for loads in ti.static(self.wall_loads):
             for i in range(first, end):
                 loads.give(i, now)
-        if ti.static(self.leaves_walls_early):
-            self.leave_walls_early(first, end, now)
         for c in ti.static(self.contacts):
             stale, fast = 0, 0
             for i in range(first, end):
@@ -167,20 +164,6 @@ class ParticlePass:
             for i in range(first, end):
                 fast |= c.overshoots(i)
             c.note_motion(stale, fast)
-
-    @ti.func
-    def leave_walls_early(self, begin, end, now):
-        """If contacts have known loads: before contacts are solved, move particles in contact to where walls will leave them."""
-        for c in ti.static(self.contacts):
-            for b in range(blocks(begin, end)):
-                low, high = block(b, begin, end)
-                near = self.near_walls(low, high)
-                for i in range(low, high):
-                    wall_move = ti.zero(self.state.x[i])
-                    if near != 0:
-                        if self.state.moves(i) and c.dev.splitting.weight[i] > 0:
-                            wall_move = self.leave_walls(i, now)
-                    c.dev.known.wall_move[i] = wall_move
 
     @ti.func
     def leave_walls(self, i, now):
@@ -202,15 +185,6 @@ class ParticlePass:
             out = self.leave_walls(i, now)
             self.state.shift(i, -out)
         return out
-
-    @ti.func
-    def undo_wall_moves(self, begin, end):
-        """Undo leave_walls_early(): move particles back to where they were."""
-        for c in ti.static(self.contacts):
-            for i in range(begin, end):
-                wall_move = c.dev.known.wall_move[i]
-                if (wall_move != 0).any():
-                    self.state.shift(i, -wall_move)
 
     @ti.func
     def apply_constraints(self, now):
@@ -253,16 +227,10 @@ class ParticlePass:
             if now.first != 0:
                 for i in range(begin, end):
                     loads.take_back(i)
-        if ti.static(self.leaves_walls_early):
-            if now.first != 0:
-                self.undo_wall_moves(begin, end)
         for c in ti.static([] if self.rows else self.contacts):
             if now.it < now.span.iterations:  # further passes have no contacts, see BodyImpacts
-                for b in range(blocks(begin, end)):
-                    low, high = block(b, begin, end)
-                    if c.busy(low) != 0:
-                        for i in range(low, high):
-                            c.apply_corrections(i, now.first)
+                for i in range(begin, end):
+                    c.apply_corrections(i, now.first)
         if ti.static(len(self.walls) > 0):
             if now.final != 0:
                 for i in range(begin, end):
@@ -526,8 +494,6 @@ class ParticlePass:
         for c in ti.static(self.contacts):
             if ti.static(bool(c.dev.rows)):
                 turned += c.dev.rows.turned[i]
-            elif ti.static(c.has_friction):
-                turned += c.dev.forces.turned[i]
         if ti.static(self.turned_by_walls):
             _reaction, part = self.reaction(i, h, t, firm, soft)
             turned += part * self.wall_turn[i]

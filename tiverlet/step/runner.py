@@ -231,13 +231,11 @@ class Runner:
     def _sleep_on(self, who: np.ndarray, d: np.ndarray, ratio: float) -> None:
         """Scale what the last substep has left of the sleeping particles `who`, with displacements d, to one of `ratio` times the
         length. For them the coming frame is no start."""
-        memory, forces = self.memory, [c.dev.forces for c in self.step.contacts if c.dev.forces]
+        memory = self.memory
         memory.write_rows(who, (self.scene.state.d, d * ratio))
-        left = [(f.before, ratio) for f in forces] + [(f.sum, ratio**2) for f in forces if "sum" in f.in_state]
-        left += [(self.step.particles.wall_displacement, ratio**2)] if self.step.particles.walls else []
-        left += [(c.dev.rows.borne, ratio**2) for c in self.step.contacts if c.dev.rows]
-        for field, factor in left:
-            memory.write_rows(who, (field, memory.rows(who, field)[0] * factor))
+        left = [self.step.particles.wall_displacement] if self.step.particles.walls else []
+        for field in left + [c.dev.rows.borne for c in self.step.contacts if c.dev.rows]:
+            memory.write_rows(who, (field, memory.rows(who, field)[0] * ratio**2))
 
     def _project(self, h: float, dt: float) -> None:
         """Remove the energy that violations and overlaps would store in a shorter substep h [s], of a frame dt [s].
@@ -311,7 +309,7 @@ class Runner:
 
     def lacks_bodies(self, batches: "list[Batch]", x: np.ndarray, inv_mass: np.ndarray) -> bool:
         """Whether these constraints, of particles at x (n, dim) [m], make the first rigid bodies: that takes other kernels."""
-        touching = [c for c in self.step.contacts if not (c.dev.bodies or c.dev.has_restitution)]
+        touching = [c for c in self.step.contacts if not (c.solves_rows or c.dev.bodies or c.dev.has_restitution)]
         return bool(touching) and bool(rigid_bodies(batches, x, inv_mass))
 
     def find_ramps(self) -> None:

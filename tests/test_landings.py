@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.contact.impact_projection import CONDITION, FALL, LEFT, PASSES
+from tiverlet.contact.limits import LEFT
 
 G, R = 10.0, 0.1
 
@@ -35,15 +35,14 @@ def dropped(world, x, height, friction=0.0, spin=None, pair=0.0, wall=0.0, skin:
     ],
 )  # fmt: skip
 def test_what_falls_stays_where_it_lands(world, counts, more):
-    # Pairs that close as after a fall by less than FALL (2 R) are pushed apart again. If that gave each disc all of its energy,
-    # their center of mass would rise by as much. Blocks that springs throw back rise by up to half of their fall.
+    # Inelastic impacts leave no velocity. Blocks that springs throw back rise by up to half of their fall.
     fall = 1.0
     for substeps in (4, 8, 30):
         w = dropped(world, lattice(*counts), fall, substeps=substeps, **more)
         w.run(np.sqrt(2 * fall / G) + 2 / 60)
         height = np.array([w.position[:, 1].mean() for _ in range(60) if w.step(1 / 60)])
         landed = R * counts[1]
-        assert height.max() < landed + FALL * 2 * R, substeps
+        assert height.max() < landed + 2e-3 * fall, substeps
         assert height[:6].min() > 0.9 * landed, substeps  # it is not pressed into the floor
 
 
@@ -79,31 +78,13 @@ def test_a_floor_rubs_all_that_stands_on_it(world, substeps):
     w = world(start, features, substeps=substeps, precision="f64")
     w.run(v / G + 2 / 60)
     slower = mu * (v + G * (w.time - v / G))
-    assert w.velocity[:, 0].mean() == pytest.approx(u - slower, abs=slower * LEFT)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dim", [2, 3])
-def test_what_lands_makes_no_heap_flatter(world, dim, monkeypatch):
-    # Grains that are poured one by one come to rest as high with the projection as by pushes alone, which have friction, too.
-    # Heaps of few grains differ by a fifth from one to another. Without friction in the projection they were half as high.
-    many, up = np.arange(400), np.eye(dim)[1]
-    x = np.stack([many % 4 - 1.5, 2 + many // (4 if dim == 2 else 16), many // 4 % 4 - 1.5], axis=1)[:, :dim] * 2.3 * R
-    x[:, ::2] += 0.8 * R * tv.golden(many[:, None] + [0, 1000][: dim - 1])
-    heights = []
-    for lands in (True, False):
-        monkeypatch.setattr(tv.Contact, "lands", lands)
-        features = [tv.Gravity(G), tv.Contact(friction=0.4), tv.HalfSpace(up, friction=0.4)]
-        w = world(tv.Particles(x, radius=R), features, substeps=8)
-        w.run(10.0)
-        heights.append(w.position[:, 1].mean())
-    assert heights[0] > 0.8 * heights[1]
+    assert w.velocity[:, 0].mean() == pytest.approx(u - slower, abs=0.01 * slower)
 
 
 @pytest.mark.parametrize("struck", [1, 2])
 def test_a_row_that_is_hit_goes_on_as_one(world, struck):
-    # Momentum is conserved, m v = (n + 1) m u, and all n + 1 discs have the same velocity u, up to what the passes leave of the
-    # slowest mode, 1 / T(PASSES), for each of two substeps. In a Newton's cradle with e = 0, the last disc does not fly off.
+    # Momentum is conserved, m v = (n + 1) m u, and all n + 1 discs have the same velocity u, up to what passes may lack: the
+    # share LEFT of its mean square. In a Newton's cradle with e = 0, the last disc does not fly off.
     n, v = struck + 1, 3.0
     x = np.zeros((n + 1, 2))
     x[1:, 0] = 2 * R * np.arange(n)
@@ -111,9 +92,8 @@ def test_a_row_that_is_hit_goes_on_as_one(world, struck):
     start = tv.Particles(x, velocity=[(v, 0.0)] + [(0.0, 0.0)] * n, radius=R)
     w = world(start, [tv.Contact()], substeps=8, precision="f64")
     w.run(0.5)
-    left = 2 / np.cosh(PASSES * np.arccosh((CONDITION + 1) / (CONDITION - 1)))
     assert np.allclose(w.velocity.sum(axis=0), (v, 0.0), atol=1e-12)
-    assert np.allclose(w.velocity[:, 0], v / (n + 1), atol=left * v)
+    assert np.allclose(w.velocity[:, 0], v / (n + 1), atol=np.sqrt(LEFT) * (n + 1) * v)
 
 
 def test_discs_that_fly_together_keep_their_momentum_and_gain_no_energy(world):
