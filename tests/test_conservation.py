@@ -51,8 +51,9 @@ def test_momentum_is_conserved_for_ten_thousand_steps(world, precision, limit):
 @pytest.mark.parametrize("what", ["shapes in 3D", "contacts"])
 def test_velocities_have_the_momentum_of_the_motion(world, what):
     # Sum m v = sum m d / h. Where the forces in v act along their directions at x_n, also sum m x x v = sum m x x d / h. Both
-    # hold in the first substep after a start and after a change of h, too. Contacts push along other directions than those at
-    # x_n, which does not affect what v contains. Friction has a moment where particles do not spin.
+    # hold in the first substep after a start and after a change of h, too. Loads of contacts act along the directions at x_n-1,
+    # which turn by u h / 0.6 for two discs of radius 0.3 with the relative velocity u. Friction has a moment where particles do
+    # not spin.
     rng = np.random.default_rng(3)
     contact = tv.Contact(friction=0.5, restitution=0.5)
     if what == "shapes in 3D":
@@ -73,9 +74,13 @@ def test_velocities_have_the_momentum_of_the_motion(world, what):
             touched += w.step(2e-3).contacts
             d, size = w._runner.memory.state()["displacement"][: len(x)] / w._clock.h, mass @ np.linalg.norm(w.velocity, axis=1)
             assert np.abs(mass @ (w.velocity - d)).max() <= 1e-12 * size
+            turned = 0.0
+            if what == "contacts":
+                arms = (mass * np.linalg.norm(w.position, axis=1) * np.linalg.norm(w.velocity - d, axis=1)).sum()
+                turned = 2 * np.linalg.norm(d, axis=1).max() * w._clock.h / 0.6 * arms
             for a, b in zip(*np.triu_indices(x.shape[1], 1), strict=True):
                 more = w.position[:, a] * (w.velocity - d)[:, b] - w.position[:, b] * (w.velocity - d)[:, a]
-                assert (rough and what == "contacts") or abs(mass @ more) <= 1e-12 * size
+                assert (rough and what == "contacts") or abs(mass @ more) <= 1e-12 * size + turned
         assert (touched > 0) == (what == "contacts")
 
 
