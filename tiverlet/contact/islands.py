@@ -82,7 +82,7 @@ class Islands:
         for row in range(self.rows.own[i], self.rows.pressed[i]):
             other, joins = self.rows.other.field[row], True
             if ti.static(which == PRESSING):
-                joins = self.rows.is_set(self.rows.p.field[row])
+                joins = self.rows.is_set(self.rows.p.field[row]) or self.rows.hit(row) > 0
             elif ti.static(which == BOUNCING):
                 joins = self.rows.impacts.blow.field[row] > 0
             if joins and self.bodies.moves(other):
@@ -217,7 +217,10 @@ class Islands:
             load += ti.abs(self.rows.along(p, n))
             if ti.static(self.rows.bounces):  # displacements are those in the middle of the substep, and impacts are not there
                 if self.rows.bounce.field[row] > 0:
-                    work += (self.rows.when[i] - 0.5) * self.rows.along(p, n) * self.rows.relative_kick(i, row).dot(n)
+                    f = self.rows.relative_kick(i, row).dot(n)
+                    work += (self.rows.when[i] - 0.5) * self.rows.along(p, n) * f
+                    if ti.static(bool(self.rows.impacts) and bool(self.bodies.answers)):
+                        work += (self.rows.time.field[row] - 0.5) * self.rows.hit(row) * f
         work -= self.rows.work_of_others(i)
         return ti.Vector([work, square, load])
 

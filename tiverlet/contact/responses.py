@@ -118,6 +118,14 @@ class Responses:
         """Return the displacement of particle i before the passes, after impacts in turn [m]."""
         return at(self.rows.impacts.thrown, i) if self.rows.impacts else at(self.state.d, i)
 
+    @inline
+    def origin(self, i):
+        """Return the displacement of particle i from which impulses may do no work [m].
+
+        Impacts in turn keep energy, so it is that after them; but they take what is held for a particle alone.
+        """
+        return at(self.state.d, i) if self.answers else self.base(i)
+
     @ti.func
     def answer(self, i, p, m):
         """Compute the displacements of particle i under impulses whose sum is p, with moments of sum m [kg m]."""
@@ -161,7 +169,7 @@ class Responses:
         The work of its impulses is the first and half of the second.
         """
         work, square = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
-        d, w = self.base(i), self.compliance(i)
+        d, w = self.origin(i), self.compliance(i)
         if w > 0:
             change = self.new[i] - d
             work += d.dot(change) / w
@@ -187,7 +195,7 @@ class Responses:
     @ti.func
     def scale(self, i, scale):
         """Multiply the impulses on particle i by a number."""
-        d = self.base(i)
+        d = self.origin(i)
         self.new[i] = d + scale * (self.new[i] - d)
         if ti.static(bool(self.answers)):
             self.answers.scale(i, scale)
