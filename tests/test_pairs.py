@@ -77,10 +77,11 @@ LEFT_OUT = {
 )
 def test_pairs_equal_brute_force(world, path, name, radius, several):
     # The list has pairs a little farther apart than the skin, for rows.
-    some = np.asarray(radius)[np.asarray(radius) > 0]
-    contact = tv.Contact(skin=SKIN - AHEAD * median(some))
+    ahead = AHEAD * median(np.asarray(radius)[np.asarray(radius) > 0])
+    skin = max(SKIN - ahead, 1e-3)
+    contact = tv.Contact(skin=skin)
     w = world(tv.Particles(several[0][0], radius=radius), [contact], precision="f64", path=path)
-    wanted = [tv.measure.overlapping(position, radius, SKIN)[0] for position, _ in several]
+    wanted = [tv.measure.overlapping(position, radius, skin + ahead)[0] for position, _ in several]
     roomy(w, 4 * max(map(len, wanted)))
     for (position, filled), want in zip(several, wanted, strict=True):
         position = np.asarray(position)

@@ -199,13 +199,14 @@ def test_blows_do_not_count_as_forces(world):
 @pytest.mark.slow
 def test_slight_blows_between_particles_do_not_either(world):
     # 20 balls graze each other in a magnet. If their blows counted as forces that go on, 0.95 J would become 41 J at 8 substeps.
+    # What is left is the error of the substep of each blow: up to 2.0 times at 8 substeps, 1.2 at 16, 1.1 at 32.
     x = np.stack([np.linspace(0, 1, 20), np.zeros(20)], axis=1)
     v = np.zeros((20, 2))
     v[1:, 1] = 2 * np.sin(0.5 * np.arange(1, 20))
     start = tv.Particles(x, velocity=v, mass=0.05, radius=0.02)
-    w = world(start, [tv.Force(magnet), tv.Contact(restitution=1.0)], substeps=8, precision="f64")
+    w = world(start, [tv.Force(magnet), tv.Contact(restitution=1.0)], substeps=16, precision="f64")
     energy = [w.step(1 / 60).energy for _ in range(600)]
-    assert max(energy) < 2 * energy[0]  # 1.6: the error of the substep of each blow
+    assert max(energy) < 1.5 * energy[0]
 
 
 def test_the_flag_comes_where_a_turn_is_not_resolved(world):
