@@ -53,7 +53,6 @@ from .limits import (
     SCALE,
     SHARE,
     SLOW,
-    STEADY,
     STRUCK,
     SUMS,
     THETA,
@@ -485,34 +484,18 @@ class Impulses:
         return out
 
     @ti.func
-    def is_light(self, i):
-        """Whether particle i has less than STEADY of the mass of another one on its rows.
-
-        Rows that take different parts of a blow for a load differ by up to STEADY of it, which moves such a particle farther than
-        the blow moves the other one. So with forces its loads change its motion by no more than all that happened in the substep:
-        what lies still under a blow of something heavy is told to lie still. Others are told the momentum of the motion.
-        """
-        out, w = False, self.bodies.compliance(i)
-        for row in range(self.rows.begin[i], self.rows.pressed[i]):
-            other = self.rows.other.field[row]
-            if self.bodies.moves(other):
-                out = out or ti.static(STEADY) * w > self.bodies.compliance(other)
-        return out
-
-    @ti.func
     def remember(self, i, final):
         """At the end: store what the rows of particle i bear, and note what touches for events.
 
-        `borne` is how far what bears moves the particle. Velocities contain half of it, see Verlet.velocity_after().
+        `borne` is how far what bears moves the particle. Velocities contain half of it, see Verlet.velocity_after(). With forces
+        it changes the motion by no more than all that happened in the substep: what lies still under a blow of something heavy is
+        told to lie still, though its rows take different parts of the blow for a load.
         """
         if final != 0:
             w, kick = self.bodies.compliance(i), self.rows.kick(i)
             push = w * self.bodies.push[i]
             change = self.bodies.new[i] - self.bodies.base(i) - self.bodies.answer_of_constraints(i)
-            borne = change - push
-            if self.is_light(i):
-                borne -= self.excess(borne + kick, change + kick)
-            self.rows.borne[i] = borne
+            self.rows.borne[i] = change - push - self.excess(change - push + kick, change + kick)
             if ti.static(self.bodies.spins):
                 turn = self.bodies.new_s[i] - self.bodies.spin.s[i]
                 blow = -(w * self.bodies.spin.inverse_inertia.of(i)) * self.bodies.moment[i]
