@@ -146,8 +146,7 @@ class Contact(PairContact):
             dev.rows.events = dev.events if dev.reports else None
         dev.rows.bind(dev.list, dev.geometry)
         dev.fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
-        dev.bodies = dev.known = dev.restitution = dev.forces = None
-        dev.has_loads = False
+        dev.bodies = dev.forces = None
         return dev.search
 
     @property

@@ -214,7 +214,7 @@ class Impacts:
                     foreign += ti.cast(self.blow.field[row] > 0, self.real)
                 shared += ti.max(foreign - 1, 0)
         bodies.push[i] = bodies.push[i] + p_own
-        return work, kept, shared
+        return ti.Vector([work, kept, shared])
 
     @ti.func
     def terms(self, i, bodies: ti.template()):  # type: ignore[valid-type]

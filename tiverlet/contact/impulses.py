@@ -312,7 +312,7 @@ class Impulses:
                 uphill += self.bodies.answers.links.sum_of(self.bodies.answers.links.uphill, i)
                 wrong += self.bodies.answers.links.sum_of(self.bodies.answers.links.wrong, i)
         self.take(i, part, p_own, m_own)
-        return lack, uphill, load, wrong
+        return ti.Vector([lack, uphill, load, wrong] if ti.static(self.rows.bounces) else [lack, uphill, load])
 
     @ti.func
     def wrong(self, row, p, gap):

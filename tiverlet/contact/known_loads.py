@@ -15,9 +15,8 @@ if TYPE_CHECKING:
     from ..features.feature import Scene
     from ..neighbours.neighbour_list import NeighbourList
 
-WINDOW = 128  # substeps over which the missing load is averaged; it begins just after sound is removed (EVERY)
-SLOW = 0.3  # substeps that it takes to learn the load of k particles, per k^2
-SLOW_BODIES = 1.2  # the same for contacts of bodies, whose sound decays more slowly
+WINDOW = 128  # substeps over which the missing load is averaged
+SLOW_BODIES = 1.2  # substeps that it takes to learn the load of k particles, per k^2
 LAG_BODIES = 448  # further substeps that bodies take to learn any load, so that no step makes them swing beyond their height
 SAME = 1e-3  # relative change of the vector between a pair beyond which it forgets its load when positions are assigned
 
@@ -45,7 +44,7 @@ class LearntLoad:
 
 
 class KnownLoads:
-    """The known loads of contacts: each pair stores the load F [N] that it bears, and applies it in every substep like a force.
+    """The known loads of Polygons: each pair stores the load F [N] that it bears, and applies it in every substep like a force.
 
     The force acts before contacts are detected. Contacts add the missing part. They may take back a part of F, but never pull. F
     acts along the normal of the pair at the end of the last substep, where the next one starts, so it has no moment.
@@ -54,44 +53,31 @@ class KnownLoads:
     is learnt gradually, which is integral control. If contacts added `mean` on average over a window, within a fifth of what they
     added in the window before, F += gain mean. Within a substep F is constant, so stability is the same as without.
 
-    Learning must be slower than the slowest sound of the pile decays, see VelocityProjection: 0.1 N^2 substeps in a column of N.
-    So gain = WINDOW / (LAG + SLOW k^2), with k = F / (m g) the number of particles that a pair bears. An impact has a large k, so
-    it is not learnt.
+    Learning must be slower than the slowest mode decays. Columns of N bodies swing, and it decays in 3 N^2 substeps, with k = 2 N
+    for the number k = F / (m g) of particles that a pair bears: s^2 + L s + L (1 + K / s) = 0 is stable where the share K learnt
+    in a substep is below L = 2.7 / k^2, and K = 1 / (SLOW_BODIES k^2). An impact has a large k, so it is not learnt.
 
     A pair with no push at the end of a pass, because its particles parted or bounced, forgets its load at once. Restitution
     decides by the overlap of a pair whether it rests; for a known load, the overlap that would hold it is added.
 
-    A wall undoes, in the same substep, the displacement into it. For contacts to see that, particles are placed where walls leave
-    them while contacts are solved (`wall_move`). Walls then start again with the whole displacement into them, which friction
-    needs.
+    The vertex stores F, which acts on it and, by shares 1 - t and t, on the ends of the edge. Contacts also know F_t, which
+    friction holds across the normal, see Polygons.learn_friction(). See SteadyMotion and WallLoads, too.
 
-    Bodies of loops (Polygons) know loads by contact: the vertex stores F, which acts on it and, by shares 1 - t and t, on the
-    ends of the edge. They also know F_t, which friction holds across the normal, see Polygons.learn_friction(). Columns of N
-    bodies swing, and the slowest mode decays in 3 N^2 substeps, with k = 2 N: s^2 + L s + L (1 + K / s) = 0 is stable where the
-    share K learnt in a substep is below L = 2.7 / k^2, and K = 1 / (SLOW_BODIES k^2). See SteadyMotion and WallLoads, too.
-
-    bodies: whether these are contacts of bodies. has_friction: whether they learn what friction holds.
+    has_friction: whether they learn what friction holds.
 
     Warm starting (Box2D) of a single pass would be unstable: a mode of eigenvalue L has the characteristic polynomial
     z^3 - 3 a z^2 + 3 a z - a, a = 1 - r L, whose roots near 1 grow like (r L)^(1/3) / 2.
     """
 
-    def __init__(self, scene: "Scene", bodies: bool = False, has_friction: bool = False):
-        self.state, self.weights, self.slow = scene.state, scene.own_weight, SLOW_BODIES if bodies else SLOW
-        self.lag = LAG_BODIES if bodies else 0.0
+    def __init__(self, scene: "Scene", has_friction: bool):
+        self.state, self.weights = scene.state, scene.own_weight
         # The load [N], the sum of its missing part in this window [kg m], and the mean of it in the window before [N].
         self.normal = LearntLoad(("load", "borne", "earlier"), True)
         self.load, self.borne = self.normal.load, self.normal.borne
         self.friction: Any = LearntLoad(("rub", "rubbed", "rubbed_earlier"), False) if has_friction else None
         self.pair_data = [*self.normal.pair_data, *(self.friction.pair_data if self.friction else [])]
-        n, dim = scene.count, scene.particles.dim
-        self.carried = Carried(scene)
-        self.in_state = {"carried": self.carried.field}
-        self.motion: Any = SteadyMotion(scene) if bodies else None
-        if self.motion:
-            self.in_state["velocity"] = self.motion.velocity
-        else:
-            self.wall_move = scene.memory.field("Contact.lean", n, width=dim)  # by walls, before contacts were solved [m]
+        self.carried, self.motion = Carried(scene), SteadyMotion(scene)
+        self.in_state = {"carried": self.carried.field, "velocity": self.motion.velocity}
 
     def bind(self, pairs: "NeighbourList", geometry: Any) -> None:
         """Store the neighbour list, which holds the pair data, and the geometry of contacts."""
@@ -171,15 +157,12 @@ class KnownLoads:
     @ti.func
     def share(self, own, k):
         """Return the share that is learnt of a load of k [m/s^2], of particles accelerated by their own weight `own` [m/s^2]."""
-        return learnt_share(own * own, ti.static(self.slow) * k * k + ti.static(self.lag) * own * own, WINDOW)
+        return learnt_share(own * own, ti.static(SLOW_BODIES) * k * k + ti.static(LAG_BODIES) * own * own, WINDOW)
 
     @ti.func
     def learn(self, of: ti.template(), i, j, e, load, mean):  # type: ignore[valid-type]
         """Return one load of entry e after a window in which `mean` of it was missing on average [N]."""
-        steady = is_steady(mean, of.earlier.field[e])
-        if ti.static(bool(self.motion)):
-            steady = steady and self.motion.is_steady(i) and self.motion.is_steady(j)
-        if steady:
+        if is_steady(mean, of.earlier.field[e]) and self.motion.is_steady(i) and self.motion.is_steady(j):
             k = ti.abs(load + mean) * ti.max(self.state.w.of(i), self.state.w.of(j))
             own = ti.max(self.weights.field[i], self.weights.field[j])
             share = self.share(own, k)

@@ -31,7 +31,6 @@ LACK, UPHILL, WORK, LOAD, ROWS, FORCE, HITS, WRONG, KINETIC = SUMS = range(9)  #
 BETA, THETA, TOLERANCE, LANDING, ALLOWED = range(5)
 H, BEGIN, END, SCALE, WHOLE, SHARES = TIMES = range(6)  # what rows know of a substep, see Rows.times
 GOING, TURN, GAINS, STRUCK = range(4)  # whether another pass follows, its number, whether any particle gains energy, or bounces
-ROUNDS = 2  # rounds of impacts that the host launches before it asks whether there are more
 THROWN = 0.5  # of the median radius: how far impacts in turn may throw something in a substep and it still meets others
 NEVER = 3.0  # a time after the substep
 APART, NEAR, TOGETHER = range(3)  # what rows are before impacts in turn: near ones go on together, unless they meet by themselves

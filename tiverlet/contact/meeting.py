@@ -1,6 +1,7 @@
 """When two surfaces meet on parabolas."""
 
 from ..device import ti
+from .limits import NEVER
 
 
 @ti.func
@@ -18,7 +19,7 @@ def meeting(gap, bend, way, moved, v, f, left, blur):
         if gap > blur:
             a, b = -v.dot(way), -f.dot(way)
             root = a * a + 2 * b * gap
-            s = 3 + 0 * gap
+            s = NEVER + 0 * gap
             if root >= 0 and a + ti.sqrt(ti.max(root, 0)) > 0:
                 s = 2 * gap / (a + ti.sqrt(root))
     else:
@@ -29,7 +30,7 @@ def meeting(gap, bend, way, moved, v, f, left, blur):
             u = v + (left / 2) * f
             b, uu = m.dot(u), u.dot(u)
             root = b * b - uu * c
-            s = 3 + 0 * gap
+            s = NEVER + 0 * gap
             if root >= 0 and uu > 0:
                 if c < 0:
                     s = (ti.sqrt(root) - b) / uu

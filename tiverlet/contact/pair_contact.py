@@ -43,7 +43,7 @@ class PairContact(Feature):
     - detect(i, first), if it `detects`
     - count(begin, end, now), by blocks of particles
     - relax(i, now)
-    - store_pushes(i, now), if its contacts are `stored_once` and know loads
+    - store_pushes(i, now), if contacts know loads
     - choose(i) and apply(i) of its `dev.restitution`, in rounds while `dev.hit` is set, if any pair has restitution
     - apply_corrections(i, first)
     - finish_substep(i, now), at the end of the substep
@@ -70,7 +70,6 @@ class PairContact(Feature):
     can_touch = True
     code_size = 3.0
     neighbours_per_particle = 0  # initial list entries per particle, if more than discs need
-    stored_once = False  # whether one particle stores a contact, and others read it; else each particle of a pair stores its own
     solves_rows = False  # whether contacts are rows, see rows.py
     detects = False  # whether each pass calls detect() for all particles, before contacts are counted
 
@@ -138,11 +137,6 @@ class PairContact(Feature):
     def has_loads(self) -> bool:
         """Whether pairs store the loads that they bear, see known_loads.py."""
         return bool(vars(self).get("loads")) and not self.solves_rows
-
-    @property
-    def shares_loads(self) -> bool:
-        """Whether particles read the loads of contacts that other particles store."""
-        return self.stored_once and self.has_loads
 
     @property
     def known(self) -> Any:

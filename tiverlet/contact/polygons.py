@@ -99,7 +99,7 @@ class Polygons(PairContact):
 
     host_only = ("loops",)
 
-    detects = stored_once = True
+    detects = True
     _after: Any = None  # the copy with the bodies after a planned edit, see can_regroup()
     neighbours_per_particle = 64  # the particles of near bodies
 
@@ -255,7 +255,7 @@ class Polygons(PairContact):
         dev.rows = None
         dev.bodies = None if dev.has_restitution else BodyProjection.made(scene, batches, self.table, 3)
         linked = excluded_pairs(batches, scene.particles.radius, dev.outline.body)
-        dev.known = KnownLoads(scene, True, dev.has_friction) if self.has_loads else None
+        dev.known = KnownLoads(scene, dev.has_friction) if self.has_loads else None
         # What contacts push along n and across it in the last pass, beside their known loads [kg m].
         dev.part = PairData("part", 2, False, is_transferred=False) if dev.known else None
         pair_data = [
@@ -276,7 +276,7 @@ class Polygons(PairContact):
         return dev.search
 
     def make_wall_loads(self) -> WallLoads:
-        """Declare the fields of the loads with which walls hold particles, and return them. Called if `shares_loads`."""
+        """Declare the fields of the loads with which walls hold particles, and return them. Called if it `has_loads`."""
         return WallLoads(self.scene, self.dev.known)
 
     @property

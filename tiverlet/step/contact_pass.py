@@ -24,7 +24,7 @@ class ContactPass:
         self.n, self.real, self.dim = scene.count, scene.real, scene.particles.dim
         self.rows: Any = RowPass(scene, contact, particles, team) if contact and contact.dev.rows else None
         self.has_restitution = bool(contact) and contact.has_restitution and not contact.solves_rows
-        keeps = contact and (contact.has_friction or contact.has_restitution or contact.has_events or contact.shares_loads)
+        keeps = contact and (contact.has_friction or contact.has_restitution or contact.has_events or contact.has_loads)
         self.remembers = bool(contact and contact.has_events if self.rows else keeps)
         self.projects_bodies = bool(contact and contact.dev.bodies)
         if self.has_restitution and team.launched:  # the host does not read whether any pair bounces in a round
@@ -44,7 +44,7 @@ class ContactPass:
             else:
                 self.count(c, now)
                 self.relax(c, now)
-            if ti.static(c.shares_loads):
+            if ti.static(c.has_loads):
                 self.store_pushes(c, now)
 
     @ti.func
@@ -166,7 +166,7 @@ class ContactPass:
         """Store the slip of friction and the slack of restitution, and log events."""
         thread = now.thread
         for c in ti.static(self.contacts):
-            if ti.static(not c.dev.rows and (c.has_friction or c.has_restitution or c.shares_loads)):
+            if ti.static(not c.dev.rows and (c.has_friction or c.has_restitution or c.has_loads)):
                 for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
                     if c.dev.state.awake(i):
                         c.finish_substep(i, now)

@@ -2,13 +2,14 @@
 
 from typing import TYPE_CHECKING, Any
 
-from ..contact.limits import BOUNCES, GOING, MOVES, ROUNDS
+from ..contact.limits import BOUNCES, GOING, MOVES
 from ..device.language import template
 from .span import Moment, Span
 
 if TYPE_CHECKING:
     from .runner import Runner
 
+ROUNDS = 2  # rounds of impacts in turn before the host asks whether there are more
 STIRRED = 2  # passes of places before the host asks whether more are needed: mostly none, or one and a look after it
 
 

@@ -45,7 +45,7 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
     """
     state, memory, step, ratio = runner.scene.state, runner.memory, runner.step, h / longest
     x, contact = state.get(memory), next(iter(step.contacts), None)
-    if runner.solves_rows or not (contact or step.walls) or not np.isfinite(x).all():
+    if not (contact or step.walls) or not np.isfinite(x).all():
         return False
     solids = Solids.loaded(runner, x, ratio)
     if not (contact or solids.count):

@@ -52,7 +52,7 @@ class ParticlePass:
         self.contacts = [contact] if contact else []
         self.acts = self.gathers or bool(contact or walls)
         self.knows_loads = bool(contact) and contact.has_loads
-        self.wall_loads = [contact.make_wall_loads()] if walls and contact and contact.shares_loads else []
+        self.wall_loads = [contact.make_wall_loads()] if walls and contact and contact.has_loads else []
         self.impacts = [scene.impacts] if scene.impacts else []
         self.weights = [scene.own_weight] if scene.own_weight else []
         self.rough = any(w.has_friction or w.has_restitution for w in walls)
@@ -464,7 +464,7 @@ class ParticlePass:
             reaction += firm * c.reaction(i, h, soft)
             if ti.static(self.knows_loads):
                 left_out = firm == 0
-                for impacts in ti.static(self.impacts if c.shares_loads else []):
+                for impacts in ti.static(self.impacts):
                     left_out = left_out or impacts.reached[i] != 0  # as the constraints of the body, which hold against them
                 reaction -= ti.select(left_out, h * h, 0 * h) * c.dev.known.carried.field[i]
         if ti.static(len(self.walls) > 0):

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ..features.feature import Scene
     from .particle_pass import ParticlePass
 
-OF_ROWS, OF_PASS, OF_LACK, OF_WORK, OF_ROUND = range(5)  # which sums are added up, see RowPass.noted
+OF_ROWS, OF_PASS, OF_PLACES, OF_WORK, OF_ROUND = range(5)  # which sums are added up, see RowPass.noted
 
 
 class RowPass:
@@ -153,22 +153,7 @@ class RowPass:
                 for i in range(begin, end):
                     self.impacts.look(i, part, self.impulses.flags[None][TURN])
         self.team.wait()
-        for k in range(self.particles.piece_count(thread) * self.going()):
-            begin, end = self.particles.piece(k, thread)
-            for part in range(self.rows.parts(), OWN + 1):
-                for b in range((end - begin + (BLOCK - 1)) // BLOCK):
-                    low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
-                    work, kept, shared = ti.Vector.zero(self.real, 3)
-                    for i in range(low, high):
-                        some_work, some_kept, some_shared = self.impacts.strike(i, part, self.bodies)
-                        work += some_work
-                        kept += some_kept
-                        shared += some_shared
-                    if part == OWN:
-                        self.impulses.note(low, WORK, work)
-                        self.impulses.note(low, LACK, kept)
-                        self.impulses.note(low, UPHILL, shared)
-        self.team.wait()
+        self.relax_rows(thread, OF_ROUND)
         n = self.n * self.going()
         self.add_up(thread, OF_ROUND)
         ti.loop_config(serialize=True)
@@ -357,6 +342,34 @@ class RowPass:
             self.team.wait()
 
     @ti.func
+    def relax_rows(self, thread, what: ti.template()):  # type: ignore[valid-type]
+        """One pass over all rows, of a round of impacts, of impulses or of places, and note its sums."""
+        for k in range(self.particles.piece_count(thread) * self.going()):
+            begin, end = self.particles.piece(k, thread)
+            for part in range(self.rows.parts(), OWN + 1):
+                for b in range((end - begin + (BLOCK - 1)) // BLOCK):
+                    low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
+                    sums = ti.Vector.zero(self.real, ti.static(len(self.noted[what])))
+                    for i in range(low, high):
+                        sums += self.relax_particle(i, part, what)
+                    if part == OWN:
+                        for s in ti.static(range(len(self.noted[what]))):
+                            self.impulses.note(low, self.noted[what][s], sums[s])
+        self.team.wait()
+
+    @ti.func
+    def relax_particle(self, i, part, what: ti.template()):  # type: ignore[valid-type]
+        """The same for a part of the rows of particle i. Returns what is noted."""
+        out = ti.Vector.zero(self.real, ti.static(len(self.noted[what])))
+        if ti.static(what == OF_ROUND):
+            out = self.impacts.strike(i, part, self.bodies)
+        elif ti.static(what == OF_PASS):
+            out = self.impulses.relax(i, part)
+        else:
+            out[0] = self.places.relax(i, part)
+        return out
+
+    @ti.func
     def relax_impulses(self, thread):
         """One pass of stage 1."""
         if ti.static(bool(self.answers)):
@@ -364,25 +377,7 @@ class RowPass:
             for r in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                 self.answers.links.relax(r, self.bodies, self.impulses.numbers[None][BETA])
             self.team.wait()
-        for k in range(self.particles.piece_count(thread) * self.going()):
-            begin, end = self.particles.piece(k, thread)
-            for part in range(self.rows.parts(), OWN + 1):
-                for b in range((end - begin + (BLOCK - 1)) // BLOCK):
-                    low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
-                    lack, uphill, load, wrong = ti.Vector.zero(self.real, 4)
-                    for i in range(low, high):
-                        some_lack, some_uphill, some_load, some_wrong = self.impulses.relax(i, part)
-                        lack += some_lack
-                        uphill += some_uphill
-                        load += some_load
-                        wrong += some_wrong
-                    if part == OWN:
-                        self.impulses.note(low, LACK, lack)
-                        self.impulses.note(low, UPHILL, uphill)
-                        self.impulses.note(low, LOAD, load)
-                        if ti.static(self.rows.bounces):
-                            self.impulses.note(low, WRONG, wrong)
-        self.team.wait()
+        self.relax_rows(thread, OF_PASS)
         self.answer(thread, self.n * self.going())
         self.add_up(thread, OF_PASS)
         ti.loop_config(serialize=True)
@@ -441,18 +436,8 @@ class RowPass:
             for r in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                 self.answers.links.relax_place(r, self.bodies)
             self.team.wait()
-        for k in range(self.particles.piece_count(thread) * self.going()):
-            begin, end = self.particles.piece(k, thread)
-            for part in range(self.rows.parts(), OWN + 1):
-                for b in range((end - begin + (BLOCK - 1)) // BLOCK):
-                    low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
-                    lack = ti.cast(0, self.real)
-                    for i in range(low, high):
-                        lack += self.places.relax(i, part)
-                    if part == OWN:
-                        self.impulses.note(low, LACK, lack)
-        self.team.wait()
-        self.add_up(thread, OF_LACK)
+        self.relax_rows(thread, OF_PLACES)
+        self.add_up(thread, OF_PLACES)
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread) * self.going()):
             self.impulses.decide_places(MOVES)

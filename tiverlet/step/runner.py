@@ -716,5 +716,4 @@ class Runner:
     @property
     def memories(self) -> list[Any]:
         """All trees of fields: the first one, and those of lists and ramps that were added later."""
-        grown = [*(search.list.store for search in self.step.searches)]
-        return [self.memory, *(m for m in grown if m), *self.ramps]
+        return [self.memory, *(search.list.store for search in self.step.searches if search.list.store), *self.ramps]
