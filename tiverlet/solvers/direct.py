@@ -418,14 +418,7 @@ class Elimination(System):
         begin, end, any_change, switched = self.part_begin[b], self.part_begin[b + 1], False, False
         rows, entries = self.solved, self.entries
         for r in range(begin, end):
-            change = ti.cast(0, ti.f64)
-            for q in range(self.corner_begin[r], self.corner_begin[r + 1]):
-                s = self.corner[q]
-                i = self.particle_of[s]
-                u = self.gradient[s].dot(moved[i] - d[i])
-                if ti.static(self.has_shared_particles):
-                    u /= self.blocks_of[i]
-                change -= self.scale[r] * u
+            change = -self.scale[r] * self.moved_along(r, moved, d)
             if ti.static(self.one_sided):
                 if self.side[r] != 0 and self.scale[r] != 0:
                     change -= self.gap[r]
@@ -465,6 +458,31 @@ class Elimination(System):
                 for q in range(self.corner_begin[r], self.corner_begin[r + 1]):
                     s = self.corner[q]
                     self.slots.answer[s] = ti.cast(self.answer[r] * ti.cast(self.move[s], ti.f64), self.real)
+
+    @ti.func
+    def end_answer(self, b, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]
+        """End the answers of part b to moves of its particles, `moved` - d: further moves are answered from here on."""
+        for r in range(self.part_begin[b], self.part_begin[b + 1]):
+            if ti.static(self.one_sided):
+                if self.side[r] != 0:
+                    self.gap[r] = ti.select(
+                        self.active[r] != 0, 0 * self.gap[r], self.gap[r] + self.scale[r] * self.moved_along(r, moved, d)
+                    )
+                self.solution[r] = self.solution[r] + self.answer[r]
+            self.answer[r] = 0
+
+    @ti.func
+    def moved_along(self, r, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]
+        """Return by how much moves of particles, `moved` - d, change the constraint of row r."""
+        out = ti.cast(0, ti.f64)
+        for q in range(self.corner_begin[r], self.corner_begin[r + 1]):
+            s = self.corner[q]
+            i = self.particle_of[s]
+            u = self.gradient[s].dot(moved[i] - d[i])
+            if ti.static(self.has_shared_particles):
+                u /= self.blocks_of[i]
+            out += u
+        return out
 
     @ti.func
     def update_active_set(self, begin, end, at_end):
