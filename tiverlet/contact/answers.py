@@ -14,7 +14,8 @@ import numpy as np
 
 from ..device import ti
 from ..device.number import OnDevice
-from ..solvers.corners import corners_of
+from ..solvers.corners import bodies_of, corners_of
+from .limits import NEVER
 from .links import Links
 
 if TYPE_CHECKING:
@@ -23,16 +24,30 @@ if TYPE_CHECKING:
     from .rows import Rows
 
 
+def answer_at_once(scene: "Scene", batches: "list[Batch]") -> bool:
+    """Whether one answer of each constraint is the answer of all: none is a row, and none shares a particle with another one."""
+    slots = scene.slots
+    if not batches:
+        return True
+    eliminated = bool(slots.system) and slots.system.answers
+    rows = [b for b in batches if not b.answers_alone]
+    return slots.exact_answers and all(eliminated and (slots.rows(b) >= 0).all() for b in rows)
+
+
 class Answers:
     """The constraints of one world that answer contacts.
 
     held: how far the answers of systems, clusters and places move each particle [m]. mobility: where clusters are, by how much a
     unit impulse moves each particle at most [1/kg]. begin, particle: the particles that each constraint connects.
+
+    Of rounds of impacts: body: the lowest particle that constraints connect with each one. first: the first impact of the
+    body of each such particle. before: the answers before a round, of slots and rows of systems; given: how far all rounds
+    have moved each particle by answers [m].
     """
 
     n: Any = OnDevice()
 
-    def __init__(self, scene: "Scene", batches: "list[Batch]", rows: "Rows"):
+    def __init__(self, scene: "Scene", batches: "list[Batch]", rows: "Rows", serial: bool):
         slots, add, count, dim = scene.slots, scene.memory.field, scene.count, scene.particles.dim
         self.state, self.slots, self.batches = scene.state, slots, batches
         self.links = Links(scene, batches, rows)
@@ -48,6 +63,12 @@ class Answers:
         begin, particle = self._tables(scene.inv_mass)
         self.begin = add("answers.begin", len(begin), kind=ti.i32, values=begin)
         self.particle = add("answers.particle", len(particle), kind=ti.i32, values=particle)
+        self.in_turn, self.serial = bool(rows.impacts), serial
+        if self.in_turn:
+            self.body = add("answers.body", count, kind=ti.i32, values=self._bodies(scene.inv_mass))
+            self.first, self.given = add("answers.first_impact", count), add("answers.given", count, width=dim)
+            self.before = add("answers.before", slots.total, width=dim)
+            self.before_row = add("answers.before_row", slots.system.rows if self.systems else 1, kind=ti.f64)
 
     def _tables(self, inv_mass: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return where the movable particles of each constraint begin, and these particles."""
@@ -56,11 +77,23 @@ class Answers:
         count = sum(b.count for b in self.batches)
         return np.searchsorted(owner[movable], np.arange(count + 1)), item[movable]
 
+    def _bodies(self, inv_mass: np.ndarray) -> np.ndarray:
+        """Return the lowest particle of the body of each particle, itself if no constraint moves it."""
+        owner, item = corners_of(self.batches)
+        label = bodies_of(sum(b.count for b in self.batches), owner, item, inv_mass)[1]
+        each = np.arange(len(label))
+        lowest = np.full(len(label) + 1 + label.max(initial=0), len(label))
+        np.minimum.at(lowest, label, each)
+        alone = label == sum(b.count for b in self.batches)
+        return np.where(alone, each, lowest[label])
+
     def reassign(self, memory: "Memory", inv_mass: np.ndarray) -> None:
         """Follow constraints that moved to other particles, as many of which can move as before."""
         begin, particle = self._tables(inv_mass)
         memory.write(self.begin, begin)
         memory.write(self.particle, particle)
+        if self.in_turn:
+            memory.write(self.body, self._bodies(inv_mass))
         self.links.reassign(memory, len(inv_mass))
 
     @ti.func
@@ -70,8 +103,19 @@ class Answers:
             self.held[i] = 0 * self.state.d[i]
             for s in range(self.slots.begin[i], self.slots.begin[i + 1]):
                 self.slots.answer[s] = 0 * self.state.d[i]
+        if ti.static(self.in_turn):
+            self.given[i], self.first[i] = 0 * self.state.d[i], NEVER
         if ti.static(self.has_clusters):
             self.mobility[i] = self.state.w.of(i)
+
+    @ti.func
+    def note_first(self, i, time):
+        """Note that particle i has its first impact at a time, for its body."""
+        body = self.body[i]
+        if ti.static(self.serial):
+            self.first[body] = ti.min(self.first[body], time)
+        else:
+            ti.atomic_min(self.first[body], time)
 
     @ti.func
     def holds(self, i):
@@ -89,10 +133,33 @@ class Answers:
         return change
 
     @ti.func
-    def scale(self, i, scale):
-        """Multiply the answers to particle i by a number."""
+    def beyond(self, i):
+        """Return how far answers of passes move particle i, without those of rounds [m]."""
+        out = self.held[i]
+        if ti.static(self.in_turn):
+            out -= self.given[i]
+        return out
+
+    @ti.func
+    def keep(self, i):
+        """Keep the answers to particle i as they are before a round of impacts, or after the last one."""
+        self.given[i] = self.held[i]
         for s in range(self.slots.begin[i], self.slots.begin[i + 1]):
-            if ti.static(self.answer_later):
+            self.before[s] = self.slots.answer[s]
+        for system in ti.static(self.systems):
+            for s in range(self.slots.begin[i], self.slots.begin[i + 1]):
+                r = system.row_of[s]
+                if r >= 0:
+                    if system.corner[system.corner_begin[r]] == s:
+                        self.before_row[r] = system.answer[r]
+
+    @ti.func
+    def scale(self, i, scale):
+        """Multiply the answers to particle i by a number, or what a round of impacts has added to them."""
+        for s in range(self.slots.begin[i], self.slots.begin[i + 1]):
+            if ti.static(self.in_turn):
+                self.slots.answer[s] = self.before[s] + scale * (self.slots.answer[s] - self.before[s])
+            elif ti.static(self.answer_later):
                 self.slots.answer[s] = scale * self.slots.answer[s]
             r = self.links.row_of[s]
             if r >= 0:
@@ -103,6 +170,11 @@ class Answers:
                 r = system.row_of[s]
                 if r >= 0:
                     if system.corner[system.corner_begin[r]] == s:
-                        system.answer[r] = scale * system.answer[r]
-        if ti.static(self.answer_later):
+                        before = 0 * system.answer[r]
+                        if ti.static(self.in_turn):
+                            before = self.before_row[r]
+                        system.answer[r] = before + scale * (system.answer[r] - before)
+        if ti.static(self.in_turn):
+            self.held[i] = self.given[i] + scale * (self.held[i] - self.given[i])
+        elif ti.static(self.answer_later):
             self.held[i] = scale * self.held[i]

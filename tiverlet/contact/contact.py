@@ -15,11 +15,11 @@ from ..features.regrouping import Regrouping
 from ..geometry.ordered import median
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
-from .answers import Answers
+from .answers import Answers, answer_at_once
 from .events import EventLog
 from .exclusions import excluded_pairs
 from .impulses import Impulses
-from .islands import Islands
+from .islands import Islands, serial
 from .limits import AHEAD, CRADLE, THROWN
 from .narrow_phase import DiscGeometry
 from .pair_contact import PairContact
@@ -121,8 +121,9 @@ class Contact(PairContact):
         bounces = dev.has_restitution or any(w.has_restitution for w in self.walls)
         self.table.bind(scene, friction or bounces)
         turns = scene.state.spins and friction and (dev.turns or any(w.turns for w in self.walls))
-        dev.rows = Rows(scene, self.table, friction, bounces, self.in_turn, turns, scene.walls, team, self.push_out, self._ahead)
-        dev.answers = Answers(scene, batches, dev.rows) if batches else None
+        in_turn = self.in_turn and answer_at_once(scene, batches)
+        dev.rows = Rows(scene, self.table, friction, bounces, in_turn, turns, scene.walls, team, self.push_out, self._ahead)
+        dev.answers = Answers(scene, batches, dev.rows, serial(team)) if batches else None
         dev.responses = Responses(scene, dev.rows, scene.state.spins and friction, dev.answers)
         dev.islands = Islands(scene, dev.rows, dev.responses, team)
         dev.impulses = Impulses(scene, dev.rows, dev.responses, team)

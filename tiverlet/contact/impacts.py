@@ -217,44 +217,61 @@ class Impacts:
         return ti.Vector([work, kept, shared])
 
     @ti.func
-    def terms(self, i, bodies: ti.template()):  # type: ignore[valid-type]
-        """Return the part of particle i in the sums over what bounces together: work, its square, and how many rows."""
-        work, rows, push = ti.cast(0, ti.f64), ti.cast(0, ti.f64), bodies.push[i]
-        for row in range(self.rows.own[i], self.rows.end[i]):
-            blow = self.blow.field[row]
-            if blow > 0:
-                work += self.part(row) * blow * self.closing.field[row]
-                rows += 1
-        return ti.Vector([work, bodies.compliance(i) * push.dot(push), rows], ti.f64)
+    def change(self, i, bodies: ti.template()):  # type: ignore[valid-type]
+        """Return how far the impulses of a round move particle i before they are scaled, with what answers [m]."""
+        out = bodies.compliance(i) * bodies.push[i]
+        if ti.static(bool(bodies.answers)):
+            out = bodies.last[i]
+        return out
 
     @ti.func
-    def scale_of(self, work, square, rows):
-        """Return the scale of what bounces together, from its sums."""
-        scale = 2 * rows
-        if rows > 1 and 2 * work < scale * square:
-            scale = 2 * work / square
+    def terms(self, i, bodies: ti.template()):  # type: ignore[valid-type]
+        """Return the part of particle i in the sums over what bounces together: the work of rows, the energy that their impulses
+        take from motion in first order, and twice that which they give in second order.
+
+        The first two are the same at e = 1, unless rows are jammed: then what closes them is an error of second order.
+        """
+        work, taken, given = ti.Vector.zero(ti.f64, 3)
+        for row in range(self.rows.own[i], self.rows.end[i]):
+            work += self.part(row) * self.blow.field[row] * self.closing.field[row]
+        w, change = bodies.compliance(i), self.change(i, bodies)
+        if (change != 0).any():
+            taken = -change.dot(self.thrown[i] + (self.first[i] - 0.5) * self.state.kick(i)) / w
+            given = change.dot(change) / w
+        return ti.Vector([work, taken, given], ti.f64)
+
+    @ti.func
+    def scale_of(self, work, taken, given):
+        """Return the scale of what bounces together, from its sums; 0 where it is jammed."""
+        scale = 0 * work
+        if given > self.rows.rounding * work:
+            scale = 2 * ti.max(ti.min(work, taken), 0) / given
         return scale
 
     @ti.func
     def apply(self, i, turn, scale, bodies: ti.template()):  # type: ignore[valid-type]
         """Let particle i bounce off what it meets in this round."""
-        push = bodies.push[i]
+        change, s = scale * self.change(i, bodies), self.first[i]
         for row in range(self.rows.begin[i], self.rows.end[i]):
             blow = scale * self.blow.field[row]
+            if self.blow.field[row] > 0 and blow == 0:  # bodies are jammed
+                self.time.field[row] = NEVER
             if blow > 0:
-                before, s = self.hit.field[row], self.time.field[row]
+                before, then = self.hit.field[row], self.time.field[row]
                 self.hit.field[row] = before + blow
                 self.rows.normal.field[row] = self.facing.field[row]
                 self.approach.field[row] = ti.max(self.approach.field[row], self.closing.field[row])
                 if before > 0:  # the time of all of them, for what forces do between
-                    s = (before * self.rows.time.field[row] + blow * s) / (before + blow)
-                self.rows.time.field[row] = ti.max(s, ti.static(FEW))
-        if (push != 0).any():
-            change, s = scale * bodies.compliance(i) * push, self.first[i]
+                    then = (before * self.rows.time.field[row] + blow * then) / (before + blow)
+                self.rows.time.field[row] = ti.max(then, ti.static(FEW))
+        if (change != 0).any():
             self.thrown[i] = self.thrown[i] + change
             self.shift[i] = self.shift[i] - s * change
             self.since[i], self.turn[i] = s, turn
-        bodies.push[i] = 0 * push
+        if ti.static(bool(bodies.answers)):
+            bodies.answers.scale(i, scale)
+            bodies.answers.first[i] = NEVER
+        bodies.push[i] = 0 * change
         self.first[i] = NEVER
 
     @ti.func

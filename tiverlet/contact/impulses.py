@@ -363,7 +363,7 @@ class Impulses:
         self.flags[None][TURN] = turn
         most = ti.select(lack > self.numbers[None][LANDING], BOUNCES, PASSES)
         goes_on = turn < most and lack > self.numbers[None][TOLERANCE]
-        if ti.static(self.rows.bounces and (not self.rows.impacts or bool(self.bodies.answers))):  # else rounds have done it
+        if ti.static(self.rows.bounces and not self.rows.impacts):  # else rounds have done it
             if self.flags[None][STRUCK] != 0 and self.total(WRONG) > ti.static(ERROR) * self.total(KINETIC):
                 goes_on = turn < BOUNCES
         self.flags[None][GOING] = ti.cast((goes_on or turn < self.least) and self.total(ROWS) > 0, ti.i32)

@@ -28,6 +28,11 @@ BITS = 40  # of the largest term of a sum, in units: sums of 2^22 terms fit into
 BIAS, MANTISSA, LEAST = 1023, 52, 64  # exponents of f64: of 1, its first bit, and the lowest whose unit is a normal number
 
 
+def serial(team: "Team") -> bool:
+    """Whether one thread finds islands. It needs no atomic operations, which SPIR-V does not have for 64 bits and f32."""
+    return runtime.architecture() not in runtime.LLVM or (team.size == 1 and not team.launched)
+
+
 class Islands:
     """The islands of one world. They are found only where some particle gains more energy than rounding explains.
 
@@ -40,8 +45,7 @@ class Islands:
     def __init__(self, scene: "Scene", rows: "Rows", bodies: "Responses", team: "Team"):
         self.rows, self.bodies, self.real = rows, bodies, scene.real
         self.n, add = scene.count, scene.memory.field
-        # One thread needs no atomic operations, which SPIR-V does not have for 64 bits.
-        self.serial = runtime.architecture() not in runtime.LLVM or (team.size == 1 and not team.launched)
+        self.serial = serial(team)
         self.root = add("Contact.island", scene.count, kind=ti.i32)
         self.sums = add("Contact.island_sums", scene.count, width=3, kind=ti.i64)
         self.largest = rows.spread  # which is free from Rows.find_eigenvalue() on: 12 bytes a particle less
@@ -219,8 +223,6 @@ class Islands:
                 if self.rows.bounce.field[row] > 0:
                     f = self.rows.relative_kick(i, row).dot(n)
                     work += (self.rows.when[i] - 0.5) * self.rows.along(p, n) * f
-                    if ti.static(bool(self.rows.impacts) and bool(self.bodies.answers)):
-                        work += (self.rows.time.field[row] - 0.5) * self.rows.hit(row) * f
         work -= self.rows.work_of_others(i)
         return ti.Vector([work, square, load])
 

@@ -115,16 +115,8 @@ class Responses:
 
     @inline
     def base(self, i):
-        """Return the displacement of particle i before the passes, after impacts in turn [m]."""
+        """Return the displacement of particle i before the passes, after impacts in turn, which keep energy [m]."""
         return at(self.rows.impacts.thrown, i) if self.rows.impacts else at(self.state.d, i)
-
-    @inline
-    def origin(self, i):
-        """Return the displacement of particle i from which impulses may do no work [m].
-
-        Impacts in turn keep energy, so it is that after them; but they take what is held for a particle alone.
-        """
-        return at(self.state.d, i) if self.answers else self.base(i)
 
     @ti.func
     def answer(self, i, p, m):
@@ -135,18 +127,18 @@ class Responses:
         self.new[i] = self.base(i) + w * p
         if ti.static(bool(self.answers)):
             if ti.static(self.answers.answer_later):
-                self.new[i] = self.new[i] + self.answers.held[i]
+                self.new[i] = self.new[i] + self.answers.beyond(i)
         if ti.static(self.spins):
             self.new_s[i] = self.spin.s[i] - (w * self.spin.inverse_inertia.of(i)) * m
 
     @ti.func
     def answer_of_constraints(self, i):
-        """Return how far constraints move particle i in answer to contacts [m]."""
+        """Return how far constraints move particle i in answer to passes over contacts [m]."""
         out = 0 * self.state.d[i]
         if ti.static(bool(self.answers)):
             out += self.compliance(i) * self.answers.links.along(self.answers.links.mu, i)
             if ti.static(self.answers.answer_later):
-                out += self.answers.held[i]
+                out += self.answers.beyond(i)
         return out
 
     @ti.func
@@ -169,7 +161,7 @@ class Responses:
         The work of its impulses is the first and half of the second.
         """
         work, square = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
-        d, w = self.origin(i), self.compliance(i)
+        d, w = self.base(i), self.compliance(i)
         if w > 0:
             change = self.new[i] - d
             work += d.dot(change) / w
@@ -195,7 +187,7 @@ class Responses:
     @ti.func
     def scale(self, i, scale):
         """Multiply the impulses on particle i by a number."""
-        d = self.origin(i)
+        d = self.base(i)
         self.new[i] = d + scale * (self.new[i] - d)
         if ti.static(bool(self.answers)):
             self.answers.scale(i, scale)

@@ -241,6 +241,12 @@ class Rows:
         return out
 
     @ti.func
+    def note_when(self, i, when):
+        """Note that a body, whose lowest particle is i, has its first impact at a time: all that are struck write the same."""
+        if self.when[i] == 0:
+            self.when[i] = ti.max(when, ti.static(FEW))
+
+    @ti.func
     def is_steady(self, change, size, slight):
         """Whether an impulse of this size, which has changed by `change`, is a load. slight: what forces can change.
 

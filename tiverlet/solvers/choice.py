@@ -32,20 +32,21 @@ BODY = 12  # width of rigid bodies with more links than hold them, such as a cub
 MOST_TRIED = 2000  # constraints in a piece up to which it is tried as a beam: refusing a larger net would take long
 
 
-def choose_solver(batches: "list[Batch]", scene: "Scene") -> Solver:
+def choose_solver(batches: "list[Batch]", scene: "Scene", answers: bool) -> Solver:
     """Return the default solver: the one that leaves few stiff constraints to Jacobi.
 
     This is ConjugateGradient if elimination would leave MANY_STIFF or more stiff constraints, in connected pieces of LARGE_PIECE
     or more, such as cloth. Its residual is two thirds of that of Jacobi and Chebyshev at equal time, and an eighth with as many
     substeps. Else it is Direct if pieces are chains, trees, loops or beams: its residual is some 1e-4 of the length of a link,
-    that of Jacobi a tenth. Else it is Jacobi, for few or soft links, and for pieces that start with violated constraints. These
-    may contradict each other; relaxed, they settle on a compromise.
+    that of Jacobi a tenth. Where links `answer` contacts, it is Direct for single links, too, unless they join clusters: they
+    answer after each pass of contacts then. Else it is Jacobi, for few or soft links, and for pieces that start with violated
+    constraints. These may contradict each other; relaxed, they settle on a compromise.
     """
     links = solvable(batches)
     if not links:
         return Jacobi()
     pieces = Pieces(links, scene, [b for b in batches if b.clusters])
-    direct, taken = pieces.choose_direct()
+    direct, taken = pieces.choose_direct(answers)
     if pieces.has_many_stiff(~taken) and all(_may_iterate(b, scene) for b in links):
         return ConjugateGradient(CG_STEPS)
     return direct or Jacobi()
@@ -54,7 +55,7 @@ def choose_solver(batches: "list[Batch]", scene: "Scene") -> Solver:
 def explain_choice(solver: Solver) -> str:
     """Return why choose_solver() has chosen this solver."""
     if isinstance(solver, Direct):
-        return f"links hang together like chains, trees, loops or beams, but for fewer than {MANY_STIFF} stiff ones"
+        return f"links hang together like chains, loops or beams, or touch something, but for fewer than {MANY_STIFF} stiff ones"
     if isinstance(solver, ConjugateGradient):
         return f"links are stiff, at least {MANY_STIFF}, and hang together more closely than elimination takes"
     return "links are few, soft or violated at the start, or there are angles that elimination is not for, or none"
@@ -93,7 +94,7 @@ class Pieces:
         self.acts = np.bincount(self.owner, minlength=self.count) > 0
         held = np.isin(self.item, np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in clusters)]))
         twice = self._any(np.bincount(self.owner, held, self.count) > 0)  # pieces of particles that clusters hold, too
-        self.implied = implied_links(links, scene) & ~twice
+        self.implied, self.shares = implied_links(links, scene) & ~twice, bool(twice.any())
         self.pair = np.concatenate([np.zeros((0, 2), dtype=np.int64), *(b.indices for b in links if b.arity == 2)])
         self.pair_of = np.flatnonzero(np.repeat([b.arity == 2 for b in links], counts))
         self.has_angles = self._any(np.repeat([b.arity > 2 for b in links], counts))
@@ -151,11 +152,12 @@ class Pieces:
         particles = np.bincount([k for k, _ in near], minlength=self.count)
         return np.rint(np.bincount(edges[:, 0], 1 - triangles, self.count) - particles + 1).astype(int)[some]
 
-    def choose_direct(self) -> tuple[Direct | None, np.ndarray]:
+    def choose_direct(self, answers: bool) -> tuple[Direct | None, np.ndarray]:
         """Return Direct with the largest width that is trusted, or None; and a mask of the constraints that it takes, (m,).
 
-        It is None where no width is trusted, or only single links would be taken. Pieces that are wider than CHAIN or have angles
-        must satisfy _is_determinate(), and consist of triangles or of one loop with springs of angles.
+        It is None where no width is trusted, or only single links would be taken, unless they answer contacts. Pieces that are
+        wider than CHAIN or have angles must satisfy _is_determinate(), and consist of triangles or of one loop with springs of
+        angles.
         """
         taken = np.zeros(self.count, dtype=bool)
         longest, needed = np.bincount(self.piece[self.acts], minlength=1).max(), ~self.implied[self.owner]
@@ -174,7 +176,7 @@ class Pieces:
                 taken[found.rows] = True
                 taken |= self.implied & self._any(taken)
                 crowd = np.bincount(self.item[(taken & self.solved)[self.owner]], minlength=1)
-                return (Direct(max([CHAIN, *found.widths])) if crowd.max() > 1 else None), taken
+                return (Direct(max([CHAIN, *found.widths])) if (answers and not self.shares) or crowd.max() > 1 else None), taken
         return None, taken
 
     def has_many_stiff(self, some: np.ndarray) -> bool:

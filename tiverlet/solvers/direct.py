@@ -156,7 +156,9 @@ class Elimination(System):
         if self.answers:
             self.slots = slots
             self.answer, self.change, self.solution, self.gap = (reals(k) for k in ("answer", "change", "solution", "gap"))
-            self.added = scene.memory.field("system.added", found.parts, kind=ti.f64)
+            self.added, self.turned_to = (
+                scene.memory.field(f"system.{k}", found.parts, kind=ti.f64) for k in ("added", "turned_to")
+            )
             inside = self.row_slots(scalars, slots)
             self.corner_begin = ints("corner_begin", np.searchsorted(inside[:, 0], np.arange(len(rows) + 1)))
             self.corner = ints("corner", inside[:, 1])
@@ -392,20 +394,27 @@ class Elimination(System):
         return self.particle_of[self.corner[q]]
 
     @ti.func
-    def begin_answer(self, b, rows: ti.template()):  # type: ignore[valid-type]
-        """Before contacts are solved: part b has answered nothing. After an impact, directions are those at its time."""
-        when = ti.cast(0, self.real)
-        for q in range(self.corner_begin[self.part_begin[b]], self.corner_begin[self.part_begin[b + 1]]):
-            when = ti.max(when, rows.when_of(self.corner_particle(q)))
+    def begin_answer(self, b):
+        """Before contacts are solved: part b has answered nothing, and has its directions at the start of the substep."""
+        self.turned_to[b] = 0
         for r in range(self.part_begin[b], self.part_begin[b + 1]):
             self.answer[r], self.solution[r], self.gap[r] = 0, self.lam[r] + self.step[r], 0
             if ti.static(self.one_sided):
                 if self.side[r] != 0:
                     self.gap[r] = self.violation[r] + self.remaining[r] + self.alpha[r] * self.step[r]
-        if when > 0:
+
+    @ti.func
+    def turn_answer(self, b, rows: ti.template()):  # type: ignore[valid-type]
+        """Turn the directions of part b to those at the time of its impact."""
+        when, before = ti.cast(0, self.real), ti.cast(self.turned_to[b], self.real)
+        for q in range(self.corner_begin[self.part_begin[b]], self.corner_begin[self.part_begin[b + 1]]):
+            when = ti.max(when, rows.when_of(self.corner_particle(q)))
+        if when != before:
+            turn = (when - before) / ti.max(1 - before, ti.static(2.0**-10))
+            self.turned_to[b] = when
             for q in range(self.corner_begin[self.part_begin[b]], self.corner_begin[self.part_begin[b + 1]]):
                 s = self.corner[q]
-                self.move[s] = self.move[s] + when * (self.move_at_end(s) - self.move[s])
+                self.move[s] = self.move[s] + turn * (self.move_at_end(s) - self.move[s])
             self.assemble(self.part_begin[b], self.part_begin[b + 1], self.added[b], 0)
             self.eliminate(self.part_begin[b], self.part_begin[b + 1])
 

@@ -112,6 +112,11 @@ class Slots:
         """Return the mass in the body of each constraint that rounding of positions moves, (m,) [kg], see Strength."""
         return self._rounding_masses[self.body(batch)]
 
+    @property
+    def exact_answers(self) -> bool:
+        """Whether no particle belongs to several blocks, so that one answer of each to an impulse is exact."""
+        return bool((self._blocks <= 1).all())
+
     def soften(self, memory: Memory, inv_mass: np.ndarray, batches: list[Batch], softness: float) -> None:
         """Make constraints hold their loads by violations `softness` times as large as those of the solver.
 

@@ -161,7 +161,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     surfaces = [*walls, *([contact] if contact else [])]
     has_friction, bounces = any(f.has_friction for f in surfaces), any(f.has_restitution for f in surfaces)
     scene.bounces = bounces and bool(walls)
-    solver = solver or (choose_solver(batches, scene) if scene.order == 2 else Direct())
+    solver = solver or (choose_solver(batches, scene, rows) if scene.order == 2 else Direct())
     if (batches and solver.loads) or (contact and contact.has_loads):
         scene.own_weight = OwnWeight(scene)
     if batches:

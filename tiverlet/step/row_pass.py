@@ -143,6 +143,8 @@ class RowPass:
             for _ in range(self.team.one(1, now.thread)):
                 self.impulses.check_hits()
             self.team.wait()
+        if ti.static(self.in_turn):
+            self.begin_answers(now)
 
     @ti.func
     def strike(self, thread):
@@ -153,23 +155,56 @@ class RowPass:
                 for i in range(begin, end):
                     self.impacts.look(i, part, self.impulses.flags[None][TURN])
         self.team.wait()
-        self.relax_rows(thread, OF_ROUND)
         n = self.n * self.going()
+        self.look_at_bodies(thread, n)
+        self.relax_rows(thread, OF_ROUND)
+        self.answer_round(thread, n)
         self.add_up(thread, OF_ROUND)
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread) * self.going()):
             self.impulses.decide_round()
         self.team.wait()
-        shared = self.impulses.flags[None][GAINS]
+        shared = 1 if ti.static(self.answers_later) else self.impulses.flags[None][GAINS]
         self.find_islands(thread, n * shared, BOUNCING)
         self.find_scales(thread, n * shared, self.impulses.blocks * ti.cast(n > 0, ti.i32) * shared, BOUNCING)
         ti.loop_config(serialize=self.islands.serial)
         for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
             scale = ti.cast(2, self.real)
-            if self.impulses.flags[None][GAINS] != 0:
+            if shared != 0:
                 scale = self.islands.scale[self.islands.root_of(i)]
             self.impacts.apply(i, self.impulses.flags[None][TURN], scale, self.bodies)
         self.team.wait()
+
+    @ti.func
+    def look_at_bodies(self, thread, n):
+        """Let the first impact of a body be that of all of its particles."""
+        if ti.static(bool(self.answers)):
+            ti.loop_config(serialize=self.islands.serial)
+            for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                self.answers.note_first(i, self.impacts.first[i])
+            self.team.wait()
+            for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                self.impacts.first[i] = self.answers.first[self.answers.body[i]]
+            self.team.wait()
+
+    @ti.func
+    def answer_round(self, thread, n):
+        """Let bodies answer the impulses of a round of impacts, before these are scaled."""
+        if ti.static(self.answers_later):
+            for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                self.answers.keep(i)
+                self.bodies.new[i] = self.impacts.thrown[i] + self.bodies.compliance(i) * self.bodies.push[i]
+                if (self.bodies.push[i] != 0).any():
+                    self.rows.note_when(self.answers.body[i], self.impacts.first[i])
+            self.team.wait()
+            for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                self.rows.when[i] = self.rows.when[self.answers.body[i]]
+            self.team.wait()
+            self.turn_answers(thread)
+            self.move_answers(thread, self.going(), True)
+            for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                self.bodies.last[i] = self.bodies.new[i] + self.answers.hold(i) - self.impacts.thrown[i]
+            self.team.wait()
 
     @called
     @ti.func
@@ -183,7 +218,9 @@ class RowPass:
         """Begin the passes of stage 1."""
         if ti.static(self.rows.bounces):
             self.aim(now.thread)
-        self.begin_answers(now)
+        if ti.static(not self.in_turn):
+            self.begin_answers(now)
+        self.turn_answers(now.thread)
         for k in range(self.particles.piece_count(now.thread)):
             begin, end = self.particles.piece(k, now.thread)
             for part in range(self.rows.parts(), OWN + 1):
@@ -211,14 +248,28 @@ class RowPass:
                 fresh = RESTARTED
             for system in ti.static(self.answers.systems):
                 for b in range(self.team.chunk_begin(system.parts, now.thread), self.team.chunk_end(system.parts, now.thread)):
-                    system.begin_answer(b, self.rows)
+                    system.begin_answer(b)
             for f in ti.static(self.answers.alone):
                 for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                     f.dev.begin_answer(c, now.h, h2_effective, fresh, self.bodies)
             self.team.wait()
+            if ti.static(self.in_turn):
+                self.turn_answers(now.thread)
             for f, first in ti.static(self.linked):
                 for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                     self.answers.links.prepare(f, c, first.now + c, now.h, h2_effective, share, fresh, self.bodies)
+            self.team.wait()
+
+    @ti.func
+    def turn_answers(self, thread):
+        """Let systems and clusters answer from where they are at the time of an impact."""
+        if ti.static(bool(self.answers)):
+            for system in ti.static(self.answers.systems):
+                for b in range(self.team.chunk_begin(system.parts, thread), self.team.chunk_end(system.parts, thread)):
+                    system.turn_answer(b, self.rows)
+            for f in ti.static(self.answers.alone):
+                for c in range(self.team.chunk_begin(f.count, thread), self.team.chunk_end(f.count, thread)):
+                    f.dev.turn_answer(c, self.bodies)
             self.team.wait()
 
     @ti.func
@@ -268,6 +319,8 @@ class RowPass:
         if ti.static(self.in_turn):
             for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                 self.impacts.settle(i)
+                if ti.static(self.answers_later):
+                    self.answers.keep(i)
             self.team.wait()
         self.find_islands(thread, n, ALL)
         ti.loop_config(serialize=self.islands.serial)
@@ -289,7 +342,7 @@ class RowPass:
         for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
             self.islands.join(i, which)
         self.team.wait()
-        if ti.static(bool(self.answers) and which != BOUNCING):
+        if ti.static(bool(self.answers)):
             bodies = self.answers.n * ti.cast(n > 0, ti.i32)
             ti.loop_config(serialize=self.islands.serial)
             for c in range(self.team.chunk_begin(bodies, thread), self.team.chunk_end(bodies, thread)):

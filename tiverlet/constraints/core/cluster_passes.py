@@ -253,10 +253,21 @@ class ClusterPasses(Passes):
 
     @ti.func
     def begin_answer(self, c, h, h2_effective, fresh, bodies: ti.template()):  # type: ignore[valid-type]
-        """Find how cluster c moves as a rigid body, at the start of the substep or at the time of an impact.
+        """Store the law of cluster c in this substep. Without shared particles, all rows that press on it share its mass."""
+        begin, end, n = self.corners.starts[c], self.corners.starts[c + 1], ti.static(self.state.dim)
+        rigid, soft, _now, _last, alpha_prime = self.law(c, h, h2_effective, fresh)
+        self.answering[c][n + n * n], self.answering[c][n + n * n + 1] = rigid + soft, alpha_prime
+        if self.is_body(c) and self.strength.is_intact(c) and self.mass[c] > 0:
+            share, eigenvalue = 0 * rigid, 0 * rigid
+            for e in range(begin, end):
+                share += bodies.rows.share[self.corners.members[e]]
+                eigenvalue += bodies.rows.eigenvalue[self.corners.members[e]]
+            for e in range(begin, end):
+                bodies.rows.share[self.corners.members[e]], bodies.rows.eigenvalue[self.corners.members[e]] = share, eigenvalue
 
-        A cluster that shares no particle divides its mass among all rows that press on it.
-        """
+    @ti.func
+    def turn_answer(self, c, bodies: ti.template()):  # type: ignore[valid-type]
+        """Find how cluster c moves as a rigid body, at the start of the substep or at the time of an impact."""
         begin, end, i0 = self.corners.starts[c], self.corners.starts[c + 1], self.corners.reference_particle(c)
         n = ti.static(self.state.dim)
         total, middle, own = ti.cast(0, ti.f64), self.zero_vector(), self.is_body(c) and self.strength.is_intact(c)
@@ -269,25 +280,19 @@ class ClusterPasses(Passes):
             S += m * r.outer_product(r)
         middle /= total
         S -= total * middle.outer_product(middle)
-        rigid, soft, _now, _last, alpha_prime = self.law(c, h, h2_effective, fresh)
         for j in ti.static(range(n)):
             self.answering[c][j] = middle[j]
             for k in ti.static(range(n)):
                 self.answering[c][n + n * j + k] = S[j, k]
-        self.answering[c][n + n * n], self.answering[c][n + n * n + 1] = rigid + soft, alpha_prime
         self.answering[c][n + n * n + 2], self.answering[c][n + n * n + 3] = total, back
         if own and self.mass[c] > 0:
-            share, eigenvalue = 0 * rigid, 0 * rigid
-            for e in range(begin, end):
-                share += bodies.rows.share[self.corners.members[e]]
-                eigenvalue += bodies.rows.eigenvalue[self.corners.members[e]]
-            give = alpha_prime / (rigid + soft + alpha_prime)
+            A, alpha = self.answering[c][n + n * n], self.answering[c][n + n * n + 1]
+            give = alpha / (A + alpha)
             for e in range(begin, end):
                 i, r = self.corners.members[e], self.relative_position(e, i0, back) - middle
                 w = self.w.of(i)
                 body = ti.cast(1 / total + rotation.turning_compliance(S, r), self.real)
                 bodies.answers.mobility[i] = give * w + (1 - give) * ti.min(body, w)
-                bodies.rows.share[i], bodies.rows.eigenvalue[i] = share, eigenvalue
 
     @ti.func
     def answer(self, c, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]

@@ -62,6 +62,10 @@ class Passes:
         """Before contacts are solved, where constraint c answers their impulses by itself: prepare for that."""
 
     @ti.func
+    def turn_answer(self, c, bodies: ti.template()):  # type: ignore[valid-type]
+        """Answer from where constraint c is at the time of an impact, or at the start of the substep without one."""
+
+    @ti.func
     def answer(self, c, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]
         """Answer moves of its corners by impulses of contacts, `moved` - d: add to Slots.answer how far it moves them."""
 
