@@ -146,6 +146,18 @@ def test_places_move_bodies_by_what_overlaps_and_not_by_what_impulses_gave(kind)
         assert (up > 0).all() and (up < over + BEYOND * SLOP * 0.1).all(), up
 
 
+@pytest.mark.parametrize("kind", ["eliminated", "clusters"])
+def test_what_is_placed_between_linked_discs_parts_without_speed(kind):
+    # Overlap stores no energy: discs part by moves alone. A cluster is as rigid as its polar decomposition, to 1e-3 of a move.
+    links, solver = KINDS[kind][0]([(0, 1)]), KINDS[kind][1]
+    start = tv.Particles([(-0.15, 0.0), (0.15, 0.0), (0.0, 0.05)], radius=0.1)
+    w = tv.World(start, [links, tv.Contact()], substeps=8, precision="f64", solver=solver)
+    for _ in range(60):
+        w.step(1 / 60)
+        assert np.abs(w.velocity).max() < 1e-4
+    assert w.last.overlap < 2 * BEYOND * SLOP
+
+
 def test_rope_bears_discs_without_a_stretch():
     """Discs on a rope between two pins, 8 substeps: links keep their length, and after the landing energy falls."""
     across = np.linspace(-1.0, 1.0, 21)

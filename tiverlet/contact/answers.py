@@ -5,7 +5,7 @@
 - By themselves: rigid and soft clusters, and particles that are drawn to a place (Passes.answer()).
 
 The last two write the sum of their answers to Slots.answer after each pass. An answer is a projection in the metric of masses,
-and raises no eigenvalue of a pass.
+and raises no eigenvalue of a pass. Where one of each is exact, rounds of impacts have answers of their own, see impacts.py.
 """
 
 from typing import TYPE_CHECKING, Any

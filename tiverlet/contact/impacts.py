@@ -1,16 +1,20 @@
 """Impacts that pass on from particle to particle, as in Newton's cradle, for pairs and walls that are nearly elastic.
 
 They come before the passes of stage 1, in rounds. In a round, each row finds when it meets next. Rows that come before all others
-of both of their particles bounce, at the same time where they share particles, and what they throw may meet something in the next
-round. A row that was open bounces at its restitution e. One that touched passes everything on, and keeps the part e of what
-separates it after all rounds: the mean of elastic and plastic impact with the weights e and 1 - e (Smith et al. 2012, Reflections
-on simultaneous impact).
+of both of their bodies bounce, at the same time where they share bodies, and what they throw may meet something in the next
+round. A body is a particle, or all that constraints connect. A row that was open bounces at its restitution e. One that touched
+passes everything on, and keeps the part e of what separates it after all rounds: the mean of elastic and plastic impact with the
+weights e and 1 - e (Smith et al. 2012, Reflections on simultaneous impact).
 
-Rows that bounce at the same time and share particles get impulses s p, p = (1 + e) / 2 c m with their closing speeds c and their
-own masses m, and the s for which energy is kept at e = 1: s = 2 sum (1 + e) / 2 p c / sum w (sum p n)^2. For a row alone s = 2.
+Rows that bounce at the same time and share bodies get impulses s p, p = (1 + e) / 2 c m with their closing speeds c and the
+masses m of their particles. With the changes u that the impulses p and the answers of bodies make, at the time of the impact,
 
-The passes begin at the displacements that these impulses give, and aim at them. They find what rests, friction, and what links
-answer, and may take back what impulses gave too much of.
+    s = 2 sum (1 + e) / 2 p c / sum m u^2,
+
+for which energy is kept at e = 1. For free particles alone s = 2, and more where they are part of something heavier.
+
+The passes begin at the displacements that these impulses give, and aim at them. They find what rests and friction, and may take
+back what impulses gave too much of.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -32,8 +36,8 @@ class Impacts:
     from its center, or the normal of a plane; `time` of the next impact, a part of the substep, or NEVER; `facing` the normal
     then; `closing` the approach [m]; `blow` the impulse of a round before it is scaled, and `hit` the sum of all [kg m];
     `approach` the largest [m]; `belt` how far the surface of a wall moves along itself [m].
-    By particle: `thrown` the displacement after impacts, and `shift` what is added to its start so that this leads to where it
-    is [m]; `since` the time of the last impact, `first` that of the next, `turn` the round of the last, 0 without one.
+    By particle: `thrown` the displacement after impacts and answers, and `shift` what is added to its start so that this leads to
+    where it is [m]; `since` the time of the last impact, `first` that of the next, `turn` the round of the last, 0 without one.
     """
 
     def __init__(self, scene: "Scene", rows: "Rows"):
