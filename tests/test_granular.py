@@ -16,7 +16,7 @@ def test_gas_of_discs():
 @pytest.mark.slow
 def test_gas_of_spheres():
     # R23: Z = (1 + phi + phi^2 - phi^3) / (1 - phi)^3; R24: 5/3.
-    figures = granular.gas(980, 3, 0.3, 0.01, 60.0)
+    figures = granular.gas(980, 3, 0.3, 0.01, 120.0)
     assert figures["pressure"] == pytest.approx(1, abs=0.03)
     assert figures["moment"] == pytest.approx(1, abs=0.02)
 

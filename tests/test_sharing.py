@@ -320,6 +320,15 @@ def test_worlds_of_many_kinds_take_few_trees(world, monkeypatch):
     assert runtime.trees - trees == made
 
 
+@pytest.mark.parametrize("width, length, most", [(0, 3, 511), (3, 3, 255), (0, 0, 511), (3, 0, 170)])
+def test_a_tree_holds_as_many_fields_as_taichi_has_nodes_for(world, width, length, most):
+    # 1024 nodes with the root. Where one more was tried, Taichi left its runtime in pieces, and the process ended later.
+    declared = layout.Declared(ti.f32, width, length, False)
+    layout.Layout((declared,) * most).destroy()
+    with pytest.raises(ValueError, match="1024"):
+        layout.Layout((declared,) * (most + 1))
+
+
 @pytest.mark.slow
 def test_many_worlds_one_after_the_other_take_no_more_than_a_few():
     # Whether they are closed or garbage-collected; more than the 511 trees that Taichi has would end the process.

@@ -250,8 +250,11 @@ def _shared(need: Counter[Kind], length: int, held: list[Layout]) -> Layout:
 
 
 def _nodes(want: Counter[Kind]) -> int:
-    """Return how many nodes so many fields of each kind have: one for each component, and one for many elements."""
-    return sum(number * (many + max(1, width)) for (_, width, many), number in want.items())
+    """Return how many nodes so many fields of each kind have.
+
+    Each component has one, and many elements have one more. Components of a single element have one more each.
+    """
+    return sum(number * (1 + max(1, width) if many else 2 * max(1, width)) for (_, width, many), number in want.items())
 
 
 def _room(want: Counter[Kind], length: int) -> int:

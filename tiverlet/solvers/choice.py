@@ -99,7 +99,7 @@ class Pieces:
         self.pair_of = np.flatnonzero(np.repeat([b.arity == 2 for b in links], counts))
         self.has_angles = self._any(np.repeat([b.arity > 2 for b in links], counts))
         off = np.concatenate([_is_violated(b) for b in links])
-        self.can_eliminate = not off.any() and all(_may_eliminate(b, scene) for b in links)
+        self.may_eliminate, self.is_off = all(_may_eliminate(b, scene) for b in links), bool(off.any())
         degree = np.bincount(np.concatenate([b.indices.ravel() for b in links]), minlength=len(w))
         self.solved = self.acts & ~np.concatenate([b.relaxed_alone(scene) for b in links])
         stiff = np.concatenate([_stiff(b, degree * w) for b in links]) & self.solved
@@ -160,8 +160,12 @@ class Pieces:
         angles.
         """
         taken = np.zeros(self.count, dtype=bool)
+        if np.bincount(self.item[self.solved[self.owner]], minlength=1).max() <= 1:  # which cannot contradict each other
+            return Direct(CHAIN) if answers and self.may_eliminate and not self.shares else None, self.solved
+        if self.is_off or not self.may_eliminate:
+            return None, taken
         longest, needed = np.bincount(self.piece[self.acts], minlength=1).max(), ~self.implied[self.owner]
-        for width in ((CHAIN,) if longest > MOST_TRIED else (BODY, RING, BEAM, CHAIN)) if self.can_eliminate else ():
+        for width in (CHAIN,) if longest > MOST_TRIED else (BODY, RING, BEAM, CHAIN):
             found = plan(self.count, self.owner[needed], self.item[needed], width)
             first = found.rows[found.part_begin[:-1]]
             widths = np.array(found.widths, dtype=int)
@@ -176,7 +180,7 @@ class Pieces:
                 taken[found.rows] = True
                 taken |= self.implied & self._any(taken)
                 crowd = np.bincount(self.item[(taken & self.solved)[self.owner]], minlength=1)
-                return (Direct(max([CHAIN, *found.widths])) if (answers and not self.shares) or crowd.max() > 1 else None), taken
+                return (Direct(max([CHAIN, *found.widths])) if crowd.max() > 1 else None), taken
         return None, taken
 
     def has_many_stiff(self, some: np.ndarray) -> bool:
