@@ -301,6 +301,7 @@ class RowPass:
             for f in ti.static(self.in_systems):
                 for c in range(self.team.chunk_begin(f.count, thread), self.team.chunk_end(f.count, thread)):
                     f.dev.end_answer(c, self.rows)
+            self.team.wait()
             for system in ti.static(self.answers.systems):
                 for b in range(self.team.chunk_begin(system.parts, thread), self.team.chunk_end(system.parts, thread)):
                     system.end_answer(b, self.bodies.new, self.state.d)
