@@ -108,17 +108,6 @@ def test_discs_that_fly_together_keep_their_momentum_and_gain_no_energy(world):
     assert energy[-1] < 0.3 * energy[0] and np.diff(energy).max() < 1e-3 * energy[0]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("e", [0.0, 0.5])
-def test_the_same_bits_on_all_paths_and_with_other_lists(world, e):
-    out = []
-    for more in ({"path": "fused"}, {"path": "parallel"}, {"path": "launched"}, {"skin": 0.2}):
-        w = dropped(world, lattice(6, 5), 0.3, friction=0.4, pair=e, wall=e, substeps=4, **more)
-        w.run(0.8)
-        out.append(np.concatenate([w.position, w.velocity]))
-    assert all((one == out[0]).all() for one in out)
-
-
 @pytest.mark.parametrize(
     "counts, pair, wall, more",
     [
