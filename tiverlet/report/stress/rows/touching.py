@@ -220,13 +220,15 @@ def _drawn_through() -> Finding:
     return Finding(", ".join(holds), holds)
 
 
-@row(83, "skins of 0.01 ... 2 contact distances, discs with soft links", "the same bits")
+@row(
+    83, "skins of 0.01 ... 2 contact distances, discs with soft links", "the same bits, as nothing moves past a disc in a substep"
+)
 def _skins() -> Finding:
     n, rng = 60, np.random.default_rng(3)
     start = Particles(rng.uniform(-2, 2, (n, 2)), velocity=rng.normal(size=(n, 2)) * 4, radius=0.1)
     rest, made = rng.uniform(0.2, 1.5, n // 2), []
     for skin in (0.002, 0.05, 0.4):
-        features = [Gravity(9.81), Distance(np.arange(n).reshape(-1, 2), rest, compliance=1e-4), Contact(skin=skin)]
+        features = [Gravity(9.81), Distance(np.arange(n).reshape(-1, 2), rest, compliance=3e-3), Contact(skin=skin)]
         with world(start, [*features, Box((-2.2, -2.2), (2.2, 2.2))], substeps=4) as w:
             w.run(1.0)
             made.append((w.hash(), w.last.overlap))
