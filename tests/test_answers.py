@@ -69,6 +69,20 @@ def test_thrown_bodies_never_gain_energy(kind, dim, restitution, friction):
         assert last < 0.7 * first
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "dim"), [("eliminated", 2), ("eliminated", 3), ("clusters", 2), ("clusters", 3)])
+def test_elastic_bodies_keep_their_energy(kind, dim):
+    """E_n = E_0 at e = 1 without friction, but for the turn of bodies within a substep, of second order: 8e-5 at 20 substeps.
+
+    Taken for free particles in rounds of impacts, links lost 2 %, and hooked crosses exploded.
+    """
+    world = _thrown(kind, dim, 1.0, 0.0, 20, "f64")
+    first = _energy(world)
+    for _ in range(180):
+        world.step(1 / 60)
+        assert abs(_energy(world) / first - 1) < 1e-3
+
+
 @pytest.mark.parametrize("kind", ["eliminated", "relaxed", "clusters"])
 def test_boxes_land_and_rest_without_strain(kind):
     """Boxes of four discs fall on each other. At rest they bear their loads without giving way: links are not springs."""
