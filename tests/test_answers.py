@@ -83,6 +83,25 @@ def test_elastic_bodies_keep_their_energy(kind, dim):
         assert abs(_energy(world) / first - 1) < 1e-3
 
 
+def test_what_is_added_belongs_to_no_body():
+    # A rod turns and strikes a floor, and two discs strike each other earlier in the same substep: to the bit as if they had been
+    # there from the start. Bodies answer in the directions at the time of their own first impact.
+    rod, discs = [(0.0, 0.103), (0.4, 0.2)], [(2.0, 2.0), (2.2001, 2.0)]
+    v = np.array([(0.0, -1.0), (0.0, 3.0), (1.0, 0.0), (0.0, 0.0)])
+
+    def made(x, v):
+        features = [tv.Distance([(0, 1)]), tv.Contact(restitution=1.0), tv.HalfSpace((0, 1), 0, restitution=1.0)]
+        start = tv.Particles(x, velocity=v, radius=0.1)
+        return tv.World(start, features, substeps=4, precision="f64", solver=tv.Direct())
+
+    whole, grown = made(rod + discs, v), made(rod, v[:2])
+    grown.add(particles=tv.Particles(discs, velocity=v[2:], radius=0.1))
+    for _ in range(4):
+        whole.step(1 / 60)
+        grown.step(1 / 60)
+    np.testing.assert_array_equal(grown.position, whole.position)
+
+
 @pytest.mark.parametrize("kind", ["eliminated", "relaxed", "clusters"])
 def test_boxes_land_and_rest_without_strain(kind):
     """Boxes of four discs fall on each other. At rest they bear their loads without giving way: links are not springs."""

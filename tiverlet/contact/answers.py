@@ -8,14 +8,12 @@ The last two write the sum of their answers to Slots.answer after each pass. An 
 and raises no eigenvalue of a pass. Where one of each is exact, rounds of impacts have answers of their own, see impacts.py.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..device import ti
-from ..device.number import OnDevice
 from ..solvers.corners import bodies_of, corners_of
-from .limits import NEVER
 from .links import Links
 
 if TYPE_CHECKING:
@@ -38,16 +36,14 @@ class Answers:
     """The constraints of one world that answer contacts.
 
     held: how far the answers of systems, clusters and places move each particle [m]. mobility: where clusters are, by how much a
-    unit impulse moves each particle at most [1/kg]. begin, particle: the particles that each constraint connects.
+    unit impulse moves each particle at most [1/kg]. below: how many numbers below each particle the first one of its body is,
+    which constraints connect with it; 0 for particles that come later.
 
-    Of rounds of impacts: body: the lowest particle that constraints connect with each one. first: the first impact of the
-    body of each such particle. before: the answers before a round, of slots and rows of systems; given: how far all rounds
-    have moved each particle by answers [m].
+    Of rounds of impacts: before: the answers before a round, of slots and rows of systems; given: how far all rounds have moved
+    each particle by answers [m].
     """
 
-    n: Any = OnDevice()
-
-    def __init__(self, scene: "Scene", batches: "list[Batch]", rows: "Rows", serial: bool):
+    def __init__(self, scene: "Scene", batches: "list[Batch]", rows: "Rows"):
         slots, add, count, dim = scene.slots, scene.memory.field, scene.count, scene.particles.dim
         self.state, self.slots, self.batches = scene.state, slots, batches
         self.links = Links(scene, batches, rows)
@@ -59,41 +55,23 @@ class Answers:
             self.held, self.nothing = add("answers.held", count, width=dim), add("answers.nothing", count, width=dim)
         if self.has_clusters:
             self.mobility = add("answers.mobility", count)
-        self.n = scene.memory.number(sum(b.count for b in batches))
-        begin, particle = self._tables(scene.inv_mass)
-        self.begin = add("answers.begin", len(begin), kind=ti.i32, values=begin)
-        self.particle = add("answers.particle", len(particle), kind=ti.i32, values=particle)
-        self.in_turn, self.serial = bool(rows.impacts), serial
+        self.below = add("answers.below", count, kind=ti.i32, values=self._below(scene.inv_mass))
+        self.in_turn = bool(rows.impacts)
         if self.in_turn:
-            self.body = add("answers.body", count, kind=ti.i32, values=self._bodies(scene.inv_mass))
-            self.first, self.given = add("answers.first_impact", count), add("answers.given", count, width=dim)
+            self.given = add("answers.given", count, width=dim)
             self.before = add("answers.before", slots.total, width=dim)
             self.before_row = add("answers.before_row", slots.system.rows if self.systems else 1, kind=ti.f64)
 
-    def _tables(self, inv_mass: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return where the movable particles of each constraint begin, and these particles."""
-        owner, item = corners_of(self.batches)
-        movable = inv_mass[item] > 0
+    def _below(self, inv_mass: np.ndarray) -> np.ndarray:
+        """Return `below`, (n,)."""
         count = sum(b.count for b in self.batches)
-        return np.searchsorted(owner[movable], np.arange(count + 1)), item[movable]
-
-    def _bodies(self, inv_mass: np.ndarray) -> np.ndarray:
-        """Return the lowest particle of the body of each particle, itself if no constraint moves it."""
-        owner, item = corners_of(self.batches)
-        label = bodies_of(sum(b.count for b in self.batches), owner, item, inv_mass)[1]
-        each = np.arange(len(label))
-        lowest = np.full(len(label) + 1 + label.max(initial=0), len(label))
-        np.minimum.at(lowest, label, each)
-        alone = label == sum(b.count for b in self.batches)
-        return np.where(alone, each, lowest[label])
+        label = bodies_of(count, *corners_of(self.batches), inv_mass)[1]
+        _labels, first, where = np.unique(label, return_index=True, return_inverse=True)
+        return np.where(label < count, np.arange(len(label)) - first[where], 0)
 
     def reassign(self, memory: "Memory", inv_mass: np.ndarray) -> None:
         """Follow constraints that moved to other particles, as many of which can move as before."""
-        begin, particle = self._tables(inv_mass)
-        memory.write(self.begin, begin)
-        memory.write(self.particle, particle)
-        if self.in_turn:
-            memory.write(self.body, self._bodies(inv_mass))
+        memory.write(self.below, self._below(inv_mass))
         self.links.reassign(memory, len(inv_mass))
 
     @ti.func
@@ -104,18 +82,14 @@ class Answers:
             for s in range(self.slots.begin[i], self.slots.begin[i + 1]):
                 self.slots.answer[s] = 0 * self.state.d[i]
         if ti.static(self.in_turn):
-            self.given[i], self.first[i] = 0 * self.state.d[i], NEVER
+            self.given[i] = 0 * self.state.d[i]
         if ti.static(self.has_clusters):
             self.mobility[i] = self.state.w.of(i)
 
     @ti.func
-    def note_first(self, i, time):
-        """Note that particle i has its first impact at a time, for its body."""
-        body = self.body[i]
-        if ti.static(self.serial):
-            self.first[body] = ti.min(self.first[body], time)
-        else:
-            ti.atomic_min(self.first[body], time)
+    def body(self, i):
+        """Return the first particle of the body of particle i."""
+        return i - self.below[i]
 
     @ti.func
     def holds(self, i):
@@ -148,10 +122,9 @@ class Answers:
             self.before[s] = self.slots.answer[s]
         for system in ti.static(self.systems):
             for s in range(self.slots.begin[i], self.slots.begin[i + 1]):
-                r = system.row_of[s]
+                r = system.row_that_begins(s)
                 if r >= 0:
-                    if system.corner[system.corner_begin[r]] == s:
-                        self.before_row[r] = system.answer[r]
+                    self.before_row[r] = system.answer[r]
 
     @ti.func
     def scale(self, i, scale):
@@ -167,13 +140,12 @@ class Answers:
                     self.links.mu[r] = scale * self.links.mu[r]
         for system in ti.static(self.systems):
             for s in range(self.slots.begin[i], self.slots.begin[i + 1]):
-                r = system.row_of[s]
+                r = system.row_that_begins(s)
                 if r >= 0:
-                    if system.corner[system.corner_begin[r]] == s:
-                        before = 0 * system.answer[r]
-                        if ti.static(self.in_turn):
-                            before = self.before_row[r]
-                        system.answer[r] = before + scale * (system.answer[r] - before)
+                    before = 0 * system.answer[r]
+                    if ti.static(self.in_turn):
+                        before = self.before_row[r]
+                    system.answer[r] = before + scale * (system.answer[r] - before)
         if ti.static(self.in_turn):
             self.held[i] = self.given[i] + scale * (self.held[i] - self.given[i])
         elif ti.static(self.answer_later):

@@ -19,7 +19,7 @@ from .answers import Answers, answer_at_once
 from .events import EventLog
 from .exclusions import excluded_pairs
 from .impulses import Impulses
-from .islands import Islands, serial
+from .islands import Islands
 from .limits import AHEAD, CRADLE, THROWN
 from .narrow_phase import DiscGeometry
 from .pair_contact import PairContact
@@ -123,7 +123,7 @@ class Contact(PairContact):
         turns = scene.state.spins and friction and (dev.turns or any(w.turns for w in self.walls))
         in_turn = self.in_turn and answer_at_once(scene, batches)
         dev.rows = Rows(scene, self.table, friction, bounces, in_turn, turns, scene.walls, team, self.push_out, self._ahead)
-        dev.answers = Answers(scene, batches, dev.rows, serial(team)) if batches else None
+        dev.answers = Answers(scene, batches, dev.rows) if batches else None
         dev.responses = Responses(scene, dev.rows, scene.state.spins and friction, dev.answers)
         dev.islands = Islands(scene, dev.rows, dev.responses, team)
         dev.impulses = Impulses(scene, dev.rows, dev.responses, team)

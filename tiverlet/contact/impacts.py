@@ -274,7 +274,6 @@ class Impacts:
             self.since[i], self.turn[i] = s, turn
         if ti.static(bool(bodies.answers)):
             bodies.answers.scale(i, scale)
-            bodies.answers.first[i] = NEVER
         bodies.push[i] = 0 * change
         self.first[i] = NEVER
 

@@ -28,11 +28,6 @@ BITS = 40  # of the largest term of a sum, in units: sums of 2^22 terms fit into
 BIAS, MANTISSA, LEAST = 1023, 52, 64  # exponents of f64: of 1, its first bit, and the lowest whose unit is a normal number
 
 
-def serial(team: "Team") -> bool:
-    """Whether one thread finds islands. It needs no atomic operations, which SPIR-V does not have for 64 bits and f32."""
-    return runtime.architecture() not in runtime.LLVM or (team.size == 1 and not team.launched)
-
-
 class Islands:
     """The islands of one world. They are found only where some particle gains more energy than rounding explains.
 
@@ -45,7 +40,8 @@ class Islands:
     def __init__(self, scene: "Scene", rows: "Rows", bodies: "Responses", team: "Team"):
         self.rows, self.bodies, self.real = rows, bodies, scene.real
         self.n, add = scene.count, scene.memory.field
-        self.serial = serial(team)
+        # One thread needs no atomic operations, which SPIR-V does not have for 64 bits and f32.
+        self.serial = runtime.architecture() not in runtime.LLVM or (team.size == 1 and not team.launched)
         self.root = add("Contact.island", scene.count, kind=ti.i32)
         self.sums = add("Contact.island_sums", scene.count, width=3, kind=ti.i64)
         self.largest = rows.spread  # which is free from Rows.find_eigenvalue() on: 12 bytes a particle less
@@ -82,7 +78,9 @@ class Islands:
 
     @ti.func
     def join(self, i, which: ti.template()):  # type: ignore[valid-type]
-        """Join the islands of particle i and those behind it on its rows: on all, those that press, or that bounce in a round."""
+        """Join the islands of particle i, its body, and those behind it on its rows: on all, those that press, or that bounce."""
+        if ti.static(bool(self.bodies.answers)):
+            self.join_two(i, self.bodies.answers.body(i))
         for row in range(self.rows.own[i], self.rows.pressed[i]):
             other, joins = self.rows.other.field[row], True
             if ti.static(which == PRESSING):
@@ -91,13 +89,6 @@ class Islands:
                 joins = self.rows.impacts.blow.field[row] > 0
             if joins and self.bodies.moves(other):
                 self.join_two(i, other)
-
-    @ti.func
-    def join_body(self, c):
-        """Join the islands of the particles that constraint c connects."""
-        begin, end = self.bodies.answers.begin[c], self.bodies.answers.begin[c + 1]
-        for k in range(begin + 1, end):
-            self.join_two(self.bodies.answers.particle[begin], self.bodies.answers.particle[k])
 
     @ti.func
     def join_two(self, i, j):
@@ -117,10 +108,15 @@ class Islands:
         root = self.root_of(i)
         for row in range(self.rows.own[i], self.rows.end[i]):
             if self.rows.bounce.field[row] > 0:
-                if ti.static(self.serial):
-                    self.scale[root] = ti.min(self.scale[root], self.rows.time.field[row])
-                else:
-                    ti.atomic_min(self.scale[root], self.rows.time.field[row])
+                self.keep_earlier(self.scale, root, self.rows.time.field[row])
+
+    @ti.func
+    def keep_earlier(self, times: ti.template(), k, time):  # type: ignore[valid-type]
+        """Lower times[k] to a time, unless it is earlier."""
+        if ti.static(self.serial):
+            times[k] = ti.min(times[k], time)
+        else:
+            ti.atomic_min(times[k], time)
 
     @ti.func
     def time_of(self, i):

@@ -394,6 +394,15 @@ class Elimination(System):
         return self.particle_of[self.corner[q]]
 
     @ti.func
+    def row_that_begins(self, s):
+        """Return the row whose first corner has slot s, -1 if that is none."""
+        r = self.row_of[s]
+        if r >= 0:
+            if self.corner[self.corner_begin[r]] != s:
+                r = -1
+        return r
+
+    @ti.func
     def begin_answer(self, b):
         """Before contacts are solved: part b has answered nothing, and has its directions at the start of the substep."""
         self.turned_to[b] = 0
@@ -410,7 +419,7 @@ class Elimination(System):
         for q in range(self.corner_begin[self.part_begin[b]], self.corner_begin[self.part_begin[b + 1]]):
             when = ti.max(when, rows.when_of(self.corner_particle(q)))
         if when != before:
-            turn = (when - before) / ti.max(1 - before, ti.static(2.0**-10))
+            turn = (when - before) / ti.max(1 - before, ti.static(2.0**-10))  # what is at the end already stays there
             self.turned_to[b] = when
             for q in range(self.corner_begin[self.part_begin[b]], self.corner_begin[self.part_begin[b + 1]]):
                 s = self.corner[q]

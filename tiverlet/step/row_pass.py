@@ -181,10 +181,10 @@ class RowPass:
         if ti.static(bool(self.answers)):
             ti.loop_config(serialize=self.islands.serial)
             for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-                self.answers.note_first(i, self.impacts.first[i])
+                self.islands.keep_earlier(self.impacts.first, self.answers.body(i), self.impacts.first[i])
             self.team.wait()
             for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-                self.impacts.first[i] = self.answers.first[self.answers.body[i]]
+                self.impacts.first[i] = self.impacts.first[self.answers.body(i)]
             self.team.wait()
 
     @ti.func
@@ -195,10 +195,10 @@ class RowPass:
                 self.answers.keep(i)
                 self.bodies.new[i] = self.impacts.thrown[i] + self.bodies.compliance(i) * self.bodies.push[i]
                 if (self.bodies.push[i] != 0).any():
-                    self.rows.note_when(self.answers.body[i], self.impacts.first[i])
+                    self.rows.note_when(self.answers.body(i), self.impacts.first[i])
             self.team.wait()
             for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-                self.rows.when[i] = self.rows.when[self.answers.body[i]]
+                self.rows.when[i] = self.rows.when[self.answers.body(i)]
             self.team.wait()
             self.turn_answers(thread)
             self.move_answers(thread, self.going(), True)
@@ -343,12 +343,6 @@ class RowPass:
         for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
             self.islands.join(i, which)
         self.team.wait()
-        if ti.static(bool(self.answers)):
-            bodies = self.answers.n * ti.cast(n > 0, ti.i32)
-            ti.loop_config(serialize=self.islands.serial)
-            for c in range(self.team.chunk_begin(bodies, thread), self.team.chunk_end(bodies, thread)):
-                self.islands.join_body(c)
-            self.team.wait()
 
     @ti.func
     def find_scales(self, thread, n, blocks, which: ti.template()):  # type: ignore[valid-type]
