@@ -419,10 +419,12 @@ def test_velocities_have_no_part_of_a_blow(world):
 @pytest.mark.parametrize(
     "contact, e, solver, paths",
     [
+        ("discs", 0.5, tv.Direct(), ("parallel", "launched")),
         ("discs", 1.0, tv.Direct(), ("parallel", "launched")),  # in turn
         ("polygons", 0.5, tv.Jacobi(), ("launched",)),
+        ("discs", 0.0, tv.ConjugateGradient(5), ("parallel",)),  # they bounce off walls alone
     ],
-    ids=["discs, Direct", "polygons, Jacobi"],
+    ids=["discs, Direct", "discs in turn, Direct", "polygons, Jacobi", "walls, ConjugateGradient"],
 )
 def test_all_paths_have_the_same_bits(world, contact, e, solver, paths):
     # Clusters, bodies of links and a stiff rod of five, which strike walls and each other at once. With every way to touch, every
