@@ -234,37 +234,6 @@ def bodies(*extra, solver=None):
     return w, [lambda: add(0), lambda: w.remove([3]), lambda: add(1), lambda: w.remove([20]), lambda: w.remove(np.arange(30, 36))]
 
 
-def outlines():
-    """Two squares and a soft pentagon between discs, with friction and restitution; edits add and remove bodies and a disc."""
-    angle = np.arange(5) * 2 * np.pi / 5
-    square, five = np.array([[0.0, 0.0], [0.3, 0.0], [0.3, 0.3], [0.0, 0.3]]), 0.2 * np.stack([np.cos(angle), np.sin(angle)], 1)
-    position = np.concatenate([square + (0.1, 0.05), square + (0.15, 0.4), five + (0.9, 0.3), [[1.4, 0.1], [1.7, 0.1]]])
-    loops = [np.arange(4), np.arange(4, 8), np.arange(8, 13)]
-    rigid, outline = tv.ShapeMatch(loops[:2]), tv.Polygons(loops, friction=0.3, restitution=0.2)
-    ring = np.stack([np.arange(5), (np.arange(5) + 1) % 5], axis=1)
-    links, area = tv.Distance(ring + 8, compliance=1e-4), tv.Area(loops[2:])
-    features = [tv.Gravity(), tv.HalfSpace((0, 1), 0.0), outline, rigid, links, area]
-    w, came = tv.World(tv.Particles(position, radius=[0.01] * 13 + [0.1] * 2), features, substeps=5), []
-
-    def add(k: int):
-        """Add a square and a larger soft pentagon."""
-        n = len(w.particles)
-        more = np.concatenate([square + (0.5, 0.9 + k), 1.1 * five + (1.2, 0.9 + k)])
-        new = [np.arange(n, n + 4), np.arange(n + 4, n + 9)]
-        both = {links: tv.Distance(ring + n + 4, compliance=1e-4), area: tv.Area(new[1:])}
-        both |= {rigid: tv.ShapeMatch(new[:1]), outline: tv.Polygons(new, 0.3, 0.2)}
-        came.append(w.add(tv.Particles(more, radius=0.01), extend=both))
-
-    def disc():
-        """Add a disc high above the place of a square at the start."""
-        w.add(tv.Particles([[0.25, 0.25 + 3.0]], radius=0.1))
-
-    return w, [
-        lambda: add(0), disc, lambda: w.remove(np.arange(4, 8)), lambda: add(1), lambda: w.remove(came[0].indices[4:]),
-        lambda: w.remove([*range(4), 10]),
-    ]  # fmt: skip
-
-
 def grown(scene, anew: bool) -> list:
     """Return what is observed of a world whose constraints are edited. anew: rebuild the world for each edit, not in place."""
     planned = edit_in_place.planned
@@ -297,11 +266,10 @@ SOLVED = {
     "direct": lambda: ropes(tv.Direct(), "f64"), "loads": lambda: ropes(tv.Jacobi(loads=True), only=True),
     "chebyshev": lambda: ropes(tv.Chebyshev(), only=True),
     "together": lambda: ropes(tv.ConjugateGradient(4), "f32-compensated", only=True),
-    "outlines": outlines, "asleep": lambda: bodies(tv.Sleep(10.0, 0.05)),
+    "asleep": lambda: bodies(tv.Sleep(10.0, 0.05)),
 }  # fmt: skip
 
 
-@pytest.mark.filterwarnings("ignore:.*no constraint holds loops")
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", SOLVED)
 def test_constraints_in_place_are_to_the_bit_as_built_anew(scene):

@@ -86,7 +86,7 @@ def test_boxes_stand_on_each_other_and_on_slopes(world):
     heights = np.diff(np.sort(stack[:, :, 1], axis=1).reshape(3, 2, 2).mean(axis=2), axis=1)[:, 0]
     assert 0 < side - heights[2] < side - heights[1] < side - heights[0] < 40 * 9.81 / 1200**2
     gaps = [stack[k, :, 1].max() - stack[k + 1, :, 1].min() for k in range(2)]
-    np.testing.assert_allclose(gaps, 0, atol=1e-9)
+    np.testing.assert_allclose(gaps, 0, atol=9.81 / 1200**2)
     np.testing.assert_allclose(stack[:, :, 0].mean(axis=1), 0, atol=1e-6)
     np.testing.assert_allclose(got[16:20], start[16:20], atol=1e-6)
     a = np.radians(30.0)
@@ -211,14 +211,13 @@ def test_a_pile_settles_without_overlap_and_alike_on_both_paths(world):
 @pytest.mark.slow
 def test_corners_of_one_width_carry_each_other(world):
     # Rigid boxes of one width, corners on corners. At so few substeps, one substep moves corners deeper than edges reach beyond
-    # their ends. Contacts are resolved. A pass gives a cluster of four corners of mass m back half of the displacement by a load
-    # F on two of them: the cluster is pressed flat by (2 + 4 F / m g) g h^2, where the 2 is its own weight.
+    # their ends. They stand where they were placed: contacts lack 5e-4 of the displacement by forces, g h^2, and those of a
+    # stack of three add up.
     x, loops, _ = bodies([regular(4, 0.2 / np.sqrt(2), (0.0, (k + 0.5) * 0.2)) for k in range(3)])
     for substeps in (4, 2):
         w = rigid(world, x, loops, 9.81, mass=1.0, substeps=substeps)
         assert w.run(2.0).clean
-        sunk = np.sort((x - w.position)[:, 1].reshape(3, 4)) / (9.81 / (60 * substeps) ** 2)
-        np.testing.assert_allclose(sunk, [[0, 0, 10, 10], [10, 10, 16, 16], [16, 16, 18, 18]], rtol=2e-3, atol=1e-9)
+        np.testing.assert_allclose(w.position, x, atol=3 * 5e-4 * 9.81 / (60 * substeps) ** 2)
 
 
 @pytest.mark.slow
@@ -242,7 +241,7 @@ def test_bodies_of_links_that_lie_edge_to_edge_fall_asleep(world):
 
 @pytest.mark.filterwarnings("ignore:.*no constraint holds loops")
 def test_overlap_is_pushed_out_and_collapse_stays_finite(world):
-    # A corner that starts inside of a box leaves it: each body is slower than 1.5 push_out (measured: 1.3). A loop without links
+    # A corner that starts inside of a box leaves it without velocity: what moves places gives no momentum. A loop without links
     # is pressed flat, and stays finite.
     x, loops, _ = bodies([regular(4, 0.5, (0.0, 0.0)), regular(4, 0.5, (0.6, 0.02)), regular(3, 0.3, (5.0, 1.0))])
     _, _, links = bodies([x[:4], x[4:8]])
@@ -250,10 +249,10 @@ def test_overlap_is_pushed_out_and_collapse_stays_finite(world):
     w, x = linked(world, start, links, loops, walls=((-99, -0.6), (99, 99)), push_out=0.3), start.position
     for _ in range(90):
         w.step(1 / 60)
-        assert np.abs(w.velocity).max() < 0.3 * 1.5
+        assert np.abs(w.velocity).max() < 0.3 * 0.01
     assert depths(w.position[4:8], w.position[:4]).max() < 1e-3 and depths(w.position[:4], w.position[4:8]).max() < 1e-3
     # Overlap at a start depends on where bodies are, not on their velocities. A body thrown deeper gets no deeper than it was,
-    # but for its motion in a substep. Both are apart after overlap / push_out.
+    # but for its motion in a substep. After overlap / push_out both overlap by no more than places leave, 0.009 half edges.
     found, v = [], np.zeros_like(x)
     for speed in ((0.0, 0.0), (0.0, -6.0), (-3.0, 7.0), (-6.0, 0.0)):
         v[4:8] = speed
@@ -271,7 +270,8 @@ def test_overlap_is_pushed_out_and_collapse_stays_finite(world):
         w.step(1 / 60)
         left = w.position[:4, 0].max() - w.position[4:8, 0].min()
         assert left < begin + 6 / 1200
-    assert left < 0
+    w.run(0.1)
+    assert sat(w.position[:4], w.position[4:8])[0] < 0.009 * 0.5 / 2**0.5
     w.position = np.concatenate([w.position[:8], [[5.0, 0.0], [5.0, 0.0], [5.0, 0.0], [50.0, 50.0]]])
     w.features[2].g = 9.81
     w.run(0.5)
@@ -303,7 +303,7 @@ def test_stacks_that_bounce_come_to_rest(world):
     met = int(np.argmax(np.array(gaps) < 0.01))
     assert max(gaps[met:]) > 0.03  # [m], after they have met
     w.run(4.0)
-    assert np.abs(w.velocity).max() < 1e-5
+    assert np.abs(w.velocity).max() < 1e-4  # what passes leave of gravity in a frame, 5e-4 g / 60 Hz
     # In a heap each corner's bounce feeds the next one's, unless approach speeds that two substeps of forces explain count as
     # rest. Otherwise some 20 of 48 boxes keep hopping at 0.1 m/s. A column of eight boxes still sways, which no impact does.
     x, loops = dropped(6, 8)
@@ -374,7 +374,8 @@ def test_discs_beside_wide_bodies_list_what_they_may_touch(world):
     start = tv.Particles([*body, *discs], radius=np.r_[np.zeros(4), np.full(100, 0.1)])
     w = world(start, [tv.Polygons([range(4)])], path="launched")  # with a kernel of its own for the list
     search = w._runner.search
-    assert search.skin == pytest.approx(0.75 * 0.1) and search.finest == pytest.approx(2 * 0.1 + 0.075, rel=1e-3)
+    skin = (0.75 + 0.15) * 0.1  # and how far ahead pairs are rows
+    assert search.skin == pytest.approx(skin) and search.finest == pytest.approx(2 * 0.1 + skin, rel=1e-3)
     w._runner.list_neighbours()
     pairs, _ = search.list.entries()
     both = pairs[(pairs >= 4).all(axis=1)]
@@ -428,16 +429,15 @@ def test_corners_that_cross_part_over_the_nearer_edge(world):
     np.testing.assert_allclose(found.overlap, [depth for depth, _ in want], rtol=1e-9)
     sign = np.where(body[found.pairs[:, 0]] % 2 == 1, 1.0, -1.0)[:, None]  # where the vertex belongs to the second body
     np.testing.assert_allclose(sign * found.normal, [n for _, n in want], atol=1e-9)
-    parted = 0.0
     for _ in range(60):
         w.step(1 / 60)
         y, d = w.position, mass[:, None] * w._runner.scene.memory.read(w._runner.scene.state.d) * 600
         moments = np.c_[d, y[:, 0] * d[:, 1] - y[:, 1] * d[:, 0]][:-1].reshape(-1, 6, 3).sum(axis=1)
         np.testing.assert_allclose(moments[:, :2], 0, atol=1e-12)
         np.testing.assert_allclose(moments[:, 2], 0, atol=0.2 * 0.2 / 600)
-        parted = max(parted, float(np.abs(w.velocity).max()))
-    assert 0.02 < parted < 0.4
-    assert max(sat(y[loops[k]], y[loops[k + 1]])[0] for k in range(0, len(shapes), 2)) < 1e-6
+        assert np.abs(w.velocity).max() < 0.2 * 0.01  # places give no momentum
+    half = np.linalg.norm(x[1:-1] - x[:-2], axis=1).max() / 2
+    assert max(sat(y[loops[k]], y[loops[k + 1]])[0] for k in range(0, len(shapes), 2)) < 0.009 * half
 
 
 @pytest.mark.slow

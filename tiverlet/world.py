@@ -283,7 +283,6 @@ class World:
 
     def _upload(self) -> None:
         """Write to the device what was changed in Python since the last frame."""
-        constraints_changed = any(b.changed for b in self._runner.batches)
         search = self._runner.search
         if search and search.walls and any(isinstance(f, Collider) and f.changed for f in self._features):
             search.list.invalidate()  # it lists the walls near particles
@@ -295,8 +294,6 @@ class World:
                 feature.changed = feature.new_force = False
                 feature.upload()
         self._runner.find_ramps()
-        if constraints_changed:
-            self._runner.find_bodies()
 
     def run(
         self, seconds: float, dt: float = 1 / 60, recorder=None, progress: bool = False, *, tolerance: float | None = None,
@@ -525,7 +522,7 @@ class World:
         contact = self._runner.step.contacts[0]
         with deferred_signals:
             self._runner.list_neighbours()
-            if contact.detects and self._runner.step.launched:
+            if self._runner.step.launched:
                 self._runner.diagnose_state()  # measures contacts; on other paths list_neighbours() has called it
         return contact.found(self.position, self._clock.h or 1.0)
 

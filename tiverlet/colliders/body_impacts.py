@@ -3,7 +3,6 @@
 from typing import TYPE_CHECKING, Any
 
 from ..device import ti
-from ..geometry import rotation
 
 if TYPE_CHECKING:
     from ..features.feature import Batch, Scene
@@ -12,8 +11,6 @@ if TYPE_CHECKING:
 # impulses propagate from link to link. One or two do where a system solves them exactly, and most of MANY have little to do.
 FEW, MANY = 8, 32
 MET = 2.0**-9  # of the first push: a smaller error of the normal displacement counts as met
-FINE = 2.0**-16  # the same where the inverse masses of rigid clusters are known
-CAREFUL = 0.55  # the least secant of a pair. Impacts may change each other: projections converge with steps of less than 1 / 0.5
 FELT = 2.0**-20  # of a squared displacement: a smaller change is no impact
 # What holds a particle that can move: rigid clusters that share particles, links, or a rigid cluster that shares none.
 IN_SHARED, LINKED, IN_CLUSTER = 1, 2, 3
@@ -78,21 +75,17 @@ class BodyImpacts:
     A rigid cluster that shares none of its particles moves as a rigid body in these passes, see ClusterImpact. If some of them
     cannot move, it turns about these.
 
-    Two particles that strike each other, at least one of them linked, obey the same law with the displacement of one relative to
-    the other: BodyRestitution for discs, PolygonRestitution for vertices and edges. Both compute the same push before either
-    moves. A particle has any number of these impacts, but one on a wall. Constraints do not take these pushes into account. How
-    rigid clusters answer is known, see response().
+    Only where there are no contacts: there, walls are rows.
 
-    open: for each pass beyond the regular ones of every substep, whether it is needed. pairs: whether particles strike each
-    other.
+    open: for each pass beyond the regular ones of every substep, whether it is needed.
     """
 
-    def __init__(self, scene: "Scene", batches: "list[Batch]", touches: bool, pairs: bool):
+    def __init__(self, scene: "Scene", batches: "list[Batch]"):
         system, batches = scene.slots.system, holding_bodies(batches)
-        self.passes = FEW if (system or all(b.clusters for b in batches)) and not pairs else MANY
+        self.passes = FEW if system or all(b.clusters for b in batches) else MANY
         self.spreads = not system  # from link to link; a system solves all links at once
         self.exact = is_exact(scene, [b for b in batches if not b.clusters])
-        self.leaves = touches or not self.exact  # regular passes leave violations: by contacts, or because they do not converge
+        self.leaves = not self.exact  # regular passes leave violations
         self.stops = stops_bodies(scene, batches)
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.state = scene.state
@@ -109,17 +102,6 @@ class BodyImpacts:
         self.log = add("impacts.log", n, kind=ti.i32)  # of the wall, by its number, or -1
         self.reached = add("impacts.stirred", n, kind=ti.i32, state=True)  # whether an impact of the last substep has reached it
         self.open = add("impacts.open", self.passes + 1, kind=ti.i32)
-        self.pairs = pairs
-        self.clusters = pairs and any(b.clusters for b in batches)  # whether pushes between particles move clusters
-        if pairs:
-            self.parts = add("impacts.parts", n)  # of each particle in the impacts on other particles that passes make
-            self.change = add("impacts.change", n, width=dim)
-        if self.clusters:  # of each cluster, by its first particle: mass, sum m r r^T, sum of all parts, turn in this substep
-            self.body = add("impacts.body", n, kind=ti.i32)
-            self.arm = add("impacts.arm", n, width=dim)  # from the center [m]
-            self.body_mass, self.body_parts = add("impacts.mass", n), add("impacts.body_parts", n)
-            self.body_moment = add("impacts.moment", n, width=dim * dim)
-            self.body_turn = add("impacts.turn", n, width=scene.particles.axes)
 
     def add_log(self, log: Any) -> int:
         """Return the number of a log; -1 for None."""
@@ -165,9 +147,6 @@ class BodyImpacts:
     def clear(self, i):
         """At the start of a substep: clear the marks of particle i."""
         self.struck[i] = self.reached[i] = 0
-        if ti.static(self.pairs):
-            self.parts[i] = 0
-            self.change[i] = ti.zero(self.change[i])
 
     @ti.func
     def clear_requests(self):
@@ -327,7 +306,6 @@ class BodyImpacts:
     def move(self, i, change):
         """Move particle i as a wall does."""
         self.state.shift(i, change)
-        self.state.note_wall_push(i, change)
 
     @ti.func
     def log_push(self, i, change):
@@ -344,53 +322,6 @@ class BodyImpacts:
             self.struck[i] = STRUCK_BEFORE
 
     @ti.func
-    def part_left(self, change, pushed):
-        """Return the part that exactly solved constraints left of the last push of a pair: the secant of a single impact."""
-        return ti.max(ti.static(CAREFUL), ti.min(change / pushed, 1))
-
-    @ti.func
-    def takes_part(self, i):
-        """Whether passes push particle i of a cluster because it struck other particles."""
-        out = False
-        if ti.static(self.clusters):
-            out = self.parts[i] > 0
-        return out
-
-    @ti.func
     def has_next_pass(self, now):
         """Whether another pass can follow this one."""
         return now.it + 1 - now.span.iterations < ti.static(self.passes)
-
-    @ti.func
-    def inverse_mass(self, i, n, m):
-        """Return how much an impulse of 1 along m on particle i changes its velocity along n, see response()."""
-        return n.dot(self.response(i, m))
-
-    @ti.func
-    def response(self, i, m):
-        """Return how much an impulse of 1 along m on particle i changes its velocity, as if it struck p times as often.
-
-        That is p w m, or for a particle of a cluster p (m / M + (I^-1 (r x m)) x r). p is the sum of the parts of the particle,
-        or of all particles of the cluster, in impacts. By Cauchy's inequality no eigenvalue of a pass exceeds 1 then.
-        """
-        out = self.parts[i] * self.state.w.of(i) * m
-        if ti.static(self.clusters):
-            if self.in_cluster(i):
-                out = self.cluster_response(self.body[i], self.arm[i], m)
-        return out
-
-    @ti.func
-    def cluster_response(self, b, r, m):
-        """Return response() at r from the center of the cluster whose first particle is b."""
-        S = rotation.from_rows(self.body_moment[b])
-        turn = rotation.turn_rate(S, rotation.axial(m.outer_product(r)))
-        return self.body_parts[b] * (m / self.body_mass[b] + rotation.skew(turn, S) @ r)
-
-    @ti.func
-    def path_bend(self, i, n):
-        """Return how far the path of particle i bends along n in this substep, if it is in a cluster, see ClusterImpact [m]."""
-        out = 0 * self.state.w.of(i)
-        if ti.static(self.clusters):
-            if self.in_cluster(i):
-                out = rotation.bend(self.body_turn[self.body[i]], self.arm[i], n)
-        return out

@@ -281,7 +281,7 @@ class Collider(Feature):
     def confine(self, i, radius, h, frame_fraction, mode):
         """Move particle i out of the wall, with self.dev.surface.push_without_slide().
 
-        mode: ANY_DEPTH, BEYOND_ROUNDING, FRICTIONLESS or BEFORE_CONTACTS.
+        mode: ANY_DEPTH, BEYOND_ROUNDING, or FRICTIONLESS.
         """
 
 

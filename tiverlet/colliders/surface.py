@@ -11,9 +11,8 @@ if TYPE_CHECKING:
     from .wall_log import WallLog
 
 # How a collider confines. ANY_DEPTH: at any depth. BEYOND_ROUNDING: only deeper than rounding. FRICTIONLESS: as
-# BEYOND_ROUNDING, without friction and bounces. BEFORE_CONTACTS: before contacts are solved, as BEYOND_ROUNDING, without
-# friction; particles that would bounce stay.
-ANY_DEPTH, BEYOND_ROUNDING, FRICTIONLESS, BEFORE_CONTACTS = range(4)
+# BEYOND_ROUNDING, without friction and bounces.
+ANY_DEPTH, BEYOND_ROUNDING, FRICTIONLESS = range(3)
 TOUCH = 2.0**-20  # of the size of a wall: a start no deeper inside than this counts as on the surface
 SLOW = 8.0  # a linked particle does not bounce if it approaches by less than this times what forces and links of a substep add
 NEAR = 1 / 64  # of its displacement: a particle that starts closer to a surface than this lies on it, and may slide along it
@@ -158,8 +157,7 @@ class Surface:
     def push(self, i, depth, start_depth, n, moved, h, mode, slides):
         """Move particle i out of a wall that it entered by `depth` [m], along the normal n; the wall itself moved by `moved`.
 
-        start_depth: depth at the start of the substep, 0 or less outside [m]. mode: ANY_DEPTH, BEYOND_ROUNDING, FRICTIONLESS or
-        BEFORE_CONTACTS.
+        start_depth: depth at the start of the substep, 0 or less outside [m]. mode: ANY_DEPTH, BEYOND_ROUNDING or FRICTIONLESS.
         slides: whether n is the normal at the start of a displacement along a curved surface. The displacement then changes as
         much as the position; otherwise the particle would pass walls that follow displacements.
         A particle within rounding of the surface touches it, so that it does not sink, or slip, by the last digits of its
@@ -191,17 +189,13 @@ class Surface:
                     gap = 0 * gap
                 if gap >= 0 and leaving < 0 and mode != FRICTIONLESS:
                     if self.is_linked(i):
-                        if self.defer_impact(i, n, moved, leaving, before, after, mode):
+                        if self.defer_impact(i, n, moved, leaving, before, after):
                             move, after = 0 * depth, leaving
                     elif ti.static(self.has_restitution):
                         rise, after, left = self.bounce(gap, leaving, before, after)
-                if mode == BEFORE_CONTACTS and rise > 0:  # a particle that bounces in this substep is not supported by the wall
-                    move, rise, after = 0 * depth, 0 * depth, leaving
             if ti.static(self.has_log):
-                if mode != BEFORE_CONTACTS:
-                    self.log.record(i, depth, n, after - leaving, -leaving, moved, h, rise > 0)
+                self.log.record(i, depth, n, after - leaving, -leaving, moved, h, rise > 0)
             change = (after - leaving) * n
-            self.state.note_wall_push(i, change)
             shift = (move + rise) * n
             stuck = False
             if ti.static(self.spins):
@@ -252,7 +246,7 @@ class Surface:
         return out
 
     @ti.func
-    def defer_impact(self, i, n, moved, leaving, before, after, mode):
+    def defer_impact(self, i, n, moved, leaving, before, after):
         """Whether linked particle i is left where it is in this pass, since it strikes the wall, and BodyImpacts pushes it.
 
         It is to leave with the restitution times its normal displacement before the substep. Without restitution it is to have
@@ -268,12 +262,9 @@ class Surface:
             static = dynamic = 0 * target
             if ti.static(self.has_friction):
                 static, dynamic = self.static(), self.dynamic()
-            if mode == BEFORE_CONTACTS:
-                out = bounces
-            else:
-                self.impacts.cancel_bounce(i, n)
-                if bounces:
-                    out = self.impacts.record_impact(i, n, moved, target, leaving, static, dynamic, self.log_number)
+            self.impacts.cancel_bounce(i, n)
+            if bounces:
+                out = self.impacts.record_impact(i, n, moved, target, leaving, static, dynamic, self.log_number)
         return out
 
     @ti.func

@@ -15,17 +15,9 @@ from ..features.regrouping import Regrouping
 from ..geometry.ordered import median
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
-from .answers import Answers, answer_at_once
-from .events import EventLog
-from .exclusions import excluded_pairs
-from .impulses import Impulses
-from .islands import Islands
+from .answers import answer_at_once
 from .limits import AHEAD, CRADLE, THROWN
-from .narrow_phase import DiscGeometry
 from .pair_contact import PairContact
-from .places import Places
-from .responses import Responses
-from .rows import Rows
 
 
 class Contact(PairContact):
@@ -62,11 +54,10 @@ class Contact(PairContact):
         self.skin, self.push_out, self.events, self.loads = skin, push_out, events, loads
 
     events = Knob(lambda f, v: checks.flag("Contact", "events", v), "Whether World.events() tells of pairs.", compiled=True)
-    loads = Knob(lambda f, v: checks.flag("Contact", "loads", v), "Whether pairs know what they bear.", compiled=True)
+    loads = Knob(lambda f, v: checks.flag("Contact", "loads", v), "Has no effect any more.")
     sensors: Any = Knob(lambda f, v: f._surface("sensors", v), "The pairs of groups of which the second senses.", built=True)
     groups: Any = Knob(lambda f, v: f._surface("groups", v), "The pairs of groups that touch; None for all.", built=True)
 
-    solves_rows = True
     compiled_for = (*PairContact.compiled_for, "in_turn")
 
     @property
@@ -113,42 +104,7 @@ class Contact(PairContact):
 
     def make_search(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields and the neighbour search, and return the search."""
-        dev = self.dev
-        face = 0
-        for group in scene.walls:
-            face = group.number_faces(scene, face)
-        friction = dev.has_friction or any(w.has_friction for w in self.walls)
-        bounces = dev.has_restitution or any(w.has_restitution for w in self.walls)
-        self.table.bind(scene, friction or bounces)
-        turns = scene.state.spins and friction and (dev.turns or any(w.turns for w in self.walls))
-        in_turn = self.in_turn and answer_at_once(scene, batches)
-        dev.rows = Rows(scene, self.table, friction, bounces, in_turn, turns, scene.walls, team, self.push_out, self._ahead)
-        dev.answers = Answers(scene, batches, dev.rows) if batches else None
-        dev.responses = Responses(scene, dev.rows, scene.state.spins and friction, dev.answers)
-        dev.islands = Islands(scene, dev.rows, dev.responses, team)
-        dev.impulses = Impulses(scene, dev.rows, dev.responses, team)
-        dev.places = Places(scene, dev.rows, dev.responses, dev.impulses, team)
-        linked = excluded_pairs(batches, scene.particles.radius)
-        dev.events = EventLog(scene, self.table) if dev.has_events else None
-        pair_data = [
-            dev.rows.memory,
-            *([dev.rows.touched, dev.rows.given] if bounces else []),
-            *([dev.rows.borne_moment] if turns else []),
-            *([dev.events.touched] if dev.events else []),
-        ]
-        dev.search = NeighbourSearch(
-            scene, self._present_skin, linked, self.table, pair_data, team, dev.responses.push, walls=scene.walls,
-            ahead=self._ahead,
-        )  # fmt: skip
-        dev.list = dev.search.list
-        dev.geometry = DiscGeometry(scene, dev.search, dev.rows.given if bounces else dev.rows.memory)
-        if dev.events:
-            dev.events.bind(dev.list, dev.geometry)
-            dev.rows.events = dev.events if dev.reports else None
-        dev.rows.bind(dev.list, dev.geometry)
-        dev.fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
-        dev.bodies = dev.forces = None
-        return dev.search
+        return self.declare_rows(scene, batches, team, in_turn=self.in_turn and answer_at_once(scene, batches))
 
     @property
     def conserves(self) -> bool:

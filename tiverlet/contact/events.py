@@ -16,7 +16,7 @@ import numpy as np
 from ..device import ti
 from ..features.feature import Scene
 from ..features.material import SENSES, TOUCH, Table
-from ..neighbours.neighbour_list import Column, PairData
+from ..neighbours.pair_data import Column, PairData
 from .touches import BEFORE, NEVER, ContactEvents, Touches, span
 
 if TYPE_CHECKING:

@@ -11,12 +11,15 @@ for ever. Links that are compliant, or can break, do not count.
 """
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..features.feature import Batch
 from ..geometry.ordered import distinct
-from ..particles import Particles
+
+if TYPE_CHECKING:
+    from ..particles import Particles
 
 DIGIT = 1e-6  # relative tolerance of lengths, for beads that just touch
 FOLDED = 0.25  # radii of the smaller particle: a link that is shorter at the start counts as folded up, and is skipped
@@ -37,7 +40,7 @@ def excluded_pairs(batches: Sequence[Batch], radius: np.ndarray, body: np.ndarra
     return np.concatenate([np.zeros((0, 2), dtype=np.int32), *own, _inside(links, lengths, radius)])
 
 
-def _joins(pairs: np.ndarray, start: Particles, body: np.ndarray) -> np.ndarray:
+def _joins(pairs: np.ndarray, start: "Particles", body: np.ndarray) -> np.ndarray:
     """Return which pairs (m, 2) are corners of two bodies whose rims are not inside each other, (m,)."""
     i, j = pairs.T
     reach, distance = start.radius[i] + start.radius[j], np.linalg.norm(start.position[i] - start.position[j], axis=1)

@@ -20,7 +20,7 @@ back what impulses gave too much of.
 from typing import TYPE_CHECKING, Any
 
 from ..device import ti
-from ..neighbours.neighbour_list import Column
+from ..neighbours.pair_data import Column
 from .limits import APART, FEW, NEAR, NEVER, OWN, SLOP, SLOW, TOGETHER, WHOLE
 from .meeting import meeting
 

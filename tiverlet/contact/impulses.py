@@ -144,21 +144,18 @@ class Impulses:
         w_own, across_own = self.bodies.split(i), self.bodies.split_tangential(i)
         for row in range(self.rows.first(i, part), self.rows.last(i, part)):
             other, n = self.rows.other.field[row], self.rows.normal.field[row]
-            w, across, most = w_own, across_own, share
+            w, across, most, e = w_own, across_own, share, self.bodies.split_place(i)
             if row < pressed:
-                others = self.rows.share[other]
-                if ti.static(not self.has_friction):
-                    others = self.rows.eigenvalue[other]
-                w += self.bodies.split(other)
-                across += self.bodies.split_tangential(other)
-                if self.bodies.moves(other):
-                    most = ti.max(most, others)
+                for k in ti.static(range(self.rows.ends)):
+                    j, c = self.rows.pressed_on(row, k), self.rows.part(row, k)
+                    w += c * self.bodies.split(j)
+                    across += c * self.bodies.split_tangential(j)
+                    e += c * self.bodies.split_place(j)
+                    if self.bodies.moves(j):
+                        most = ti.max(most, self.rows.share[j] if ti.static(self.has_friction) else self.rows.eigenvalue[j])
             step, move = ti.cast(RELAXATION, self.real), ti.cast(SHARE, self.real)
             if most < ALONE:  # a row that shares its particles with none that it could disturb is solved in one pass
                 step, move = 1, 1
-            e = self.bodies.split_place(i)
-            if row < pressed:
-                e += self.bodies.split_place(other)
             self.rows.firm.field[row] = move / e
             p = self.rows.p.field[row]
             if ti.static(self.has_friction):
@@ -177,7 +174,9 @@ class Impulses:
             p_own += v
             if ti.static(self.bodies.spins):
                 m_own += self.bodies.spin.moment(n, v)
-            if part == OWN and row < kept:
+            if ti.static(bool(self.rows.edges)):
+                self.rows.edges.gone.field[row] = v
+            elif part == OWN and row < kept:
                 self.bodies.give(other, n, v)
             if ti.static(self.rows.turns):
                 self.prepare_turn(i, row, other)
@@ -241,12 +240,17 @@ class Impulses:
         p += self.bodies.push[i]
         if ti.static(self.bodies.spins):
             m += self.bodies.moment[i]
-        if part == OWN:
+        if part == OWN and ti.static(not self.rows.edges):
             self.bodies.answer(i, p, m)
         else:
             self.bodies.push[i] = p
             if ti.static(self.bodies.spins):
                 self.bodies.moment[i] = m
+
+    @ti.func
+    def gather(self, i):
+        """Compute the answer of particle i to the impulses of its rows and of those of its edges."""
+        self.bodies.answer(i, self.bodies.push[i] + self.rows.edges.gather(i), self.no_moment())
 
     @ti.func
     def relax(self, i, part):
@@ -269,6 +273,9 @@ class Impulses:
             t = u - un * n
             # The true gap at the end, less that at the start where it was negative.
             gap = self.rows.gap.field[row] + un + self.rows.rise(u.dot(u) - un * un, un, self.rows.bend.field[row])
+            if ti.static(bool(self.rows.edges)):
+                if row < pressed and self.rows.edges.place.field[row] >= 0:
+                    gap = self.rows.edges.gap(row, u, self.bodies.v)
             if ti.static(self.rows.bounces):
                 if self.rows.bounce.field[row] > 0:
                     gap = un - self.rows.target.field[row]
@@ -301,7 +308,9 @@ class Impulses:
             p_own += p
             if ti.static(self.bodies.spins):
                 m_own += self.bodies.spin.moment(n, p)
-            if part == OWN and row < kept:
+            if ti.static(bool(self.rows.edges)):
+                self.rows.edges.gone.field[row] = p
+            elif part == OWN and row < kept:
                 self.bodies.give(other, n, p)
             if ti.static(self.rows.turns):
                 uphill += self.relax_turn(i, row, other, n, self.rows.along(new, n) + hit, beta)
@@ -456,7 +465,8 @@ class Impulses:
             size, borne = self.rows.along(p, n), ti.max(scale * self.rows.along(before, n), 0)
             load, slight = size, weight
             if row < self.rows.pressed[i]:
-                slight += self.weight(self.rows.other.field[row])
+                for k in ti.static(range(self.rows.ends)):
+                    slight += self.rows.part(row, k) * self.weight(self.rows.pressed_on(row, k))
             if not self.rows.is_steady(ti.abs(size - borne), size, slight):
                 load = ti.static(SLOW) * slight
             if ti.static(self.rows.bounces):
@@ -464,12 +474,16 @@ class Impulses:
                     load = borne
                 if self.rows.bounced(row):
                     load = 0
+            if ti.static(bool(self.rows.edges)):
+                self.rows.edges.gone.field[row] = 0 * n
             if size > load:
                 impact = (1 - load / size) * self.rows.vector(p, n)
                 p_own += impact
+                if ti.static(bool(self.rows.edges)):
+                    self.rows.edges.gone.field[row] = impact
                 if ti.static(self.bodies.spins):
                     m_own += self.bodies.spin.moment(n, impact)
-                if part == OWN and row < self.rows.kept[i]:
+                if part == OWN and row < self.rows.kept[i]:  # never with edges, which gather
                     self.bodies.give(self.rows.other.field[row], n, impact)
         self.bodies.push[i] = self.bodies.push[i] + p_own
         if ti.static(self.bodies.spins):
@@ -489,9 +503,9 @@ class Impulses:
 
         `borne` is how far what bears moves the particle. Velocities contain half of it, see Verlet.velocity_after(). With forces
         it changes the motion by no more than all that happened in the substep: what lies still under a blow of something heavy is
-        told to lie still, though its rows take different parts of the blow for a load.
+        told to lie still, though its rows take different parts of the blow for a load. What sleeps keeps it.
         """
-        if final != 0:
+        if final != 0 and self.state.awake(i):
             w, kick = self.bodies.compliance(i), self.rows.kick(i)
             push = w * self.bodies.push[i]
             change = self.bodies.new[i] - self.bodies.base(i) - self.bodies.answer_of_constraints(i)

@@ -87,8 +87,19 @@ class Islands:
                 joins = self.rows.is_set(self.rows.p.field[row]) or self.rows.hit(row) > 0
             elif ti.static(which == BOUNCING):
                 joins = self.rows.impacts.blow.field[row] > 0
-            if joins and self.bodies.moves(other):
+            if ti.static(bool(self.rows.edges)):
+                if joins:
+                    self.join_edge(i, other, self.rows.edges.end.field[row])
+            elif joins and self.bodies.moves(other):
                 self.join_two(i, other)
+
+    @ti.func
+    def join_edge(self, v, a, b):
+        """Join the islands of vertex v, whose row it is whether it moves or not, and of the ends that can move."""
+        if self.bodies.moves(a):
+            self.join_two(v, a)
+        if self.bodies.moves(b):
+            self.join_two(v, b)
 
     @ti.func
     def join_two(self, i, j):

@@ -4,6 +4,7 @@ RELAXATION = 1.3  # of split masses in a pass of impulses; beyond 1.6 passes div
 FEW = 1e-30  # keeps divisors from being 0, and marks what presses with none
 ALONE = 1.001  # by what masses are split where a row shares its particles with none, to rounding
 MET = 0.0005  # of the displacement by forces in a substep: what rows may lack. It adds up over the height of a pile
+DIGIT = 1 / 8  # of the last two digits of a position: what rows may lack where clusters place particles, to rounding
 PASSES = 20  # most passes of impulses in a substep
 LANDS = 0.2  # of the displacement by forces: where rows lack more after PASSES, something lands
 BOUNCES = 200  # most of them where anything bounces or lands: the impulse has to reach the other end of what touches

@@ -24,16 +24,16 @@ def checked(loops: Iterable) -> list[np.ndarray]:
     return out
 
 
-def laid(loops: list[np.ndarray], x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def laid(loops: list[np.ndarray], x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the arrays of an Outline for particles at x (n, 2) [m], and refuse flat loops.
 
     These are the next and the previous particle, counterclockwise (n, 2), the number of the loop (n,), both -1 in no loop, and
-    the length of the longer edge (n,) [m].
+    the lengths of the longer and the shorter edge (n,) [m].
     """
     n = len(x)
-    ends, body, length = np.full((n, 2), -1), np.full(n, -1), np.zeros(n)
+    ends, body, longer, shorter = np.full((n, 2), -1), np.full(n, -1), np.zeros(n), np.zeros(n)
     if not loops:
-        return ends, body, length
+        return ends, body, longer, shorter
     corner, begin, owner = flat(loops)
     if corner.max() >= n:
         k = int(owner[np.argmax(corner >= n)])
@@ -53,8 +53,9 @@ def laid(loops: list[np.ndarray], x: np.ndarray) -> tuple[np.ndarray, np.ndarray
         raise ValueError(f"Polygons: particles {corner[m]} and {after[m]} of loops[{k}] are in the same place.")
     left = area[owner] > 0
     ends[corner, 0], ends[corner, 1], body[corner] = np.where(left, after, before), np.where(left, before, after), owner
-    length[corner] = np.maximum(edge, edge[turned(begin, -1)])
-    return ends, body, length
+    before = edge[turned(begin, -1)]
+    longer[corner], shorter[corner] = np.maximum(edge, before), np.minimum(edge, before)
+    return ends, body, longer, shorter
 
 
 def flat(loops: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ import numpy as np
 from ..device import ti
 from ..features.feature import Scene
 from ..features.material import TOUCH, TOUCHES
-from ..neighbours.neighbour_list import PairData
+from ..neighbours.pair_data import PairData
 from ..neighbours.queries import Contacts, between
 
 if TYPE_CHECKING:

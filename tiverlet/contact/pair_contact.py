@@ -6,7 +6,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from .. import checks
-from ..colliders.surface import speed_of_parting
 from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Feature, Knob, Scene
@@ -16,6 +15,16 @@ from ..neighbours.neighbour_list import MOVED
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.queries import Contacts
 from ..particles import Particles
+from .answers import Answers
+from .edges import EdgePairTable, Edges
+from .events import EventLog
+from .exclusions import excluded_pairs
+from .impulses import Impulses
+from .islands import Islands
+from .narrow_phase import DiscGeometry
+from .places import Places
+from .responses import Responses
+from .rows import Rows
 
 
 class Geometry(Protocol):
@@ -37,16 +46,8 @@ class PairContact(Feature):
 
     bodies: arrays of particles that sleep and wake together. ties: the constraints of its world.
 
-    A subclass defines prepare() and make_search(), which makes `dev.geometry`. Contacts that are rows are solved by RowPass.
-    Else, methods are called in a pass of a substep in this order:
-
-    - detect(i, first), if it `detects`
-    - count(begin, end, now), by blocks of particles
-    - relax(i, now)
-    - store_pushes(i, now), if contacts know loads
-    - choose(i) and apply(i) of its `dev.restitution`, in rounds while `dev.hit` is set, if any pair has restitution
-    - apply_corrections(i, first)
-    - finish_substep(i, now), at the end of the substep
+    A subclass defines prepare() and make_search(), which calls declare_rows(). Contacts are rows, see rows.py, and are solved by
+    RowPass.
 
     For sleep, is_pressed(i, e) returns whether there is a contact at entry e of the list of particle i. pressed_particle(j)
     returns the other particle of that contact. touched_sleeper(i, e, margin) returns the sleeping particle at entry e that
@@ -60,7 +61,8 @@ class PairContact(Feature):
         lambda f, v: None if v is None else checks.number("Contact", "push_out", v, least=0.0), "[m/s], or None.", built=True
     )
     compiled_for = ("has_friction", "has_restitution", "turns", "uniform")
-    _smallest_radius = _present_skin = 0.0  # the smallest radius, and the present skin [m]
+    # The smallest radius, the present skin, and the gap up to which pairs are rows [m].
+    _smallest_radius = _present_skin = _ahead = 0.0
     table: Table  # bound to one world
     bodies: Sequence[np.ndarray] = ()
     host_only = ("ties", "walls")
@@ -70,8 +72,6 @@ class PairContact(Feature):
     can_touch = True
     code_size = 3.0
     neighbours_per_particle = 0  # initial list entries per particle, if more than discs need
-    solves_rows = False  # whether contacts are rows, see rows.py
-    detects = False  # whether each pass calls detect() for all particles, before contacts are counted
 
     def _surface(self, name: str, value):
         """Check one setting of pairs together with the other settings."""
@@ -119,11 +119,6 @@ class PairContact(Feature):
         return self._pairs.has_restitution or "has_restitution" in self.compiled_so_far
 
     @property
-    def strikes_bodies(self) -> bool:
-        """Whether bodies of linked particles bounce off each other as wholes, see BodyImpacts."""
-        return False
-
-    @property
     def turns(self) -> bool:
         """Whether any pair has rolling, twisting or tangential restitution, now or when kernels were compiled."""
         return self._pairs.turns or "turns" in self.compiled_so_far
@@ -133,24 +128,53 @@ class PairContact(Feature):
         """Whether World.events() reports contacts or sensors."""
         return bool(vars(self).get("events") or vars(self).get("sensors"))
 
-    @property
-    def has_loads(self) -> bool:
-        """Whether pairs store the loads that they bear, see known_loads.py."""
-        return bool(vars(self).get("loads")) and not self.solves_rows
-
-    @property
-    def known(self) -> Any:
-        """The KnownLoads that the present kernels have, or None."""
-        return vars(self.dev).get("known")
-
-    @property
-    def speed_of_parting(self) -> float:
-        """How fast what was placed in each other parts, where contacts are no rows [m/s]."""
-        return speed_of_parting(self.push_out)
-
     def make_search(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields and the neighbour search, and return the search. enter() comes before."""
         raise NotImplementedError
+
+    def declare_rows(
+        self, scene: Scene, batches: list[Batch], team: Team, in_turn: bool = False, edges: Edges | None = None
+    ) -> NeighbourSearch:
+        """Declare the fields of rows and the neighbour search, and return the search. edges: of bodies, or None."""
+        dev, face = self.dev, 0
+        for group in scene.walls:
+            face = group.number_faces(scene, face)
+        friction = dev.has_friction or any(w.has_friction for w in self.walls)
+        bounces = dev.has_restitution or any(w.has_restitution for w in self.walls)
+        self.table.bind(scene, asked=friction or bounces or bool(edges))
+        turns = scene.state.spins and friction and (dev.turns or any(w.turns for w in self.walls))
+        walls, ahead, skin = scene.walls, self._ahead, self._present_skin
+        dev.rows = Rows(scene, self.table, friction, bounces, in_turn, turns, walls, team, self.push_out, ahead, edges)
+        dev.answers = Answers(scene, batches, dev.rows) if batches else None
+        dev.responses = Responses(scene, dev.rows, scene.state.spins and friction, dev.answers)
+        dev.islands = Islands(scene, dev.rows, dev.responses, team)
+        dev.impulses = Impulses(scene, dev.rows, dev.responses, team)
+        dev.places = Places(scene, dev.rows, dev.responses, dev.impulses, team)
+        linked = excluded_pairs(batches, scene.particles.radius, *([edges.outline.body] if edges else []))
+        dev.events = EventLog(scene, self.table) if dev.has_events else None
+        pair_data = [
+            dev.rows.memory,
+            *([dev.rows.touched, dev.rows.given] if bounces else []),
+            *([dev.rows.borne_moment] if turns else []),
+            *([dev.events.touched] if dev.events else []),
+            *(edges.pair_data if edges else []),
+        ]
+        pairs, reach = self.table, None
+        if edges:
+            dev.edge_pair_table = pairs = EdgePairTable(edges, self.table, scene.memory.number(skin + ahead, scene.real))
+            reach = edges.outline.reach
+        dev.search = NeighbourSearch(
+            scene, skin, linked, pairs, pair_data, team, dev.responses.push, reach, walls=walls, ahead=ahead
+        )
+        dev.list = dev.search.list
+        discs = DiscGeometry(scene, dev.search, dev.rows.given if bounces else dev.rows.memory)
+        dev.geometry = edges or discs
+        if dev.events:
+            dev.events.bind(dev.list, discs)
+            dev.rows.events = dev.events if dev.reports else None
+        dev.rows.bind(dev.list, discs)
+        dev.fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
+        return dev.search
 
     def enter(self, scene: Scene) -> None:
         """Store the scene, and fix what kernels contain. Called before fields are declared, and before the impacts of bodies."""
@@ -227,24 +251,9 @@ class PairContact(Feature):
                 self.dev.fast[None] = 1
 
     @ti.func
-    def restore(self, i, h):
-        """Reduce the overlap that particle i is allowed, after a substep h [s]. Rows allow none."""
-
-    @ti.func
-    def is_shrunk(self, i):
-        """Whether particle i is allowed to overlap for a while."""
-        return False
-
-    @ti.func
     def worst_overlap(self, i):
         """Return the number of contacts that particle i counts for the report, and its worst overlap relative to its size."""
         return self.dev.geometry.worst_overlap(i)
-
-    @ti.func
-    def start_last_substep(self, i, scale):
-        """Keep the displacement of particle i as the last substep of a frame begins. ForceShare needs it to tell impacts."""
-        if ti.static(bool(self.dev.forces)):
-            self.dev.forces.start(i, scale)
 
 
 def _skin(value):

@@ -42,17 +42,26 @@ class Places:
         Rows of particles that have not moved since they were found apart are not tested again.
         """
         out, total = ti.zero(self.radius.of(i)), 0 * self.state.d[i]
-        kept, pressed, own = self.rows.kept[i], self.rows.pressed[i], self.radius.of(i)
+        kept, pressed, own = self.rows.kept[i], self.rows.pressed[i], self.rows.size(i)
         again = self.impulses.flags[None][TURN] > 0
         still = again and (self.bodies.last[i] == 0).all()
         for row in range(self.rows.first(i, part), self.rows.last(i, part)):
             other = self.rows.other.field[row]
             gap, n, slop, push_out = 0 * own + 1, 0 * total, own, self.rows.push_out
             if row < pressed:
-                if not (still and (self.bodies.last[other] == 0).all()):
+                others_still = (self.bodies.last[other] == 0).all()
+                if ti.static(bool(self.rows.edges)):
+                    others_still = others_still and (self.bodies.last[self.rows.edges.end.field[row]] == 0).all()
+                on_edge = False
+                if ti.static(bool(self.rows.edges)):
+                    on_edge = self.rows.edges.place.field[row] >= 0
+                    if on_edge and not (still and others_still):
+                        slop = self.rows.edges.smaller(i, other)
+                        gap, n = self.rows.edges.gap_now(i, row)
+                if not (on_edge or (still and others_still)):
                     r = self.state.separation(i, other)
                     distance = self.rows.geometry.contact_distance(i, other)
-                    slop = ti.min(slop, self.radius.of(other))
+                    slop = ti.min(slop, self.rows.size(other))
                     near, rr = distance - ti.static(SLOP * BEYOND) * slop, r.dot(r)
                     if rr < near * near:
                         length = ti.sqrt(rr)
@@ -68,11 +77,15 @@ class Places:
                 gap -= ti.min(self.rows.gap.field[row], ti.static(-SLOP) * slop)
             else:
                 gap = 0 * gap
+            if ti.static(bool(self.rows.edges)):
+                self.rows.edges.gone.field[row] = 0 * n
             if gap < 0:
                 p = -gap * self.rows.firm.field[row] * n
                 total += p
                 out -= gap
-                if part == OWN and row < kept:
+                if ti.static(bool(self.rows.edges)):
+                    self.rows.edges.gone.field[row] = p
+                elif part == OWN and row < kept:
                     self.bodies.push[other] = self.bodies.push[other] - p
         if part == OWN:
             if ti.static(bool(self.bodies.answers)):

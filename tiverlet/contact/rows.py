@@ -15,7 +15,8 @@ from ..device import at, inline, ti
 from ..device.language import impl
 from ..device.number import OnDevice
 from ..features.material import DYNAMIC, RESTITUTION, ROLLING, STATIC, TANGENTIAL, TOUCH, TOUCHES, TWISTING
-from ..neighbours.neighbour_list import WALL, Column, PairData
+from ..neighbours.neighbour_list import WALL
+from ..neighbours.pair_data import Column, PairData
 from .impacts import Impacts
 from .limits import (
     AHEAD,
@@ -41,6 +42,7 @@ from .meeting import meeting
 if TYPE_CHECKING:
     from ..device.thread_team import Team
     from ..features.feature import Scene
+    from .edges import Edges
     from .narrow_phase import DiscGeometry
 
 
@@ -62,11 +64,13 @@ class Rows:
 
     def __init__(
         self, scene: "Scene", table: Any, has_friction: bool, bounces: bool, in_turn: bool, turns: bool, walls: list[Any],
-        team: "Team", push_out: float | None, ahead: float,
+        team: "Team", push_out: float | None, ahead: float, edges: "Edges | None" = None,
     ):  # fmt: skip
         n, add = scene.count, scene.memory.field
         self.scene, self.state, self.table = scene, scene.state, table
         self.has_friction, self.real, self.dim, self.radius = has_friction, scene.real, scene.particles.dim, scene.radius
+        self.edges: Any = edges
+        self.ends = 2 if edges else 1  # particles on which a row presses
         self.walls, self.width = walls, scene.particles.dim if has_friction else 0
         self.begin, self.own, self.kept, self.pressed, self.end = (
             add(f"Contact.rows_{name}", n, kind=ti.i32) for name in ("begin", "own", "kept", "pressed", "end")
@@ -78,12 +82,14 @@ class Rows:
         if scene.state.spins:
             self.turned = add("Contact.turned", n, width=scene.particles.axes, state=True)
         # What each pair and wall bore in the last substep [kg m]: along the normal, or with friction the whole vector.
-        self.memory = PairData("impulse" if has_friction else "push", self.width, persistent=True, has_owner=True)
+        self.memory = PairData("impulse" if has_friction else "push", self.width, persistent=True, has_owner=not edges)
         self.other, self.entry = Column("row_other", kind=ti.i32), Column("row_entry", kind=ti.i32)
         self.normal, self.gap, self.bend = Column("row_normal", self.dim), Column("row_gap"), Column("row_bend")
         self.stiff, self.firm = Column("row_stiff", 2 if has_friction else 0), Column("row_firm")
         self.p, self.step = Column("row_p", self.width), Column("row_step", self.width)
         self.columns = [self.other, self.entry, self.normal, self.gap, self.bend, self.stiff, self.firm, self.p, self.step]
+        if edges:
+            self.columns += edges.columns
         self.moved: Any = None
         self.friction: Any = None
         if walls:
@@ -98,9 +104,9 @@ class Rows:
         self.touched: Any = None
         if bounces:
             # What each pair gave along the normal in the last substep, with impacts [kg m].
-            self.given = PairData("given", 0, persistent=True, for_reports=True, has_owner=True)
+            self.given = PairData("given", 0, persistent=True, for_reports=True, has_owner=not edges)
             # Whether a pair touched in the last substep: then it goes on together instead of bouncing.
-            self.touched = PairData("touches", 0, persistent=True, kind=ti.i32, has_owner=True)
+            self.touched = PairData("touches", 0, persistent=True, kind=ti.i32, has_owner=not edges)
             self.bounce, self.time, self.target = Column("row_bounce"), Column("row_time"), Column("row_target")
             self.columns += [self.bounce, self.time, self.target]
             self.when = add("Contact.when", n)  # the part of the substep before the impact of the island of a particle
@@ -119,7 +125,7 @@ class Rows:
             self.arms, self.rolling, self.turn_stiff = (Column(f"row_{name}", 2) for name in ("arms", "rolling", "turn_stiff"))
             self.across = Column("row_across", self.dim)  # tangential displacement that the points which touch aim at [m]
             self.columns += [self.f, self.f_step, self.arms, self.rolling, self.turn_stiff, self.across]
-        self.divided = team.size > 1 or team.launched
+        self.divided = (team.size > 1 or team.launched) and not edges
         self.has_still = bool((scene.inv_mass == 0).any()) or bool(scene.state.sleepers)  # particles that impulses do not move
         # H: the substep [s]. BEGIN, END: the fractions of the frame at its ends. SCALE: by how much what rows bore is scaled.
         # WHOLE: the part of State.kick() that the substep adds to displacements. SHARES: spin_shares().
@@ -131,7 +137,10 @@ class Rows:
         """Add the columns to the neighbour list, before it is allocated."""
         self.list, self.geometry = listed, geometry
         listed.columns = [*listed.columns, *self.columns]
-        listed.movable = lambda: self.scene.inv_mass > 0
+        if self.edges:
+            self.edges.bind(self, listed, geometry)
+        else:
+            listed.movable = lambda: self.scene.inv_mass > 0
 
     @property
     def sheared(self) -> bool:
@@ -227,10 +236,27 @@ class Rows:
     def relative(self, u, d: ti.template(), i, other, row, pressed):  # type: ignore[valid-type]
         """Return the displacement u of particle i, relative to that of what a row presses on; d: displacements of particles."""
         if row < pressed:
-            u = self.state.relative_displacement(u - d[other], i, other)
+            for k in ti.static(range(self.ends)):
+                u -= self.part(row, k) * d[self.pressed_on(row, k)]
+            u = self.state.relative_displacement(u, i, other)
         elif ti.static(len(self.walls) > 0):
             u -= self.moved.field[row]
         return u
+
+    @inline
+    def pressed_on(self, row, k):
+        """Return one of the particles on which a row presses."""
+        return at(self.edges.end.field, row) if k else at(self.other.field, row)
+
+    @inline
+    def part(self, row, k):
+        """Return the part of the impulse of a row that this particle gets."""
+        return self.edges.part(row, k) if self.edges else 1
+
+    @inline
+    def size(self, i):
+        """Return the size of particle i, of which slop is a part [m]."""
+        return at(self.edges.size, i) if self.edges else self.radius.of(i)
 
     @ti.func
     def when_of(self, i):
@@ -259,9 +285,9 @@ class Rows:
         """Return State.kick() of particle i, relative to that of what a row presses on."""
         f = self.state.kick(i)
         if row < self.pressed[i]:
-            other = self.other.field[row]
-            if self.state.moves(other):
-                f -= self.state.kick(other)
+            for k in ti.static(range(self.ends)):
+                if self.state.moves(self.pressed_on(row, k)):
+                    f -= self.part(row, k) * self.state.kick(self.pressed_on(row, k))
         return f
 
     @ti.func
@@ -296,6 +322,41 @@ class Rows:
         """List the rows of particle i from `row` on. begin, end: of its piece. Returns the row behind the last."""
         scale = self.times[None][SCALE]
         self.begin[i] = row
+        if ti.static(bool(self.edges)):
+            row = self.find_edges(i, row, scale)
+        else:
+            row = self.find_pairs(i, begin, end, row, scale)
+        self.pressed[i] = row
+        if ti.static(len(self.walls) > 0):
+            first = self.list.first[i] + self.list.number[i]
+            if self.state.moves(i):
+                for e in range(first, first + self.list.wall_number[i]):
+                    row = self.find_wall(i, e, row, scale)
+                pressing = self.pressed[i]
+                for e in range(first, first + self.list.wall_number[i]):
+                    if pressing < row and self.entry.field[pressing] == e:
+                        pressing += 1
+                    else:
+                        self.forget(e)
+        self.end[i] = row
+        self.share[i] = self.share[i] + ti.cast(row - self.begin[i], self.real)
+        spread = self.spread[i]
+        for k in range(self.begin[i], row):
+            spread += self.square(self.normal.field[k])
+        self.spread[i] = spread
+        return row
+
+    @ti.func
+    def find_edges(self, i, row, scale):
+        """List the rows of which particle i is the vertex. Returns the row behind the last."""
+        self.own[i], self.kept[i] = row, row
+        for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
+            row = self.edges.list_row(i, e, row, scale)
+        return row
+
+    @ti.func
+    def find_pairs(self, i, begin, end, row, scale):
+        """List the rows of pairs of particle i. Returns the row behind the last."""
         first, number = self.list.first[i], self.list.number[i]
         if ti.static(self.divided):
             for e in range(first, first + number):
@@ -325,22 +386,6 @@ class Rows:
                 j = self.list.neighbour[e]
                 if not self.state.moves(j):
                     row = self.find_pair(i, j, e, row, scale)
-        self.pressed[i] = row
-        if ti.static(len(self.walls) > 0):
-            for e in range(first + number, first + number + self.list.wall_number[i]):
-                row = self.find_wall(i, e, row, scale)
-            pressing = self.pressed[i]
-            for e in range(first + number, first + number + self.list.wall_number[i]):
-                if pressing < row and self.entry.field[pressing] == e:
-                    pressing += 1
-                else:
-                    self.forget(e)
-        self.end[i] = row
-        self.share[i] = self.share[i] + ti.cast(row - self.begin[i], self.real)
-        spread = self.spread[i]
-        for k in range(self.begin[i], row):
-            spread += self.square(self.normal.field[k])
-        self.spread[i] = spread
         return row
 
     @ti.func
@@ -380,9 +425,13 @@ class Rows:
         out, pressed = ti.cast(0, ti.f64), self.pressed[i]
         if ti.static(self.has_still):
             for row in range(self.kept[i], pressed):
-                other = self.other.field[row]
-                if not self.state.moves(other):
-                    out += self.vector(self.p.field[row], self.normal.field[row]).dot(self.state.d[other])
+                p = self.vector(self.p.field[row], self.normal.field[row])
+                for k in ti.static(range(self.ends)):
+                    if not self.state.moves(self.pressed_on(row, k)):
+                        out += self.part(row, k) * p.dot(self.state.d[self.pressed_on(row, k)])
+                if ti.static(bool(self.edges)):
+                    if not self.state.moves(i):
+                        out -= p.dot(self.state.d[i])
         if ti.static(self.sheared):
             for row in range(self.own[i], pressed):
                 sheared = self.state.relative_displacement(0 * self.state.d[i], i, self.other.field[row])
@@ -479,7 +528,7 @@ class Rows:
             s, m = meeting(gap, bend, way, 0 * u, v, f, ti.cast(1, self.real), ti.cast(0, self.real))
             met = -(v + f * s).dot(m)
             blur = self.rounding * (u.norm() + ti.sqrt(size) * ti.static(2.0**-7))
-            least = ti.static(SLOW) * ti.max(self.times[None][WHOLE], 1) * ti.abs(f_own.dot(m)) + blur
+            least = ti.static(SLOW) * ti.max(self.times[None][WHOLE], 1) * f_own.norm() + blur
             rests = e * met <= ti.max(-f.dot(m), 0) * (1 - s) / 2
             hit = 0 <= s and (s - 1) * met <= blur and gap >= -met and met > least and not rests
             s = ti.min(s, 1)
@@ -574,7 +623,7 @@ class Rows:
                 if ti.static(bool(self.impacts)):  # what is struck may go anywhere
                     ahead = ti.min(ahead, gap + un - self.ahead)
                 # What it bore, it may still bear; but an open side, which is nowhere, has no row.
-                lists = ahead < ti.select(self.is_set(p), 1, ti.cast(SLOP, self.real)) * self.radius.of(i)
+                lists = ahead < ti.select(self.is_set(p), 1, ti.cast(SLOP, self.real)) * self.size(i)
                 if ti.static(w.dev.surface.has_switch):
                     lists = lists and w.dev.surface.active[None] != 0
                 if ti.static(w.dev.surface.is_one_way):

@@ -21,7 +21,8 @@ from ..features.regrouping import Regrouping
 from ..geometry.ordered import distinct
 from .cell_list import CellList, add_to
 from .images import FLOW, GRADIENT
-from .neighbour_list import MOVED, STALE, WALL, NeighbourList, PairData
+from .neighbour_list import MOVED, STALE, WALL, NeighbourList
+from .pair_data import PairData
 
 if TYPE_CHECKING:
     from ..features.feature import Scene

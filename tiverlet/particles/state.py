@@ -33,7 +33,6 @@ class State:
         self.two_digits = 2.0**-50 if self.double else 2.0**-21  # the size of the last two binary digits of 1
         self.count, self.dim = n, dim
         self.starts = self.befores = self.lifts = self.carries = self.spins = False
-        self.keeps_wall_push = False
         self.images: Any = None  # set in a periodic box, see neighbours/periodic.py
         self.sleepers: Any = None  # set if particles may sleep, see step/sleep.py
         self.number = memory.number(n)  # of particles
@@ -182,16 +181,13 @@ class State:
             x += self.low0[i]
         return x
 
-    def remember(self, memory: "Memory", start: bool, before: bool, lifts: bool, wall_push: bool, lasts: bool) -> None:
+    def remember(self, memory: "Memory", start: bool, before: bool, lifts: bool) -> None:
         """Declare what friction, swept walls and impacts need.
 
         start, before: position and displacement at the start of the substep. lifts: whether particles that bounced may not be
-        where their displacement says. wall_push: how far walls have pushed since then. lasts: whether the next substep needs
-        that.
+        where their displacement says.
         """
-        self.starts, self.befores, self.lifts, self.keeps_wall_push = start, before, lifts, wall_push
-        if wall_push:
-            self.wall_push = memory.field("wall_push", self.number, width=self.dim, state=lasts)
+        self.starts, self.befores, self.lifts = start, before, lifts
         if start:
             self.x0 = memory.field("position_at_start", self.number, width=self.dim)
             if self.sums:
@@ -203,21 +199,6 @@ class State:
     def kick(self, i):
         """Return the displacement of particle i by forces in the substep, twice that at a start, where `before` is kept [m]."""
         return at(self.d, i) - at(self.before, i)
-
-    @ti.func
-    def note_wall_push(self, i, change):
-        """Note that a wall changed the displacement of particle i."""
-        if ti.static(self.keeps_wall_push):
-            self.wall_push[i] = self.wall_push[i] + change
-
-    @ti.func
-    def wall_normal(self, i):
-        """Return the direction in which walls push particle i in this substep, or 0."""
-        push = self.wall_push[i]
-        size = push.norm()
-        if size > 0:
-            push /= size
-        return push
 
     @ti.func
     def digits(self, i):

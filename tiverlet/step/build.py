@@ -156,13 +156,13 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     contact = next((c for c in of(PairContact) if c.can_touch), None)
     if contact or walls:
         scene.radius = Radii(memory, particles.radius, scene.count)
-    rows = bool(contact and contact.solves_rows)  # whether contacts are rows
+    rows = bool(contact)
     scene.walls = grouped(walls)
     surfaces = [*walls, *([contact] if contact else [])]
     has_friction, bounces = any(f.has_friction for f in surfaces), any(f.has_restitution for f in surfaces)
     scene.bounces = bounces and bool(walls)
     solver = solver or (choose_solver(batches, scene, rows) if scene.order == 2 else Direct())
-    if (batches and solver.loads) or (contact and contact.has_loads):
+    if batches and solver.loads:
         scene.own_weight = OwnWeight(scene)
     if batches:
         with memory.owned("slots"):
@@ -179,18 +179,14 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     if contact:
         contact.enter(scene)
     if can_have_impacts(scene, batches) and not rows:
-        pairs = bool(contact and contact.strikes_bodies)
-        if pairs or any(w.has_restitution for w in walls) or (walls and stops_bodies(scene, batches)):
-            scene.impacts = BodyImpacts(scene, batches, bool(contact), pairs)
+        if any(w.has_restitution for w in walls) or (walls and stops_bodies(scene, batches)):
+            scene.impacts = BodyImpacts(scene, batches)
     search = contact.make_search(scene, batches, team) if contact else None
-    bodies = bool(search and contact and contact.dev.bodies)
     state.remember(
         memory,
         has_friction or rows or any(w.needs_start_position for w in walls) or scene.bounces,
-        bounces or bool(scene.impacts) or bodies or rows,
+        bounces or bool(scene.impacts) or rows,
         bounces,
-        bool(bodies and walls),
-        bodies,
     )
     for feature in of(Batch):
         feature.scene = scene  # also for those that do nothing, because all of their particles are held
@@ -204,11 +200,10 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         feature.new_force = False  # the force has been on the device from the start
         feature.changed = feature in drivers  # they move to their targets in the first frame; other knobs are in fields already
         feature.note_built()
-    known = contact.known if contact else None
-    forces = Forces(scene, [*accelerations, known.carried] if known else accelerations)
+    forces = Forces(scene, accelerations)
     integrator = Verlet(scene, forces, bool(contact)) if scene.order == 2 else high_order.Composition(scene, forces, batches)
     if scene.own_weight:
-        scene.own_weight.follow(integrator, [known.carried] if known else [])
+        scene.own_weight.follow(integrator)
     step = Step(scene, integrator, batches, drivers, contact, search, walls, team)
     if state.sleepers:
         step.sleep = SleepPass(step, state.sleepers, drivers, batches)
@@ -249,7 +244,7 @@ def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
 
 def usual_substeps(features: tuple[Feature, ...]) -> int:
     """Return how many substeps frames have where the user does not say."""
-    rows = any(isinstance(f, PairContact) and f.solves_rows for f in features)
+    rows = any(isinstance(f, PairContact) for f in features)
     linked = any(isinstance(f, Batch) and not f.is_kinematic for f in features)
     free = all((f.common and f.steady) or not f.accelerates for f in features if isinstance(f, Acceleration))
     return GRAINS if rows and free and not linked else USUAL

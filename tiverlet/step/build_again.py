@@ -185,7 +185,6 @@ class Rebuild:
         # Data without an old value, of features that were just added, is 0.
         nothing = {p.name: np.zeros((len(pairs), p.width) if p.width else len(pairs)) for p in search.list.persistent}
         search.list.restore(pairs[both], {name: self.old.get(f"Contact.{name}", none)[both] for name, none in nothing.items()})
-        self.world._runner.carry_loads()
 
 
 def _fields(attributes: dict[str, Any], names: dict[int, Any]) -> dict[tuple[str, str], Any]:

@@ -158,13 +158,13 @@ def complement(a: np.ndarray) -> np.ndarray:
     return out
 
 
-def cluster_rows(batches: list, w: np.ndarray, every: bool = False) -> list[ClusterRows]:
-    """Return rows of the rigid clusters that share particles with other constraints, or, with `every`, of all rigid clusters; and
-    of the soft ones that share particles with other clusters.
+def cluster_rows(batches: list, w: np.ndarray) -> list[ClusterRows]:
+    """Return rows of the rigid clusters that share particles with other constraints, and of the soft ones that share particles
+    with other clusters.
 
     Passes leave clusters that share particles violated. Large clusters get no rows, see WIDEST.
     """
-    rows = [ClusterRows(b, w, some & ~_wide(b)) for b, some in _coupled(batches, w, every) if (some & ~_wide(b)).any()]
+    rows = [ClusterRows(b, w, some & ~_wide(b)) for b, some in _coupled(batches, w) if (some & ~_wide(b)).any()]
     return [some for some in rows if some.count]
 
 
@@ -183,9 +183,9 @@ def left_out(batches: list, w: np.ndarray, x: np.ndarray, h: float) -> float:
     return worst
 
 
-def _coupled(batches: list, w: np.ndarray, every: bool = False) -> Iterator[tuple[Any, np.ndarray]]:
-    """Yield each batch and the mask of its rigid clusters that share particles with other constraints, with `every` of all rigid
-    ones, and of its soft clusters that share particles with other clusters."""
+def _coupled(batches: list, w: np.ndarray) -> Iterator[tuple[Any, np.ndarray]]:
+    """Yield each batch and the mask of its rigid clusters that share particles with other constraints, and of its soft clusters
+    that share particles with other clusters."""
     clusters = [b for b in batches if b.clusters and b.count]
     degrees = [
         np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in some)]), minlength=len(w))
@@ -193,7 +193,7 @@ def _coupled(batches: list, w: np.ndarray, every: bool = False) -> Iterator[tupl
     ]
     for b in clusters:
         with_any, with_clusters = (np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) > 1 for degree in degrees)
-        yield b, np.where(b.compliance == 0, every | with_any, with_clusters) & ~b.broken & ~b.immovable(w)
+        yield b, np.where(b.compliance == 0, with_any, with_clusters) & ~b.broken & ~b.immovable(w)
 
 
 def _wide(batch: Any) -> np.ndarray:

@@ -70,8 +70,6 @@ def planned(
     known = {id(start): start for start in (world._particles, *(f.start for f in world.features))}
     starts = {one: now.placed(change.regrouped_rows(start.position, came)) for one, start in known.items()}
     bound, tied = None, [f for f in batches if not f.can_regroup(change)]
-    if links and runner.lacks_bodies(list(links.values()), now.position, inv_mass):
-        return None
     if links or tied:
         if any(not f.acts for f in tied):
             return None
@@ -124,13 +122,11 @@ def regroup(world: Any, edit: Edit, added: Particles | None) -> None:
         bind(world, change, bound)
     if runner.sleep:
         runner.sleep.bind_again(step.drivers, runner.batches)
-    runner.find_bodies(everything=True)
     runner.regroup()
     for log in runner.logs:
         log.forget()
     if pairs:
         search.list.replace(*pairs)
-    runner.carry_loads()
 
 
 @dataclass
@@ -203,12 +199,10 @@ def grab(world: Any, change: Grab) -> None:
         rows = runner.step.contact_pass.rows
         if rows and rows.answers:
             rows.answers.reassign(memory, change.inv_mass)
-        runner.find_bodies(everything=True)
     for f in pins:
         f.grab(scene)
     for log in runner.logs:
         log.forget()
-    runner.carry_loads()
 
 
 def _joined(some: list[np.ndarray]) -> Rows:

@@ -15,7 +15,6 @@ from ..shapes.shape import morton
 from ..solvers.choice import explain_choice
 from .launcher import STIRRED
 from .sleep import Sleep
-from .step import REBOUNDS
 
 if TYPE_CHECKING:
     from ..world import World
@@ -86,8 +85,7 @@ def _launches(world: "World") -> str:
     if not step.launched:
         return "1 launch per frame" + f", of {step.team.size} threads" * (step.team.size > 1)
     solved = world.iterations * (step.constraints.steps + 1) if step.constraints.steps else 0
-    rounds = REBOUNDS + 1 if step.has_restitution else 0
-    each = (world.iterations * step.halves if step.particles.acts else 1) + solved + rounds
+    each = (world.iterations * step.halves if step.particles.acts else 1) + solved
     waits, least = "one", ""
     if step.has_impacts:  # after each substep the host reads whether linked particles struck anything
         each, waits = each + step.finishes, str(world.substeps + 1)
@@ -148,8 +146,10 @@ def _absent(world: "World") -> list[str]:
         (not step.walls, "wall pass: no wall"),
         (not world.particles.spins and bool(step.walls or step.search), "spin: particles have none"),
         (not step.state.images, "nearest images: no Periodic"),
-        (any(not (c.solves_rows or c.has_loads) for c in step.contacts), "loads that pairs know: no Polygons with loads=True"),
-        (any(c.solves_rows and not c.in_turn for c in step.contacts), "impacts one after the other: no restitution above 0.97"),
+        (
+            any(not r.in_turn for r in [step.contact_pass.rows] if r),
+            "impacts one after the other: no restitution above 0.97, or links that are relaxed",
+        ),
         (bool(step.batches) and not step.constraints.learners, "loads that links know: no Jacobi(loads=True)"),
         (not step.sleepers, "islands and who sleeps: no Sleep"),
         (not step.integrator.forces.all, "accelerations: no force"),

@@ -23,15 +23,11 @@ class Launcher:
 
     def __init__(self, runner: "Runner"):
         self.runner, step = runner, runner.step
-        self.halves, self.newton_steps, self.has_restitution = step.halves, step.newton_steps, step.has_restitution
-        self.finishes, self.projects_bodies = step.finishes, step.projects_bodies
-        self.drives, self.constrains, self.touches, self.acts = map(
-            bool, (step.drivers, step.batches, step.contacts, step.particles.acts)
-        )
+        self.halves, self.newton_steps, self.finishes = step.halves, step.newton_steps, step.finishes
+        self.drives, self.constrains, self.acts = map(bool, (step.drivers, step.batches, step.particles.acts))
         self.has_pair_forces, self.lists_pairs = step.has_pair_forces, bool(step.listed_forces)
         self.systems, self.steps = bool(step.constraints.systems), step.constraints.steps
-        self.solves_rows = bool(step.contact_pass.rows)
-        self.impacts, self.has_pair_impacts = step.impacts, step.has_pair_impacts
+        self.rows, self.impacts = step.contact_pass.rows, step.impacts
         self.looks, self.applies_first = step.looks, step.particles.applies_first
         self.needs_more = True  # whether extra passes of this substep may be needed, see BodyImpacts
         self.waiting: list[str] = []
@@ -166,19 +162,17 @@ class Launcher:
         return now.span.iterations == 1 and now.it == 0
 
     def solve_contacts(self, now: Moment) -> None:
-        """Add the phase solve_contacts, if there are contacts. Passes over rows are launches; some do nothing.
+        """Add the phases that solve contacts, if there are any. Passes over rows are launches; some do nothing.
 
         The host asks whether more of them are needed, see repeat().
         """
-        self.put(now, "solve_contacts", self.touches and not self.solves_rows)
-        if self.solves_rows and now.it == 0:
+        if self.rows and now.it == 0:
             self.put(now, "start_events")
             self.put(now, "find_rows")
-            if self.runner.step.contact_pass.rows.in_turn:
+            if self.rows.in_turn:
                 self.repeat(now, "strike", ROUNDS, BOUNCES)
                 self.put(now, "begin_impulses")
-            impulses = self.runner.step.contact_pass.rows.impulses
-            self.repeat(now, "relax_impulses", impulses.least, BOUNCES)
+            self.repeat(now, "relax_impulses", self.rows.impulses.least, BOUNCES)
             self.put(now, "finish_impulses")
             self.repeat(now, "relax_places", STIRRED, MOVES)
 
@@ -187,7 +181,7 @@ class Launcher:
 
         An answer takes the host as long as a few launches, so at most half of them do nothing for it.
         """
-        flags, done, more = self.runner.step.contact_pass.rows.impulses.flags, 0, least
+        flags, done, more = self.rows.impulses.flags, 0, least
         while more:
             for _ in range(more):
                 self.flush()
@@ -198,37 +192,9 @@ class Launcher:
             if more and not self.runner.memory.read(flags)[..., GOING].any():
                 return
 
-    def any_struck(self) -> bool:
-        """Always true. The host does not read whether a pair bounces; a round without a bounce does nothing."""
-        return True
-
-    def rebound(self, now: Moment) -> None:
-        """Launch one round of restitution."""
-        self.flush()
-        self.put(now, "rebound")
-        self.flush()
-
-    def push_bodies(self, now: Moment) -> None:
-        """Add this phase; the step calls it only where bodies can strike each other."""
-        self.put(now, "push_bodies")
-
     def apply_corrections(self, now: Moment) -> None:
         """Add the last phase of a pass, if particles have corrections to apply."""
         self.put(now, "apply_corrections", self.acts)
-
-    def has_struck_bodies(self, now: Moment) -> bool:
-        """Whether bodies struck each other in this substep. The host has to wait for the answer."""
-        self.flush()
-        return bool(self.runner.memory.read(self.runner.step.contacts[0].dev.bodies.any_struck))
-
-    def body_rounds(self, now: Moment) -> int:
-        """Return how many rounds find the impacts of bodies."""
-        return self.runner.step.contacts[0].dev.bodies.passes + 3
-
-    def project_bodies(self, now: Moment) -> None:
-        """Add one round of the impacts of bodies, in a launch of its own."""
-        self.flush()
-        self.put(now.of(now.it, half=now.it * self.halves), "project_bodies")
 
     def finish_substep(self, now: Moment) -> None:
         """Add the phase finish_substep, after the last pass."""

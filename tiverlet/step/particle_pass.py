@@ -2,8 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from ..colliders.surface import ANY_DEPTH, BEFORE_CONTACTS, BEYOND_ROUNDING, FRICTIONLESS
-from ..contact.force_share import accumulate
+from ..colliders.surface import ANY_DEPTH, BEYOND_ROUNDING, FRICTIONLESS
 from ..contact.limits import SLOP
 from ..device import inline, ti
 from ..device.number import OnDevice
@@ -40,7 +39,7 @@ class ParticlePass:
         self.few = scene.memory.compiler.few
         self.whole = team.size == 1 and not team.launched  # all particles are one piece
         self.undivided = self.whole and self.few  # and one tile: no loop over tiles is compiled
-        self.rows: Any = contact.dev.rows if contact else None
+        self.rows = bool(contact)  # whether contacts, and walls with them, are rows
         self.groups: list[WallGroup] = scene.walls
         walls = [] if self.rows else [group.wall for group in scene.walls]  # otherwise they keep inside what rows leave outside
         self.alone = len(walls) == 1 and scene.walls[0].single and not walls[0].needs_repeat
@@ -51,8 +50,6 @@ class ParticlePass:
         self.held = bool(batches)
         self.contacts = [contact] if contact else []
         self.acts = self.gathers or bool(contact or walls)
-        self.knows_loads = bool(contact) and contact.has_loads
-        self.wall_loads = [contact.make_wall_loads()] if walls and contact and contact.has_loads else []
         self.impacts = [scene.impacts] if scene.impacts else []
         self.weights = [scene.own_weight] if scene.own_weight else []
         self.rough = any(w.has_friction or w.has_restitution for w in walls)
@@ -120,23 +117,11 @@ class ParticlePass:
     @ti.func
     def advance(self, first, end, now):
         """Integrate a tile of particles, in short loops that the compiler can vectorize."""
-        for c in ti.static(self.contacts):
-            if now.final != 0:
-                scale = ti.select(now.fresh != 0, now.h, ti.cast(1, self.real))
-                for i in range(first, end):
-                    if self.state.awake(i):
-                        c.start_last_substep(i, scale)
         if ti.static(self.state.starts):
             for i in range(first, end):
                 self.state.x0[i] = self.state.x[i]
                 if ti.static(self.state.sums):
                     self.state.low0[i] = self.state.low[i]
-        if ti.static(self.state.keeps_wall_push):
-            for c in ti.static(self.contacts):
-                for i in range(first, end):
-                    if ti.static(bool(c.dev.bodies)):
-                        c.dev.bodies.note_wall(i, now.tick)
-                    self.state.wall_push[i] = ti.zero(self.state.x[i])
         if ti.static(self.state.spins):
             if now.fresh != 0:
                 for i in range(first, end):
@@ -152,39 +137,13 @@ class ParticlePass:
             if (now.span.since + now.s + 1) % ti.static(WEIGHED) == 0 or now.fresh != 0:
                 for i in range(first, end):
                     weights.store_weight(i, now)
-        for loads in ti.static(self.wall_loads):
-            for i in range(first, end):
-                loads.give(i, now)
         for c in ti.static(self.contacts):
             stale, fast = 0, 0
-            for i in range(first, end):
-                c.restore(i, now.h)
             for i in range(first, end):
                 stale |= self.search.moved_too_far(i)
             for i in range(first, end):
                 fast |= c.overshoots(i)
             c.note_motion(stale, fast)
-
-    @ti.func
-    def leave_walls(self, i, now):
-        """Move particle i out of the walls, without friction and bounces. Returns the move [m]."""
-        d = self.state.d[i]
-        before, wall_push = self.wall_values(i)
-        moving = True
-        for _ in range(SWEEPS):
-            if moving:
-                moving = not self.touch_all(i, now.h, now.frame_fraction, BEFORE_CONTACTS)
-        self.restore_wall_values(i, before, wall_push)
-        return self.state.d[i] - d
-
-    @ti.func
-    def normal_of_walls(self, i, now):
-        """Return how far walls would push particle i without friction [m]. It does not move."""
-        out = ti.zero(self.state.x[i])
-        if self.state.moves(i):
-            out = self.leave_walls(i, now)
-            self.state.shift(i, -out)
-        return out
 
     @ti.func
     def apply_constraints(self, now):
@@ -223,14 +182,6 @@ class ParticlePass:
         if ti.static(self.gathers):
             for i in range(begin, end):
                 self.gather(i, now)
-        for loads in ti.static(self.wall_loads):
-            if now.first != 0:
-                for i in range(begin, end):
-                    loads.take_back(i)
-        for c in ti.static([] if self.rows else self.contacts):
-            if now.it < now.span.iterations:  # further passes have no contacts, see BodyImpacts
-                for i in range(begin, end):
-                    c.apply_corrections(i, now.first)
         if ti.static(len(self.walls) > 0):
             if now.final != 0:
                 for i in range(begin, end):
@@ -240,12 +191,6 @@ class ParticlePass:
                     for i in range(begin, end):
                         if self.state.awake(i):
                             accumulate(self.wall_turn, i, -self.state.spin.s[i], now.first)
-        for loads in ti.static(self.wall_loads):
-            if now.first != 0 and loads.ends_window(now):
-                for i in range(begin, end):
-                    loads.normal[i] = self.normal_of_walls(i, now)
-            for i in range(begin, end):
-                accumulate(loads.pushed, i, -self.state.d[i], now.first)
         for impacts in ti.static(self.impacts):
             if now.it >= now.span.iterations:
                 for i in range(begin, end):
@@ -260,22 +205,16 @@ class ParticlePass:
                 if self.near_walls(low, high) != 0:
                     for i in range(low, high):
                         self.confine(i, now.h, now.frame_fraction)
-        if ti.static(bool(self.rows) and len(self.groups) > 0):
+        if ti.static(self.rows and len(self.groups) > 0):
             for i in range(begin, end):
                 if self.search.list.wall_number[i] > 0 or self.search.moved_too_far(i) != 0:
                     self.guard(i, now)
-        for loads in ti.static(self.wall_loads):
-            for i in range(begin, end):
-                loads.pushed[i] = loads.pushed[i] + self.state.d[i]
         for impacts in ti.static(self.impacts):
             for i in range(begin, end):
                 if impacts.is_struck_now(i):
                     if now.it + 1 >= now.span.iterations:
                         impacts.correct_push(i, now)
                     impacts.request_pass(now)
-                if ti.static(impacts.pairs):
-                    if now.it < now.span.iterations and impacts.parts[i] > 0:
-                        impacts.request_pass(now)
         for c in ti.static(self.contacts):
             if now.checks_list != 0:
                 stale = 0
@@ -313,14 +252,6 @@ class ParticlePass:
                 self.wall_displacement[i] = self.wall_displacement[i] - blow * n
                 if ti.static(self.turned_by_walls):
                     self.wall_turn[i] = 0 * self.wall_turn[i]
-
-    @ti.func
-    def learn_wall_loads(self, now):
-        """At the end of a substep: learn the loads with which walls hold particles."""
-        for loads in ti.static(self.wall_loads):
-            for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
-                if self.state.awake(i):
-                    loads.learn(i, now)
 
     @ti.func
     def near_walls(self, begin, end):
@@ -377,24 +308,6 @@ class ParticlePass:
         return (self.state.d[i] == d).all() and (self.state.x[i] == x).all()
 
     @ti.func
-    def wall_values(self, i):
-        """Return the values of particle i that walls change, besides its position and displacement."""
-        before = wall_push = ti.zero(self.state.d[i])
-        if ti.static(self.state.befores):
-            before = self.state.before[i]
-        if ti.static(self.state.keeps_wall_push):
-            wall_push = self.state.wall_push[i]
-        return before, wall_push
-
-    @ti.func
-    def restore_wall_values(self, i, before, wall_push):
-        """Restore the values of particle i that wall_values() returned."""
-        if ti.static(self.state.befores):
-            self.state.before[i] = before
-        if ti.static(self.state.keeps_wall_push):
-            self.state.wall_push[i] = wall_push
-
-    @ti.func
     def touch_group(self, group: ti.template(), i, radius, h, frame_fraction, mode):  # type: ignore[valid-type]
         """Apply the corrections of the walls of a group that particle i may meet, in turn."""
         if ti.static(group.single):
@@ -423,7 +336,9 @@ class ParticlePass:
         d_low = ti.zero(d)
         if ti.static(self.state.carries):
             d_low = self.state.d_low[i]
-        before, wall_push = self.wall_values(i)
+        before = ti.zero(d)
+        if ti.static(self.state.befores):
+            before = self.state.before[i]
         self.state.d[i] = move
         moving = True
         for k in range(ROUNDS + 1):
@@ -434,7 +349,8 @@ class ParticlePass:
         self.state.d[i] = d
         if ti.static(self.state.carries):
             self.state.d_low[i] = d_low
-        self.restore_wall_values(i, before, wall_push)
+        if ti.static(self.state.befores):
+            self.state.before[i] = before
 
     @ti.func
     def cancel_move(self, i):
@@ -451,8 +367,7 @@ class ParticlePass:
     def reaction(self, i, h, t, firm, soft):
         """Return h^2 times the acceleration of particle i by constraints (from Slots), contacts and walls in the last substep.
 
-        Also returns the share of the push of walls that it contains. firm, soft: see Passes.push_reaction(); with firm = 0, known
-        loads of contacts are subtracted, too.
+        Also returns the share of the push of walls that it contains. firm, soft: see Passes.push_reaction().
         The push of walls counts as far as it balances all other forces. So a body at rest has velocity 0, but half of a blow is
         not added to the velocity of a particle that has just bounced, nor to the other particles of its body, whose walls and
         rigid constraints count for nothing.
@@ -462,11 +377,6 @@ class ParticlePass:
             reaction = self.slots.total_of(i)
         for c in ti.static(self.contacts):
             reaction += firm * c.reaction(i, h, soft)
-            if ti.static(self.knows_loads):
-                left_out = firm == 0
-                for impacts in ti.static(self.impacts):
-                    left_out = left_out or impacts.reached[i] != 0  # as the constraints of the body, which hold against them
-                reaction -= ti.select(left_out, h * h, 0 * h) * c.dev.known.carried.field[i]
         if ti.static(len(self.walls) > 0):
             push = firm * self.wall_displacement[i]
             v = self.state.d[i] / h
@@ -492,9 +402,17 @@ class ParticlePass:
         """Return r omega of particle i at the end of the last substep: s / h plus half of what moments of forces added to it."""
         turned = 0 * self.state.spin.s[i]
         for c in ti.static(self.contacts):
-            if ti.static(bool(c.dev.rows)):
-                turned += c.dev.rows.turned[i]
+            turned += c.dev.rows.turned[i]
         if ti.static(self.turned_by_walls):
             _reaction, part = self.reaction(i, h, t, firm, soft)
             turned += part * self.wall_turn[i]
         return (self.state.spin.s[i] + firm / 2 * turned) / h
+
+
+@ti.func
+def accumulate(field: ti.template(), i, value, first):  # type: ignore[valid-type]
+    """Add a value to the entry of particle i in a field. The first pass begins the sum."""
+    if first != 0:
+        field[i] = value
+    else:
+        field[i] = field[i] + value

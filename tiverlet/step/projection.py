@@ -35,7 +35,6 @@ from .anchor_rows import AnchorRows, anchor_rows
 from .block_matrix import WIDEST, BlockMatrix, WideRows, summed
 from .clock import CHANGED
 from .cluster_rows import ClusterRows, cluster_rows, left_out
-from .contact_rows import ContactRows
 from .free_bodies import FreeBodies
 from .integrator import h2_effective_of
 from .jacobian import Jacobian
@@ -59,18 +58,15 @@ FAR = 0.75  # of the longest substep: below, violations that are small now are s
 NEWTON = 40  # steps, at most
 PRODUCTS = 1e9  # multiplications, at most: some seconds, after which the remaining violations stay
 QUICK = 1 / 32  # of these where a loop measures dt: a wait would make the next frame still longer
-SHARED = PRODUCTS / 8  # the limit where contacts move, too: that is tried after links alone, several times
 BEGIN, HARDEST, LEAST = 1e-3, 10.0, 1e-9  # mu of the first and of the last try; the least mu
 FINE, STALLED = 1e-5, 0.05  # mu from which on a step must remove this share of the stored energy, or violations are left
-SLIGHT = 0.01  # of the kinetic energy: what violations may become where contacts are in the way
+SLIGHT = 0.01  # of the kinetic energy: what violations may become where walls are in the way
 SLIGHTEST = 1e-3  # of the kinetic energy inside bodies: what violations, and moves in the next substep, may add to it
 LOOKS = 8  # steps of conjugate gradients, to estimate the moves of a solver
 LEFT = 0.01  # of the energy that violations store: what may be left of it in the shorter substep
 DONE = 1e-6, 1e-13  # of its size: a violation that counts as none; and one that breaks nothing in the shortest substep
 TURNS = 16  # with walls, at most: a link that stands on a wall halves its violation in each
 WORSE = 2.0  # times the energy stored before: a result that stores more is discarded
-BETTER = 0.5  # times that energy, of links and contacts: the limit where contacts move, too
-TOGETHER = 4  # rounds in which links and contacts move together: each may lead into further contacts
 HELD = 1e3  # of its mass: the stiffness with which a wall holds a particle that it has stopped
 GRIP = 1e-3  # of the push of a wall: the tangential part from which on friction holds a particle
 
@@ -90,18 +86,14 @@ class Aims(NamedTuple):
     done: float
 
 
-def project(
-    runner: "Runner", h: float, dt: float, longest: float, contacts: ContactRows | None = None, measured: bool = False,
-    stiffens: bool = False,
-) -> bool | None:  # fmt: skip
+def project(runner: "Runner", h: float, dt: float, longest: float, measured: bool = False, stiffens: bool = False) -> bool | None:
     """Remove the energy that violations would store in a shorter substep; d holds velocities.
 
-    Nothing happens if violations are small, or if the moves would make contacts overlap more. h: the coming substep [s], of a
-    frame dt [s]. longest: the longest substep since the last projection [s]. contacts: contacts that move together with links.
-    measured: whether a loop measures dt; then more violation counts as small. stiffens: whether systems that give way are to bear
-    their loads again; if not, they remain as soft as they are.
-    Returns whether positions are settled for h; None where contacts are in the way and the energy is more than a hundredth of the
-    kinetic energy.
+    Nothing happens if violations are small. h: the coming substep [s], of a frame dt [s]. longest: the longest substep since the
+    last projection [s]. measured: whether a loop measures dt; then more violation counts as small. stiffens: whether systems that
+    give way are to bear their loads again; if not, they remain as soft as they are.
+    Returns whether positions are settled for h; None where that fails and the energy is more than a hundredth of the kinetic
+    energy.
     """
     ratio = h / longest
     uneven = measured and ratio >= UNEVEN
@@ -122,13 +114,12 @@ def project(
     batches += sideways_rows(batches)
     batches += anchor_rows(runner.batches, x)
     clusters = Solids.loaded(runner, x, 1.0, apart=False)  # a fast test
-    if batches or contacts or would_vibrate(clusters.worst, ratio, enough):
-        batches += cluster_rows(runner.batches, w, every=contacts is not None)
+    if batches or would_vibrate(clusters.worst, ratio, enough):
+        batches += cluster_rows(runner.batches, w)
     elif clusters.count and clusters.copies.shared:
         return ratio < FAR
     if not batches:
         return True
-    batches += [contacts] if contacts else []
     rails = Rails(runner, x)
     start = Rows(batches, w, x, runner.scene.periodic, rails)
     undone = start.undone(runner)
@@ -149,33 +140,29 @@ def project(
     # A solver that converges removes remaining violations at once in the next substep, which leaves velocities.
     steps = LOOKS if slots.converges or slots.exact else 0
     slight = SLIGHTEST * 2 * h * h * start.kinetic(v[:n])
-    still = (undone != 0) & (start.theta > FIRM) & ~start.touches
+    still = (undone != 0) & (start.theta > FIRM)
     v[:n] += rows.jacobian.solve((rows.pace(runner, h, dt) - rows.jacobian.rates(v[:n])) * still, still)
     energy, overlap = seen_before(runner)
     finest = ratio**4 if frail else ratio**2  # by loads, or by energies
-    products = (SHARED if contacts else PRODUCTS) * (QUICK if measured else 1.0)
+    products = PRODUCTS * (QUICK if measured else 1.0)
     aims = Aims(LEFT * finest, steps, 0.0 if frail else slight, products, DONE[frail])
     rows, stopped = _moved(runner, start, _leaning(runner, rows, share), aims)
-    left = 0.0
-    if contacts:
-        rows, stopped, left = _together(runner, start, rows, stopped, contacts.stored(before, w), batches[:-1], aims)
     x = rows.x
     bodies = FreeBodies(start.jacobian, x, stopped | tethered(runner))
     v[:n], spun = bodies.spun(v[:n], before, kept[:n])
     memory.write(state.d, v)
     runner.invalidate()  # moves may lead to particles that are not listed
     more, deeper = seen(runner)
-    fails = left > BETTER if contacts else deeper > overlap or rows.stored > WORSE * start.stored
-    if fails:
+    if deeper > overlap or rows.stored > WORSE * start.stored:
         state.put(memory, before)
         memory.write(state.d, kept)
         stake = max(_over(start.weight * undone**2, start.diagonal).sum() / (2 * h * h), stored / ratio**2)
         kinetic = (start.mass[:, None] * kept[:n].astype(np.float64) ** 2).sum() / 2
-        return None if contacts or stake > SLIGHT * kinetic else True
+        return None if stake > SLIGHT * kinetic else True
     due = more - energy - given_back(runner, energy, spun)
     if due > 0:
         moves = bodies.unturned(x - before)
-        v[:n] = take_energy(start.jacobian, v[:n], moves, due, rows.wall.any(axis=1), None if contacts else bodies)
+        v[:n] = take_energy(start.jacobian, v[:n], moves, due, rows.wall.any(axis=1), bodies)
         memory.write(state.d, v)
     return True
 
@@ -194,8 +181,6 @@ def stiffen(runner: "Runner", h: float, dt: float, longest: float, measured: boo
     x, d, energy = state.get(memory), memory.read(state.d), seen_before(runner)[0]
     most = energy if clock.bound is None else max(energy, clock.bound)
     done = project(runner, h, dt, longest, measured=measured, stiffens=True)
-    if done is None:
-        done = project(runner, h, dt, longest, ContactRows.of(runner), measured, stiffens=True)
     if done:
         room = most + SLIGHTEST * clock.kinetic - seen(runner)[0]
         if room >= 0 and system.stiffen(state.get(memory), h, room):
@@ -240,32 +225,6 @@ def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: Aims) -> tuple["
             if rows.stored <= enough:
                 break
     return rows, stopped
-
-
-def _together(
-    runner: "Runner", start: "Rows", rows: "Rows", stopped: np.ndarray, pressed: float, links: list[Any],
-    aims: Aims,
-) -> tuple["Rows", np.ndarray, float]:  # fmt: skip
-    """Move links and contacts together, in rounds; each round includes the contacts that the last one led into.
-
-    Returns the best rows, their stopped particles, and the energy that links and contacts store there as a share of that before.
-    pressed: the energy that contacts stored at the start.
-    """
-    before, left, products = start.stored_in_links() + pressed, np.inf, 0
-    for _ in range(TOGETHER):
-        contacts: Any = ContactRows.of(runner)
-        stored = rows.stored_in_links() + contacts.stored(rows.x, rows.w)
-        if stored >= left:
-            break
-        best, left = (rows, stopped), stored
-        products += rows.matrix.products
-        if left <= aims.share * before or products > aims.products:
-            break
-        rows, more = _moved(runner, start, rows.among([*links, contacts], runner), aims)
-        stopped = stopped | more
-    runner.scene.state.put(runner.memory, best[0].x)
-    rows, stopped = best
-    return rows, stopped, left / before if before > 0 else np.inf
 
 
 def _newton(rows: "Rows", enough: float, aims: Aims) -> np.ndarray:
@@ -339,7 +298,7 @@ def seen_before(runner: Any) -> tuple[float, float]:
     return energy if runner.clock.energy is None else runner.clock.energy, overlap
 
 
-def sizes(batch: Scalar | AnchorRows | SidewaysRows | ClusterRows | ContactRows) -> np.ndarray:
+def sizes(batch: Scalar | AnchorRows | SidewaysRows | ClusterRows) -> np.ndarray:
     """Return the number of corners of each constraint, (m,)."""
     return np.bincount(batch.owner, minlength=batch.count)
 
@@ -368,8 +327,8 @@ class Rows:
     rails: Any = None  # see Rails
 
     def __init__(
-        self, batches: Sequence[Scalar | AnchorRows | SidewaysRows | ClusterRows | ContactRows], w: np.ndarray, x: np.ndarray,
-        box: Any = None, rails: Rails | None = None,
+        self, batches: Sequence[Scalar | AnchorRows | SidewaysRows | ClusterRows], w: np.ndarray, x: np.ndarray, box: Any = None,
+        rails: Rails | None = None,
     ):  # fmt: skip
         self.rails = rails if rails and len(rails.who) else None
         self.batches, self.w, self.n, self.dim = batches, w, *x.shape
@@ -379,7 +338,6 @@ class Rows:
         for b, some in zip(batches, self.some, strict=True):
             if drive := getattr(b.dev, "drive", None):
                 some &= ~drive.is_at_limit(b.dev.equation.lam)[: b.count]
-        self.touches = self._each([np.full(b.count, isinstance(b, ContactRows)) for b in batches])
         self.side, arity = (self._each([of(b) for b in batches]) for of in (lambda b: np.full(b.count, b.side), sizes))
         self.m = len(self.side)
         self.corner = [some[b.owner] for b, some in zip(batches, self.some, strict=True)]
@@ -406,10 +364,6 @@ class Rows:
         self.J, self.diagonal = self.jacobian.J, self.jacobian.diagonal
         self.worst = float(np.abs(self.C * self.close).max(initial=0.0))
         self.stored = float(_over(self.weight * self.C * self.C, self.diagonal).sum())
-
-    def stored_in_links(self) -> float:
-        """Return the energy that links store, without contacts."""
-        return float((_over(self.weight * self.C * self.C, self.diagonal) * ~self.touches).sum())
 
     def _bounded(self, C: np.ndarray) -> np.ndarray:
         """Return C, and 0 for one-sided constraints that do not act."""
@@ -490,12 +444,6 @@ class Rows:
         new._measure(self.x)
         new._link()
         return new
-
-    def among(self, batches: list[Any], runner: Any) -> "Rows":
-        """Return rows with the same links and goals, and with other contacts, the last of `batches`, whose goal is 0."""
-        new = Rows(batches, self.w, self.x, self.box, self.rails)
-        new.undone(runner)  # sets theta and weight
-        return new.with_goal(np.concatenate([self.goal[~self.touches], np.zeros(int(new.touches.sum()))]))
 
     def undone(self, runner: Any) -> np.ndarray:
         """Return Z = theta C_(n+1) + (1 - theta) C_n + damping dC/dt + alpha lam / h^2, to second order, (m,).

@@ -8,6 +8,7 @@ from ..contact.limits import (
     ALLOWED,
     BETA,
     BLOCK,
+    DIGIT,
     FORCE,
     GAINS,
     GOING,
@@ -16,6 +17,7 @@ from ..contact.limits import (
     KINETIC,
     LACK,
     LOAD,
+    MET,
     MOVES,
     OWN,
     ROWS,
@@ -48,12 +50,13 @@ class RowPass:
         dev = contact.dev
         self.rows, self.bodies, self.impulses, self.places = dev.rows, dev.responses, dev.impulses, dev.places
         self.islands, self.impacts = dev.islands, dev.rows.impacts
-        self.in_turn = bool(self.impacts)
+        self.in_turn, self.edges = bool(self.impacts), bool(dev.rows.edges)
         some = [HITS, KINETIC] if self.rows.bounces else []
         passes = [LACK, UPHILL, LOAD, *([WRONG] if self.rows.bounces else [])]
         self.noted = [ROWS, FORCE, *some], passes, [LACK], [WORK], [WORK, LACK, UPHILL]
         self.answers: Any = dev.answers
         self.answers_later = bool(dev.answers) and dev.answers.answer_later
+        self.places_particles = bool(dev.answers) and dev.answers.has_clusters and not scene.state.sums
         self.linked: list[Any] = []
         self.in_systems: list[Any] = []
         if dev.answers:
@@ -99,6 +102,8 @@ class RowPass:
                 self.rows.when[i] = 0
             if ti.static(self.in_turn):
                 self.impacts.clear(i)
+            if ti.static(self.edges):
+                self.rows.edges.clear(i)
         for f, first in ti.static(self.linked):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                 self.answers.links.note_open(f, c, first.now + c)
@@ -113,10 +118,10 @@ class RowPass:
                     kick = self.rows.kick(i)
                     self.bodies.begin(i)
                     self.rows.begin_empty(i, row)
-                    if self.bodies.moves(i):
+                    if ti.static(self.edges) or self.bodies.moves(i):
                         row = self.rows.find(i, begin, end, row)
                         count += ti.cast(row - self.rows.own[i], self.real)
-                        force += kick.dot(kick)
+                        force += kick.dot(kick) + self.noise(i)
                         if ti.static(bool(self.answers)):
                             count += self.answers.links.sum_of(self.answers.links.open, i)
                     if ti.static(self.rows.bounces):
@@ -132,6 +137,8 @@ class RowPass:
                 self.impulses.note(low, FORCE, force)
         self.team.wait()
         for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+            if ti.static(self.edges):
+                self.rows.edges.share(i)
             self.rows.find_eigenvalue(i)
             if ti.static(bool(self.answers)):
                 self.rows.share[i] = self.rows.share[i] + self.answers.links.degree[i]
@@ -145,6 +152,15 @@ class RowPass:
             self.team.wait()
         if ti.static(self.in_turn):
             self.begin_answers(now)
+
+    @ti.func
+    def noise(self, i):
+        """Return what the digits of positions add to the square of the displacement by forces, where clusters place particles."""
+        out = ti.cast(0, self.real)
+        if ti.static(self.places_particles):
+            digit = ti.static(DIGIT / MET) * self.state.digits(i)
+            out = digit * digit
+        return out
 
     @ti.func
     def strike(self, thread):
@@ -206,6 +222,23 @@ class RowPass:
                 self.bodies.last[i] = self.bodies.new[i] + self.answers.hold(i) - self.impacts.thrown[i]
             self.team.wait()
 
+    @ti.func
+    def gather(self, thread, n):
+        """Let the first n particles answer the impulses of their rows, and of those of their edges."""
+        if ti.static(self.edges):
+            self.team.wait()
+            for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                self.impulses.gather(i)
+            self.team.wait()
+
+    @ti.func
+    def gather_pushes(self, thread, n):
+        """Add what rows of their edges want of the first n particles to their sums."""
+        if ti.static(self.edges):
+            for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                self.bodies.push[i] = self.bodies.push[i] + self.rows.edges.gather(i)
+            self.team.wait()
+
     @called
     @ti.func
     def strike_all(self, thread: ti.i32):
@@ -226,6 +259,7 @@ class RowPass:
             for part in range(self.rows.parts(), OWN + 1):
                 for i in range(begin, end):
                     self.impulses.prepare(i, part)
+        self.gather(now.thread, self.n)
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, now.thread)):
             self.impulses.start_passes()
@@ -429,6 +463,7 @@ class RowPass:
                 self.answers.links.relax(r, self.bodies, self.impulses.numbers[None][BETA])
             self.team.wait()
         self.relax_rows(thread, OF_PASS)
+        self.gather(thread, self.n * self.going())
         self.answer(thread, self.n * self.going())
         self.add_up(thread, OF_PASS)
         ti.loop_config(serialize=True)
@@ -464,6 +499,7 @@ class RowPass:
                 for i in range(begin, end):
                     self.impulses.sum_impacts(i, part)
         self.team.wait()
+        self.gather_pushes(thread, self.n * sums)
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             self.impulses.remember(i, final)
         self.team.wait()
@@ -488,6 +524,7 @@ class RowPass:
                 self.answers.links.relax_place(r, self.bodies)
             self.team.wait()
         self.relax_rows(thread, OF_PLACES)
+        self.gather_pushes(thread, self.n * self.going())
         self.add_up(thread, OF_PLACES)
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread) * self.going()):

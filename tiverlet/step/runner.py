@@ -9,22 +9,18 @@ import numpy as np
 from ..constraints.core.scalar import Scalar
 from ..constraints.path import Path
 from ..constraints.pin import Pin
-from ..contact.parting import parting_speeds
-from ..contact.rigid_bodies import rigid_bodies
 from ..device.interrupts import deferred_signals
 from ..device.memory import Rows, numbers_of
 from ..device.patches.compiler import CachedLaunch
-from ..features.feature import Batch
 from ..particles.spin import moments_of_inertia
 from . import high_order, initial_shape, initial_violation, softness
 from .clock import Clock, initial_margin
-from .contact_rows import ContactRows
+from .cluster_release import release
 from .diagnostics import BARE, EXTENT, STARTED, STEPPED, UNSTEPPED
 from .frames import Frames
 from .impulse import factor_of
 from .integrator import FREE, decay, h2_effective_of, h2_rigid_of, shares_of
 from .launcher import Launcher
-from .overlap_release import release
 from .projection import project, stiffen
 from .span import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Span
 from .step import frame
@@ -68,7 +64,6 @@ class Runner:
         self.springs: list[Any] = [b for b in self.batches if isinstance(b, Scalar) and b.soft and not b.dev.equation.forces]
         self.weights_alone: dict[Any, np.ndarray] = {}  # of constraints that passes solve, see softness.py
         self.paths = [f for f in step.drivers if isinstance(f, Path)]
-        self.known = [c.known for c in step.contacts if c.known]  # KnownLoads of contacts
         self.logs: list[Any] = [*(c.dev.events for c in step.contacts if c.dev.events), *step.wall_logs]  # of events
         self.semi_iterations, self.drags = step.constraints.semi_iterations, step.integrator.forces.drags
         self._immovable: int | None = None
@@ -77,7 +72,7 @@ class Runner:
         self.asks_velocities = any(wall.has_switch for wall in step.walls)
         self.asks_release = any(isinstance(f, Pin) for f in step.drivers)
         self.bounces = any(f.has_restitution for f in (*step.walls, *step.contacts))
-        self.solves_rows = any(c.dev.rows for c in step.contacts)
+        self.solves_rows = bool(step.contacts)
         self.launcher = Launcher(self)
         self._prepare()
 
@@ -234,7 +229,7 @@ class Runner:
         memory = self.memory
         memory.write_rows(who, (self.scene.state.d, d * ratio))
         left = [self.step.particles.wall_displacement] if self.step.particles.walls else []
-        for field in left + [c.dev.rows.borne for c in self.step.contacts if c.dev.rows]:
+        for field in left + [c.dev.rows.borne for c in self.step.contacts]:
             memory.write_rows(who, (field, memory.rows(who, field)[0] * ratio**2))
 
     def _project(self, h: float, dt: float) -> None:
@@ -247,9 +242,6 @@ class Runner:
         stiffen(self, h, dt, longest, measured)
         released = release(self, h, longest)
         projected = project(self, h, dt, longest, measured=measured)
-        # Links and contacts must move together. With frames of slightly uneven length, stacks would creep sideways.
-        if projected is None and (dt == clock.frame[1] or 2 * h <= longest):
-            projected = project(self, h, dt, longest, ContactRows.of(self), measured=measured)
         if projected is None and not released:
             released = release(self, h, longest, small=True)
         if projected or projected is None or released:
@@ -267,9 +259,6 @@ class Runner:
     def set_initial_figures(self, energy: float, overlap: float) -> None:
         """The second half of begin(), with the energy [J] and the overlap of the initial state of the frame."""
         self.clock.energy, self.clock.parting = energy, overlap > 0
-        if overlap > 0 and self.clock.first_moved is not None:
-            with self.memory.compiler():
-                self.shrink_overlapping(self.clock.first_moved)
 
     def placed(self) -> None:
         """The end of begin(): particles that were placed have been dealt with."""
@@ -300,17 +289,6 @@ class Runner:
         """Set the factors by which loads follow from the multipliers of the last substep."""
         factor = self.integrator.h2_factor
         self.scene.multipliers_per_newton = factor * h2_rigid_of(self.clock), factor * h2_effective_of(self.clock)
-
-    def find_bodies(self, everything: bool = False) -> None:
-        """Tell contacts which constraints make rigid bodies, if knobs of these have changed it. everything: also their masses."""
-        for c in self.step.contacts:
-            if c.dev.bodies:
-                c.dev.bodies.update(self.batches, everything)
-
-    def lacks_bodies(self, batches: "list[Batch]", x: np.ndarray, inv_mass: np.ndarray) -> bool:
-        """Whether these constraints, of particles at x (n, dim) [m], make the first rigid bodies: that takes other kernels."""
-        touching = [c for c in self.step.contacts if not (c.solves_rows or c.dev.bodies or c.dev.has_restitution)]
-        return bool(touching) and bool(rigid_bodies(batches, x, inv_mass))
 
     def find_ramps(self) -> None:
         """After knobs were uploaded: find the batches with new rest values."""
@@ -379,10 +357,6 @@ class Runner:
         initial_violation.forget(self.scene, self.batches, position)
         if self.springs:
             self._forget_springs(self.scene.state.get(self.memory), position)
-        for known in self.known:
-            known.forget(self.scene, position)
-        for loads in self.step.particles.wall_loads:
-            loads.forget((self.scene.state.get(self.memory) != position).any(axis=1))
 
     def _forget_springs(self, before: np.ndarray, now: np.ndarray) -> None:
         """Let springs whose particles were moved from `before` to `now`, (n, dim), start with the forces that they have now."""
@@ -391,11 +365,6 @@ class Runner:
             offset = self.memory.read(b.dev.equation.spring.offset)
             offset[: b.count][np.bincount(b.owner, moved[b.indices.ravel()], minlength=b.count) > 0] = 0.0
             self.memory.write(b.dev.equation.spring.offset, offset)
-
-    def carry_loads(self) -> None:
-        """After particles were added, removed or pinned: sum the known loads of their contacts again for each particle."""
-        for known in self.known:
-            known.carry(self.scene, self.scene.state.get(self.memory), *self.search.list.persistent_data())
 
     def restart(self, iterations: int) -> None:
         """Turn displacements into velocities, so that the next substep is a start from the present state. iterations: of the
@@ -677,15 +646,6 @@ class Runner:
                 search.list.invalidate()
             else:
                 self.memory.write_some(search.list.stale, 1, some)
-
-    def shrink_overlapping(self, first: int) -> None:
-        """Let bodies part gently of which particles from number `first` on were placed into others. Rows do so by themselves."""
-        contact = self.step.contacts[0]
-        if not contact.solves_rows:
-            x = self.scene.state.get(self.memory)
-            candidates = contact.dev.geometry.candidates(x)
-            speeds = parting_speeds(self.scene, self.batches, candidates, x, first, contact.speed_of_parting)
-            self.step.shrink_overlapping(first, speeds)
 
     def report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
         """The StepReport of the last diagnostics."""

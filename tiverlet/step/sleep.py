@@ -294,8 +294,6 @@ class SleepPass:
             way = ti.max(way, s.dot(s))
         still, most = self.sleepers.still[i] + ti.cast(dt, self.real), self.sleepers.limits[None][0] * ti.cast(h, self.real)
         slow = way < most * most and self.kept_awake[i] == 0
-        for c in ti.static(self.contacts):
-            slow = slow and not c.is_shrunk(i)
         self.sleepers.still[i] = ti.select(slow, still, 0 * still)
 
     @ti.func

@@ -21,8 +21,6 @@ from .span import ACTIVE_THREADS, BEFORE, FIRST, HALT, Moment, Span, integer, sp
 if TYPE_CHECKING:
     from ..colliders.collider import Collider
 
-REBOUNDS = 8  # most rounds of restitution in a substep
-
 
 @ti.pyfunc
 def frame(do, span):
@@ -63,18 +61,7 @@ def substep(do, now):
             if half % do.halves == do.halves - 1:
                 if do.is_regular(now, half):
                     do.solve_contacts(this_pass)
-                if ti.static(do.has_restitution):
-                    for _ in range(REBOUNDS):
-                        if this_pass.first != 0 and do.any_struck() != 0:
-                            do.rebound(this_pass)
-                if ti.static(do.has_pair_impacts):
-                    if not do.is_regular(now, half):
-                        do.push_bodies(this_pass)
                 do.apply_corrections(this_pass)
-    if ti.static(do.projects_bodies):
-        if do.ends_substep(now) and do.has_struck_bodies(now):
-            for k in range(do.body_rounds(now)):
-                do.project_bodies(now.of(k))
     if ti.static(do.finishes):
         if do.ends_substep(now):
             do.finish_substep(now)
@@ -115,16 +102,13 @@ class Step:
         self.halves = 2 if batches and contact else 1  # of a pass; each begins with a valid list
         self.impacts: Any = scene.impacts
         self.has_impacts = bool(scene.impacts)
-        self.has_pair_impacts = self.has_impacts and self.impacts.pairs
         self.newton_steps = 2 if scene.slots and scene.slots.refines else 1  # most of them in a pass
-        self.has_restitution, self.projects_bodies = self.contact_pass.has_restitution, self.contact_pass.projects_bodies
         self.orients = self.state.spins and self.state.spin.orients
         keeps = self.contact_pass.remembers or bool(self.breakers)
         self.finishes = keeps or self.orients or bool(self.wall_logs) or bool(self.constraints.learners)
         self.hashes = bool(search)
         self.sleepers = scene.state.sleepers
         self.looks = bool(search) and bool(self.sleepers)  # for contacts between awake and sleeping particles
-        self.detects = any(c.detects for c in self.contacts)
         apart = search and search.finds_all_neighbours and not self.launched and not scene.memory.compiler.few
         self.strays: Any = Strays(scene, search, team) if apart else None
         self.pair_forces: list[Any] = integrator.forces.pairwise
@@ -353,7 +337,7 @@ class Step:
         if ti.static(self.hashes):
             self.rebuild_stale(now, half)
         if ti.static(self.looks):
-            if self.has_pass(now) and (self.sleepers.count[None] > 0 or ti.static(self.detects)):
+            if self.has_pass(now) and self.sleepers.count[None] > 0:
                 self.look_for_sleepers(self.pass_of(now, half))
                 if self.sleepers.calls[None] != 0:
                     self.halt[None] = [1, now.s, half]
@@ -378,12 +362,6 @@ class Step:
     @ti.func
     def look_for_sleepers(self, now):
         """Mark sleeping particles that are touched. The frame stops to wake them before contacts are solved."""
-        for c in ti.static(self.contacts):
-            if ti.static(c.detects):
-                n = ti.select(now.half % self.halves == self.halves - 1 or self.sleepers.count[None] > 0, self.n, 0)
-                for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
-                    c.detect(i, now.first)
-                self.team.wait()
         n = ti.select(self.sleepers.count[None] > 0, self.n, 0)
         for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
             self.sleep.call_touched(i, self.halves - 1 - now.half % self.halves)
@@ -501,21 +479,6 @@ class Step:
         self.contact_pass.rows.relax_places(now.thread)
 
     @ti.func
-    def any_struck(self):
-        """1 if a pair bounces in this substep."""
-        return self.contact_pass.struck()
-
-    @ti.func
-    def rebound(self, now):
-        """One round of restitution."""
-        self.contact_pass.rebound(now.thread)
-
-    @ti.func
-    def push_bodies(self, now):
-        """In extra passes: push bodies that struck each other."""
-        self.contact_pass.push_bodies(now)
-
-    @ti.func
     def apply_corrections(self, now):
         """Move particles as contacts and constraints want; walls have the last word."""
         self.particles.apply_corrections(now)
@@ -535,7 +498,6 @@ class Step:
                 f.dev.break_overloaded(c, h2_rigid, h2_effective, now.tick)
         self.constraints.learn(now)
         self.contact_pass.finish(now)
-        self.particles.learn_wall_loads(now)
         if ti.static(self.orients):
             for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                 if self.state.awake(i):
@@ -545,27 +507,6 @@ class Step:
             for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
                 log.close(i)
         self.team.wait()
-
-    @ti.func
-    def has_struck_bodies(self, now):
-        """Whether bodies struck each other in this substep."""
-        return self.contact_pass.has_struck_bodies()
-
-    @ti.func
-    def body_rounds(self, now):
-        """How many rounds find the impacts of bodies."""
-        return self.contact_pass.body_rounds()
-
-    @ti.func
-    def project_bodies(self, now):
-        """One round of the impacts of bodies."""
-        self.push_struck_bodies(now.thread, now.it, now.tick)
-
-    @called
-    @ti.func
-    def push_struck_bodies(self, thread: ti.i32, it: ti.i32, tick: ti.i32):
-        """One round of project_bodies()."""
-        self.contact_pass.project_bodies(thread, it, tick)
 
     @ti.func
     def diagnose(self, now):
@@ -602,13 +543,6 @@ class Step:
         """Build the k-th neighbour list outside of a frame. Returns the largest number of entries that a block needs."""
         self.searches[k].build(0)
         return self.searches[k].list.need[None]
-
-    @ti.kernel
-    def shrink_overlapping(self, first: ti.i32, speeds: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
-        """Shrink particles that overlap any of number `first` or above until they fit. speeds: of parting, (n,) [m/s]."""
-        for c in ti.static(self.contacts):
-            for i in range(self.n):
-                c.shrink(i, first, ti.cast(speeds[i], self.real))
 
     @ti.kernel
     def stop_moved(self, old: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]

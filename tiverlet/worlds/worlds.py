@@ -233,9 +233,6 @@ class Worlds:
             clocks.kinetic[unknown] = np.where(first, 0.0, clocks.kinetic[unknown])
             clocks.conserves[unknown] = UNKNOWN
             clocks.parting[unknown] = np.where(placed, overlap > 0, clocks.parting[unknown])
-            for k in unknown[(overlap > 0) & placed]:
-                with self._as_world(k), runner.memory.compiler():
-                    runner.shrink_overlapping(int(clocks.first_moved[k]))
         for contact in runner.step.contacts:
             runner.memory.write_some(contact.dev.fast, 1, np.flatnonzero(jumped))
         clocks.first_moved[some], clocks.needs_drag[some] = NONE, False

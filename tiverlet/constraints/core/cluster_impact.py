@@ -1,4 +1,4 @@
-"""Impacts of rigid clusters on walls and other bodies: the cluster leaves as a rigid body, by Newton's law, see BodyImpacts."""
+"""Impacts of rigid clusters on walls: the cluster leaves as a rigid body, by Newton's law, see BodyImpacts."""
 
 from typing import Any
 
@@ -11,13 +11,12 @@ MET = 2.0**-12  # of the first push: a smaller change ends the sweeps
 
 
 class ClusterImpact:
-    """In extra passes: moves a cluster as a rigid body, by the pushes on its particles that struck walls or other particles.
+    """In extra passes: moves a cluster as a rigid body, by the pushes on its particles that struck walls.
 
     A push p along n [m] of a particle of mass m at r from the center moves the body by V += m p n / M, and turns it by
     W += I^-1 (r x m p n). So it adds k p to the normal displacement there, k = m (1 / M + (r x n) . I^-1 (r x n)). Particles take
-    turns, p' = max(p + miss / k, 0), and their friction likewise across n, until all have what they are to have. Pushes between
-    particles are those of the pass before: their contacts compute them, see BodyImpacts.inverse_mass(). The cluster keeps the
-    deformation that contacts and loads have left in it.
+    turns, p' = max(p + miss / k, 0), and their friction likewise across n, until all have what they are to have. The cluster
+    keeps the deformation that loads have left in it.
 
     The path of a particle bends as the body turns by T in a substep, and d is a chord: with b = n.(T x (T x r)) / 2 the particle
     came at d.n + b before the substep and leaves at d.n - b after it. Newton's law holds for these velocities, along tangents,
@@ -47,7 +46,7 @@ class ClusterImpact:
         begin, end, hit = self.corners.starts[c], self.corners.starts[c + 1], False
         for e in range(begin, end):
             i = self.corners.members[e]
-            hit = hit or (self.impacts.in_cluster(i) and (self.is_struck(i) or self.impacts.takes_part(i)))
+            hit = hit or (self.impacts.in_cluster(i) and self.is_struck(i))
         if hit:
             self.move_as_body(c, begin, end)
         else:
@@ -72,8 +71,6 @@ class ClusterImpact:
         W, off = 0 * rotation.axial(S), True
         turn = self.turn_so_far(c, begin, end, i0, start, S)
         self.aim_along_tangents(begin, end, i0, start, turn)
-        if ti.static(self.impacts.clusters):
-            V, W = self.take_up_pushes(c, begin, end, i0, start, M, S)
         for _ in range(SWEEPS):
             if off:
                 off = False
@@ -86,8 +83,6 @@ class ClusterImpact:
                         W += rotation.turn_rate(S, rotation.axial(push.outer_product(s)))
                         off = off or change > ti.static(MET) * self.impacts.first_push[i]
         T = rotation.cayley(W, S)
-        if ti.static(self.impacts.clusters):
-            self.impacts.body_turn[i0] = ti.cast(turn + W, self.real)
         for e in range(begin, end):
             i, r = self.corners.members[e], self.cluster.relative_position(e, i0, 0) - center
             move = ti.cast(V + T @ r - r, self.real)
@@ -96,9 +91,6 @@ class ClusterImpact:
             if self.is_struck(i):
                 s = self.cluster.relative_position(e, i0, 1) - start
                 self.impacts.bend[i] = ti.cast(rotation.bend(turn + W, s, self.wide(self.impacts.normal[i])), self.real)
-            if ti.static(self.impacts.clusters):
-                self.cluster.pull[e] = self.cluster.pull[e] - self.impacts.change[i]
-                self.impacts.change[i] = 0 * self.impacts.change[i]
             self.impacts.mark_struck_in_cluster(i)
             self.corners.write_move(e, move)
         self.cluster.write_matrix(self.cluster.pose, c, T @ self.cluster.read_matrix(self.cluster.pose, c))
@@ -124,25 +116,6 @@ class ClusterImpact:
                 before = target - self.wide(self.impacts.first_push[i]) - 2 * b  # d.n before the substep, -target / e
                 if target > 0 and before < 0:
                     self.impacts.target[i] = ti.cast(target * ti.max(1 + b / before, 0), self.real)
-
-    @ti.func
-    def take_up_pushes(self, c, begin, end, i0, start, M, S):
-        """Return how the pushes of the last pass on the particles of cluster c move it and turn it.
-
-        It also stores what the next pushes depend on. i0, start, M, S: reference particle, center, mass, and sum m r r^T.
-        """
-        V, parts = self.cluster.zero_vector(), ti.cast(0, self.real)
-        X = V.outer_product(V)
-        for e in range(begin, end):
-            i, m = self.corners.members[e], self.cluster.mass_of(e, c, FIXED)
-            r, push = self.cluster.relative_position(e, i0, 1) - start, m * self.wide(self.impacts.change[i])
-            V += push / M
-            X += push.outer_product(r)
-            parts += self.impacts.parts[i]
-            self.impacts.body[i], self.impacts.arm[i] = i0, ti.cast(r, self.real)
-        self.impacts.body_mass[i0], self.impacts.body_parts[i0] = ti.cast(M, self.real), parts
-        self.cluster.write_matrix(self.impacts.body_moment, i0, ti.cast(S, self.real))
-        return V, rotation.turn_rate(S, rotation.axial(X))
 
     @ti.func
     def corrected_push(self, i, r, s, V, W, turn, M, S, m):
@@ -182,4 +155,3 @@ class ClusterImpact:
             push = sign * (self.impacts.pushed[i] * self.impacts.normal[i] - self.impacts.held[i])
             self.cluster.pull[e] = self.cluster.pull[e] - push
             self.impacts.log_push(i, push)
-            self.state.note_wall_push(i, push)

@@ -100,7 +100,8 @@ class Equation:
         C, A = self.quantity.excess(c, f), ti.cast(1, self.real)
         if ti.static(self.answers):
             if first != 0:
-                self.left[c] = ti.select(self.touched[c] != 0, self.earlier_violation(c, f0, 1), 0 * f0)
+                stays = self.touched[c] != 0 and not self.has_cusp(c)  # at a cusp, its direction would not be that of a link
+                self.left[c] = ti.select(stays, self.earlier_violation(c, f0, 1), 0 * f0)
             C -= self.left[c]
         B, alpha = ti.cast(0, self.real), ti.cast(0, self.real)
         lam = self.lam[c]

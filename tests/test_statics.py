@@ -1,4 +1,4 @@
-"""Bodies with known loads: stacks and heaps of Polygons give way to nothing at rest, and bear what statics says."""
+"""Statics of bodies: stacks and heaps of Polygons give way to nothing at rest, and bear what statics says."""
 
 from typing import Any
 
@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.contact.known_loads import LAG_BODIES, SLOW_BODIES, WINDOW
-from tiverlet.features.learning import GAIN, LAG, STEADY, SWING
 
 G = 10.0
 
@@ -32,7 +30,7 @@ def tossed(columns, rows):
 
 
 def standing(
-    world, shapes, mass: Any = 1.0, friction: object = 0.5, pinned=(), discs=(), loads=True, low=(-99, 0), high=(99, 99),
+    world, shapes, mass: Any = 1.0, friction: object = 0.5, pinned=(), discs=(), low=(-99, 0), high=(99, 99),
     restitution=0.0, velocity=0.0, links=False, **settings
 ):  # fmt: skip
     """Return a world of rigid bodies of these masses on a floor, and the particles of each.
@@ -47,7 +45,7 @@ def standing(
     corners = np.array(loops)
     sides = np.concatenate([corners[:, [k, m]] for k, m in ((0, 1), (1, 2), (2, 3), (3, 0), (0, 2))])
     ties: Any = tv.Distance(sides) if links else tv.ShapeMatch(loops)
-    polygons, box = tv.Polygons(loops, friction=0.5, restitution=restitution, loads=loads), tv.Box(low, high, friction=0.5)
+    polygons, box = tv.Polygons(loops, friction=0.5, restitution=restitution), tv.Box(low, high, friction=0.5)
     start = tv.Particles(x, mass=each, radius=radius, pinned=held, velocity=velocity)
     w = world(start, [tv.Gravity(G), polygons, ties, box], **({"substeps": 8, "precision": "f64"} | settings))
     polygons.friction = box.friction = friction  # type: ignore[assignment]
@@ -73,73 +71,21 @@ def contact_forces(w):
     return out
 
 
-def reference(n, h, substeps):
-    """Return the heights of the lower and upper edges of a column(n) of mass 1, and the loads of contacts, in NumPy.
-
-    By symmetry a block is a lower and an upper point of mass 1/2. In each substep known loads and gravity act, blocks become
-    rigid, contacts take back overlap and no more than they gave, and the floor takes back what is below it.
-    """
-    low, up, w = np.arange(n) * 1.0, np.arange(n) + 1.0, 2.0
-    d_low, d_up = np.zeros(n), np.zeros(n)
-    load, borne, earlier, seen = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((2, n))  # the first one is that of the floor
-    for s in range(substeps):
-        kick = h * h / (2 if s == 0 else 1)
-        known = kick * load
-        d_low, d_up = d_low - kick * G, d_up - kick * G
-        d_low, d_up[:-1] = d_low + w * known, d_up[:-1] - w * known[1:]
-        turn = (up + d_up - low - d_low - 1) / 2
-        d_low, d_up = d_low + turn, d_up - turn
-        at_end = s % WINDOW == 0
-        if at_end:
-            now = np.stack([d_low, d_up]) / h
-            calm, seen = np.abs(now - seen) / (WINDOW * h) <= SWING * G, now
-        part = np.maximum((up + d_up)[:-1] - (low + d_low)[1:], -2 * w * known[1:]) / (2 * w)
-        part[(part < 0) & (load[1:] == 0)] = 0
-        d_low[0] -= w * known[0]
-        d_low[1:], d_up[:-1] = d_low[1:] + w * part, d_up[:-1] - w * part
-        floor = max(-(low[0] + d_low[0]), 0)
-        d_low[0] += floor
-        low, up = low + d_low, up + d_up
-        part = np.r_[floor / w - known[0], part]
-        if at_end:
-            mean = borne / (WINDOW * h * h)
-            steady = (np.abs(mean - earlier) < STEADY * np.abs(mean)) & calm[0] & np.r_[True, calm[1, :-1]]
-            k = (load + mean) * w / G
-            share = steady * np.minimum(WINDOW / (LAG + LAG_BODIES + SLOW_BODIES * k * k), GAIN)
-            load, earlier, borne = np.maximum(load + share * mean, 0), (1 - share) * mean, 0 * borne
-        borne += part
-    return low, up, load
-
-
-@pytest.mark.slow
-def test_a_column_learns_as_the_reference_does(world):
-    # Four blocks for ten windows at 2 substeps: sums of the same numbers, to rounding.
-    w, loops = standing(world, column(4), friction=0.0, substeps=2)
-    w.run(10 * WINDOW / 120)
-    low, up, load = reference(4, 1 / 120, 10 * WINDOW)
-    assert load.min() > 1.0
-    x = w.position[:16].reshape(4, 4, 2)[:, :, 1]
-    np.testing.assert_allclose(x, np.stack([low, low, up, up], axis=1), atol=1e-11)
-    pairs, values = w._runner.search.list.persistent_data()
-    body = np.minimum(pairs, 15) // 4
-    np.testing.assert_allclose(np.bincount(body[:, 0], values["load"], minlength=4)[1:], load[1:], rtol=1e-9)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("links", [False, True])
 def test_a_column_bears_what_is_above(world, links):
-    # Without known loads, clusters are pressed flat by (2 + 4 F / m g) g h^2, see test_polygons.py.
+    # By body, the pushes of contacts add up to its weight, and nothing gives way.
     mass = 2.0 + np.arange(6) % 2
     w, loops = standing(world, column(6), mass, substeps=4, links=links)
     start = G * (mass * (np.arange(6) + 0.5)).sum()
     assert max(w.step(1 / 60).energy for _ in range(2400)) <= start + 1e-9
-    # By body, the pushes of contacts add up to its weight.
     total = contact_forces(w)[:24, 1].reshape(6, 4).sum(axis=1)
     np.testing.assert_allclose(total[1:], G * mass[1:], rtol=1e-5)
     assert total[0] == pytest.approx(-G * mass[1:].sum(), rel=1e-5)
     most = 2e-5 if links else 1e-8  # links bend more while boxes come to rest, and friction on the floor keeps some of it
     assert bent(w, loops) < most and np.abs(w.velocity).max() < most
-    np.testing.assert_allclose(w.position[:24], np.concatenate(column(6)), atol=most)
+    # They sink by less than gravity moves them in a substep, while passes find the loads.
+    np.testing.assert_allclose(w.position[:24], np.concatenate(column(6)), atol=G / 240**2)
 
 
 def test_a_beam_on_two_supports(world):
@@ -153,7 +99,7 @@ def test_a_beam_on_two_supports(world):
     moment = -(w.position[:8, 0] * right[:, 1]).sum()
     np.testing.assert_allclose(posts.sum(axis=0), [0, 5 * G], atol=5 * G * 1e-6)
     assert moment == pytest.approx(3 * G * 1.0, rel=1e-5)
-    assert bent(w, loops) < 1e-6 and w.contacts.overlap.max() < 1e-7
+    assert bent(w, loops) < 1e-6 and w.contacts.overlap.max() < 0.01 * G / 120**2
 
 
 def test_each_box_of_a_pyramid_bears_what_is_on_it(world):
@@ -180,9 +126,7 @@ def test_friction_bears_its_load_on_a_slope(world):
     before = w.position
     w.run(30.0)
     np.testing.assert_allclose(w.position, before, atol=1e-9)
-    pairs, values = w._runner.search.list.persistent_data()
-    assert values["load"].sum() == pytest.approx(G * np.cos(a), rel=1e-6)
-    assert np.abs(values["rub"].sum()) == pytest.approx(G * np.sin(a), rel=1e-6)
+    assert w.contacts.impulse.sum() * 240 == pytest.approx(G * np.cos(a), rel=1e-6)
     assert bent(w, loops) < 1e-8
 
 
@@ -205,15 +149,13 @@ def test_loads_are_gone_with_what_bore_them(world):
     assert max(w.step(1 / 60).energy for _ in range(600)) <= before + 2 * G**2 * (1 + 4 + 9) / 120**2
     w.run(40.0)
     assert np.abs(w.velocity).max() < 1e-3 and w.position[:-1, 1].max() == pytest.approx(4.0, abs=1e-3)
-    # A box that is put elsewhere falls as it would alone, and the others keep their loads.
+    # A box that is put elsewhere falls as it would alone, but for half of the displacement by gravity in a substep: its load is
+    # gone in the first one.
     x = w.position.copy()
     x[12:16] += [5.0, 3.0]
-    known = w._runner.search.list.persistent_data()[1]["load"].sum()
     w.position = x
-    kept = w._runner.search.list.persistent_data()[1]["load"].sum()
-    assert kept == pytest.approx(known - G, rel=1e-2)
     w.step(1 / 60)
-    np.testing.assert_allclose(w.position[12:16] - x[12:16], [[0.0, -G / 60**2 / 2]] * 4, atol=1e-4)
+    np.testing.assert_allclose(w.position[12:16] - x[12:16], [[0.0, -G / 60**2 / 2]] * 4, atol=1.01 * G / 120**2)
 
 
 def test_a_lift_carries_a_stack(world):
@@ -234,13 +176,12 @@ def test_a_lift_carries_a_stack(world):
 
 
 @pytest.mark.slow
-def test_what_was_learnt_holds_at_any_substep(world):
-    # A load is a force: what was learnt at 40 substeps a frame bears five boxes at 2 substeps. Without loads they would sink by
-    # the sum of (2 + 4 k) g h^2, k = 0 ... 4, 0.035 m.
+def test_a_column_stands_whatever_the_substep(world):
+    # A load is a force: what was borne at 40 substeps a frame bears five boxes at 2 substeps.
     w, loops = standing(world, column(5), substeps=40, precision="f32")
     w.run(8.0)
     w.substeps = 2
-    w.run(8.0)
+    w.run(12.0)
     assert bent(w, loops) < 1e-4 and np.abs(w.velocity).max() < 1e-3
     assert np.abs(w.position[:20] - np.concatenate(column(5))).max() < 1e-3
 
@@ -249,33 +190,28 @@ def test_what_was_learnt_holds_at_any_substep(world):
 def test_a_heap_with_discs_hardly_overlaps(world):
     # 24 boxes and 12 discs between rough walls. Energy never rises above the start.
     discs = np.stack([0.8 + 0.9 * (np.arange(12) % 6), 9.0 + 0.9 * (np.arange(12) // 6)], axis=1)
-    found = []
-    for loads in (True, False):
-        w, loops = standing(world, tossed(4, 6), discs=discs, loads=loads, low=(0, 0), high=(6.5, 99))
-        start = w.step(1 / 60).energy
-        assert max(w.step(1 / 60).energy for _ in range(2400)) <= start * (1 + 1e-9)
-        found.append((bent(w, loops), np.maximum(w.contacts.overlap, 0).mean()))
-        assert np.abs(w.velocity).max() < 1e-2
-    assert found[0][0] < 0.1 * found[1][0] and found[0][1] < 0.1 * found[1][1], found
+    w, loops = standing(world, tossed(4, 6), discs=discs, low=(0, 0), high=(6.5, 99))
+    start = w.step(1 / 60).energy
+    assert max(w.step(1 / 60).energy for _ in range(2400)) <= start * (1 + 1e-9)
+    assert np.abs(w.velocity).max() < 1e-3
+    # What overlaps by less than 0.009 of half an edge of 1 m at most, or of a disc, stays; clusters are rigid.
+    assert w.contacts.overlap.max() < 0.009 * 0.5 and bent(w, loops) < 1e-4
 
 
 @pytest.mark.slow
-def test_boxes_that_bounce_know_no_load(world):
-    # A box falls on a pinned one and leaves at e times its speed, with and without loads alike. Later it rests on its known load.
-    shapes, frames = [block(3.0, 1.0, (0.0, 0.5)), block(1.0, 1.0, (0.0, 2.0))], []
-    for loads in (True, False):
-        w, loops = standing(world, shapes, pinned=(0,), loads=loads, restitution=0.6)
-        frames.append([w.position for _ in range(60) if w.step(1 / 60)])
-        w.run(20.0)
-        assert w.contacts.impulse.sum() * 480 == pytest.approx(G, rel=1e-6)
-        assert (bent(w, loops) < 1e-8) == loads
-    np.testing.assert_allclose(*frames, atol=1e-9)
-    assert max(x[4:8, 1].min() for x in frames[0][30:]) == pytest.approx(1.0 + 0.36 * 0.5, abs=0.02)
+def test_a_box_that_bounces_comes_to_rest_under_its_weight(world):
+    # A box falls on a pinned one and leaves at e times its speed. Later it rests.
+    shapes = [block(3.0, 1.0, (0.0, 0.5)), block(1.0, 1.0, (0.0, 2.0))]
+    w, loops = standing(world, shapes, pinned=(0,), restitution=0.6)
+    frames = [w.position for _ in range(60) if w.step(1 / 60)]
+    w.run(20.0)
+    assert w.contacts.impulse.sum() * 480 == pytest.approx(G, rel=1e-6) and bent(w, loops) < 1e-8
+    assert max(x[4:8, 1].min() for x in frames[30:]) == pytest.approx(1.0 + 0.36 * 0.5, abs=0.02)
 
 
 @pytest.mark.slow
 def test_loads_are_of_the_state(world):
-    # Both paths, clones and Worlds have the same bits, also after an edit in place. Loads may be switched on later.
+    # Both paths, clones and Worlds have the same bits.
     hashes = []
     for path in ("fused", "parallel"):
         w, _ = standing(world, tossed(3, 3), low=(0, 0), high=(5, 99), precision="f32", path=path)
@@ -288,11 +224,5 @@ def test_loads_are_of_the_state(world):
             assert other.hash() == w.hash()
             np.testing.assert_array_equal(many.position[1], w.position)
     assert hashes[0] == hashes[1]
-    late, loops = standing(world, column(4), substeps=4, loads=False)
-    late.run(5.0)
-    before = bent(late, loops)
-    late.features[1].loads = True  # type: ignore[attr-defined]
-    late.run(20.0)
-    assert bent(late, loops) < 1e-3 * before
     with pytest.raises(TypeError, match="loads"):
         tv.Polygons([[0, 1, 2]], loads="yes")  # type: ignore[arg-type]

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.contact.body_projection import SLOW
-from tiverlet.contact.rigid_bodies import rigid_bodies
+from tiverlet.contact.limits import SLOW
 
 BOX = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])  # of side 1
 DIAGONAL, BOTH = [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2)], [*itertools.combinations(range(4), 2)]
@@ -196,28 +195,6 @@ def test_boxes_thrown_at_each_other_keep_momentum(world):
         change = corner @ cross(w.position, w.velocity) - corner @ cross(x, first)
         assert abs(change) < turned * (corner @ np.linalg.norm(x, axis=1)) * 3
         assert (corner @ w.velocity**2).sum() < 0.6 * (corner @ first**2).sum()
-
-
-def test_bodies_are_found(world):
-    def found(features, x, pinned=()):
-        w = world(tv.Particles(x, radius=0.1, pinned=pinned), features)
-        scene = w._runner.scene
-        return sorted(sorted(body) for body in rigid_bodies(w._runner.batches, scene.particles.position, scene.inv_mass))
-
-    two = np.concatenate([BOX, BOX + (3, 0)])
-    assert found([_links([range(4)], DIAGONAL)], BOX) == [[0, 1, 2, 3]]
-    assert found([_links([range(4)], DIAGONAL[:4])], BOX) == []  # it shears
-    hinged = [*DIAGONAL, *(np.array(DIAGONAL) + 4), (1, 4)]
-    assert found([tv.Distance(hinged)], two) == [[0, 1, 2, 3], [4, 5, 6, 7]]
-    assert found([tv.ShapeMatch([range(4), range(4, 8)]), tv.Distance([(1, 4)])], two) == [[0, 1, 2, 3], [4, 5, 6, 7]]
-    assert found([tv.ShapeMatch([range(4), range(2, 8)])], two) == [list(range(8))]  # they share two particles
-    assert found([tv.Distance(DIAGONAL, compliance=1e-3)], BOX) == []
-    assert found([tv.Distance(DIAGONAL, break_at=1.0)], BOX) == []
-    assert found([tv.Distance(DIAGONAL)], BOX, pinned=[0]) == [[0, 1, 2, 3]]
-    flat = np.c_[BOX, np.zeros(4)]
-    assert found([_links([range(4)], BOTH)], flat) == []  # it folds
-    flat[3, 2] = 0.5
-    assert found([_links([range(4)], BOTH)], flat) == [[0, 1, 2, 3]]
 
 
 @pytest.mark.slow

@@ -1,11 +1,10 @@
-"""Overlap that bears a load does not become energy in a shorter substep."""
+"""A change of the substep brings no energy into piles, stacks, bridges and clusters under load."""
 
 import numpy as np
 import pytest
 
 import tiverlet as tv
 from tiverlet import shapes as S
-from tiverlet.contact.candidates import EdgeCandidates
 from tiverlet.step.solids import Solids
 
 G, R = 10.0, 0.5
@@ -140,8 +139,8 @@ def stack(n=4):
 @pytest.mark.slow
 @pytest.mark.parametrize("hold", ["links", "shapes"])
 def test_a_stack_of_bodies_gains_no_energy(world, hold):
-    # Each contact bears the squares above it: it overlaps by some h^2 F. In a substep h' this is a spring with (h / h')^2 of that
-    # energy. Without the release, it would throw up the stack of links with 26 times the energy that the stack had.
+    # Each contact bears the squares above it. Were a load held by an overlap h^2 F, a shorter substep would throw up the stack of
+    # links with 26 times the energy that it had.
     x, loops = stack()
     pairs = np.concatenate([[(a, b) for a in loop for b in loop if a < b] for loop in loops[:-1]])
     holds = {
@@ -158,9 +157,8 @@ def test_a_stack_of_bodies_gains_no_energy(world, hold):
         for frame in range(90):
             w.substeps = turns if turns == "auto" else turns[frame // 9 % 2]
             assert w.step(1 / 60).energy <= energy * (1 + 1e-3), (turns, frame)
-        # At rest the stack is lowered by some h^2 F. More substeps lift it again: at 64 hardly anything is left.
-        if turns == (4, 64):
-            assert w.last.energy == pytest.approx(G * (x[: n - 4, 1] - 0.01 * (1 + np.arange(16) // 4)).sum(), rel=5e-3)
+        stands = G * (x[: n - 4, 1] - 0.01 * (1 + np.arange(16) // 4)).sum()  # with the gaps of the start closed
+        assert w.last.energy == pytest.approx(stands, rel=5e-3)
 
 
 @pytest.mark.slow
@@ -175,34 +173,6 @@ def test_a_cluster_on_a_floor_gains_none(world, compliance):
     for frame in range(150):
         w.substeps = (1, 16)[frame // 9 % 2]
         assert w.step(1 / 60).energy <= start * (1 + 1e-3)
-
-
-def test_gradients_of_candidates():
-    # By central differences: a square on a hexagon, which has pushed two of its corners, and discs at a corner and beside an
-    # edge. A corner that was pushed over one edge stays with that edge, although another edge is nearer.
-    rng = np.random.default_rng(2)
-    x = np.vstack([outline(6, 1.0, (0, 0)), outline(4, 0.5, (0.0, 1.2), 0.8), [(-1.05, 0.0), (0.9, 0.55)]])
-    x += 1e-3 * rng.standard_normal(x.shape)
-    ends, body = np.full((12, 2), -1), np.repeat([0, 1, -1], [6, 4, 2])
-    for first, k in ((0, 6), (6, 4)):
-        ends[first : first + k] = first + np.stack([np.roll(np.arange(k), -1), np.roll(np.arange(k), 1)], axis=1)
-    pairs = np.array([(v, a) for v in range(12) for a in range(12) if v != a and (body[v] != body[a] or body[v] < 0)])
-    found, pushed = np.tile([-1.0, 0.0, 0.0, 0.0], (len(pairs), 1)), np.zeros(len(pairs), dtype=bool)
-    for v, a in ((8, 1), (9, 1), (11, 0)):
-        pushed |= (pairs == (v, a)).all(axis=1)
-    found[(pairs == (10, 3)).all(axis=1)] = 0.05, -1.0, -1.0, 0.0
-    radius = np.full(12, 0.1)
-    candidates = EdgeCandidates(x, pairs, found, -1, pushed, ends, body, radius, np.zeros(len(pairs)))
-    overlap, gradient = candidates.at(x)
-    for v, a, b in ((8, 1, 2), (9, 1, 2), (11, 0, 1), (10, 3, 3)):
-        (k,) = np.flatnonzero((candidates.who == (v, a, b)).all(axis=1))
-        r, u = x[v] - x[a], x[b] - x[a]
-        height = (r[0] * u[1] - r[1] * u[0]) / np.linalg.norm(u) if a != b else np.linalg.norm(r)
-        assert overlap[k] == pytest.approx(0.2 - height)
-    way, eps = rng.standard_normal(x.shape), 1e-6
-    slope = (candidates.at(x + eps * way)[0] - candidates.at(x - eps * way)[0]) / (2 * eps)
-    np.testing.assert_allclose(-slope, (gradient * way[candidates.who]).sum(axis=(1, 2)), atol=1e-8)
-    assert (candidates.at(x)[0] > 0).sum() <= 4  # no corner comes in over an edge that it was behind
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -231,11 +201,9 @@ def test_moves_of_whole_bodies(world, dim):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("hold", ["links", "shapes"])
-def test_planks_on_a_hinge_go_where_their_load_needs_them(world, hold):
-    # Two planks between two pins, hinged at the same height by a link of length 0, with a box on them, at rest at 8 substeps. The
-    # hinge gapes by 15 mm, because contacts and links bear a load F by a violation D h^2 F. 256 substeps lift it, which takes
-    # 3.9 J, and then nothing moves. Contacts and links have to move together: otherwise what is left of their violations,
-    # C^2 / (2 D h^2), is 1500 J.
+def test_planks_on_a_hinge_bear_a_box_whatever_the_substep(world, hold):
+    # Two planks between two pins, hinged at the same height by a link of length 0, with a box on them, at rest at 8 substeps.
+    # The hinge does not gape, and 16 substeps lift nothing: m g times a centimetre is 0.6 J.
     corners = []
     for a, b in (((0.0, 0.0), (1.8, -0.35)), ((1.8, -0.35), (3.6, 0.0))):
         a, b = np.array(a), np.array(b)
@@ -258,33 +226,10 @@ def test_planks_on_a_hinge_go_where_their_load_needs_them(world, hold):
     def gap():
         return np.linalg.norm(w.position[2] - w.position[7])
 
-    assert tv.measure.kinetic_energy(w) < 0.05 and gap() > 0.007
-    w.substeps = 256
+    assert tv.measure.kinetic_energy(w) < 0.5 and gap() < 2e-3
+    w.substeps = 16
     energy = [w.step(1 / 60).energy for _ in range(30)]
-    assert 0.5 < energy[0] - rest < 4.5 and np.ptp(energy) < 0.1 and gap() < 1e-4
-    assert tv.measure.kinetic_energy(w) < 0.01
-
-
-@pytest.mark.slow
-def test_what_is_lifted_does_not_end_inside_of_what_was_far(world):
-    # A bob of 20 kg on a rope rests 0.7 m lower at 2 substeps than at 20, which lift it by m g 0.7 = 144 J: beside Polygons,
-    # links do not answer contacts. A bead, on no neighbour list of the bob, is pinned where the bob ends up. The bob must not end
-    # inside of the bead, which would bring up to 3000 J.
-    n = 8
-    rope = np.stack([np.zeros(n), 3 - 0.2 * np.arange(n)], axis=1)
-    told = []
-    for bead in ((5.0, 5.0), (0.004, 1.6)):
-        beside = [(9.0, 9.0), (9.019, 9.0), (9.0, 9.1)]  # overlap, as the bead and the bob may: both cases have the same kernels
-        mass = [0.5] * (n - 1) + [20.0, 1.0, 1.0, 1e-6, 1.0]
-        start = tv.Particles([*rope, bead, *beside], radius=0.01, mass=mass, pinned=[0, n, n + 1, n + 2, n + 3])
-        links = tv.Distance(np.stack([np.arange(n - 1), np.arange(1, n)], axis=1))
-        features = [tv.Gravity(9.81), links, tv.Drag(5.0), tv.Polygons([[n + 1, n + 2, n + 3]])]
-        w = world(start, features, substeps=2, solver=tv.Jacobi(), precision="f64")
-        low = w.run(400 / 60).energy
-        w.substeps = 20
-        told.append(w.step(1 / 60))
-        assert not told[-1].flags
-    assert told[0].energy - low > 100 and told[1].energy == pytest.approx(told[0].energy, abs=3)
+    assert max(energy) - rest < 0.6 and gap() < 2e-3
 
 
 @pytest.mark.slow
