@@ -440,6 +440,31 @@ def test_corners_that_cross_part_over_the_nearer_edge(world):
     assert max(sat(y[loops[k]], y[loops[k + 1]])[0] for k in range(0, len(shapes), 2)) < 0.009 * half
 
 
+@pytest.mark.parametrize("gap", [0.0, 1e-2])
+def test_what_slides_over_level_tiles_keeps_its_speed(world, gap):
+    # A box, a hexagon, a disc and a point slide at 1 m/s over 4 pinned squares of 1 m, with gaps between, without friction, each
+    # over squares of its own. The foremost corner meets the side of the next square a slop below its top. The disc also touches
+    # corners, whose normals lean: a blow between two of them takes (gap / radius)^2 / 2 of the speed, and a substep has its part.
+    sides, lines = regular(4, np.sqrt(0.5), (0.0, -0.5)), []
+    box, hexagon = regular(4, 0.56, (0.0, 0.56 / np.sqrt(2))), regular(6, 0.4, (0.0, 0.4 * np.sin(np.pi / 3)))
+    for k, body in enumerate((box, hexagon, [(0.0, 0.3)], [(0.0, 0.0)])):
+        lines.append([*(sides + (j * (1 + gap), -9.0 * k) for j in range(4)), np.array(body) + (0.0, -9.0 * k)])
+    x, loops, _ = bodies([shape for line in lines for shape in line])
+    moves = np.concatenate([np.full(len(shape), k % 5 == 4) for k, shape in enumerate(s for line in lines for s in line)])
+    loops = [loop for loop in loops if len(loop) > 1]
+    radius = np.where(np.arange(len(x)) == len(x) - 18, 0.3, 0.0)
+    start = tv.Particles(x, velocity=moves[:, None] * [1.0, 0.0], radius=radius, pinned=np.flatnonzero(~moves))
+    held = tv.ShapeMatch([loop for loop in loops if moves[loop[0]]])
+    w = world(start, [tv.Gravity(9.81), tv.Polygons(loops), held], precision="f64")
+    most = np.where(start.radius[moves] > 0, 1.5e-3 + 3 * (gap / 0.3) ** 2 / 2, 1e-3)
+    for substeps in (8, 60):
+        w.position, w.velocity, w.substeps = start.position, start.velocity, substeps
+        for _ in range(150):
+            w.step(1 / 60)
+            assert (np.abs(w.velocity[moves, 0] - 1.0) < most).all()
+        assert np.abs(w.position - start.position)[moves, 1].max() < 0.005 * 0.5 and w.last.clean
+
+
 @pytest.mark.slow
 def test_a_hub_that_is_tied_to_all_corners_is_no_stray_particle(world):
     # A wheel with its hub inside, in one rigid cluster or by spokes, rolls along the floor: its middle stays a radius above it.

@@ -426,7 +426,7 @@ class Edges:
             w = self.from_to(self.before(a), a, 1)
         m, zone = perp(w).normalized(), ti.static(SLOP * BEYOND) * size
         d = self.state.relative_displacement(self.state.d[v] - self.state.d[c], v, c)
-        near = rest.dot(rest) <= 4 * zone * zone or (ti.abs(rest.dot(m)) <= zone and ti.abs(rest.dot(n)) <= zone)
+        near = rest.dot(rest) <= 2 * zone * zone  # as deep as the slop below both edges of a right angle
         convex = ti.select(at_end, u.cross(w), w.cross(u)) > 0
         f, _, _ = self.kick(v, c, c, 0 * size)
         return (
