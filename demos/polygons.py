@@ -18,8 +18,7 @@ RADIUS, SPEED = 1.5, 0.8  # radius [m] and speed [rad/s] of the drum
 def build(bodies: int = 45) -> tv.World:
     """Make regular polygons of 3 to 7 corners in a hexagonal drum, held by links along the sides and from the first corner.
 
-    These are as many links as make a body rigid, which are solved exactly. With more, such as both diagonals of a box, the solver
-    is Jacobi, under which towers of bodies sway.
+    These are as many links as make a body rigid, which are solved exactly.
     """
     spots = tv.golden(np.arange(4 * bodies), dim=2) * 2.2 - 1.1
     chosen: list[np.ndarray] = []
@@ -39,7 +38,7 @@ def build(bodies: int = 45) -> tv.World:
     turn = np.arange(6) * np.pi / 3
     drum = tv.Polygon(RADIUS * np.stack([np.cos(turn), np.sin(turn)], axis=1), inside=True, friction=0.5)
     features = [tv.Gravity(9.81), tv.Distance(np.concatenate(links)), tv.Polygons(loops, friction=0.4), drum]
-    return tv.World(tv.Particles(np.concatenate(position), mass=0.1), features, substeps=40)
+    return tv.World(tv.Particles(np.concatenate(position), mass=0.1), features, substeps=10)
 
 
 def deepest(world: tv.World) -> float:

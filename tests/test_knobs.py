@@ -174,6 +174,7 @@ ROWS2 = {
     ),
 }  # fmt: skip
 ELSEWHERE = {
+    ("Contact", "loads"),
     ("ShapeMatch", "creep"),
     ("ShapeMatch", "yield_strain"),
     ("AngleLimit", "lower"),

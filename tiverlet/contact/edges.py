@@ -149,8 +149,9 @@ class Edges:
         """Return the size of a contact of vertex v with an edge from a: the smaller one; a point has none [m]."""
         return ti.select(self.size[v] > 0, ti.min(self.size[v], self.size[a]), self.size[a])
 
+    @called
     @ti.func
-    def corner(self, v, a, start):
+    def corner(self, v: ti.i32, a: ti.i32, start: ti.i32) -> ti.i32:
         """Return 1 if v is in front of the corner a, beside none of its edges; -1 if behind an inner corner; 0 if beside an edge.
 
         A particle without edges is a corner on all sides.
@@ -328,11 +329,13 @@ class Edges:
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             self.marks.field[e] = 0 * self.marks.field[e]
 
+    @called
     @ti.func
-    def list_row(self, v, e, row, scale):
+    def list_row(self, v: ti.i32, e: ti.i32, begin: ti.i32) -> ti.i32:
         """List the contact of vertex v at entry e if it may press. Returns the next free row."""
+        scale = self.rows.scale()
         a = self.list.neighbour[e]
-        b, begin = self.after(a), row
+        b, row = self.after(a), begin
         moves = self.state.moves(v) or self.state.moves(a)
         if b >= 0:
             moves = moves or self.state.moves(b)
@@ -509,8 +512,9 @@ class Edges:
 
     # Reports and sleep
 
+    @called
     @ti.func
-    def detect(self, i):
+    def detect(self, i: ti.i32):
         """Find the contacts at present in which particle i is the vertex, or one of two discs."""
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             j = self.list.neighbour[e]

@@ -347,7 +347,7 @@ class Impulses:
         """Before the first pass: no extrapolation, and what rows may lack. One thread calls it."""
         rows, force = self.total(ROWS), self.total(FORCE)
         mean = force / ti.max(ti.cast(self.n, self.real), 1)
-        met, lands = ti.static(MET * MET) * mean * rows, ti.static(LANDS * LANDS) * mean * rows
+        met, lands = ti.static(MET * MET) * mean * rows + self.total(LOAD), ti.static(LANDS * LANDS) * mean * rows
         self.numbers[None] = [0, ti.static(MOMENTUM), met, lands, 0]
         self.flags[None][GOING], self.flags[None][TURN] = ti.cast(rows > 0, ti.i32), 0
 

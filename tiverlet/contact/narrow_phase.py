@@ -55,13 +55,6 @@ class DiscGeometry:
         return overlap, n
 
     @ti.func
-    def gap(self, i, j):
-        """Return the (negative) overlap of a pair that is apart [m], and its normal."""
-        r = self.state.separation(i, j)
-        length = r.norm()
-        return self.contact_distance(i, j) - length, r / length
-
-    @ti.func
     def fallback_normal(self, i, j, r):
         """Return a normal for two particles in the same place: opposite for (j, i), different for other pairs."""
         low, high = ti.cast(ti.min(i, j), ti.u32), ti.cast(ti.max(i, j), ti.u32)

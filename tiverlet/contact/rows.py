@@ -323,7 +323,7 @@ class Rows:
         scale = self.times[None][SCALE]
         self.begin[i] = row
         if ti.static(bool(self.edges)):
-            row = self.find_edges(i, row, scale)
+            row = self.find_edges(i, row)
         else:
             row = self.find_pairs(i, begin, end, row, scale)
         self.pressed[i] = row
@@ -347,11 +347,11 @@ class Rows:
         return row
 
     @ti.func
-    def find_edges(self, i, row, scale):
+    def find_edges(self, i, row):
         """List the rows of which particle i is the vertex. Returns the row behind the last."""
         self.own[i], self.kept[i] = row, row
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
-            row = self.edges.list_row(i, e, row, scale)
+            row = self.edges.list_row(i, e, row)
         return row
 
     @ti.func

@@ -226,15 +226,6 @@ class Table:
             row = self.rank[i] * self.groups + self.rank[j]
         return self.entries[row]
 
-    @ti.func
-    def held(self, i, j, n, normal, slip):
-        """Return the part of a slip [m] of particles i and j that friction takes back, for a normal displacement along n [m].
-
-        It is at most friction times that displacement (Cundall and Strack 1979).
-        """
-        s, row = slip - slip.dot(n) * n, self.of(i, j)
-        return limit_length(s, row[STATIC] * normal, row[DYNAMIC] * normal)
-
     @inline
     def cutoff(self, radius, i, j):
         """Return the distance up to which particles i and j touch [m]."""

@@ -160,12 +160,6 @@ class NeighbourList:
         assert self.store
         return self.store.read(piece.field)[at].astype(np.float64)
 
-    def scale(self, piece: PairData, factor: float) -> None:
-        """Multiply the data of all pairs by a factor."""
-        if self.store:
-            for field in (piece.field, piece.old) if self.saved else (piece.field,):
-                self.store.write(field, self.store.read(field) * factor)
-
     def _entries(self, first, number, with_walls: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Return the particle of every entry and the place of the entry, (m,) each."""
         first, number = self.memory.read(first)[: self.n], self.memory.read(number)[: self.n]

@@ -17,7 +17,6 @@ from ..contact.limits import (
     KINETIC,
     LACK,
     LOAD,
-    MET,
     MOVES,
     OWN,
     ROWS,
@@ -53,10 +52,10 @@ class RowPass:
         self.in_turn, self.edges = bool(self.impacts), bool(dev.rows.edges)
         some = [HITS, KINETIC] if self.rows.bounces else []
         passes = [LACK, UPHILL, LOAD, *([WRONG] if self.rows.bounces else [])]
-        self.noted = [ROWS, FORCE, *some], passes, [LACK], [WORK], [WORK, LACK, UPHILL]
+        self.noted = [ROWS, FORCE, LOAD, *some], passes, [LACK], [WORK], [WORK, LACK, UPHILL]
         self.answers: Any = dev.answers
         self.answers_later = bool(dev.answers) and dev.answers.answer_later
-        self.places_particles = bool(dev.answers) and dev.answers.has_clusters and not scene.state.sums
+        self.shakes = bool(dev.rows.edges and dev.answers) and dev.answers.has_clusters and not scene.state.sums
         self.linked: list[Any] = []
         self.in_systems: list[Any] = []
         if dev.answers:
@@ -113,7 +112,7 @@ class RowPass:
             row = self.rows.list.first[begin]
             for b in range((end - begin + (BLOCK - 1)) // BLOCK):
                 low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
-                count, force, hits, kinetic = ti.Vector.zero(self.real, 4)
+                count, force, hits, kinetic, noise = ti.Vector.zero(self.real, 5)
                 for i in range(low, high):
                     kick = self.rows.kick(i)
                     self.bodies.begin(i)
@@ -121,7 +120,8 @@ class RowPass:
                     if ti.static(self.edges) or self.bodies.moves(i):
                         row = self.rows.find(i, begin, end, row)
                         count += ti.cast(row - self.rows.own[i], self.real)
-                        force += kick.dot(kick) + self.noise(i)
+                        noise += self.noise(i) * ti.cast(row - self.rows.own[i], self.real)
+                        force += kick.dot(kick)
                         if ti.static(bool(self.answers)):
                             count += self.answers.links.sum_of(self.answers.links.open, i)
                     if ti.static(self.rows.bounces):
@@ -135,6 +135,7 @@ class RowPass:
                     self.impulses.note(low, KINETIC, kinetic)
                 self.impulses.note(low, ROWS, count)
                 self.impulses.note(low, FORCE, force)
+                self.impulses.note(low, LOAD, noise)
         self.team.wait()
         for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
             if ti.static(self.edges):
@@ -155,10 +156,10 @@ class RowPass:
 
     @ti.func
     def noise(self, i):
-        """Return what the digits of positions add to the square of the displacement by forces, where clusters place particles."""
+        """Return the square of what a row of vertex i may lack by the digits of positions, where clusters place corners."""
         out = ti.cast(0, self.real)
-        if ti.static(self.places_particles):
-            digit = ti.static(DIGIT / MET) * self.state.digits(i)
+        if ti.static(self.shakes):
+            digit = ti.static(DIGIT) * self.state.digits(i)
             out = digit * digit
         return out
 
