@@ -1,4 +1,4 @@
-"""Impacts of bodies on walls and on each other: where a struck particle is linked to other particles."""
+"""Impacts of bodies on walls, in worlds without contacts: where a struck particle is linked to other particles."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -136,8 +136,3 @@ class Contact(PairContact):
                 met = met or r.dot(r) < distance * distance
             out = ti.select(met, j, -1)
         return out
-
-    @ti.func
-    def reaction(self, i, h, soft):
-        """Return how far loads moved particle i in the last substep of a frame, h [s] long [m]."""
-        return self.dev.rows.borne[i]

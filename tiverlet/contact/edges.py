@@ -179,7 +179,7 @@ class Edges:
         overlap, n = t - 1, 0 * r
         if uu > 0:
             length = ti.sqrt(uu)
-            t, n = r.dot(u) / uu, ti.Vector([u[1], -u[0]]) / length
+            t, n = r.dot(u) / uu, perp(u) / length
             height, shared, tips = r.dot(n), a, 0
             outside = height >= -SLACK * length
             beside = -SLACK <= t <= 1 + SLACK
@@ -443,15 +443,11 @@ class Edges:
     def kick(self, v, a, b, t):
         """Return the relative kick of a contact, that of the particle which has most, and how large coordinates are, squared."""
         f, most = 0 * self.state.x[v], 0 * self.state.x[v]
-        for i, part in ti.static(((0, 1), (1, 2), (2, 3))):
-            k, share = v, 1 + 0 * t
-            if ti.static(i == 1):
-                k, share = a, t - 1
-            elif ti.static(i == 2):
-                k, share = b, -t
-            if self.state.moves(k):
-                one = self.state.kick(k)
-                f += share * one
+        who, share = ti.Vector([v, a, b]), ti.Vector([1 + 0 * t, t - 1, -t])
+        for k in ti.static(range(3)):
+            if self.state.moves(who[k]):
+                one = self.state.kick(who[k])
+                f += share[k] * one
                 if one.dot(one) > most.dot(most):
                     most = one
         place = self.state.place(v)

@@ -174,10 +174,7 @@ class Impulses:
             p_own += v
             if ti.static(self.bodies.spins):
                 m_own += self.bodies.spin.moment(n, v)
-            if ti.static(bool(self.rows.edges)):
-                self.rows.edges.gone.field[row] = v
-            elif part == OWN and row < kept:
-                self.bodies.give(other, n, v)
+            self.send(row, n, v, part == OWN and row < kept)
             if ti.static(self.rows.turns):
                 self.prepare_turn(i, row, other)
                 m_own += self.give_turn(row, other, part == OWN and row < kept)
@@ -248,6 +245,14 @@ class Impulses:
                 self.bodies.moment[i] = m
 
     @ti.func
+    def send(self, row, n, p, gives):
+        """Let what a row presses on have an impulse p: edges gather it, a particle is given it if the row `gives`."""
+        if ti.static(bool(self.rows.edges)):
+            self.rows.edges.gone.field[row] = p
+        elif gives:
+            self.bodies.give(self.rows.other.field[row], n, p)
+
+    @ti.func
     def gather(self, i):
         """Compute the answer of particle i to the impulses of its rows and of those of its edges."""
         self.bodies.answer(i, self.bodies.push[i] + self.rows.edges.gather(i), self.no_moment())
@@ -308,10 +313,7 @@ class Impulses:
             p_own += p
             if ti.static(self.bodies.spins):
                 m_own += self.bodies.spin.moment(n, p)
-            if ti.static(bool(self.rows.edges)):
-                self.rows.edges.gone.field[row] = p
-            elif part == OWN and row < kept:
-                self.bodies.give(other, n, p)
+            self.send(row, n, p, part == OWN and row < kept)
             if ti.static(self.rows.turns):
                 uphill += self.relax_turn(i, row, other, n, self.rows.along(new, n) + hit, beta)
                 m_own += self.give_turn(row, other, part == OWN and row < kept)
@@ -479,12 +481,9 @@ class Impulses:
             if size > load:
                 impact = (1 - load / size) * self.rows.vector(p, n)
                 p_own += impact
-                if ti.static(bool(self.rows.edges)):
-                    self.rows.edges.gone.field[row] = impact
                 if ti.static(self.bodies.spins):
                     m_own += self.bodies.spin.moment(n, impact)
-                if part == OWN and row < self.rows.kept[i]:  # never with edges, which gather
-                    self.bodies.give(self.rows.other.field[row], n, impact)
+                self.send(row, n, impact, part == OWN and row < self.rows.kept[i])
         self.bodies.push[i] = self.bodies.push[i] + p_own
         if ti.static(self.bodies.spins):
             self.bodies.moment[i] = self.bodies.moment[i] + m_own

@@ -28,7 +28,7 @@ from .rows import Rows
 
 
 class Geometry(Protocol):
-    """The geometry of contacts in one world. DiscGeometry and PolygonGeometry also give their feature overlaps and normals."""
+    """The geometry of contacts in one world. DiscGeometry and Edges also give their feature overlaps and normals."""
 
     def overshoots(self, i) -> Any:
         """Return 1 if particle i moves so far in one substep that a contact may be missed."""
@@ -249,6 +249,11 @@ class PairContact(Feature):
         if fast != 0:
             if self.dev.fast[None] == 0:
                 self.dev.fast[None] = 1
+
+    @ti.func
+    def reaction(self, i, h, soft):
+        """Return how far loads moved particle i in the last substep of a frame, h [s] long [m]."""
+        return self.dev.rows.borne[i]
 
     @ti.func
     def worst_overlap(self, i):

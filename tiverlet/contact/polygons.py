@@ -200,11 +200,6 @@ class Polygons(PairContact):
         return self.loops
 
     @ti.func
-    def reaction(self, i, h, soft):
-        """Return how far loads moved particle i in the last substep of a frame, h [s] long [m]."""
-        return self.dev.rows.borne[i]
-
-    @ti.func
     def is_pressed(self, i, e):
         """Whether particle i, as a vertex, presses on the edge or disc at entry e of its list."""
         return self.dev.rows.is_set(self.dev.rows.memory.field[e]) or self.dev.geometry.touches(i, self.dev.list.neighbour[e], 0)

@@ -25,23 +25,15 @@ class ContactPass:
     @ti.func
     def solve(self, now):
         """Solve contacts, in the first pass of a substep."""
-        for c in ti.static(self.contacts):
-            if ti.static(c.dev.has_events):
-                self.start_events(now)
+        self.begin_events(now)
+        if ti.static(bool(self.rows)):
             if now.first != 0:
                 self.rows.solve(now)
 
     @ti.func
     def begin_events(self, now):
-        """Begin the events of a pass, if there are any."""
-        for c in ti.static(self.contacts):
-            if ti.static(c.dev.has_events):
-                self.start_events(now)
-
-    @ti.func
-    def start_events(self, now):
-        """Record the number of the substep, and at the start of a frame the pairs that touched before."""
-        for c in ti.static(self.contacts):
+        """If there are events: record the number of the substep, and at the start of a frame the pairs that touched before."""
+        for c in ti.static([c for c in self.contacts if c.dev.has_events]):
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, now.thread)):
                 c.dev.events.start(now.s, now.first)
