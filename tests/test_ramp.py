@@ -141,15 +141,14 @@ def test_springs_follow_a_moving_rest_value_to_second_order(world):
 
 def test_a_rest_value_may_change_with_the_substep(world):
     # Two weights hang on springs. As their rest lengths grow from 1 to 1.5 m in a frame, they go down,
-    # also where the substep gets shorter in that frame: positions were settled for the rest lengths that were, not for the new
-    # ones, which would lift the lower one by 1.7 m.
+    # also where the substep gets shorter in that frame. Links are as soft as before then, and dashpots so many times slower.
     spring = tv.Distance([[0, 1], [1, 2]], 1.0, compliance=1e-3, damping=100.0)
     start = tv.Particles([[0.0, 0], [0, -1.0], [0, -2.0]], pinned=[0])
     w = world(start, [tv.Gravity(9.81), spring], precision="f64", substeps=2, solver=tv.Jacobi())
     w.run(2.0)
     low, spring.rest, w.substeps = w.position[2, 1], 1.5, 8
     w.step(DT)
-    assert -0.35 < w.position[2, 1] - low < -0.2
+    assert -0.35 < w.position[2, 1] - low < -0.05
 
 
 def test_an_angle_goes_the_shorter_way(world):

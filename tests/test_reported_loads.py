@@ -236,7 +236,7 @@ def test_a_start_gives_the_impulse_of_a_whole_frame(world, restitution):
 
 def test_what_sags_holds_where_the_substep_gets_shorter(world):
     # A pass holds a moment by a sag that falls with h^2: 1e-4 rad here. In a substep of a half to a tenth of the length, this sag
-    # is 4 to 100 times the moment. Where it could break a joint, it is taken out first, however slight.
+    # would be 4 to 100 times the moment. It stays that moment, but for what vibrates, and in the end without.
     particles = tv.Particles([(0, 1), (0, 0), (1, 0), (2, 0)], mass=[1, 1, 2, 1], pinned=[0, 1])
     for ratio in (2, 4, 10):
         angles = tv.Bend([[0, 1, 2], [1, 2, 3]], break_at=np.inf)
@@ -244,8 +244,9 @@ def test_what_sags_holds_where_the_substep_gets_shorter(world):
         w.run(2.0)
         np.testing.assert_allclose(np.abs(angles.load), [4 * G, G], rtol=1e-4)
         angles.break_at = 1.2 * np.array([4.0, 1.0]) * G
-        w.run(0.5, dt=1 / 60 / ratio)
-        np.testing.assert_allclose(np.abs(angles.load), [4 * G, G], rtol=1e-4)
+        for seconds, error in ((0.5, 0.03), (6.0, 1e-4)):
+            w.run(seconds, dt=1 / 60 / ratio)
+            np.testing.assert_allclose(np.abs(angles.load), [4 * G, G], rtol=error)
         assert not angles.broken.any()
 
 

@@ -183,7 +183,7 @@ def test_moves_of_whole_bodies(world, dim):
     x, mass = rng.standard_normal((9, dim)), rng.uniform(0.5, 2, 9)
     w = world(tv.Particles(x, mass=mass), [tv.ShapeMatch([range(5), range(5, 8)])], precision="f64")
     w.step(1e-3)
-    solids = Solids.loaded(w._runner, x, 0.5)
+    solids = Solids.rigid(w._runner.batches, w._runner.scene.inv_mass)
     whole = solids.whole(x)
     p, q = rng.standard_normal((2, 9, dim))
     np.testing.assert_allclose(whole(whole(p)), whole(p), atol=1e-12)

@@ -134,6 +134,11 @@ class CGSystem(System):
         """Declare a field of real numbers, one for each row."""
         return self.memory.field(f"system.{name}", self.rows)
 
+    @property
+    def greatest_floor(self) -> float:
+        """The largest of the floors of all parts."""
+        return float(self.memory.read(self.floor).max(initial=0.0))
+
     def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
         """Reset the floors, because steps may converge from the new positions.
 

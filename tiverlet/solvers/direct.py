@@ -263,10 +263,10 @@ class Elimination(System):
         """Whether a part is softened for a longer substep than the present one, so that shorter ones do not help."""
         return bool((np.abs(self.memory.read(self.softened)[:, 0]) > 1).any())
 
-    def gives_way(self, batch: Batch, stiffens: bool = False) -> np.ndarray:
-        """Return a mask of the constraints of a batch in parts that give way, (m,). stiffens: only if they cannot stiffen."""
+    def gives_way(self, batch: Batch) -> np.ndarray:
+        """Return a mask of the constraints of a batch in parts that give way, (m,)."""
         soft = self.memory.read(self.softened)[:, 0] != 0
-        parts = (soft & ~(stiffens & self._can_stiffen()))[self._part]
+        parts = soft[self._part]
         row = self.row(batch)
         return parts[row] & (row >= 0)
 

@@ -77,16 +77,17 @@ class Slots:
         self._scalars = bool(scalars)
         self._blocks = blocks = self.system.blocks if self.system else degree
         self._sagging: np.ndarray | None = None  # see _in_sagging_bodies()
-        self.can_soften = not self.loads and (not self.system or self.system.steps > 0)
+        # Whether passes leave violations that bear loads, see softness.py. Links that answer contacts are solved with them.
+        alone = not self.system or self.system.steps > 0 or self.system.count_relaxed_alone(batches) > 0
+        self.can_soften = alone and (not answers or any(b.clusters or b.arity == 1 for b in batches))
         if self.loads or any(b.breaks for b in batches):
             self._bodies, self._rounding_masses = self._connected_bodies(batches, inv_mass)
         if self.loads:
             self.bodies = memory.number(1 + max(int(b.max(initial=0)) for b in self._bodies.values()))
             self.body_load = memory.field("slots.bears", self.bodies)
         self.split = memory.field("slots.split_mass", scene.count, values=blocks * inv_mass)
-        self.corrects_tension = self.can_soften and self.converges
-        if self.corrects_tension:  # by 1 / softness, since it is computed from split masses
-            self.inverse_softness = memory.field("slots.inverse_softness", None, values=[1.0])
+        if self.can_soften:
+            self.softness = memory.field("slots.softness", None, values=[1.0])
         factor = solver.relaxed_by(scene, batches, blocks * inv_mass)
         self.relaxation = checks.number(type(solver).__name__, "relaxed_by()", factor, above=0.0)
 
@@ -129,8 +130,20 @@ class Slots:
         split = np.zeros(len(inv_mass))
         split[:n] = self._blocks[:n] * inv_mass[:n] * np.where(sags, softness, 1.0)
         memory.write(self.split, split)
-        if self.corrects_tension:
-            memory.write(self.inverse_softness, 1 / softness)
+        if self.can_soften:
+            memory.write(self.softness, softness)
+        if self.system and self.system.has_shared_particles:
+            memory.write(self.system.blocks_of, self._blocks * np.where(self._blocks > 1, softness, 1.0))
+
+    @property
+    def sags_anywhere(self) -> bool:
+        """Whether any constraint bears loads by a violation."""
+        return self.can_soften and bool(self.shared.any() or (self.system and self.system.steps))
+
+    @property
+    def shared(self) -> np.ndarray:
+        """Mask of the particles that several blocks of constraints share, (n,)."""
+        return self._blocks > 1
 
     def sags(self, inv_mass: np.ndarray, batches: list[Batch]) -> np.ndarray:
         """Return a mask of the particles whose constraints soften() changes, of all that constraints hold."""
@@ -143,8 +156,8 @@ class Slots:
         rows = sum(b.count for b in batches)
         body = bodies_of(rows, *corners_of(batches), inv_mass)[1][: len(self._blocks)]
         sags = self._blocks > 1
-        for b in batches:
-            sags[b.indices.ravel()[(self.rows(b) >= 0)[b.owner]]] = True  # conjugate gradients
+        for b in batches if self.system and self.system.steps else ():  # conjugate gradients
+            sags[b.indices.ravel()[(self.rows(b) >= 0)[b.owner]]] = True
         out = np.zeros(rows + 1, dtype=bool)
         out[body[sags]] = True
         out[rows] = False  # particles that no constraint moves
@@ -183,6 +196,14 @@ class Slots:
     def rows(self, batch: Batch) -> np.ndarray:
         """Return the row of each constraint of a batch in the system, (m,), -1 for constraints that are relaxed alone."""
         return self.system.row(batch) if self.system else np.full(batch.count, -1)
+
+    @ti.func
+    def softened(self, w):
+        """Return w h^2 / h'^2, where h' is the substep whose stiffness constraints have, see softness.py."""
+        out = w
+        if ti.static(self.can_soften):
+            out *= self.softness[None]
+        return out
 
     @ti.func
     def most_tense(self, geometric_stiffness):

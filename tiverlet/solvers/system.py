@@ -36,6 +36,7 @@ class System:
     answers = False  # whether parts answer the impulses of contacts, see Elimination.answer_part()
     steps = 0  # iterations of a pass, by start(), iterate() and end(); 0 for a solution by solve()
     refines = False  # whether parts may take a second Newton step in a pass, see takes_step() and is_unmet()
+    greatest_floor: float = 0.0  # sigma, by which rows hold a load F by a violation sigma W h^2 F
     can_stiffen: Any = False  # whether parts gave way in a longer substep, and may bear their loads in this one
     keeps_softness_of_longer: Any = False  # whether a part is softened for a longer substep, so that shorter ones do not help
     has_implied = False  # whether rows are links that others imply, which take no step
@@ -66,7 +67,7 @@ class System:
             self.motion, self.spare_energy, self.own_step = self.reals("toward"), self.reals("spare"), self.reals("instead")
             self.trusted_step = self.reals("most")
         if self.has_shared_particles:
-            self.blocks_of = scene.memory.field("system.share", scene.count, kind=ti.i32, values=self.blocks)
+            self.blocks_of = scene.memory.field("system.share", scene.count, values=self.blocks)
 
     def ints(self, name: str, values: np.ndarray, width: int = 0):
         """Declare a field of integers with these values."""
@@ -129,8 +130,8 @@ class System:
         off: for some batches, (m,), the violations of rigid constraints that cannot be removed at the new positions.
         """
 
-    def gives_way(self, batch: "Batch", stiffens: bool = False) -> np.ndarray:
-        """Return a mask of the constraints of a batch in parts that give way, (m,). stiffens: only if they cannot stiffen."""
+    def gives_way(self, batch: "Batch") -> np.ndarray:
+        """Return a mask of the constraints of a batch in parts that give way, (m,)."""
         return np.zeros(batch.count, dtype=bool)
 
     def stiffen(self, x: np.ndarray, h: float, energy: float) -> bool:

@@ -108,7 +108,7 @@ class StepController:
         self.prepare(world.iterations, dt, tolerance, budget)
         before, flags = world._undo  # type: ignore[misc]  # before the upload of knobs; without an upload, the present state
         kept = checkpoint.keep(world) if any(map(any, flags)) else replace(before, controller=self.memory)
-        world._runner.begin(dt, self.substeps, world.iterations)
+        world._runner.begin(dt, self.substeps, world.iterations, self.iterations)
         if first:
             world._runner.compile_for_repeats()
         tries = Tries(self.substeps, self.iterations, self.stuck, world._clock.energy)
@@ -126,7 +126,7 @@ class StepController:
                 tries.verdict = "substeps-capped"
                 break
             checkpoint.put_back(world, kept)
-            world._runner.begin(dt, tries.substeps, world.iterations)
+            world._runner.begin(dt, tries.substeps, world.iterations, tries.iterations)
         self.substeps, self.iterations, self.stuck = n, k, tries.stuck  # so that the next frames do not try in vain
         self.plan_next_frame(world.iterations, max(figures), tries.verdict, tries.count)
         return with_verdict(report, max(figures), risks, tries.verdict, tries.count)
@@ -359,7 +359,7 @@ def pumps(energies: list[float], kinetic: float) -> bool:
     """Whether the last doubling of the effort added more energy than the one before, and led beyond the bound.
 
     energies: before the frame, then after each try [J]. The bound follows from all but the last two of them, see energy_limit().
-    Violations that could not be removed first act as springs, which a shorter substep makes stiffer, see projection.py.
+    Violations that could not be removed first act as springs, which a shorter substep makes stiffer, see leftover.py.
     """
     if len(energies) < 4:
         return False

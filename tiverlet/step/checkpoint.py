@@ -120,6 +120,7 @@ def put_back(world: "World", kept: Checkpoint) -> None:
     if world._clock.softness != kept.clock.softness:
         world._runner.set_softness(kept.clock.softness)
     world._clock.put_back(kept.clock)
+    world._runner.set_multipliers_per_newton()
     world._controller.memory = kept.controller
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 # Names in recordings.
 NAMES = {
-    "_time": "time", "_tick": "tick", "_since": "since", "_h": "h", "_fresh": "d_is_velocity", "_longest": "longest",
+    "_time": "time", "_tick": "tick", "_since": "since", "_h": "h", "_fresh": "d_is_velocity", "_iterations": "iterations",
     "_frame": "frame", "_drag": "drag", "_started": "started", "_owed": "owed", "_lacked": "lacked",
     "_parted": "velocity_override", "_placed": "first_moved", "_energy": "energy", "_bound": "bound",
     "_kinetic": "kinetic", "_parting": "parting", "_softness": "softness", "_softened": "softened",
@@ -43,7 +43,7 @@ class Clock:
 
     time: simulated [s]. tick, since: number of substeps so far, and since the last start, modulo 2^31. h: the last substep [s].
     d_is_velocity: whether displacements hold velocities, so that the next substep is a start. started: whether the last substep
-    was a start. longest: the longest substep since violations were last removed [s], see projection.py. softness, softened: how
+    was a start. iterations: of the last frame. softness, softened: how
     many times as soft as passes make them links are, 1 or more, and when a substep last made them about that soft [s], see
     softness.py. frame: when frames of the present length began [s], their length [s], their number. drag: its factors for h, see
     integrator.decay(). owed: the kick by rigid constraints that velocities before a start lack, as a time [s]. lacked: `owed` of
@@ -63,7 +63,7 @@ class Clock:
     h: float = 0.0
     d_is_velocity: bool = True
     started: bool = False
-    longest: float = 0.0
+    iterations: int = 1
     softness: float = 1.0
     softened: float = 0.0
     frame: tuple[float, float, int] = (0.0, 0.0, 0)
@@ -133,19 +133,18 @@ class Clock:
         since, length, count = self.frame
         return (since, dt, count + 1) if dt == length else (self.time, dt, 1)
 
-    def advance(self, substeps: int, frame: tuple[float, float, int], started: bool) -> None:
-        """Advance by so many substeps, which made one frame."""
+    def advance(self, substeps: int, iterations: int, frame: tuple[float, float, int], started: bool) -> None:
+        """Advance by so many substeps of so many passes, which made one frame."""
         self.tick, self.since = (self.tick + substeps) % 2**31, (self.since + substeps) % 2**31
-        self.started, self.d_is_velocity, self.velocity_override = started, False, None
+        self.iterations, self.started, self.d_is_velocity, self.velocity_override = iterations, started, False, None
         self.lacked = self.owed if started else 0.0
         self.frame, self.time = frame, frame[0] + frame[1] * frame[2]
 
     @property
     def hashed(self) -> list[Any]:
         """The values that the next frames depend on, for the hash."""
-        later: list[Any] = [self.longest] if self.longest > self.h else []  # matters when h changes
+        later: list[Any] = [] if self.softness == 1 else [self.softness, self.softened]
         later += [] if self.velocity_override is None else [np.asarray(self.velocity_override, dtype=np.float64).tobytes()]
-        later += [] if self.softness == 1 else [self.softness, self.softened]
         return [self.time, self.tick, self.since, self.h, self.d_is_velocity, *later]
 
     def is_valid(self, particles: int, dim: int) -> bool:
@@ -154,12 +153,9 @@ class Clock:
             np.shape(self.velocity_override) != (particles, dim) or not np.isfinite(self.velocity_override).all()
         ):
             return False
-        right = [type(k) is int and 0 <= k < 2**31 for k in (self.tick, self.since)]
+        right = [type(k) is int and 0 <= k < 2**31 for k in (self.tick, self.since, self.iterations)]
         right += [type(some) is bool for some in (self.d_is_velocity, self.started, self.parting)]
         energies = self.energy or 0, self.bound or 0, self.kinetic
-        right += [
-            type(v) in (int, float)
-            for v in (self.time, self.h, self.longest, self.softness, self.softened, *self.frame, *energies)
-        ]
+        right += [type(v) in (int, float) for v in (self.time, self.h, self.softness, self.softened, *self.frame, *energies)]
         right += [self.first_moved is None or 0 <= self.first_moved <= particles, len(self.frame) == 3, self.softness >= 1]
         return all(right) and (self.drag is None or [type(v) for v in self.drag] == [float] * 5)

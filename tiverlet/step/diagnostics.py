@@ -473,7 +473,7 @@ class Reporter:
             )
         if released > 0:
             return (
-                f"Large clusters, or links that contradict each other, were off by {100 * released:.3g} % of their size "
+                f"Links that contradict each other were off by {100 * released:.3g} % of their size "
                 "as the frame began. A shorter substep turns that into energy; contradictions let all that hangs together with "
                 "them give way. Give all frames as many substeps, or these constraints compliance, or lengths that fit."
             )

@@ -12,8 +12,7 @@ import numpy as np
 
 from ..geometry.ordered import distinct
 from ..solvers.corners import bodies_of
-from .block_matrix import summed
-from .jacobian import Jacobian
+from .jacobian import Jacobian, summed
 
 FLAT = 1e-9  # of the largest moment of inertia: below, a moment is zero up to rounding
 
@@ -52,27 +51,18 @@ class FreeBodies:
         spin = np.einsum("kij,kj->ki", self._mobility, moment)
         return self.free * _turning(spin[self.body], self.arm)
 
-    def spun(self, v: np.ndarray, x: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return v with the angular momenta that velocities `before` had at positions x, and the energy that this adds [J]."""
+    def spun(self, v: np.ndarray, x: np.ndarray, before: np.ndarray) -> np.ndarray:
+        """Return v with the angular momenta that velocities `before` had at positions x, (n, dim)."""
         if not self.free.any():
-            return v, 0.0
-        out = v + self.turned(self.moment(self._about_center(x), before) - self.moment(self.arm, v))
-        return out, float((self.mass * (out**2 - v**2)).sum() / 2)
+            return v
+        return v + self.turned(self.moment(self._about_center(x), before) - self.moment(self.arm, v))
 
-    def calmed(self, v: np.ndarray, due: np.ndarray) -> np.ndarray:
-        """Return velocities after each free body has lost the energy `due` from its inner motion.
-
-        Inner motion is without translation and rotation. due: (n,) [J], the energy of its body for each particle.
-        """
-        inner = self.free * self.unturned(self._about_center(v))
-        kinetic, owed = summed(self.mass * inner**2, self.body, self.count).sum(axis=1) / 2, np.zeros(self.count)
-        np.maximum.at(owed, self.body, due)
-        left = np.maximum(1 - np.divide(owed, kinetic, out=np.zeros_like(owed), where=kinetic > 0), 0.0) ** 0.5
-        return v - (1 - left)[self.body][:, None] * inner
-
-    def unturned(self, moves: np.ndarray) -> np.ndarray:
-        """Return moves or velocities without the rotation of free bodies, (n, dim)."""
-        return moves - self.turned(self.moment(self.arm, moves)) if self.free.any() else moves
+    def inner(self, v: np.ndarray) -> np.ndarray:
+        """Return velocities v, (n, dim), without the translation and the rotation of free bodies."""
+        if not self.free.any():
+            return v
+        out = np.where(self.free, self._about_center(v), v)
+        return out - self.turned(self.moment(self.arm, out))
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

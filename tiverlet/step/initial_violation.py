@@ -134,13 +134,13 @@ def move_to_curves(scene: Scene, batches: list[Batch], placed: int) -> tuple[np.
 
 
 def remove(
-    scene: Scene, batches: list[Batch], placed: int, ratio: float, stop: Callable[[np.ndarray], None]
+    scene: Scene, batches: list[Batch], placed: int, ratio: float, stop: Callable[[np.ndarray], None], steps: int = NEWTON
 ) -> tuple[np.ndarray, float] | None:
     """Move bodies to where their rigid constraints are satisfied, or as near as possible. Bodies that satisfy them stay.
 
     placed: the first placed particle; only bodies with a placed particle move. ratio: of the coming substep to the last. stop:
-    lets walls stop particles that have moved from given positions, (n, dim). Returns how far each particle moved, (n,) [m], and
-    the worst violation that was removed, as a share of its size; None where nothing moved.
+    lets walls stop particles that have moved from given positions, (n, dim). steps: of Newton's method, at most. Returns how far
+    each particle moved, (n,) [m], and the worst violation that was removed, as a share of its size; None where nothing moved.
     """
     w, state, memory = scene.inv_mass, scene.state, scene.memory
     rigid = [b for b in _rigid(batches) if not b.broken.any()]
@@ -162,7 +162,7 @@ def remove(
     new, moving = x, going.copy()
     for _ in range(TURNS):
         old = new
-        state.put(memory, met(rows, body, moving))
+        state.put(memory, met(rows, body, moving, steps))
         sent = state.get(memory)
         stop(old)
         new = state.get(memory)
@@ -198,17 +198,22 @@ def _borne(scene: Scene, batches: list[Scalar], x: np.ndarray, others: np.ndarra
         who = b.indices.ravel()
         W = np.bincount(b.owner, split[who] * (g**2).sum(axis=1), minlength=b.count)
         gone = np.bincount(b.owner, others[who], minlength=b.count) > 0
-        lam = b.sagging
-        out.append(np.where((scene.slots.rows(b) >= 0) | gone, 0.0, -part * W * lam))
+        lam = b.sagging  # several passes leave less than W lam
+        borne = part * -np.sign(lam) * np.minimum(W * np.abs(lam), np.abs(b.violation(x)))
+        out.append(np.where((scene.slots.rows(b) >= 0) | gone, 0.0, borne))
     return out
 
 
-def met(rows: "Rows", body: np.ndarray, going: np.ndarray) -> np.ndarray:
+def met(rows: "Rows", body: np.ndarray, going: np.ndarray, steps: int = NEWTON) -> np.ndarray:
     """Return positions near those of the rows, (n, dim), at which their constraints are satisfied as far as possible.
 
-    body: the body of each particle, (n,). going: mask of the bodies that move.
+    body: the body of each particle, (n,). going: mask of the bodies that move. steps: of Newton's method; with fewer than usual,
+    nothing else is tried where constraints contradict each other.
     """
-    rows = _relaxed(_newton(rows, body, going), body, going)
+    rows = _newton(rows, body, going, steps)
+    if steps < NEWTON:
+        return rows.x
+    rows = _relaxed(rows, body, going)
     worst, left = _violation(rows, body, len(going))
     pushed = going & (worst > SEEN) & _pushed(rows, body, len(going))
     if pushed.any():
@@ -218,12 +223,12 @@ def met(rows: "Rows", body: np.ndarray, going: np.ndarray) -> np.ndarray:
     return rows.x
 
 
-def _newton(rows: "Rows", body: np.ndarray, going: np.ndarray) -> "Rows":
+def _newton(rows: "Rows", body: np.ndarray, going: np.ndarray, steps: int = NEWTON) -> "Rows":
     """Return the rows at the positions where Newton's method ends."""
     going, bodies = going.copy(), len(going)
     x = rows.x
     far = np.ones(bodies)
-    for _ in range(NEWTON):
+    for _ in range(steps):
         _, size = _violation(rows, body, bodies)
         going &= _open(rows, body, bodies)
         if not going.any():

@@ -4,9 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .block_matrix import STEPS, conjugate_gradients, summed
-
 SOFT = 1e-6  # of the diagonal: softness, so that nearly singular directions stay
+STEPS = 200  # of conjugate gradients, at most
 DONE = 1e-12  # of r . z at the start: where conjugate gradients end
 
 
@@ -48,3 +47,33 @@ class Jacobian:
         mu = soft * self.diagonal
         scale = np.divide(1, self.diagonal + mu, out=np.zeros_like(mu), where=self.diagonal > 0)
         return conjugate_gradients(lambda p: some * self.rates(self.moves(p)) + mu * p, lambda r: scale * r, right, enough, steps)
+
+
+def summed(values: np.ndarray, who: np.ndarray, count: int) -> np.ndarray:
+    """Return the sums of values (numbers, vectors or matrices) by particle or body who[k], (count, ...)."""
+    sums = [np.bincount(who, column, minlength=count) for column in values.reshape(len(values), -1).T]
+    return np.stack(sums, axis=1).reshape(count, *values.shape[1:])
+
+
+def conjugate_gradients(
+    apply: Callable[[np.ndarray], np.ndarray], precondition: Callable[[np.ndarray], np.ndarray], right: np.ndarray, enough: float,
+    steps: int = STEPS,
+) -> np.ndarray:  # fmt: skip
+    """Return x with A x = right, by preconditioned conjugate gradients (Hestenes and Stiefel 1952).
+
+    enough: the share of the first r . z at which the iteration ends. steps: the largest number of steps. Sums are NumPy's,
+    because bits of BLAS depend on its number of threads.
+    """
+    x, r = np.zeros_like(right), right
+    p = z = precondition(r)
+    now = first = float((r * z).sum())
+    for _ in range(steps):
+        if now <= enough * first:
+            break
+        q = apply(p)
+        step = now / float((p * q).sum())
+        x, r = x + step * p, r - step * q
+        z = precondition(r)
+        now, last = float((r * z).sum()), now
+        p = z + now / last * p
+    return x

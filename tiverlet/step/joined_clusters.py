@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from .cluster_rows import best_rotation
+from .rotation import best_rotation
 
 FLAT = 1e-6  # of the largest singular value: below, points do not extend along an axis
 ALIKE = 1e-3  # of the radius: clusters whose shared particles differ by more contradict each other, and stay apart

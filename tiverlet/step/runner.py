@@ -13,15 +13,13 @@ from ..device.interrupts import deferred_signals
 from ..device.memory import Rows, numbers_of
 from ..device.patches.compiler import CachedLaunch
 from ..particles.spin import moments_of_inertia
-from . import high_order, initial_shape, initial_violation, softness
+from . import high_order, initial_shape, initial_violation, leftover, softness
 from .clock import Clock, initial_margin
-from .cluster_release import release
 from .diagnostics import BARE, EXTENT, STARTED, STEPPED, UNSTEPPED
 from .frames import Frames
 from .impulse import factor_of
 from .integrator import FREE, decay, h2_effective_of, h2_rigid_of, shares_of
 from .launcher import Launcher
-from .projection import project, stiffen
 from .span import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Span
 from .step import frame
 from .step_report import StepReport
@@ -62,7 +60,6 @@ class Runner:
         self.n, self.launched, self.team, self.integrator = step.n, step.launched, step.team, step.integrator
         self.driven = [b for b in self.batches if b.driven]
         self.springs: list[Any] = [b for b in self.batches if isinstance(b, Scalar) and b.soft and not b.dev.equation.forces]
-        self.weights_alone: dict[Any, np.ndarray] = {}  # of constraints that passes solve, see softness.py
         self.paths = [f for f in step.drivers if isinstance(f, Path)]
         self.logs: list[Any] = [*(c.dev.events for c in step.contacts if c.dev.events), *step.wall_logs]  # of events
         self.semi_iterations, self.drags = step.constraints.semi_iterations, step.integrator.forces.drags
@@ -106,7 +103,7 @@ class Runner:
 
     def regroup(self) -> None:
         """Take the new number of particles, after the parts were edited in place."""
-        self.n, self.weights_alone, self._immovable = self.step.n, {}, None
+        self.n, self._immovable = self.step.n, None
         self.passes_at_once = self._passes_at_once()
         self.diagnostics.report.regroup()
         if self.sleep:
@@ -122,10 +119,10 @@ class Runner:
 
     # Frames.
 
-    def begin(self, dt: float, substeps: int, iterations: int) -> None:
+    def begin(self, dt: float, substeps: int, iterations: int, passes: int | None = None) -> None:
         """Prepare a frame of dt [s]. If the substep has another length than the last one, displacements become velocities, and
         the frame is a start."""
-        if self.prepare(dt, substeps, iterations):
+        if self.prepare(dt, substeps, iterations, passes):
             clock, placed = self.clock, self.clock.first_moved is not None
             if clock.energy is None:
                 clock.forget_bound()
@@ -149,25 +146,24 @@ class Runner:
                     clock.energy = float(self._data[0])
             self.placed()
 
-    def prepare(self, dt: float, substeps: int, iterations: int) -> bool:
+    def prepare(self, dt: float, substeps: int, iterations: int, passes: int | None = None) -> bool:
         """The first half of begin(). Returns whether the second half is needed: the state has changed and must be diagnosed."""
+        adapts, passes = passes is not None, passes or iterations
         h, clock, self.released, self.jumped = dt / substeps * self.integrator.first, self.clock, 0.0, False
         drag = decay(sum(f.rate for f in self.drags), h) if self.drags else None
         if h == clock.h and drag == clock.drag and not clock.d_is_velocity and clock.first_moved is None:
-            if clock.softness > 1:
+            if clock.softness > 1 or passes != clock.iterations:
                 with self.memory.compiler():
-                    softness.keep(self, 1.0, dt)
+                    softness.keep(self, h, dt, passes, adapts)
             return clock.energy is None
         keeps, goes_on = self.solves_rows and clock.first_moved != 0, not clock.d_is_velocity
         asleep = self._sleeping() if keeps and goes_on and clock.first_moved is None else None
         if asleep is None:
             self.wake()
-        softens = softness.can_keep(self, h, dt, substeps, keeps)
         with self.memory.compiler():
             self._jump()
             if h != clock.h or drag != clock.drag:
-                clock.longest = max(clock.longest, clock.h if clock.first_moved != 0 else 0.0)
-                self.restart(iterations)
+                self.restart(iterations, h if softness.acts(self, h, passes) else None)
             self.moved, first = 0.0, clock.first_moved if self.scene.slots else None
             if first is not None:
                 for b in self.driven:
@@ -176,15 +172,11 @@ class Runner:
             if h != clock.h or drag != clock.drag:
                 if self.scene.slots and self.scene.slots.system and clock.h:
                     self.scene.slots.system.keep_softness(h / clock.h)
-                if softens or (h == clock.h and clock.softness > 1):
-                    softness.keep(self, h / clock.h, dt)
-                elif h < clock.longest and not (self.probe or self.solves_rows):
-                    x = self.scene.state.get(self.memory) if self.springs else None
-                    self._project(h, dt)
-                    if x is not None:
-                        self._forget_springs(x, self.scene.state.get(self.memory))
-                if not (h == clock.h or softens):
-                    softness.end(self, h)
+                settles = h < clock.h and first is None and self.scene.slots and not (self.probe or keeps)
+                if settles and leftover.remove(self, h, dt != clock.frame[1], adapts):
+                    self.set_softness(1.0)
+                else:
+                    softness.keep(self, h, dt, passes, adapts)
                 if asleep is not None and keeps:
                     self._sleep_on(*asleep, h / clock.h)
                 elif asleep is not None:
@@ -232,21 +224,6 @@ class Runner:
         for field in left + [c.dev.rows.borne for c in self.step.contacts]:
             memory.write_rows(who, (field, memory.rows(who, field)[0] * ratio**2))
 
-    def _project(self, h: float, dt: float) -> None:
-        """Remove the energy that violations and overlaps would store in a shorter substep h [s], of a frame dt [s].
-
-        Where a loop measures dt, it must not wait long.
-        """
-        clock, longest = self.clock, self.clock.longest
-        measured = dt != clock.frame[1] and clock.first_moved != 0
-        stiffen(self, h, dt, longest, measured)
-        released = release(self, h, longest)
-        projected = project(self, h, dt, longest, measured=measured)
-        if projected is None and not released:
-            released = release(self, h, longest, small=True)
-        if projected or projected is None or released:
-            clock.longest = h
-
     def _note_moved(self, removed: tuple[np.ndarray, float] | None) -> None:
         """Note how far particles were moved to meet their constraints, (n,) [m], and the violation that was removed, if any."""
         if removed is not None:
@@ -277,7 +254,7 @@ class Runner:
         span, started = clock.next_frame(dt), clock.d_is_velocity and substeps * self.integrator.stages == 1
         if not (self.sleep and self.sleep.rests):
             self.run(substeps if self.n else 0, iterations, span[0] + span[1] * span[2], STARTED if started else STEPPED)
-        clock.advance(substeps, span, started)
+        clock.advance(substeps, iterations, span, started)
         self.left = None
         if self.sleep:
             self.settle(dt)
@@ -348,7 +325,6 @@ class Runner:
         clock, known = self.clock, moved if self.clock.first_moved is None else self.clock.moved_mask
         clock.energy, clock.first_moved, clock.moved_mask = None, 0, None if known is None else known | moved
         if (moved | (self.scene.inv_mass == 0)).all():  # what is violated now no pass has left
-            clock.longest = 0.0
             with self.memory.compiler():
                 self.set_softness(1.0)
 
@@ -366,20 +342,23 @@ class Runner:
             offset[: b.count][np.bincount(b.owner, moved[b.indices.ravel()], minlength=b.count) > 0] = 0.0
             self.memory.write(b.dev.equation.spring.offset, offset)
 
-    def restart(self, iterations: int) -> None:
+    def restart(self, iterations: int, softened: float | None = None) -> None:
         """Turn displacements into velocities, so that the next substep is a start from the present state. iterations: of the
-        substep, for velocities of higher order.
+        substep, for velocities of higher order. softened: its length [s], if links are to bear their loads in it as before.
 
         d / h of a particle at rest stands for -g h / 2 without its support. Without restitution the next substep stops it all the
         same. With restitution it would leave at e g h / 2, which a shorter substep does not take for rest. So in worlds with
-        restitution, but for those of rows, the velocities are those that users read.
+        restitution, but for those of rows, the velocities are those that users read. Links that are softer than rigid ones do not
+        stop it either: they supply the kick of one substep, half of which the velocities lack then.
         """
         clock = self.clock
         if not clock.d_is_velocity:
-            if clock.velocity_override is not None or (self.bounces and not self.solves_rows):
+            if clock.velocity_override is not None or softened or (self.bounces and not self.solves_rows):
                 held, seen = (self.scene.inv_mass == 0)[:, None], clock.velocity_override
-                seen = self.velocity(iterations) if seen is None else seen
+                lacking = softened if softened and seen is None else 0.0
+                seen = self.velocity(iterations, links=1 - lacking / clock.h) if seen is None else seen
                 self.start(np.where(held, self.memory.read(self.scene.state.d)[: self.n] / clock.h, seen))
+                clock.owed = lacking
             elif self.probe:
                 self.memory.write(self.scene.state.d, high_order.velocity(self.probe, clock, self.memory, iterations))
             else:
@@ -432,13 +411,13 @@ class Runner:
         first: int = 0,
         end: int | None = None,
         just_added: bool = False,
-        links: bool = True,
+        links: float = 1.0,
         touches: bool = True,
     ) -> np.ndarray:
         """Velocities as the user sees them, to the order of the world, of particles `first` to `end` - 1, (end - first, dim).
 
-        just_added: whether these were just added, and touch nothing yet. links: whether reactions of rigid constraints count.
-        touches: whether reactions of contacts and walls count.
+        just_added: whether these were just added, and touch nothing yet. links: the share of reactions of rigid constraints that
+        counts. touches: whether reactions of contacts and walls count.
         """
         clock = self.clock
         if clock.d_is_velocity:
@@ -454,7 +433,7 @@ class Runner:
             return out
         return out[first : self.n if end is None else end]
 
-    def _velocities(self, first: int = 0, end: int | None = None, links: bool = True, touches: bool = True) -> np.ndarray:
+    def _velocities(self, first: int = 0, end: int | None = None, links: float = 1.0, touches: bool = True) -> np.ndarray:
         """Launch the kernel that computes velocities from displacements."""
         launch = self._with_room(self._velocity, "velocities", 7, self.scene.state.dim, self.n)
         self._velocity = launch if self.n <= KEPT else None

@@ -6,16 +6,16 @@ from typing import Any
 import numpy as np
 
 from ..solvers.corners import bodies_of, corners_of
-from .block_matrix import summed
-from .cluster_rows import HEAVY, best_rotation
-from .integrator import h2_effective_of
+from .jacobian import summed
 from .joined_clusters import Copies, joined
+from .rotation import best_rotation
 
+HEAVY = 1024  # masses of the cluster: the mass of a particle that cannot move
 SEEN, BORNE = 1e-3, 4.0  # of the radius: out of shape by more, and by so many times what loads do to a cluster
 
 
 class Solids:
-    """Clusters, or bodies of several ones, with the shapes that they have at rest or under their loads.
+    """Clusters, or bodies of several ones, with the shapes that they have at rest.
 
     Each has its own copy of the particles that several of them share, and all positions and moves are those of copies. Corner k
     belongs to cluster owner[k] and is copy who[k], of mass m[k]. worst: the largest deformation that passes have left in a
@@ -38,28 +38,6 @@ class Solids:
         self.total = np.bincount(self.owner, self.m)
         self.shape = q - self._means(q)
         self.radius = np.sqrt(np.bincount(self.owner, self.m * (self.shape**2).sum(axis=1)) / self.total)[self.owner]
-
-    @staticmethod
-    def loaded(runner: Any, x: np.ndarray, ratio: float, apart: bool = True) -> "Solids":
-        """Return the clusters with the shapes that they have at x, (n, dim), without a part of their residual deformation.
-
-        The residual Z of passes is that of projection.py; ratio^2 of it stays. apart: only clusters that share no particle.
-        """
-        w, h, h2_effective = runner.scene.inv_mass, runner.clock.h, h2_effective_of(runner.clock)
-        found = [(b, some & (alone | (not apart))) for b, some, alone in _movable(runner.batches, w)]
-        found = [(b, some) for b, some in found if some.any()]
-        columns = [(b.indices, b.owner, *_state(b, w, h, h2_effective)) for b, _ in found]
-        parts = [_of(b, some, rows) for (b, some), rows in zip(found, columns, strict=True)]
-        out = Solids(w, parts)
-        if out.count:
-            x = out.copies.lift(x)
-            last, pull, now, give = (np.concatenate([part[k] for part in parts]) for k in range(3, 7))
-            off, turn = x[out.who] - out._placed(x), out.turn[out.owner]
-            off, pull = np.einsum("kba,kb->ka", turn, off), np.einsum("kba,kb->ka", turn, pull)
-            undone = now[:, None] * off + (1 - now)[:, None] * last + give[:, None] * pull
-            out.worst = float(out._shares(undone).max())
-            out.shape = out.shape + off - (1 - ratio**2) * undone
-        return out
 
     @staticmethod
     def rigid(batches: list[Any], w: np.ndarray, first: int = 0) -> "Solids":
@@ -185,19 +163,3 @@ def _of(batch: Any, some: np.ndarray, columns: tuple[np.ndarray, ...]) -> tuple[
     """Return the columns (particles, owners, others) for the clusters in the mask `some`, (m,), with owners renumbered."""
     who, owner, *others = (column[some[batch.owner]] for column in columns)
     return who, (np.cumsum(some) - 1)[owner], *others
-
-
-def _state(batch: Any, w: np.ndarray, h: float, h2_effective: float) -> tuple[np.ndarray, ...]:
-    """Return for each corner the rest shape, the last deformation and the pull, (corners, dim), and two weights, (corners,).
-
-    The weights are those of the present deformation and of the pull in the residual of passes. See ShapeMatch and Equation for
-    the symbols.
-    """
-    read, spring, owner = batch.scene.memory.read, batch.dev.spring, batch.owner
-    mass = np.divide(1, w[batch.indices], out=np.zeros(len(owner)), where=w[batch.indices] > 0)
-    alpha, total = batch.compliance, np.bincount(owner, mass)
-    reach = h * h * np.divide(1, total, out=np.zeros_like(total), where=total > 0)
-    theta = np.divide(reach**2, reach**2 + alpha**2, out=np.zeros_like(reach), where=reach > 0)
-    q, pull = (read(field)[: len(owner)].astype(np.float64) for field in (batch.dev.shape, batch.dev.pull))
-    last = read(spring.last)[: len(owner)].astype(np.float64) if spring.soft else np.zeros_like(q)
-    return q, last, pull, (theta + batch.damping * alpha / h)[owner], (alpha * total / h2_effective)[owner]

@@ -7,7 +7,7 @@ from ..step.integrator import FREE
 
 # Attributes with the same name and meaning in Clock.
 PLAIN = (
-    "time", "tick", "since", "h", "d_is_velocity", "started", "longest", "softness", "softened", "owed", "lacked",
+    "time", "tick", "since", "h", "d_is_velocity", "started", "iterations", "softness", "softened", "owed", "lacked",
     "kinetic", "parting",
 )  # fmt: skip
 NONE = -1  # first_moved where no particle was placed
@@ -44,7 +44,7 @@ class Clocks:
     h: np.ndarray
     d_is_velocity: np.ndarray
     started: np.ndarray
-    longest: np.ndarray
+    iterations: np.ndarray
     softness: np.ndarray
     softened: np.ndarray
     owed: np.ndarray
@@ -101,12 +101,13 @@ class Clocks:
         new = some & (self.frame[:, 1] != dt)
         self.frame[new, 0], self.frame[new, 1], self.frame[new, 2] = self.time[new], dt, 0
 
-    def advance(self, substeps: int, frames: int, started: np.ndarray) -> None:
-        """Advance all worlds by `frames` frames of `substeps` substeps. started: as in Clock, for a launch of one frame."""
+    def advance(self, substeps: int, iterations: int, frames: int, started: np.ndarray) -> None:
+        """Advance all worlds by `frames` frames of so many substeps and passes. started: as in Clock, for one frame."""
         for count in (self.tick, self.since):
             count[...] = (count.astype(np.int64) + substeps * frames) % 2**31
         self.frame[:, 2] += frames
         self.time = self.frame[:, 0] + self.frame[:, 1] * self.frame[:, 2]
+        self.iterations = np.full(self.count, iterations)
         self.started = started & (frames == 1)
         self.lacked = np.where(self.started, self.owed, 0.0)
         self.d_is_velocity = np.zeros(self.count, dtype=bool)

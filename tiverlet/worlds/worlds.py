@@ -211,7 +211,8 @@ class Worlds:
             clocks.needs_drag |= self._knobs.waiting_mask(drag)
         self._upload()
         h = dt / world.substeps * runner.integrator.first
-        ready = (clocks.first_moved == NONE) & (clocks.h == h) & ~clocks.needs_drag & (clocks.softness == 1)
+        ready = (clocks.first_moved == NONE) & (clocks.h == h) & ~clocks.needs_drag
+        ready &= (clocks.softness == 1) & (clocks.iterations == world.iterations)
         clocks.since[ready & clocks.d_is_velocity] = 0
         moved, released, jumped = np.zeros(len(self)), np.zeros(len(self)), np.zeros(len(self), dtype=bool)
         some = np.flatnonzero(~ready)
@@ -306,7 +307,7 @@ class Worlds:
         self._launch_worlds(plan, np.arange(len(self)), sheets, dates, figures, flat)
         energy = np.where(clocks.known, clocks.energy, np.nan)
         runner.end_ramps()
-        clocks.advance(substeps, frames, started)
+        clocks.advance(substeps, iterations, frames, started)
         with np.errstate(all="ignore"):  # energies may be infinite, which flags report
             self._last = self._report(figures, energy, moved, released, perf_counter() - begun)
         return self._last

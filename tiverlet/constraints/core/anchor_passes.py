@@ -6,7 +6,7 @@ import numpy as np
 
 from ...device import ti
 from .passes import Passes
-from .spring import Spring, stiff
+from .spring import Spring
 
 if TYPE_CHECKING:
     from ...features.feature import Scene
@@ -133,7 +133,7 @@ class AnchorPasses(Passes):
             if w > 0 and alpha > 0:
                 C = self.place.offset_now(c, 0)
                 rate = self.place.offset_change(c) / h
-                move = -h * h * w * (1 - stiff(alpha, h, w)) * (C / alpha + self.spring.damping[c] * rate)
+                move = -h * h * w * (1 - self.spring.stiff(c, h, w)) * (C / alpha + self.spring.damping[c] * rate)
         self.corners.write_move(c, 0, move)
 
     @ti.func

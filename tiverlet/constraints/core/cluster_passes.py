@@ -98,7 +98,7 @@ class ClusterPasses(Passes):
                 soft, now, last = self.spring.law(c, h, 1 / mass, fresh)
                 if soft < 1 / 64:  # at a start it would be 0 for soft springs, but c and R have to be determined
                     soft, now = ti.cast(1 / 64, self.real), now + soft - 1 / 64
-                rigid = ti.min(stiff(alpha, h, 1 / mass), soft)
+                rigid = ti.min(self.spring.stiff(c, h, 1 / mass), soft)
                 soft -= rigid
                 alpha_prime = alpha * mass / h2_effective
         return rigid, soft, now, last, alpha_prime
@@ -506,7 +506,7 @@ class ClusterPasses(Passes):
         out = 0 * C
         if alpha > 0:
             rate = (C - self.read_matrix(self.pose, c) @ self.spring.last[e]) / h
-            out = -h * h * (1 - stiff(alpha, h, 1 / mass)) * (C / alpha + self.spring.damping[c] * rate) / mass
+            out = -h * h * (1 - self.spring.stiff(c, h, 1 / mass)) * (C / alpha + self.spring.damping[c] * rate) / mass
         return out
 
     @ti.func

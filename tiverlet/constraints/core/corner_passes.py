@@ -346,8 +346,8 @@ class CornerPasses(Passes):
         In a chain of links l it is 4 w / l, where W = 2 w.
         """
         out = 2 * W * self.inverse_size[c]
-        if ti.static(self.slots.corrects_tension):
-            out *= self.slots.inverse_softness[None]
+        if ti.static(self.slots.converges and self.slots.can_soften):  # W contains it
+            out /= self.slots.softness[None]
         return out
 
     @ti.func

@@ -6,7 +6,7 @@ import numpy as np
 
 from ...device import ti
 from .ramp import Ramp
-from .spring import RESTARTED, Spring, stiff
+from .spring import RESTARTED, Spring
 from .step_limit import StepLimit
 from .strength import Strength
 
@@ -118,7 +118,7 @@ class Equation:
                     )
                     if ti.static(not self.forces):
                         if fresh == RESTARTED:
-                            B += (1 - stiff(self.spring.alpha[c], h, w)) * self.spring.offset[c]
+                            B += (1 - self.spring.stiff(c, h, w)) * self.spring.offset[c]
                     self.spring.history[c] = B
                     self.spring.last[c] = f0
                 else:
@@ -224,7 +224,7 @@ class Equation:
                             force -= self.spring.damping[c] * (f - f0) / h
                 else:
                     had, change = soft * self.lam[c], self.spring.force_change(c, self.growth(c, f), h, w, W)
-                    force, elastic = (1 - stiff(alpha, h, w)) * had + change, had + change
+                    force, elastic = (1 - self.spring.stiff(c, h, w)) * had + change, had + change
                     if ti.static(self.side != 0):
                         force, elastic = -self.clip_to_side(-force), -self.clip_to_side(-elastic)
                     force /= h * h

@@ -82,7 +82,7 @@ class Spring:
         restarts: bool = False,
     ):  # fmt: skip
         add, width = scene.memory.field, start.shape[1] if start.ndim == 2 else 0
-        self._memory, self.real = scene.memory, scene.real
+        self._memory, self.real, self.slots = scene.memory, scene.real, scene.slots
         self.soft, self.damped, self.in_state = compliance is not None, damping is not None, {}
         if compliance is not None:
             self.alpha = add(f"{name}.compliance", len(compliance), values=compliance)
@@ -169,7 +169,7 @@ class Spring:
         a substep alpha + W h^2 / 4 takes the place of alpha, see law(). A stiff spring keeps the force that it had.
         """
         alpha = self.alpha[c]
-        return -(1 - stiff(alpha, h, w)) * grown / (alpha / (h * h) + W / 4)
+        return -(1 - self.stiff(c, h, w)) * grown / (alpha / (h * h) + W / 4)
 
     @ti.func
     def last_value(self, c, present, fresh):
@@ -179,4 +179,9 @@ class Spring:
     @ti.func
     def law(self, c, h, w, fresh):
         """Return law() of constraint c."""
-        return law(self.alpha[c], self.dashpot(c), h, w, fresh)
+        return law(self.alpha[c], self.dashpot(c), h, self.slots.softened(w), fresh)
+
+    @ti.func
+    def stiff(self, c, h, w):
+        """Return stiff() of constraint c."""
+        return stiff(self.alpha[c], h, self.slots.softened(w))
