@@ -76,6 +76,7 @@ class Slots:
         self.exact = bool(scalars) and (not self.system.steps if self.system else bool(degree.max(initial=0) <= 1))
         self._scalars = bool(scalars)
         self._blocks = blocks = self.system.blocks if self.system else degree
+        self._alone = 0 if scene.walls and not answers else 1  # blocks of a particle that a pass solves exactly
         self._sagging: np.ndarray | None = None  # see _in_sagging_bodies()
         # Whether passes leave violations that bear loads, see softness.py. Links that answer contacts are solved with them.
         alone = not self.system or self.system.steps > 0 or self.system.count_relaxed_alone(batches) > 0
@@ -133,17 +134,22 @@ class Slots:
         if self.can_soften:
             memory.write(self.softness, softness)
         if self.system and self.system.has_shared_particles:
-            memory.write(self.system.blocks_of, self._blocks * np.where(self._blocks > 1, softness, 1.0))
+            memory.write(self.system.blocks_of, self._blocks * np.where(self.shared, softness, 1.0))
 
     @property
     def sags_anywhere(self) -> bool:
         """Whether any constraint bears loads by a violation."""
-        return self.can_soften and bool(self.shared.any() or (self.system and self.system.steps))
+        return self.can_soften and bool(self._inexact.any() or (self.system and self.system.steps))
 
     @property
     def shared(self) -> np.ndarray:
         """Mask of the particles that several blocks of constraints share, (n,)."""
         return self._blocks > 1
+
+    @property
+    def _inexact(self) -> np.ndarray:
+        """Mask of the particles for which one pass is not exact, because blocks share them, or walls without rows press, (n,)."""
+        return self._blocks > self._alone
 
     def sags(self, inv_mass: np.ndarray, batches: list[Batch]) -> np.ndarray:
         """Return a mask of the particles whose constraints soften() changes, of all that constraints hold."""
@@ -155,7 +161,7 @@ class Slots:
         """Return a mask of the particles whose constraints a pass does not solve exactly, with all that is connected to them."""
         rows = sum(b.count for b in batches)
         body = bodies_of(rows, *corners_of(batches), inv_mass)[1][: len(self._blocks)]
-        sags = self._blocks > 1
+        sags = self._inexact
         for b in batches if self.system and self.system.steps else ():  # conjugate gradients
             sags[b.indices.ravel()[(self.rows(b) >= 0)[b.owner]]] = True
         out = np.zeros(rows + 1, dtype=bool)

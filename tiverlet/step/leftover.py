@@ -15,12 +15,11 @@ from ..constraints.core.scalar import Scalar
 from . import initial_violation
 from .free_bodies import FreeBodies
 from .jacobian import Jacobian
-from .softness import stored
+from .softness import stored, worst
 
 if TYPE_CHECKING:
     from .runner import Runner
 
-TINY = 1e-4  # of its size: a violation that needs no care, in a substep as long as the last one
 ENOUGH = 1e-3  # of its size: a violation that matters, times (1 - r^2)^2 / r^2, r = h' / h: what a jump leaves to vibrate
 QUICK = 8  # steps of Newton's method where links may stay soft instead
 SLIGHT = 1e-3  # of the largest kinetic energy: what velocities may gain, and what may be more than ever
@@ -40,10 +39,10 @@ def remove(runner: "Runner", h: float, measured: bool, adapts: bool) -> bool:
     if not np.isfinite(x).all():
         return False
     square = (h / clock.h) ** 2 / clock.softness  # by how much less the same loads need
-    worst = _worst(runner, x) if sags else 0.0
+    off = worst(runner) if sags else 0.0
     must = stiffens or bool(system and _gain(runner, x, h) > SLIGHT * clock.kinetic)
-    if not (must or worst * (1 - square) ** 2 > ENOUGH * square):
-        return sags and worst <= TINY * square
+    if not (must or off * (1 - square) ** 2 > ENOUGH * square):
+        return False
     d, n = memory.read(state.d), runner.n
     loads = [(b.dev.equation.lam, memory.read(b.dev.equation.lam)) for b in runner.batches if isinstance(b, Scalar)]
     energy, before = clock.energy if clock.energy is not None else _energy(runner), stored(runner) if sags else 0.0
@@ -131,12 +130,3 @@ def _stored(runner: "Runner", x: np.ndarray, h: float) -> float:
 def _bound(clock: Any) -> float:
     """Return the energy that the scene must not exceed [J]."""
     return -np.inf if clock.bound is None else clock.bound
-
-
-def _worst(runner: "Runner", x: np.ndarray) -> float:
-    """Return the worst violation of all links at x, (n, dim), as a share of its size."""
-    out = 0.0
-    for b in runner.batches:
-        C = b.violation(x) * b.inverse_size(b.start.position) * ~b.broken
-        out = max(out, float((np.abs(C) if b.side == 0 else b.side * C).max(initial=0.0)))
-    return out

@@ -163,7 +163,8 @@ class Runner:
         with self.memory.compiler():
             self._jump()
             if h != clock.h or drag != clock.drag:
-                self.restart(iterations, h if softness.acts(self, h, passes) else None)
+                softens = softness.acts(self, h, passes) and not self.springs  # springs have a start of their own
+                self.restart(iterations, h if softens else None)
             self.moved, first = 0.0, clock.first_moved if self.scene.slots else None
             if first is not None:
                 for b in self.driven:
@@ -358,7 +359,7 @@ class Runner:
                 lacking = softened if softened and seen is None else 0.0
                 seen = self.velocity(iterations, links=1 - lacking / clock.h) if seen is None else seen
                 self.start(np.where(held, self.memory.read(self.scene.state.d)[: self.n] / clock.h, seen))
-                clock.owed = lacking
+                clock.owed = (clock.drag or FREE)[3] * lacking
             elif self.probe:
                 self.memory.write(self.scene.state.d, high_order.velocity(self.probe, clock, self.memory, iterations))
             else:
@@ -399,6 +400,8 @@ class Runner:
         if (self.linked or self.step.contacts) and not self.probe:
             with self.memory.compiler():
                 self.stop_at_walls(self.scene.state.get(self.memory))
+                if self.scene.slots and self.scene.slots.sags_anywhere and not self.springs:
+                    self._velocities()
 
     def stop_at_walls(self, before: np.ndarray) -> None:
         """Stop particles at walls that the host has moved from `before`, (n, dim); with memory.compiler()."""

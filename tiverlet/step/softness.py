@@ -20,13 +20,17 @@ import numpy as np
 
 from ..constraints.core.anchored import Anchored
 from ..constraints.core.scalar import Scalar
+from ..particles import LARGEST
 from .clock import CHANGED
+from .solids import Solids
 
 if TYPE_CHECKING:
     from .runner import Runner
 
 NEAR = 0.8  # of the substep whose stiffness links have: a substep about as long
 HOLD, SETTLE = 1.0, 0.5  # how long links stay soft, and the time constant with which they stiffen then [s]
+CONVERGED = 1e-3  # of the violations that one pass leaves: with less, passes hold loads in the same place whatever h is
+TINY = 1e-4  # of its size: a violation that needs no care, in a substep as long as the last one
 SETTLED = 1e-3  # excess of s that is dropped
 SLIGHT = 2e-3  # of the largest kinetic energy: what may be more than ever
 
@@ -59,7 +63,9 @@ def keep(runner: "Runner", h: float, dt: float, iterations: int, adapts: bool = 
         return
     growth, measured = _growth(runner, h, iterations), dt != clock.frame[1]
     s = max(1.0, clock.softness / growth)
-    if measured and growth >= NEAR**2 * clock.softness:
+    if s > 1 and (converges(runner) or (worst(runner) <= TINY / s and not any(b.breaks for b in runner.batches))):
+        s = 1.0
+    elif measured and growth >= NEAR**2 * clock.softness:
         clock.softened = clock.time
     elif s > 1 and (adapts or clock.time >= clock.softened + HOLD * (clock.softened > 0)):
         s = stiffened(runner, s, dt, adapts)
@@ -77,6 +83,37 @@ def stiffened(runner: "Runner", s: float, dt: float, adapts: bool) -> float:
         room = (clock.bound + SLIGHT * clock.kinetic - clock.energy) / store
         most = room if adapts else min(most, room)
     return s / max(1.0, min(s, most))
+
+
+def converges(runner: "Runner") -> bool:
+    """Whether passes have left less than CONVERGED of the violations that one pass would leave by the same loads."""
+    memory, h, stores, one = runner.memory, runner.clock.h, 0.0, 0.0
+    x, split = runner.scene.state.get(memory), memory.read(runner.scene.slots.split)
+    if not (np.abs(x) < LARGEST).all():  # or NaN
+        return False
+    for b in runner.batches:
+        if isinstance(b, Anchored) or (b.clusters and b.soft):
+            return False
+        if isinstance(b, Scalar) and b.count:
+            W = np.bincount(b.owner, split[b.indices.ravel()] * (b.gradients(x).reshape(-1, x.shape[1]) ** 2).sum(axis=1))
+            one += float((W * (h * b.load) ** 2).sum()) / 2
+            stores += float(np.maximum(np.abs(b.load * b.violation(x)) - b.compliance * b.load**2, 0.0).sum()) / 2
+    solids = Solids.rigid(runner.batches, runner.scene.inv_mass)
+    met = not solids.count or solids.far(solids.copies.lift(x)).max(initial=0.0) <= CONVERGED * solids.worst
+    return bool(met and stores <= CONVERGED * one)
+
+
+def worst(runner: "Runner") -> float:
+    """Return the worst violation of rigid links and clusters, as a share of their size; infinite if any may give."""
+    x, w, out = runner.scene.state.get(runner.memory), runner.scene.inv_mass, 0.0
+    if any(getattr(b, "soft", False) for b in runner.batches) or not (np.abs(x) < LARGEST).all():  # or NaN
+        return np.inf
+    for b in runner.batches:
+        if isinstance(b, Scalar) and b.count:
+            C = b.violation(x) * b.inverse_size(b.start.position) * ~b.broken
+            out = max(out, float((np.abs(C) if b.side == 0 else b.side * C).max(initial=0.0)))
+    solids = Solids.rigid(runner.batches, w)
+    return max(out, float(solids.far(solids.copies.lift(x)).max(initial=0.0))) if solids.count else out
 
 
 def stored(runner: "Runner") -> float:
