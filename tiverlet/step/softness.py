@@ -32,7 +32,7 @@ HOLD, SETTLE = 1.0, 0.5  # how long links stay soft, and the time constant with 
 CONVERGED = 1e-3  # of the violations that one pass leaves: with less, passes hold loads in the same place whatever h is
 TINY = 1e-4  # of its size: a violation that needs no care, in a substep as long as the last one
 SETTLED = 1e-3  # excess of s that is dropped
-SLIGHT = 2e-3  # of the largest kinetic energy: what may be more than ever
+SLIGHT = 5e-4  # of the largest kinetic energy: what may be more than ever
 
 
 def acts(runner: "Runner", h: float, iterations: int) -> bool:
