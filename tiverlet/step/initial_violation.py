@@ -194,9 +194,7 @@ def _borne(scene: Scene, batches: list[Scalar], x: np.ndarray, others: np.ndarra
     """
     split, out = scene.memory.read(scene.slots.split)[: len(x)].astype(np.float64), []
     for b in batches:
-        g = b.gradients(x).reshape(-1, x.shape[1])
-        who = b.indices.ravel()
-        W = np.bincount(b.owner, split[who] * (g**2).sum(axis=1), minlength=b.count)
+        who, W = b.indices.ravel(), b.weights(x, split)
         gone = np.bincount(b.owner, others[who], minlength=b.count) > 0
         lam = b.sagging  # several passes leave less than W lam
         borne = part * -np.sign(lam) * np.minimum(W * np.abs(lam), np.abs(b.violation(x)))

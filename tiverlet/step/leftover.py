@@ -39,7 +39,7 @@ def remove(runner: "Runner", h: float, measured: bool, adapts: bool) -> bool:
     if not np.isfinite(x).all():
         return False
     square = (h / clock.h) ** 2 / clock.softness  # by how much less the same loads need
-    off = worst(runner) if sags else 0.0
+    off = worst(runner.batches, x) if sags else 0.0
     must = stiffens or bool(system and _gain(runner, x, h) > SLIGHT * clock.kinetic)
     if not (must or off * (1 - square) ** 2 > ENOUGH * square):
         return False

@@ -14,7 +14,7 @@ loop measures dt, links wait until no frame has been about as long for HOLD. Wha
 """
 
 from math import exp
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -63,7 +63,7 @@ def keep(runner: "Runner", h: float, dt: float, iterations: int, adapts: bool = 
         return
     growth, measured = _growth(runner, h, iterations), dt != clock.frame[1]
     s = max(1.0, clock.softness / growth)
-    if s > 1 and (converges(runner) or (worst(runner) <= TINY / s and not any(b.breaks for b in runner.batches))):
+    if s > 1 and clock.softness == 1 and needs_no_care(runner, s):
         s = 1.0
     elif measured and growth >= NEAR**2 * clock.softness:
         clock.softened = clock.time
@@ -85,35 +85,38 @@ def stiffened(runner: "Runner", s: float, dt: float, adapts: bool) -> float:
     return s / max(1.0, min(s, most))
 
 
-def converges(runner: "Runner") -> bool:
-    """Whether passes have left less than CONVERGED of the violations that one pass would leave by the same loads."""
-    memory, h, stores, one = runner.memory, runner.clock.h, 0.0, 0.0
-    x, split = runner.scene.state.get(memory), memory.read(runner.scene.slots.split)
+def needs_no_care(runner: "Runner", s: float) -> bool:
+    """Whether links may be as stiff as passes make them at once, where they would be `s` times as soft.
+
+    So it is where violations are tiny and nothing may break, or where passes have left less than CONVERGED of the violations that
+    one pass would leave by the same loads.
+    """
+    memory, batches, w, h = runner.memory, runner.batches, runner.scene.inv_mass, runner.clock.h
+    x = runner.scene.state.get(memory)
     if not (np.abs(x) < LARGEST).all():  # or NaN
         return False
-    for b in runner.batches:
-        if isinstance(b, Anchored) or (b.clusters and b.soft):
-            return False
+    solids = Solids.rigid(batches, w)
+    far = float(solids.far(solids.copies.lift(x)).max(initial=0.0)) if solids.count else 0.0
+    if not any(b.soft or b.breaks for b in batches) and max(worst(batches, x), far) <= TINY / s:
+        return True
+    if any(isinstance(b, Anchored) or (b.clusters and b.soft) for b in batches) or not far <= CONVERGED * solids.worst:
+        return False
+    split, stores, one = memory.read(runner.scene.slots.split), 0.0, 0.0
+    for b in batches:
         if isinstance(b, Scalar) and b.count:
-            W = np.bincount(b.owner, split[b.indices.ravel()] * (b.gradients(x).reshape(-1, x.shape[1]) ** 2).sum(axis=1))
-            one += float((W * (h * b.load) ** 2).sum()) / 2
-            stores += float(np.maximum(np.abs(b.load * b.violation(x)) - b.compliance * b.load**2, 0.0).sum()) / 2
-    solids = Solids.rigid(runner.batches, runner.scene.inv_mass)
-    met = not solids.count or solids.far(solids.copies.lift(x)).max(initial=0.0) <= CONVERGED * solids.worst
-    return bool(met and stores <= CONVERGED * one)
+            one += float((b.weights(x, split) * (h * b.load) ** 2).sum()) / 2
+            stores += _stored_in(b, x)
+    return stores <= CONVERGED * one
 
 
-def worst(runner: "Runner") -> float:
-    """Return the worst violation of rigid links and clusters, as a share of their size; infinite if any may give."""
-    x, w, out = runner.scene.state.get(runner.memory), runner.scene.inv_mass, 0.0
-    if any(getattr(b, "soft", False) for b in runner.batches) or not (np.abs(x) < LARGEST).all():  # or NaN
-        return np.inf
-    for b in runner.batches:
+def worst(batches: list[Any], x: np.ndarray) -> float:
+    """Return the worst violation of links at x, (n, dim), as a share of its size."""
+    out = 0.0
+    for b in batches:
         if isinstance(b, Scalar) and b.count:
             C = b.violation(x) * b.inverse_size(b.start.position) * ~b.broken
             out = max(out, float((np.abs(C) if b.side == 0 else b.side * C).max(initial=0.0)))
-    solids = Solids.rigid(runner.batches, w)
-    return max(out, float(solids.far(solids.copies.lift(x)).max(initial=0.0))) if solids.count else out
+    return out
 
 
 def stored(runner: "Runner") -> float:
@@ -122,8 +125,7 @@ def stored(runner: "Runner") -> float:
     x, split = runner.scene.state.get(memory), memory.read(runner.scene.slots.split)
     for b in runner.batches:
         if isinstance(b, Scalar) and b.count:
-            F = b.load
-            out += float(np.maximum(np.abs(F * b.violation(x)) - b.compliance * F * F, 0.0).sum()) / 2
+            out += _stored_in(b, x)
         elif isinstance(b, Anchored) or b.clusters:
             who = b.indices.ravel()
             lam = memory.read(b.dev.lam if isinstance(b, Anchored) else b.dev.pull)[: len(who)].astype(np.float64)
@@ -131,3 +133,9 @@ def stored(runner: "Runner") -> float:
                 lam *= np.divide(1, w[who], out=np.zeros(len(who)), where=w[who] > 0)[:, None]
             out += float((lam**2).sum(axis=1) @ split[who]) / (2 * h * h)
     return out
+
+
+def _stored_in(batch: Scalar, x: np.ndarray) -> float:
+    """Return the same for scalar constraints, sum |F C| / 2 [J]."""
+    F = batch.load
+    return float(np.maximum(np.abs(F * batch.violation(x)) - batch.compliance * F * F, 0.0).sum()) / 2

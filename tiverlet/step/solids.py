@@ -18,8 +18,8 @@ class Solids:
     """Clusters, or bodies of several ones, with the shapes that they have at rest.
 
     Each has its own copy of the particles that several of them share, and all positions and moves are those of copies. Corner k
-    belongs to cluster owner[k] and is copy who[k], of mass m[k]. worst: the largest deformation that passes have left in a
-    cluster, as a share of its radius.
+    belongs to cluster owner[k] and is copy who[k], of mass m[k]. worst: the largest deformation by loads, as a share of
+    the radius of its cluster.
     """
 
     def __init__(self, w: np.ndarray, parts: list[tuple[np.ndarray, ...]]):
@@ -45,7 +45,7 @@ class Solids:
 
         worst: deformation by loads.
         """
-        found = [(b, some & (b.compliance == 0)) for b, some, _ in _movable(batches, w)]
+        found = [(b, some & (b.compliance == 0)) for b, some in _movable(batches, w)]
         found = [(b, some) for b, some in found if some.any()]
         parts = []
         for (b, some), reached in zip(found, _reached([b for b, _ in found], [some for _, some in found], w, first), strict=True):
@@ -138,13 +138,9 @@ def first_off(batches: list[Any], w: np.ndarray, x: np.ndarray) -> int | None:
     return min(solids.copies.particle[solids.who[off]].tolist(), default=None)
 
 
-def _movable(batches: list[Any], w: np.ndarray) -> list[tuple[Any, np.ndarray, np.ndarray]]:
-    """Return each batch of clusters, and masks, (m,), of those that are not broken and can move, and that share no particle."""
-    clusters = [b for b in batches if b.clusters and b.count]
-    degree = np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices for b in clusters)]), minlength=len(w))
-    return [
-        (b, ~b.immovable(w) & ~b.broken, np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) == 1) for b in clusters
-    ]
+def _movable(batches: list[Any], w: np.ndarray) -> list[tuple[Any, np.ndarray]]:
+    """Return each batch of clusters, and the mask, (m,), of those that are not broken and can move."""
+    return [(b, ~b.immovable(w) & ~b.broken) for b in batches if b.clusters and b.count]
 
 
 def _reached(batches: list[Any], some: list[np.ndarray], w: np.ndarray, first: int) -> list[np.ndarray]:

@@ -70,16 +70,6 @@ class Drive:
         """Return the current rest values, (m,)."""
         return self._memory.read(self.target)
 
-    def rates(self, h: float) -> np.ndarray:
-        """How fast they go in a substep h, where nothing holds them up, (m,)."""
-        speed = self._memory.read(self.speed)
-        if self.endless:
-            return speed
-        way = self._memory.read(self.goal) - self.values()
-        if self.period > 0:
-            way -= self.period * np.round(way / self.period)
-        return np.clip(way / (h + self.time_constant), -np.abs(speed), np.abs(speed))
-
     def is_at_limit(self, lam: ti.Field) -> np.ndarray:
         """Return which multipliers of the field `lam` have reached the largest, (m,).
 

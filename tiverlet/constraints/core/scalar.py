@@ -184,9 +184,9 @@ class Scalar(Batch):
         """Return grad_k f of every constraint at the given positions, (m, arity, dim); for outlines (total, dim)."""
         return self.quantity.gradients(self.placed(position) if self.arity else position)
 
-    def weights(self, position: np.ndarray) -> np.ndarray:
-        """Return the sum of w |grad f|^2 of every constraint at the given positions, (m,)."""
-        w, squares = self.scene.inv_mass[self.indices], (self.gradients(position) ** 2).sum(axis=-1)
+    def weights(self, position: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
+        """Return the sum of w |grad f|^2 of every constraint at the given positions, (m,). w: (n,), None for inverse masses."""
+        w, squares = (self.scene.inv_mass if w is None else w)[self.indices], (self.gradients(position) ** 2).sum(axis=-1)
         return (w * squares).sum(axis=1) if self.arity else np.bincount(self.owner, w * squares, minlength=self.count)
 
     def inverse_size(self, position: np.ndarray) -> np.ndarray:
