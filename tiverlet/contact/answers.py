@@ -36,8 +36,9 @@ class Answers:
     """The constraints of one world that answer contacts.
 
     held: how far the answers of systems, clusters and places move each particle [m]. mobility: where clusters are, by how much a
-    unit impulse moves each particle at most [1/kg]. below: how many numbers below each particle the first one of its body is,
-    which constraints connect with it; 0 for particles that come later.
+    unit impulse moves each particle at most [1/kg]; shared: the largest eigenvalue of how all rows of its body move it, over the
+    number of these rows [1/kg]. below: how many numbers below each particle the first one of its body is, which constraints
+    connect with it; 0 for particles that come later.
 
     Of rounds of impacts: before: the answers before a round, of slots and rows of systems; given: how far all rounds have moved
     each particle by answers [m].
@@ -54,7 +55,7 @@ class Answers:
         if self.answer_later:
             self.held, self.nothing = add("answers.held", count, width=dim), add("answers.nothing", count, width=dim)
         if self.has_clusters:
-            self.mobility = add("answers.mobility", count)
+            self.mobility, self.shared = add("answers.mobility", count), add("answers.shared", count)
         self.below = add("answers.below", count, kind=ti.i32, values=self._below(scene.inv_mass))
         self.in_turn = bool(rows.impacts)
         if self.in_turn:
@@ -84,7 +85,7 @@ class Answers:
         if ti.static(self.in_turn):
             self.given[i] = 0 * self.state.d[i]
         if ti.static(self.has_clusters):
-            self.mobility[i] = self.state.w.of(i)
+            self.mobility[i] = self.shared[i] = self.state.w.of(i)
 
     @ti.func
     def body(self, i):

@@ -339,10 +339,20 @@ class Impulses:
         return out
 
     @ti.func
-    def gain(self, i):
-        """Return the energy that impulses give particle i, 0 if they take some, times h^2 [kg m^2]."""
-        work, square = self.bodies.work(i)
-        return ti.max(ti.cast(work + square / 2 - self.rows.work_of_others(i), self.real), 0)
+    def gain(self, block):
+        """Return the energy that impulses give to bodies of a block, without those from which they take some, times h^2 [J s^2].
+
+        Particles that follow each other are mostly of one body, and of one island: what pushes one corner down lifts another one.
+        """
+        out, of_body, body = ti.cast(0, self.real), ti.cast(0, ti.f64), -1
+        for i in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.n)):
+            own = self.bodies.body(i)
+            if own != body:
+                out += ti.cast(ti.max(of_body, 0), self.real)
+                body, of_body = own, 0 * of_body
+            work, square = self.bodies.work(i)
+            of_body += work + square / 2 - self.rows.work_of_others(i)
+        return out + ti.cast(ti.max(of_body, 0), self.real)
 
     @ti.func
     def start_passes(self):

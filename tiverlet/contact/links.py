@@ -90,11 +90,12 @@ class Links:
     def sum_of(self, values: ti.template(), i):  # type: ignore[valid-type]
         """Return the sum of values of the rows whose first corner is particle i."""
         out = ti.cast(0, self.real)
-        if self.degree[i] > 0:
-            for s in range(self.slots.begin[i], self.slots.begin[i + 1]):
-                if self.row_of[s] >= 0:
-                    if self.is_first(s):
-                        out += values[self.row_of[s]]
+        if ti.static(len(self.batches) > 0):
+            if self.degree[i] > 0:
+                for s in range(self.slots.begin[i], self.slots.begin[i + 1]):
+                    if self.row_of[s] >= 0:
+                        if self.is_first(s):
+                            out += values[self.row_of[s]]
         return out
 
     @ti.func
@@ -104,22 +105,24 @@ class Links:
         It is times h^2 [kg m^2].
         """
         out = ti.cast(0, self.real)
-        if self.degree[i] > 0:
-            for s in range(self.slots.begin[i], self.slots.begin[i + 1]):
-                r = self.row_of[s]
-                if r >= 0:
-                    if self.is_first(s):
-                        out += self.mu[r] * self.violation[r] / (2 * self.factor[r])
+        if ti.static(len(self.batches) > 0):
+            if self.degree[i] > 0:
+                for s in range(self.slots.begin[i], self.slots.begin[i + 1]):
+                    r = self.row_of[s]
+                    if r >= 0:
+                        if self.is_first(s):
+                            out += self.mu[r] * self.violation[r] / (2 * self.factor[r])
         return out
 
     @ti.func
     def along(self, values: ti.template(), i):  # type: ignore[valid-type]
         """Return the sum of values of the rows of particle i, times their normals there."""
         out = 0 * self.state.d[i]
-        if self.degree[i] > 0:
-            for s in range(self.slots.begin[i], self.slots.begin[i + 1]):
-                if self.row_of[s] >= 0:
-                    out += values[self.row_of[s]] * self.normal[s]
+        if ti.static(len(self.batches) > 0):
+            if self.degree[i] > 0:
+                for s in range(self.slots.begin[i], self.slots.begin[i + 1]):
+                    if self.row_of[s] >= 0:
+                        out += values[self.row_of[s]] * self.normal[s]
         return out
 
     @ti.func

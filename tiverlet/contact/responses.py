@@ -61,11 +61,15 @@ class Responses:
     @ti.func
     def split(self, i):
         """Return the same, with masses split among the rows of the body [1/kg]."""
-        out = self.mobility(i)
-        if ti.static(self.rows.has_friction):
-            out *= self.rows.share[i]
+        out = self.compliance(i)
+        if ti.static(not self.rows.has_friction):
+            out = self.split_place(i)
         else:
-            out *= self.rows.eigenvalue[i]
+            if ti.static(bool(self.answers)):
+                if ti.static(self.answers.has_clusters):
+                    if out > 0:
+                        out = self.answers.shared[i]
+            out *= self.rows.share[i]
         return out
 
     @ti.func
@@ -85,6 +89,11 @@ class Responses:
     def turning_compliance(self, i):
         """Return by how much a unit moment over the radius turns the surface of particle i [1/kg]."""
         return self.compliance(i) * self.spin.inverse_inertia.of(i)
+
+    @inline
+    def body(self, i):
+        """Return the first particle of the body of particle i."""
+        return self.answers.body(i) if self.answers else i
 
     @ti.func
     def begin(self, i):

@@ -20,7 +20,8 @@ class State:
     substep, and d / h is the velocity half a substep ago, without the cancellation of x_n - x_(n-1).
     With `compensated`, x has a second word, `low`. With `carries`, rounding errors of the sums in x and d are carried along in
     `low` and `d_low` (two-sum, Knuth). In f32 these rounding errors are the remaining error, and grow as substeps get shorter.
-    Either of the two declares `low`, but code that only reads x ignores `low` unless `compensated` is set.
+    Either of the two declares `low`, but code that only reads x ignores `low` unless `compensated` is set; differences of
+    positions count it if `subtracts_low` is.
     """
 
     host_only = ("count", "number")
@@ -39,7 +40,7 @@ class State:
         self.x = memory.field("position", self.number, width=dim, values=particles.position, state=True)
         self.d = memory.field("displacement", self.number, width=dim, values=particles.velocity, state=True)
         self.w = PerParticle(memory, "inv_mass", inv_mass, self.number)
-        self.sums = compensated  # whether x has two words
+        self.sums = self.subtracts_low = compensated  # sums: whether x has two words
         if compensated:
             self._add_low(memory, particles)
 
@@ -47,12 +48,13 @@ class State:
         low = particles.position - particles.position.astype(np.float32)
         self.low = memory.field("position_low", self.number, width=self.dim, values=low, state=True)
 
-    def carry(self, memory: "Memory", particles: "Particles") -> None:
-        """Declare the low words of displacements, and those of positions if there are none."""
+    def carry(self, memory: "Memory", particles: "Particles", subtracts: bool) -> None:
+        """Declare the low words of displacements, and those of positions if there are none. subtracts: see `subtracts_low`."""
         self.d_low = memory.field("displacement_low", self.number, width=self.dim, state=True)
         if not self.sums:
             self._add_low(memory, particles)
         self.carries = self.sums = True
+        self.subtracts_low |= subtracts
 
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether particles can be added and removed in place."""
@@ -129,7 +131,7 @@ class State:
         if self.images and self.compensated:  # f32 cannot resolve the difference of particles many boxes apart
             return ti.cast(self.between(i, j), self.real)
         r = at(self.x, i) - at(self.x, j)
-        return self.nearest(r + (at(self.low, i) - at(self.low, j)) if self.compensated else r)
+        return self.nearest(r + (at(self.low, i) - at(self.low, j)) if self.subtracts_low else r)
 
     @ti.func
     def between(self, i, j):

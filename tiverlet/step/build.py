@@ -167,11 +167,12 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     if batches:
         with memory.owned("slots"):
             scene.slots = Slots(scene, batches, solver, rows)
-        # Rounding errors are carried along where they are all that constraints leave, and where rest values move by themselves,
-        # whose steady loads would otherwise tremble by m ulp(x) / h^2.
-        carries = sums_exactly() and (scene.slots.exact or any(b.driven for b in batches))
+        # Rounding errors are carried along where they are all that constraints leave, where rest values move by themselves, whose
+        # steady loads would otherwise tremble by m ulp(x) / h^2, and where clusters lie on each other, which would sway.
+        stacks = rows and any(b.clusters for b in batches)
+        carries = sums_exactly() and (scene.slots.exact or stacks or any(b.driven for b in batches))
         if not state.double and (state.compensated or carries):
-            state.carry(memory, particles)
+            state.carry(memory, particles, stacks)
         if scene.order > 2:
             high_order.check_solved(batches, scene, solver)
     size = size_of(path, scale.work)

@@ -55,7 +55,7 @@ class RowPass:
         self.noted = [ROWS, FORCE, LOAD, *some], passes, [LACK], [WORK], [WORK, LACK, UPHILL]
         self.answers: Any = dev.answers
         self.answers_later = bool(dev.answers) and dev.answers.answer_later
-        self.shakes = bool(dev.rows.edges and dev.answers) and dev.answers.has_clusters and not scene.state.sums
+        self.shakes = bool(dev.rows.edges and dev.answers) and dev.answers.has_clusters
         self.linked: list[Any] = []
         self.in_systems: list[Any] = []
         if dev.answers:
@@ -160,6 +160,8 @@ class RowPass:
         out = ti.cast(0, self.real)
         if ti.static(self.shakes):
             digit = ti.static(DIGIT) * self.state.digits(i)
+            if ti.static(self.state.subtracts_low):
+                digit = ti.static(DIGIT * self.state.two_digits) * self.rows.size(i)
             out = digit * digit
         return out
 
@@ -481,11 +483,9 @@ class RowPass:
         """End stage 1: take back energy that impulses gave, store what rows bear, move particles, and begin stage 2."""
         blocks = self.impulses.blocks
         for b in range(self.team.chunk_begin(blocks, thread), self.team.chunk_end(blocks, thread)):
-            work = ti.cast(0, self.real)
+            self.impulses.sums[b][WORK] = self.impulses.gain(b)
             for i in range(b * BLOCK, ti.min((b + 1) * BLOCK, self.n)):
-                work += self.impulses.gain(i)
                 self.bodies.forget_sums(i)
-            self.impulses.sums[b][WORK] = work
         self.team.wait()
         self.add_up_groups(thread, OF_WORK)
         ti.loop_config(serialize=True)

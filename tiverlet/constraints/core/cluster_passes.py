@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from ...features.feature import Scene
 
 HEAVY = 1024  # mass of a particle that cannot move, in masses of its cluster
+FEW = 1e-30  # keeps divisors from being 0
 LEAST = 2.0**-46  # smaller relative changes of a rotation are rounding
 
 
@@ -62,9 +63,13 @@ class ClusterPasses(Passes):
             self.fit = add(f"{name}.fit", m, width=dim * dim, kind=ti.f64, state=for_reports)
             self.middle = add(f"{name}.middle", m, width=dim, kind=ti.f64)
             self.mean = add(f"{name}.mean", m, width=dim, kind=ti.f64, state=for_reports)
-        if scene.slots.answers:  # the middle, sum m r r^T about it, A, alpha', the mass, and when, see begin_answer()
-            self.answering = add(f"{name}.answering", m, width=dim * dim + dim + 4, kind=ti.f64)
+        if scene.slots.answers:  # see turn_answer()
+            self.inertia = add(f"{name}.inertia", m, width=dim * dim, kind=ti.f64)  # sum m r r^T about the middle
+            self.answering = add(f"{name}.answering", m, width=3, kind=ti.f64)  # A, alpha' and the mass
+            self.arm = add(f"{name}.arm", total, width=dim, kind=ti.f64)  # from the middle
+            self.weight = add(f"{name}.weight", total, width=2, kind=ti.f64)  # mass, and 1 / (A n + alpha')
             self.answered = add(f"{name}.answered", total, width=dim, state=True)  # in the last substep
+            self.pressed = add(f"{name}.pressed", total)  # by how many rows, of contacts
             self.blow = add(f"{name}.blow", total, width=dim, state=True)  # the part of `pull` that is over
         self.impacts: Any = scene.impacts
         self.impact: Any = ClusterImpact(self, scene.impacts) if scene.impacts else None
@@ -85,7 +90,7 @@ class ClusterPasses(Passes):
         """
         i = self.corners.members[e]
         move = ti.cast(self.state.d[i], ti.f64) - ti.cast(self.state.d[i0], ti.f64)
-        return ti.cast(self.state.separation(i, i0), ti.f64) - back * move
+        return self.state.between(i, i0) - back * move
 
     @ti.func
     def law(self, c, h, h2_effective, fresh):
@@ -254,13 +259,14 @@ class ClusterPasses(Passes):
     @ti.func
     def begin_answer(self, c, h, h2_effective, fresh, bodies: ti.template()):  # type: ignore[valid-type]
         """Store the law of cluster c in this substep. Without shared particles, all rows that press on it share its mass."""
-        begin, end, n = self.corners.starts[c], self.corners.starts[c + 1], ti.static(self.state.dim)
+        begin, end = self.corners.starts[c], self.corners.starts[c + 1]
         rigid, soft, _now, _last, alpha_prime = self.law(c, h, h2_effective, fresh)
-        self.answering[c][n + n * n], self.answering[c][n + n * n + 1] = rigid + soft, alpha_prime
+        self.answering[c][0], self.answering[c][1] = rigid + soft, alpha_prime
         if self.is_body(c) and self.strength.is_intact(c) and self.mass[c] > 0:
             share, eigenvalue = 0 * rigid, 0 * rigid
             for e in range(begin, end):
-                share += bodies.rows.share[self.corners.members[e]]
+                self.pressed[e] = bodies.rows.share[self.corners.members[e]]
+                share += self.pressed[e]
                 eigenvalue += bodies.rows.eigenvalue[self.corners.members[e]]
             for e in range(begin, end):
                 bodies.rows.share[self.corners.members[e]], bodies.rows.eigenvalue[self.corners.members[e]] = share, eigenvalue
@@ -269,61 +275,66 @@ class ClusterPasses(Passes):
     def turn_answer(self, c, bodies: ti.template()):  # type: ignore[valid-type]
         """Find how cluster c moves as a rigid body, at the start of the substep or at the time of an impact."""
         begin, end, i0 = self.corners.starts[c], self.corners.starts[c + 1], self.corners.reference_particle(c)
-        n = ti.static(self.state.dim)
         total, middle, own = ti.cast(0, ti.f64), self.zero_vector(), self.is_body(c) and self.strength.is_intact(c)
         back = 1 - bodies.rows.when_of(self.corners.members[begin])
-        S = middle.outer_product(middle)
+        S, A, alpha = middle.outer_product(middle), self.answering[c][0], self.answering[c][1]
         for e in range(begin, end):
-            m, r = self.mass_in_fit(e, c), self.relative_position(e, i0, back)
+            i, m, r = self.corners.members[e], self.mass_in_fit(e, c), self.relative_position(e, i0, back)
             total += m
             middle += m * r
             S += m * r.outer_product(r)
+            self.arm[e], self.weight[e][0], self.weight[e][1] = r, m, 0
+            if self.w.positive(i):
+                self.weight[e][1] = 1 / (A * self.slots.split[i] / self.w.of(i) + alpha)
         middle /= total
         S -= total * middle.outer_product(middle)
-        for j in ti.static(range(n)):
-            self.answering[c][j] = middle[j]
-            for k in ti.static(range(n)):
-                self.answering[c][n + n * j + k] = S[j, k]
-        self.answering[c][n + n * n + 2], self.answering[c][n + n * n + 3] = total, back
+        for e in range(begin, end):
+            self.arm[e] = self.arm[e] - middle
+        self.write_matrix(self.inertia, c, S)
+        self.answering[c][2] = total
         if own and self.mass[c] > 0:
-            A, alpha = self.answering[c][n + n * n], self.answering[c][n + n * n + 1]
-            give = alpha / (A + alpha)
+            give, rows, arm, turns, free = alpha / (A + alpha), 0 * total, self.zero_vector(), 0 * total, 0 * A
             for e in range(begin, end):
-                i, r = self.corners.members[e], self.relative_position(e, i0, back) - middle
+                r = self.arm[e]
+                rows += self.pressed[e]
+                arm += self.pressed[e] * r
+                turns += self.pressed[e] * rotation.turning_compliance(S, r)
+                free = ti.max(free, self.w.of(self.corners.members[e]))
+            # The largest eigenvalue of [[rows / M, R], [R^T, turns]], with |R|^2 = turning_compliance(S, arm) / M.
+            moves, coupled = rows / total, rotation.turning_compliance(S, arm) / total
+            largest = (moves + turns + ti.sqrt((moves - turns) ** 2 + 4 * coupled)) / 2
+            shared = ti.min(ti.cast(largest / ti.max(rows, FEW), self.real), free)
+            for e in range(begin, end):
+                i, r = self.corners.members[e], self.arm[e]
                 w = self.w.of(i)
                 body = ti.cast(1 / total + rotation.turning_compliance(S, r), self.real)
                 bodies.answers.mobility[i] = give * w + (1 - give) * ti.min(body, w)
+                bodies.answers.shared[i] = give * w + (1 - give) * shared
 
     @ti.func
     def answer(self, c, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]
         """Move corners to a rigid motion of the cluster, as far as it is stiff: A (C of the moves) + alpha' answer = 0."""
-        begin, end, i0 = self.corners.starts[c], self.corners.starts[c + 1], self.corners.reference_particle(c)
-        n = ti.static(self.state.dim)
+        begin, end = self.corners.starts[c], self.corners.starts[c + 1]
         if self.mass[c] > 0 and self.strength.is_intact(c):
-            middle, mean, some = self.zero_vector(), self.zero_vector(), False
-            S = middle.outer_product(middle)
+            mean, some = self.zero_vector(), False
+            S, A, alpha = self.read_matrix(self.inertia, c), self.answering[c][0], self.answering[c][1]
             X = 0 * S
-            for j in ti.static(range(n)):
-                middle[j] = self.answering[c][j]
-                for k in ti.static(range(n)):
-                    S[j, k] = self.answering[c][n + n * j + k]
-            A, alpha, total = self.answering[c][n + n * n], self.answering[c][n + n * n + 1], self.answering[c][n + n * n + 2]
-            back = self.answering[c][n + n * n + 3]
             for e in range(begin, end):
                 i = self.corners.members[e]
-                m, move = self.mass_in_fit(e, c), ti.cast(moved[i] - d[i], ti.f64)
-                some = some or (moved[i] - d[i]).norm_sqr() > 0
-                mean += m * move
-                X += m * (self.relative_position(e, i0, back) - middle).outer_product(move)
+                step = moved[i] - d[i]
+                move = self.weight[e][0] * ti.cast(step, ti.f64)
+                some = some or (step != 0).any()
+                mean += move
+                X += self.arm[e].outer_product(move)
             if some:
-                mean /= total
+                mean /= self.answering[c][2]
                 spin = rotation.rigid_rotation(S, X)
                 for e in range(begin, end):
                     i, place = self.corners.members[e], self.corners.places[e]
                     if place >= 0:
-                        C = ti.cast(moved[i] - d[i], ti.f64) - mean - spin @ (self.relative_position(e, i0, back) - middle)
+                        C = ti.cast(moved[i] - d[i], ti.f64) - mean - spin @ self.arm[e]
                         before = ti.cast(self.slots.answer[place], ti.f64)
-                        change = (A * C + alpha * before) / (A * self.slots.split[i] / self.w.of(i) + alpha)
+                        change = (A * C + alpha * before) * self.weight[e][1]
                         self.slots.answer[place] = ti.cast(before - change, self.real)
 
     @ti.func
