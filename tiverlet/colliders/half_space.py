@@ -102,28 +102,27 @@ class HalfSpace(Collider):
         return self.dev.normal[None].dot(self.dev.state.place(i)) - ti.max(offset[0], offset[1]) - radius
 
     @ti.func
+    def offset_at(self, frame_fraction):
+        """Return the offset at a fraction of the frame [m]; a resting plane keeps its own bit for bit."""
+        a, b = self.dev.offset[None][0], self.dev.offset[None][1]
+        return ti.select(a == b, a, a * (1 - frame_fraction) + b * frame_fraction)
+
+    @ti.func
     def start_gap(self, face, i, radius, frame_fraction):
         """Return the gap to the plane."""
-        n, offset = self.dev.normal[None], self.dev.offset[None]
-        before = offset[0] * (1 - frame_fraction[0]) + offset[1] * frame_fraction[0]
-        now = offset[0] * (1 - frame_fraction[1]) + offset[1] * frame_fraction[1]
+        n, before, now = self.dev.normal[None], self.offset_at(frame_fraction[0]), self.offset_at(frame_fraction[1])
         gap = n.dot(self.dev.state.place(i)) - n.dot(self.dev.state.d[i]) - before - radius
         return gap, n, 0 * gap, (now - before) * n
 
     @ti.func
     def end_gap(self, face, i, radius, frame_fraction):
         """Return the gap to the plane."""
-        n, offset = self.dev.normal[None], self.dev.offset[None]
-        now = offset[0] * (1 - frame_fraction[1]) + offset[1] * frame_fraction[1]
-        return n.dot(self.dev.state.place(i)) - now - radius, n
+        n = self.dev.normal[None]
+        return n.dot(self.dev.state.place(i)) - self.offset_at(frame_fraction[1]) - radius, n
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, mode):
         """Press the particle if it is below the plane."""
-        n, offset = self.dev.normal[None], self.dev.offset[None]
-        before, now = (
-            offset[0] * (1 - frame_fraction[0]) + offset[1] * frame_fraction[0],
-            offset[0] * (1 - frame_fraction[1]) + offset[1] * frame_fraction[1],
-        )
+        n, before, now = self.dev.normal[None], self.offset_at(frame_fraction[0]), self.offset_at(frame_fraction[1])
         depth, moved = now + radius - n.dot(self.dev.state.place(i)), (now - before) * n
         self.dev.surface.push_without_slide(i, depth, depth + self.dev.surface.path(i, moved).dot(n), n, moved, h, mode)

@@ -51,8 +51,9 @@ class Target(Place):
 
     @ti.func
     def aim(self, c, frame_fraction):
-        """Return the target at this fraction of the frame."""
-        return self.source[c] * (1 - frame_fraction) + self.target[c] * frame_fraction
+        """Return the target at this fraction of the frame; a resting one keeps its place bit for bit."""
+        a, b = self.source[c], self.target[c]
+        return ti.select(a == b, a, a * (1 - frame_fraction) + b * frame_fraction)
 
     @ti.func
     def drive(self, c, h, frame_fraction):

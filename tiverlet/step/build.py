@@ -168,11 +168,11 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         with memory.owned("slots"):
             scene.slots = Slots(scene, batches, solver, rows)
         # Rounding errors are carried along where they are all that constraints leave, where rest values move by themselves, whose
-        # steady loads would otherwise tremble by m ulp(x) / h^2, and where clusters lie on each other, which would sway.
-        stacks = rows and any(b.clusters for b in batches)
-        carries = sums_exactly() and (scene.slots.exact or stacks or any(b.driven for b in batches))
+        # steady loads would otherwise tremble by m ulp(x) / h^2, and where clusters lie on something: they would sway and creep.
+        lies = bool(contact or walls) and any(b.clusters for b in batches)
+        carries = sums_exactly() and (scene.slots.exact or lies or any(b.driven for b in batches))
         if not state.double and (state.compensated or carries):
-            state.carry(memory, particles, stacks)
+            state.carry(memory, particles, lies)
         if scene.order > 2:
             high_order.check_solved(batches, scene, solver)
     size = size_of(path, scale.work)

@@ -75,7 +75,7 @@ class OnCurve(Place):
             s += self.target[c] * h
             self.source[c] = s
         else:
-            s = s * (1 - frame_fraction) + self.target[c] * frame_fraction
+            s = ti.select(s == self.target[c], s, s * (1 - frame_fraction) + self.target[c] * frame_fraction)
         if ti.static(self.closed):
             s -= ti.floor(s / length) * length
         else:
