@@ -78,7 +78,8 @@ def test_a_column_bears_what_is_above(world, links):
     mass = 2.0 + np.arange(6) % 2
     w, loops = standing(world, column(6), mass, substeps=4, links=links)
     start = G * (mass * (np.arange(6) + 0.5)).sum()
-    assert max(w.step(1 / 60).energy for _ in range(2400)) <= start + 1e-9
+    lack = 5e-4 * G / 240**2  # what passes may leave of each row in a substep [m]
+    assert max(w.step(1 / 60).energy for _ in range(2400)) <= start + 2 * G * mass.sum() * lack
     total = contact_forces(w)[:24, 1].reshape(6, 4).sum(axis=1)
     np.testing.assert_allclose(total[1:], G * mass[1:], rtol=1e-5)
     assert total[0] == pytest.approx(-G * mass[1:].sum(), rel=1e-5)
