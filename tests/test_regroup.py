@@ -69,7 +69,7 @@ def test_what_stays_goes_on_to_the_bit(world):
     w.step(1 / 60)
     lead()
     kept, knobs = checkpoint.keep(w), (rope.break_at, hand.target, hand.moving)
-    before = w.run(0.4)
+    before = w.run(0.3)
     without = look()
     checkpoint.put_back(w, kept)
     rope.break_at, hand.target = 2 * knobs[0], knobs[1] + 1.0  # so that the same values wait to be uploaded once more
@@ -94,7 +94,9 @@ def test_what_stays_goes_on_to_the_bit(world):
     np.testing.assert_array_equal(right.indices, np.arange(n, len(some)))
     np.testing.assert_array_equal(w.position[right], x[some[n:]])
     assert [f.count for f in features if isinstance(f, Batch)] == [5, 7, 1, 1, 1, 1, 1] and w.features == tuple(features)
-    after = w.run(0.2)
+    # Until 0.36 s on, the rope lies on the rim: passes over contacts are extrapolated anew for all of them together, so what the
+    # other half no longer does changes the last digits.
+    after = w.run(0.1)
     for a, b in zip(look(), without, strict=True):
         np.testing.assert_array_equal(a, b)
     assert rope.broken.tolist() == [False] * 4 + [True] and after.flags <= before.flags

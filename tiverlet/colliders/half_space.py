@@ -9,6 +9,7 @@ from ..features.feature import Knob, Scene
 from ..geometry.intervals import entry, rounding, slab
 from ..particles import Particles
 from .collider import Collider
+from .track import Track
 
 
 class HalfSpace(Collider):
@@ -47,20 +48,18 @@ class HalfSpace(Collider):
         """Declare the normal, and the offsets at the start and the end of a frame."""
         Collider.bind(self, scene)
         self.dev.normal = scene.memory.field("HalfSpace.normal", None, width=len(self.normal), values=self.normal)
-        self.dev.offset = scene.memory.field("HalfSpace.offset", None, width=2, values=[self.offset] * 2, state=True)
+        self.dev.offset = Track(scene.memory, "HalfSpace.offset", np.atleast_1d(self.offset))
         self.changed = False
 
     def upload(self) -> None:
         """Move from the last offset to the new one in the next frame."""
         Collider.upload(self)
-        memory = self.scene.memory
-        memory.write(self.dev.offset, [memory.read(self.dev.offset)[0, 1], self.offset])
+        self.dev.offset.set_target(np.atleast_1d(self.offset))
         self.moving = True
 
     def end_motion(self) -> None:
         """Stay at the last offset."""
-        memory = self.scene.memory
-        memory.write(self.dev.offset, memory.read(self.dev.offset)[0, 1])
+        self.dev.offset.end_motion()
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """Return lines across the scene: one in 2D, two at right angles in 3D."""
@@ -91,21 +90,20 @@ class HalfSpace(Collider):
     @property
     def _plane(self) -> float:
         """The present offset of the plane [m]."""
-        return float(self.offset if self.scene is None else self.scene.memory.read(self.dev.offset)[0, 1])  # type: ignore[arg-type]
+        return float(self.offset if self.scene is None else self.dev.offset.now[0])  # type: ignore[arg-type]
 
     sides = 1  # type: ignore[assignment]
 
     @ti.func
     def least_gap(self, face, i, radius):
         """Return the gap at the higher one of the planes between which it moves."""
-        offset = self.dev.offset[None]
-        return self.dev.normal[None].dot(self.dev.state.place(i)) - ti.max(offset[0], offset[1]) - radius
+        higher = ti.max(self.dev.offset.ends[0][0], self.dev.offset.ends[1][0])
+        return self.dev.normal[None].dot(self.dev.state.place(i)) - higher - radius
 
     @ti.func
     def offset_at(self, frame_fraction):
-        """Return the offset at a fraction of the frame [m]; a resting plane keeps its own bit for bit."""
-        a, b = self.dev.offset[None][0], self.dev.offset[None][1]
-        return ti.select(a == b, a, a * (1 - frame_fraction) + b * frame_fraction)
+        """Return the offset at a fraction of the frame [m]."""
+        return self.dev.offset.at(frame_fraction)[0]
 
     @ti.func
     def start_gap(self, face, i, radius, frame_fraction):

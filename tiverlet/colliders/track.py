@@ -4,6 +4,7 @@ import numpy as np
 
 from ..device import ti
 from ..device.memory import Memory
+from ..geometry.interpolation import interpolate
 
 
 class Track:
@@ -32,9 +33,8 @@ class Track:
 
     @ti.func
     def at(self, frame_fraction):
-        """Return the place at this fraction of the frame; a resting point keeps its place bit for bit."""
-        a, b = self.ends[0], self.ends[1]
-        return ti.select(a == b, a, a * (1 - frame_fraction) + b * frame_fraction)
+        """Return the place at this fraction of the frame."""
+        return interpolate(self.ends[0], self.ends[1], frame_fraction)
 
     @ti.func
     def step(self, frame_fraction):

@@ -9,6 +9,7 @@ from .. import checks
 from ..device import ti
 from ..device.memory import ALL, rows_of
 from ..features.feature import Knob, Scene
+from ..geometry.interpolation import interpolate
 from ..particles import Particles, in_range
 from .core.anchor_passes import AnchorPasses, Place
 from .core.anchored import Anchored, one_each
@@ -51,9 +52,8 @@ class Target(Place):
 
     @ti.func
     def aim(self, c, frame_fraction):
-        """Return the target at this fraction of the frame; a resting one keeps its place bit for bit."""
-        a, b = self.source[c], self.target[c]
-        return ti.select(a == b, a, a * (1 - frame_fraction) + b * frame_fraction)
+        """Return the target at this fraction of the frame."""
+        return interpolate(self.source[c], self.target[c], frame_fraction)
 
     @ti.func
     def drive(self, c, h, frame_fraction):

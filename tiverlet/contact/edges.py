@@ -38,7 +38,6 @@ REACH = 1.35  # from one end of an edge to the farthest contact: |(1 + PAST, 1 /
 CLOSE = 1e-4  # edges whose relative distances differ by less are equally near: the first one counts
 TILT = 1 / 16  # sine of the angle by which edges that lie on each other may lean, as bodies deform
 TINY = 1e-30
-MORE = 1.001  # a quick test leaves out what is farther by so much, so that rounding decides nothing
 DISCS = -1  # the place on an edge where there is no edge: two discs touch
 OVER_EDGE = 1  # what tips_cross() returns if the way out is over the edge of the second corner
 BEGIN, END = range(2)  # of an edge
@@ -342,8 +341,7 @@ class Edges:
             moves = moves or self.state.moves(b)
         if moves:
             if b >= 0:
-                if self.may_press(v, a, b, e):
-                    row = self.list_edge(v, a, b, e, row, scale)
+                row = self.list_edge(v, a, b, e, row, scale)
             if row == begin and self.keeps(v, a) and self.radius.of(v) + self.radius.of(a) > 0:
                 if self.corner(v, a, 1) > 0 and self.corner(a, v, 1) > 0 and self.tips_cross(v, a, 1) == 0:
                     row = self.rows.find_pair(v, a, e, row, scale)
@@ -353,26 +351,6 @@ class Edges:
             if row == begin:
                 self.rows.forget(e)
         return row
-
-    @ti.func
-    def may_press(self, v, a, b, e):
-        """Whether vertex v may press on the edge from a to b: a quick test, without roots, that leaves out nothing.
-
-        In front of it, v must bear a load, or be within reach at the end of the substep; behind it, no deeper than half of it.
-        """
-        r1, u1 = self.state.separation(v, a), self.state.separation(b, a)
-        dr = self.state.relative_displacement(self.state.d[v] - self.state.d[a], v, a)
-        r0, u0 = r1 - dr, u1 - self.state.relative_displacement(self.state.d[b] - self.state.d[a], b, a)
-        over, uu, out = r0.dot(perp(u0)), u0.dot(u0), True  # over: height times length
-        if over >= 0:
-            ahead, size = r1.dot(perp(u1)), ti.max(self.smaller(v, a), self.smaller(v, b))
-            most = self.radius.of(v) + ti.max(self.radius.of(a), self.radius.of(b))
-            most += ti.max(ti.static(SLOP) * size, ti.min(ti.static(AHEAD) * size, self.rows.ahead))
-            out = ahead <= 0 or ahead * ahead <= ti.static(MORE) * most * most * u1.dot(u1)
-            out = out or self.rows.is_set(self.rows.memory.field[e])
-        else:
-            out = over >= ti.static(-MORE / 2) * uu and r0.dot(u0) <= ti.static(MORE * (1 + PAST)) * uu
-        return out
 
     @ti.func
     def list_edge(self, v, a, b, e, row, scale):
@@ -439,16 +417,21 @@ class Edges:
         return row
 
     @ti.func
+    def nearer_end(self, a, b, r, u):
+        """Return whether x_a + r is nearer to the end b of the edge u from a, the corner there, and the way from this corner."""
+        at_end, c, rest = 2 * r.dot(u) > u.dot(u), a, r
+        if at_end:
+            c, rest = b, r - u
+        return at_end, c, rest
+
+    @ti.func
     def is_doubled(self, v, a, b, r, u, dr):
         """Whether a corner of the edge u from a to b, which lies at vertex v, presses on the edge of v there: one row is enough.
 
         So two edges that lie on each other have two rows, where their ends meet, too. v is at x_a + r, and moves by dr.
         """
-        out, length = False, u.norm()
-        at_end, slight = 2 * r.dot(u) > u.dot(u), ti.static(SLOP) * self.smaller(v, a)
-        c, rest = a, r
-        if at_end:
-            c, rest = b, r - u
+        out, length, slight = False, u.norm(), ti.static(SLOP) * self.smaller(v, a)
+        at_end, c, rest = self.nearer_end(a, b, r, u)
         if v > c and self.after(v) >= 0:
             w = self.from_to(v, self.after(v), 1)
             if not at_end:
@@ -467,10 +450,10 @@ class Edges:
 
         So what slides over level pieces passes from one to the next.
         """
-        at_end = 2 * r.dot(u) > u.dot(u)
-        c, rest, w = a, r, 0 * u
+        at_end, c, rest = self.nearer_end(a, b, r, u)
+        w = 0 * u
         if at_end:
-            c, rest, w = b, r - u, self.from_to(b, self.after(b), 1)
+            w = self.from_to(b, self.after(b), 1)
         else:
             w = self.from_to(self.before(a), a, 1)
         m, zone = perp(w).normalized(), ti.static(SLOP * BEYOND) * size

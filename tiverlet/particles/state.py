@@ -212,6 +212,14 @@ class State:
         return ti.static(self.two_digits) * size
 
     @ti.func
+    def digits_of_difference(self, i, size):
+        """Return the size of the last two binary digits of x_i - x_j, where it is of this size [m]."""
+        close = ti.static(self.two_digits) * size
+        if ti.static(not self.subtracts_low):
+            close = self.digits(i)
+        return close
+
+    @ti.func
     def digits_along(self, i, n, size):
         """Return the size of the last two binary digits of n . x_i and of lengths of this size, for a unit vector n [m].
 

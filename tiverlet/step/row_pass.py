@@ -159,9 +159,7 @@ class RowPass:
         """Return the square of what a row of vertex i may lack by the digits of positions, where clusters place corners."""
         out = ti.cast(0, self.real)
         if ti.static(self.shakes):
-            digit = ti.static(DIGIT) * self.state.digits(i)
-            if ti.static(self.state.subtracts_low):
-                digit = ti.static(DIGIT * self.state.two_digits) * self.rows.size(i)
+            digit = ti.static(DIGIT) * self.state.digits_of_difference(i, self.rows.size(i))
             out = digit * digit
         return out
 

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from ...features.feature import Scene
 
 HEAVY = 1024  # mass of a particle that cannot move, in masses of its cluster
-FEW = 1e-30  # keeps divisors from being 0
 LEAST = 2.0**-46  # smaller relative changes of a rotation are rounding
 
 
@@ -295,21 +294,22 @@ class ClusterPasses(Passes):
         if own and self.mass[c] > 0:
             give, rows, arm, turns, free = alpha / (A + alpha), 0 * total, self.zero_vector(), 0 * total, 0 * A
             for e in range(begin, end):
-                r = self.arm[e]
+                i, turning = self.corners.members[e], rotation.turning_compliance(S, self.arm[e])
+                w, body = self.w.of(i), ti.cast(1 / total + turning, self.real)
+                bodies.answers.mobility[i] = give * w + (1 - give) * ti.min(body, w)
                 rows += self.pressed[e]
-                arm += self.pressed[e] * r
-                turns += self.pressed[e] * rotation.turning_compliance(S, r)
-                free = ti.max(free, self.w.of(self.corners.members[e]))
+                arm += self.pressed[e] * self.arm[e]
+                turns += self.pressed[e] * turning
+                free = ti.max(free, w)
             # The largest eigenvalue of [[rows / M, R], [R^T, turns]], with |R|^2 = turning_compliance(S, arm) / M.
             moves, coupled = rows / total, rotation.turning_compliance(S, arm) / total
             largest = (moves + turns + ti.sqrt((moves - turns) ** 2 + 4 * coupled)) / 2
-            shared = ti.min(ti.cast(largest / ti.max(rows, FEW), self.real), free)
+            shared = free
+            if rows > 0:
+                shared = ti.min(ti.cast(largest / rows, self.real), free)
             for e in range(begin, end):
-                i, r = self.corners.members[e], self.arm[e]
-                w = self.w.of(i)
-                body = ti.cast(1 / total + rotation.turning_compliance(S, r), self.real)
-                bodies.answers.mobility[i] = give * w + (1 - give) * ti.min(body, w)
-                bodies.answers.shared[i] = give * w + (1 - give) * shared
+                i = self.corners.members[e]
+                bodies.answers.shared[i] = give * self.w.of(i) + (1 - give) * shared
 
     @ti.func
     def answer(self, c, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]

@@ -6,6 +6,7 @@ import numpy as np
 
 from ...device import ti
 from ...features.feature import FAR
+from ...geometry.interpolation import interpolate
 from .anchor_passes import AnchorPasses, Place
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ class OnCurve(Place):
             s += self.target[c] * h
             self.source[c] = s
         else:
-            s = ti.select(s == self.target[c], s, s * (1 - frame_fraction) + self.target[c] * frame_fraction)
+            s = interpolate(s, self.target[c], frame_fraction)
         if ti.static(self.closed):
             s -= ti.floor(s / length) * length
         else:
