@@ -7,7 +7,7 @@ import tiverlet as tv
 from tiverlet.contact.limits import SLOP
 from tiverlet.step import edit_in_place
 
-COLUMNS = ("pairs", "point", "normal", "impulse", "speed", "began", "ended")
+COLUMNS = ("pairs", "groups", "point", "normal", "impulse", "speed", "began", "ended")
 
 
 def equal(one, two):
@@ -305,6 +305,43 @@ def test_recorded_cloned_edited(world, tmp_path, monkeypatch):
     w.step(1 / 60)
     for events, known in zip((w.events(), w.wall_events()), touched, strict=True):
         assert rows(events.touches[np.isnan(events.touches.began)].pairs) == known != set()
+
+
+def test_each_pair_that_begins_ends(world):
+    # Whatever is removed: sum of begun - ended = pairs that touch now, by groups, too; in a clone made after the edit as well.
+    start = tv.Particles(
+        [(0, 0), (0.5, 0), (-0.5, 0), (0, 0.5), (0, -98.9)], radius=[1.0, *[0.1] * 4], group=[7, 0, 1, 0, 0], pinned=[0]
+    )
+    box = tv.Box([-99] * 2, [99] * 2, events=True)
+    w = world(start, [tv.Gravity(1e-3), tv.Contact(sensors=[(0, 7), (1, 7)], events=True), box], precision="f64")
+    inside = np.zeros(3, dtype=int)
+
+    def count(of, *walls):
+        pairs = [of.events(groups) for groups in (None, [(0, 7)])]
+        inside[:] += [len(e.begun) - len(e.ended) for e in (*pairs, *(walls or (of.wall_events(),)))]
+        return inside.tolist()
+
+    w.step(1 / 60)
+    assert count(w) == [3, 2, 1]
+    w.remove([1])
+    w.remove([1])  # the second disc of both removed, one by one
+    twin = w.clone()
+    assert not len(w.events().ended)  # they end in the next frame
+    w.step(1 / 60)
+    assert count(w) == [1, 1, 1]
+    ended = w.events().ended
+    assert rows(ended.pairs) == {(0, -1)} and ended.groups.tolist() == [[7, 0], [7, 1]] and (ended.impulse == 0).all()
+    np.testing.assert_allclose(ended.point, [[0.7, 0.0], [-0.7, 0.0]], atol=1e-6)
+    twin.step(1 / 60)
+    equal(twin.events(), w.events())
+    w.remove([2], [box])
+    w.step(1 / 60)
+    assert count(w, w._all_events()[1]) == [1, 1, 0]
+    w.remove([0])
+    w.step(1 / 60)
+    assert count(w, w._all_events()[1]) == [0, 0, 0] and not len(w.events().lasting)
+    w.step(1 / 60)
+    assert count(w, w._all_events()[1]) == [0, 0, 0]
 
 
 def test_what_is_held_and_let_go(world):

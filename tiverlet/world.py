@@ -102,6 +102,7 @@ class World:
         self._watchers: list[Any] = []  # recorders: called at each assignment, and before and after every step
         self._undo: tuple | None = None  # the state before a step that takes long, and flags of features
         self._events: tuple[ContactEvents, ContactEvents] | None = None  # of the last frame, once the device has lost them
+        self._ended = self._ending = (none := no_events(particles.dim)), none  # by edits before the last frame, and since
 
     @property
     def _build_options(self) -> tuple[Solver | None, str, str, int, Scale]:
@@ -172,6 +173,7 @@ class World:
                 report = energy_bound.checked_for_loss(self, report)
             report.__dict__["seconds"] = perf_counter() - clock  # the report is frozen; this field is not compared
             self._last, self._clock.energy, self._undo, self._events = report, report.energy, None, None
+            self._ended, self._ending = self._ending, ((none := no_events(self._particles.dim)), none)
             for watcher in self._watchers:
                 watcher.after(dt, report)
         return report
@@ -538,7 +540,7 @@ class World:
         self._runner.memory.check()
         if not any(isinstance(f, PairContact) and f.has_events for f in self._features):
             raise RuntimeError("World.events: nothing tells of contacts. Write tv.Contact(events=True), or give it sensors.")
-        return self._all_events()[0].among(self._particles.group, groups)
+        return self._all_events()[0].among(groups)
 
     def wall_events(self) -> ContactEvents:
         """Return the contacts of particles with walls that began, ended and lasted in the last step, for walls with events=True.
@@ -561,11 +563,12 @@ class World:
         walls = []
         for contact in step.contacts:
             if contact.dev.events:
-                pairs = contact.dev.events.read(h, time)
+                pairs = contact.dev.events.read(self._particles.group, h, time)
         for number, f in enumerate(self._features):
             if isinstance(f, Collider) and f.dev.log:
                 walls.append(f.dev.log.read(number, h, time))
-        return pairs, ContactEvents(joined([none.touches, *walls])) if walls else none
+        told = pairs, ContactEvents(joined([none.touches, *walls])) if walls else none
+        return told[0].joined_with(self._ended[0]), told[1].joined_with(self._ended[1])
 
     @property
     def broken(self) -> list[tuple[Feature, np.ndarray]]:
@@ -722,6 +725,7 @@ class World:
         new = World._from_starts(self._particles, copies, [f.start for f in self._features], **{**settings, **changes})
         checkpoint.transfer(self, new)
         new._runner.pass_on(self._runner.left, np.ones(len(self._particles), dtype=bool))
+        new._ending = self._ending
         return new
 
     def report(self, seconds: float, tolerance: float | None = None, **options):

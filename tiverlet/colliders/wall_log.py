@@ -128,4 +128,5 @@ class WallLog:
         normal[several] = impulse[several] / size[several, None]
         pairs = np.stack([some, np.full(len(some), number)], axis=1)
         given = np.where(several, size, along) / self._scene.inv_mass[some] / h
-        return Touches(pairs, point, normal, given, speed / h, *span(when[some], substeps, h, time))
+        groups = np.stack([self._scene.particles.group[some], np.full(len(some), -1)], axis=1)
+        return Touches(pairs, groups, point, normal, given, speed / h, *span(when[some], substeps, h, time))

@@ -191,8 +191,11 @@ class EventLog:
         """Empty the table, because the state is not the end of a frame that was just computed."""
         self.list.memory.write(self.counter, 0)
 
-    def read(self, h: float, time: float) -> ContactEvents:
-        """Return the events of the last frame, which had substeps h [s] and ended at `time` [s]."""
+    def read(self, groups: np.ndarray, h: float, time: float) -> ContactEvents:
+        """Return the events of the last frame, which had substeps h [s] and ended at `time` [s].
+
+        groups: (n,), of all particles.
+        """
         memory, store = self.list.memory, self.list.store
         assert store
         count, substeps = int(memory.read(self.rows)[0]), int(memory.read(self.substep)[0])
@@ -208,4 +211,4 @@ class EventLog:
             when = np.stack([np.minimum.reduceat(when[:, 0], one), np.maximum.reduceat(when[:, 1], one)], axis=1)
             impulse, speed = np.add.reduceat(impulse, one), np.maximum.reduceat(speed, one)
         times, order = span(when, substeps, h, time), order[one]
-        return ContactEvents(Touches(pairs[one], point[order], normal[order], impulse / h, speed / h, *times))
+        return ContactEvents(Touches(pairs[one], groups[pairs[one]], point[order], normal[order], impulse / h, speed / h, *times))

@@ -15,7 +15,7 @@ BEFORE, NEVER = 0, -1  # in place of substeps, counted from 1: touched when the 
 class Touches:
     """Pairs that touched in a frame, each once, in the order of their indices.
 
-    pairs: (m, 2), i < j.
+    pairs: (m, 2), i < j; -1 for what was removed since the frame before. groups: (m, 2), of these particles.
     normal: (m, dim), from j to i. point: (m, dim) [m], in the middle between the two surfaces. Both are those of the time when
     the pair met. For a pair that touched before the frame they are those of the last touch, or of the end of the frame once it
     has parted.
@@ -29,12 +29,13 @@ class Touches:
     began: (m,) [s], when the pair first met in this frame; NaN if it touched before. ended: (m,) [s], when it was apart again;
     NaN if it still touches. Times are those of the ends of substeps.
 
-    For walls, a pair is a particle and the number of the wall in world.features. Normals point from the wall to the particle, in
-    corners and hollows along the sum of the impulses from all sides. Normal and point of a particle that left a wall as the frame
-    began are not known: they are 0.
+    For walls, a pair is a particle and the number of the wall in world.features, of group -1. Normals point from the wall to the
+    particle, in corners and hollows along the sum of the impulses from all sides. Normal and point of a particle that left a
+    wall as the frame began are not known: they are 0.
     """
 
     pairs: np.ndarray
+    groups: np.ndarray
     point: np.ndarray
     normal: np.ndarray
     impulse: np.ndarray
@@ -60,7 +61,9 @@ class ContactEvents:
     that touch now. Each pair is in `touches` once, so that sums count nothing twice.
 
     A pair touches in a substep if it overlaps before contacts push it apart; a pair at rest under a load does. A pair that falls
-    asleep while it touches, see Sleep, stays in `lasting` while it sleeps, with an impulse of 0.
+    asleep while it touches, see Sleep, stays in `lasting` while it sleeps, with an impulse of 0. A pair that touches when one
+    of it is removed is in `ended` of the next frame, with its last point and normal, and an impulse of 0. So each begun pair
+    ends.
     """
 
     touches: Touches
@@ -83,32 +86,51 @@ class ContactEvents:
     def __len__(self) -> int:
         return len(self.touches)
 
-    def among(self, group: np.ndarray, groups: Iterable | None) -> "ContactEvents":
-        """Return the contacts between some pairs of groups. group: (n,), of each particle. groups: the pairs, None for all."""
+    def among(self, groups: Iterable | None) -> "ContactEvents":
+        """Return the contacts between some pairs of groups, None for all."""
         if groups is None:
             return self
         wanted = checks.rows("World.events", "groups", groups, "a list of pairs of groups, such as [(0, 1)],")
-        some, (a, b) = np.zeros(len(self), dtype=bool), group[self.touches.pairs.T]
+        some, (a, b) = np.zeros(len(self), dtype=bool), self.touches.groups.T
         for pair in wanted:
             one, other = checks.group_pair("World.events", "groups", pair)
             some |= ((a == one) & (b == other)) | ((a == other) & (b == one))
         return ContactEvents(self.touches[some])
 
     def renumbered(self, first: np.ndarray, second: np.ndarray) -> "ContactEvents":
-        """Return the events with new indices, without pairs of which one is removed (-1).
+        """Return the events with new indices.
 
-        first, second: the new indices, by the old ones, of the first and second member of each pair. They keep their order.
+        first, second: the new indices, by the old ones, of the first and second member of each pair, -1 for removed ones. They
+        keep their order.
         """
+        old = self.touches.pairs
         if not len(self):
             return self
-        pairs = np.stack([first[self.touches.pairs[:, 0]], second[self.touches.pairs[:, 1]]], axis=1)
-        return ContactEvents(replace(self.touches, pairs=pairs)[(pairs >= 0).all(axis=1)])
+        new = np.stack([first[old[:, 0]], second[old[:, 1]]], axis=1)
+        return ContactEvents(replace(self.touches, pairs=np.where(old >= 0, new, -1)))
+
+    def without_removed(self, first: np.ndarray, second: np.ndarray, time: float) -> tuple["ContactEvents", "ContactEvents"]:
+        """Return the same without pairs of which one is removed, and the events of the next frame in which these end.
+
+        time: the present one [s].
+        """
+        new = self.renumbered(first, second).touches
+        gone = ((new.pairs < 0) & (self.touches.pairs >= 0)).any(axis=1)
+        lost = new[gone & np.isnan(new.ended)]
+        zero = np.zeros(len(lost))
+        return ContactEvents(new[~gone]), ContactEvents(
+            replace(lost, impulse=zero, speed=zero, began=zero * np.nan, ended=zero + time)
+        )
+
+    def joined_with(self, other: "ContactEvents") -> "ContactEvents":
+        """Return the events of both."""
+        return ContactEvents(joined([self.touches, other.touches])) if len(other) else self
 
 
 def no_events(dim: int) -> ContactEvents:
     """Return the events of a frame without contacts."""
     pairs, vectors, numbers = np.zeros((0, 2), dtype=np.int64), np.zeros((0, dim)), np.zeros(0)
-    return ContactEvents(Touches(pairs, vectors, vectors, numbers, numbers, numbers, numbers))
+    return ContactEvents(Touches(pairs, pairs, vectors, vectors, numbers, numbers, numbers, numbers))
 
 
 def joined(parts: list[Touches]) -> Touches:

@@ -258,7 +258,10 @@ def _edited(
     """
     number, clock = np.where(some, np.cumsum(some) - 1, -1), world._clock
     n, m = int(np.count_nonzero(some)), 0 if added is None else len(added)
-    world._events = told[0].renumbered(number, number), told[1].renumbered(number, walls)
+    pairs, parted = told[0].without_removed(number, number, clock.time)
+    touches, left = told[1].without_removed(number, walls, clock.time)
+    ending, leaving = world._ending[0].renumbered(number, number), world._ending[1].renumbered(number, walls)
+    world._events, world._ending = (pairs, touches), (ending.joined_with(parted), leaving.joined_with(left))
     for one in list(world._handles):
         one.follow(number)
     if m or features_too or n < len(some):  # otherwise only the kernels have changed

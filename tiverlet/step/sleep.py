@@ -18,13 +18,15 @@ if TYPE_CHECKING:
     from .step import Step
 
 TRIES = 4  # searches for islands that can fall asleep, in each `time`
+ROAM = 1 / 16  # of speed times time: what has moved farther does not tremble, it goes somewhere
 
 
 class Sleep(Feature):
     """Skips particles that have come to rest, until something reaches them.
 
     speed: [m/s] below which a particle is slow, both its center and its turning surface. time: [s] for which it must be slow.
-    Both are live.
+    Both are live. In this time it must not go anywhere either: what moves by speed times time / 16 drifts, or is about to turn
+    round, and stays awake. So what rolls up a slope, flies or swings goes on if it is accelerated by more than speed / time / 2.
 
     Particles that press on each other, or are linked, form an island. An island falls asleep as a whole, once each of its
     particles has been slow for `time`. A sleeping particle keeps the state of its last substep bit for bit: position,
@@ -94,10 +96,11 @@ def blocks_of(n: int) -> int:
 class Sleepers:
     """The sleeping particles of one world, on the device. time: [s] of Sleep.
 
-    asleep: 1 if a particle sleeps. still: for how long it has been slow [s]. island: the particle that stands for the island of a
-    sleeping particle, the same for the whole island. called: 1 for islands that are to wake, by the particle that stands for
-    them. calls: whether there are any. blocks: 0 for blocks of particles that all sleep. count: number of sleeping particles.
-    pull: the acceleration with which a particle fell asleep, if forces may change by themselves.
+    asleep: 1 if a particle sleeps. still: for how long it has been slow [s]. place: where it was when it became so. island: the
+    particle that stands for the island of a sleeping particle, the same for the whole island. called: 1 for islands that are
+    to wake, by the particle that stands for them. calls: whether there are any. blocks: 0 for blocks of particles that all
+    sleep. count: number of sleeping particles. pull: the acceleration with which a particle fell asleep, if forces may change
+    by themselves.
     """
 
     host_only = ("scene", "time")
@@ -109,6 +112,7 @@ class Sleepers:
         self.scene, self.n, self.time = scene, n, time
         self.asleep = add("Sleep.asleep", n, kind=ti.i32, state=True)
         self.still = add("Sleep.still", n, state=True)
+        self.place = add("Sleep.place", n, width=scene.particles.dim, state=True)
         self.island = add("Sleep.island", n, kind=ti.i32, state=True)
         self.count = add("Sleep.count", None, kind=ti.i32, state=True)
         self.blocks = add("Sleep.blocks", blocks_of(scene.particles.count), kind=ti.i32, values=1)
@@ -292,9 +296,13 @@ class SleepPass:
         if ti.static(self.state.spins):
             s = self.state.spin.s[i]
             way = ti.max(way, s.dot(s))
-        still, most = self.sleepers.still[i] + ti.cast(dt, self.real), self.sleepers.limits[None][0] * ti.cast(h, self.real)
-        slow = way < most * most and self.kept_awake[i] == 0
-        self.sleepers.still[i] = ti.select(slow, still, 0 * still)
+        x, limits = self.state.place(i), self.sleepers.limits[None]
+        still, most = self.sleepers.still[i] + ti.cast(dt, self.real), limits[0] * ti.cast(h, self.real)
+        stays = (x - self.sleepers.place[i]).norm() < ti.static(ROAM) * limits[0] * limits[1]
+        if not (way < most * most and stays and self.kept_awake[i] == 0):
+            still *= 0
+            self.sleepers.place[i] = x
+        self.sleepers.still[i] = still
 
     @ti.func
     def pull(self, i, t):
