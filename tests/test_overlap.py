@@ -93,3 +93,25 @@ def test_what_goes_to_another_place_compiles_nothing(world):
         w.position = x
         w.run(0.5)
     assert names == [] and np.linalg.norm(w.position[5] - w.position[8]) > 0.2 - 0.1 * SLOP * BEYOND - 1e-6
+
+
+def test_a_lasting_overlap_is_flagged_and_the_advice_ends_it(world):
+    # Masses of 1, 1000 and 1e5 kg on each other: at 4 substeps they would rest a third of a radius in each other, without a word.
+    x, radius, mass = [(0, 0.1), (0, 0.45), (0.05, 0.8)], [0.1, 0.25, 0.1], [1.0, 1e3, 1e5]
+    features = [tv.Gravity(), tv.Contact(), tv.Box((-0.3, 0), (0.3, 9))]
+    w = world(tv.Particles(x, radius=radius, mass=mass), features, substeps=4)
+    for _ in range(6):
+        w.run(1.0)
+        report = w.step(1 / 60)
+        if report.clean:
+            break
+        assert report.flags == {"compressed"} and report.overlap > 0.05
+        w.substeps = int(report.notes[0].partition("Use up to ")[2].partition(" substeps")[0])
+    assert w.substeps > 20 and report.overlap < 0.05
+
+
+@pytest.mark.parametrize(("part", "flags"), [(0.045, set()), (0.055, {"compressed"})])
+def test_the_border_of_what_counts_as_compressed_is_a_twentieth_of_a_radius(world, part, flags):
+    x = [(0.0, 0.0), (0.2 - 0.1 * part, 0.0)]
+    w = world(tv.Particles(x, radius=0.1), [tv.Contact(push_out=1e-3)], substeps=4)
+    assert w.step(1 / 60).flags == flags

@@ -285,3 +285,34 @@ def test_files_that_are_refused(tmp_path, name, text, message):
 def test_bodies_that_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("spacing", [0.3, 0.2, 0.15, 0.09, 0.08])
+@pytest.mark.parametrize("outline", ["square", "L", "circle"])
+def test_a_blob_fills_outlines_whose_points_lie_on_lines_and_circles(outline, spacing):
+    """The areas of the triangles add up to that inside of the outline, and n - edges + faces = 1 (Euler), at any spacing."""
+    turn = np.arange(20) * np.pi / 10
+    corners, area = {
+        "square": ([(0, 0.5), (1, 0.5), (1, 1.5), (0, 1.5)], 1.0),
+        "L": ([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], 3.0),
+        "circle": (np.stack([np.cos(turn), np.sin(turn)], axis=1), 10 * np.sin(np.pi / 10)),
+    }[outline]
+    s = tv.shapes.blob(corners, spacing)
+    u, v = (s.position[s.faces[:, k]] - s.position[s.faces[:, 0]] for k in (1, 2))
+    assert (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum() / 2 == pytest.approx(area, rel=1e-12)
+    assert len(s) - len(s.links) + len(s.faces) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rope", "bridge", "tree 2D", "ball", "cloth 3D", "balloon", "ragdoll 2D"])
+def test_shapes_work_as_they_come(name, world):
+    """Each with its own constraints, thick enough to touch itself, falls on a floor at the default settings: no flag."""
+    s = BODIES[name] if name in BODIES else S.ragdoll((0, 0.5))
+    links = np.concatenate([s.links, s.braces])
+    dim, short = s.position.shape[1], np.linalg.norm(s.position[links[:, 0]] - s.position[links[:, 1]], axis=1).min()
+    up = np.eye(dim)[1]
+    features = [tv.Gravity(9.81 * -up), tv.Distance(links), tv.HalfSpace(up, s.position[:, 1].min() - 1.0), tv.Contact()]
+    features += [tv.AngleLimit(s.limits, s.lower, s.upper)] if len(s.limits) else []
+    features += [tv.Area(list(s.loops))] if s.loops else []
+    w = world(tv.Particles(s.position, radius=s.radius if s.radius.any() else 0.4 * short), features)
+    assert not w.run(2.0).flags

@@ -11,6 +11,8 @@ _POINTS = {
     "shoulder": (0.0, 0.80, 0.11), "elbow": (0.0, 0.62, 0.13), "hand": (0.0, 0.44, 0.14),
     "joint": (0.0, 0.52, 0.06), "knee": (0.0, 0.28, 0.07), "foot": (0.0, 0.04, 0.07),
 }  # fmt: skip
+# From the side, in 2D: how far left parts are behind the middle and right ones before it, so that nothing overlaps.
+_APART = {"shoulder": 0.03, "elbow": 0.07, "hand": 0.11, "joint": 0.03, "knee": 0.03, "foot": 0.03}
 _NAMES = ["head", "neck", "chest", "hip"] + [
     f"{side} {part}" for side in ("left", "right") for part in ("shoulder", "elbow", "hand", "joint", "knee", "foot")
 ]
@@ -33,11 +35,10 @@ def ragdoll(feet, height: float = 1.8) -> Shape:
     position = []
     for name in NAMES:
         side, _, part = name.rpartition(" ")
-        x, y, z = _POINTS[part]
-        position.append([x, y, -z if side == "left" else z])
-    x = np.array(position) * height
-    if len(base) == 2:  # from the side: left and right are slightly apart, so that no link has length 0
-        x = x[:, :2] + 0.005 * height * np.sign(x[:, 2:])
+        x, y, z = _POINTS[part] if len(base) == 3 else (_APART.get(part, 0.0), _POINTS[part][1], 0.0)
+        sign = -1 if side == "left" else 1
+        position.append([x * sign, y, z * sign])
+    x = np.array(position)[:, : len(base)] * height
     number = {name: k for k, name in enumerate(NAMES)}
 
     def pairs(*names):

@@ -8,6 +8,9 @@ from .. import checks
 from ..tools import golden
 from .shape import Shape, edges_of, point, quads_of, rims_of, single_edges, surface_of
 
+SHAKE = 1e-7  # of the size of a body: far above rounding, far below any triangle
+FLAT = 8 * SHAKE  # of it: triangles that are lower are points on a line
+
 
 def polygon(center, radius: float, sides: int) -> Shape:
     """Make a regular polygon of `sides` particles around `center` in 2D: a rim with its loop."""
@@ -197,9 +200,13 @@ def _inside(points: np.ndarray, rim: np.ndarray) -> np.ndarray:
 
 
 def _delaunay(points: np.ndarray) -> np.ndarray:
-    """Return triangles with empty circumcircles (Bowyer and Watson 1981), counterclockwise, without flat ones."""
-    n, middle, size = len(points), points.mean(axis=0), 1e3 * np.ptp(points, axis=0).max()
-    x = np.concatenate([points, middle + size * np.array([[-1.0, -1], [1, -1], [0, 1]])])
+    """Return triangles with empty circumcircles (Bowyer and Watson 1981), counterclockwise, without flat ones.
+
+    Points on a line or a circle are shaken apart, since rounding would decide about them in one way here and in another there.
+    """
+    n, middle, size = len(points), points.mean(axis=0), float(np.ptp(points, axis=0).max())
+    shaken = points + SHAKE * size * (golden(np.arange(n), dim=2) - 0.5)
+    x = np.concatenate([shaken, middle + 1e3 * size * np.array([[-1.0, -1], [1, -1], [0, 1]])])
     triangles = np.array([[n, n + 1, n + 2]])
     for k in range(n):
         a, b, c = (x[triangles[:, j]] - x[k] for j in range(3))
@@ -216,7 +223,7 @@ def _delaunay(points: np.ndarray) -> np.ndarray:
         triangles = np.concatenate([triangles[~inside], np.column_stack([rim, np.full(len(rim), k)])])
     triangles = triangles[(triangles < n).all(axis=1)]
     u, v = x[triangles[:, 1]] - x[triangles[:, 0]], x[triangles[:, 2]] - x[triangles[:, 0]]
-    return triangles[u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] > 1e-9 * np.maximum((u * u).sum(axis=1), (v * v).sum(axis=1))]
+    return triangles[u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] > FLAT * size * np.maximum(np.hypot(*u.T), np.hypot(*v.T))]
 
 
 def pile(lower, upper, radius) -> Shape:

@@ -10,7 +10,7 @@ NAMES = {
     "_time": "time", "_tick": "tick", "_since": "since", "_h": "h", "_fresh": "d_is_velocity", "_iterations": "iterations",
     "_frame": "frame", "_drag": "drag", "_started": "started", "_owed": "owed", "_lacked": "lacked",
     "_parted": "velocity_override", "_placed": "first_moved", "_energy": "energy", "_bound": "bound",
-    "_kinetic": "kinetic", "_parting": "parting", "_softness": "softness", "_softened": "softened",
+    "_kinetic": "kinetic", "_overlap": "overlap", "_parting": "parting", "_softness": "softness", "_softened": "softened",
 }  # fmt: skip
 
 SHARE = 0.1  # of the largest kinetic energy: the gain, or the loss, that is allowed
@@ -52,9 +52,10 @@ class Clock:
     particle that the user placed since the last frame; None if there is none. moved_mask: which of the particles from there on
     moved, (n,); None: all may have.
     energy: at the end of the last frame [J]; None if unknown. bound, kinetic, parting: the energy that must not be exceeded [J],
-    None if unknown; the largest kinetic energy since then [J]; whether particles that were placed into each other still part; see
-    energy_bound.py. conserves: whether the scene conserves energy, see energy_bound.conserves(); None if unknown. It follows from
-    the features, and is not recorded; nor is moved_mask, which is None after a frame.
+    None if unknown; the largest kinetic energy since then [J]; whether particles that were placed into each other still part;
+    see energy_bound.py. overlap: of the worst contact at the end of the last frame [radii]. conserves: whether the scene
+    conserves energy, see energy_bound.conserves(); None if unknown. It follows from the features, and is not recorded; nor is
+    moved_mask, which is None after a frame.
     """
 
     time: float = 0.0
@@ -76,6 +77,7 @@ class Clock:
     energy: float | None = None
     bound: float | None = None
     kinetic: float = 0.0
+    overlap: float = 0.0
     parting: bool = False
     conserves: bool | None = None
 
@@ -117,7 +119,7 @@ class Clock:
         elif self.bound == CHANGED:
             self.bound, self.kinetic, self.parting = energy, 0.0, self.parting or overlap > SQUEEZED
             self.conserves = None
-        self.kinetic = max(self.kinetic, kinetic)
+        self.kinetic, self.overlap = max(self.kinetic, kinetic), overlap
         if self.parting:
             self.bound, self.parting = max(self.bound, energy), overlap > PARTED
         return energy > energy_limit(self.bound, self.kinetic, energy)

@@ -357,21 +357,22 @@ class Reporter:
         substeps: int,
         iterations: int,
         before: float | None,
+        pressed: float,
         moved: float,
         released: float,
         asleep: int = 0,
     ) -> tuple[StepReport, list[float]]:
         """Return the report of a frame, and the edges of the bounding box [m].
 
-        before: the energy one frame ago [J]. moved: the longest move of a particle before the first substep [m]. released: see
-        Runner.
+        before: the energy one frame ago [J]. pressed: the overlap then [radii]. moved: the longest move of a particle before the
+        first substep [m]. released: see Runner.
         """
         energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned, _, *extent = self.figures.tolist()
         stiff = max(stiff, self.fastest * h * h)
         first = int(bad) if bad < self.n else None
         notes = {}
         for flag, there in risks(
-            self.n, self.farthest, bad, reach, fast, overlap, turned, moved, tension, stiff, released, residual
+            self.n, self.farthest, bad, reach, fast, overlap, pressed, turned, moved, tension, stiff, released, residual
         ).items():  # fmt: skip
             if there:
                 notes[flag] = self._note(flag, first, reach, overlap, moved, tension, stiff, released, residual, substeps)
@@ -423,10 +424,10 @@ class Reporter:
                 f"Coordinates of {reach:g} m are rounded to {rounding:.2g} m in f32: shift the scene towards the origin, or use "
                 'precision="f32-compensated".'
             )
-        need = np.ceil(substeps * overlap / UNCONVERGED)  # of order h after impacts, h^2 under loads
+        need = np.ceil(substeps * overlap / COMPRESSED)  # of order h after impacts, h^2 under loads
         given = [c.push_out for c in self._step.contacts if c.push_out is not None]
         placed = f"; what was placed so parts at push_out = {max(given):g} m/s" if given else ""
-        return f"Use up to {need:.7g} substeps, or more iterations{placed}."
+        return f"Use up to {need:.7g} substeps{placed}."
 
     def _note(self, flag, first, reach, overlap, moved, tension, stiff, released, residual, substeps) -> str:
         """Return the note of a flag: its meaning and a remedy, with the figures of this frame."""
@@ -442,7 +443,8 @@ class Reporter:
         if flag == "compressed":
             return (
                 f"Contacts are pressed or thrown together by more than they hold: the worst overlaps by {100 * overlap:.3g} % "
-                f"of the radius of the smaller particle. {self._less_overlap(reach, overlap, substeps)}"
+                "of the radius of the smaller particle (world.contacts.overlap tells which). "
+                f"{self._less_overlap(reach, overlap, substeps)}"
             )
         if flag == "turned":
             return (
@@ -487,13 +489,13 @@ class Reporter:
         )
 
 
-def risks(n, farthest, bad, reach, fast, overlap, turned, moved, tension, stiff, released, residual) -> dict[str, Any]:
+def risks(n, farthest, bad, reach, fast, overlap, pressed, turned, moved, tension, stiff, released, residual) -> dict[str, Any]:
     """Return whether a frame has each flag, in the order of the notes. For arrays of figures, of many frames, return arrays."""
     return {
         "non-finite": bad < n,
         "out-of-range": reach >= farthest,
         "tunnelling-risk": fast > 0,
-        "compressed": overlap > COMPRESSED,
+        "compressed": (overlap > COMPRESSED) & (pressed > COMPRESSED),
         "turned": turned == FAR,
         "moved": moved > 0,
         "softened": tension >= TENSEST,

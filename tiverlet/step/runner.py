@@ -236,7 +236,7 @@ class Runner:
 
     def set_initial_figures(self, energy: float, overlap: float) -> None:
         """The second half of begin(), with the energy [J] and the overlap of the initial state of the frame."""
-        self.clock.energy, self.clock.parting = energy, overlap > 0
+        self.clock.energy, self.clock.overlap, self.clock.parting = energy, overlap, overlap > 0
 
     def placed(self) -> None:
         """The end of begin(): particles that were placed have been dealt with."""
@@ -634,7 +634,7 @@ class Runner:
         clock = self.clock
         asleep = int(self.memory.read(self.sleepers.count)[0]) if self.sleepers else 0
         report, extent = self._reporter(
-            clock.time, clock.h, substeps, iterations, clock.energy, self.moved, self.released, asleep
+            clock.time, clock.h, substeps, iterations, clock.energy, clock.overlap, self.moved, self.released, asleep
         )
         for search in self.step.searches:
             search.fit(extent)

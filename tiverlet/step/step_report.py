@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 UNCONVERGED = 0.1  # residual above which a frame is flagged "unconverged"
-COMPRESSED = 0.5  # overlap above which a frame is flagged "compressed", in radii
+COMPRESSED = 0.05  # overlap from one frame to the next above which it is flagged "compressed", in radii; piles have 0.01
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,8 @@ class StepReport:
         "non-finite"        a position or displacement is NaN or infinite
         "out-of-range"      a coordinate is too large for the precision, or for the cells of the contact grid
         "tunnelling-risk"   a particle moved by more than its own size in one substep, so it may have passed another
-        "compressed"        a contact overlaps by more than half of the radius of the smaller particle
+        "compressed"        a contact overlaps by more than a twentieth of the radius of the smaller particle, and did so
+                            when the frame began
         "stiff-force"       a force changes too fast for the substep (omega h > 2): one that depends on position makes energy
                             grow; one that depends on velocity turns motion far too little
         "energy-gain"       the scene gained more than a tenth of its largest kinetic energy, though nothing does work on it

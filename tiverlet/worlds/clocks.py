@@ -8,7 +8,7 @@ from ..step.integrator import FREE
 # Attributes with the same name and meaning in Clock.
 PLAIN = (
     "time", "tick", "since", "h", "d_is_velocity", "started", "iterations", "softness", "softened", "owed", "lacked",
-    "kinetic", "parting",
+    "kinetic", "overlap", "parting",
 )  # fmt: skip
 NONE = -1  # first_moved where no particle was placed
 NO, YES, UNKNOWN = range(3)  # whether a world conserves energy
@@ -50,6 +50,7 @@ class Clocks:
     owed: np.ndarray
     lacked: np.ndarray
     kinetic: np.ndarray
+    overlap: np.ndarray
     parting: np.ndarray
 
     def of(self, k: int) -> Clock:

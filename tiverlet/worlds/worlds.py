@@ -234,6 +234,7 @@ class Worlds:
             clocks.kinetic[unknown] = np.where(first, 0.0, clocks.kinetic[unknown])
             clocks.conserves[unknown] = UNKNOWN
             clocks.parting[unknown] = np.where(placed, overlap > 0, clocks.parting[unknown])
+            clocks.overlap[unknown] = overlap
         for contact in runner.step.contacts:
             runner.memory.write_some(contact.dev.fast, 1, np.flatnonzero(jumped))
         clocks.first_moved[some], clocks.needs_drag[some] = NONE, False
@@ -348,9 +349,10 @@ class Worlds:
         )
         stiff = np.maximum(stiff, (self._fastest * clocks.h**2)[:, None])
         first = np.arange(figures.shape[1]) == 0
+        pressed = np.column_stack([clocks.overlap, overlap[:, :-1]])
         every = risks(
-            n, reporter.farthest, bad, reach, fast, overlap, turned, np.where(first, moved[:, None], 0.0), tension, stiff,
-            np.where(first, released[:, None], 0.0), residual,
+            n, reporter.farthest, bad, reach, fast, overlap, pressed, turned, np.where(first, moved[:, None], 0.0), tension,
+            stiff, np.where(first, released[:, None], 0.0), residual,
         )  # fmt: skip
         every[energy_bound.FLAG] = self._gains(before, figures)
         every[energy_bound.LOST] = self._losses(figures[:, -1])[:, None]
@@ -387,6 +389,7 @@ class Worlds:
             clocks.conserves[unknown | changed] = UNKNOWN
             clocks.bound = np.where(clocks.parting, np.maximum(clocks.bound, energy[:, k]), clocks.bound)
             clocks.parting = clocks.parting & (overlap[:, k] > PARTED)
+            clocks.overlap = overlap[:, k].copy()
             gain[:, k] = energy[:, k] - energy_limit(clocks.bound, clocks.kinetic, energy[:, k])
         out = gain > 0
         for k in np.flatnonzero(out.any(1)):
