@@ -274,3 +274,26 @@ def test_what_is_moved_steadily_bears_its_weight_in_f32(world):
         turned = speed * (w.time - h)
         expected = [*bodies.loads[:4], -WEIGHT * np.cos(turned), bodies.loads[5]]
         np.testing.assert_allclose([f.load[0] for f in bodies.features[:6]], expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize("path", ["fused", "parallel"])
+@pytest.mark.parametrize("substeps", [4, 20])
+def test_what_breaks_first_unloads_the_others(world, path, substeps):
+    # 20 kg on a chain of 20 links that bear 50 N each: the uppermost one bears most, 216 N, and breaks. The rest falls freely.
+    x, k = np.stack([np.zeros(21), -0.1 * np.arange(21)], axis=1), np.arange(20)
+    links = tv.Distance(np.stack([k, k + 1], axis=1), break_at=50.0)
+    mass = np.append(np.full(20, 0.1), 20.0)
+    w = world(tv.Particles(x, mass=mass, pinned=[0]), [tv.Gravity(9.81), links], substeps=substeps, path=path, solver=tv.Direct())
+    w.run(0.5)
+    assert np.flatnonzero(links.broken).tolist() == [0]
+    np.testing.assert_allclose(w.velocity[1:, 1], -9.81 * 0.5, rtol=0.01)
+
+
+@pytest.mark.parametrize(("more", "breaks"), [(1.1, 0), (1.18, 1)])
+def test_of_loads_that_are_alike_the_first_breaks(world, more, breaks):
+    # Overloads of 2 and 2 * more: by less than an eighth of the larger one they are taken for equal.
+    links = tv.Distance([(0, 1), (1, 2)], break_at=[9.81, 9.81 / 2 / more])
+    particles = tv.Particles([(0, 0), (0, -1), (0, -2)], pinned=[0])
+    w = world(particles, [tv.Gravity(9.81), links], precision="f64", solver=tv.Direct())
+    w.step(1 / 60)
+    assert np.flatnonzero(links.broken).tolist() == [breaks]

@@ -13,7 +13,7 @@ from .colliders.collider import Collider
 from .constraints.core.strength import BREAKS
 from .contact.pair_contact import PairContact
 from .contact.rays import Hits, inside, ray
-from .contact.touches import ContactEvents, joined, no_events
+from .contact.touches import ContactEvents, Told, joined, joined_events, no_events
 from .device.copies import Copies
 from .device.interrupts import deferred_signals
 from .features.arguments import suggest_name
@@ -101,8 +101,9 @@ class World:
         self._last: StepReport | None = None
         self._watchers: list[Any] = []  # recorders: called at each assignment, and before and after every step
         self._undo: tuple | None = None  # the state before a step that takes long, and flags of features
-        self._events: tuple[ContactEvents, ContactEvents] | None = None  # of the last frame, once the device has lost them
-        self._ended = self._ending = (none := no_events(particles.dim)), none  # by edits before the last frame, and since
+        self._events: Told | None = None  # of the last frame, once the device has lost them
+        self._ended: Told | None = None  # by edits before the last frame, of pairs and walls
+        self._ending: Told | None = None  # by edits since then
 
     @property
     def _build_options(self) -> tuple[Solver | None, str, str, int, Scale]:
@@ -173,7 +174,7 @@ class World:
                 report = energy_bound.checked_for_loss(self, report)
             report.__dict__["seconds"] = perf_counter() - clock  # the report is frozen; this field is not compared
             self._last, self._clock.energy, self._undo, self._events = report, report.energy, None, None
-            self._ended, self._ending = self._ending, ((none := no_events(self._particles.dim)), none)
+            self._ended, self._ending = self._ending, None
             for watcher in self._watchers:
                 watcher.after(dt, report)
         return report
@@ -554,7 +555,7 @@ class World:
             raise RuntimeError("World.wall_events: no wall tells of them. Write, for one, tv.Box(lower, upper, events=True).")
         return self._all_events()[1]
 
-    def _all_events(self) -> tuple[ContactEvents, ContactEvents]:
+    def _all_events(self) -> Told:
         """Return the events of particles, and those of walls; no events where nothing records them."""
         if self._events is not None:
             return self._events
@@ -568,7 +569,7 @@ class World:
             if isinstance(f, Collider) and f.dev.log:
                 walls.append(f.dev.log.read(number, h, time))
         told = pairs, ContactEvents(joined([none.touches, *walls])) if walls else none
-        return told[0].joined_with(self._ended[0]), told[1].joined_with(self._ended[1])
+        return joined_events(told, self._ended)
 
     @property
     def broken(self) -> list[tuple[Feature, np.ndarray]]:
@@ -689,7 +690,7 @@ class World:
         any of its particles, and so is a whole loop, surface, cluster or body of Polygons. Its feature stays, with the remaining
         constraints, as the same Python object; an empty feature costs nothing. features: features of world.features; they may be
         used in another world afterwards. To cut one link of many, make the links with break_at=np.inf, and assign an array that
-        is 1e-30 at that link: it breaks in the next substep in which it has any load.
+        is 1e-30 at that link: it breaks in the next substep in which it has any load, of several that meet one after the other.
 
         Everything else continues bit for bit, see add(). The force of a removed constraint ends with the next substep, as when a
         constraint breaks. Functions of the user that take the number of a particle or constraint get the new number.

@@ -122,15 +122,21 @@ class ContactEvents:
             replace(lost, impulse=zero, speed=zero, began=zero * np.nan, ended=zero + time)
         )
 
-    def joined_with(self, other: "ContactEvents") -> "ContactEvents":
-        """Return the events of both."""
-        return ContactEvents(joined([self.touches, other.touches])) if len(other) else self
+
+Told = tuple[ContactEvents, ContactEvents]  # of particles, and of walls
 
 
 def no_events(dim: int) -> ContactEvents:
     """Return the events of a frame without contacts."""
     pairs, vectors, numbers = np.zeros((0, 2), dtype=np.int64), np.zeros((0, dim)), np.zeros(0)
     return ContactEvents(Touches(pairs, pairs, vectors, vectors, numbers, numbers, numbers, numbers))
+
+
+def joined_events(told: Told, more: Told | None) -> Told:
+    """Join more events with those told: of particles, and of walls."""
+    if more is None:
+        return told
+    return ContactEvents(joined([more[0].touches, told[0].touches])), ContactEvents(joined([more[1].touches, told[1].touches]))
 
 
 def joined(parts: list[Touches]) -> Touches:

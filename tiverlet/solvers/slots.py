@@ -11,6 +11,7 @@ from ..device.number import OnDevice
 from ..features.feature import BENT, FAR, Batch, Scene
 from ..features.regrouping import Regrouping
 from ..tools import golden_steps
+from .breaks import Breaks
 from .corners import bodies_of, corners_of
 from .system import solvable
 
@@ -67,7 +68,7 @@ class Slots:
             self.tension = memory.field("slots.tension", None, kind=ti.f64)
         self.turned = memory.field("slots.turned", None, kind=ti.i32)  # the worst turn since the last diagnostics
         if any(b.breaks for b in batches):
-            self.broken = memory.field("slots.broken", None, kind=ti.i32)
+            self.broken, self.breaks = memory.field("slots.broken", None, kind=ti.i32), Breaks(scene)
         self.system: Any = solver.system(scene, batches, self)
         self.has_system = bool(self.system)
         self.refines = self.has_system and self.system.refines

@@ -14,7 +14,7 @@ from .. import checks
 from ..colliders.collider import Collider
 from ..constraints.pin import Pin
 from ..contact.pair_contact import PairContact
-from ..contact.touches import ContactEvents
+from ..contact.touches import Told, joined_events
 from ..device.memory import numbers_of
 from ..features.feature import Batch, Feature
 from ..neighbours.periodic import Periodic
@@ -248,7 +248,7 @@ def _holds(feature: Any) -> bool:
 
 
 def _edited(
-    world: Any, some: np.ndarray, added: Particles | None, told: tuple[ContactEvents, ContactEvents], seen: np.ndarray | None,
+    world: Any, some: np.ndarray, added: Particles | None, told: Told, seen: np.ndarray | None,
     loose: np.ndarray, moved: np.ndarray, walls: np.ndarray, features_too: bool, tied: int | None = None,
 ) -> None:  # fmt: skip
     """Finish an edit after particles and features have changed: events, handles, the clock, velocities, watchers.
@@ -260,8 +260,8 @@ def _edited(
     n, m = int(np.count_nonzero(some)), 0 if added is None else len(added)
     pairs, parted = told[0].without_removed(number, number, clock.time)
     touches, left = told[1].without_removed(number, walls, clock.time)
-    ending, leaving = world._ending[0].renumbered(number, number), world._ending[1].renumbered(number, walls)
-    world._events, world._ending = (pairs, touches), (ending.joined_with(parted), leaving.joined_with(left))
+    known = world._ending and (world._ending[0].renumbered(number, number), world._ending[1].renumbered(number, walls))
+    world._events, world._ending = (pairs, touches), joined_events((parted, left), known)
     for one in list(world._handles):
         one.follow(number)
     if m or features_too or n < len(some):  # otherwise only the kernels have changed

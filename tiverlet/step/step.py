@@ -13,6 +13,7 @@ from ..device.number import OnDevice, read_all
 from ..device.thread_team import LEAST, Team
 from ..features.feature import Batch, Scene
 from ..neighbours.strays import Strays
+from .break_pass import BreakPass
 from .constraint_pass import ConstraintPass
 from .contact_pass import ContactPass
 from .particle_pass import ParticlePass
@@ -92,6 +93,7 @@ class Step:
         self.wall_logs: list[Any] = [w.dev.log for w in walls if w.dev.log]
         self.sheared = bool(scene.state.images and scene.state.images.sheared)
         self.breakers: list[Any] = [b for b in batches if b.breaks]
+        self.break_pass = BreakPass(scene, self.breakers, team)
         self.launched = team.launched
         # Loop iterations per piece of work in short loops: Taichi gives each CPU thread at least LEAST iterations.
         self.stride = LEAST if self.launched and runtime.architecture() == "cpu" else 1
@@ -493,9 +495,8 @@ class Step:
         """
         h2_effective = self.integrator.h2_effective(now.h, now.fresh)
         h2_rigid = self.integrator.h2_rigid(now.h, now.fresh, ti.cast(now.span.owed, self.real))
-        for f in ti.static(self.breakers):
-            for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
-                f.dev.break_overloaded(c, h2_rigid, h2_effective, now.tick)
+        if ti.static(bool(self.breakers)):
+            self.break_pass.run(now, h2_rigid, h2_effective)
         self.constraints.learn(now)
         self.contact_pass.finish(now)
         if ti.static(self.orients):

@@ -1,9 +1,11 @@
 """The report of a frame, as the user gets it."""
 
+import re
 from dataclasses import dataclass, field
 from typing import Any
 
 UNCONVERGED = 0.1  # residual above which a frame is flagged "unconverged"
+FIGURE = re.compile(r"\d[^ ,;:]*")  # notes that differ by figures only are of one kind
 COMPRESSED = 0.05  # overlap from one frame to the next above which it is flagged "compressed", in radii; piles have 0.01
 
 
@@ -73,6 +75,10 @@ class StepReport:
         new.__dict__.update(figures)
         return new
 
+    def __str__(self) -> str:
+        """The figures, and the notes below them."""
+        return "\n".join([repr(self), *(f"    {note}" for note in self.notes)])
+
     def _repr_html_(self) -> str:
         from ..recording.markup import of_report
 
@@ -90,7 +96,7 @@ class StepReport:
             last.time, max(first.substeps, last.substeps), max(first.iterations, last.iterations),
             max(first.residual, last.residual), max(first.overlap, last.overlap), max(first.contacts, last.contacts),
             last.energy, first.energy_change + last.energy_change, first.flags | last.flags,
-            tuple({n.partition(":")[0]: n for n in first.notes + last.notes}.values()),
+            tuple({FIGURE.sub("", n): n for n in first.notes + last.notes}.values()),
             last.bad if first.bad is None else first.bad,
             first.broken + last.broken, last.asleep, max(first.turn, last.turn), max(first.tension, last.tension),
             max(first.tries, last.tries), max(first.seconds, last.seconds),

@@ -521,10 +521,11 @@ class ClusterPasses(Passes):
         return out
 
     @ti.func
-    def break_overloaded(self, c, h2_rigid, h2_effective, tick):
-        """Break cluster c if the force on one of its particles was too large, see Strength."""
+    def overload(self, c, h2_rigid, h2_effective):
+        """Return by how much the force on a particle of cluster c was too large, see Strength."""
+        out = 0 * h2_rigid
         if self.strength.is_intact(c):
-            w, i0, snaps = self.mass[c], self.corners.reference_particle(c), False
+            w, i0 = self.mass[c], self.corners.reference_particle(c)
             if w > 0:
                 w = 1 / w
             per_newton = self.spring.multiplier_per_newton(c, w, h2_rigid, h2_effective)
@@ -532,9 +533,14 @@ class ClusterPasses(Passes):
                 i = self.corners.members[e]
                 if self.w.of(i) > 0:
                     past = self.strength.add_excess(c, e, self.pull[e] / self.w.of(i), per_newton)
-                    snaps = snaps or past > self.strength.rounding(c, i, i0)
-            if snaps:
-                self.strength.mark_broken(c, tick)
+                    if past > self.strength.rounding(c, i, i0):
+                        out = ti.max(out, self.strength.overload_by(c, past, per_newton))
+        return out
+
+    @ti.func
+    def forget_excess(self, c):
+        """Forget that cluster c bore too much."""
+        self.strength.forget_excess(self.corners.starts[c], self.corners.starts[c + 1])
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):

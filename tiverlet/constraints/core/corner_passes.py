@@ -434,12 +434,12 @@ class CornerPasses(Passes):
             self.corners.write_move(c, k, self.w.of(self.corners.member(c, k)) * pull * g[k, :])
 
     @ti.func
-    def break_overloaded(self, c, h2_rigid, h2_effective, tick):
-        """Break constraint c if its multiplier, or the sum over many substeps, is too large, see Strength.
+    def overload(self, c, h2_rigid, h2_effective):
+        """Return by how much the multiplier of constraint c, or the sum over many substeps, is too large, see Strength.
 
         Velocities contain its known load, as a spring force. Where low words are carried, lengths are exact.
         """
-        lam, w = self.equation.lam[c], ti.cast(0, self.real)
+        lam, w, out = self.equation.lam[c], ti.cast(0, self.real), ti.cast(0, self.real)
         if ti.static(self.spring.soft):
             if h2_rigid > h2_effective:
                 w = self.weight(c)
@@ -456,7 +456,13 @@ class CornerPasses(Passes):
                             rounding = self.strength.rounding(c, self.corners.member(c, k), self.corners.member(c, 0))
                             unsure = ti.max(unsure, rounding / g[k, :].norm())
                 if past > unsure:
-                    self.strength.mark_broken(c, tick)
+                    out = self.strength.overload_by(c, past, per_newton)
+        return out
+
+    @ti.func
+    def forget_excess(self, c):
+        """Forget that constraint c bore too much."""
+        self.strength.forget_excess(c, c + 1)
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):

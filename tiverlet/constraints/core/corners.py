@@ -50,6 +50,14 @@ class FixedCorners:
             self.slots.move[place] = move
 
     @ti.func
+    def compare(self, loop: ti.template(), c, overload, number):  # type: ignore[valid-type]
+        """Compare the overload of constraint c with others at its corners, see Breaks. Returns 1 if none comes before it."""
+        out = 1
+        for k in ti.static(range(self.arity)):
+            out = ti.min(out, self.slots.breaks.compare(loop, self.member(c, k), overload, number))
+        return out
+
+    @ti.func
     def rest(self, c):
         """Write no moves for constraint c."""
         for k in ti.static(range(self.arity)):
@@ -127,6 +135,14 @@ class VariableCorners:
         """Whether constraint c is awake."""
         sleepers = self.state.sleepers
         return at(sleepers.asleep, at(self.mover, c)) == 0 if sleepers else ti.cast(1, ti.i32) > 0
+
+    @ti.func
+    def compare(self, loop: ti.template(), c, overload, number):  # type: ignore[valid-type]
+        """Compare the overload of constraint c with others at its corners, see Breaks. Returns 1 if none comes before it."""
+        out = 1
+        for e in range(self.starts[c], self.starts[c + 1]):
+            out = ti.min(out, self.slots.breaks.compare(loop, self.members[e], overload, number))
+        return out
 
     @ti.func
     def write_move(self, e, move):

@@ -131,8 +131,9 @@ class OutlinePasses(Passes):
             self.corners.write_move(e, self.w.of(self.corners.members[e]) * pull * self.quantity.slope(e, 0))
 
     @ti.func
-    def break_overloaded(self, c, h2_rigid, h2_effective, tick):
-        """Break constraint c if its multiplier, or the sum over many substeps, is too large, see Strength."""
+    def overload(self, c, h2_rigid, h2_effective):
+        """Return by how much the multiplier of constraint c, or the sum over many substeps, is too large, see Strength."""
+        out = 0 * h2_rigid
         if self.strength.is_intact(c):
             per_newton = self.equation.spring.multiplier_per_newton(c, self.weight(c), h2_rigid, h2_effective)
             past, unsure, i0 = (
@@ -146,7 +147,13 @@ class OutlinePasses(Passes):
                     if g > 0:
                         unsure = ti.max(unsure, self.strength.rounding(c, self.corners.members[e], i0) / g)
                 if past > unsure:
-                    self.strength.mark_broken(c, tick)
+                    out = self.strength.overload_by(c, past, per_newton)
+        return out
+
+    @ti.func
+    def forget_excess(self, c):
+        """Forget that constraint c bore too much."""
+        self.strength.forget_excess(c, c + 1)
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):

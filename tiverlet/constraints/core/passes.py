@@ -74,12 +74,15 @@ class Passes:
         """Add the answer of constraint c to its multiplier, and tell the part that came of a blow."""
 
     @ti.func
-    def break_overloaded(self, c, h2_rigid, h2_effective, tick):
-        """Where the batch `breaks`: break constraint c if its load in this substep was too large.
+    def overload(self, c, h2_rigid, h2_effective):
+        """Where the batch `breaks`: return the load of constraint c as a multiple of break_at if it is too large, else 0.
 
-        It does not act from the next substep on. h2_rigid, h2_effective: its multiplier for 1 N, for rigid and for soft
-        constraints.
+        h2_rigid, h2_effective: its multiplier for 1 N, for rigid and for soft constraints.
         """
+
+    @ti.func
+    def forget_excess(self, c):
+        """Forget that constraint c bore too much."""
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):

@@ -24,8 +24,9 @@ def strength_of(batch: "Batch", value: Any) -> np.ndarray | None:
 class Strength:
     """The loads at which the constraints of a batch (with break_at and breaks) break, and which have broken, on the device.
 
-    A constraint whose load exceeds break_at at the end of a substep does not act from the next one on. It keeps its share of the
-    masses that are split between constraints until the world is rebuilt. That is safe, but slows convergence.
+    A constraint whose load exceeds break_at at the end of a substep does not act from the next one on, unless what breaks beside
+    it unloads it, see Breaks. It keeps its share of the masses that are split between constraints until the world is rebuilt.
+    That is safe, but slows convergence.
 
     Positions are known to about ulp(x), so a load is known to m ulp(x) / h^2: in f32 at 1280 substeps a frame, 2 kg that hang
     at rest pull with 0 to 1400 N. But a body that gets too much in one substep gets less in the next: sums of multipliers over
@@ -37,8 +38,9 @@ class Strength:
     Where rounding is small, a load above break_at breaks at once; elsewhere it breaks within the substeps that tell it from
     rounding. m: the root of the sum of the squares of the masses of the body, since roundings of particles are independent.
 
-    A batch that never `breaks` costs nothing. in_state: its fields in the exact state, by name. entries, width: number and
-    components of its loads, if they are not one number for each constraint.
+    A batch that never `breaks` costs nothing. overload: the load as a multiple of break_at, 0 up to 1. in_state: its fields in
+    the exact state, by name. entries, width: number and components of its loads, if they are not one number for each
+    constraint.
     """
 
     def __init__(self, scene: "Scene", name: str, batch: Any, entries: int | None = None, width: int = 0):
@@ -48,6 +50,7 @@ class Strength:
             self.counter, self.state, self.width = scene.slots.broken, scene.state, width
             self.limit = scene.memory.field(f"{name}.break_at", batch.count, values=limit)
             self.stamp = scene.memory.field(f"{name}.broken", batch.count, kind=ti.i32, state=True)
+            self.overload = scene.memory.field(f"{name}.overload", batch.count)
             total = batch.count if entries is None else entries
             self.excess = scene.memory.field(f"{name}.over", total, width=width, state=True)
             epsilon = np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps
@@ -91,6 +94,17 @@ class Strength:
             past = share
         self.excess[e] = share * total
         return past
+
+    @ti.func
+    def forget_excess(self, begin, end):
+        """Forget the excess of some entries: what breaks beside them unloads them."""
+        for e in range(begin, end):
+            self.excess[e] *= 0
+
+    @ti.func
+    def overload_by(self, c, past, per_newton):
+        """Return the overload of constraint c from the excess of its load."""
+        return 1 + past / (self.limit[c] * per_newton)
 
     @ti.func
     def rounding(self, c, i, j):
