@@ -229,3 +229,66 @@ def test_bodies_without_extent_are_moved_without_velocity(world):
         assert w.step(1 / 60).flags == {"moved"}
         np.testing.assert_allclose(w.position, place, atol=1e-6)
         assert np.abs(w.velocity).max() < 1e-5
+
+
+def scene():
+    """Return particles and features with all that can be shifted: walls, pins that drive and draw, forces, contacts."""
+    rope = tv.shapes.rope((1.0, 3.0), (2.0, 3.0), 6)
+    x = np.vstack([rope.position, [(0.3, 0.1), (0.52, 0.1), (0.4, 0.29), (3.5, 0.6), (2.2, 2.5)]])
+    features = [
+        tv.Gravity(9.81), tv.Drag(0.1), tv.Distance(rope.links), tv.Pin([0], [(1.0, 3.0)]),
+        tv.Pin([5], [(2.1, 3.0)], compliance=1e-3), tv.Capsule((2, 1), (2.5, 1.2), 0.1),
+        tv.HalfSpace((0.0, 1.0), 0.0, friction=0.4), tv.Box((0, -1), (4, 9)), tv.Ball((3.4, 0.2), 0.3),
+        tv.Polygon([(0, 0), (0.5, 0), (0, 0.5)], position=(1.2, 0.0)), tv.Attractor((2.0, 8.0), 0.5), tv.Contact(friction=0.3),
+    ]  # fmt: skip
+    return tv.Particles(x, radius=0.1), features
+
+
+def test_a_shifted_scene_goes_on_as_it_was(world, tmp_path):
+    # Everything but the origin stays: floating origin. In f64, 1000 m away, positions agree to the digits that are left there.
+    by = np.array([-1024.0, -256.0])
+    start, features = scene()
+    w = world(start, features, precision="f64", substeps=8)
+    w.run(0.3)
+    features[8].center = (3.42, 0.2)  # walls that move on
+    w.step(1 / 60)
+    twin = w.clone()
+    with tv.Recorder(tmp_path / "shift.rrd", twin) as recorder:
+        twin.shift(by)
+        np.testing.assert_array_equal(twin.position, w.position + by)
+        for _ in range(20):
+            features[8].center = features[8].center + [0.001, 0.0]
+            twin.features[8].center = twin.features[8].center + [0.001, 0.0]
+            a, b = w.step(1 / 60), twin.step(1 / 60)
+            recorder.log()
+            assert a.flags == b.flags == frozenset()
+    np.testing.assert_allclose(twin.position - by, w.position, atol=1e-9)
+    np.testing.assert_allclose(twin.velocity, w.velocity, atol=1e-8)
+    assert tv.replay(tmp_path / "shift.rrd").verify()
+
+
+def test_what_is_fixed_in_space_is_named(world):
+    w = world(tv.Particles([(0.5, 0.5)]), [tv.Periodic((0, 0), (1, 1))])
+    with pytest.raises(ValueError, match="Periodic.* is fixed in space. Remove it"):
+        w.shift((1.0, 0.0))
+
+
+def test_what_is_placed_has_no_speed(world):
+    # A floor that is raised during a frame throws a disc up at 6 m/s; one that is there at once does not.
+    for place in (False, True):
+        floor, hand = tv.HalfSpace((0, 1), 0.0), tv.Pin([1], [(3.0, 3.0)])
+        w = world(tv.Particles([(0.0, 0.3), (3.0, 3.0)], radius=0.1), [tv.Gravity(0.0), floor, hand], precision="f64")
+        w.step(1 / 60)
+        if place:
+            w.place(floor, offset=0.1)
+            w.place(hand, target=[(5.0, 3.0)])
+            np.testing.assert_allclose(w.position[1], (5.0, 3.0))
+        else:
+            floor.offset, hand.target = 0.3, [(5.0, 3.0)]
+        w.step(1 / 60)
+        speed = np.abs(w.velocity).max(axis=1)
+        assert (speed < 1e-9).all() if place else (speed > [5.0, 100.0]).all()
+    with pytest.raises(TypeError, match="has no knob height; it has .*offset"):
+        w.place(floor, height=1.0)
+    with pytest.raises(ValueError, match="no wall, Pin or Path"):
+        w.place(w.features[0], g=1.0)

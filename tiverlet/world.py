@@ -23,7 +23,7 @@ from .neighbours.queries import Contacts, PointSearch, near_by_brute_force, near
 from .particles import Particles, at_rest, in_range, spin_of
 from .solvers.jacobi import Jacobi
 from .solvers.solver import Solver
-from .step import checkpoint, edit_scene, energy_bound, impulse, initial_violation
+from .step import checkpoint, edit_scene, energy_bound, impulse, initial_violation, placing
 from .step.adaptive import StepController
 from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver, usual_substeps
 from .step.build_again import Rebuild
@@ -355,15 +355,45 @@ class World:
     def position(self, value) -> None:
         """Move particles to (n, dim) [m]. Velocities are kept, and neighbour lists are rebuilt."""
         value = checks.points("World", "position", value, dim=self._particles.dim, count=len(self._particles))
-        in_range("World", "position", value)
-        if self._runner.step.contacts:
-            self._runner.step.contacts[0].check_range(value)
+        self._check_places("World", value)
         self._runner.memory.check()
         with deferred_signals:
             for watcher in self._watchers:
                 watcher.assigned("position", value)
             self._runner.place(value, self._iterations)
             self._runner.invalidate()
+
+    def _check_places(self, who: str, position: np.ndarray) -> None:
+        """Raise ValueError where positions, (n, dim) [m], are too far out."""
+        in_range(who, "position", position)
+        if self._runner.step.contacts:
+            self._runner.step.contacts[0].check_range(position)
+
+    def place(self, feature: Feature, **knobs) -> None:
+        """Set knobs of a wall or a Pin, which is there at once: world.place(floor, offset=2.0), world.place(pin, target=x).
+
+        Assigned to the feature, they are where it goes to during the next frame, at the speed that this takes. Driven particles
+        are placed with their Pin.
+
+        Raises ValueError or TypeError for what is no wall, Pin or Path of this world, and for names and values that it refuses.
+        """
+        self._runner.memory.check()
+        with deferred_signals:
+            placing.place(self, feature, knobs)
+
+    def shift(self, by) -> None:
+        """Shift the whole scene by a vector, (dim,) [m]: particles, walls, targets of pins, centers of forces; without motion.
+
+        So a game keeps what it looks at near the origin, where f32 has most digits (floating origin). Loads, velocities, contacts
+        and sleep of the next frames are as without the shift, to rounding. What was assigned to walls and targets since the last
+        step is there at once.
+
+        Raises ValueError for features that are fixed in space: Periodic, Path, Snap, and forces of your own that read positions.
+        """
+        self._runner.memory.check()
+        by = checks.vector("World.shift", "by", by, self._particles.dim)
+        with deferred_signals:
+            placing.shift(self, by)
 
     @property
     def velocity(self) -> np.ndarray:

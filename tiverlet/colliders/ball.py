@@ -31,7 +31,9 @@ class Ball(Collider):
     along n where it is nearest or was met: first order, and it loses speed.
     """
 
-    center = Knob(lambda f, v: checks.vector("Ball", "center", v, f.dim or len(np.atleast_1d(v))), "Middle of the ball [m].")
+    center = Knob(
+        lambda f, v: checks.vector("Ball", "center", v, f.dim or len(np.atleast_1d(v))), "Middle of the ball [m].", place=True
+    )
 
     shares_code = True
     radius = Knob(lambda f, v: f._size(v), "Of the ball [m].", device="size")

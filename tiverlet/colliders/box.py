@@ -44,8 +44,8 @@ class Box(Collider):
 
     inside = poses = shares_code = True
     widest = 0.0
-    lower = Knob(_corner("lower"), "Lower corner [m].")
-    upper = Knob(_corner("upper"), "Upper corner [m].")
+    lower = Knob(_corner("lower"), "Lower corner [m].", place=True)
+    upper = Knob(_corner("upper"), "Upper corner [m].", place=True)
 
     def __init__(
         self, lower, upper, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float | None = None, active:

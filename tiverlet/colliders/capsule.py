@@ -19,7 +19,9 @@ MARCH = 32  # steps along a path; a grazing path is then resolved within 1e-6 of
 
 
 def _end(name: str) -> Knob:
-    return Knob(lambda f, v: checks.vector("Capsule", name, v, f.dim or len(np.atleast_1d(v))), "End of the axis [m].")
+    return Knob(
+        lambda f, v: checks.vector("Capsule", name, v, f.dim or len(np.atleast_1d(v))), "End of the axis [m].", place=True
+    )
 
 
 class Capsule(Collider):

@@ -1,5 +1,7 @@
 """A plane with particles on one side."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -60,6 +62,10 @@ class HalfSpace(Collider):
     def end_motion(self) -> None:
         """Stay at the last offset."""
         self.dev.offset.end_motion()
+
+    def shifted(self, by: np.ndarray) -> dict[str, Any]:
+        """Return the offset of the shifted plane."""
+        return {"offset": self.offset + float(np.dot(self.normal, by))}
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """Return lines across the scene: one in 2D, two at right angles in 3D."""

@@ -52,7 +52,7 @@ class Moving(Collider):
         built=True,
         device="thickness",
     )
-    position = Knob(_position, "Where the origin of the wall's frame is [m].")
+    position = Knob(_position, "Where the origin of the wall's frame is [m].", place=True)
     rotation = Knob(_rotation, "Angle (2D) or rotation vector (3D) [rad].")
 
     def place(self, position: Any, rotation: Any) -> None:

@@ -130,6 +130,11 @@ class Constraint(Scalar):
     _cached_gradients: tuple[Any, Any, Any] = (None, None, None)  # positions, and values and gradients there
     rest = Knob(lambda f, v: checks.per_item(repr(f), "rest", v, f.count), "What function should be.")
 
+    @property
+    def is_fixed_in_space(self) -> bool:  # type: ignore[override]
+        """Whether it holds particles somewhere, not to each other."""
+        return self.arity == 1
+
     def __init__(
         self, function, indices, rest: ArrayLike = 0.0, *, gradient=None, side: int = 0, origin=None, unit=None, compliance:
         ArrayLike = 0.0, damping: ArrayLike = 0.0, break_at=None,

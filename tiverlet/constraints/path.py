@@ -33,6 +33,7 @@ class Path(Anchored):
     `length` is the length of the curve [m], `place(s)` its points, `load` the force of the wire on each particle [N].
     """
 
+    is_fixed_in_space = True
     each = ("compliance", "damping", "speed", "at")
     speed = Knob(lambda f, v: f._drive("speed", v), "Along the curve [m/s], (m,).")
     at = Knob(lambda f, v: f._drive("at", v), "Arc length at the end of the next frame [m].")

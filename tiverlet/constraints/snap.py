@@ -82,6 +82,7 @@ class Snap(Anchored):
     `load` is the force on each particle [N].
     """
 
+    is_fixed_in_space = True
     can_extend = True
 
     def __init__(self, indices, spacing, origin: ArrayLike = 0.0, *, compliance: ArrayLike, damping: ArrayLike = 0.0):

@@ -28,14 +28,15 @@ class Knob:
     force: the knob changes a force, so displacements are turned into velocities first, see World._restart_for_new_forces().
     compiled: kernels contain the value, so the world is rebuilt for another one, see Feature.needs_other_kernels.
     built: the world is rebuilt for another value, too, but with the same kernels.
+    place: the value is a point in space, or several, which World.shift() moves.
     device: the attribute with the knob's field. Kernels read the setting by the knob's name; None where they do not read it.
     """
 
     def __init__(
         self, check: Callable, doc: str, *, force: bool = False, compiled: bool = False, built: bool = False,
-        device: str | None = None,
+        place: bool = False, device: str | None = None,
     ):  # fmt: skip
-        self.check, self.force, self.compiled, self.built, self.device = check, force, compiled, built, device
+        self.check, self.force, self.compiled, self.built, self.place, self.device = check, force, compiled, built, place, device
         self.__doc__ = doc
 
     def __set_name__(self, owner, name: str) -> None:

@@ -99,6 +99,7 @@ class Feature:
     compiled_for: tuple[str, ...] = ()  # properties that decide the code of its kernels
     has_own_compile_time = True  # compile times are reported per class
     does_work = False  # it may add energy unknown to reports; motion that only a knob causes is seen by `changed`
+    is_fixed_in_space = False  # it depends on places that are no knobs, so World.shift() cannot move it
     conserves = False  # it takes no energy out of the scene, as far as is known
     has_no_particle_data = False  # no data of it, on device or host, depends on which particles exist; see can_regroup()
     code_size = 0.3  # size of its kernel code relative to that of a Distance; see build.LONG
@@ -140,6 +141,11 @@ class Feature:
 
     def end_motion(self) -> None:
         """End a motion: the target of the last frame is where the next motion starts. Called when `moving`."""
+
+    def shifted(self, by: np.ndarray) -> dict[str, Any]:
+        """Return the knobs that are places, by name, after a shift of the scene by a vector, (dim,) [m]."""
+        kind = type(self)
+        return {name: getattr(self, name) + by for name in knobs_of(kind) if getattr(kind, name).place}
 
     def compiled(self) -> dict[str, Any]:
         """Return the values that its kernels contain: knobs that are compiled, and the properties in compiled_for."""
@@ -235,6 +241,7 @@ class Acceleration(Feature):
 
     accelerates = True
     uniform = False
+    is_fixed_in_space = True  # forces may read places; those that read none, or tell them as knobs, say so
     common = False
     steady = False
     uses_velocity = False

@@ -20,9 +20,10 @@ class Attractor(Acceleration):
     center itself it is 0. Elsewhere the step resolves an orbit of angular velocity omega while omega h is well below 1.
     """
 
+    is_fixed_in_space = False
     has_no_particle_data = True
     conservative = True
-    center = Knob(lambda f, v: checks.vector("Attractor", "center", v, f.dim or len(np.atleast_1d(v))), "[m].")
+    center = Knob(lambda f, v: checks.vector("Attractor", "center", v, f.dim or len(np.atleast_1d(v))), "[m].", place=True)
     strength = Knob(lambda f, v: checks.number("Attractor", "strength", v), "G M [m^3/s^2].")
     softening = Knob(lambda f, v: checks.number("Attractor", "softening", v, least=0.0), "[m].")
     dim = 0

@@ -12,6 +12,7 @@ class Drag(Acceleration):
     With a constant acceleration a of other forces, the displacements obey d' = exp(-z) d + h^2 a (1 - exp(-z)) / z, z = rate h.
     """
 
+    is_fixed_in_space = False
     has_no_particle_data = True
     accelerates = False
     decays = True

@@ -26,6 +26,7 @@ class Gravity(Acceleration):
     has_no_particle_data = True
     conservative = True
     uniform = common = steady = True
+    is_fixed_in_space = False
     dim = 0
     g = Knob(_vector, "Acceleration [m/s^2]: a number along -y, or a vector.")
 

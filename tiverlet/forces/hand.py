@@ -38,10 +38,11 @@ class Hand(Acceleration):
     1, and is stable below 2. All are live: assign between frames, without compiling. A pinned particle stays where it is.
     """
 
+    is_fixed_in_space = False
     uses_velocity = True
     conservative = True
     particle = Knob(_particle, "The particle that is drawn; -1: none.")
-    target = Knob(_target, "Where it is drawn to [m].")
+    target = Knob(_target, "Where it is drawn to [m].", place=True)
     rate = Knob(lambda f, v: checks.number("Hand", "rate", v, least=0.0), "How fast it gets there [1/s].")
     dim = _count = 0
 

@@ -60,6 +60,7 @@ class PairForce(Acceleration):
 
     pairwise = True
     uniform = True  # stiffness() measures its stiffness instead
+    is_fixed_in_space = False
     host_only = ("radius",)
 
     def __init__(self, function, radius: float | None = None, *, potential=None):

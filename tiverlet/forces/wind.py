@@ -21,6 +21,7 @@ class Wind(Acceleration):
     rate = Knob(lambda f, v: checks.number("Wind", "rate", v, least=0.0), "Drag rate [1/s].")
     decays = True
     uniform = steady = True
+    is_fixed_in_space = False
     dim = 0
 
     def __init__(self, velocity, rate):

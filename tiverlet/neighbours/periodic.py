@@ -45,6 +45,7 @@ class Periodic(Feature):
     Raises ValueError for a box that is too small for its contents. A world has at most one.
     """
 
+    is_fixed_in_space = True
     compiled_for = ("sheared",)
     host_only = ("low", "high")
     _last_strain_and_offset = 0.0, 0.0

@@ -1,0 +1,74 @@
+"""Placing walls and targets at once, and shifting a whole scene: changes of place that no motion leads to."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..colliders.collider import Collider
+from ..constraints.core.anchored import Anchored
+from ..constraints.pin import Pin
+from ..features.arguments import knobs_of
+from ..features.feature import Feature
+from .clock import CHANGED
+
+Values = Mapping[Feature, Mapping[str, Any]]  # values of knobs
+
+
+def place(world: Any, feature: Feature, values: Mapping[str, Any]) -> None:
+    """Set knobs of a wall or a Pin, which is there at once. Raises what assigning them does, with the feature unchanged."""
+    if feature not in world.features or not isinstance(feature, Collider | Anchored):
+        raise ValueError(f"World.place: {feature!r} is no wall, Pin or Path of this world. Give one of world.features.")
+    if unknown := sorted(set(values) - {*knobs_of(type(feature))}):
+        raise TypeError(f"World.place: {feature!r} has no knob {unknown[0]}; it has {', '.join(knobs_of(type(feature)))}.")
+    position, world._clock.bound = world.position.copy(), CHANGED
+    _take(world, {feature: values})
+    if isinstance(feature, Pin) and feature.is_kinematic:
+        position[feature.indices[:, 0]] = feature.target
+        world.position = position
+
+
+def shift(world: Any, by: np.ndarray) -> None:
+    """Shift all particles, walls, targets and centers by a vector, (dim,) [m]. Raises ValueError for what is fixed in space."""
+    for f in world.features:
+        if f.is_fixed_in_space:
+            raise ValueError(
+                f"World.shift: {f!r} is fixed in space. Remove it before, and add it again where it belongs then: "
+                "world.remove(features=[...]), world.add(features=[...])."
+            )
+    runner, position = world._runner, world.position + by
+    world._check_places("World.shift", position)
+    _take(world, {f: f.shifted(by) for f in world.features}, position)
+    runner.clock.energy, runner.clock.moved_mask = None, None
+    runner.clock.forget_bound()
+
+
+def _take(world: Any, values: Values, position: np.ndarray | None = None) -> None:
+    """Set knobs, and positions, (n, dim), without a motion from the present ones."""
+    world._rebuild_for_knobs()  # for what waits already
+    before = {f: {name: getattr(f, name) for name in some} for f, some in values.items()}
+    try:
+        for f, some in values.items():
+            for name, value in some.items():
+                setattr(f, name, value)
+    except Exception:
+        for f, some in before.items():
+            for name, value in some.items():
+                setattr(f, name, value)
+        raise
+    if position is None:  # a shift changes no force
+        world._rebuild_for_knobs()
+    runner = world._runner
+    for watcher in world._watchers:
+        watcher.before()
+    world._upload()
+    for f in values:
+        if f.moving:
+            f.moving = False
+            f.end_motion()
+    if position is not None:
+        runner.scene.state.put(runner.memory, position)
+    runner.wake()
+    runner.invalidate()
+    for watcher in world._watchers:
+        watcher.broken_off()
