@@ -11,7 +11,8 @@ import pytest
 import tiverlet as tv
 from tests.test_recorder import read
 from tiverlet.recording import messages, overlays, viewer, watch
-from tiverlet.recording.fill import Fill, outlines
+from tiverlet.recording.drawing import colors
+from tiverlet.recording.fill import Fill, outlines, roundings
 from tiverlet.recording.layout import SCENE_VIEW, unit
 from tiverlet.recording.picture import FLOWN, NEAR, framed
 
@@ -139,16 +140,20 @@ def test_strain_can_be_left_out(tmp_path):
 
 @pytest.mark.filterwarnings("ignore:.*no constraint holds loops")
 @pytest.mark.parametrize("turn", [0.0, 0.7])
+@pytest.mark.parametrize("rounding", [0.0, 0.1])
 @pytest.mark.parametrize("shape", ["brick", "hexagon", "triangle"])
-def test_lines_fill_bodies_in_the_plane(shape, turn):
-    # Points inside the body are on a line, except in sharp corners and at the very middle; and no line leaves the body.
+def test_lines_fill_bodies_in_the_plane(shape, turn, rounding):
+    # Points inside the body are on a line, except in sharp corners and at the very middle; and no line leaves the body, which
+    # reaches as far as its rounding: what rests on a floor is drawn on it.
     x = {
         "brick": np.array([[0.0, 0], [2, 0], [2, 1], [0, 1]]),
         "hexagon": np.stack([np.cos(np.arange(6) * np.pi / 3), np.sin(np.arange(6) * np.pi / 3)], axis=1),
         "triangle": np.array([[0.0, 0], [1, 0], [0.5, 0.9]]),
     }[shape]
-    world = tv.World(tv.Particles(x), [tv.Polygons([np.arange(len(x))[::-1]])])
-    fill = Fill(outlines(world), x, np.zeros((len(x), 3)), np.zeros(0, dtype=np.int64))
+    world = tv.World(tv.Particles(x, radius=rounding), [tv.Polygons([np.arange(len(x))[::-1]])])
+    loops = outlines(world)
+    fill = Fill(loops, x, roundings(world, loops), np.zeros((len(x), 3)), np.zeros(0, dtype=np.int64))
+    assert len(fill.colors(np.zeros(0, dtype=np.int64))) == len(fill.radii)
     c, s = np.cos(turn), np.sin(turn)
     there = x @ np.array([[c, s], [-s, c]]) + 5.0  # the body has moved since
     points, ends = fill.strips(there)
@@ -161,7 +166,8 @@ def test_lines_fill_bodies_in_the_plane(shape, turn):
     closed = np.concatenate([there, there[:1]])
     inside, edge = winding(there, spread), distance_to(closed, spread)
     assert (gap[inside] < 1e-6).mean() > 0.96
-    assert gap[~inside & (edge > 1e-6)].min() > -1e-6
+    assert gap[~inside & (edge > rounding + 1e-6)].min() > -1e-6
+    assert rounding == 0 or gap[edge < rounding].max() < 1e-6
 
 
 def distance_to(strip, points):
@@ -284,3 +290,13 @@ def test_notebooks_show_worlds_reports_features_and_recordings(tmp_path):
     assert world._repr_html_() == f"<code>{world!r}</code>"
     solid = tv.World(tv.Particles([[0.0, 0, 0], [1, 0, 0]], radius=0.1), [tv.HalfSpace((0, 1, 0)), tv.Gravity()])
     assert solid._repr_html_().count("<circle") == 2
+
+
+def test_bodies_in_turn_have_other_colours_whatever_their_first_particles_are(world):
+    # Golden-ratio steps come back after a Fibonacci number of them: ropes of 21 particles were all red.
+    ropes = [tv.shapes.rope((0.0, 0.2 * k), (1.0, 0.2 * k), 21) for k in range(6)]
+    body, parts = tv.shapes.join(*ropes)
+    hues = colors(world(tv.Particles(body.position), [tv.Distance(body.links)])).astype(float)
+    each = np.array([hues[p][0] for p in parts])
+    apart = np.abs(each[:, None] - each).max(axis=2) + 255 * np.eye(6)
+    assert apart.min() > 60 and all((hues[p] == hues[p][0]).all() for p in parts)

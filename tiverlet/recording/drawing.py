@@ -13,7 +13,7 @@ from ..features.feature import Batch, Feature
 from ..forces import Gravity
 from ..neighbours import Periodic
 from ..tools import golden_colors
-from .fill import Fill, outlines, within
+from .fill import Fill, outlines, roundings, within
 from .images import InBox, box_of, crosses_box
 from .journal import PARTICLES
 from .layout import LEGEND, SCENE, WIDE
@@ -142,7 +142,7 @@ class Drawing:
             self._surface = Surface(corners, hues, self._pairs[under], upwards(world))
         self._fill = None
         if loops:
-            self._fill = Fill(loops, world.position, hues, inside[self._pairs[under, 0]])
+            self._fill = Fill(loops, world.position, roundings(world, loops), hues, inside[self._pairs[under, 0]])
             self.static(f"{self._root}/fill", self._strips.from_fields(radii=self._fill.radii, draw_order=BELOW))
         self._line_links, self._surface_links = some, under
         self._breakable_links = [(k, np.flatnonzero(number == k), row[number == k]) for k, _ in found if k in self._broken]
@@ -348,9 +348,9 @@ def upwards(world: "World | Parts") -> np.ndarray:
 
 
 def colors(world: "World | Parts") -> np.ndarray:
-    """Return hues, (n, 3): one for each body and each loose particle; grey for fixed particles."""
-    body = bodies(world)
-    hues = golden_colors(len(body))[body]
+    """Return hues, (n, 3): one for each body and each loose particle, in turn; grey for fixed particles."""
+    first, number = np.unique(bodies(world), return_inverse=True)
+    hues = golden_colors(len(first))[number.ravel()]
     hues[world.particles.inv_mass == 0] = (140, 140, 150)
     return hues
 

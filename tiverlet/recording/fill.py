@@ -34,6 +34,12 @@ def outlines(world: "World") -> list[np.ndarray]:
     return list(out.values())[:MANY]
 
 
+def roundings(world: "World", loops: list[np.ndarray]) -> np.ndarray:
+    """Return by how much each body is rounded, (loops,) [m]: Polygons are, by the radius of their corners."""
+    solid = {int(i) for f in world.features if isinstance(f, Polygons) for loop in f.loops for i in loop}
+    return np.array([float(world.particles.radius[loop].min()) if int(loop[0]) in solid else 0.0 for loop in loops])
+
+
 def within(world: "World", loops: list[np.ndarray]) -> np.ndarray:
     """Return the number of the loop that each particle is in, (n,), or -1.
 
@@ -47,14 +53,14 @@ def within(world: "World", loops: list[np.ndarray]) -> np.ndarray:
 
 
 class Fill:
-    """Lines that fill bodies: their outlines, moved inwards step by step.
+    """Lines that fill bodies: their outlines, moved inwards step by step, and for rounded ones the outline itself.
 
-    loops: particles around each body, counterclockwise. x: their positions at first, which set the widths of lines. hues: colours
-    of particles, (n, 3). body: for each link inside a body the number of the body, (m,); the link's strain shows in the colour,
-    from 1 % on.
+    loops: particles around each body, counterclockwise. x: their positions at first, which set the widths of lines. rounding: by
+    how much each body is rounded, (loops,) [m]. hues: colours of particles, (n, 3). body: for each link inside a body the number
+    of the body, (m,); the link's strain shows in the colour, from 1 % on.
     """
 
-    def __init__(self, loops: list[np.ndarray], x: np.ndarray, hues: np.ndarray, body: np.ndarray):
+    def __init__(self, loops: list[np.ndarray], x: np.ndarray, rounding: np.ndarray, hues: np.ndarray, body: np.ndarray):
         size = np.array([len(loop) for loop in loops])
         self._corner = np.concatenate(loops)
         first = np.cumsum(size) - size
@@ -69,7 +75,10 @@ class Fill:
         middle = np.stack([np.bincount(self._owner, p[:, c]) / size for c in range(2)], axis=1)
         depth = np.einsum("ij,ij->i", middle[self._owner] - p, self._inwards(p))
         self._depth = np.maximum(np.minimum.reduceat(depth, first), 0.0)
-        self.radii = (self._depth * HALF[:, None]).ravel().astype(np.float32)
+        self._round = np.flatnonzero(rounding > 0)
+        self._rim = np.flatnonzero(np.repeat(rounding > 0, size + 1))
+        self._rim_ends = np.concatenate([[0], np.cumsum(size[self._round] + 1)])
+        self.radii = np.append(self._depth * HALF[:, None], rounding[self._round]).astype(np.float32)
         self._hues = SHADE * hues[self._corner[first]].astype(np.float64)
         self._body = body
 
@@ -86,9 +95,9 @@ class Fill:
         m = n[self._before]
         corner = (n + m) / np.maximum(1 + np.einsum("ij,ij->i", n, m), 2 / STEEP**2)[:, None]
         step = corner * self._depth[self._owner, None]
-        points = np.concatenate([(p + inset * step)[self._way] for inset in INSETS])
+        points = np.concatenate([*((p + inset * step)[self._way] for inset in INSETS), p[self._way[self._rim]]])
         turns = [self._ends[:-1] + k * self._ends[-1] for k in range(len(INSETS))]
-        return points.astype(np.float32), np.concatenate([*turns, [len(points)]])
+        return points.astype(np.float32), np.concatenate([*turns, len(INSETS) * self._ends[-1] + self._rim_ends])
 
     def colors(self, level: np.ndarray) -> np.ndarray:
         """Return RGBA of all lines as u32. level: the level of the strain of each link, (m,); each body shows its worst."""
@@ -99,7 +108,8 @@ class Fill:
             share = np.maximum(0, 3 * (most >> 1) / LEVELS - 2)[:, None]
             hues = hues + share * (np.where((most & 1)[:, None], LONGER, SHORTER) - hues)
         rgb = np.rint(hues).astype(np.uint32)
-        return np.tile(rgb[:, 0] << 24 | rgb[:, 1] << 16 | rgb[:, 2] << 8 | np.uint32(255), len(INSETS))
+        packed = rgb[:, 0] << 24 | rgb[:, 1] << 16 | rgb[:, 2] << 8 | np.uint32(255)
+        return np.concatenate([np.tile(packed, len(INSETS)), packed[self._round]])
 
 
 def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
