@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from .device import runtime  # first: it sets variables that Taichi reads at import  # isort: skip
-from . import measure, shapes
+from . import checks, measure, shapes
 from .colliders import Ball, Box, Capsule, HalfSpace, Mesh, Polygon, Sdf
 from .constraints import (
     AngleLimit,
@@ -23,7 +23,7 @@ from .constraints import (
     Winch,
 )
 from .contact import Contact, Polygons
-from .device.runtime import init
+from .features.unknown_names import no_name
 from .forces import Attractor, Drag, Force, Gravity, Hand, PairForce, Wind
 from .neighbours import Periodic
 from .particles import Particles
@@ -46,6 +46,7 @@ __all__ = [
     "clamp", "golden", "golden_colors", "golden_index", "gradient", "init", "measure", "mix", "play", "replay", "runtime",
     "shapes", "smoothstep", "sweep",
 ]  # fmt: skip
+init = checks.answer_arguments(runtime.init)
 __version__ = "0.1.0"  # the only place where it is written
 
 
@@ -64,4 +65,8 @@ def __getattr__(name: str) -> Any:
         from .live import play
 
         return play
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    for part in (shapes, measure):
+        if name.lower() in part.__all__:
+            write = f"write tv.{part.__name__.rpartition('.')[2]}.{name.lower()}"
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}; {write}.")
+    raise no_name(__name__, name, __all__)

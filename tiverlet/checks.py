@@ -1,20 +1,26 @@
 """Argument checks, before Taichi reads anything. Errors name the argument, index and value, and say what to write instead."""
 
+import functools
+import inspect
 import math
 import numbers
 import os
 import sys
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+
+from .features.unknown_names import owners_of, suggest
 
 ANY = 2**31 - 1  # number of particles, while it is not yet known
 FEW = 16  # numbers that Python examines faster than NumPy, at most
 OF_SHAPE = {"position": "position", "pairs": "links", "triples": "bends", "quads": "quads", "loops": "loops"}  # by argument
 
+Kind = TypeVar("Kind", bound=type)
+Function = TypeVar("Function", bound=Callable[..., Any])
 PACKAGE = str(Path(__file__).parent) + os.sep
 
 
@@ -217,3 +223,55 @@ def group_pair(who: str, name: str, pair: Any, what: str = "") -> tuple[int, int
     if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and all(isinstance(k, (int, np.integer)) for k in pair)):
         raise TypeError(f"{who}: {name} has {what}{pair!r}, but a pair of groups such as (0, 1) is needed.")
     return int(pair[0]), int(pair[1])
+
+
+def answer_calls(kind: Kind) -> Kind:
+    """Decorate a class: answer_arguments() for its __init__ and its public methods."""
+    for name, value in list(vars(kind).items()):
+        if inspect.isfunction(value) and (name == "__init__" or not name.startswith("_")):
+            setattr(kind, name, answer_arguments(value))
+    return kind
+
+
+def answer_arguments(function: Function) -> Function:
+    """Decorate a function: calling it with arguments that it does not take raises a TypeError that says which are meant.
+
+    A call costs 0.1 us more.
+    """
+
+    @functools.wraps(function)
+    def answering(*args, **kwargs):
+        """Call it. Only where that fails are the arguments compared with those that it takes."""
+        try:
+            return function(*args, **kwargs)
+        except TypeError:
+            if words := _misfit(function, args, kwargs):
+                raise TypeError(words) from None
+            raise
+
+    return answering  # type: ignore[return-value]
+
+
+def _misfit(function: Callable[..., Any], args: tuple, kwargs: dict[str, Any]) -> str:
+    """Return why arguments do not fit a function; empty if they do."""
+    signature = inspect.signature(function)
+    try:
+        signature.bind(*args, **kwargs)
+        return ""
+    except TypeError as e:
+        reason = str(e)
+    takes, who = dict(signature.parameters), function.__qualname__
+    owners, given = [who], len(args)
+    if "self" in takes:
+        del takes["self"]
+        given -= 1
+    if function.__name__ == "__init__":
+        who, owners = type(args[0]).__name__, owners_of(type(args[0]))
+    listed = f"It takes {', '.join(takes)}." if takes else "It takes no arguments."
+    if unknown := [name for name in kwargs if name not in takes]:
+        return f"{who}: there is no {unknown[0]}{suggest(unknown[0], owners, takes)} {listed}"
+    places = [name for name, p in takes.items() if p.kind is p.POSITIONAL_OR_KEYWORD]
+    if given > len(places):
+        named = ", ".join(f"{name}=" for name in takes if name not in places)
+        return f"{who}: {given} arguments, but {len(places)} without a name{f'; write {named} before others' if named else ''}."
+    return f"{who}: {reason}. {listed}"

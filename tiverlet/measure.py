@@ -1,15 +1,20 @@
 """Physical quantities of a scene, computed from plain arrays in f64: for tests and reports."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .features.unknown_names import no_name
 from .neighbours.queries import between
 from .particles.spin import moments_of_inertia
 
 if TYPE_CHECKING:
     from .neighbours import Periodic
     from .world import World
+
+__all__ = [
+    "angular_momentum", "center_of_mass", "kinetic_energy", "moment_sum", "momentum", "overlapping", "strain", "torque",
+]  # fmt: skip
 
 
 def kinetic_energy(world: "World") -> float:
@@ -102,3 +107,10 @@ def _spin(world: "World") -> np.ndarray:
 def _mass(world: "World") -> np.ndarray:
     p = world.particles
     return np.where(p.inv_mass > 0, p.mass, 0.0)
+
+
+if not TYPE_CHECKING:  # type checkers know which names there are
+
+    def __getattr__(name: str) -> Any:
+        """Raise an AttributeError that says which name is meant."""
+        raise no_name(__name__, name, __all__)

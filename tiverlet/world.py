@@ -16,9 +16,9 @@ from .contact.rays import Hits, inside, ray
 from .contact.touches import ContactEvents, Told, joined, joined_events, no_events
 from .device.copies import Copies
 from .device.interrupts import deferred_signals
-from .features.arguments import suggest_name
 from .features.feature import Acceleration, Batch, Feature
 from .features.read_only import assign_whole_advice, read_only, structure_advice
+from .features.unknown_names import answer_names, suggest
 from .neighbours.queries import Contacts, PointSearch, near_by_brute_force, nearest
 from .particles import Particles, at_rest, in_range, spin_of
 from .solvers.jacobi import Jacobi
@@ -38,6 +38,8 @@ from .step.step_report import StepReport
 LIVE = ("position", "velocity", "spin", "substeps", "iterations")
 
 
+@answer_names
+@checks.answer_calls
 class World:
     """A scene: particles, the features that act on them, and the time step.
 
@@ -786,9 +788,9 @@ class World:
 
     def __setattr__(self, name: str, value) -> None:
         if not name.startswith("_") and name not in LIVE:
-            guess = "" if hasattr(self, name) else suggest_name(name, LIVE)
+            guess = "." if hasattr(self, name) else suggest(name, ["World"], LIVE)
             raise AttributeError(
-                f"World.{name} cannot be set{guess}. Live are {', '.join(LIVE[:-1])} and {LIVE[-1]}, and the knobs of the "
+                f"World.{name} cannot be set{guess} Live are {', '.join(LIVE[:-1])} and {LIVE[-1]}, and the knobs of the "
                 "features; everything else is structure, fixed when the world is built."
             )
         object.__setattr__(self, name, value)

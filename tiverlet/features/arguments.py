@@ -5,19 +5,18 @@ underscore can be set: the rest of an object is compiled into kernels. The objec
 self._keep(name=value). Arrays become read-only, since kernels would not see values written to them.
 """
 
-import difflib
 import functools
 import inspect
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
+from .. import checks
 from ..device import at
 from ..device.language import inside_kernel
 from .read_only import as_read_only, assign_whole_advice, structure_advice
-
-TAKEN_BY = {"one_way": "Capsule, Polygon and Mesh"}  # arguments that only some features of a kind take
+from .unknown_names import owners_of, suggest
 
 
 class Knob:
@@ -77,7 +76,7 @@ def record_arguments(kind: Any) -> None:
     live = tuple(name for name, value in vars(kind).items() if isinstance(value, Knob))
     kind.host_only = (*vars(kind).get("host_only", ()), *live)  # kernels contain only the values in compiled()
     if "__init__" in vars(kind):
-        kind.__init__ = _recording(kind.__init__)
+        kind.__init__ = _recording(checks.answer_arguments(kind.__init__))
 
 
 def set_attribute(thing: Any, name: str, value: Any) -> None:
@@ -116,7 +115,7 @@ def _refused(thing: Any, name: str) -> str:
             f"{thing!r}.{name} cannot be set: it is fixed when {kind.__name__} is made. {can}. For another {name} make "
             f"a new {kind.__name__}; in a world, world.remove(features=[old]) and world.add(features=[new])."
         )
-    return f"{thing!r} has no {name!r}{suggest_name(name, [*live, *given])}. {can}."
+    return f"{thing!r} has no {name!r}{suggest(name, owners_of(kind), [*live, *given])} {can}."
 
 
 @functools.cache
@@ -125,20 +124,12 @@ def knobs_of(kind: type) -> tuple[str, ...]:
     return tuple(name for name in dir(kind) if isinstance(getattr(kind, name, None), Knob))
 
 
-def suggest_name(name: str, names: Iterable[str]) -> str:
-    """Guess which name a misspelt one meant, as the end of a sentence; empty if no name is similar."""
-    near = difflib.get_close_matches(name, [*names], 1)
-    return f"; did you mean {near[0]!r}?" if near else ""
-
-
 def _recording(init):
     signature = inspect.signature(init)
 
     @functools.wraps(init)
     def recorded(self, *args, **kwargs):
         """Run the original __init__, and keep its arguments."""
-        for name in (kwargs.keys() - signature.parameters.keys()) & TAKEN_BY.keys():
-            raise TypeError(f"{type(self).__name__}: there is no {name}. {TAKEN_BY[name]} take it.")
         args, kwargs = _frozen(args), _frozen(kwargs)
         init(self, *args, **kwargs)
         if type(self).__init__ is recorded:  # not in the __init__ of a base class, called by a subclass

@@ -35,6 +35,7 @@ from ..device.number import Number
 from .arguments import Knob as Knob
 from .arguments import keep, knobs_of, record_arguments, refuse_deletion, set_attribute, state_alone
 from .read_only import as_read_only, assign_whole_advice
+from .unknown_names import answer_names
 
 if TYPE_CHECKING:
     from ..device.memory import Memory
@@ -79,6 +80,7 @@ class Scene:
         return self.memory.real
 
 
+@answer_names
 class Feature:
     """The base class of all features.
 

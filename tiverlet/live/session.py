@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .. import checks
 from ..constraints import Pin
 from ..contact import Polygons
 from ..features.feature import Batch
@@ -201,6 +202,7 @@ def _structure(world: "World") -> list[Any]:
     return out
 
 
+@checks.answer_arguments
 def play(
     world: "World", *, record: str | os.PathLike | None = None, each_frame: Callable[["World"], None] | None = None,
     title: str = "tiverlet", port: int = 0, browser: bool = True,

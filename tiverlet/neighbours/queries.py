@@ -6,12 +6,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..device import ti
+from ..features.unknown_names import answer_names
 
 if TYPE_CHECKING:
     from .neighbour_search import NeighbourSearch
     from .periodic import Periodic
 
 
+@answer_names
 @dataclass(frozen=True)
 class Contacts:
     """Contacts: pairs that overlap now, or were pushed apart in the last substep.

@@ -4,12 +4,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import checks
-from ..features.arguments import suggest_name
 from ..features.read_only import read_only, structure_advice
+from ..features.unknown_names import answer_names, no_attribute
 
 LARGEST = 1e15  # [m] squared lengths up to 1e30 leave room below the largest f32, 3e38
 
 
+@answer_names
+@checks.answer_calls
 class Particles:
     """n point masses with optional radii: the initial state of a world, and its structure.
 
@@ -124,7 +126,7 @@ class Particles:
     def __setattr__(self, name: str, value) -> None:
         if getattr(self, "_fixed", False):
             if not hasattr(self, name):
-                raise AttributeError(f"Particles has no {name!r}{suggest_name(name, vars(self))}. All of it is structure.")
+                raise no_attribute(self, name)
             raise AttributeError(
                 f"Particles.{name} is structure, fixed when a world is built. Make new Particles for a new world; "
                 "to move particles assign to world.position or world.velocity."

@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import checks
 from ..device import interrupts
+from ..features.unknown_names import answer_names
 from ..step import checkpoint
 from ..step.explain import explain
 from ..world import World
@@ -29,6 +30,8 @@ SPARSE = 300  # frames after which an exact state is written in any case
 RESERVE = 40_000  # bytes of a budget reserved for the layout and the summary
 
 
+@answer_names
+@checks.answer_calls
 class Recorder:
     """Writes frames of a world to an .rrd file, and everything needed to compute them again, bit for bit.
 

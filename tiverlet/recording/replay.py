@@ -14,6 +14,7 @@ import numpy as np
 from .. import checks
 from ..device import runtime
 from ..device.language import NAMES
+from ..features.unknown_names import answer_names
 from ..shapes import Shape
 from ..step import checkpoint
 from ..step.clock import Clock
@@ -81,6 +82,8 @@ def _with_clear_errors(function):
     return guarded
 
 
+@answer_names
+@checks.answer_calls
 class Replay:
     """A recording read from a file. See replay()."""
 
@@ -376,6 +379,7 @@ class Replay:
         return exports.export(self, os.fspath(path), shape)
 
 
+@checks.answer_arguments
 def replay(path, given: Iterable[Any] | Mapping[str, Any] = ()) -> Replay:
     """Read a recording that a Recorder has written.
 

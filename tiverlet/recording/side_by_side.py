@@ -10,6 +10,7 @@ import numpy as np
 
 from .. import checks
 from ..device import interrupts
+from ..features.unknown_names import answer_names
 from ..world import World
 from ..worlds.worlds import Worlds
 from . import scene
@@ -20,6 +21,8 @@ MOST = 64  # most views in a recording
 FEW = 9  # views by default
 
 
+@answer_names
+@checks.answer_calls
 class WorldsRecorder:
     """Writes some of many worlds to an .rrd file as a grid of views, all at the same scale and time.
 

@@ -1,5 +1,8 @@
 """Ready-made bodies as plain arrays: positions to put into Particles, and index tuples to put into constraints."""
 
+from typing import TYPE_CHECKING, Any
+
+from ..features.unknown_names import no_name
 from .files import load, save
 from .lines import bridge, chain, rope, tree
 from .people import ragdoll
@@ -26,3 +29,9 @@ __all__ = [
     "tree",
     "truss",
 ]
+
+if not TYPE_CHECKING:  # type checkers know which names there are
+
+    def __getattr__(name: str) -> Any:
+        """Raise an AttributeError that says which name is meant."""
+        raise no_name(__name__, name, __all__)

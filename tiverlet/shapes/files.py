@@ -15,6 +15,7 @@ _TYPES = {
 }  # fmt: skip
 
 
+@checks.answer_arguments
 def load(path, dim: int = 3) -> Shape:
     """Read a body from an .obj or .ply file (ascii or binary): vertices, edges, faces, and tetrahedra if there are any.
 
@@ -45,6 +46,7 @@ def load(path, dim: int = 3) -> Shape:
     return Shape(position[:, :dim], edges, faces=faces, quads=quads, tetrahedra=cells, polygons=polygons, uv=uv)
 
 
+@checks.answer_arguments
 def save(path, shape: Shape, binary: bool = True) -> None:
     """Write a body to an .obj or .ply file: position, links, faces and (PLY) tetrahedra.
 

@@ -12,6 +12,7 @@ def _in_line(n: int) -> dict:
     return {"links": np.stack([i[:-1], i[1:]], axis=1), "bends": np.stack([i[:-2], i[1:-1], i[2:]], axis=1)}
 
 
+@checks.answer_arguments
 def rope(start, end, points: int) -> Shape:
     """Make `points` particles in a straight line from `start` to `end` [m], both included, each linked to the next."""
     checks.integer("rope", "points", points, least=2)
@@ -20,6 +21,7 @@ def rope(start, end, points: int) -> Shape:
     return Shape(a * (1 - amount) + b * amount, **_in_line(points))
 
 
+@checks.answer_arguments
 def chain(start, end, length: float, points: int) -> Shape:
     """Make a chain of a given length that hangs from `start` to `end` along its catenary, gravity along -y.
 
@@ -50,6 +52,7 @@ def chain(start, end, length: float, points: int) -> Shape:
     return Shape(position, **_in_line(points))
 
 
+@checks.answer_arguments
 def bridge(start, end, panels: int, height: float) -> Shape:
     """Make a truss bridge: a deck of `panels` panels from `start` to `end` [m], and a chord above it, joined by a zigzag."""
     checks.integer("bridge", "panels", panels, least=1)
@@ -63,6 +66,7 @@ def bridge(start, end, panels: int, height: float) -> Shape:
     return Shape(np.concatenate([deck, (deck[1:] + deck[:-1]) / 2 + up]), np.concatenate(links))
 
 
+@checks.answer_arguments
 def tree(root, height: float, levels: int = 4, branches: int = 2, segments: int = 4, spread: float = 0.6) -> Shape:
     """Make a plant: a stem of `segments` links that splits into `branches` shorter ones, and so on for `levels` levels.
 

@@ -24,6 +24,7 @@ _TURNS = [
 ]  # fmt: skip
 
 
+@checks.answer_arguments
 def ragdoll(feet, height: float = 1.8) -> Shape:
     """Make a figure of 16 points that stands upright at `feet` [m]: in 2D from the side, facing +x, or in 3D.
 

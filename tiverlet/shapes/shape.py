@@ -5,12 +5,14 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 
 from .. import checks
+from ..features.unknown_names import answer_names
 
 
 def _none(width: int):
     return field(default_factory=lambda: np.zeros((0, width), dtype=np.int64))
 
 
+@answer_names
 @dataclass(frozen=True)
 class Shape:
     """Points, and tuples of indices into them, one tuple per constraint. Parts that a body does not have are empty.

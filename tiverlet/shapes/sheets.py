@@ -6,6 +6,7 @@ from .. import checks
 from .shape import Shape, point, quads_of
 
 
+@checks.answer_arguments
 def cloth(corner, along, across, points: tuple[int, int], *, shear: bool = True, bend: bool = True) -> Shape:
     """Make a sheet of points[0] x points[1] particles from `corner`, spanned by vectors `along` and `across` [m], in 2D or 3D.
 
@@ -43,6 +44,7 @@ def cloth(corner, along, across, points: tuple[int, int], *, shear: bool = True,
     return Shape(position, links, np.concatenate(braces), bends, faces=faces, quads=quads)
 
 
+@checks.answer_arguments
 def net(corner, along, across, points: tuple[int, int]) -> Shape:
     """Make a sheet as cloth() does, with only the links between neighbours."""
     sheet = cloth(corner, along, across, points, shear=False, bend=False)

@@ -12,6 +12,7 @@ SHAKE = 1e-7  # of the size of a body: far above rounding, far below any triangl
 FLAT = 8 * SHAKE  # of it: triangles that are lower are points on a line
 
 
+@checks.answer_arguments
 def polygon(center, radius: float, sides: int) -> Shape:
     """Make a regular polygon of `sides` particles around `center` in 2D: a rim with its loop."""
     middle = checks.vector("polygon", "center", center, 2)
@@ -23,6 +24,7 @@ def polygon(center, radius: float, sides: int) -> Shape:
     return Shape(middle + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1), links, bends=bends, loops=(k,))
 
 
+@checks.answer_arguments
 def ball(center, radius: float, rings: int = 3) -> Shape:
     """Make a filled round body in 2D or 3D: a lattice with `rings` shells, which are bent into circles or spheres.
 
@@ -95,6 +97,7 @@ def _solid(position: np.ndarray, cells: np.ndarray) -> Shape:
     return Shape(position, edges_of(cells), faces=faces, quads=quads_of(faces), tetrahedra=cells)
 
 
+@checks.answer_arguments
 def truss(lower, upper, cells) -> Shape:
     """Make a box between two corners [m], with `cells` cells along each axis, in 2D or 3D.
 
@@ -122,6 +125,7 @@ def truss(lower, upper, cells) -> Shape:
     return Shape(position, links, braces, faces=faces, quads=quads_of(faces), tetrahedra=simplices)
 
 
+@checks.answer_arguments
 def balloon(center, radius: float, level: int = 2) -> Shape:
     """Make a hollow sphere in 3D: an icosahedron with each face cut into four, `level` times.
 
@@ -154,6 +158,7 @@ def balloon(center, radius: float, level: int = 2) -> Shape:
     return Shape(x, edges_of(faces), faces=faces, quads=quads_of(faces))
 
 
+@checks.answer_arguments
 def blob(outline, spacing: float) -> Shape:
     """Make a body of any outline in 2D, filled with particles about `spacing` [m] apart.
 
@@ -226,6 +231,7 @@ def _delaunay(points: np.ndarray) -> np.ndarray:
     return triangles[u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] > FLAT * size * np.maximum(np.hypot(*u.T), np.hypot(*v.T))]
 
 
+@checks.answer_arguments
 def pile(lower, upper, radius) -> Shape:
     """Make loose discs or spheres that fill a box without touching, ready to fall.
 

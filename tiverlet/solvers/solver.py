@@ -9,6 +9,7 @@ import numpy as np
 from ..device import ti
 from ..features.arguments import keep, record_arguments, refuse_deletion, set_attribute
 from ..features.feature import Batch, Scene
+from ..features.unknown_names import answer_names
 from .elimination import plan_of
 from .system import solvable
 
@@ -38,6 +39,7 @@ class SemiIteration:
         return correction
 
 
+@answer_names
 class Solver:
     """How the constraints of a world are solved.
 

@@ -4,11 +4,14 @@ import re
 from dataclasses import dataclass, field
 from typing import Any
 
+from ..features.unknown_names import answer_names
+
 UNCONVERGED = 0.1  # residual above which a frame is flagged "unconverged"
 FIGURE = re.compile(r"\d[^ ,;:]*")  # notes that differ by figures only are of one kind
 COMPRESSED = 0.05  # overlap from one frame to the next above which it is flagged "compressed", in radii; piles have 0.01
 
 
+@answer_names
 @dataclass(frozen=True)
 class StepReport:
     """The report of the frame that world.step() has just finished.

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .. import checks
 from ..world import World
 from .worlds import Worlds
 
@@ -20,6 +21,7 @@ class Gradient(NamedTuple):
     derivative: dict[str, Any]
 
 
+@checks.answer_arguments
 def gradient(
     make: Callable[..., World],
     parameters: Mapping[str, Any],

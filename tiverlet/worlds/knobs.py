@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..features.arguments import knobs_of, suggest_name
+from ..features.arguments import knobs_of
 from ..features.feature import Feature
+from ..features.unknown_names import owners_of, suggest
 
 if TYPE_CHECKING:
     from ..world import World
@@ -57,9 +58,8 @@ class Knobs:
         for name, values in knobs.items():
             if name not in knobs_of(type(f)):
                 live = ", ".join(knobs_of(type(f))) or "nothing"
-                raise AttributeError(
-                    f"Worlds.set: {name} is no knob of {f!r}{suggest_name(name, knobs_of(type(f)))}. Live are {live}."
-                )
+                guess = suggest(name, owners_of(type(f)), knobs_of(type(f)))
+                raise AttributeError(f"Worlds.set: {name} is no knob of {f!r}{guess} Live are {live}.")
             one = not isinstance(values, (list, tuple)) and np.ndim(values) == 0
             if one or len(values) != len(chosen):
                 has = "one value" if one else f"{len(values)} values"

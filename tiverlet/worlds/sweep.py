@@ -51,6 +51,7 @@ class SweepResult(dict[str, np.ndarray]):
         return f"SweepResult({figures}{again})"
 
 
+@checks.answer_arguments
 def sweep(
     make: Callable[..., World], parameters: Mapping[str, Any] | Iterable[Mapping[str, Any]],
     figures: Callable[[Any], Mapping[str, Any]], executor: Any = None, at_once: int = 256, progress: bool = False,

@@ -13,9 +13,10 @@ from ..device import runtime
 from ..device.copies import Copies
 from ..device.interrupts import deferred_signals
 from ..device.patches.compiler import CachedLaunch
-from ..features.arguments import knobs_of, suggest_name
+from ..features.arguments import knobs_of
 from ..features.feature import Feature
 from ..features.read_only import assign_whole_advice, read_only
+from ..features.unknown_names import answer_names, suggest
 from ..particles import in_range
 from ..step import checkpoint, energy_bound, impulse
 from ..step import frames as kernel
@@ -42,6 +43,8 @@ class Rollout(NamedTuple):
     report: WorldsReport
 
 
+@answer_names
+@checks.answer_calls
 class Worlds:
     """Copies of a world, or worlds that differ in numbers only, stepped in one launch.
 
@@ -721,8 +724,8 @@ class Worlds:
 
     def __setattr__(self, name: str, value: Any) -> None:
         if not name.startswith("_") and name not in LIVE:
-            guess = "" if hasattr(self, name) else suggest_name(name, LIVE)
-            raise AttributeError(f"Worlds.{name} cannot be set{guess}. Live are {', '.join(LIVE)}, and knobs by set().")
+            guess = "." if hasattr(self, name) else suggest(name, ["Worlds"], LIVE)
+            raise AttributeError(f"Worlds.{name} cannot be set{guess} Live are {', '.join(LIVE)}, and knobs by set().")
         object.__setattr__(self, name, value)
 
     def __reduce_ex__(self, protocol):

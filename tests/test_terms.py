@@ -1,0 +1,224 @@
+"""Names from other programs, read or passed: errors say what they are called here, and what they say exists."""
+
+import inspect
+import re
+from typing import Any
+
+import pytest
+
+import tiverlet as tv
+from tiverlet.contact.pair_contact import PairContact
+from tiverlet.features.feature import Batch, Feature
+from tiverlet.features.terms import ROWS, TERMS
+from tiverlet.neighbours.queries import Contacts
+from tiverlet.recording.replay import Replay
+
+X, LINK, CORNERS = [[0.0, 0.0], [1.0, 0.0]], [[0, 1]], ((0.0, 0.0), (1.0, 1.0))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Return a world whose attributes are read, and never one that fails."""
+    start, walls = tv.Particles(X, radius=0.1, orientation=0.0), [tv.Contact(), tv.HalfSpace((0, 1), -1.0)]
+    w = tv.World(start, [tv.Gravity(), tv.Distance(LINK), *walls])
+    w.step(0.01)
+    yield w
+    w.close()
+
+
+@pytest.mark.parametrize(
+    "name, words",
+    [
+        # Box2D, pymunk, matter.js
+        ("Space", r"write tv.World\(particles, features\)"),
+        ("Engine", r"write tv.World\("),
+        ("Body", r"write tv.Particles\(position"),
+        ("RigidBody", r"tv.ShapeMatch\(clusters\) or tv.Polygons\(loops\)"),
+        ("Circle", r"write tv.Particles\(position, radius="),
+        ("Segment", r"write tv.Capsule\(a, b, radius\)"),
+        ("DampedSpring", r"write tv.Distance\(pairs, rest, compliance=1 / stiffness"),
+        ("Spring", r"write tv.Distance\(pairs, rest, compliance=1 / stiffness"),
+        ("DistanceJoint", r"write tv.Distance\(pairs\)"),
+        ("RopeJoint", r"write tv.Rope\(pairs, length\)"),
+        ("RevoluteJoint", r"write tv.Pin\(indices\)"),
+        ("PrismaticJoint", r"write tv.Path\(indices, points\)"),
+        ("MouseConstraint", r"write tv.Hand\(target\)"),
+        ("SimpleMotor", r"write tv.Motor\(hinges, speed\)"),
+        ("Bounds", r"write tv.Box\(lower, upper\)"),
+        # MuJoCo, LAMMPS, Taichi, Warp
+        ("Plane", r"write tv.HalfSpace\(normal, offset\)"),
+        ("Sphere", r"tv.Ball\(center, radius\)"),
+        ("Mesh_", "did you mean 'Mesh'"),
+        ("LennardJones", r"write tv.PairForce\(function, radius\)"),
+        ("backend", r"write tv.init\(arch="),
+        ("load", r"tv.shapes.load"),
+        ("save", r"write tv.Recorder\(path, world\)|tv.shapes.save"),
+        # Blender
+        ("SoftBody", r"write tv.ShapeMatch\(clusters, compliance="),
+        ("Cloth", r"write tv.shapes.cloth"),
+        ("Collision", r"write tv.Contact\(friction, restitution\)"),
+        ("ForceField", r"write tv.Force\(function\)"),
+        ("Distnace", "did you mean 'Distance'"),
+        ("kinetic_energy", r"write tv.measure.kinetic_energy"),
+    ],
+)
+def test_a_name_of_the_package_is_answered(name, words):
+    with pytest.raises(AttributeError, match=words):
+        getattr(tv, name)
+
+
+@pytest.mark.parametrize(
+    "read, words",
+    [
+        (lambda w: w.mass, "write world.particles.mass"),
+        (lambda w: w.energy, "write world.last.energy"),
+        (lambda w: w.kinetic_energy, r"write tv.measure.kinetic_energy\(world\)"),
+        (lambda w: w.gravity, "it is a feature"),
+        (lambda w: w.pos, "write world.position"),
+        (lambda w: w.GetPosition, "did you mean 'position'"),
+        (lambda w: w.x, "write world.position"),
+        (lambda w: w.angularVelocity, "write world.spin"),
+        (lambda w: w.rotation, "write world.orientation"),
+        (lambda w: w.dt, r"write world.step\(dt\)"),
+        (lambda w: w.bodies, "read world.features"),
+        (lambda w: w.CreateBody, r"write world.add\(particles"),
+        (lambda w: w.add_particles, r"write world.add\(particles"),
+        (lambda w: w.simulate, r"write world.step\(dt\)"),
+        (lambda w: w.apply_force, r"write tv.Force\(function\)"),
+        (lambda w: w.apply_impulse, "world.velocity = velocity"),
+        (lambda w: w.raycast, r"write world.ray\("),
+        (lambda w: w.save, r"write tv.Recorder\(path, world\)"),
+        (lambda w: w.num_particles, r"write len\(world.particles\)"),
+        (lambda w: w.stpe, "did you mean 'step'"),
+        (lambda w: w.particles.masses, "did you mean 'mass'"),
+        (lambda w: w.particles.fixed, "write pinned"),
+        (lambda w: w.particles.restitution, r"write tv.Contact\(friction=..., restitution="),
+        (lambda w: w.features[1].stiffness, "write compliance = 1 / stiffness"),
+        (lambda w: w.features[1].rest_length, "write rest"),
+        (lambda w: w.features[1].tension, "write load"),
+        (lambda w: w.features[0].direction, r"write tv.Gravity\(\(0, -9.81\)\)"),
+        (lambda w: w.features[2].forces, "write world.contacts"),
+        (lambda w: w.features[3].elasticity, "write restitution"),
+        (lambda w: w.last.kinetic_energy, r"write tv.measure.kinetic_energy\(world\)"),
+        (lambda w: w.last.penetration, "write overlap"),
+        (lambda w: w.last.converged, "write clean, flags and notes"),
+        (lambda w: w.contacts.depth, "write overlap"),
+        (lambda w: tv.shapes.rope((0, 0), (1, 0), 3).edges, "write links"),
+        (lambda w: tv.shapes.rope((0, 0), (1, 0), 3).vertices, "write position"),
+        (lambda w: tv.shapes.Rope, "did you mean 'rope'"),
+        (lambda w: tv.measure.potential_energy, "write world.last.energy"),
+        (lambda w: tv.Worlds(w, 2).num_envs, r"write len\(worlds\)"),
+        (lambda w: setattr(w, "gravity", (0, -1)), "cannot be set; it is a feature"),
+        (lambda w: setattr(w.features[1], "stiffness", 5.0), "write compliance = 1 / stiffness. Live are"),
+    ],
+)
+def test_an_attribute_is_answered(scene, read, words):
+    with pytest.raises(AttributeError, match=words):
+        read(scene)
+
+
+@pytest.mark.parametrize(
+    "call, words",
+    [
+        (lambda w: tv.Distance(LINK, stiffness=100.0), "write compliance = 1 / stiffness. It takes pairs, rest, compliance"),
+        (lambda w: tv.Distance(LINK, rest_length=1.0), "write rest"),
+        (lambda w: tv.Distance(LINK, frequencyHz=4.0), "write compliance = 1 / "),
+        (lambda w: tv.Distance(LINK, max_force=4.0), "write break_at"),
+        (lambda w: tv.Distance(body_a=0, body_b=1), "its first argument has the indices"),
+        (lambda w: tv.Rope(LINK, max_length=1.0), "write length"),
+        (lambda w: tv.Box(*CORNERS, elasticity=0.5), "write restitution"),
+        (lambda w: tv.Box(*CORNERS, bounce=0.5), "write restitution"),
+        (lambda w: tv.Box(*CORNERS, mass=1.0), "walls have no mass"),
+        (lambda w: tv.Box(*CORNERS, one_way=(0, 1)), "Capsule, Polygon and Mesh take it"),
+        (lambda w: tv.Box(min=(0, 0), max=(1, 1)), "write lower"),
+        (lambda w: tv.Box(width=2.0, height=1.0), r"write its corners: tv.Box\(lower, upper\)"),
+        (lambda w: tv.HalfSpace((0, 1), point=(0, 0)), "write offset"),
+        (lambda w: tv.Ball((0, 0), r=1.0), "write radius"),
+        (lambda w: tv.Capsule(start=(0, 0), end=(1, 0), radius=0.1), "write a"),
+        (lambda w: tv.Contact(stiffness=1e5), "contacts are rigid"),
+        (lambda w: tv.Contact(bounce=0.3), "write restitution"),
+        (lambda w: tv.Contact(mu=0.3), "write friction"),
+        (lambda w: tv.Contact(0.3, 0.5, 0.1), "3 arguments, but 2 without a name; write skin=, groups="),
+        (lambda w: tv.Gravity(y=-9.81), r"write tv.Gravity\(\(0, -9.81\)\)"),
+        (lambda w: tv.Drag(damping=0.1), "write rate"),
+        (lambda w: tv.Attractor((0, 0), mass=3.0), "write strength"),
+        (lambda w: tv.Wind(direction=(1, 0), rate=1.0), "write velocity"),
+        (lambda w: tv.Particles(X, velocities=0.0), "write velocity|did you mean 'velocity'"),
+        (lambda w: tv.Particles(X, density=1000.0), r"write mass=density \* volume"),
+        (lambda w: tv.Particles(X, isStatic=True), r"It takes position, velocity, mass"),
+        (lambda w: tv.Particles(X, fixed=[0]), "write pinned"),
+        (lambda w: tv.Particles(X, restitution=0.5), r"write tv.Contact\("),
+        (lambda w: tv.Particles(X, angle=0.0), "write orientation"),
+        (lambda w: tv.Particles(X, charge=1.0), r"write tv.PairForce\(function\)"),
+        (lambda w: tv.Particles(X, 0.0), "2 arguments, but 1 without a name; write velocity=, mass="),
+        (lambda w: tv.Particles(), "missing a required argument: 'position'"),
+        (lambda w: tv.World(w.particles, gravity=(0, -9.81)), "it is a feature"),
+        (lambda w: tv.World(w.particles, dt=0.01), r"write world.step\(dt\)"),
+        (lambda w: tv.World(w.particles, constraints=[]), "are features"),
+        (lambda w: tv.World(w.particles, solver_iterations=4), "iterations="),
+        (lambda w: tv.World(w.particles, device="cuda"), r"write tv.init\(arch="),
+        (lambda w: tv.World(w.particles, sub_steps=4), "did you mean 'substeps'"),
+        (lambda w: w.step(1 / 60, iterations=4), "write world.substeps = 20 or world.iterations = 4"),
+        (lambda w: w.step(timestep=1 / 60), "write dt"),
+        (lambda w: w.run(steps=100), r"write world.run\(seconds, dt\)"),
+        (lambda w: w.run(1.0, record="a.rrd"), "write recorder="),
+        (lambda w: w.run(), "missing a required argument: 'seconds'"),
+        (lambda w: w.hash(1), "1 arguments, but 0 without a name"),
+        (lambda w: tv.Recorder("a.rrd", w, fps=30), "write every="),
+        (lambda w: tv.init(device="cuda"), 'write arch="cuda"'),
+        (lambda w: tv.init(num_threads=4), "write threads="),
+        (lambda w: tv.shapes.rope((0, 0), (1, 0), segments=10), "write points. It takes start, end, points"),
+        (lambda w: tv.Jacobi(omega=1.5), "It takes relaxation, loads"),
+    ],
+)
+def test_an_argument_is_answered(scene, call, words):
+    with pytest.raises(TypeError, match=words):
+        call(scene)
+
+
+def test_an_error_inside_of_a_call_stays_what_it_is(scene):
+    # A call that fits raises its own TypeError, and a knob that waits for its world says so.
+    with pytest.raises(TypeError, match="dt = 'x' is a str"):
+        scene.step("x")
+    with pytest.raises(AttributeError, match="has no rest before it is in a World"):
+        _ = tv.Distance(LINK).rest
+    assert str(inspect.signature(tv.Drag)) == "(rate)" and not hasattr(scene, "__array__")
+
+
+OWNERS: dict[str, Any] = {
+    "Feature": Feature, "Batch": Batch, "PairContact": PairContact, "Contacts": Contacts, "Replay": Replay, "tiverlet": tv,
+    "tiverlet.measure": tv.measure, "Collider": tv.Box.__mro__[2], "Shape": tv.shapes.Shape,
+}  # fmt: skip
+
+
+def owner(name: str) -> Any:
+    """Return the class, module or function that a table of terms belongs to."""
+    if name in OWNERS:
+        return OWNERS[name]
+    kind, _, method = name.partition(".")
+    found = getattr(tv, kind, None) or getattr(tv.shapes, kind)
+    return getattr(found, method) if method else found
+
+
+def names_of(thing: Any) -> set[str]:
+    """Return the names that exist: arguments of a call, or attributes where nothing is called."""
+    plain = inspect.ismodule(thing) or "__init__" not in vars(thing) and not inspect.isfunction(thing)
+    return {n for n in {*dir(thing), *vars(thing)} if not n.startswith("_")} if plain else {*inspect.signature(thing).parameters}
+
+
+@pytest.mark.parametrize("name", TERMS)
+def test_terms_are_of_others_and_their_answers_exist(name, scene):
+    rows = [(names, clause) for owners, rows in ROWS.items() if name in owners.split() for names, clause in rows.items()]
+    asked = [one for names, _ in rows for one in names.split()]
+    assert len({*asked}) == len(asked) and not {*asked} & names_of(owner(name))  # no name twice, and none that exists
+    for _, clause in rows:
+        for path, arguments in re.findall(r"\btv\.([\w.]*\w)(?:\(((?:[^()]|\([^()]*\))*)\))?", clause):
+            thing = tv
+            for part in path.split("."):
+                thing = getattr(thing, part)
+            for keyword in re.findall(r"(\w+)=(?!=)", re.sub(r"\btv\.\w+\([^()]*\)", "", arguments)):
+                assert keyword in inspect.signature(thing).parameters, clause
+        for place in re.findall(r"\bworld\.([\w.]*\w)", clause):
+            thing = scene
+            for part in place.split("."):
+                thing = getattr(thing, part)

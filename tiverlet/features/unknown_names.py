@@ -1,0 +1,59 @@
+"""Errors for names that do not exist, read or passed: they say which is meant, by terms of other programs and by spelling.
+
+Public classes are decorated by answer_names(), and by answer_calls() of checks.py, which answers arguments.
+"""
+
+import difflib
+from collections.abc import Iterable
+from typing import Any, TypeVar
+
+from .terms import TERMS, spelt
+
+Kind = TypeVar("Kind", bound=type)
+
+
+def suggest(name: str, owners: Iterable[str], names: Iterable[str]) -> str:
+    """Return what a name stands for, as the end of a sentence; a full stop if it resembles nothing.
+
+    owners: whose terms are looked up, in this order. names: those that exist.
+    """
+    wanted = spelt(name)
+    for owner in owners:
+        if clause := TERMS.get(owner, {}).get(wanted):
+            return f"; {clause}."
+    there = {spelt(n): n for n in names}
+    near = difflib.get_close_matches(wanted, there, 1)
+    return f"; did you mean {there[near[0]]!r}?" if near else "."
+
+
+def owners_of(kind: type) -> list[str]:
+    """Return the names of a class and of its base classes, whose terms hold for it."""
+    return [base.__name__ for base in kind.__mro__]
+
+
+def no_attribute(thing: Any, name: str) -> AttributeError:
+    """Return the error for an attribute that an object does not have."""
+    kind = type(thing)
+    guess = suggest(name, owners_of(kind), [n for n in [*vars(thing), *dir(kind)] if not n.startswith("_")])
+    return AttributeError(f"{kind.__name__} has no {name!r}{guess}", name=name, obj=thing)
+
+
+def no_name(module: str, name: str, names: Iterable[str]) -> AttributeError:
+    """Return the error for a name that a module does not have."""
+    guess = "" if name.startswith("_") else suggest(name, [module], names)
+    return AttributeError(f"module {module!r} has no attribute {name!r}{guess}", name=name)
+
+
+def answer_names(kind: Kind) -> Kind:
+    """Decorate a class: reading an attribute that it lacks says which one is meant."""
+    kind.__getattr__ = _missing  # type: ignore[attr-defined]
+    return kind
+
+
+def _missing(self: Any, name: str) -> Any:
+    """The __getattr__ of classes that answer names: called where nothing of that name was found."""
+    if name.startswith("_"):  # asked by Python, NumPy and Taichi for what few objects have
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
+    if hasattr(type(self), name):  # a property or a knob has raised it, and says why
+        return object.__getattribute__(self, name)
+    raise no_attribute(self, name)
