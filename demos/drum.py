@@ -23,7 +23,7 @@ def build(rolling: float = 0.1) -> tv.World:
     x = 1.7 * (tv.golden(np.arange(3 * GRAINS), dim=2) - 0.5)
     x = x[np.linalg.norm(x, axis=1) < 0.9][:GRAINS]
     radius = RADIUS * (0.85 + 0.3 * tv.golden(np.arange(GRAINS)))
-    grains = tv.Particles(x, radius=radius, mass=1000 * np.pi * radius**2, spin=0, orientation=0)
+    grains = tv.Particles(x, radius=radius, mass=1000 * np.pi * radius**2, spin=True, orientation=0)
     return tv.World(grains, [tv.Gravity(9.81), tv.Contact(friction=grip), drum], substeps=20)
 
 

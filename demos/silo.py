@@ -29,7 +29,7 @@ def build() -> tv.World:
     ground = np.stack([floor, np.full(len(floor), 0.0)], axis=1)
     start = tv.Particles(
         np.concatenate([x, ground]), radius=np.r_[radius, np.full(len(floor), RADIUS / 2)],
-        mass=np.r_[1000 * np.pi * radius**2, np.ones(len(floor))], pinned=np.arange(len(x), len(x) + len(floor)), spin=0,
+        mass=np.r_[1000 * np.pi * radius**2, np.ones(len(floor))], pinned=np.arange(len(x), len(x) + len(floor)), spin=True,
     )  # fmt: skip
     walls = [
         tv.Polygon(np.array([(0, 0), (0.1, 0), (0.1, 3.6), (0, 3.6)]) + (left, -0.01), friction=grip)

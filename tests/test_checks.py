@@ -94,6 +94,8 @@ def scene(*features, **kwargs):
         (lambda: tv.HalfSpace((0, 0)), ValueError, "no direction"),
         (lambda: tv.HalfSpace((0, 1), INF), ValueError, "offset = inf"),
         (lambda: tv.Gravity(NAN), ValueError, "g = nan"),
+        (lambda: tv.Gravity(-9.81), ValueError, r"g = -9.81, .* along -y: write 9.81, or \(0, 9.81\) for gravity that pulls up"),
+        (particles(spin=False, radius=1.0, orientation=0.0), ValueError, "spin = False, but orientation is for particles that"),
         (scene(tv.Gravity((0, 0, -9.81))), ValueError, r"g has shape \(3,\)"),
         (lambda: tv.Drag(-1), ValueError, "rate = -1, but it must be at least 0"),
         (lambda: tv.Wind((1, 0), NAN), ValueError, "rate = nan"),

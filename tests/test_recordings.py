@@ -3,6 +3,7 @@
 import json
 import os
 import pathlib
+import pickle
 import re
 import resource
 import signal
@@ -287,12 +288,41 @@ def test_a_full_disk_is_an_error_and_loses_nothing_that_was_written(world, tmp_p
         tv.Recorder(tmp_path, w)
 
 
+@pytest.mark.parametrize("name", ["film.mp4", "a.csv", "run.1"])
+def test_recordings_have_their_own_ending(world, tmp_path, name):
+    # Else the .rrd file that a film's name stands for is opened by no player, and by no viewer.
+    w, path = world(tv.Particles(np.eye(2)), [tv.Gravity(1.0)]), tmp_path / name
+    for attempt in (lambda: w.run(0.1, recorder=path), lambda: tv.Recorder(path, w, overwrite=True)):
+        with pytest.raises(ValueError, match=f"{name} ends in .* Write '.*{name.partition('.')[0]}.rrd'; of that, tv.replay"):
+            attempt()
+    assert w.time == 0 and not [*tmp_path.iterdir()]
+    assert main(["run", "hello", "--out", str(path)]) == 2
+
+
+def test_the_advice_for_who_pickles_a_world_works(world, tmp_path, monkeypatch, read_here):
+    w = world(tv.Particles(np.eye(2), velocity=(0.1, 0.2)), [tv.Gravity(1.0)])
+    w.run(0.1)
+    with pytest.raises(TypeError, match="cannot be copied or pickled") as said:
+        pickle.dumps(w)
+    monkeypatch.chdir(tmp_path)
+    write, read = re.findall(r"tv\.\w+\(.*?\)\.\w+\(\)", str(said.value))
+    eval(write, {"tv": tv, "world": w})
+    with eval(read, {"tv": tv}) as again:
+        assert again.hash() == w.hash() and again.time == w.time
+
+
+def test_a_recording_leads_to_its_last_frame(falling, read_here):
+    recording = tv.replay(falling)
+    with recording.world() as last, recording.world(20) as twentieth:
+        assert recording.frames[-1] == 20 and last.hash() == twentieth.hash()
+
+
 def test_nothing_is_overwritten_unasked(falling, world, tmp_path, read_here):
     w = world(tv.Particles(np.eye(2)), [tv.Gravity(1.0)])
-    path, other = tmp_path / "a.rrd", tmp_path / "thesis.txt"
+    path, other = tmp_path / "a.rrd", tmp_path / "thesis.rrd"
     path.write_bytes(falling.read_bytes())
     other.write_text("years of work")
-    for target, what in ((path, "a.rrd exists. Choose"), (other, "thesis.txt exists, and is no recording. Choose")):
+    for target, what in ((path, "a.rrd exists. Choose"), (other, "thesis.rrd exists, and is no recording. Choose")):
         with pytest.raises(FileExistsError, match=f"{what} another name, or replace it: .*overwrite=True"):
             tv.Recorder(target, w)
     with tv.replay(path).world(20) as again, pytest.raises(FileExistsError):
@@ -312,7 +342,7 @@ def test_nothing_is_overwritten_unasked(falling, world, tmp_path, read_here):
         assert not tv.replay(path).complete
         assert list(tv.replay(path).frames) == [0]
     assert tv.replay(path).complete and not w._watchers
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.rrd", "b.rrd", "thesis.txt"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.rrd", "b.rrd", "thesis.rrd"]
 
 
 @pytest.mark.parametrize("how", ["removed", "replaced"])

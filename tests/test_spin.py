@@ -381,6 +381,24 @@ def test_what_cannot_spin_is_refused(what):
         BAD[what]()
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_particles_turn_where_it_is_asked_for(world, dim):
+    # Down a slope a grain slides with g sin a - mu g cos a, or rolls with g sin a / (1 + I / m r^2). explain() says who slides.
+    angle, mu, t = 0.3, 0.2, 0.5
+    normal, down = slope(angle, dim)
+    gentle = np.zeros(dim)
+    gentle[1] = 1.0
+    pull, share = G * np.sin(angle), {2: 0.5, 3: 0.4}[dim]
+    for spin, a, said in ((True, pull / (1 + share), False), (False, pull - mu * G * np.cos(angle), True)):
+        p = tv.Particles([0.1 * normal], radius=0.1, spin=spin)
+        w = world(p, [tv.Gravity(G), tv.HalfSpace(normal, friction=mu), tv.HalfSpace(gentle, -9.0, friction=mu)], substeps=8)
+        assert p.spins == spin and ("particles slide down a slope; with tv.Particles(spin=True)" in w.explain()) == said
+        w.run(t)
+        assert (w.position[0] - 0.1 * normal) @ down == pytest.approx(a * t**2 / 2, rel=2e-3)
+    flat = world(tv.Particles(np.zeros((1, dim)), radius=0.1), [tv.Gravity(G), tv.HalfSpace(gentle, -9.0, friction=mu)])
+    assert "slope" not in flat.explain()
+
+
 def test_none_and_some_that_spin(world):
     # A world without particles has spins, too; and a world without spins gets them with added particles.
     none = world(tv.Particles(np.zeros((0, 2)), spin=0, orientation=0), [tv.Gravity(), tv.Contact(friction=0.5)])

@@ -440,7 +440,7 @@ class World:
     def spin(self, value) -> None:
         """Set the angular velocities, (n,) in 2D, (n, 3) in 3D [rad/s]. Raises ValueError where particles do not spin."""
         if not self._particles.spins:
-            raise ValueError("World.spin: these particles do not spin. Make them with tv.Particles(..., spin=0).")
+            raise ValueError("World.spin: these particles do not spin. Make them with tv.Particles(..., spin=True).")
         value = spin_of("World", value, self._particles)
         self._runner.memory.check()
         with deferred_signals:
@@ -798,7 +798,7 @@ class World:
     def __reduce_ex__(self, protocol):
         raise TypeError(
             "A World holds compiled kernels and memory of the device, so it cannot be copied or pickled. Use world.clone(), or "
-            "write it to a file with tv.Recorder(path, world) and read it back with tv.replay(path).world()."
+            'write it to a file: tv.Recorder("world.rrd", world).close(), and read it back: tv.replay("world.rrd").world().'
         )
 
     def _repr_html_(self) -> str:

@@ -13,14 +13,21 @@ from ..particles import Particles
 
 def _vector(feature: "Gravity", g):
     if np.ndim(g) == 0:
-        return checks.number("Gravity", "g", g)
+        size = checks.number("Gravity", "g", g)
+        if size < 0:
+            up = f"(0, {-size:g})" if feature.dim != 3 else f"(0, {-size:g}, 0)"
+            raise ValueError(
+                f"Gravity: g = {size:g}, but a number is how strongly it pulls down, along -y: write {-size:g}, or {up} for "
+                "gravity that pulls up."
+            )
+        return size
     return checks.vector("Gravity", "g", g, feature.dim or len(np.asarray(g)))
 
 
 class Gravity(Acceleration):
     """Uniform gravity: a = g for every particle. Position Verlet follows the parabola exactly, for any step.
 
-    g: a number [m/s^2] along -y, or a vector (dim,). Live: assign to .g between frames.
+    g: a number [m/s^2] along -y, at least 0, or a vector (dim,) in any direction. Live: assign to .g between frames.
     """
 
     has_no_particle_data = True
@@ -28,7 +35,7 @@ class Gravity(Acceleration):
     uniform = common = steady = True
     is_fixed_in_space = False
     dim = 0
-    g = Knob(_vector, "Acceleration [m/s^2]: a number along -y, or a vector.")
+    g = Knob(_vector, "Acceleration [m/s^2]: a number of at least 0 along -y, or a vector.")
 
     def __init__(self, g: ArrayLike = 9.81):
         self.g = g

@@ -21,9 +21,10 @@ class Particles:
     radius: number or (n,) [m], at least 0. A point (radius 0) touches discs and walls but not other points.
     pinned: indices or a Boolean mask of particles that stay in place, whatever their mass.
     group: integer or (n,), for contact filters.
-    spin: angular velocity [rad/s]: a number or (n,) in 2D, counterclockwise; 0, (3,) or (n, 3) in 3D. Without it, particles do
-    not spin, and nothing is computed for spin; 0 makes them spin from rest. Friction turns them, see Contact. A particle that
-    cannot move (pinned, or of infinite mass) keeps its spin, as a driven roller does.
+    spin: whether friction turns them, so that they roll, see Contact. False, the default: they slide, and nothing is computed for
+    spin. True: they turn, from rest. Or the angular velocity [rad/s] with which they begin: a number or (n,) in 2D,
+    counterclockwise; 0, (3,) or (n, 3) in 3D. A particle that cannot move (pinned, or of infinite mass) keeps its spin, as a
+    driven roller does.
     inertia: moment of inertia in units of mass radius^2: "disc" (1/2; the default in 2D), "ring" (1), "sphere" (2/5; the default
     in 3D), "shell" (2/3), or a number or (n,), above 0; inf for particles that friction does not turn.
     orientation: initial orientation: an angle or (n,) in 2D [rad]; 0, (4,) or (n, 4) unit quaternions (x, y, z, w) in 3D. Without
@@ -175,6 +176,11 @@ def at_rest(name: str, particles: "Particles") -> np.ndarray:
 def turning(particles: "Particles", spin, inertia, orientation) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
     """Return the checked arguments in TURNING for each particle; None for those that are absent."""
     who, n = "Particles", particles.count
+    if isinstance(spin, (bool, np.bool_)):
+        given = "inertia" if inertia is not None else "orientation" if orientation is not None else ""
+        if given and not spin:
+            raise ValueError(f"{who}: spin = False, but {given} is for particles that turn. Leave one of them out.")
+        spin = 0.0 if spin else None
     if spin is None and inertia is None and orientation is None:
         return None, None, None
     rates = at_rest("spin", particles) if spin is None else spin_of(who, spin, particles)

@@ -79,6 +79,7 @@ class Sink:
             self.stream.set_sinks(rr.FileSink(path), rr.GrpcSink(viewer), default_blueprint=blueprint)
 
     def _create(self, overwrite: bool) -> Any:
+        check_ending(self.path)
         try:
             kind = os.stat(self.path).st_mode
         except FileNotFoundError:
@@ -261,8 +262,20 @@ def is_recording(path: str) -> bool:
         return file.read(4) in (b"RRF2", b"")
 
 
+def check_ending(path: str | os.PathLike) -> None:
+    """Raise ValueError for a name with another ending than .rrd: neither the viewer nor a player of films would open the file."""
+    name = os.fspath(path)
+    stem, ending = os.path.splitext(name)
+    if ending not in ("", ".rrd"):
+        raise ValueError(
+            f"{name} ends in {ending!r}, but a recording is an .rrd file. Write {stem + '.rrd'!r}; of that, "
+            f"tv.replay({stem + '.rrd'!r}).export(path) makes films, meshes and tables, in the format of the ending of path."
+        )
+
+
 def check_replaceable(path: str | os.PathLike) -> None:
-    """Raise ValueError for an existing file that is no recording, which no command replaces."""
+    """Raise ValueError for an existing file that is no recording, which no command replaces, and for a name of other files."""
+    check_ending(path)
     if os.path.isfile(path) and not is_recording(os.fspath(path)):
         raise ValueError(f"{os.fspath(path)} is no recording, and is not replaced. Give another name, or remove it first.")
 

@@ -5,10 +5,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..colliders.box import Box
 from ..colliders.collider import Collider
+from ..colliders.half_space import HalfSpace
 from ..device import runtime
 from ..device.patches import patched
 from ..features.feature import Acceleration, Batch
+from ..forces import Gravity
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.periodic import Periodic
 from ..shapes.shape import morton
@@ -21,6 +24,7 @@ if TYPE_CHECKING:
 
 
 MANY = 10_000  # particles from which their order in memory matters
+FLAT = 1e-6  # 1 - cos(slope), up to which a floor is level: a twelfth of a degree
 
 
 def explain(world: "World") -> str:
@@ -122,7 +126,24 @@ def _present(world: "World") -> list[str]:
             out.append(f"{f!r}: nothing, since all radii are 0")
     if world.particles.spins:
         out.append("spin: with friction" + (", and orientations" if world._runner.step.orients else ""))
+    out += _sliding(world)
     return out or ["motion in a straight line"]
+
+
+def _sliding(world: "World") -> list[str]:
+    """Return a note on walls with friction and a slope, on which discs and spheres slide that one may expect to roll."""
+    p = world.particles
+    pull = sum((np.asarray(f.kernel_values()["g"]) for f in world.features if isinstance(f, Gravity)), np.zeros(p.dim))
+    if p.spins or not p.radius.any() or not pull.any():
+        return []
+    rough = [repr(f) for f in world.features if isinstance(f, Collider) and np.any(f.friction) and not _is_level(f, pull)]
+    return [f"{', '.join(rough)}: particles slide down a slope; with tv.Particles(spin=True) they roll"] if rough else []
+
+
+def _is_level(wall: Collider, pull: np.ndarray) -> bool:
+    """Whether a wall is a floor across the pull of gravity [m/s^2], or a box with one."""
+    normals = wall.normal[None] if isinstance(wall, HalfSpace) else np.eye(len(pull)) if isinstance(wall, Box) else []
+    return any(abs(n @ pull) >= (1 - FLAT) * np.linalg.norm(pull) for n in normals)
 
 
 def _pairs(f: Acceleration) -> str:
