@@ -76,7 +76,7 @@ def changing(tmp_path, world) -> Replay:
     """Return a recording in which a third particle is added and no frame is computed."""
     w = world(tv.Particles([[0.0, 0.0], [1.0, 0.0]]), [tv.Distance([(0, 1)])])
     with tv.Recorder(tmp_path / "c.rrd", w) as recorder:
-        w.add(tv.Particles([[2.0, 1.0]]))
+        w.add(tv.Particles([[2.0, 1.0]], radius=0.5))
         recorder.log()
     return tv.replay(tmp_path / "c.rrd")
 
@@ -247,13 +247,145 @@ def test_a_plane_is_at_zero_and_particles_may_come(changing, tmp_path):
     assert [len(S.load(tmp_path / f"a_000{k}.obj")) for k in (0, 1)] == [2, 3]
     changing.export(tmp_path / "a.csv")
     table = np.loadtxt(tmp_path / "a.csv", delimiter=",", skiprows=1)
-    assert table.tolist() == [[0, 0, 0, 0, 0], [0, 0, 1, 1, 0], [1, 0, 0, 0, 0], [1, 0, 1, 1, 0], [1, 0, 2, 2, 1]]
+    rows = [[0, 0, 0, 0, 0], [0, 0, 1, 1, 0], [1, 0, 0, 0, 0], [1, 0, 1, 1, 0], [1, 0, 2, 2, 1]]
+    assert table[:, :5].tolist() == rows and table[:, 5].tolist() == [0, 0, 0, 0, 0.5]
     changing.export(tmp_path / "a.xyz")
-    assert "radius" not in (tmp_path / "a.xyz").read_text()
+    lines = (tmp_path / "a.xyz").read_text().splitlines()
+    assert lines[1].startswith("Properties=species:S:1:pos:R:3:radius:R:1 ") and lines[-3:] == [
+        "X 0 0 0 0", "X 1 0 0 0", "X 2 1 0 0.5",
+    ]  # fmt: skip
     for kind, others in (("npz", ".csv"), ("glb", ".csv, .obj, .pvd or .xyz")):
         with pytest.raises(ValueError, match=f"not the same in all frames, so .* export to {others}"):
             changing.export(tmp_path / f"a.{kind}")
         assert not (tmp_path / f"a.{kind}").exists()
+
+
+def rolled(path: pathlib.Path, dim: int, poured: bool) -> tuple[Replay, list[tuple[np.ndarray, ...]]]:
+    """Return a recording of grains that roll, to which one of another radius may be added; and their motion in each frame."""
+    up = np.eye(dim)[1]
+    x, v = np.array([[0.0, 0.1], [1.0, 0.1]]) @ np.eye(2, dim), 2.0 * np.eye(dim)[0]
+    grains = tv.Particles(x, velocity=[v, -v], radius=0.1, spin=True, orientation=0.0)
+    truth = []
+    with tv.World(grains, [tv.Gravity(), tv.HalfSpace(up, friction=0.5)], substeps=4) as w, tv.Recorder(path, w) as recorder:
+        truth.append((w.velocity, w.spin, w.orientation))
+        for frame in range(4):
+            if poured and frame == 2:
+                more = tv.Particles([x[1] + 2 * v], radius=0.25, velocity=v, spin=True, orientation=0.0)
+                w.add(more)
+            w.step(1 / 30)
+            recorder.log()
+            truth.append((w.velocity, w.spin, w.orientation))
+    return tv.replay(path), [tuple(np.array(one) for one in row) for row in truth]
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_grains_that_are_poured_keep_radii_and_motion(dim, tmp_path):
+    # In space, the velocity of a plane has a third component of 0, spin is about z, and an angle a is (0, 0, sin a/2, cos a/2).
+    recording, truth = rolled(tmp_path / "a.rrd", dim, poured=True)
+    radii = [np.array([0.1, 0.1, 0.25])[: len(v)] for v, _, _ in truth]
+    space = [np.hstack(row) for row in truth] if dim == 3 else [
+        np.column_stack([v, 0 * w, 0 * w, 0 * w, w, 0 * a, 0 * a, np.sin(a / 2), np.cos(a / 2)]) for v, w, a in truth
+    ]  # fmt: skip
+    assert recording.verify() and [len(r) for r in radii] == [2, 2, 2, 3, 3] and abs(space[-1][0, 5]) > 1
+    recording.export(tmp_path / "a.csv", motion=True)
+    names = "vx,vy,spin,angle" if dim == 2 else "vx,vy,vz,spin_x,spin_y,spin_z,qx,qy,qz,qw"
+    assert (tmp_path / "a.csv").read_text().split("\n")[0] == f"frame,time,particle,{'x,y,z'[: 2 * dim - 1]},radius,{names}"
+    table = np.loadtxt(tmp_path / "a.csv", delimiter=",", skiprows=1)
+    plain = np.concatenate([np.column_stack([r, *row]) for r, row in zip(radii, truth, strict=True)])
+    np.testing.assert_allclose(table[:, 3 + dim :], plain, rtol=1e-8, atol=1e-9)
+    recording.export(tmp_path / "a.xyz", motion=True)
+    lines = (tmp_path / "a.xyz").read_text().splitlines()
+    assert "radius:R:1:velo:R:3:angular_velocity:R:3:orientation:R:4 Time=" in lines[1]
+    found = np.array([line.split()[4:] for line in lines if line.startswith("X ")], dtype=float)
+    wanted = np.column_stack([np.concatenate(radii), np.concatenate(space)])
+    np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-9)
+    for name, r, row in zip(recording.export(tmp_path / "a.pvd", motion=True)[1:], radii, space, strict=True):
+        data = meshio.read(name).point_data
+        np.testing.assert_array_equal(data["radius"], r)
+        np.testing.assert_allclose(np.hstack([data[n] for n in ("velocity", "spin", "orientation")]), row, atol=1e-15)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_what_rolls_turns_in_arrays_and_meshes(dim, tmp_path):
+    recording, truth = rolled(tmp_path / "a.rrd", dim, poured=False)
+    recording.export(tmp_path / "a.npz", motion=True)
+    with np.load(tmp_path / "a.npz") as arrays:
+        for k, name in enumerate(("velocity", "spin", "orientation")):
+            np.testing.assert_array_equal(arrays[name], [row[k] for row in truth])
+    recording.export(tmp_path / "a.glb", motion=True)
+    text, blob = parsed(tmp_path / "a.glb")
+    [animation] = text["animations"]
+    at = {(text["nodes"][c["target"]["node"]]["name"], c["target"]["path"]): c["sampler"] for c in animation["channels"]}
+    turned = values(text, blob, animation["samplers"][at["particle 0", "rotation"]]["output"])
+    angle = [a[0] if dim == 2 else 2 * np.arctan2(a[0, 2], a[0, 3]) for _, _, a in truth]
+    wanted = np.stack([np.zeros(5), np.zeros(5), np.sin(np.array(angle) / 2), np.cos(np.array(angle) / 2)], axis=1)
+    np.testing.assert_allclose(turned, wanted, atol=1e-6)
+    recording.export(tmp_path / "b.npz")
+    with np.load(tmp_path / "b.npz") as arrays:
+        assert not {"velocity", "spin", "orientation"} & {*arrays}
+    with pytest.raises(ValueError, match="a.obj takes no motion; .csv, .glb, .gltf, .npz, .pvd, .xyz do"):
+        recording.export(tmp_path / "a.obj", motion=True)
+
+
+def test_meshes_have_walls_where_they_are_in_each_frame(tmp_path, world):
+    # A floor that stands still has no targets; a lid moves down, a gate opens in frame 2, and a wire is a line.
+    lid, gate = tv.HalfSpace((0, -1, 0), -2.0), tv.Ball((1, 1, 0), 0.5, active=True)
+    walls = [tv.HalfSpace((0, 1, 0)), lid, gate, tv.Path([1], [(0, 0, 0), (0, 0, 1)])]
+    w = world(tv.Particles([[0.0, 1.0, 0.0], [0.0, 0.0, 0.5]], radius=0.1), [tv.Gravity(), *walls])
+    with tv.Recorder(tmp_path / "a.rrd", w) as recorder:
+        for frame in range(1, 4):
+            lid.offset = -2.0 + 0.1 * frame
+            gate.active = frame < 2
+            w.step(1 / 60)
+            recorder.log()
+    recording = tv.replay(tmp_path / "a.rrd")
+    recording.export(tmp_path / "a.glb")
+    text, blob = parsed(tmp_path / "a.glb")
+    names = {node["name"]: node for node in text["nodes"]}
+    assert {"HalfSpace 1", "HalfSpace 2", "Ball 3", "Path 4"} < set(names)
+    places = {}
+    for name in ("HalfSpace 1", "HalfSpace 2", "Ball 3", "Path 4"):
+        [part] = text["meshes"][names[name]["mesh"]]["primitives"]
+        first = values(text, blob, part["attributes"]["POSITION"])
+        places[name] = [first, *(first + values(text, blob, t["POSITION"]) for t in part.get("targets") or [])]
+        hue = values(text, blob, part["attributes"]["COLOR_0"])
+        assert part["mode"] == (1 if name == "Path 4" else 4) and (hue == hue[0]).all() and (hue[0, :3] < 128).all()
+    np.testing.assert_allclose([p[:, 1] for p in places["HalfSpace 2"]], np.repeat([[2.0], [1.9], [1.8], [1.7]], 6, 1), atol=1e-6)
+    assert len(places["HalfSpace 1"]) == len(places["Path 4"]) == 1 and (places["HalfSpace 1"][0][:, 1] == 0).all()
+    sizes = [np.ptp(p, axis=0).max() for p in places["Ball 3"]]
+    np.testing.assert_allclose(sizes, [1, 1, 0, 0], atol=0.01)
+    np.testing.assert_allclose(places["Path 4"][0][[0, -1], 2], [0, 1], atol=1e-6)
+
+
+def test_films_have_the_size_the_theme_and_the_camera_that_are_asked_for(recording, tmp_path):
+    # The single grain is at x = 3, y = 0, z = 2, up is z; from the left or above it is elsewhere in the picture.
+    def film(name, **look):
+        recording.export(tmp_path / name, **look)
+        with Image.open(tmp_path / name) as made:
+            return np.asarray(made.convert("RGB"))
+
+    plain, light = film("a.gif"), film("b.gif", theme="light")
+    assert plain.shape[1] == 640 and light.shape == plain.shape
+    assert plain[0, 0].max() < 30 and light[0, 0].min() > 240
+    assert film("c.webp", size=320).shape[1] == 320 and film("d.gif", size=(402, 300)).shape == (300, 402, 3)
+    wide = film("e.gif", size=1280)
+    lit = [(p.max(axis=2) > 40).mean() for p in (plain, wide)]
+    assert lit[0] == pytest.approx(lit[1], rel=0.1)  # lines and dots grow with the picture
+    front, top = film("f.gif", size=(400, 400), camera=(0, 0)), film("g.gif", size=(400, 400), camera=(0, np.pi / 2))
+    spans = [np.ptp(np.nonzero(p.max(axis=2) > 40), axis=1) for p in (front, top)]
+    x = np.array(positions(recording))
+    wide, deep, tall = x.max(axis=(0, 1)) - x.min(axis=(0, 1))
+    assert spans[0][0] / spans[0][1] == pytest.approx(tall / wide, abs=0.15)  # rows by columns
+    assert spans[1][0] / spans[1][1] == pytest.approx(deep / wide, abs=0.15)
+    for name, look, words in (
+        ("a.gif", {"size": (401, 300)}, r"size = \(401, 300\), but films have even numbers of pixels; write 402"),
+        ("a.gif", {"theme": "blue"}, "theme = 'blue', but it must be one of 'dark', 'light'"),
+        ("a.gif", {"camera": (0, 3)}, r"camera\[1\] = 3, but it must be at most 1.57"),
+        ("a.csv", {"size": 640}, "a.csv takes no size; .gif, .mp4, .webp do"),
+        ("a.glb", {"theme": "light"}, "a.glb takes no theme; .gif, .mp4, .webp do"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            recording.export(tmp_path / name, **look)
 
 
 @pytest.mark.slow
@@ -361,7 +493,7 @@ def test_errors_say_what_can_be_done(recording, roof, whole, tmp_path, monkeypat
         recording.export(tmp_path / "none" / "a.glb")
     with pytest.raises(ValueError, match="shape has 5 points, but the recording has 10 particles"):
         recording.export(tmp_path / "a.obj", shape=roof)
-    with pytest.raises(ValueError, match="a.csv has no faces, so it takes no shape; .gif, .glb"):
+    with pytest.raises(ValueError, match="a.csv takes no shape; .gif, .glb"):
         recording.export(tmp_path / "a.csv", shape=whole)
     with pytest.raises(TypeError, match="shape = 'roof.obj' is a str"):
         recording.export(tmp_path / "a.obj", shape="roof.obj")  # type: ignore[arg-type]
@@ -381,6 +513,22 @@ def test_the_command_exports(recording, whole, tmp_path, capsys):
     assert [len(p) for p in S.load(tmp_path / "b_4.obj").polygons] == [4, 3]
     assert main(["replay", recording.path, "--export", "stl"]) == 2
     assert "can be written" in capsys.readouterr().err
+    film = [
+        "replay",
+        recording.path,
+        "--export",
+        str(tmp_path / "a.gif"),
+        "--size",
+        "96x64",
+        "--camera=-0.5,0.2",
+        "--theme",
+        "light",
+    ]
+    assert main(film) == 0
+    with Image.open(tmp_path / "a.gif") as made:
+        assert made.size == (96, 64) and made.convert("RGB").getpixel((0, 0)) == (250, 250, 250)
+    assert main(["replay", recording.path, "--export", str(tmp_path / "a.obj"), "--motion"]) == 2
+    assert "a.obj takes no motion" in capsys.readouterr().err
 
 
 def test_shapes_keep_polygons(roof, whole, tmp_path):

@@ -29,10 +29,27 @@ def add(parser: argparse.ArgumentParser) -> None:
         "glb, gltf (an animated mesh, for Blender), obj (a file for each frame), pvd (ParaView); gif, webp, mp4 (a film)",
     )  # fmt: skip
     parser.add_argument("--shape", metavar="BODY.obj", help="of --export: take its faces, quads and texture coordinates")
+    parser.add_argument(
+        "--motion", action="store_true", help="of --export: velocities, spins and orientations too; computes again"
+    )
+    parser.add_argument("--size", type=size, metavar="WxH", help="of --export, of films: pixels, or the width alone")
+    parser.add_argument("--camera", type=angles, metavar="A,B", help="of --export, of 3D films: angles to the right and up [rad]")
+    parser.add_argument("--theme", help="of --export, of films: dark or light")
     parser.add_argument("--frame", type=int, action="append", help="of --png; several with a %%d in the name; default the last")
     parser.add_argument("--scene", action="store_true", help="of --png: the scene alone, without curves and text")
     parser.add_argument("--port", type=port, default=9090, help="of --web; default 9090")
     parser.add_argument("--given", metavar="SCRIPT.py", help="of --verify: where the user's own functions in the scene are")
+
+
+def size(text: str) -> int | tuple[int, ...]:
+    """Return the size of a film, such as 1280x720 or 1280."""
+    numbers = tuple(map(int, text.split("x")))
+    return numbers if len(numbers) > 1 else numbers[0]
+
+
+def angles(text: str) -> tuple[float, ...]:
+    """Return the angles of a camera, such as 0.5,0.3 [rad]."""
+    return tuple(map(float, text.split(",")))
 
 
 def main(args: argparse.Namespace) -> int:
@@ -57,7 +74,8 @@ def main(args: argparse.Namespace) -> int:
         return STATUS[verdict.kind]
     if args.export:
         out = args.export if "." in args.export else f"{os.path.splitext(args.file)[0]}.{args.export}"
-        written = recording.export(out, load(args.shape) if args.shape else None)
+        shape, look = load(args.shape) if args.shape else None, {"size": args.size, "camera": args.camera, "theme": args.theme}
+        written = recording.export(out, shape, motion=args.motion, **look)
         more = f" and {len(written) - 1} more" if len(written) > 1 else ""
         print(f"{written[0]}{more}: {sum(map(os.path.getsize, written))} bytes")
         return 0

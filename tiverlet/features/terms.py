@@ -188,7 +188,7 @@ ROWS: dict[str, dict[str, str]] = {
     "Recorder WorldsRecorder": {
         "filename file output": "write path",
         "fps frame_rate": "a frame is one world.step(dt); write every=...",
-        "size width height camera theme": "a recording is seen in the viewer; films and pictures take it: tv.replay(path)",
+        "size width height camera theme": "films take it; write tv.replay(path).export(path, size=..., camera=..., theme=...)",
         "write record save add capture frame append": "write log()",
         "finish stop end": "write close()",
     },

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 POINT = -2.5  # radius of the dot for a particle without radius (negative: pixels)
 MANY = 5000  # most links drawn as lines; of more, an even selection
 WALL = np.array([[92, 97, 112]], dtype=np.uint8)  # colour of surfaces of walls
+EDGE = (120, 125, 140)  # colour of walls that are lines
 OPEN = (60, 63, 70)  # colour of an inactive wall
 EDGES = (150, 120, 70)  # colour of a periodic box
 HELD, PINS = (225, 228, 235), 200  # colour of the marks of fixed particles; no marks if there are more of them
@@ -243,7 +244,7 @@ class Drawing:
                 return
             strips, thickness = wall.outline(*self.extent)
             radius = thickness if thickness else -1.5  # half the width [m], or pixels (negative)
-            hue = OPEN if isinstance(wall, Collider) and not wall.active else (120, 125, 140)
+            hue = OPEN if isinstance(wall, Collider) and not wall.active else EDGE
             self._log(f"{self._root}/walls/{k}", self._strips(strips, colors=[hue], radii=[radius]))
             self.bytes += strips.nbytes
 

@@ -166,8 +166,8 @@ class Replay:
         world = None
         try:
             for world, entry in self._run(start, goal):
-                if entry.kind == "frame" and _short_hash(world, checkpoint.keep(world, pairs=False)) != entry.data["hash"]:
-                    raise RuntimeError(f"replay: frame {entry.frame} of {self.path} does not come out as recorded. {self._why()}")
+                if entry.kind == "frame":
+                    self._compare(world, entry)
             assert world
             return world
         except BaseException:
@@ -331,6 +331,28 @@ class Replay:
             for k, values in entry.data["features"].items()
         ]
 
+    def motion(self) -> Iterator[dict[str, np.ndarray]]:
+        """Compute everything again, and yield what the picture does not hold, for each frame drawn: its motion.
+
+        "velocity" (n, dim) [m/s]; "spin" (n,) or (n, 3) [rad/s] where particles spin; "orientation", (n,) [rad] or quaternions
+        (n, 4), where it is tracked. All in f64. Raises RuntimeError if a frame does not come out as recorded.
+        """
+        world = None
+        try:
+            for world, entry in self._run(1, len(self._entries) - 1):
+                if entry.kind == "frame" and entry.frame in self._frames:
+                    self._compare(world, entry)
+                    names = ("velocity", *(n for n in ("spin", "orientation") if getattr(world.particles, n) is not None))
+                    yield {name: np.asarray(getattr(world, name)) for name in names}
+        finally:
+            if world:
+                world.close()
+
+    def _compare(self, world: "World", entry: Entry) -> None:
+        """Raise RuntimeError if a world is not in the state of a frame."""
+        if _short_hash(world, checkpoint.keep(world, pairs=False)) != entry.data["hash"]:
+            raise RuntimeError(f"replay: frame {entry.frame} of {self.path} does not come out as recorded. {self._why()}")
+
     @property
     @_with_clear_errors
     def scenes(self) -> list[SceneFrames]:
@@ -356,28 +378,35 @@ class Replay:
         """Return particles and features of a scene, by its entry, for inspection without a world."""
         return scene.parts(entry.data, entry.arrays)
 
-    def export(self, path: str | os.PathLike, shape: Shape | None = None) -> list[str]:
+    def export(
+        self, path: str | os.PathLike, shape: Shape | None = None, *, motion: bool = False, size: int | tuple[int, int] | None =
+        None, camera: tuple[float, float] | None = None, theme: str | None = None,
+    ) -> list[str]:  # fmt: skip
         """Write the recording for other programs, in the format of the ending of `path`. Returns the names of the files.
 
             .npz          positions [m], times [s], masses [kg], radii [m] and curves, for numpy
-            .csv          positions, a row for each particle in each frame
-            .xyz          extended XYZ for OVITO and ASE: positions, and radii if no particles are added or removed
-            .glb, .gltf   an animated mesh, y up, for Blender and browsers
+            .csv          positions and radii, a row for each particle in each frame
+            .xyz          extended XYZ for OVITO and ASE: positions and radii
+            .glb, .gltf   an animated mesh, y up, with its walls, for Blender and browsers
             .obj          a file for each frame, named a_0000.obj, a_0001.obj ..., or by a %d in the name
             .pvd          a file for each frame for ParaView, a_0000.vtu ..., with radii, masses, links and faces
             .gif, .webp, .mp4  a film in the scene's own time, 25 pictures a second
 
-        Faces are those of the picture. shape: the shape that the particles were made from; meshes and films then use its faces,
-        with their quads, and its texture coordinates if the shape came from a file that has them. Features with the user's
-        functions contribute no faces and links.
+        shape: the shape that the particles were made from; meshes and films then use its faces, with their quads, and its texture
+        coordinates; else faces are those of the picture. Features with the user's functions contribute no faces and links.
+        motion: whether .npz, .csv, .xyz and .pvd also hold velocities [m/s], spins [rad/s] and orientations, and spheres turn in
+        .glb and .gltf. The picture does not have them, so all is computed again, see motion().
+        Of films: size, their width and height [pixels], or the width alone; camera, the angles [rad] of the eye to the right of
+        the front and above the horizon in 3D; theme, "dark" or "light".
 
-        Raises ValueError for another ending, for added or removed particles in a format that cannot hold them, and for a shape of
-        other particles; FileNotFoundError if the folder is missing; ImportError for .glb, .gltf and .mp4 without
-        tiverlet[export].
+        Raises ValueError for another ending, an argument that the format does not take, added or removed particles in a format
+        that cannot hold them, and a shape of other particles; RuntimeError if motion does not come out as recorded;
+        FileNotFoundError if the folder is missing; ImportError for .glb, .gltf and .mp4 without tiverlet[export].
         """
         from . import exports  # imported late, since it imports rerun
 
-        return exports.export(self, os.fspath(path), shape)
+        motion = checks.flag("replay", "motion", motion)
+        return exports.export(self, os.fspath(path), shape=shape, motion=motion or None, size=size, camera=camera, theme=theme)
 
 
 @checks.answer_arguments

@@ -13,9 +13,8 @@ import numpy as np
 
 from ...shapes import Shape
 from ..drawing import upwards
-from ..scene import set_knobs
 from .extras import needed
-from .sketch import Sketch, View, extent
+from .sketch import Look, Sketch, View, extent
 from .stretch import Stretch, stretches
 
 if TYPE_CHECKING:
@@ -24,14 +23,17 @@ if TYPE_CHECKING:
 RATE = 25  # pictures a second: 40 ms each, which GIF can store exactly, in hundredths of a second
 
 
-def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
+def write(
+    recording: "Replay", path: str, *, shape: Shape | None = None, size: Any = None, camera: Any = None, theme: Any = "dark"
+) -> list[str]:
     """Write a film in the scene's own time, RATE pictures a second; each picture shows the nearest frame."""
+    look = Look.checked(size, camera, theme, recording.scenes[0].entry.arrays["position"].shape[1])
     image, draw = needed("PIL.Image", path), needed("PIL.ImageDraw", path)
     kind = os.path.splitext(path)[1].lower()
     video = _ffmpeg(path) if kind == ".mp4" else ""
     if not len(recording.frames):
         raise ValueError(f"replay: {recording.path} has no frame, so there is nothing for {path}.")
-    pictures = _pictures(recording, shape, image, draw)
+    pictures = _pictures(recording, shape, image, draw, look)
     first = next(pictures)
     if not video:
         first.save(path, save_all=True, append_images=pictures, duration=1000 // RATE, loop=0)
@@ -56,7 +58,7 @@ def _ffmpeg(path: str) -> str:
     return shutil.which("ffmpeg") or needed("imageio_ffmpeg", path).get_ffmpeg_exe()
 
 
-def _pictures(recording: "Replay", shape: Shape | None, image: Any, draw: Any) -> Iterator[Any]:
+def _pictures(recording: "Replay", shape: Shape | None, image: Any, draw: Any, look: Look) -> Iterator[Any]:
     """Yield one picture after the other, all from the same point of view."""
     times = recording.times
     moments = np.arange(times[0], times[-1] + 0.5 / RATE, 1 / RATE)
@@ -69,7 +71,7 @@ def _pictures(recording: "Replay", shape: Shape | None, image: Any, draw: Any) -
     low, high = (pick([e[k] for e in ends], axis=0) for k, pick in enumerate((np.min, np.max)))
     if not np.isfinite([low, high]).all():
         raise ValueError(f"replay: {recording.path} has no particles, or positions that are not finite, so there is no picture.")
-    view = View(low, high, upwards(found[0].parts))
+    view = View(low, high, upwards(found[0].parts), look)
     for stretch in found:
         here = set(stretch.frames.tolist())
         yield from _stretch(stretch, shape, [k for k in wanted if k in here], image, draw, view, (low, high))
@@ -81,11 +83,7 @@ def _stretch(
     """Yield the pictures of one stretch, with walls at their places in each frame."""
     geometries = dict(zip(stretch.frames.tolist(), stretch.geometries(shape), strict=True))
     sketch = Sketch(image, draw, stretch.parts, next(iter(geometries.values())), view, ends)
-    features = dict(zip(stretch.parts.numbers, stretch.parts.features, strict=True))
-    changes = list(stretch.knob_changes)
+    turn = stretch.knobs_at()
     for frame in wanted:
-        while changes and changes[0][0] <= frame:
-            _, k, values = changes.pop(0)
-            if k in features:
-                set_knobs(features[k], values)
+        turn(frame)
         yield sketch.frame(stretch.recording.position(frame), geometries[frame])

@@ -15,7 +15,9 @@ from ...colliders.round_mesh import rounded
 from ...shapes import Shape
 from .extras import needed
 from .geometry import Geometry
-from .stretch import Stretch, only
+from .sketch import extent
+from .stretch import Stretch, in_space, only
+from .walls import Wall, drawn_walls
 
 if TYPE_CHECKING:
     from ..replay import Replay
@@ -27,27 +29,37 @@ FLOAT, UINT, BYTE = 5126, 5125, 5121  # for types of numbers
 VERTICES, INDICES = 34962, 34963  # for uses of buffers
 
 
-def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
-    """Write surfaces with normals, colours and texture coordinates, other links as lines, and particles.
+def write(recording: "Replay", path: str, *, shape: Shape | None = None, motion: bool = False) -> list[str]:
+    """Write surfaces with normals, colours and texture coordinates, other links as lines, particles, and walls that may move.
 
-    Particles that no surface hides are spheres of their radii, or points.
+    Particles that no surface hides are spheres of their radii, or points. motion: spheres turn as their orientations do.
     """
     lib: Any = needed("pygltflib", path)
-    stretch = only(recording, path, "mesh", ".csv, .obj, .pvd or .xyz")
+    stretch = only(recording, path, "mesh", ".csv, .obj, .pvd or .xyz", motion)
     geometries = [*stretch.geometries(shape)]
     geometry = geometries[0]
-    x = np.array([stretch.flat(x) for _, _, x in stretch], dtype=np.float32)
+    both = [(stretch.flat(x), in_space(moved)) for (_, _, x), moved in zip(stretch, stretch.motion, strict=False)]
+    x = np.array([x for x, _ in both], dtype=np.float32)
     if not (x.size and np.isfinite(x).all()):
         why = "has positions that are not finite" if x.size else "has no particles"
         raise ValueError(f"replay: {recording.path} {why}, which glTF cannot say; export to .csv, .obj, .pvd or .xyz.")
     times = stretch.times.astype(np.float32)
     later = np.append(np.diff(times) > 0, True)  # of several frames at the same time, keep the last
-    scene = _Scene(lib, x[later], times[later])
+    ends = extent(stretch.parts, x[:, :, : stretch.parts.particles.dim])
+    walls = [wall.at(later) for wall in drawn_walls(stretch, *ends)]
+    hues = np.concatenate([geometry.hues, *(np.repeat(wall.hue, wall.corners.shape[1], axis=0) for wall in walls)])
+    turned = [moved["orientation"] for _, moved in both if "orientation" in moved]
+    scene = _Scene(lib, np.concatenate([x[later], *(wall.corners for wall in walls)], axis=1), times[later])
     root = scene.node(name="scene", rotation=_turn(geometry.up))
     single = geometry.bare if len(geometry.bare) <= SPHERES else geometry.bare[:0]
     unbroken = [g.links for g, kept in zip(geometries, later.tolist(), strict=True) if kept]
     nodes = _meshes(scene, geometry, unbroken, np.setdiff1d(geometry.loose, single))
-    scene.children(root, [*nodes, *_spheres(scene, stretch, geometry, single)])
+    nodes += _spheres(scene, stretch, geometry, single, np.array(turned)[later] if turned else None)
+    begin = x.shape[1]
+    for wall in walls:
+        nodes.append(_wall(scene, wall, begin, hues))
+        begin += wall.corners.shape[1]
+    scene.children(root, nodes)
     return scene.save(path)
 
 
@@ -121,8 +133,23 @@ def _normals(x: np.ndarray, at: np.ndarray, triangles: np.ndarray) -> np.ndarray
     return np.where(size > 0, normal / np.where(size > 0, size, 1), [0.0, 1.0, 0.0])
 
 
-def _spheres(scene: "_Scene", stretch: Stretch, geometry: Geometry, single: np.ndarray) -> list[int]:
-    """Return a node for each particle, which moves with it."""
+def _wall(scene: "_Scene", wall: Wall, begin: int, hues: np.ndarray) -> int:
+    """Return the node of a wall, whose corners are the points from `begin` on."""
+    at = begin + np.arange(wall.corners.shape[1])
+    if not wall.solid:
+        return scene.moving(wall.name, scene.primitive(LINES, at, hues, wall.parts))
+    normals = np.array([_normals(x, at, wall.parts) for x in scene.x], dtype=np.float32)
+    return scene.moving(wall.name, scene.primitive(TRIANGLES, at, hues, wall.parts, normals))
+
+
+def _continuous(turned: np.ndarray) -> np.ndarray:
+    """Return quaternions (frames, 4), each with the sign that is nearer to the one before: interpolation takes the short way."""
+    flips = np.cumprod(np.where((turned[1:] * turned[:-1]).sum(axis=1) < 0, -1.0, 1.0))
+    return (turned * np.append(1.0, flips)[:, None]).astype(np.float32)
+
+
+def _spheres(scene: "_Scene", stretch: Stretch, geometry: Geometry, single: np.ndarray, turned: np.ndarray | None) -> list[int]:
+    """Return a node for each particle, which moves with it. turned: orientations, (frames, n, 4), if spheres turn."""
     if not len(single):
         return []
     vertices, faces = rounded(np.zeros(3), np.zeros(3), 1.0)
@@ -143,6 +170,8 @@ def _spheres(scene: "_Scene", stretch: Stretch, geometry: Geometry, single: np.n
         node = scene.node(name=f"particle {i}", mesh=meshes[hue], translation=place[0].tolist(), scale=[float(radius[i])] * 3)
         if (place != place[0]).any():
             scene.animate(node, "translation", scene.sampler(place, "VEC3"))
+        if turned is not None and len(turned) > 1:
+            scene.animate(node, "rotation", scene.sampler(_continuous(turned[:, i]), "VEC4"))
         nodes.append(node)
     return nodes
 
@@ -203,7 +232,8 @@ class _Scene:
         if len(uv):  # glTF's v axis points down
             first["TEXCOORD_0"] = self.add(np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).astype(np.float32), "VEC2", VERTICES)
         targets = []
-        for k in range(1, len(self.x)):
+        stands = all((self.x[k, at[k]] == self.x[0, at[0]]).all() for k in range(1, len(self.x)))
+        for k in range(1, 1 if stands else len(self.x)):
             targets.append({"POSITION": self.add(self.x[k, at[k]] - self.x[0, at[0]], "VEC3", VERTICES, ends=True)})
             if normals is not None:
                 targets[-1]["NORMAL"] = self.add(normals[k] - normals[0], "VEC3", VERTICES)
@@ -229,7 +259,7 @@ class _Scene:
     def moving(self, name: str, part: Any) -> int:
         """Add a node with a mesh that follows the frames; return its number."""
         node = self.node(name=name, mesh=self.mesh(name, part))
-        if len(self.x) > 1:
+        if part.targets:
             if self._weights is None:
                 self._weights = self.sampler(np.eye(len(self.x), dtype=np.float32)[:, 1:].ravel(), "SCALAR")
             self.animate(node, "weights", self._weights)

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from ..replay import Replay
 
 
-def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
+def write(recording: "Replay", path: str, *, shape: Shape | None = None) -> list[str]:
     """Write positions, faces, other links as lines, and loose particles as points.
 
     Faces and texture coordinates are those of `shape`; without it, faces are triangles.

@@ -5,14 +5,16 @@ strain nor contacts.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from ... import checks
 from ...colliders.collider import Collider
 from ...constraints import Path
 from ...neighbours import Periodic
-from ..drawing import OPEN, WALL, upwards, walled
+from ..drawing import EDGE, OPEN, WALL, upwards, walled
 from ..images import box_of, crosses_box
 from ..scene import Parts
 from ..surfaces import Surface
@@ -23,29 +25,67 @@ FINE = 2  # factor of oversampling in each direction, for smooth edges
 STEP = 16  # sizes are multiples of so many pixels, as video requires
 TALL = (0.3, 1.2)  # least and most ratio of height to width
 DOT, LINE = 3, 1.5  # [pixels] diameter of a particle without radius, half the width of a line
-BACK, EDGE = (13, 16, 17), (120, 125, 140)
-ASIDE, ABOVE = np.radians(30), np.radians(20)  # angles of the eye in 3D
+# Background, inactive walls, surfaces of walls.
+THEMES = {
+    "dark": ((13, 16, 17), OPEN, WALL),
+    "light": ((250, 250, 250), (200, 203, 210), np.array([[190, 194, 205]], dtype=np.uint8)),
+}
+CAMERA = float(np.radians(30)), float(np.radians(20))  # default angles of the eye in 3D
+
+
+@dataclass(frozen=True)
+class Look:
+    """How pictures look.
+
+    size: width and height [pixels]; None for the height takes that of the scene. camera: angles of the eye in 3D [rad]: how far
+    it stands to the right of the front, and above the horizon. theme: one of THEMES.
+    """
+
+    size: tuple[int, int | None] = (WIDE, None)
+    camera: tuple[float, float] = CAMERA
+    theme: str = "dark"
+
+    @staticmethod
+    def checked(size: Any, camera: Any, theme: Any, dim: int) -> "Look":
+        """Return a look from the arguments of Replay.export(), or raise ValueError or TypeError."""
+        who, wide, tall = "replay", WIDE, None
+        if size is not None:
+            wide, tall = size if isinstance(size, (tuple, list)) and len(size) == 2 else (size, None)
+            for name, value in (("the width", wide), *([("the height", tall)] if tall is not None else [])):
+                if checks.integer(who, f"{name} in size", value, least=STEP) % 2:
+                    raise ValueError(f"{who}: size = {size}, but films have even numbers of pixels; write {value + 1}.")
+        if camera is not None and dim != 3:
+            raise ValueError(f"{who}: camera = {camera}, but a {dim}D scene is seen from the front; leave it out.")
+        if camera is not None:
+            camera = checks.vector(who, "camera", camera, 2)
+            checks.number(who, "camera[1]", camera[1].item(), least=-np.pi / 2, most=np.pi / 2)
+        if theme not in THEMES:
+            raise ValueError(f"{who}: theme = {theme!r}, but it must be one of {', '.join(map(repr, THEMES))}.")
+        return Look((wide, tall), CAMERA if camera is None else tuple(camera.tolist()), theme)
 
 
 class View:
     """Maps points of a scene between two corners [m] to pixels, in parallel projection."""
 
-    def __init__(self, low: np.ndarray, high: np.ndarray, up: np.ndarray):
+    def __init__(self, low: np.ndarray, high: np.ndarray, up: np.ndarray, look: Look):
+        self.look, (aside, above) = look, look.camera
         if len(low) == 2:
             self._axes = np.array([[1.0, 0], [0, 1], [0, 0]])
         else:
             front = np.array([0.0, -1, 0] if abs(up[2]) > 0.5 else [0.0, 0, 1])  # so that x points to the right
             front -= front @ up * up
             front /= np.linalg.norm(front)
-            eye = np.cos(ASIDE) * front + np.sin(ASIDE) * np.cross(up, front)
+            eye = np.cos(aside) * front + np.sin(aside) * np.cross(up, front)
             right = np.cross(up, eye)
-            eye = np.cos(ABOVE) * eye + np.sin(ABOVE) * up
+            eye = np.cos(above) * eye + np.sin(above) * up
             self._axes = np.array([right, np.cross(eye, right), eye])
         corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(len(low), -1)
         at = (self._axes @ corners)[:2]
         self._low, size = at.min(axis=1), np.maximum(np.ptp(at, axis=1), 1e-9 * np.abs(at).max() + 1e-30)
-        share = np.clip(size[1] / size[0], *TALL)
-        self.size = tuple(STEP * max(1, round(WIDE * s / STEP)) for s in (1.0, share))
+        wide, tall = look.size
+        if tall is None:
+            wide, tall = (STEP * max(1, round(wide * s / STEP)) for s in (1.0, np.clip(size[1] / size[0], *TALL)))
+        self.size, self.line = (wide, tall), FINE * wide / WIDE  # line: pixels of the canvas per pixel of DOT and LINE
         room = FINE * (1 - 2 * MARGIN) * np.array(self.size)
         self.scale = float((room / size).min())  # pixels per meter
         self._begin = FINE * np.array(self.size) / 2 - self.scale * size / 2
@@ -89,7 +129,7 @@ class Sketch:
     def frame(self, x: np.ndarray, geometry: Geometry) -> Any:
         """Return the picture of a frame. x: positions [m]. geometry: with the links of the frame, see Stretch.geometries."""
         view = self._view
-        canvas = self._image.new("RGB", tuple(FINE * s for s in view.size), BACK)
+        canvas = self._image.new("RGB", tuple(FINE * s for s in view.size), THEMES[view.look.theme][0])
         draw = self._draw.Draw(canvas)
         x = x.astype(np.float64)
         things = [*self._walls(), *self._faces(x), *self._links(x, geometry.links), *self._discs(x, geometry)]
@@ -117,7 +157,7 @@ class Sketch:
 
     def _links(self, x: np.ndarray, links: np.ndarray) -> list[tuple]:
         at, near = self._view.place(x)
-        out, width = [], round(2 * FINE * LINE)
+        out, width = [], round(2 * self._view.line * LINE)
         across = crosses_box(box_of(self._parts), x[links[:, 0]] - x[links[:, 1]]) if len(links) else np.zeros(0, dtype=bool)
         for i, j in links[~across].tolist():
             places = [*at[i].tolist(), *at[j].tolist()]
@@ -126,34 +166,34 @@ class Sketch:
 
     def _discs(self, x: np.ndarray, geometry: Geometry) -> list[tuple]:
         at, near = self._view.place(x)
-        radii = np.maximum(self._view.scale * self._parts.particles.radius, FINE * DOT / 2)[:, None]
+        radii = np.maximum(self._view.scale * self._parts.particles.radius, self._view.line * DOT / 2)[:, None]
         boxes = np.concatenate([at - radii, at + radii], axis=1)
         hues, dots = self._geometry.hues.astype(int), np.union1d(geometry.bare, geometry.loose).tolist()
         return [(near[i], "disc", boxes[i].tolist(), tuple(hues[i].tolist()), 0) for i in dots]
 
     def _walls(self) -> list[tuple]:
-        out = []
+        out, (_, off, solid) = [], THEMES[self._view.look.theme]
         for wall in self._parts.features:
             if isinstance(wall, Periodic):
                 for edge in wall.outline(*self._extent):
                     at, near = self._view.place(edge)
-                    out.append((float(near.min()), "line", at.ravel().tolist(), EDGE, round(FINE * LINE)))
+                    out.append((float(near.min()), "line", at.ravel().tolist(), EDGE, round(self._view.line * LINE)))
             if not isinstance(wall, (Collider, Path)):
                 continue
             closed = not isinstance(wall, Collider) or wall.active
             if isinstance(wall, Collider) and not self._flat:
                 vertices, faces = wall.solid(*self._extent)
                 if len(faces):
-                    hues = np.repeat(WALL if closed else WALL // 2, len(vertices), axis=0)
+                    hues = np.repeat(solid if closed else solid // 2, len(vertices), axis=0)
                     light = Surface(faces, hues, np.zeros((0, 2), dtype=np.int64), upwards(self._parts))
                     shades = _bytes(light.colors(vertices, np.zeros(0)))
                     out += self._mesh(vertices, faces, np.min, shades)  # np.min puts bodies on the wall in front of it
                     continue
             strips, thickness = wall.outline(*self._extent)
-            width = max(round(2 * self._view.scale * thickness), round(FINE * LINE))
+            width = max(round(2 * self._view.scale * thickness), round(self._view.line * LINE))
             for strip in strips:
                 at, near = self._view.place(np.asarray(strip))
-                out.append((float(near.min()), "line", at.ravel().tolist(), EDGE if closed else OPEN, width))
+                out.append((float(near.min()), "line", at.ravel().tolist(), EDGE if closed else off, width))
         return out
 
 

@@ -1,7 +1,8 @@
 """Stretches: parts of a recording in which no particles are added or removed."""
 
 import functools
-from collections.abc import Iterator
+import itertools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from ...shapes import Shape
 from ..journal import Entry
-from ..scene import Parts
+from ..scene import Parts, set_knobs
 from .geometry import Geometry, geometry, without_broken
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ class Stretch:
 
     entry: the entry of the scene. frames: their numbers. times [s]. knob_changes: the knobs that the user set: before which
     frame, the number of the feature, and the values of its knobs. broken: constraints that broke: before which frame, the number
-    of the feature, and those of its constraints.
+    of the feature, and those of its constraints. motion: yields what Replay.motion() does for each frame; nothing unless asked.
     """
 
     recording: "Replay"
@@ -31,6 +32,7 @@ class Stretch:
     times: np.ndarray
     knob_changes: list[tuple[int, int, dict[str, Any]]]
     broken: list[tuple[int, int, np.ndarray]]
+    motion: Iterator[dict[str, np.ndarray]]
 
     def __iter__(self) -> Iterator[tuple[int, float, np.ndarray]]:
         """Yield number, time [s] and positions [m] of each frame."""
@@ -62,6 +64,19 @@ class Stretch:
                 now = without_broken(now, self.parts, gone)
             yield now
 
+    def knobs_at(self) -> Callable[[int], None]:
+        """Return a function that gives the features of `parts` the knobs that they have in a frame; frames must ascend."""
+        features, changes = dict(zip(self.parts.numbers, self.parts.features, strict=True)), list(self.knob_changes)
+
+        def turn(frame: int) -> None:
+            """Set the knobs that the user had set before the frame."""
+            while changes and changes[0][0] <= frame:
+                _, k, values = changes.pop(0)
+                if k in features:
+                    set_knobs(features[k], values)
+
+        return turn
+
     def flat(self, x: np.ndarray) -> np.ndarray:
         """Return positions in 3D; a 2D scene lies at z = 0."""
         out = np.zeros((len(x), 3), dtype=x.dtype)
@@ -69,23 +84,37 @@ class Stretch:
         return out
 
 
-def stretches(recording: "Replay") -> list[Stretch]:
-    """Return the stretches of a recording, in order."""
+def in_space(moved: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return velocities (n, 3), spins (n, 3) and orientations as quaternions (n, 4) (x, y, z, w). A 2D scene lies at z = 0."""
+    out = {}
+    for name, values in moved.items():
+        if name == "velocity":
+            values = np.column_stack([values, np.zeros((len(values), 3 - values.shape[1]))])
+        elif values.ndim == 1:
+            none = np.zeros((len(values), 2))
+            values = np.column_stack([none, values] if name == "spin" else [none, np.sin(values / 2), np.cos(values / 2)])
+        out[name] = values
+    return out
+
+
+def stretches(recording: "Replay", motion: bool = False) -> list[Stretch]:
+    """Return the stretches of a recording, in order, each to be read once if motion is asked for."""
+    moved = recording.motion() if motion else itertools.repeat({})
     times = dict(zip(recording.frames.tolist(), recording.times.tolist(), strict=True))
     out = []
     for scene in recording.scenes:
         if scene.frames:
             moments = np.array([times[k] for k in scene.frames])
-            out.append(Stretch(recording, scene.entry, np.array(scene.frames), moments, scene.knobs, scene.broken))
+            out.append(Stretch(recording, scene.entry, np.array(scene.frames), moments, scene.knobs, scene.broken, moved))
     return out
 
 
-def only(recording: "Replay", path: str, what: str, others: str) -> Stretch:
+def only(recording: "Replay", path: str, what: str, others: str, motion: bool = False) -> Stretch:
     """Return the only stretch of a recording; raise ValueError if there are more or none.
 
     what, others: for the message, what needs a single stretch, and which formats can hold several.
     """
-    found = stretches(recording)
+    found = stretches(recording, motion)
     if not found:
         raise ValueError(f"replay: {recording.path} has no frame, so there is nothing for {path}.")
     if len(found) > 1:

@@ -2,20 +2,32 @@
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from .stretch import stretches
 
 if TYPE_CHECKING:
     from ..replay import Replay
 
+NAMES = {  # columns by quantity and dimension
+    "velocity": {2: "vx,vy", 3: "vx,vy,vz"}, "spin": {2: "spin", 3: "spin_x,spin_y,spin_z"},
+    "orientation": {2: "angle", 3: "qx,qy,qz,qw"},
+}  # fmt: skip
 
-def write(recording: "Replay", path: str) -> list[str]:
-    """Write positions to a .csv file."""
+
+def write(recording: "Replay", path: str, *, motion: bool = False) -> list[str]:
+    """Write positions, radii and motion to a .csv file. Cells stay empty before the first particle that spins is added."""
+    found = stretches(recording, motion)
+    names = [n for n in NAMES if motion and (n == "velocity" or any(n in s.entry.arrays for s in found))]
     with open(path, "w", encoding="ascii") as out:
-        for first, stretch in enumerate(stretches(recording)):
-            dim = stretch.entry.arrays["position"].shape[1]
+        for first, stretch in enumerate(found):
+            radius, dim = stretch.column("radius"), stretch.column("position").shape[1]
             if not first:
-                out.write(f"frame,time,particle,{','.join('xyz'[:dim])}\n")
-            rows = "".join(f"\0,{i}{',%.9g' * dim}\n" for i in range(len(stretch.column("mass"))))
-            for frame, time, x in stretch:
-                out.write((rows % tuple(x.ravel().tolist())).replace("\0", f"{frame},{time!r}"))
+                columns = ["frame,time,particle", "x,y,z"[: 2 * dim - 1], "radius", *(NAMES[n][dim] for n in names)]
+                out.write(f"{','.join(columns)}\n")
+            there = "".join((",%.9g" if n in stretch.entry.arrays else ",") * len(NAMES[n][dim].split(",")) for n in names)
+            rows = "".join(f"\0,{i}{',%.9g' * (dim + 1)}{there}\n" for i in range(len(radius)))
+            for (frame, time, x), moved in zip(stretch, stretch.motion, strict=False):
+                table = np.column_stack([x, radius, *moved.values()])
+                out.write((rows % tuple(table.ravel().tolist())).replace("\0", f"{frame},{time!r}"))
     return [path]

@@ -14,7 +14,7 @@ import numpy as np
 from ...shapes import Shape
 from .geometry import Geometry
 from .names import numbered
-from .stretch import Stretch, stretches
+from .stretch import Stretch, in_space, stretches
 
 if TYPE_CHECKING:
     from ..replay import Replay
@@ -24,17 +24,19 @@ KINDS = {"f4": "Float32", "f8": "Float64", "i4": "Int32", "u1": "UInt8"}
 ORDER = "LittleEndian" if sys.byteorder == "little" else "BigEndian"
 
 
-def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
-    """Write points with radius [m] and mass [kg], and cells: faces, other links, loose particles."""
+def write(recording: "Replay", path: str, *, shape: Shape | None = None, motion: bool = False) -> list[str]:
+    """Write points with radius [m], mass [kg] and motion, and cells: faces, other links, loose particles."""
     base, out, sets = os.path.splitext(path)[0], [path], []
-    for stretch in stretches(recording):
+    for stretch in stretches(recording, motion):
         laid_out = None
-        for (frame, time, x), geometry in zip(stretch, stretch.geometries(shape), strict=True):
+        for (frame, time, x), geometry, moved in zip(stretch, stretch.geometries(shape), stretch.motion, strict=False):
             if geometry is not laid_out:
                 laid_out, (before, after) = geometry, _laid_out(stretch, geometry)
             name = numbered(f"{base}.vtu", frame)
             with open(name, "wb") as file:
-                file.writelines([before, _array("position", stretch.flat(x).astype(np.float32)), after])
+                more = [_array(name, values) for name, values in in_space(moved).items()]
+                place = _array("position", stretch.flat(x).astype(np.float32))
+                file.writelines([before, *more, b"</PointData>\n<Points>\n", place, after])
             out.append(name)
             sets.append(f'<DataSet timestep="{time!r}" file={quoteattr(os.path.basename(name))}/>\n')
     with open(path, "w", encoding="utf-8") as file:
@@ -45,7 +47,7 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
 
 
 def _laid_out(stretch: Stretch, geometry: Geometry) -> tuple[bytes, bytes]:
-    """Return the text that is the same in all files until links break, before and after the positions."""
+    """Return the text that is the same in all files until links break, before motion and positions, and after them."""
     rows = [*geometry.faces, *geometry.links, *geometry.loose[:, None]]
     kinds = [{3: TRIANGLE, 4: QUAD}.get(len(face), POLYGON) for face in geometry.faces]
     kinds += [LINE] * len(geometry.links) + [VERTEX] * len(geometry.loose)
@@ -55,7 +57,7 @@ def _laid_out(stretch: Stretch, geometry: Geometry) -> tuple[bytes, bytes]:
         f'<VTKFile type="UnstructuredGrid" version="1.0" byte_order="{ORDER}" header_type="UInt64">\n<UnstructuredGrid>\n'
         f'<Piece NumberOfPoints="{len(stretch.column("mass"))}" NumberOfCells="{len(rows)}">\n<PointData>\n'
     ).encode()
-    before += b"".join(_array(name, stretch.column(name)) for name in ("radius", "mass")) + b"</PointData>\n<Points>\n"
+    before += b"".join(_array(name, stretch.column(name)) for name in ("radius", "mass"))
     cells = [_array("connectivity", around), _array("offsets", ends), _array("types", np.array(kinds, dtype=np.uint8))]
     after = [b"</Points>\n<Cells>\n", *cells, b"</Cells>\n</Piece>\n</UnstructuredGrid>\n</VTKFile>\n"]
     return before, b"".join(after)
@@ -63,7 +65,7 @@ def _laid_out(stretch: Stretch, geometry: Geometry) -> tuple[bytes, bytes]:
 
 def _array(name: str, array: np.ndarray) -> bytes:
     """Return an array in base 64, with its size before it."""
-    wide = ' NumberOfComponents="3"' if array.ndim == 2 else ""
+    wide = f' NumberOfComponents="{array.shape[1]}"' if array.ndim == 2 else ""
     data = base64.b64encode(np.uint64(array.nbytes).tobytes() + array.tobytes())
     head = f'<DataArray type="{KINDS[array.dtype.str[1:]]}" Name="{name}"{wide} format="binary">'
     return head.encode() + data + b"</DataArray>\n"

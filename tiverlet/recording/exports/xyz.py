@@ -2,22 +2,25 @@
 
 from typing import TYPE_CHECKING
 
-from .stretch import stretches
+import numpy as np
+
+from .stretch import in_space, stretches
 
 if TYPE_CHECKING:
     from ..replay import Replay
 
+NAMES = {"velocity": "velo:R:3", "spin": "angular_velocity:R:3", "orientation": "orientation:R:4"}  # as OVITO names columns
 
-def write(recording: "Replay", path: str) -> list[str]:
-    """Write positions, and radii if no particles are added or removed. A 2D scene lies at z = 0."""
-    found = stretches(recording)
-    same = len(found) == 1
-    columns = "species:S:1:pos:R:3" + (":radius:R:1" if same else "")
+
+def write(recording: "Replay", path: str, *, motion: bool = False) -> list[str]:
+    """Write positions and radii of each frame, and its motion. A 2D scene lies at z = 0."""
     with open(path, "w", encoding="ascii") as out:
-        for stretch in found:
-            radii = stretch.column("radius").tolist()
-            rows = "".join(f"X %.9g %.9g %.9g{f' {r:.9g}' if same else ''}\n" for r in radii)
-            for frame, time, x in stretch:
+        for stretch in stretches(recording, motion):
+            radius = stretch.column("radius")
+            for (frame, time, x), moved in zip(stretch, stretch.motion, strict=False):
+                turned = in_space(moved)
+                columns = ":".join(["species:S:1:pos:R:3:radius:R:1", *(NAMES[name] for name in turned)])
                 out.write(f'{len(x)}\nProperties={columns} Time={time!r} Frame={frame} pbc="F F F"\n')
-                out.write(rows % tuple(stretch.flat(x).ravel().tolist()))
+                table = np.column_stack([stretch.flat(x), radius, *turned.values()])
+                out.write((f"X{' %.9g' * table.shape[1]}\n" * len(x)) % tuple(table.ravel().tolist()))
     return [path]

@@ -1,0 +1,70 @@
+"""The walls and wires of a recording as triangles or lines, at their places in each frame."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...colliders.collider import Collider
+from ...constraints import Path
+from ..drawing import EDGE, WALL
+
+if TYPE_CHECKING:
+    from .stretch import Stretch
+
+
+@dataclass(frozen=True)
+class Wall:
+    """A wall in all frames.
+
+    corners: (frames, v, 3) [m], all in one point where the wall is inactive. parts: corners of its triangles, (t, 3), each with
+    corners of its own, or ends of its lines, (m, 2). hue: its colour, (1, 3).
+    """
+
+    name: str
+    corners: np.ndarray
+    parts: np.ndarray
+    hue: np.ndarray
+
+    @property
+    def solid(self) -> bool:
+        """Whether it is made of triangles."""
+        return self.parts.shape[1] == 3
+
+    def at(self, some: np.ndarray) -> "Wall":
+        """Return it in some of the frames."""
+        return replace(self, corners=self.corners[some])
+
+
+def drawn_walls(stretch: "Stretch", low: np.ndarray, high: np.ndarray) -> list[Wall]:
+    """Return walls and wires in each frame of a stretch, as far as they are between two corners (dim,) [m]."""
+    dim = len(low)
+    walls = [(k, f) for k, f in zip(stretch.parts.numbers, stretch.parts.features, strict=True) if isinstance(f, Collider | Path)]
+    turn, found = stretch.knobs_at(), [[] for _ in walls]
+    for frame in stretch.frames.tolist():
+        turn(frame)
+        for (_, wall), shown in zip(walls, found, strict=True):
+            shown.append(_shape(wall, low, high))
+    out = []
+    for (k, wall), shown in zip(walls, found, strict=True):
+        corners, parts = shown[0]
+        same = [now if now.shape == corners.shape else corners for now, _ in shown]
+        flat = np.zeros((len(same), len(corners), 3), dtype=np.float32)
+        flat[..., :dim] = same
+        if len(parts):
+            out.append(Wall(f"{type(wall).__name__} {k}", flat, parts, WALL if parts.shape[1] == 3 else np.array([EDGE])))
+    return out
+
+
+def _shape(wall: Collider | Path, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return corners (v, dim) [m], and those of each triangle or line."""
+    vertices, faces = wall.solid(low, high) if isinstance(wall, Collider) else (low[None], np.zeros((0, 3), dtype=np.int64))
+    if len(faces):
+        corners, parts = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
+    else:
+        strips = np.asarray(wall.outline(low, high)[0])
+        number = np.arange(strips.shape[0] * strips.shape[1]).reshape(strips.shape[:2])
+        corners, parts = strips.reshape(-1, len(low)), np.stack([number[:, :-1], number[:, 1:]], axis=-1).reshape(-1, 2)
+    if isinstance(wall, Collider) and not wall.active:
+        corners = np.broadcast_to(corners[:1], corners.shape)
+    return corners, parts
