@@ -254,7 +254,7 @@ def test_a_plane_is_at_zero_and_particles_may_come(changing, tmp_path):
     assert lines[1].startswith("Properties=species:S:1:pos:R:3:radius:R:1 ") and lines[-3:] == [
         "X 0 0 0 0", "X 1 0 0 0", "X 2 1 0 0.5",
     ]  # fmt: skip
-    for kind, others in (("npz", ".csv"), ("glb", ".csv, .obj, .pvd or .xyz")):
+    for kind, others in (("npz", ".csv"), ("glb", ".csv, .obj, .pvd, .usd or .xyz")):
         with pytest.raises(ValueError, match=f"not the same in all frames, so .* export to {others}"):
             changing.export(tmp_path / f"a.{kind}")
         assert not (tmp_path / f"a.{kind}").exists()
@@ -323,8 +323,52 @@ def test_what_rolls_turns_in_arrays_and_meshes(dim, tmp_path):
     recording.export(tmp_path / "b.npz")
     with np.load(tmp_path / "b.npz") as arrays:
         assert not {"velocity", "spin", "orientation"} & {*arrays}
-    with pytest.raises(ValueError, match="a.obj takes no motion; .csv, .glb, .gltf, .npz, .pvd, .xyz do"):
+    with pytest.raises(ValueError, match="a.obj takes no motion; .csv, .glb, .gltf, .npz, .pvd, .usd, .usda, .usdc, .xyz do"):
         recording.export(tmp_path / "a.obj", motion=True)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_usd_holds_grains_that_are_poured(dim, tmp_path):
+    usd, geom = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdGeom")
+    recording, truth = rolled(tmp_path / "a.rrd", dim, poured=True)
+    assert recording.export(tmp_path / "a.usdc", motion=True) == [str(tmp_path / "a.usdc")]
+    stage = usd.Stage.Open(str(tmp_path / "a.usdc"))
+    assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode()) == (60, 60 * recording.times[-1])
+    assert geom.GetStageUpAxis(stage) == "Y" and geom.GetStageMetersPerUnit(stage) == 1
+    for k, (frame, time) in enumerate(zip(recording.frames, recording.times, strict=True)):
+        parts = [stage.GetPrimAtPath(f"/scene/part_{j}") for j in (0, 1)]
+        seen = [geom.Imageable(part).ComputeVisibility(60 * time) for part in parts]
+        assert seen == (["inherited", "invisible"] if k < 3 else ["invisible", "inherited"])
+        points, n = geom.Points(stage.GetPrimAtPath(f"{parts[k >= 3].GetPath()}/particles")), len(truth[k][0])
+        x, v = recording.position(int(frame)), truth[k][0]
+        np.testing.assert_array_equal(np.array(points.GetPointsAttr().Get(60 * time))[:, :dim], x)
+        np.testing.assert_allclose(np.array(points.GetVelocitiesAttr().Get(60 * time))[:, :dim], v, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(points.GetWidthsAttr().Get(), [0.2, 0.2, 0.5][:n], rtol=1e-6)
+        turned = geom.PrimvarsAPI(points)
+        spin, quaternion = (np.array(turned.GetPrimvar(name).Get(60 * time)) for name in ("spin", "orientation"))
+        angle = truth[k][2] if dim == 2 else 2 * np.arctan2(truth[k][2][:, 2], truth[k][2][:, 3])
+        np.testing.assert_allclose(spin[:, 2], truth[k][1] if dim == 2 else truth[k][1][:, 2], rtol=1e-6, atol=1e-5)
+        np.testing.assert_allclose(quaternion[:, 2:], np.stack([np.sin(angle / 2), np.cos(angle / 2)], axis=1), atol=1e-6)
+
+
+def test_usd_holds_surfaces_links_and_up(recording, whole, tmp_path):
+    usd, geom = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdGeom")
+    recording.export(tmp_path / "a.usda", shape=whole)
+    stage = usd.Stage.Open(str(tmp_path / "a.usda"))
+    turn = np.array(geom.Xformable(stage.GetPrimAtPath("/scene")).ComputeLocalToWorldTransform(0))
+    np.testing.assert_allclose([0, 0, 1, 0] @ turn, [0, 1, 0, 0], atol=1e-7)  # z, which is up, becomes y
+    mesh, lines, grains = (geom.Imageable(stage.GetPrimAtPath(f"/scene/part_0/{n}")) for n in ("surfaces", "links", "particles"))
+    mesh, lines, grains = geom.Mesh(mesh), geom.BasisCurves(lines), geom.Points(grains)
+    assert [*mesh.GetFaceVertexCountsAttr().Get()] == [4, 3] and mesh.ValidateTopology(
+        mesh.GetFaceVertexIndicesAttr().Get(), mesh.GetFaceVertexCountsAttr().Get(), 5
+    )
+    uv = np.array(geom.PrimvarsAPI(mesh).GetPrimvar("st").Get())
+    np.testing.assert_allclose(uv, np.concatenate([one for one in whole.uv if len(one)]))
+    for time, x in zip(recording.times, positions(recording), strict=True):
+        np.testing.assert_array_equal(mesh.GetPointsAttr().Get(60 * time), x[:5])
+        np.testing.assert_array_equal(lines.GetPointsAttr().Get(60 * time), x[[5, 6, 6, 7]])
+        np.testing.assert_array_equal(grains.GetPointsAttr().Get(60 * time), x[8:])
+    assert [*lines.GetCurveVertexCountsAttr().Get(0)] == [2, 2] and grains.GetWidthsAttr().Get()[0] == 0.5
 
 
 def test_meshes_have_walls_where_they_are_in_each_frame(tmp_path, world):
@@ -486,7 +530,7 @@ def test_films_show_what_moves(kind, tmp_path, world):
 
 
 def test_errors_say_what_can_be_done(recording, roof, whole, tmp_path, monkeypatch):
-    endings = ".csv, .gif, .glb, .gltf, .mp4, .npz, .obj, .pvd, .webp or .xyz can be written"
+    endings = ".csv, .gif, .glb, .gltf, .mp4, .npz, .obj, .pvd, .usd, .usda, .usdc, .webp or .xyz can be written"
     with pytest.raises(ValueError, match=f"a.stl ends in '.stl', but {endings}"):
         recording.export("a.stl")
     with pytest.raises(FileNotFoundError, match="folder of .*a.glb does not exist"):
@@ -498,9 +542,9 @@ def test_errors_say_what_can_be_done(recording, roof, whole, tmp_path, monkeypat
     with pytest.raises(TypeError, match="shape = 'roof.obj' is a str"):
         recording.export(tmp_path / "a.obj", shape="roof.obj")  # type: ignore[arg-type]
     monkeypatch.setenv("PATH", "")  # hides any other ffmpeg
-    for module, kind in (("pygltflib", "glb"), ("imageio_ffmpeg", "mp4")):
+    for module, kind, extra in (("pygltflib", "glb", "export"), ("imageio_ffmpeg", "mp4", "export"), ("pxr.Usd", "usd", "usd")):
         monkeypatch.setitem(sys.modules, module, None)
-        with pytest.raises(ImportError, match=rf"a.{kind} needs {module}, .* pip install 'tiverlet\[export\]'"):
+        with pytest.raises(ImportError, match=rf"a.{kind} needs {module}, .* pip install 'tiverlet\[{extra}\]'"):
             recording.export(tmp_path / f"a.{kind}")
     assert not list(tmp_path.iterdir())
 

@@ -26,7 +26,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     what.add_argument(
         "--export", metavar="KIND",
         help="write for other programs, beside the file or to a name with this ending: npz (arrays, curves), csv, xyz (OVITO); "
-        "glb, gltf (an animated mesh, for Blender), obj (a file for each frame), pvd (ParaView); gif, webp, mp4 (a film)",
+        "glb, gltf (an animated mesh, for Blender), obj (a file for each frame), pvd (ParaView), usd; gif, webp, mp4 (a film)",
     )  # fmt: skip
     parser.add_argument("--shape", metavar="BODY.obj", help="of --export: take its faces, quads and texture coordinates")
     parser.add_argument(

@@ -390,18 +390,19 @@ class Replay:
             .glb, .gltf   an animated mesh, y up, with its walls, for Blender and browsers
             .obj          a file for each frame, named a_0000.obj, a_0001.obj ..., or by a %d in the name
             .pvd          a file for each frame for ParaView, a_0000.vtu ..., with radii, masses, links and faces
+            .usd, .usda, .usdc  Universal Scene Description: faces, links, points and walls, y up
             .gif, .webp, .mp4  a film in the scene's own time, 25 pictures a second
 
         shape: the shape that the particles were made from; meshes and films then use its faces, with their quads, and its texture
         coordinates; else faces are those of the picture. Features with the user's functions contribute no faces and links.
-        motion: whether .npz, .csv, .xyz and .pvd also hold velocities [m/s], spins [rad/s] and orientations, and spheres turn in
-        .glb and .gltf. The picture does not have them, so all is computed again, see motion().
+        motion: whether .npz, .csv, .xyz, .pvd and .usd also hold velocities [m/s], spins [rad/s] and orientations, and spheres
+        turn in .glb. The picture does not have them, so all is computed again, see motion().
         Of films: size, their width and height [pixels], or the width alone; camera, the angles [rad] of the eye to the right of
         the front and above the horizon in 3D; theme, "dark" or "light".
 
-        Raises ValueError for another ending, an argument that the format does not take, added or removed particles in a format
-        that cannot hold them, and a shape of other particles; RuntimeError if motion does not come out as recorded;
-        FileNotFoundError if the folder is missing; ImportError for .glb, .gltf and .mp4 without tiverlet[export].
+        Raises ValueError for what a format does not take, such as added or removed particles, and for a shape of other particles;
+        RuntimeError if motion does not come out as recorded; FileNotFoundError if the folder is missing; ImportError for .glb and
+        .mp4 without tiverlet[export], and for .usd without tiverlet[usd].
         """
         from . import exports  # imported late, since it imports rerun
 

@@ -9,14 +9,15 @@ import os
 from typing import TYPE_CHECKING, Any
 
 from ...shapes import Shape
-from . import arrays, film, gltf, obj, table, vtk, xyz
+from . import arrays, film, gltf, obj, table, usd, vtk, xyz
 
 if TYPE_CHECKING:
     from ..replay import Replay
 
 FORMATS = {
     ".csv": table.write, ".gif": film.write, ".glb": gltf.write, ".gltf": gltf.write, ".mp4": film.write, ".npz": arrays.write,
-    ".obj": obj.write, ".pvd": vtk.write, ".webp": film.write, ".xyz": xyz.write,
+    ".obj": obj.write, ".pvd": vtk.write, ".usd": usd.write, ".usda": usd.write, ".usdc": usd.write, ".webp": film.write,
+    ".xyz": xyz.write,
 }  # fmt: skip
 ENDINGS = sorted(FORMATS)
 

@@ -132,3 +132,18 @@ def _pieces(faces: np.ndarray) -> Iterable[tuple[np.ndarray, np.ndarray, bool]]:
                     turned[other] = turned[face] ^ same
                     piece.append(other)
         yield np.array(piece), turned[piece] == 1, all(len(near[face]) == 3 for face in piece)
+
+
+def turn(up: np.ndarray) -> list[float]:
+    """Return the quaternion that rotates the axis nearest to `up` to y."""
+    axis = int(np.argmax(np.abs(up)))
+    sign, half = np.sign(up[axis]), float(np.sqrt(0.5))
+    if axis == 1:
+        return [0.0, 0.0, 0.0, 1.0] if sign > 0 else [1.0, 0.0, 0.0, 0.0]
+    return [0.0, 0.0, sign * half, half] if axis == 0 else [-sign * half, 0.0, 0.0, half]
+
+
+def linear(hue: np.ndarray) -> np.ndarray:
+    """Convert sRGB in 0 ... 255 to linear light in 0 ... 1, as glTF and USD store colours."""
+    share = hue / 255
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)

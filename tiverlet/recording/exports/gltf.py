@@ -14,7 +14,7 @@ import numpy as np
 from ...colliders.round_mesh import rounded
 from ...shapes import Shape
 from .extras import needed
-from .geometry import Geometry
+from .geometry import Geometry, linear, turn
 from .sketch import extent
 from .stretch import Stretch, in_space, only
 from .walls import Wall, drawn_walls
@@ -35,14 +35,14 @@ def write(recording: "Replay", path: str, *, shape: Shape | None = None, motion:
     Particles that no surface hides are spheres of their radii, or points. motion: spheres turn as their orientations do.
     """
     lib: Any = needed("pygltflib", path)
-    stretch = only(recording, path, "mesh", ".csv, .obj, .pvd or .xyz", motion)
+    stretch = only(recording, path, "mesh", ".csv, .obj, .pvd, .usd or .xyz", motion)
     geometries = [*stretch.geometries(shape)]
     geometry = geometries[0]
     both = [(stretch.flat(x), in_space(moved)) for (_, _, x), moved in zip(stretch, stretch.motion, strict=False)]
     x = np.array([x for x, _ in both], dtype=np.float32)
     if not (x.size and np.isfinite(x).all()):
         why = "has positions that are not finite" if x.size else "has no particles"
-        raise ValueError(f"replay: {recording.path} {why}, which glTF cannot say; export to .csv, .obj, .pvd or .xyz.")
+        raise ValueError(f"replay: {recording.path} {why}, which glTF cannot say; export to .csv, .obj, .pvd, .usd or .xyz.")
     times = stretch.times.astype(np.float32)
     later = np.append(np.diff(times) > 0, True)  # of several frames at the same time, keep the last
     ends = extent(stretch.parts, x[:, :, : stretch.parts.particles.dim])
@@ -50,7 +50,7 @@ def write(recording: "Replay", path: str, *, shape: Shape | None = None, motion:
     hues = np.concatenate([geometry.hues, *(np.repeat(wall.hue, wall.corners.shape[1], axis=0) for wall in walls)])
     turned = [moved["orientation"] for _, moved in both if "orientation" in moved]
     scene = _Scene(lib, np.concatenate([x[later], *(wall.corners for wall in walls)], axis=1), times[later])
-    root = scene.node(name="scene", rotation=_turn(geometry.up))
+    root = scene.node(name="scene", rotation=turn(geometry.up))
     single = geometry.bare if len(geometry.bare) <= SPHERES else geometry.bare[:0]
     unbroken = [g.links for g, kept in zip(geometries, later.tolist(), strict=True) if kept]
     nodes = _meshes(scene, geometry, unbroken, np.setdiff1d(geometry.loose, single))
@@ -61,15 +61,6 @@ def write(recording: "Replay", path: str, *, shape: Shape | None = None, motion:
         begin += wall.corners.shape[1]
     scene.children(root, nodes)
     return scene.save(path)
-
-
-def _turn(up: np.ndarray) -> list[float]:
-    """Return the quaternion that rotates the axis nearest to `up` to y."""
-    axis = int(np.argmax(np.abs(up)))
-    sign, half = np.sign(up[axis]), float(np.sqrt(0.5))
-    if axis == 1:
-        return [0.0, 0.0, 0.0, 1.0] if sign > 0 else [1.0, 0.0, 0.0, 0.0]
-    return [0.0, 0.0, sign * half, half] if axis == 0 else [-sign * half, 0.0, 0.0, half]
 
 
 def _meshes(scene: "_Scene", geometry: Geometry, unbroken: list[np.ndarray], points: np.ndarray) -> list[int]:
@@ -159,7 +150,7 @@ def _spheres(scene: "_Scene", stretch: Stretch, geometry: Geometry, single: np.n
     meshes: dict[tuple, int] = {}
     radius, nodes = stretch.column("radius"), []
     for i in single.tolist():
-        hue = tuple(_linear(geometry.hues[i]).tolist())
+        hue = tuple(linear(geometry.hues[i]).tolist())
         if hue not in meshes:
             part = scene.lib.Primitive(
                 mode=TRIANGLES, indices=corners, material=scene.material(hue),
@@ -174,12 +165,6 @@ def _spheres(scene: "_Scene", stretch: Stretch, geometry: Geometry, single: np.n
             scene.animate(node, "rotation", scene.sampler(_continuous(turned[:, i]), "VEC4"))
         nodes.append(node)
     return nodes
-
-
-def _linear(hue: np.ndarray) -> np.ndarray:
-    """Convert sRGB in 0 ... 255 to linear light in 0 ... 1, as glTF stores colours."""
-    share = hue / 255
-    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
 
 class _Scene:
@@ -225,7 +210,7 @@ class _Scene:
         normals: (frames, vertices, 3).
         """
         at = np.broadcast_to(at, (len(self.x), at.shape[-1]))
-        hue = np.column_stack([np.rint(255 * _linear(hues[at[0]])), np.full(at.shape[1], 255)]).astype(np.uint8)
+        hue = np.column_stack([np.rint(255 * linear(hues[at[0]])), np.full(at.shape[1], 255)]).astype(np.uint8)
         first = {"POSITION": self.add(self.x[0, at[0]], "VEC3", VERTICES, ends=True), "COLOR_0": self.add(hue, "VEC4", VERTICES)}
         if normals is not None:
             first["NORMAL"] = self.add(normals[0], "VEC3", VERTICES)

@@ -21,13 +21,13 @@ def write(recording: "Replay", path: str, *, motion: bool = False) -> list[str]:
     names = [n for n in NAMES if motion and (n == "velocity" or any(n in s.entry.arrays for s in found))]
     with open(path, "w", encoding="ascii") as out:
         for first, stretch in enumerate(found):
-            radius, dim = stretch.column("radius"), stretch.column("position").shape[1]
+            radii, dim = stretch.column("radius").tolist(), stretch.column("position").shape[1]
             if not first:
                 columns = ["frame,time,particle", "x,y,z"[: 2 * dim - 1], "radius", *(NAMES[n][dim] for n in names)]
                 out.write(f"{','.join(columns)}\n")
             there = "".join((",%.9g" if n in stretch.entry.arrays else ",") * len(NAMES[n][dim].split(",")) for n in names)
-            rows = "".join(f"\0,{i}{',%.9g' * (dim + 1)}{there}\n" for i in range(len(radius)))
+            rows = "".join(f"\0,{i}{',%.9g' * dim},{r:.9g}{there}\n" for i, r in enumerate(radii))
             for (frame, time, x), moved in zip(stretch, stretch.motion, strict=False):
-                table = np.column_stack([x, radius, *moved.values()])
+                table = np.column_stack([x, *moved.values()])
                 out.write((rows % tuple(table.ravel().tolist())).replace("\0", f"{frame},{time!r}"))
     return [path]
