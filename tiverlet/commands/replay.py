@@ -43,8 +43,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def size(text: str) -> int | tuple[int, ...]:
     """Return the size of a film, such as 1280x720 or 1280."""
-    numbers = tuple(map(int, text.split("x")))
-    return numbers if len(numbers) > 1 else numbers[0]
+    numbers = [int(number) for number in text.split("x")]
+    return tuple(numbers) if len(numbers) > 1 else numbers[0]
 
 
 def angles(text: str) -> tuple[float, ...]:
