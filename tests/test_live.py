@@ -277,11 +277,12 @@ def test_a_page_that_does_not_read_holds_up_nobody(server):
 
 
 def test_play_replaces_recordings_only(rope, server, tmp_path):
-    notes = tmp_path / "notes.txt"
-    notes.write_text("mine")
-    with pytest.raises(ValueError, match="is no recording, and is not replaced"):
-        Session(rope, server, record=notes)
-    assert notes.read_text() == "mine" and not rope._watchers
+    for name, words in (("notes.rrd", "is no recording, and is not replaced"), ("notes.txt", "ends in '.txt', but a recording")):
+        notes = tmp_path / name
+        notes.write_text("mine")
+        with pytest.raises(ValueError, match=words):
+            Session(rope, server, record=notes)
+        assert notes.read_text() == "mine" and not rope._watchers
 
 
 def test_only_who_knows_the_address_gets_in(server):

@@ -8,6 +8,8 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.contact.pair_contact import PairContact
+from tiverlet.contact.rays import Hits
+from tiverlet.contact.touches import Touches
 from tiverlet.features.feature import Batch, Feature
 from tiverlet.features.terms import ROWS, TERMS
 from tiverlet.neighbours.queries import Contacts
@@ -103,6 +105,7 @@ def test_a_name_of_the_package_is_answered(name, words):
         (lambda w: w.last.penetration, "write overlap"),
         (lambda w: w.last.converged, "write clean, flags and notes"),
         (lambda w: w.contacts.depth, "write overlap"),
+        (lambda w: w.ray((5.0, 5.0), (0, -1)).fraction, "write distance"),
         (lambda w: tv.shapes.rope((0, 0), (1, 0), 3).edges, "write links"),
         (lambda w: tv.shapes.rope((0, 0), (1, 0), 3).vertices, "write position"),
         (lambda w: tv.shapes.Rope, "did you mean 'rope'"),
@@ -186,7 +189,8 @@ def test_an_error_inside_of_a_call_stays_what_it_is(scene):
 
 
 OWNERS: dict[str, Any] = {
-    "Feature": Feature, "Batch": Batch, "PairContact": PairContact, "Contacts": Contacts, "Replay": Replay, "tiverlet": tv,
+    "Feature": Feature, "Batch": Batch, "PairContact": PairContact, "Contacts": Contacts, "Touches": Touches, "Hits": Hits,
+    "Replay": Replay, "tiverlet": tv,
     "tiverlet.measure": tv.measure, "Collider": tv.Box.__mro__[2], "Shape": tv.shapes.Shape,
 }  # fmt: skip
 

@@ -798,7 +798,7 @@ class World:
     def __reduce_ex__(self, protocol):
         raise TypeError(
             "A World holds compiled kernels and memory of the device, so it cannot be copied or pickled. Use world.clone(), or "
-            'write it to a file: tv.Recorder("world.rrd", world).close(), and read it back: tv.replay("world.rrd").world().'
+            'write it to a file: tv.Recorder("world.rrd", world).close(), and read it back: tv.replay("world.rrd").world(0).'
         )
 
     def _repr_html_(self) -> str:

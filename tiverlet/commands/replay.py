@@ -41,10 +41,10 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--given", metavar="SCRIPT.py", help="of --verify: where the user's own functions in the scene are")
 
 
-def size(text: str) -> int | tuple[int, ...]:
+def size(text: str) -> int | tuple[int, int]:
     """Return the size of a film, such as 1280x720 or 1280."""
-    numbers = [int(number) for number in text.split("x")]
-    return tuple(numbers) if len(numbers) > 1 else numbers[0]
+    wide, _, tall = text.partition("x")
+    return (int(wide), int(tall)) if tall else int(wide)
 
 
 def angles(text: str) -> tuple[float, ...]:

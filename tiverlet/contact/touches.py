@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 
 from .. import checks
+from ..features.unknown_names import answer_names
 
 BEFORE, NEVER = 0, -1  # in place of substeps, counted from 1: touched when the frame began; has not touched yet
 
 
+@answer_names
 @dataclass(frozen=True)
 class Touches:
     """Pairs that touched in a frame, each once, in the order of their indices.
@@ -51,6 +53,7 @@ class Touches:
         return Touches(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
+@answer_names
 @dataclass(frozen=True)
 class ContactEvents:
     """The contacts of the last frame.

@@ -223,6 +223,19 @@ ROWS: dict[str, dict[str, str]] = {
         "force forces": "write impulse, and divide it by the substep",
         "position": "write point",
     },
+    "Touches": {
+        "i j a b": "write pairs",
+        "force forces": "write impulse, and divide it by the frame's dt",
+        "position": "write point",
+        "start begin time": "write began and ended [s]",
+        "velocity": "write speed",
+    },
+    "Hits": {
+        "t fraction depth": "write distance",
+        "position": "write point",
+        "index body": "write particle, link or wall",
+        "hit": "write met",
+    },
     "rope chain cloth net": {"n count segments num_points resolution": "write points"},
 }  # fmt: skip
 

@@ -155,13 +155,12 @@ class Replay:
         return {name: (np.array([k for k, _ in rows]), np.array([v for _, v in rows])) for name, rows in found.items()}
 
     @_with_clear_errors
-    def world(self, frame: int | None = None) -> "World":
+    def world(self, frame: int) -> "World":
         """Return a world in the exact state of a frame, computed from the nearest earlier state and compared with the recording.
 
-        frame: its number; None for the last one. Raises RuntimeError if the computation does not lead to the recorded state, as
-        may happen on another machine.
+        Raises RuntimeError if the computation does not lead to the recorded state, as may happen on another machine.
         """
-        goal = self._entries.index(self._entry(int(self.frames[-1]) if frame is None else frame))
+        goal = self._entries.index(self._entry(frame))
         start = max(k for k, e in enumerate(self._entries[: goal + 1]) if e.kind == "state")
         world = None
         try:

@@ -9,6 +9,7 @@ import numpy as np
 from ... import checks
 from ...colliders.collider import Collider
 from ...features.feature import Feature
+from ...features.unknown_names import answer_names
 from ...geometry.bounding_tree import BoundingTree, ray_entry_bound
 from ...geometry.intervals import ball, capsule, entry, rounding
 from ...geometry.nearest import closest_segment_point, surface_normal
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 WHO = "World.ray"
 
 
+@answer_names
 @dataclass(frozen=True)
 class Hits:
     """What each of k rays meets first: a particle, a link or a wall. For one ray, given as (dim,), the first axis is left out.

@@ -48,9 +48,11 @@ class Look:
     @staticmethod
     def checked(size: Any, camera: Any, theme: Any, dim: int) -> "Look":
         """Return a look from the arguments of Replay.export(), or raise ValueError or TypeError."""
-        who, wide, tall = "replay", WIDE, None
+        who = "replay"
+        wide: Any = WIDE
+        tall: Any = None
         if size is not None:
-            wide, tall = (size[0], size[1]) if isinstance(size, (tuple, list)) and len(size) == 2 else (size, None)
+            wide, tall = size if isinstance(size, (tuple, list)) and len(size) == 2 else (size, None)
             for name, value in (("the width", wide), *([("the height", tall)] if tall is not None else [])):
                 if checks.integer(who, f"{name} in size", value, least=STEP) % 2:
                     raise ValueError(f"{who}: size = {size}, but films have even numbers of pixels; write {value + 1}.")
@@ -98,7 +100,7 @@ class View:
         return np.stack([across, down], axis=1), near
 
 
-def extent(parts: Parts, frames: np.ndarray | Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def extent(parts: Parts, frames: Sequence[np.ndarray] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return two corners [m] around particles in all frames and around walls of finite size."""
     r, x = parts.particles.radius[:, None], np.array(frames)
     low, high = ((x.astype(np.float64) + s * r).reshape(-1, x.shape[-1]) for s in (-1, 1))
