@@ -610,7 +610,7 @@ def test_an_infinite_tension_makes_a_note(world):
     w.step(1 / 60)
     reporter = w._runner.diagnostics.report
     reporter.figures[9] = np.inf
-    report, _ = reporter(w.time, 1 / 1200, 20, 1, None, 0.0, 0.0)
+    report, _ = reporter(w.time, 1 / 1200, 20, 1, None, 0.0, 0.0, 0.0)
     assert report.flags == {"softened"} and "Use about inf substeps" in report.notes[0]
 
 

@@ -5,6 +5,7 @@ from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import inline, ti
+from ..features.arguments import shifted
 from ..features.feature import Knob, Scene
 from ..geometry.intervals import ball, entry, exit_of, rounding
 from ..geometry.nearest import surface_normal
@@ -32,7 +33,7 @@ class Ball(Collider):
     """
 
     center = Knob(
-        lambda f, v: checks.vector("Ball", "center", v, f.dim or len(np.atleast_1d(v))), "Middle of the ball [m].", place=True
+        lambda f, v: checks.vector("Ball", "center", v, f.dim or len(np.atleast_1d(v))), "Middle of the ball [m].", place=shifted
     )
 
     shares_code = True

@@ -5,6 +5,7 @@ from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
+from ..features.arguments import shifted
 from ..features.feature import Knob, Scene
 from ..geometry.intervals import box, exit_of, rounding
 from ..particles import Particles
@@ -44,8 +45,8 @@ class Box(Collider):
 
     inside = poses = shares_code = True
     widest = 0.0
-    lower = Knob(_corner("lower"), "Lower corner [m].", place=True)
-    upper = Knob(_corner("upper"), "Upper corner [m].", place=True)
+    lower = Knob(_corner("lower"), "Lower corner [m].", place=shifted)
+    upper = Knob(_corner("upper"), "Upper corner [m].", place=shifted)
 
     def __init__(
         self, lower, upper, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float | None = None, active:

@@ -5,6 +5,7 @@ from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import inline, ti
+from ..features.arguments import shifted
 from ..features.feature import Knob, Scene
 from ..geometry.intervals import capsule, entry, rounding
 from ..geometry.nearest import closest_segment_point, surface_normal
@@ -20,7 +21,7 @@ MARCH = 32  # steps along a path; a grazing path is then resolved within 1e-6 of
 
 def _end(name: str) -> Knob:
     return Knob(
-        lambda f, v: checks.vector("Capsule", name, v, f.dim or len(np.atleast_1d(v))), "End of the axis [m].", place=True
+        lambda f, v: checks.vector("Capsule", name, v, f.dim or len(np.atleast_1d(v))), "End of the axis [m].", place=shifted
     )
 
 

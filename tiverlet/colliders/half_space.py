@@ -1,7 +1,5 @@
 """A plane with particles on one side."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -27,7 +25,10 @@ class HalfSpace(Collider):
     """
 
     shares_code = True
-    offset = Knob(lambda f, v: checks.number("HalfSpace", "offset", v), "Of the plane along its normal [m].")
+    offset = Knob(
+        lambda f, v: checks.number("HalfSpace", "offset", v), "Of the plane along its normal [m].",
+        place=lambda f, offset, by: offset + float(np.dot(f.normal, by)),
+    )  # fmt: skip
 
     def __init__(
         self, normal, offset: ArrayLike = 0.0, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float |
@@ -62,10 +63,6 @@ class HalfSpace(Collider):
     def end_motion(self) -> None:
         """Stay at the last offset."""
         self.dev.offset.end_motion()
-
-    def shifted(self, by: np.ndarray) -> dict[str, Any]:
-        """Return the offset of the shifted plane."""
-        return {"offset": self.offset + float(np.dot(self.normal, by))}
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """Return lines across the scene: one in 2D, two at right angles in 3D."""

@@ -6,6 +6,7 @@ import numpy as np
 
 from .. import checks
 from ..device import ti
+from ..features.arguments import shifted
 from ..features.feature import Knob, Scene
 from ..particles import Particles
 from .collider import Collider
@@ -52,7 +53,7 @@ class Moving(Collider):
         built=True,
         device="thickness",
     )
-    position = Knob(_position, "Where the origin of the wall's frame is [m].", place=True)
+    position = Knob(_position, "Where the origin of the wall's frame is [m].", place=shifted)
     rotation = Knob(_rotation, "Angle (2D) or rotation vector (3D) [rad].")
 
     def place(self, position: Any, rotation: Any) -> None:

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from .. import checks
 from ..device import ti
 from ..device.memory import ALL, rows_of
+from ..features.arguments import shifted
 from ..features.feature import Knob, Scene
 from ..geometry.interpolation import interpolate
 from ..particles import Particles, in_range
@@ -109,7 +110,7 @@ class Pin(Anchored):
     indices: Any = Knob(_indices, "The particles that are held, (m, 1).")
     _grabs = False  # whether other particles were assigned since the last frame; the previous ones are in _held
     _held = np.zeros((0, 1), dtype=np.int32)
-    target = Knob(_targets, "Where the particles are held, (m, dim) [m].", place=True)
+    target = Knob(_targets, "Where the particles are held, (m, dim) [m].", place=shifted)
 
     def __init__(self, indices, target=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0):
         self.setup(indices, compliance, damping)

@@ -27,13 +27,13 @@ class Knob:
     force: the knob changes a force, so displacements are turned into velocities first, see World._restart_for_new_forces().
     compiled: kernels contain the value, so the world is rebuilt for another one, see Feature.needs_other_kernels.
     built: the world is rebuilt for another value, too, but with the same kernels.
-    place: the value is a point in space, or several, which World.shift() moves.
+    place: a function (feature, value, vector) -> value after World.shift(vector), such as shifted(); None if it is no place.
     device: the attribute with the knob's field. Kernels read the setting by the knob's name; None where they do not read it.
     """
 
     def __init__(
         self, check: Callable, doc: str, *, force: bool = False, compiled: bool = False, built: bool = False,
-        place: bool = False, device: str | None = None,
+        place: Callable | None = None, device: str | None = None,
     ):  # fmt: skip
         self.check, self.force, self.compiled, self.built, self.place, self.device = check, force, compiled, built, place, device
         self.__doc__ = doc
@@ -62,6 +62,11 @@ class Knob:
         own["changed"] = True
         if self.force:
             own["new_force"] = True
+
+
+def shifted(feature: Any, value: np.ndarray, by: np.ndarray) -> np.ndarray:
+    """Return places (..., dim) [m], the value of a knob, after a shift of the scene by a vector, (dim,)."""
+    return value + by
 
 
 def _is_same(old: Any, new: Any) -> bool:

@@ -144,11 +144,6 @@ class Feature:
     def end_motion(self) -> None:
         """End a motion: the target of the last frame is where the next motion starts. Called when `moving`."""
 
-    def shifted(self, by: np.ndarray) -> dict[str, Any]:
-        """Return the knobs that are places, by name, after a shift of the scene by a vector, (dim,) [m]."""
-        kind = type(self)
-        return {name: getattr(self, name) + by for name in knobs_of(kind) if getattr(kind, name).place}
-
     def compiled(self) -> dict[str, Any]:
         """Return the values that its kernels contain: knobs that are compiled, and the properties in compiled_for."""
         knobs = [name for name in knobs_of(type(self)) if getattr(type(self), name).compiled]

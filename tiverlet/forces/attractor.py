@@ -6,6 +6,7 @@ import numpy as np
 
 from .. import checks
 from ..device import ti
+from ..features.arguments import shifted
 from ..features.feature import Acceleration, Knob
 from ..particles import Particles
 
@@ -23,7 +24,7 @@ class Attractor(Acceleration):
     is_fixed_in_space = False
     has_no_particle_data = True
     conservative = True
-    center = Knob(lambda f, v: checks.vector("Attractor", "center", v, f.dim or len(np.atleast_1d(v))), "[m].", place=True)
+    center = Knob(lambda f, v: checks.vector("Attractor", "center", v, f.dim or len(np.atleast_1d(v))), "[m].", place=shifted)
     strength = Knob(lambda f, v: checks.number("Attractor", "strength", v), "G M [m^3/s^2].")
     softening = Knob(lambda f, v: checks.number("Attractor", "softening", v, least=0.0), "[m].")
     dim = 0

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
+from ..features.arguments import shifted
 from ..features.feature import Acceleration, Knob, Scene
 from ..features.regrouping import Regrouping
 from ..particles import Particles, in_range
@@ -42,7 +43,7 @@ class Hand(Acceleration):
     uses_velocity = True
     conservative = True
     particle = Knob(_particle, "The particle that is drawn; -1: none.")
-    target = Knob(_target, "Where it is drawn to [m].", place=True)
+    target = Knob(_target, "Where it is drawn to [m].", place=shifted)
     rate = Knob(lambda f, v: checks.number("Hand", "rate", v, least=0.0), "How fast it gets there [1/s].")
     dim = _count = 0
 

@@ -38,7 +38,9 @@ def shift(world: Any, by: np.ndarray) -> None:
             )
     runner, position = world._runner, world.position + by
     world._check_places("World.shift", position)
-    _take(world, {f: f.shifted(by) for f in world.features}, position)
+    knobs = {f: {name: getattr(type(f), name) for name in knobs_of(type(f))} for f in world.features}
+    values = {f: {n: knob.place(f, getattr(f, n), by) for n, knob in own.items() if knob.place} for f, own in knobs.items()}
+    _take(world, values, position)
     runner.clock.energy, runner.clock.moved_mask = None, None
     runner.clock.forget_bound()
 
