@@ -158,13 +158,13 @@ def _gravity() -> Finding:
     holds, pull = {}, Gravity(0.0)
     with world(Particles([[0.0, 0.0]]), [pull], substeps=3) as w:
         for g in (0.0, 1e6, -1e6):
-            pull.g = g
+            pull.g = (0.0, -g)
             rerun(w, 0.5, 0.1)
             holds[f"g = {g:g}"] = bool(np.isclose(w.position[0, 1], -g * 0.125, rtol=1e-13, atol=0))
         w.position, w.velocity = np.zeros((1, 2)), np.zeros((1, 2))
         x, v = 0.0, 0.0
         for g in np.random.default_rng(0).uniform(-1e3, 1e3, 20):
-            pull.g = g
+            pull.g = (0.0, -g)
             w.step(0.1)
             x, v = x + v * 0.1 - g * 0.005, v - g * 0.1
         error = abs(w.position[0, 1] - x)
