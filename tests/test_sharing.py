@@ -26,7 +26,7 @@ def hung(world, mass, compliance, g, rest, points):
     """Return a world with a hanging rope and a spring across it."""
     rope = tv.shapes.rope((0, 0), (1, 0.2), points=points)
     links = [tv.Distance(rope.links), tv.Distance([[2, 7]], rest=rest, compliance=compliance)]
-    return world(tv.Particles(rope.position, mass=mass, pinned=[0]), [tv.Gravity(g), *links], substeps=5)
+    return world(tv.Particles(rope.position, mass=mass, pinned=[0]), [tv.Gravity((0, -g)), *links], substeps=5)
 
 
 NUMBERS = [(0.01, 1e-3, 9.81, 0.3, 12), (0.5, 1e-5, 1.6, 0.6, 9), (2.0, 0.1, -3.0, 0.2, 17)]
