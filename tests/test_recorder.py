@@ -9,6 +9,7 @@ import rerun as rr
 
 import tiverlet as tv
 from tiverlet.recording import messages
+from tiverlet.recording.hues import PALETTE, colors
 from tiverlet.recording.lines import Lines, cells, trails
 from tiverlet.recording.strain import LEVELS, LONGER, SCALE, SHORTER, levels
 from tiverlet.recording.surfaces import DARKEST, Surface, triangles
@@ -68,7 +69,7 @@ def test_every_frame_reads_back(world, tmp_path, dim):
     assert list(radii) == [None] and radii[None][0] < 0 and radii[None][1] == np.float32(0.02)
     assert len(strips[12]) < 29 or len(set(hues[12])) > 1  # neighbouring links of one colour are one strip
     hues = np.array(read(path, "/world/scene/particles", f"Points{kind}:colors")[None], dtype=np.uint32) >> 8  # RGBA
-    red, green, blue = tv.golden_colors(1)[0].tolist()  # a rope is one body
+    red, green, blue = PALETTE[0].tolist()  # a rope is one body
     assert (hues[1:] == red << 16 | green << 8 | blue).all() and hues[0] == 140 << 16 | 140 << 8 | 150
     for end, names in {"energy": ["energy"], "violation": ["residual", "overlap"], "substeps": ["substeps"]}.items():
         curve = read(path, f"/figures/{end}", "Scalars:scalars")
@@ -207,3 +208,35 @@ def test_what_is_too_far_away_for_a_picture_is_recorded(world, tmp_path, read_he
         assert "out-of-range" in w.step(1 / 60).flags
         recorder.log()
     assert tv.replay(str(tmp_path / "far.rrd")).verify()
+
+
+def in_lab(rgb) -> np.ndarray:
+    """Return colours, (n, 3) of sRGB in 0 ... 255, in CIELAB (D65), where distances are as seen: 2 is just noticeable."""
+    c = np.atleast_2d(np.asarray(rgb, dtype=np.float64)) / 255
+    c = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    xyz = c @ to_xyz.T / [0.9505, 1.0, 1.089]
+    f = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
+    return np.stack([116 * f[:, 1] - 16, 500 * (f[:, 0] - f[:, 1]), 200 * (f[:, 1] - f[:, 2])], axis=1)
+
+
+@pytest.mark.parametrize("points", [5, 8, 13, 21])
+def test_neighbouring_bodies_differ_in_colour_wherever_their_particles_begin(points):
+    # Six ropes side by side, and bodies in rows of any length: each differs from all eight around it.
+    ropes = [tv.shapes.rope((k, 2), (k, 1), points=points) for k in range(6)]
+    both, slices = tv.shapes.join(*ropes)
+    hues = in_lab(colors(tv.World(tv.Particles(both.position), [tv.Distance(both.links)]))[[s.start for s in slices]])
+    assert np.linalg.norm(np.diff(hues, axis=0), axis=1).min() > 24
+    at = np.stack(np.meshgrid(np.arange(points), np.arange(9)), axis=-1).reshape(-1, 2)
+    lab = in_lab(colors(tv.World(tv.Particles(at)))).reshape(9, points, 3)
+    for one, two in ((lab[1:], lab[:-1]), (lab[:, 1:], lab[:, :-1]), (lab[1:, 1:], lab[:-1, :-1]), (lab[1:, :-1], lab[:-1, 1:])):
+        assert np.linalg.norm(one - two, axis=2).min() > 24
+
+
+def test_bodies_have_no_colour_of_strain_and_keep_theirs_when_others_are_added():
+    strain = in_lab(np.stack([SCALE >> 24, SCALE >> 16 & 255, SCALE >> 8 & 255], axis=1))
+    assert np.linalg.norm(in_lab(PALETTE)[:, None] - strain, axis=2).min() > 24
+    world = tv.World(tv.Particles(tv.golden(np.arange(40), dim=2)))
+    before = colors(world)
+    world.add(tv.Particles([[0.5, 0.5]]))
+    np.testing.assert_array_equal(colors(world)[:40], before)

@@ -12,7 +12,8 @@ from ..constraints import Path
 from ..constraints.core.length import is_link
 from ..features.feature import Batch
 from ..forces import Hand
-from ..recording.drawing import colors, links, upwards
+from ..recording.drawing import links, upwards
+from ..recording.hues import colors
 from ..recording.images import box_of
 from ..recording.surfaces import covered, triangles
 

@@ -12,8 +12,8 @@ from ..constraints.core.length import is_link
 from ..features.feature import Batch, Feature
 from ..forces import Gravity
 from ..neighbours import Periodic
-from ..tools import golden_colors
-from .fill import Fill, outlines, roundings, within
+from .fill import Fill, outlines, within
+from .hues import colors
 from .images import InBox, box_of, crosses_box
 from .journal import PARTICLES
 from .layout import LEGEND, SCENE, WIDE
@@ -346,14 +346,6 @@ def upwards(world: "World | Parts") -> np.ndarray:
             up -= g if g.ndim else -g * np.eye(dim)[1]
     size = float(np.linalg.norm(up))
     return up / size if size else np.eye(dim)[1]
-
-
-def colors(world: "World | Parts") -> np.ndarray:
-    """Return hues, (n, 3): one for each body and each loose particle, in turn; grey for fixed particles."""
-    first, number = np.unique(bodies(world), return_inverse=True)
-    hues = golden_colors(len(first))[number.ravel()]
-    hues[world.particles.inv_mass == 0] = (140, 140, 150)
-    return hues
 
 
 def links(world: "World | Parts") -> list[tuple[int, Batch]]:

@@ -11,7 +11,8 @@ import numpy as np
 
 from ..colliders.collider import Collider
 from ..constraints import Path
-from .drawing import bounds, colors, links, upwards
+from .drawing import bounds, links, upwards
+from .hues import colors
 from .images import InBox
 from .layout import eye_axes
 

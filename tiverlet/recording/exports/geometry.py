@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...shapes import Shape
-from ..drawing import colors, links, upwards
+from ..drawing import links, upwards
+from ..hues import colors
 from ..scene import Parts
 from ..surfaces import covered, triangles
 
