@@ -1,5 +1,6 @@
 """What a Recorder draws on request, which quantities of users it stores, how it frames a run; and what notebooks show."""
 
+import json
 import re
 import subprocess
 import urllib.request
@@ -7,14 +8,19 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
+from PIL import Image, ImageDraw
 
 import tiverlet as tv
 from tests.test_recorder import read
+from tiverlet.live.scene import scene
 from tiverlet.recording import messages, overlays, viewer, watch
-from tiverlet.recording.drawing import colors
-from tiverlet.recording.fill import Fill, outlines, roundings
+from tiverlet.recording.exports.geometry import geometry
+from tiverlet.recording.exports.sketch import FINE, Sketch, View
+from tiverlet.recording.fill import Fill, outlines
 from tiverlet.recording.layout import SCENE_VIEW, unit
 from tiverlet.recording.picture import FLOWN, NEAR, framed
+from tiverlet.recording.rims import rims
+from tiverlet.recording.scene import describe, parts
 
 pytestmark = pytest.mark.usefixtures("read_here")
 
@@ -150,10 +156,8 @@ def test_lines_fill_bodies_in_the_plane(shape, turn, rounding):
         "hexagon": np.stack([np.cos(np.arange(6) * np.pi / 3), np.sin(np.arange(6) * np.pi / 3)], axis=1),
         "triangle": np.array([[0.0, 0], [1, 0], [0.5, 0.9]]),
     }[shape]
-    world = tv.World(tv.Particles(x, radius=rounding), [tv.Polygons([np.arange(len(x))[::-1]])])
-    loops = outlines(world)
-    fill = Fill(loops, x, roundings(world, loops), np.zeros((len(x), 3)), np.zeros(0, dtype=np.int64))
-    assert len(fill.colors(np.zeros(0, dtype=np.int64))) == len(fill.radii)
+    world = tv.World(tv.Particles(x), [tv.Polygons([np.arange(len(x))[::-1]])])
+    fill = Fill(outlines(world), x, np.zeros((len(x), 3)), np.zeros(0, dtype=np.int64), rims(world))
     c, s = np.cos(turn), np.sin(turn)
     there = x @ np.array([[c, s], [-s, c]]) + 5.0  # the body has moved since
     points, ends = fill.strips(there)
@@ -168,6 +172,37 @@ def test_lines_fill_bodies_in_the_plane(shape, turn, rounding):
     assert (gap[inside] < 1e-6).mean() > 0.96
     assert gap[~inside & (edge > rounding + 1e-6)].min() > -1e-6
     assert rounding == 0 or gap[edge < rounding].max() < 1e-6
+
+
+@pytest.mark.filterwarnings("ignore:.*no constraint holds loops")
+def test_bodies_are_drawn_rounded_by_their_radius():
+    # A box of corners with a radius of 0.1 m that stands on a floor, in a film, a recording, a notebook and the page: the floor
+    # shows nowhere below it, and nothing is farther than 0.1 m from the outline of its corners.
+    x = np.array([[0.0, 0.1], [2, 0.1], [2, 1.1], [0, 1.1]])
+    world = tv.World(tv.Particles(x, radius=0.1), [tv.Polygons([np.arange(4)])])
+    spread = np.random.default_rng(0).uniform((-0.3, -0.2), (2.3, 1.4), (4000, 2))
+    away = np.where(winding(x, spread), -1, 1) * distance_to(np.concatenate([x, x[:1]]), spread)
+    lines = Fill(outlines(world), x, np.zeros((4, 3)), np.zeros(0, dtype=np.int64), rims(world))
+    points, ends = lines.strips(x)
+    gaps = [distance_to(points[ends[k] : ends[k + 1]], spread) - radius for k, radius in enumerate(lines.radii)]
+    assert len(ends) == len(lines.radii) + 1 == len(lines.colors(np.zeros(0))) + 1 == 3 + 4 + 1
+    drawn = np.min(gaps, axis=0) <= 0
+    assert drawn[(away < 0.0999) & (np.abs(away) < 0.3)].all() and not drawn[away > 0.1001].any()
+
+    found = parts(*describe(world))
+    shape = geometry(found)
+    view = View(np.array([-0.3, -0.2]), np.array([2.3, 1.4]), np.array([0.0, 1]))
+    film = np.asarray(Sketch(Image, ImageDraw, found, shape, view, (spread.min(axis=0), spread.max(axis=0))).frame(x, shape))
+    column, row = np.floor(view.place(spread)[0].T / FINE).astype(int)
+    lit = (film[row, column] == shape.hues[0]).all(axis=1)
+    pixel = FINE / view.scale  # [m]
+    assert lit[away < 0.1 - 2 * pixel].all() and not lit[away > 0.1 + 2 * pixel].any()
+
+    (scale,) = {float(r) / 0.1 for r in re.findall(r"r='([0-9.]+)'", world._repr_html_())}  # pixels per meter
+    widths = [float(w) for w in re.findall(r"stroke-width='([0-9.]+)'", world._repr_html_())]
+    assert widths == pytest.approx([0.2 * scale] * 4, abs=0.2)  # they have one decimal
+    message = json.loads(scene(world, "", (x[0], x[2])))
+    assert message["edges"] == [[0, 1], [1, 2], [2, 3], [3, 0]] and message["edge_radius"] == pytest.approx([0.1] * 4)
 
 
 def distance_to(strip, points):

@@ -2,7 +2,7 @@
 "use strict";
 
 const canvas = document.getElementById("view");
-const gl = canvas.getContext("webgl2", { antialias: !inSoftware() });
+const gl = canvas.getContext("webgl2", { alpha: false, antialias: !inSoftware() });
 if (!gl) {
   document.getElementById("notes").textContent = "This browser draws no WebGL 2. Switch it on, or open the address in another one.";
   throw new Error("no WebGL 2");
@@ -58,10 +58,10 @@ const discs = program(
      color = vec4(hue.rgb * light, 1.0 - smoothstep(1.0 - edge, 1.0 + edge, rr));
    }`);
 
-// Lines with round ends. wide: half of their width, in pixels, or, negative, in scene units.
+// Lines with round ends. wide: half of their width, in pixels, or, negative, in scene units; a number, or one of each line.
 const lines = program(
   `layout(location=0) in vec2 corner; layout(location=1) in vec3 a; layout(location=2) in vec3 b;
-   layout(location=3) in vec4 color; uniform float wide; uniform float pixels; out vec2 at; out float len; out vec4 hue; out float r;
+   layout(location=3) in vec4 color; layout(location=4) in float wide; uniform float pixels; out vec2 at; out float len; out vec4 hue; out float r;
    void main() {
      vec4 p = look * vec4(a, 1.0), q = look * vec4(b, 1.0);
      vec2 d = (q.xy / q.w - p.xy / p.w) * size / 2.0;
@@ -229,8 +229,14 @@ function drawLines(name, ends, colors, wide) {
   if (!ends.length) return;
   upload(name, fourfold(ends, 6));
   upload(name + ".color", fourfold(colors, 4));
-  const where = use(lines);
-  gl.uniform1f(where("wide"), wide);
+  use(lines);
+  if (wide.length) {
+    upload(name + ".wide", fourfold(wide, 1));
+    attribute(4, name + ".wide", 1);
+  } else {
+    gl.disableVertexAttribArray(4);
+    gl.vertexAttrib1f(4, wide);
+  }
   attribute(1, name, 3, 24, 0);
   attribute(2, name, 3, 24, 12);
   attribute(3, name + ".color", 4, 0, 0, true);
@@ -244,6 +250,15 @@ function drawDiscs(name, centers, radius, hues) {
   attribute(2, radius, 1);
   attribute(3, hues, 4, 0, 0, true);
   squares(centers.length / 3);
+}
+
+function drawRims(points) { // the rounded edges of bodies, in the shade of their faces
+  const ends = new Float32Array(6 * scene.edges.length), colors = new Uint8Array(4 * scene.edges.length);
+  scene.edges.forEach(([a, b], j) => {
+    for (let c = 0; c < 3; c++) { ends[6 * j + c] = points[3 * a + c]; ends[6 * j + 3 + c] = points[3 * b + c]; }
+    colors.set([...scene.color[a].map((v) => 0.82 * v), 255], 4 * j);
+  });
+  drawLines("rims", ends, colors, new Float32Array(scene.edge_radius.map((r) => -r)));
 }
 
 function drawMarks(points, n) { // how far particles have turned: a line to the rim of a disc, two spots on a ball, as in recordings
@@ -294,6 +309,7 @@ function draw() {
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffers.triangles);
     gl.drawElements(gl.TRIANGLES, 3 * scene.triangles.length, gl.UNSIGNED_INT, 0);
   }
+  drawRims(points);
   for (const [k, wall] of walls.entries()) {
     if (wall.faces.length) {
       const where = use(faces);

@@ -15,6 +15,7 @@ from ..forces import Hand
 from ..recording.drawing import links, upwards
 from ..recording.hues import colors
 from ..recording.images import box_of
+from ..recording.rims import rims
 from ..recording.surfaces import covered, triangles
 
 if TYPE_CHECKING:
@@ -27,14 +28,15 @@ def scene(world: "World", title: str, extent: tuple[np.ndarray, np.ndarray]) -> 
     found = links(world)
     none = np.zeros((0, 2), dtype=np.int64)
     rest = [np.asarray(f.rest, dtype=np.float64) if is_link(f) else np.zeros(f.count) for _, f in found]
-    corners, box = triangles(world), box_of(world)
+    corners, box, (edges, radius) = triangles(world), box_of(world), rims(world)
     return json.dumps({
         "kind": "scene", "title": title, "dim": p.dim, "radius": _short(p.radius),
         "pinned": (p.inv_mass == 0).astype(int).tolist(), "turns": p.orientation is not None,
         "color": colors(world).tolist(), "links": np.concatenate([none, *(f.indices for _, f in found)]).tolist(),
         "rest": _short(np.concatenate([np.zeros(0), *rest])), "triangles": corners.tolist(),
-        "covered": covered(world, corners).astype(int).tolist(), "low": _short(extent[0]),
-        "high": _short(extent[1]), "up": _short(upwards(world)), "box": None if box is None else _short(box.lengths),
+        "covered": covered(world, corners).astype(int).tolist(), "edges": edges.tolist(), "edge_radius": _short(radius),
+        "low": _short(extent[0]), "high": _short(extent[1]),
+        "up": _short(upwards(world)), "box": None if box is None else _short(box.lengths),
     })  # fmt: skip
 
 

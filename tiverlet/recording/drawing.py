@@ -19,6 +19,7 @@ from .journal import PARTICLES
 from .layout import LEGEND, SCENE, WIDE
 from .lines import Lines
 from .overlays import AHEAD, ARROW, LOAD, Overlays, loads, ramp
+from .rims import rims
 from .strain import LEVELS, levels
 from .surfaces import Surface, bodies, covered, triangles
 
@@ -143,7 +144,7 @@ class Drawing:
             self._surface = Surface(corners, hues, self._pairs[under], upwards(world))
         self._fill = None
         if loops:
-            self._fill = Fill(loops, world.position, roundings(world, loops), hues, inside[self._pairs[under, 0]])
+            self._fill = Fill(loops, world.position, hues, inside[self._pairs[under, 0]], rims(world))
             self.static(f"{self._root}/fill", self._strips.from_fields(radii=self._fill.radii, draw_order=BELOW))
         self._line_links, self._surface_links = some, under
         self._breakable_links = [(k, np.flatnonzero(number == k), row[number == k]) for k, _ in found if k in self._broken]

@@ -53,14 +53,16 @@ def within(world: "World", loops: list[np.ndarray]) -> np.ndarray:
 
 
 class Fill:
-    """Lines that fill bodies: their outlines, moved inwards step by step, and for rounded ones the outline itself.
+    """Lines that fill bodies: their outlines, moved inwards step by step, and their rounded edges.
 
-    loops: particles around each body, counterclockwise. x: their positions at first, which set the widths of lines. rounding: by
-    how much each body is rounded, (loops,) [m]. hues: colours of particles, (n, 3). body: for each link inside a body the number
-    of the body, (m,); the link's strain shows in the colour, from 1 % on.
+    loops: particles around each body, counterclockwise. x: their positions at first, which set the widths of lines. hues: colours
+    of particles, (n, 3). body: for each link inside a body the number of the body, (m,); the link's strain shows in the colour,
+    from 1 % on. rims: see rims().
     """
 
-    def __init__(self, loops: list[np.ndarray], x: np.ndarray, rounding: np.ndarray, hues: np.ndarray, body: np.ndarray):
+    def __init__(
+        self, loops: list[np.ndarray], x: np.ndarray, hues: np.ndarray, body: np.ndarray, rims: tuple[np.ndarray, np.ndarray]
+    ):
         size = np.array([len(loop) for loop in loops])
         self._corner = np.concatenate(loops)
         first = np.cumsum(size) - size
@@ -75,10 +77,13 @@ class Fill:
         middle = np.stack([np.bincount(self._owner, p[:, c]) / size for c in range(2)], axis=1)
         depth = np.einsum("ij,ij->i", middle[self._owner] - p, self._inwards(p))
         self._depth = np.maximum(np.minimum.reduceat(depth, first), 0.0)
-        self._round = np.flatnonzero(rounding > 0)
-        self._rim = np.flatnonzero(np.repeat(rounding > 0, size + 1))
-        self._rim_ends = np.concatenate([[0], np.cumsum(size[self._round] + 1)])
-        self.radii = np.append(self._depth * HALF[:, None], rounding[self._round]).astype(np.float32)
+        owner = np.full(len(x), -1)
+        owner[self._corner] = self._owner
+        some = owner[rims[0][:, 0]] >= 0
+        self._edges = rims[0][some]
+        filling = np.tile(np.arange(len(loops)), len(INSETS))
+        self._shown = np.concatenate([filling, owner[self._edges[:, 0]]])  # the body of each line
+        self.radii = np.concatenate([(self._depth * HALF[:, None]).ravel(), rims[1][some]]).astype(np.float32)
         self._hues = SHADE * hues[self._corner[first]].astype(np.float64)
         self._body = body
 
@@ -95,9 +100,10 @@ class Fill:
         m = n[self._before]
         corner = (n + m) / np.maximum(1 + np.einsum("ij,ij->i", n, m), 2 / STEEP**2)[:, None]
         step = corner * self._depth[self._owner, None]
-        points = np.concatenate([*((p + inset * step)[self._way] for inset in INSETS), p[self._way[self._rim]]])
+        points = np.concatenate([*((p + inset * step)[self._way] for inset in INSETS), x[self._edges.ravel()]])
         turns = [self._ends[:-1] + k * self._ends[-1] for k in range(len(INSETS))]
-        return points.astype(np.float32), np.concatenate([*turns, len(INSETS) * self._ends[-1] + self._rim_ends])
+        begin = len(INSETS) * self._ends[-1]
+        return points.astype(np.float32), np.concatenate([*turns, np.arange(begin, len(points) + 1, 2)])
 
     def colors(self, level: np.ndarray) -> np.ndarray:
         """Return RGBA of all lines as u32. level: the level of the strain of each link, (m,); each body shows its worst."""
@@ -108,8 +114,7 @@ class Fill:
             share = np.maximum(0, 3 * (most >> 1) / LEVELS - 2)[:, None]
             hues = hues + share * (np.where((most & 1)[:, None], LONGER, SHORTER) - hues)
         rgb = np.rint(hues).astype(np.uint32)
-        packed = rgb[:, 0] << 24 | rgb[:, 1] << 16 | rgb[:, 2] << 8 | np.uint32(255)
-        return np.concatenate([np.tile(packed, len(INSETS)), packed[self._round]])
+        return (rgb[:, 0] << 24 | rgb[:, 1] << 16 | rgb[:, 2] << 8 | np.uint32(255))[self._shown]
 
 
 def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 # Far from each other, and from all colours of strain (red, blue, grey), by at least 24 in CIELAB (1976).
 PALETTE = np.array(
-    [[85, 227, 242], [237, 242, 85], [242, 85, 137], [90, 242, 85], [76, 61, 173], [173, 140, 61], [242, 85, 242],
+    [[85, 227, 242], [237, 242, 85], [242, 85, 137], [90, 242, 85], [118, 88, 226], [173, 140, 61], [242, 85, 242],
      [87, 173, 107], [214, 157, 242]], dtype=np.uint8,
 )  # fmt: skip
 FIXED = (140, 140, 150)  # of particles that cannot move

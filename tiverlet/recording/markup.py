@@ -15,6 +15,7 @@ from .drawing import bounds, links, upwards
 from .hues import colors
 from .images import InBox
 from .layout import eye_axes
+from .rims import rims
 
 if TYPE_CHECKING:
     from ..features.feature import Feature
@@ -101,13 +102,19 @@ def picture(world: "World", x: np.ndarray) -> str:
             parts += [_line(strip, GREY, max(1.0, 2 * radius * scale)) for strip in place(strips)] if strips.size else []
     ends = np.concatenate([np.zeros((0, 2), dtype=np.int64), *(f.indices for _, f in links(world))])
     parts += [_line(pair, GREY, 1.0) for pair in place(x[ends[:: -(-len(ends) // MANY) or 1]])]
+    hues, (edges, thick) = colors(world), rims(world)
+    parts += [_line(pair, _hex(hues[i]), 2 * r * scale) for pair, i, r in zip(place(x[edges]), edges[:, 0], thick, strict=True)]
     depth = (x @ view.T)[:, 2] if x.shape[1] == 3 else np.zeros(len(x))
-    hues, radii = colors(world), np.maximum(world.particles.radius * scale, 1.2)
+    radii = np.maximum(world.particles.radius * scale, 1.2)
     for i in some[np.argsort(depth[some], kind="stable")]:
-        (a, b), (r, g, blue) = place(x[i]), hues[i].tolist()
-        parts.append(f"<circle cx='{a:.1f}' cy='{b:.1f}' r='{radii[i]:.1f}' fill='#{r:02x}{g:02x}{blue:02x}'/>")
+        a, b = place(x[i])
+        parts.append(f"<circle cx='{a:.1f}' cy='{b:.1f}' r='{radii[i]:.1f}' fill='{_hex(hues[i])}'/>")
     size = f"width='{wide * scale + 4:.0f}' height='{tall * scale + 4:.0f}'"
     return f"<svg xmlns='http://www.w3.org/2000/svg' {size}>{''.join(parts)}</svg>"
+
+
+def _hex(hue: np.ndarray) -> str:
+    return "#" + bytes(hue.tolist()).hex()
 
 
 def _line(points: np.ndarray, color: str, width: float) -> str:

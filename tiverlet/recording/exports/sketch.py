@@ -16,6 +16,7 @@ from ...constraints import Path
 from ...neighbours import Periodic
 from ..drawing import EDGE, OPEN, WALL, upwards, walled
 from ..images import box_of, crosses_box
+from ..rims import rims
 from ..scene import Parts
 from ..surfaces import Surface
 from .geometry import Geometry
@@ -134,7 +135,8 @@ class Sketch:
         canvas = self._image.new("RGB", tuple(FINE * s for s in view.size), THEMES[view.look.theme][0])
         draw = self._draw.Draw(canvas)
         x = x.astype(np.float64)
-        things = [*self._walls(), *self._faces(x), *self._links(x, geometry.links), *self._discs(x, geometry)]
+        things = [*self._walls(), *self._faces(x), *self._rims(x), *self._links(x, geometry.links)]
+        things += self._discs(x, np.union1d(geometry.bare, geometry.loose))
         for _, kind, places, hue, width in sorted(things, key=lambda thing: thing[0]) if not self._flat else things:
             if kind == "face":
                 draw.polygon(places, fill=hue)
@@ -157,6 +159,17 @@ class Sketch:
         hues = _bytes(self._surface.colors(x, np.zeros(0))) if self._surface else self._geometry.hues
         return self._mesh(x, self._triangles, np.mean, hues)
 
+    def _rims(self, x: np.ndarray) -> list[tuple]:
+        """Return the rounded edges of bodies: bands, and discs at their corners."""
+        edges, radius = rims(self._parts)
+        at, _ = self._view.place(x)
+        a, b = at[edges[:, 0]], at[edges[:, 1]]
+        along = (b - a) / np.maximum(np.linalg.norm(b - a, axis=1), 1e-30)[:, None]
+        out = (self._view.scale * radius)[:, None] * np.stack([along[:, 1], -along[:, 0]], axis=1)
+        bands = np.concatenate([a + out, b + out, b - out, a - out], axis=1).tolist()
+        hues = map(tuple, self._geometry.hues[edges[:, 0]].tolist())
+        return [(0.0, "face", band, hue, 0) for band, hue in zip(bands, hues, strict=True)] + self._discs(x, edges[:, 0])
+
     def _links(self, x: np.ndarray, links: np.ndarray) -> list[tuple]:
         at, near = self._view.place(x)
         out, width = [], round(2 * self._view.line * LINE)
@@ -166,12 +179,11 @@ class Sketch:
             out.append(((near[i] + near[j]) / 2, "line", places, tuple(map(int, self._geometry.hues[i])), width))
         return out
 
-    def _discs(self, x: np.ndarray, geometry: Geometry) -> list[tuple]:
+    def _discs(self, x: np.ndarray, some: np.ndarray) -> list[tuple]:
         at, near = self._view.place(x)
-        radii = np.maximum(self._view.scale * self._parts.particles.radius, self._view.line * DOT / 2)[:, None]
-        boxes = np.concatenate([at - radii, at + radii], axis=1)
-        hues, dots = self._geometry.hues.astype(int), np.union1d(geometry.bare, geometry.loose).tolist()
-        return [(near[i], "disc", boxes[i].tolist(), tuple(hues[i].tolist()), 0) for i in dots]
+        radii = np.maximum(self._view.scale * self._parts.particles.radius, FINE * DOT / 2)[:, None]
+        boxes, hues = np.concatenate([at - radii, at + radii], axis=1), self._geometry.hues.astype(int)
+        return [(near[i], "disc", boxes[i].tolist(), tuple(hues[i].tolist()), 0) for i in some.tolist()]
 
     def _walls(self) -> list[tuple]:
         out, (_, off, solid) = [], THEMES[self._view.look.theme]
