@@ -28,6 +28,8 @@ BODIES = {
     "balloon": S.balloon((0, 0, 0), 2.0, 2),
     "blob": S.blob(STAR, 0.15),
     "polygon": S.polygon((0, 0), 1.0, 12),
+    "box 2D": S.box((0, 0), (4, 1), 0.1),
+    "box 3D": S.box((0, 0, 0), (3, 2, 1), 0.3),
     "truss 2D": S.truss((0, 0), (4, 1), (4, 1)),
     "truss 3D": S.truss((0, 0, 0), (3, 2, 1), (3, 2, 1)),
     "ragdoll 2D": S.ragdoll((0, 0)),
@@ -259,6 +261,26 @@ def test_files_that_are_refused(tmp_path, name, text, message):
         S.load(tmp_path / name)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(0.4, 0.2), (0.5, 0.3, 0.4)])
+def test_boxes_have_their_size_and_stand_on_their_sides(size):
+    # Two boxes, one on the other, on a floor: their centers come to rest at a half and one and a half of their height.
+    dim = len(size)
+    both, slices = S.join(*(S.box([0, y * size[1], 0][:dim], size, radius=0.05) for y in (0.55, 1.6)))
+    for s in slices:
+        x, r = both.position[s], both.radius[s, None]
+        np.testing.assert_allclose((x + r).max(axis=0) - (x - r).min(axis=0), size)
+    groups = [np.arange(s.start, s.stop) for s in slices]
+    contact = tv.Polygons(both.loops, friction=0.5) if dim == 2 else tv.Contact(friction=0.5)
+    walls = [tv.ShapeMatch(groups), contact, tv.HalfSpace([0, 1, 0][:dim])]
+    world = tv.World(tv.Particles(both.position, radius=both.radius), [tv.Gravity(), *walls], substeps=8)
+    world.run(1.5)
+    middle = [world.position[s].mean(axis=0) for s in slices]
+    np.testing.assert_allclose(middle, [[0, h * size[1], 0][:dim] for h in (0.5, 1.5)], atol=2e-3)
+    for k in range(3 if dim == 3 else 0):  # spheres are at most two radii apart along each axis
+        assert np.diff(np.unique(both.position[slices[0], k])).max() <= 2 * 0.05 + 1e-12
+
+
 @pytest.mark.parametrize(
     "make, message",
     [
@@ -271,6 +293,7 @@ def test_files_that_are_refused(tmp_path, name, text, message):
         (lambda: S.ball((0, 0), 1.0, 0), "rings = 0"),
         (lambda: S.blob([[0, 0], [1, 0], [2, 0]], 0.1), "no area"),
         (lambda: S.blob(MOUTH, 5.0), "make it smaller"),
+        (lambda: S.box((0, 0), (1, 0.2), 0.1), r"box: size\[1\] = 0.2, but it must be above 0.2"),
         (lambda: S.truss((0, 0), (1, -1), 2), r"upper\[1\] = -1"),
         (lambda: S.truss((0, 0), (1, 1), (1, 2, 3)), r"cells = \(1, 2, 3\), but one number"),
         (lambda: S.pile((0, 0), (1, 1), (1, 2, 3)), r"radius = \(1, 2, 3\), but a number"),
