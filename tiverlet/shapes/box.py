@@ -13,7 +13,8 @@ def box(center, size, radius: float = 0.0) -> Shape:
     """Make a box around `center`, of this outer size [m], with edges rounded by a radius, in 2D or 3D.
 
         brick = tv.shapes.box((0, 1), (0.4, 0.2), radius=0.02)
-        world = tv.World(tv.Particles(brick.position, radius=brick.radius), [tv.Polygons(brick.loops), tv.ShapeMatch(brick.loops)])
+        particles = tv.Particles(brick.position, radius=brick.radius)
+        world = tv.World(particles, [tv.Polygons(brick.loops), tv.ShapeMatch(brick.loops)])
 
     size: number or (dim,) [m], above 2 radius. radius: [m] of its particles, at least 0.
     2D: four corners, with their loop. They hold all of its mass, so it takes three times the torque of a uniform plate to turn.
