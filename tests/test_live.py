@@ -12,7 +12,7 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.commands.play import load_world
-from tiverlet.live import session
+from tiverlet.live import scene, session
 from tiverlet.live.server import Server
 from tiverlet.live.session import Session
 from tiverlet.recording import surfaces
@@ -350,6 +350,19 @@ def test_walls_have_surfaces_that_lie_on_them(world):
         vertices, faces = wall.solid(low, high)
         np.testing.assert_allclose(far(vertices), 0, atol=1e-12)
         assert faces.min() == 0 and faces.max() == len(vertices) - 1
+
+
+def test_the_eye_stays_above_the_highest_floor():
+    # The page gets its height: that of planes which face up and of boxes, switched on. A wall at the side is none.
+    low, high = np.array([-1.0, 0, -1]), np.array([1.0, 2, 1])
+    sunk, floor = tv.Box((-2, -0.5, -2), (2, 3, 2)), tv.HalfSpace((0, 1, 0), 0.25)
+    for walls, height in (([], None), ([tv.HalfSpace((1, 0, 0), -1)], None), ([sunk], -0.5), ([sunk, floor], 0.25)):
+        world = tv.World(tv.Particles(np.array([[0.0, 1, 0]])), [*(wall.copy() for wall in walls), tv.Gravity()])
+        assert json.loads(scene.walls(world, (low, high)))["floor"] == height
+    world.features[1].active = False
+    assert json.loads(scene.walls(world, (low, high)))["floor"] == -0.5
+    above = tv.World(tv.Particles(np.array([[0.0, 0, 1]])), [tv.Gravity((0, 0, -9.81)), tv.HalfSpace((0, 0, 1), -0.1)])
+    assert json.loads(scene.walls(above, (low, high)))["floor"] == pytest.approx(-0.1)
 
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

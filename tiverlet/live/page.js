@@ -15,7 +15,7 @@ function inSoftware() { // in software, smooth edges of faces cost a fifth of th
   return /swiftshader|llvmpipe|software/i.test(told ? probe.getParameter(told.UNMASKED_RENDERER_WEBGL) : "");
 }
 const $ = (id) => document.getElementById(id);
-let scene = null, walls = [], figures = {}, x = null, turned = null, held = null, dirty = true, frames = 0, fps = 0;
+let scene = null, walls = [], ground = null, figures = {}, x = null, turned = null, held = null, dirty = true, frames = 0, fps = 0;
 const show = { strain: false, particles: false };
 
 // Shader programs. All of them are 3D; a 2D scene has z = 0.
@@ -158,6 +158,13 @@ function fit() {
   dirty = true;
 }
 
+function keepAbove() { // neither the middle of the view nor the eye gets below the floor
+  if (ground === null) return;
+  const up = unit(scene.up), above = dot(eye.center, up) - ground;
+  eye.center = add(eye.center, up, Math.max(0, -above));
+  eye.lift = Math.max(eye.lift, Math.asin(Math.max(-1, 0.02 - Math.max(0, above) / eye.far))); // 0.02: nothing nearer is shown
+}
+
 function aim() {
   const w = canvas.width, h = canvas.height;
   if (scene.dim === 2) {
@@ -165,6 +172,7 @@ function aim() {
     place = [c[0], c[1], 1]; pixels = s;
     look.set([2 * s / w, 0, 0, 0, 0, 2 * s / h, 0, 0, 0, 0, -0.001, 0, -2 * s / w * c[0], -2 * s / h * c[1], 0, 1]);
   } else {
+    keepAbove();
     const [r, u, o] = axes(), f = 1 / Math.tan(0.4), near = eye.far * 0.02, far = eye.far * 20;
     place = add(eye.center, o, eye.far); pixels = f * h / 2;
     const a = f * h / w, zz = -(far + near) / (far - near), zw = -2 * far * near / (far - near);
@@ -384,7 +392,7 @@ function hear({ data }) {
   }
   const message = JSON.parse(data);
   if (message.kind === "scene") take(message);
-  if (message.kind === "walls") { walls = message.walls; dirty = true; }
+  if (message.kind === "walls") { walls = message.walls; ground = message.floor; dirty = true; }
   if (message.kind === "broken") { scene.broken = new Set(message.links); sort(); }
   if (message.kind === "told") { $("named").textContent = message.text; $("named").hidden = false; }
 }

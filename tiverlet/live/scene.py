@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import checks
+from ..colliders import Box, HalfSpace
 from ..colliders.collider import Collider
 from ..constraints import Path
 from ..constraints.core.length import is_link
@@ -20,6 +21,8 @@ from ..recording.surfaces import covered, triangles
 
 if TYPE_CHECKING:
     from ..world import World
+
+STEEP = 0.9  # the least cosine of the slope of a floor: 25 degrees
 
 
 def scene(world: "World", title: str, extent: tuple[np.ndarray, np.ndarray]) -> str:
@@ -61,7 +64,18 @@ def walls(world: "World", extent: tuple[np.ndarray, np.ndarray]) -> str:
             out.append(_wall([] if len(faces) else strips, radius, vertices, faces))
     if box := box_of(world):
         out.append(_wall(box.outline(*extent), 0.0, np.zeros((0, 3)), np.zeros((0, 3))))
-    return json.dumps({"kind": "walls", "walls": out})
+    return json.dumps({"kind": "walls", "walls": out, "floor": floor(world, extent)})
+
+
+def floor(world: "World", extent: tuple[np.ndarray, np.ndarray]) -> float | None:
+    """Return the height of the highest floor against gravity [m], below which no eye should get; None without one."""
+    up, heights = upwards(world), []
+    for f in world.features:
+        if isinstance(f, HalfSpace) and f.active and f.normal @ up > STEEP:
+            heights.append(float((f.outline(*extent)[0] @ up).mean()))
+        elif isinstance(f, Box) and f.active:
+            heights.append(float((f.outline(*extent)[0] @ up).min()))
+    return max(heights, default=None)
 
 
 def _wall(strips: Any, radius: float, vertices: np.ndarray, faces: np.ndarray) -> dict[str, Any]:
