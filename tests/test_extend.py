@@ -187,3 +187,41 @@ def test_a_feature_takes_its_own_kind_and_nothing_else():
     assert w.hash() == before and link.count == 1 and (link.rest == rest).all()
     w.close()
     other.close()
+
+
+@pytest.mark.slow
+def test_a_shape_is_added_as_it_is():
+    # As if its particles, links, limits and loops were given one by one; what is rigid and of the same kind is extended.
+    rope, doll, brick = tv.shapes.rope((0, 2), (1, 2), 4), tv.shapes.ragdoll((3, 1)), tv.shapes.box((6, 0.5), (0.4, 0.2), 0.05)
+    start = [tv.Distance([[0, 1]], compliance=1e-3), tv.Distance([[1, 2]]), tv.Polygons([[3, 4, 5]]), tv.ShapeMatch([[3, 4, 5]])]
+    first = tv.Particles([[-3.0, 2], [-2, 2], [-1, 2], [-3, 0], [-2, 0], [-3, 1]])
+    worlds = [tv.World(first, [f.copy() for f in start], substeps=4) for _ in range(2)]
+    one, other = worlds
+    handles = [one.add(shape) for shape in (rope, doll, brick)]
+    assert [len(handle) for handle in handles] == [len(rope), len(doll), 4] and len(one.features) == 5
+    n = 6
+    for shape in (rope, doll, brick):
+        links = np.concatenate([shape.links, shape.braces]) + n
+        extend = {other.features[1]: tv.Distance(links)}
+        late = [tv.AngleLimit(shape.limits + n, shape.lower, shape.upper)] if len(shape.limits) else []
+        if shape is brick:
+            extend[other.features[2]] = tv.Polygons([loop + n for loop in shape.loops])
+        other.add(tv.Particles(shape.position, radius=shape.radius), late, extend=extend)
+        n += len(shape)
+    for world in worlds:
+        world.run(0.1)
+    assert one.hash() == other.hash()
+    assert one.features[0].count == 1 and one.features[1].count == 1 + len(rope.links) + len(doll.links) + len(doll.braces) + 5
+    with pytest.raises(ValueError, match="World.add: particles are in 3D, but the world is in 2D"):
+        one.add(tv.shapes.rope((0, 0, 0), (1, 0, 0), 3))
+
+
+def test_bodies_that_are_added_with_what_holds_them_bring_no_warning():
+    # Warnings are errors here.
+    brick = tv.shapes.box((0, 0.5), (0.4, 0.2), 0.05)
+    particles, loops = tv.Particles(brick.position, radius=brick.radius), brick.loops
+    world = tv.World(particles, [tv.ShapeMatch(loops), tv.Polygons(loops)])
+    more = [loop + 4 for loop in loops]
+    held, bodies = world.features
+    world.add(tv.Particles(brick.position + 1, radius=0.05), extend={held: tv.ShapeMatch(more), bodies: tv.Polygons(more)})
+    assert len(world.features[1].loops) == 2

@@ -27,7 +27,7 @@ from .features.unknown_names import no_name
 from .forces import Attractor, Drag, Force, Gravity, Hand, PairForce, Wind
 from .neighbours import Periodic
 from .particles import Particles
-from .recording import Recorder, WorldsRecorder, replay
+from .recording import Recorder, WorldsRecorder, load, replay
 from .solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
 from .step.sleep import Sleep
 from .step.step_report import StepReport
@@ -43,7 +43,7 @@ __all__ = [
     "Contact", "Dihedral", "Direct", "Distance", "Drag", "Force", "Gravity", "HalfSpace", "Hand", "Jacobi", "Mesh", "Motor",
     "PairForce", "Particles", "Path", "Periodic", "Pin", "Polygon", "Polygons", "Recorder", "Rope", "Sdf", "ShapeMatch", "Sleep",
     "Snap", "Spacer", "StepReport", "SweepResult", "Volume", "Winch", "Wind", "World", "Worlds", "WorldsRecorder", "approach",
-    "clamp", "golden", "golden_colors", "golden_index", "gradient", "init", "measure", "mix", "play", "replay", "runtime",
+    "clamp", "golden", "golden_colors", "golden_index", "gradient", "init", "load", "measure", "mix", "play", "replay", "runtime",
     "shapes", "smoothstep", "sweep",
 ]  # fmt: skip
 init = checks.answer_arguments(runtime.init)

@@ -21,6 +21,7 @@ from .features.read_only import assign_whole_advice, read_only, structure_advice
 from .features.unknown_names import answer_names, suggest
 from .neighbours.queries import Contacts, PointSearch, near_by_brute_force, nearest
 from .particles import Particles, at_rest, in_range, spin_of
+from .shapes import Shape
 from .solvers.jacobi import Jacobi
 from .solvers.solver import Solver
 from .step import checkpoint, edit_scene, energy_bound, impulse, initial_violation, placing
@@ -684,12 +685,15 @@ class World:
 
     def add(
         self,
-        particles: Particles | None = None,
+        particles: Particles | Shape | None = None,
         features: Iterable[Feature] = (),
         *,
         extend: Mapping[Feature, Feature] | None = None,
     ) -> Handle:
         """Add particles and features, between frames. Returns a handle to the particles, see Handle.
+
+        particles: Particles, or a Shape as it is: particles of 1 kg with its radii, its links and braces rigid, its limits; in a
+        world with Polygons its loops, if all particles are on them. They extend rigid features of the world.
 
         The new particles come after the last. Features name all particles by their numbers, so a rope that is added to a world of
         n particles has the links shapes.rope(...).links + n. Rest values that are not given are taken from the present positions.
@@ -773,6 +777,18 @@ class World:
 
         return scene_report(self, seconds, tolerance, **options)
 
+    def save(self, path: str | os.PathLike, overwrite: bool = True) -> None:
+        """Write the scene and its exact state to a file that tv.load(path) reads: it continues bit for bit.
+
+        The file is a recording of one frame, see Recorder; its name ends with .rrd. overwrite: whether an existing recording may
+        be replaced. Raises ValueError for another file of this name, and the errors of Recorder.
+        """
+        from .recording import Recorder
+        from .recording.sink import check_replaceable
+
+        check_replaceable(path)
+        Recorder(path, self, overwrite=overwrite).close()
+
     def close(self) -> None:
         """Free the memory on the device. Using the world afterwards raises RuntimeError."""
         for memory in self._runner.memories:
@@ -798,7 +814,7 @@ class World:
     def __reduce_ex__(self, protocol):
         raise TypeError(
             "A World holds compiled kernels and memory of the device, so it cannot be copied or pickled. Use world.clone(), or "
-            'write it to a file: tv.Recorder("world.rrd", world).close(), and read it back: tv.replay("world.rrd").world(0).'
+            "write it to a file with world.save(path) and read it back with tv.load(path)."
         )
 
     def _repr_html_(self) -> str:

@@ -4,6 +4,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .feature import Batch
+
 if TYPE_CHECKING:
     from ..particles import Particles
 
@@ -17,7 +19,8 @@ def extended(feature: Any, more: Any, start: "Particles", now: "Particles", box:
     more.periodic, more.start = box, now
     inv_mass = now.inv_mass.copy()
     more.prepare(now, inv_mass)
-    more.review(now, inv_mass)
+    if isinstance(more, Batch):  # bodies are reviewed with all constraints, see check_added()
+        more.review(now, inv_mass)
     position = np.array(now.position)
     mine = feature.indices.ravel()
     position[mine] = start.position[mine]

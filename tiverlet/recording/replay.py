@@ -438,6 +438,12 @@ def replay(path, given: Iterable[Any] | Mapping[str, Any] = ()) -> Replay:
         raise ValueError(f"replay: {path} is damaged, or was not written by a Recorder: {e!r}.") from e
 
 
+def load(path, given: Iterable[Any] | Mapping[str, Any] = ()) -> "World":
+    """Return the world that world.save(path) has written, or that of the last frame of any recording, see replay()."""
+    recording = replay(path, given)
+    return recording.world(int(recording.frames[-1]))
+
+
 def _compiler(environment: dict[str, Any]) -> str:
     """Return the name of the compiler in an environment of a recording."""
     return plain(str(environment["compiler"])).partition(" ")[0]

@@ -19,7 +19,8 @@ from ..device.memory import numbers_of
 from ..features.feature import Batch, Feature
 from ..neighbours.periodic import Periodic
 from ..particles import Particles
-from . import edit_in_place, impulse, initial_violation, solids
+from ..shapes import Shape
+from . import added_shape, edit_in_place, impulse, initial_violation, solids
 from .build import check_settings, checked_features, listed
 from .sleep import Sleep
 
@@ -57,11 +58,16 @@ class Handle:
         return f"Handle({len(self)} particles)"
 
 
-def add(world: Any, particles: Particles | None, features: Iterable[Feature], extend: Mapping[Feature, Feature] | None) -> Handle:
+def add(
+    world: Any, particles: Particles | Shape | None, features: Iterable[Feature], extend: Mapping[Feature, Feature] | None
+) -> Handle:
     """Add particles, features and constraints to a world, see World.add."""
     world._runner.memory.check()
     late, extend = listed("World.add", features), extend or {}
     check_extended(world, extend)
+    shape = particles if isinstance(particles, Shape) else None
+    if shape is not None:
+        particles = Particles(shape.position, radius=shape.radius)
     if particles is not None:
         if isinstance(particles, Feature):
             raise TypeError(f"World.add: particles = {particles!r} is a feature; write features=[...].")
@@ -69,6 +75,9 @@ def add(world: Any, particles: Particles | None, features: Iterable[Feature], ex
             raise TypeError(f"World.add: particles = {particles!r} is a {type(particles).__name__}; use tv.Particles(position).")
         if particles.dim != world.particles.dim:
             raise ValueError(f"World.add: particles are in {particles.dim}D, but the world is in {world.particles.dim}D.")
+    if shape is not None:
+        own, both = added_shape.features(world, shape)
+        late, extend = (*late, *own), {**both, **extend}
     checked_features((*late, *extend.values()))
     if sum(isinstance(f, PairContact) for f in (*world.features, *late)) > 1:
         raise ValueError("World.add: more than one Contact; one covers all particles.")
