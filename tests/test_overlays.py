@@ -14,10 +14,12 @@ import tiverlet as tv
 from tests.test_recorder import read
 from tiverlet.live.scene import scene
 from tiverlet.recording import messages, overlays, viewer, watch
+from tiverlet.recording.drawing import view_up
 from tiverlet.recording.exports.geometry import geometry
 from tiverlet.recording.exports.sketch import FINE, Sketch, View
 from tiverlet.recording.fill import Fill, outlines
-from tiverlet.recording.layout import SCENE_VIEW, unit
+from tiverlet.recording.hues import PALETTE
+from tiverlet.recording.layout import SCENE_VIEW, scene_view, unit
 from tiverlet.recording.picture import FLOWN, NEAR, framed
 from tiverlet.recording.rims import rims
 from tiverlet.recording.scene import describe, parts
@@ -327,11 +329,27 @@ def test_notebooks_show_worlds_reports_features_and_recordings(tmp_path):
     assert solid._repr_html_().count("<circle") == 2
 
 
-def test_bodies_in_turn_have_other_colours_whatever_their_first_particles_are(world):
-    # Golden-ratio steps come back after a Fibonacci number of them: ropes of 21 particles were all red.
-    ropes = [tv.shapes.rope((0.0, 0.2 * k), (1.0, 0.2 * k), 21) for k in range(6)]
-    body, parts = tv.shapes.join(*ropes)
-    hues = colors(world(tv.Particles(body.position), [tv.Distance(body.links)])).astype(float)
-    each = np.array([hues[p][0] for p in parts])
-    apart = np.abs(each[:, None] - each).max(axis=2) + 255 * np.eye(6)
-    assert apart.min() > 60 and all((hues[p] == hues[p][0]).all() for p in parts)
+def test_y_points_down_where_the_view_is_asked_for_it(tmp_path):
+    # A disc below another one in coordinates of pixels: lower in the picture where y points down. The physics is the same.
+    hashes = []
+    for down in (False, True):
+        world = tv.World(tv.Particles([[100.0, 50], [100, 250]], radius=20), [tv.Gravity((0, 981)), tv.Box((0, 0), (200, 300))])
+        with tv.Recorder(tmp_path / "run.rrd", world, overwrite=True, y_down=down) as recorder:
+            world.run(0.1, recorder=recorder)
+        recording = tv.replay(tmp_path / "run.rrd")
+        assert recording.verify()
+        hashes.append(world.hash())
+        assert read(tmp_path / "run.rrd", "/world/scene", "Transform3D:scale")[None] == [[1, 1 if down else -1, 1]]
+        film = recording.export(tmp_path / "run.gif")[0]
+        with Image.open(film) as image:
+            pixels = np.asarray(image.convert("RGB")).astype(int)
+        rows = [np.argwhere((np.abs(pixels - hue) < 12).all(axis=2))[:, 0].mean() for hue in PALETTE[:2].astype(int)]
+        assert (rows[0] < rows[1]) == down
+        view = scene_view(np.zeros(2), np.array([200.0, 300]), view_up(world, down))
+        ends = view.properties["VisualBounds2D"].range.as_arrow_array().to_pylist()[0]
+        assert (ends["y_range"] == [-15, 315]) == down and (ends["y_range"] == [-315, 15]) != down
+        assert json.loads(scene(world, "", (np.zeros(2), np.ones(2)), down))["up"] == [0, -1 if down else 1]
+    assert hashes[0] == hashes[1]
+    high = tv.World(tv.Particles([[0.0, 0, 0]]))
+    with pytest.raises(ValueError, match="y_down is for worlds in 2D"):
+        tv.Recorder(tmp_path / "high.rrd", high, y_down=True)

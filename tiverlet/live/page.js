@@ -152,7 +152,7 @@ function fit() {
   eye.center = add(low, span, 0.5);
   const keys = $("keys").offsetHeight * devicePixelRatio;
   eye.scale = Math.min(canvas.width / (span[0] || 1), (canvas.height - keys) / (span[1] || 1)) * 0.88 || 100;
-  if (scene.dim === 2) eye.center[1] -= keys / 2 / eye.scale;
+  if (scene.dim === 2) eye.center[1] -= keys / 2 / eye.scale * scene.up[1];
   eye.far = 1.5 * Math.hypot(...span) || 1;
   eye.turn = 0.5; eye.lift = 0.3; eye.chosen = false;
   dirty = true;
@@ -168,9 +168,9 @@ function keepAbove() { // neither the middle of the view nor the eye gets below 
 function aim() {
   const w = canvas.width, h = canvas.height;
   if (scene.dim === 2) {
-    const s = eye.scale, c = eye.center;
+    const s = eye.scale, c = eye.center, y = scene.up[1]; // 1, or -1 where y points down
     place = [c[0], c[1], 1]; pixels = s;
-    look.set([2 * s / w, 0, 0, 0, 0, 2 * s / h, 0, 0, 0, 0, -0.001, 0, -2 * s / w * c[0], -2 * s / h * c[1], 0, 1]);
+    look.set([2 * s / w, 0, 0, 0, 0, 2 * s * y / h, 0, 0, 0, 0, -0.001, 0, -2 * s / w * c[0], -2 * s * y / h * c[1], 0, 1]);
   } else {
     keepAbove();
     const [r, u, o] = axes(), f = 1 / Math.tan(0.4), near = eye.far * 0.02, far = eye.far * 20;
@@ -188,7 +188,7 @@ function project(p) { // returns pixels on the canvas, and the distance
 }
 
 function under(px, py, through) { // returns the point under the mouse at the distance of `through`
-  if (scene.dim === 2) return [eye.center[0] + (px - canvas.width / 2) / eye.scale, eye.center[1] - (py - canvas.height / 2) / eye.scale, 0];
+  if (scene.dim === 2) return [eye.center[0] + (px - canvas.width / 2) / eye.scale, eye.center[1] - scene.up[1] * (py - canvas.height / 2) / eye.scale, 0];
   const [r, u, o] = axes(), w = dot(sub(place, through), o) / pixels;
   return add(add(add(place, o, -w * pixels), r, (px - canvas.width / 2) * w), u, (canvas.height / 2 - py) * w);
 }

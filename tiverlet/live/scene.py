@@ -13,7 +13,7 @@ from ..constraints import Path
 from ..constraints.core.length import is_link
 from ..features.feature import Batch
 from ..forces import Hand
-from ..recording.drawing import links, upwards
+from ..recording.drawing import links, upwards, view_up
 from ..recording.hues import colors
 from ..recording.images import box_of
 from ..recording.rims import rims
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 STEEP = 0.9  # the least cosine of the slope of a floor: 25 degrees
 
 
-def scene(world: "World", title: str, extent: tuple[np.ndarray, np.ndarray]) -> str:
-    """Return particles, links, surfaces and the view as JSON. extent: the corners of the view [m]."""
+def scene(world: "World", title: str, extent: tuple[np.ndarray, np.ndarray], y_down: bool = False) -> str:
+    """Return particles, links, surfaces and the view as JSON. extent: the corners of the view [m]. y_down: see play()."""
     p = world.particles
     found = links(world)
     none = np.zeros((0, 2), dtype=np.int64)
@@ -39,7 +39,7 @@ def scene(world: "World", title: str, extent: tuple[np.ndarray, np.ndarray]) -> 
         "rest": _short(np.concatenate([np.zeros(0), *rest])), "triangles": corners.tolist(),
         "covered": covered(world, corners).astype(int).tolist(), "edges": edges.tolist(), "edge_radius": _short(radius),
         "low": _short(extent[0]), "high": _short(extent[1]),
-        "up": _short(upwards(world)), "box": None if box is None else _short(box.lengths),
+        "up": _short(view_up(world, y_down)), "box": None if box is None else _short(box.lengths),
     })  # fmt: skip
 
 

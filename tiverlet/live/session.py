@@ -16,6 +16,7 @@ from ..constraints import Pin
 from ..contact import Polygons
 from ..features.feature import Batch
 from ..forces import Hand
+from ..recording.drawing import checked_y_down
 from ..recording.scene import knobs, set_knobs
 from ..recording.sink import check_replaceable
 from ..step import checkpoint
@@ -41,7 +42,7 @@ class Session:
 
     def __init__(
         self, world: "World", server: Server, *, title: str = "", record: str | os.PathLike | None = None,
-        each_frame: Callable[["World"], None] | None = None,
+        each_frame: Callable[["World"], None] | None = None, y_down: bool = False,
     ):  # fmt: skip
         self.world, self.server, self.title, self.record, self.each_frame = world, server, title, record, each_frame
         if record is not None:
@@ -57,7 +58,8 @@ class Session:
         self._knobs = [copy.deepcopy(knobs(f)) for f in world.features]
         self._structure = _structure(world)  # at the start
         self._computed: deque[tuple[float, float]] = deque(maxlen=30)  # for each frame: its begin [s] and computing time [ms]
-        self._parts = Parts(world, title)
+        self.y_down = checked_y_down("play", world, y_down)
+        self._parts = Parts(world, title, self.y_down)
         self._sent = 0.0
         self._holder: Viewer | None = None
         self._recorder: Recorder | None = None
@@ -68,7 +70,7 @@ class Session:
         if self.record is not None:
             from ..recording import Recorder
 
-            self._recorder = Recorder(self.record, self.world, overwrite=True)
+            self._recorder = Recorder(self.record, self.world, overwrite=True, y_down=self.y_down)
 
     def close(self) -> None:
         """Finish the file, and leave the world."""
@@ -205,7 +207,7 @@ def _structure(world: "World") -> list[Any]:
 @checks.answer_arguments
 def play(
     world: "World", *, record: str | os.PathLike | None = None, each_frame: Callable[["World"], None] | None = None,
-    title: str = "tiverlet", port: int = 0, browser: bool = True,
+    title: str = "tiverlet", port: int = 0, browser: bool = True, y_down: bool = False,
 ) -> None:  # fmt: skip
     """Run a world in real time in a page of the browser, where the user can drag its particles, until Ctrl-C.
 
@@ -215,6 +217,7 @@ def play(
     record: a file that is written meanwhile, see Recorder. It contains what the hand did, which is computed again bit for bit.
     After a restart the file begins again. each_frame: called with the world before each frame, for example to move walls. title:
     of the page. port: 0 uses a free one. browser: whether to open the page; its address is printed in any case.
+    y_down: whether y points down, as in coordinates of pixels (2D).
 
     The page is served to this machine only. To watch from another machine, forward the port: ssh -L PORT:127.0.0.1:PORT host, and
     open the address there; over SSH this command is printed. In a notebook the page shows below the cell, which runs until it is
@@ -225,7 +228,7 @@ def play(
     server = Server(port)
     session = None
     try:
-        session = Session(world, server, title=title, record=record, each_frame=each_frame)
+        session = Session(world, server, title=title, record=record, each_frame=each_frame, y_down=y_down)
         _announce(server, browser)
         session.run()
     except KeyboardInterrupt:

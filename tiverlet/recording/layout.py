@@ -25,12 +25,12 @@ def unit(low: np.ndarray, high: np.ndarray) -> float:
     return 1.0 if size < 1e-30 or SEEN[0] <= size <= SEEN[1] else 10.0 ** -np.floor(np.log10(size))
 
 
-def transform(dim: int, unit: float) -> rr.Transform3D:
-    """Return the transform between the data and the origin of the view.
+def transform(up: np.ndarray, unit: float) -> rr.Transform3D:
+    """Return the transform between the data and the origin of the view. up: see view_up().
 
     The y axis of the viewer's 2D views points down and cannot be changed; a mirror turns it up without touching the data.
     """
-    return rr.Transform3D(scale=[unit, -unit if dim == 2 else unit, unit])
+    return rr.Transform3D(scale=[unit, -unit * up[1] if len(up) == 2 else unit, unit])
 
 
 def upright(up: np.ndarray) -> rr.components.ViewCoordinates:
@@ -63,14 +63,15 @@ def distance(size: np.ndarray, axes: np.ndarray) -> float:
 def scene_view(low: np.ndarray, high: np.ndarray, up: np.ndarray, origin: str = "world", name: str = "Scene") -> rrb.View:
     """Return the view of a scene within the corners low and high [m].
 
-    up: the direction against gravity. origin: the entity above the scene.
+    up: see view_up(). origin: the entity above the scene.
     """
     size = np.maximum(high - low, 1e-9)
     if len(low) == 2:
         edge = 0.05 * size.max()
+        ends = sorted([-up[1] * low[1], -up[1] * high[1]])  # the viewer's y points down
         bounds = rrb.VisualBounds2D(
             x_range=[float(low[0] - edge), float(high[0] + edge)],
-            y_range=[float(-high[1] - edge), float(-low[1] + edge)],
+            y_range=[float(ends[0] - edge), float(ends[1] + edge)],
         )
         return rrb.Spatial2DView(origin=origin, name=name, visual_bounds=bounds)
     else:
@@ -91,8 +92,7 @@ def blueprint(
 ) -> rrb.Blueprint:
     """Return the layout of a scene within the corners low and high [m]: the scene on the left, curves and text on the right.
 
-    figures: see informative_views() in curves.py. legend: the title of the colour scale, or None. up: the direction against
-    gravity.
+    figures: see informative_views() in curves.py. legend: the title of the colour scale, or None. up: see view_up().
     """
     view = scene_view(low, high, up)
     curves = [

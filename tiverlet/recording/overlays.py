@@ -22,12 +22,13 @@ RAMP = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253
 
 @dataclass(frozen=True)
 class Overlays:
-    """The overlays requested of a Recorder. color: name, least and most value of a quantity of particles."""
+    """What is requested of a Recorder. color: name, least and most value of a quantity of particles. y_down: see view_up()."""
 
     strain: bool = True
     forces: bool = False
     velocities: bool = False
     color: tuple[str, float, float] | None = None
+    y_down: bool = False
 
     def title(self, links: bool) -> str | None:
         """Return the title of the colour scale, or None without a scale. links: whether the scene has any."""
@@ -46,7 +47,7 @@ class Overlays:
     def of(stored: dict[str, Any]) -> "Overlays":
         """Return the overlays stored in a recording."""
         color = stored["color"]
-        return Overlays(stored["strain"], stored["forces"], stored["velocities"], None if color is None else (*color,))  # type: ignore[arg-type]
+        return Overlays(**{**stored, "color": None if color is None else (*color,)})  # type: ignore[arg-type]
 
 
 def checked_color(value: Any) -> tuple[str, float, float] | None:

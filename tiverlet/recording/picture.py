@@ -29,7 +29,7 @@ class Picture:
     def __init__(self, world: "World", stream: Any, explained: str, environment: dict[str, Any], overlays: Overlays):
 
         from .curves import Curves
-        from .drawing import Drawing, bounds, upwards
+        from .drawing import Drawing, bounds, upwards, view_up
         from .layout import SCENE, transform, unit, upright
 
         self.world, self._stream, self._explained, self._environment = world, stream, explained, environment
@@ -37,7 +37,7 @@ class Picture:
         self.drawing = Drawing(world, stream, bounds(world), overlays)
         self._low, self._high = np.full((2, world.particles.dim), [[np.inf], [-np.inf]])  # corners of everything drawn
         self._unit, dim = unit(*self.drawing.extent), world.particles.dim
-        about = [transform(dim, self._unit)] if dim == 2 or self._unit != 1 else []
+        about = [transform(view_up(world, overlays.y_down), self._unit)] if dim == 2 or self._unit != 1 else []
         self.drawing.static(SCENE, *about, *([upright(upwards(world))] if dim == 3 else []))
         self.curves = Curves(world, stream)
         self._about(None, 0, "")
@@ -112,12 +112,12 @@ def layout(
     quantities that have curves.
     """
     from .curves import informative_views, own_path
-    from .drawing import bounds, links, upwards
+    from .drawing import bounds, links, view_up
     from .layout import blueprint, unit
 
     (low, high), scale = seen or (bounds(world), unit(*bounds(world)))
     figures = {name: (own_path(name), [True]) for name in own} | informative_views(world)
-    return blueprint(scale * low, scale * high, overlays.title(bool(links(world))), figures, upwards(world))
+    return blueprint(scale * low, scale * high, overlays.title(bool(links(world))), figures, view_up(world, overlays.y_down))
 
 
 def framed(extent: tuple[np.ndarray, np.ndarray], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -17,6 +17,7 @@ from ..step import checkpoint
 from ..step.explain import explain
 from ..world import World
 from ..worlds.worlds import Worlds
+from .drawing import checked_y_down
 from .journal import JOURNAL, brief, flags_to_record
 from .journal_writer import Journal
 from .overlays import Overlays, checked_color, checked_quantities
@@ -48,6 +49,7 @@ class Recorder:
     relative to the other loads of the frame. velocities: draw arrows that show the path of the next 0.05 s. color: (name, least,
     most), a quantity of log() by which particles are coloured. live: show the recording while it is made: True for a window,
     "web" for a page in the browser, "notebook" below a cell, or the address of a running viewer.
+    y_down: whether y points down in the picture, as in coordinates of pixels (2D); the physics does not depend on it.
 
     The picture has positions (f32), coloured by body; surfaces of bodies that have them; links, coloured by their strain; walls,
     contacts in scenes of up to 1500 particles, breaks, and curves. The file also holds the scene with all arguments, exact
@@ -63,6 +65,7 @@ class Recorder:
     def __init__(
         self, path, world: World, every: int = 1, budget: int | None = None, overwrite: bool = False, *, strain: bool = True,
         forces: bool = False, velocities: bool = False, color: tuple[str, float, float] | None = None, live: bool | str = False,
+        y_down: bool = False,
     ):  # fmt: skip
         import rerun as rr
 
@@ -76,6 +79,7 @@ class Recorder:
         self.budget = None if budget is None else checks.integer("Recorder", "budget", budget, least=1)
         flags = {"strain": strain, "forces": forces, "velocities": velocities}
         given = {name: checks.flag("Recorder", name, value) for name, value in flags.items()}
+        given["y_down"] = checked_y_down("Recorder", world, y_down)
         self._overlays = Overlays(color=checked_color(color), **given | ({"strain": False} if color else {}))
         self._own: dict[str, Any] = {}  # the user's quantities, for the next frame that is drawn
         if path is None and not live:

@@ -67,11 +67,11 @@ class WorldsRecorder:
             self._open(overlays, overwrite)
 
     def _open(self, overlays: Overlays, overwrite: bool) -> None:
-        from .drawing import bounds, links, upwards
+        from .drawing import bounds, links, view_up
 
         def known(world: World) -> tuple:
             """Return the corners of a world's view, the direction up, and the title of its colour scale."""
-            return bounds(world), upwards(world), overlays.title(bool(links(world)))
+            return bounds(world), view_up(world), overlays.title(bool(links(world)))
 
         each, self._ups, titles = zip(*self.worlds.each(known, self.chosen), strict=True)
         self._title, corners = titles[0], np.array(each)  # (worlds, 2, dim)
@@ -165,7 +165,7 @@ class _View:
     """One world among others: a Drawing under entities of its own."""
 
     def __init__(self, world: World, stream: "_Below", extent: tuple[np.ndarray, np.ndarray], overlays: Overlays):
-        from .drawing import Drawing, upwards
+        from .drawing import Drawing, upwards, view_up
         from .layout import SCENE, transform, unit, upright
 
         dim = world.particles.dim
@@ -174,7 +174,7 @@ class _View:
         self._known: list[dict[str, Any]] = [{} for _ in world.features]
         self._broken = 0
         turn = [upright(upwards(world))] if dim == 3 else []
-        self.drawing.static(SCENE, transform(dim, unit(*extent)), *turn)
+        self.drawing.static(SCENE, transform(view_up(world), unit(*extent)), *turn)
         self.drawing.begin(1)
 
     def frame(self, world: World) -> None:

@@ -73,7 +73,7 @@ class View:
     def __init__(self, low: np.ndarray, high: np.ndarray, up: np.ndarray, look: Look):
         self.look, (aside, above) = look, look.camera
         if len(low) == 2:
-            self._axes = np.array([[1.0, 0], [0, 1], [0, 0]])
+            self._axes = np.array([[1.0, 0], [0, up[1]], [0, 0]])
         else:
             front = np.array([0.0, -1, 0] if abs(up[2]) > 0.5 else [0.0, 0, 1])  # so that x points to the right
             front -= front @ up * up

@@ -62,7 +62,7 @@ def record(report: "ErrorReport", path) -> None:
         if not curves:
             continue
         entity = "cases/" + "".join(k if k.isalnum() or k in "_-" else "_" for k in name)
-        stream.log(entity, transform(2, 1.0), static=True)
+        stream.log(entity, transform(np.array([0.0, 1.0]), 1.0), static=True)
         every = np.concatenate([xy for _, xy in curves])
         low, high = np.floor(every.min(axis=0)), np.ceil(every.max(axis=0))
         grid = [[[x, low[1]], [x, high[1]]] for x in np.arange(low[0], high[0] + 1)]

@@ -75,7 +75,9 @@ class Autopsy:
         points, strips = (rr.Points2D, rr.LineStrips2D) if flat else (rr.Points3D, rr.LineStrips3D)
         stream: Any = rr.RecordingStream("tiverlet_autopsy")
         stream.save(os.fspath(path))
-        stream.log("world/scene", transform(2, 1.0) if flat else rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
+        stream.log(
+            "world/scene", transform(np.array([0.0, 1.0]), 1.0) if flat else rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True
+        )
         stream.log("about", rr.TextDocument(str(self)), static=True)
         for k, (t, x) in enumerate(zip(self.times, self.positions, strict=True)):
             stream.set_time("substep", sequence=k)
