@@ -4,8 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from ..constraints import AngleLimit, Distance
-from ..contact import Polygons
+from ..constraints.angle_limit import AngleLimit
+from ..constraints.distance import Distance
+from ..contact.polygons import Polygons
 from ..features.feature import Batch, Feature
 from ..shapes import Shape
 
