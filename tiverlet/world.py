@@ -814,7 +814,7 @@ class World:
     def __reduce_ex__(self, protocol):
         raise TypeError(
             "A World holds compiled kernels and memory of the device, so it cannot be copied or pickled. Use world.clone(), or "
-            "write it to a file with world.save(path) and read it back with tv.load(path)."
+            'write it to a file: world.save("world.rrd"), and read it back: tv.load("world.rrd").'
         )
 
     def _repr_html_(self) -> str:

@@ -34,12 +34,6 @@ def outlines(world: "World") -> list[np.ndarray]:
     return list(out.values())[:MANY]
 
 
-def roundings(world: "World", loops: list[np.ndarray]) -> np.ndarray:
-    """Return by how much each body is rounded, (loops,) [m]: Polygons are, by the radius of their corners."""
-    solid = {int(i) for f in world.features if isinstance(f, Polygons) for loop in f.loops for i in loop}
-    return np.array([float(world.particles.radius[loop].min()) if int(loop[0]) in solid else 0.0 for loop in loops])
-
-
 def within(world: "World", loops: list[np.ndarray]) -> np.ndarray:
     """Return the number of the loop that each particle is in, (n,), or -1.
 

@@ -1,5 +1,8 @@
 """Ready-made bodies as plain arrays: positions to put into Particles, and index tuples to put into constraints."""
 
+from typing import TYPE_CHECKING, Any
+
+from ..features.unknown_names import no_name
 from .box import box
 from .files import load, save
 from .lines import bridge, chain, rope, tree

@@ -9,6 +9,7 @@ from .shape import Shape, point
 from .solids import truss
 
 
+@checks.answer_arguments
 def box(center, size, radius: float = 0.0) -> Shape:
     """Make a box around `center`, of this outer size [m], with edges rounded by a radius, in 2D or 3D.
 

@@ -13,7 +13,6 @@ import numpy as np
 
 from ...shapes import Shape
 from ..drawing import view_up
-from ..scene import set_knobs
 from .extras import needed
 from .sketch import Look, Sketch, View, extent
 from .stretch import Stretch, stretches
@@ -72,7 +71,7 @@ def _pictures(recording: "Replay", shape: Shape | None, image: Any, draw: Any, l
     low, high = (pick([e[k] for e in ends], axis=0) for k, pick in enumerate((np.min, np.max)))
     if not np.isfinite([low, high]).all():
         raise ValueError(f"replay: {recording.path} has no particles, or positions that are not finite, so there is no picture.")
-    view = View(low, high, view_up(found[0].parts, found[0].entry.data["overlays"].get("y_down", False)))
+    view = View(low, high, view_up(found[0].parts, found[0].entry.data["overlays"].get("y_down", False)), look)
     for stretch in found:
         here = set(stretch.frames.tolist())
         yield from _stretch(stretch, shape, [k for k in wanted if k in here], image, draw, view, (low, high))

@@ -181,7 +181,7 @@ class Sketch:
 
     def _discs(self, x: np.ndarray, some: np.ndarray) -> list[tuple]:
         at, near = self._view.place(x)
-        radii = np.maximum(self._view.scale * self._parts.particles.radius, FINE * DOT / 2)[:, None]
+        radii = np.maximum(self._view.scale * self._parts.particles.radius, self._view.line * DOT / 2)[:, None]
         boxes, hues = np.concatenate([at - radii, at + radii], axis=1), self._geometry.hues.astype(int)
         return [(near[i], "disc", boxes[i].tolist(), tuple(hues[i].tolist()), 0) for i in some.tolist()]
 
