@@ -89,7 +89,7 @@ def test_imports_are_shallow():
 
     longest = max(map(chain, modules()), key=len)
     assert len(longest) <= DEPTH, " -> ".join(longest)
-    assert chain("tiverlet.world")[-1] == "tiverlet.device.language"  # shows that imports are found
+    assert len(longest) > 10 and "tiverlet.step.build" in imported("tiverlet.world")  # shows that imports are found
 
 
 @functools.cache
