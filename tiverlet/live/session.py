@@ -16,7 +16,7 @@ from ..constraints import Pin
 from ..contact import Polygons
 from ..features.feature import Batch
 from ..forces import Hand
-from ..recording.drawing import checked_y_down
+from ..recording.overlays import checked_y_down
 from ..recording.scene import knobs, set_knobs
 from ..recording.sink import check_replaceable
 from ..step import checkpoint

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import checks
 from ..colliders import Ball, Box, Capsule, HalfSpace, Mesh, Polygon
 from ..colliders.collider import Collider
 from ..constraints import Path
@@ -353,13 +352,6 @@ def upwards(world: "World | Parts") -> np.ndarray:
 def view_up(world: "World | Parts", y_down: bool = False) -> np.ndarray:
     """Return the direction that points up in pictures, (dim,): against gravity in 3D; along y in 2D, or against it for y_down."""
     return upwards(world) if world.particles.dim == 3 else np.array([0.0, -1.0 if y_down else 1.0])
-
-
-def checked_y_down(who: str, world: "World", value: Any) -> bool:
-    """Check the argument `y_down`, which is for 2D."""
-    if checks.flag(who, "y_down", value) and world.particles.dim == 3:
-        raise ValueError(f"{who}: y_down is for worlds in 2D; in 3D the direction of gravity is down.")
-    return bool(value)
 
 
 def links(world: "World | Parts") -> list[tuple[int, Batch]]:

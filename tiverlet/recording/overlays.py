@@ -50,6 +50,13 @@ class Overlays:
         return Overlays(**{**stored, "color": None if color is None else (*color,)})  # type: ignore[arg-type]
 
 
+def checked_y_down(who: str, world: "World", value: Any) -> bool:
+    """Check the argument `y_down`, which is for 2D."""
+    if checks.flag(who, "y_down", value) and world.particles.dim == 3:
+        raise ValueError(f"{who}: y_down is for worlds in 2D; in 3D the direction of gravity is down.")
+    return bool(value)
+
+
 def checked_color(value: Any) -> tuple[str, float, float] | None:
     """Check the argument `color` of a Recorder: None, or (name, least, most)."""
     if value is None:

@@ -17,10 +17,9 @@ from ..step import checkpoint
 from ..step.explain import explain
 from ..world import World
 from ..worlds.worlds import Worlds
-from .drawing import checked_y_down
 from .journal import JOURNAL, brief, flags_to_record
 from .journal_writer import Journal
-from .overlays import Overlays, checked_color, checked_quantities
+from .overlays import Overlays, checked_color, checked_quantities, checked_y_down
 from .picture import Picture, layout
 from .scene import environment
 from .sink import BACKLOG, CHECK_INTERVAL, SMALL, Sink, file_error
