@@ -248,6 +248,26 @@ def test_a_rod_of_no_length_is_a_ball(world):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
+def test_a_rod_stops_what_comes_in_at_a_grazing_angle_as_a_plane_does(world, dim):
+    # Along the axis the top of a rod is flat: paths and impulses are those on a half-space, at angles down to 3e-4.
+    angles = np.array([0.3, 0.1, 0.03, 0.01, 3e-3, 3e-4])
+    x, v = np.zeros((6, dim)), np.zeros((6, dim))
+    x[:, 0], x[:, 1] = 3.0 * np.arange(6) - 8.0, 0.01
+    v[:, 0], v[:, 1] = 10.0 * np.cos(angles), -10.0 * np.sin(angles)
+    up, end = np.eye(dim)[1], 50.0 * np.eye(dim)[0]
+    paths, given = [], []
+    for wall in (tv.HalfSpace(up, events=True), tv.Capsule(-end - up, end - up, 1.0, events=True)):
+        w = world(tv.Particles(x, velocity=v, radius=0.0), [tv.Gravity(9.81 * -up), wall], substeps=4, precision="f64")
+        for _ in range(20):
+            w.step(1 / 60)
+            paths.append(w.position)
+            touches = w.wall_events().touches
+            given.append(np.bincount(touches.pairs[:, 0], touches.impulse, 6))
+    np.testing.assert_allclose(paths[20:], paths[:20], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(given[20:], given[:20], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
 def test_a_ball_stops_what_would_fly_through_it(world, dim):
     # v h = 20 diameters of the ball: a point is caught on the side that it came from; with restitution 1 it goes back.
     x = np.zeros((2, dim))

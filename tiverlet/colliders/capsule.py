@@ -16,7 +16,7 @@ from .surface import TOUCH
 from .track import Track
 
 SHORT = 1e-30  # square of the length of an axis that has no direction, as where both ends have moved to one place [m^2]
-MARCH = 32  # steps along a path; a grazing path is then resolved within 1e-6 of its length
+STEPS = 64  # most steps along a path; each at least halves what is left of one that grazes the rod
 
 
 def _end(name: str) -> Knob:
@@ -34,7 +34,7 @@ class Capsule(Collider):
     live: it changes at once. friction, restitution, push_out, active, events, surface_velocity, one_way: see Collider.
 
     A particle that passes through in one substep is caught on the way in, however thin the rod. Its path relative to the rod is
-    followed to where it meets the surface (sphere tracing, Hart 1996). No force can pull a particle through either.
+    followed to where it meets the surface. No force can pull a particle through either.
     """
 
     code_size = 0.6
@@ -198,7 +198,8 @@ class Capsule(Collider):
         # Otherwise the path begins further from the rod than it is long, whatever the rounding.
         if depth + 2 * way > -TOUCH * (ends + abs(x).sum() + contact_distance):
             s, start_depth, k, going = 0 * length, 0 * length, 0, True
-            # If the particle was outside, or touched, step along its path, each step no longer than the distance to the surface.
+            # If the particle was outside, or touched, follow its path by Newton's method: the gap is convex along it, so that a step
+            # never goes beyond the surface.
             while going:
                 _t, distance, m = self.nearest(x - (1 - s) * d, a, b)
                 gap = distance - contact_distance
@@ -208,9 +209,11 @@ class Capsule(Collider):
                     if not going and gap < way:
                         going = self.dev.surface.starts_on(i, start_depth, m, depth, n, ends + way)
                 if going:
-                    further = s
-                    if k <= MARCH:
-                        further += ti.max(gap, 0) / way
+                    further, closing = 0 * s + 1, -d.dot(m)
+                    if gap < closing * (1 - s):
+                        further = s + ti.max(gap, 0) / closing
+                    if k == STEPS:
+                        further = s
                     k += 1
                     if not (further < 1) or further == s:  # past the end, or at the surface
                         going, depth = False, ti.min(depth, 0)
