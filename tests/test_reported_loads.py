@@ -234,6 +234,58 @@ def test_a_start_gives_the_impulse_of_a_whole_frame(world, restitution):
         w.position, w.velocity = start.position, start.velocity  # another start
 
 
+def falling(kind):
+    """Return what falls, for world(): particles from 1 m up at 3 m/s, and the features that hold them together."""
+    square = [(0, 0), (0.5, 0.05), (0.45, 0.55), (-0.05, 0.5)]
+    sides, loop = [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3)], [[0, 1, 2, 3]]
+    x, features = {
+        "disc": ([(0, 0)], [tv.Contact()]),
+        "dumbbell": ([(0, 0), (0.5, 0.3)], [tv.Distance([(0, 1)]), tv.Contact()]),
+        "rope": ([(0, 0.2 * k) for k in range(8)], [tv.Distance([(k, k + 1) for k in range(7)]), tv.Contact()]),
+        "truss": (square, [tv.Distance(sides), tv.Contact()]),
+        "cluster": (square, [tv.ShapeMatch(loop), tv.Contact()]),
+        "box": (square, [tv.ShapeMatch(loop), tv.Polygons(loop)]),
+    }[kind]
+    radius = 0.0 if kind == "box" else 0.05
+    return tv.Particles(np.add(x, (0.0, 1.0)), radius=radius, mass=MASS, velocity=(1.0, -3.0)), features
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["disc", "dumbbell", "rope", "truss", "cluster", "box"])
+def test_walls_give_all_the_momentum_of_a_landing(world, kind):
+    # sum J = sum m (v - v_0) + m g t, whatever lands, on a plane as on a rod. An impulse counts until the middle of the last
+    # substep, and a velocity until its end, with half of a kick: m g h / 2 for each particle.
+    up = np.array([0.0, 1.0])
+    for floor in (tv.HalfSpace(up, events=True), tv.Capsule((-9, -1), (9, -1), 1.0, events=True)):
+        for n in (2, 60):
+            start, features = falling(kind)
+            w = world(start, [tv.Gravity(G), *features, floor.copy()], substeps=n, precision="f64")
+            given = 0.0
+            for _ in range(90):
+                w.step(1 / 60)
+                given += w.wall_events().touches.impulse.sum()
+            count = len(w.position)
+            gained = MASS * (w.velocity - start.velocity)[:, 1].sum() + count * WEIGHT * w.time
+            assert abs(given - gained) < 1.1 * count * WEIGHT / 60 / n / 2 + 1e-9, (type(floor).__name__, n)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [tv.Distance, tv.Rope])
+@pytest.mark.parametrize("substeps", [4, 20, 60])
+def test_a_blow_breaks_a_spring_that_is_weaker_than_its_peak(world, make, substeps):
+    # A weight at v on a spring k at its rest length: F = m g + sqrt((m g)^2 + k m v^2) at most. N = 16 substeps in a period
+    # 2 pi sqrt(m / k) see at least cos(pi / N) = 0.98 of it.
+    for v in (0.5, 5.0):
+        k = MASS * (2 * np.pi * 60 * substeps / 16) ** 2
+        peak = WEIGHT + np.sqrt(WEIGHT**2 + k * MASS * v * v)
+        links = make([(0, 1), (2, 3)], 1.0, compliance=1 / k, break_at=[0.97 * peak, 1.03 * peak])
+        x = [(0, 0), (0, -1), (1, 0), (1, -1)]
+        particles = tv.Particles(x, mass=MASS, velocity=np.outer([0, 1, 0, 1], (0, -v)), pinned=[0, 2])
+        w = world(particles, [tv.Gravity(G), links], substeps=substeps, precision="f64")
+        w.run(0.5)
+        assert links.broken.tolist() == [True, False]
+
+
 def test_what_sags_holds_where_the_substep_gets_shorter(world):
     # A pass holds a moment by a sag that falls with h^2: 1e-4 rad here. In a substep of a half to a tenth of the length, this sag
     # would be 4 to 100 times the moment. It stays that moment, but for what vibrates, and in the end without.

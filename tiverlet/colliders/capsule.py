@@ -198,8 +198,8 @@ class Capsule(Collider):
         # Otherwise the path begins further from the rod than it is long, whatever the rounding.
         if depth + 2 * way > -TOUCH * (ends + abs(x).sum() + contact_distance):
             s, start_depth, k, going = 0 * length, 0 * length, 0, True
-            # If the particle was outside, or touched, follow its path by Newton's method: the gap is convex along it, so that a step
-            # never goes beyond the surface.
+            # If the particle was outside, or touched, follow its path by Newton's method: the gap is convex along it, so no step
+            # goes beyond the surface.
             while going:
                 _t, distance, m = self.nearest(x - (1 - s) * d, a, b)
                 gap = distance - contact_distance

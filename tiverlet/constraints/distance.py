@@ -16,7 +16,8 @@ class Distance(Scalar):
     compliance: inverse stiffness, number or (m,) [m/N]; 0 is rigid. A spring of k [N/m] has compliance 1 / k.
     damping: of a dashpot parallel to the spring, number or (m,) [N s/m]; it has no effect on a rigid link.
     break_at: load at which a link breaks, pulled or pushed, number or (m,) [N]; None for never. A broken link does not act from
-    the next substep on; see world.broken and .broken.
+    the next substep on; see world.broken and .broken. Under a blow a link bears v sqrt(m k), if its period is resolved; a
+    rigid one bears about m v / h, which grows with the number of substeps.
 
     Second order in h, without artificial damping, for every compliance (see Equation). `load` is the tension of each link [N].
     """
