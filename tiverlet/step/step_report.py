@@ -6,7 +6,7 @@ from typing import Any
 
 from ..features.unknown_names import answer_names
 
-UNCONVERGED = 0.1  # residual above which a frame is flagged "unconverged"
+UNCONVERGED = 0.05  # residual above which a frame is flagged "unconverged"
 FIGURE = re.compile(r"\d[^ ,;:]*")  # notes that differ by figures only are of one kind
 COMPRESSED = 0.05  # overlap from one frame to the next above which it is flagged "compressed", in radii; piles have 0.01
 
@@ -40,7 +40,7 @@ class StepReport:
                             damped by it. Never where anything may take energy out (damping, drag, friction, rigid constraints,
                             which lose in impacts, sleep), nor with forces that vary in space
         "softened"          a solver let constraints give way, because their tension is too large for the substep
-        "unconverged"       the residual is above 0.1: a link is off by a tenth of its length, an angle by a tenth of a radian
+        "unconverged"       the residual is above 0.05: a link is off by a twentieth of its length, an angle by 3 degrees
                             (or large clusters that share particles gained energy, because a substep became shorter)
         "turned"            a constraint turned by more than 41 degrees in a substep and lost its second order there; a rigid one
                             dissipates energy, a spring that the substep resolves conserves it on average
