@@ -327,10 +327,12 @@ def test_a_blob_fills_outlines_whose_points_lie_on_lines_and_circles(outline, sp
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["rope", "bridge", "tree 2D", "ball", "cloth 3D", "balloon", "ragdoll 2D"])
+@pytest.mark.parametrize(
+    "name", ["rope", "bridge", "tree 2D", "ball 2D", "ball 3D", "blob", "cloth 3D", "balloon", "ragdoll 2D", "ragdoll 3D"]
+)
 def test_shapes_work_as_they_come(name, world):
     """Each with its own constraints, thick enough to touch itself, falls on a floor at the default settings: no flag."""
-    s = BODIES[name] if name in BODIES else S.ragdoll((0, 0.5))
+    s = BODIES[name]
     links = np.concatenate([s.links, s.braces])
     dim, short = s.position.shape[1], np.linalg.norm(s.position[links[:, 0]] - s.position[links[:, 1]], axis=1).min()
     up = np.eye(dim)[1]

@@ -111,12 +111,23 @@ class AngleLimit(Scalar):
     @property
     def middle(self) -> np.ndarray:
         """The middle of each free range [rad], (m,)."""
-        return (self.lower + self.upper) / 2
+        low, high = self._range
+        return (low + high) / 2
 
     @property
     def rest(self) -> np.ndarray:
         """Half the width of each free range [rad], (m,)."""
-        return (self.upper - self.lower) / 2
+        low, high = self._range
+        return (high - low) / 2
+
+    @property
+    def _range(self) -> tuple[np.ndarray, np.ndarray]:
+        """The free ranges [rad]. In 3D a path turns on through straight, and through folded back: 0 and pi are no limits."""
+        low, high = self.lower, self.upper
+        if self.start and self.start.dim == 3:
+            low = np.where(self.lower == 0, -self.upper, low)
+            high = np.where((self.upper == np.pi) & (self.lower > 0), TURN - self.lower, high)
+        return low, high
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the indices, and check the limits against the dimension."""
