@@ -1,5 +1,7 @@
 """Flags over a catalogue of scenes: none where the motion is right, the one that names the fault where it is not."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -166,6 +168,17 @@ def test_a_scene_that_does_not_move_as_it_should_has_the_flag_that_says_why(worl
     w = world(*make(), substeps=substeps, solver=solver)
     flags = set().union(*(w.step(1 / 60).flags for _ in range(60)))
     assert flag in flags
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["a linkage at 40 rad/s", "a spring that is not resolved", "heavy on light at 1 substep"])
+def test_a_scene_that_follows_the_advice_of_the_worst_frame_has_no_flag(world, name):
+    make, substeps, solver, flag = WRONG[name]
+    w = world(*make(), substeps=substeps, solver=solver)
+    (note,) = w.run(1.0).notes
+    need = re.search(r"(\d+) substeps", note)
+    assert need and int(need[1]) > substeps
+    assert world(*make(), substeps=int(need[1]), solver=solver).run(1.0).clean
 
 
 @pytest.mark.slow

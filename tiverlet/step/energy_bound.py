@@ -43,7 +43,7 @@ MISSED = 0.02  # share of the largest kinetic energy by which the energy may be 
 BOUNCED = 0.003  # the same where bodies bounce and nothing takes energy out: impacts follow each other, and errors add up
 SKIN = 1e-5  # share of the largest coordinate: apparent depth of particles that lie on a wall, at most
 ROUNDED = 64  # rounding error of positions, in units in the last place of the largest coordinate
-RESOLVED = 0.1  # omega h up to which a spring loses less than 1e-4 of its energy in a period
+SMALL_LOSS = 0.05  # of its energy, that a spring may lose: half of what is flagged. In a radian it loses (omega h)^5 of it
 FLAG, LOST = "energy-gain", "energy-loss"
 
 
@@ -80,12 +80,12 @@ def checked_for_loss(world: "World", report: StepReport) -> StepReport:
     if not (clock.conserves and loss > loss_error(world, sheet[EXTENT : EXTENT + world.particles.dim], sheet[REACH])):
         return report
     omega = fastest_spring(world)
-    need = np.ceil(report.substeps * omega * clock.h / RESOLVED)
+    need = np.ceil(report.substeps * omega * clock.h * (omega * clock.time / SMALL_LOSS) ** 0.2)
     note = (
         f"Nothing is said to take energy out of the scene, but it has {bound - report.energy:.3g} J less than it had; its "
         f"kinetic energy was {clock.kinetic:.3g} J at most. Springs that a substep does not resolve are damped by it: the "
-        f"fastest has omega h = {omega * clock.h:.3g}. About {need:.7g} substeps resolve it. Otherwise say that energy is lost: "
-        "give springs damping, or make rigid what is too stiff (compliance 0)."
+        f"fastest has omega h = {omega * clock.h:.3g}. With {need:.7g} substeps it would lose {100 * SMALL_LOSS:g} % by now. "
+        "Otherwise say that energy is lost: give springs damping, or make rigid what is too stiff (compliance 0)."
     )
     return replace(report, flags=report.flags | {LOST}, notes=(*report.notes, note))
 

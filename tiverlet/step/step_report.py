@@ -95,12 +95,22 @@ class StepReport:
     def worse(self, other: "StepReport") -> "StepReport":
         """Return the later of two reports, with the worst figures of both."""
         first, last = (self, other) if self.time <= other.time else (other, self)
+        notes = {FIGURE.sub("", note): note for note in sorted(first.notes + last.notes, key=_badness)}
         return StepReport(
             last.time, max(first.substeps, last.substeps), max(first.iterations, last.iterations),
             max(first.residual, last.residual), max(first.overlap, last.overlap), max(first.contacts, last.contacts),
             last.energy, first.energy_change + last.energy_change, first.flags | last.flags,
-            tuple({FIGURE.sub("", n): n for n in first.notes + last.notes}.values()),
+            tuple(notes.values()),
             last.bad if first.bad is None else first.bad,
             first.broken + last.broken, last.asleep, max(first.turn, last.turn), max(first.tension, last.tension),
             max(first.tries, last.tries), max(first.seconds, last.seconds),
         )  # fmt: skip
+
+
+def _badness(note: str) -> float:
+    """Return the first figure of a note, by which notes of one kind are compared."""
+    found = FIGURE.search(note)
+    try:
+        return float(found.group()) if found else 0.0
+    except ValueError:
+        return 0.0
