@@ -4,7 +4,6 @@ import ast
 import gc
 import inspect
 import io
-import os
 import re
 import sys
 import tempfile
@@ -15,10 +14,8 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.device import ti
-from tiverlet.device.language import impl
 from tiverlet.device.patches import patched, source_cache, timing
 from tiverlet.device.patches.compiler import BRIEF, LEAN, UNSEARCHED, Compiler
-from tiverlet.device.patches.machine_code import drop_old, machine_code
 from tiverlet.step import build
 
 from .conftest import ARCH, compiled, python
@@ -101,55 +98,6 @@ tv.World(tv.Particles(np.stack([x, 0 * x], axis=1), radius=0.1), [tv.Contact()])
 """
     few, many = (python(code.replace("COUNT", count), TI_OFFLINE_CACHE="0").stderr for count in ("10", "1000"))
     assert many.count("Loop Strength Reduction") == 2 * few.count("Loop Strength Reduction") > 0
-
-
-STARTED = """
-import tiverlet as tv
-from tiverlet.device import ti
-from tiverlet.device.patches.machine_code import machine_code
-world = tv.World(tv.Particles([(0, 0), (0, 1), (1.5, 1)]), [tv.Gravity(), tv.Distance([(0, 1), (1, 2)]), tv.Pin([0])])
-world.step(1 / 60)
-code = machine_code()
-before = code.found, code.generated
-@ti.kernel
-def theirs(count: ti.i32) -> ti.i32:
-    return count + 1
-theirs(1)
-assert before == (code.found, code.generated)
-print(*before, world.hash())
-"""
-
-
-@pytest.mark.skipif(not (ARCH == "cpu" and machine_code()), reason="LLVM's generator is found there")
-def test_a_second_process_finds_machine_code_of_the_same_bits(tmp_path):
-    # An empty cache: all code is generated, and kept. The second process finds all of it, by the second of its names, and gives
-    # it the first, so that most files have two. What is damaged is generated again. Of the user's kernels nothing is kept.
-    started = [python(STARTED, TI_OFFLINE_CACHE_FILE_PATH=str(tmp_path)).stdout.split() for _ in range(2)]
-    names = {file.name: file.stat().st_nlink for file in (tmp_path / "machine_code").iterdir() if file.suffix != ".json"}
-    (none, made, bits), (found, again, same) = started
-    assert (none, again, bits) == ("0", "0", same) and int(made) == int(found) == sum(1 / n for n in names.values()) >= 3
-    for name in names:
-        (tmp_path / "machine_code" / name).write_bytes(b"damaged")
-    started = [python(STARTED, TI_OFFLINE_CACHE_FILE_PATH=str(tmp_path)).stdout.split() for _ in range(2)]
-    assert started == [[none, made, bits], [made, "0", bits]]
-    assert names == {name: (tmp_path / "machine_code" / name).stat().st_nlink for name in names} and 2 in names.values()
-    assert python(STARTED, TI_OFFLINE_CACHE_FILE_PATH=str(tmp_path), TI_OFFLINE_CACHE="0").stdout.split() == ["0", "0", bits]
-
-
-@pytest.mark.skipif(not (ARCH == "cpu" and machine_code()), reason="LLVM's generator is found there")
-def test_machine_code_takes_no_more_room_than_taichis_cache(tmp_path, monkeypatch):
-    # Eleven files of 100 bytes exceed 1000 bytes: those read last stay, 500 bytes of them.
-    for k in range(11):
-        file = tmp_path / str(k)
-        file.write_bytes(bytes(100))
-        os.utime(file, (k, k))
-    config = impl.default_cfg()
-    monkeypatch.setattr(config, "offline_cache_max_size_of_files", 1100)
-    drop_old.__wrapped__(tmp_path)
-    assert len([*tmp_path.iterdir()]) == 11
-    config.offline_cache_max_size_of_files = 1000
-    drop_old.__wrapped__(tmp_path)
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["10", "6", "7", "8", "9"]
 
 
 def test_what_the_user_compiles_is_compiled_as_ever():

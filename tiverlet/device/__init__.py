@@ -8,14 +8,13 @@ from .patches import assignments, lean, patched
 if lean:
     assignments.apply()
 if patched:
-    from .patches import calls, machine_code, sharing, source_cache, statements, syntax_cache, timing
+    from .patches import calls, sharing, source_cache, statements, syntax_cache, timing
 
     source_cache.apply()  # first: the modules imported after it then import in half the time
     syntax_cache.apply()
     statements.apply()
     sharing.apply(timing.compiled)
     timing.apply()
-    machine_code.apply()
     called: Any = calls.called
     called_with: Any = calls.called_with
 else:

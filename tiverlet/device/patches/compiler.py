@@ -24,7 +24,6 @@ from ..language import active, impl, sources
 from ..user_errors import shortened
 from . import lean, patched
 from .llvm_switches import restore_switches, set_switches
-from .machine_code import kept
 
 HOSTS = ("Arch.x64", "Arch.arm64")  # where LLVM makes kernels as fast without Taichi's passes; measured on x64
 # Loops do not cache a field element in a variable: Taichi misses that another index may be the same element, such as field[k] for
@@ -105,7 +104,7 @@ class Compiler:
     @contextlib.contextmanager
     def _entered(self) -> Iterator[None]:
         runtime: Any = impl.get_runtime()
-        with _lock, kept():
+        with _lock:
             config, literals = runtime.prog.config(), runtime.default_fp
             self.config = config
             before = {name: getattr(config, name) for name in SETTINGS}

@@ -1,4 +1,4 @@
-"""The LLVM in Taichi's library: its command line, and other functions that the library does not export.
+"""The LLVM in Taichi's library: its command line, whose functions the library does not export.
 
 They are found in the library's symbol table. Searching it takes some hundredths of a second, so the addresses found are kept in a
 file beside Taichi's cached kernels.
@@ -25,17 +25,17 @@ SYMBOL = np.dtype([("name", "<u4"), ("kind", "<u4"), ("value", "<u8"), ("size", 
 TABLE = 2  # section type of a symbol table
 
 
-def folder() -> pathlib.Path | None:
+def _folder() -> pathlib.Path | None:
     """Return the folder of what is kept between processes, inside that of Taichi's cached kernels; None if Taichi keeps none."""
     impl = sys.modules["taichi.lang.impl"]  # loaded wherever the library is
     config, runs = impl.default_cfg(), impl.get_runtime().prog is not None
     if os.environ.get("TI_OFFLINE_CACHE") == "0" or runs and not config.offline_cache:
         return None
     asked = None if runs else os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")  # ti.init reads it
-    return pathlib.Path(asked or config.offline_cache_file_path, "machine_code")
+    return pathlib.Path(asked or config.offline_cache_file_path, "tiverlet")
 
 
-def replace_file(path: pathlib.Path, content: bytes) -> None:
+def _replace_file(path: pathlib.Path, content: bytes) -> None:
     """Write a file that other processes see whole or not at all. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.name}.{os.getpid()}")
@@ -44,7 +44,7 @@ def replace_file(path: pathlib.Path, content: bytes) -> None:
 
 
 @functools.cache
-def stamp() -> str | None:
+def _stamp() -> str | None:
     """Return what tells this build of the library from others; None where its symbol table cannot be read."""
     path = getattr(sys.modules.get("taichi._lib.core.taichi_python"), "__file__", None)
     if path and sys.platform == "linux" and sys.byteorder == "little":
@@ -77,7 +77,7 @@ class CommandLine:
 @functools.cache
 def command_line() -> CommandLine | None:
     """Return the command line of the LLVM in Taichi's library; None if it is not found."""
-    addresses = find(*SWITCHED)
+    addresses = _find(*SWITCHED)
     if addresses is None:
         return None
     parse, reset = addresses
@@ -85,16 +85,16 @@ def command_line() -> CommandLine | None:
     return CommandLine(ctypes.CFUNCTYPE(None, *arguments)(parse), ctypes.CFUNCTYPE(None)(reset))
 
 
-def find(*names: bytes) -> list[int] | None:
-    """Return the addresses of functions and tables in this process, by their mangled names; None if one of them is missing."""
-    if stamp() is None:
+def _find(*names: bytes) -> list[int] | None:
+    """Return the addresses of functions in this process, by their mangled names; None if one of them is missing."""
+    if _stamp() is None:
         return None
     known, asked = _known(), [name.decode() for name in (*names, SEEN)]
     if not all(name in known for name in asked):
         known.update(_search(_path(), *names, SEEN))
         with contextlib.suppress(OSError):
             if path := _file():
-                replace_file(path, json.dumps(known).encode())
+                _replace_file(path, json.dumps(known).encode())
     at = [known[name] for name in asked]
     if not all(at):
         return None
@@ -108,8 +108,8 @@ def _path() -> str:
 
 def _file() -> pathlib.Path | None:
     """Return the file with the addresses in this build of the library."""
-    where = folder()
-    return where / f"{hashlib.blake2b(str(stamp()).encode(), digest_size=8).hexdigest()}.json" if where else None
+    where = _folder()
+    return where / f"{hashlib.blake2b(str(_stamp()).encode(), digest_size=8).hexdigest()}.json" if where else None
 
 
 @functools.cache
