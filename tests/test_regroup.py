@@ -268,3 +268,21 @@ def test_a_clone_parts_what_came_into_others_as_the_world_does(world):
     w.run(0.1)
     twin.run(0.1)
     np.testing.assert_array_equal(twin.position[:-1], w.position)
+
+
+@pytest.mark.parametrize("which", ["wall", "floor", "last"])
+def test_loads_stay_with_their_walls_where_walls_come_and_go(world, which):
+    # habitat-sim#801, reactphysics3d#235: what lay on a floor that is removed hangs in the air. Here it fell on with the load of
+    # another wall, or, if there was none, the process ended. A disc lies in a corner of two walls of one kind.
+    floor, wall, far = tv.HalfSpace((0, 1)), tv.HalfSpace((1, 0)), tv.HalfSpace((-1, 0), -9.0)
+    walls = {"wall": [wall, floor], "floor": [floor, wall], "last": [floor]}[which]
+    disc = tv.Particles([[0.1, 0.1]], radius=0.1, mass=2.0)
+    w = world(disc, [tv.Gravity((-30.0 if which != "last" else 0.0, -10.0)), tv.Contact(), *walls], substeps=20, precision="f64")
+    w.run(0.5)
+    assert np.abs(w.position - 0.1).max() < 1e-12
+    if which != "last":
+        w.add(features=[far])  # its code is that of the others, so faces get other numbers
+    w.remove(features=[walls[0]])
+    w.run(0.5)
+    fall = np.array([-30.0 if which == "wall" else 0.0, 0.0 if which == "wall" else -10.0]) / 8
+    np.testing.assert_allclose(w.position[0] - 0.1, fall, atol=10 * 0.5 / 1200)

@@ -25,7 +25,7 @@ class WallGroup:
     walls are without bounds, or particles have images.
     """
 
-    host_only = ("walls",)
+    host_only = ("walls", "faces")
 
     def __init__(self, walls: "Sequence[Collider]"):
         self.walls = list(walls)
@@ -39,6 +39,7 @@ class WallGroup:
         self.tree: Any = None
         self.state: Any = None
         self.first_face: Any = None  # the number of its first face, among those of all walls
+        self.faces: list[np.ndarray] = []  # of each wall, their numbers
 
     def bind(self, scene: "Scene") -> None:
         """Bind the walls."""
@@ -88,6 +89,7 @@ class WallGroup:
     def number_faces(self, scene: "Scene", first: int) -> int:
         """Number the faces of the walls, from `first` on. Returns the number behind the last."""
         sides = np.array([wall.sides for wall in self.walls])
+        self.faces = np.split(first + np.arange(sides.sum()), np.cumsum(sides)[:-1])
         self.first_face, self.total = scene.memory.number(first), scene.memory.number(int(sides.sum()))
         if not (self.single or self.sides):
             add, name = scene.memory.field, repr(self.wall)

@@ -148,7 +148,7 @@ class Rebuild:
         """Install the new parts in the world, with the state that was carried over."""
         world, last = self.world, self.world._runner
         contact = next((c for c in last.step.contacts if c in self.features), None)
-        multipliers, left = last.scene.multipliers_per_newton, last.left
+        multipliers, left, faces = last.scene.multipliers_per_newton, last.left, _faces(last.scene)
         world._clock.velocity_override = None
         world._install(world._particles.regrouped(self.some, self.added), self.features, parts)
         runner = world._runner
@@ -161,7 +161,7 @@ class Rebuild:
                 runner.memory.put_scratch(f, rows, self.masks[f])
         runner.wake()
         if contact and contact in runner.step.contacts:
-            self._give_contacts()
+            self._give_contacts(faces)
         drag, world._clock.drag = world._clock.drag, None
         if runner.integrator.decays:
             runner.set_substep(world._clock.h, drag)
@@ -175,16 +175,28 @@ class Rebuild:
         if any(isinstance(f, PairContact) for f in self.new_features):
             world._clock.first_moved = 0
 
-    def _give_contacts(self) -> None:
-        """Carry over the data of pairs in contact."""
+    def _give_contacts(self, faces: dict[Any, np.ndarray]) -> None:
+        """Carry over the data of pairs in contact. faces: the numbers of those of each wall before."""
         search, pairs = self.world._runner.search, self.old["Contact.pairs"].copy()
         assert search
         some = pairs < WALL
         pairs[some] = self.number[pairs[some]]
+        now, walls = _faces(self.world._runner.scene), pairs[~some] - WALL
+        face = np.full(walls.max(initial=-1) + 1, -1)
+        for wall, before in faces.items():
+            kept = before[before < len(face)]
+            if len(now.get(wall, ())) == len(before):
+                face[kept] = WALL + now[wall][: len(kept)]
+        pairs[~some] = face[walls]
         both = (pairs >= 0).all(axis=1)
         # Data without an old value, of features that were just added, is 0.
         nothing = {p.name: np.zeros((len(pairs), p.width) if p.width else len(pairs)) for p in search.list.persistent}
         search.list.restore(pairs[both], {name: self.old.get(f"Contact.{name}", none)[both] for name, none in nothing.items()})
+
+
+def _faces(scene: Any) -> dict[Any, np.ndarray]:
+    """Return the numbers of the faces of each wall that contacts meet."""
+    return {wall: faces for group in scene.walls for wall, faces in zip(group.walls, group.faces, strict=False)}
 
 
 def _fields(attributes: dict[str, Any], names: dict[int, Any]) -> dict[tuple[str, str], Any]:
