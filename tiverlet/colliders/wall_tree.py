@@ -30,7 +30,10 @@ class WallTree:
         leaf = np.empty(len(middles))
         leaf[rows[rows[:, MEMBER] >= 0, MEMBER]] = np.flatnonzero(rows[:, MEMBER] >= 0)
         self.leaf = add(f"{name}.leaves", len(middles), kind=ti.i32, values=leaf)
-        self.low, self.high = (add(f"{name}.{end}", len(rows), width=self.dim) for end in ("low", "high"))
+        # Lists that are made before the first frame find all walls.
+        everywhere = np.full((len(rows), self.dim), np.inf)
+        self.low = add(f"{name}.low", len(rows), width=self.dim, values=-everywhere)
+        self.high = add(f"{name}.high", len(rows), width=self.dim, values=everywhere)
 
     @ti.func
     def put(self, member, low, high):
