@@ -477,6 +477,10 @@ def test_a_hub_that_is_tied_to_all_corners_is_no_stray_particle(world):
         w = world(tv.Particles(x, velocity=(1.0, 0.0)), features)
         assert w.run(0.5).clean and w.last.contacts == 0
         np.testing.assert_allclose(np.linalg.norm(w.position[1:] - w.position[0], axis=1), 0.3, rtol=0.02)
+    plank = np.array([[0.0, 0.0], [-2.0, -0.1], [2.0, -0.1], [2.0, 0.1], [-2.0, 0.1]])  # a hub near to its edges, too
+    w = world(tv.Particles(plank, velocity=(1.0, 0.0)), [tv.Polygons([np.arange(1, 5)]), tv.ShapeMatch([np.arange(5)])])
+    assert w.run(0.5).clean and w.last.contacts == 0
+    np.testing.assert_allclose(w.position, plank + (0.5, 0.0), atol=1e-6)
     with pytest.raises(ValueError, match="particle 0 starts 0.29 m inside of loops"):
         world(tv.Particles(x), [tv.Polygons(loops), tv.ShapeMatch(loops)])
     with pytest.warns(UserWarning, match=r"no constraint holds loops\[0\] \(1 such in all\)"):

@@ -30,11 +30,13 @@ def excluded_pairs(batches: Sequence[Batch], radius: np.ndarray, body: np.ndarra
 
     body: the number of the body of each particle, see Outline, -1 for none; None without bodies. Linked corners of two bodies are
     not left out: a link fixes their distance, not on which side of an edge of the other body each of them is. Boxes in a row, on
-    two rods each, folded into each other. Only corners whose rims the link holds inside each other are left out.
+    two rods each, folded into each other. Only corners whose rims the link holds inside each other are left out. A particle of no
+    body, as the hub of a plank, touches no body whose corners are in its cluster.
     """
     own = [b.excluded_pairs(b.start) for b in batches]
     if body is not None:
         own = [pairs if b.clusters else pairs[~_joins(pairs, b.start, body)] for b, pairs in zip(batches, own, strict=True)]
+        own += [_hubs(b.indices.ravel(), b.owner, body) for b in batches if b.clusters]
     limits = [b.max_distances() for b in batches]
     links, lengths = (np.concatenate(some) for some in zip((np.zeros((0, 2), dtype=np.int32), np.zeros(0)), *limits, strict=True))
     return np.concatenate([np.zeros((0, 2), dtype=np.int32), *own, _inside(links, lengths, radius)])
@@ -45,6 +47,16 @@ def _joins(pairs: np.ndarray, start: "Particles", body: np.ndarray) -> np.ndarra
     i, j = pairs.T
     reach, distance = start.radius[i] + start.radius[j], np.linalg.norm(start.position[i] - start.position[j], axis=1)
     return (body[i] != body[j]) & (np.minimum(body[i], body[j]) >= 0) & ((reach == 0) | (distance > (1 + DIGIT) * reach))
+
+
+def _hubs(who: np.ndarray, owner: np.ndarray, body: np.ndarray) -> np.ndarray:
+    """Return pairs of a particle in no body and a corner of a body in the same cluster. who: members; owner: their clusters."""
+    inner, rim = np.flatnonzero(body[who] < 0), np.flatnonzero(body[who] >= 0)
+    rim = rim[np.argsort(owner[rim], kind="stable")]
+    first, last = (np.searchsorted(owner[rim], owner[inner], side) for side in ("left", "right"))
+    each = np.repeat(np.arange(len(inner)), last - first)
+    place = np.arange(len(each)) - np.repeat(np.cumsum(last - first) - last, last - first)
+    return np.stack([who[inner[each]], who[rim[place]]], axis=1).astype(np.int32)
 
 
 def _inside(links: np.ndarray, lengths: np.ndarray, radius: np.ndarray) -> np.ndarray:
