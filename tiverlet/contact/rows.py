@@ -332,6 +332,7 @@ class Rows:
             if self.state.moves(i):
                 for e in range(first, first + self.list.wall_number[i]):
                     row = self.find_wall(i, e, row, scale)
+                self.level(i, row)
                 pressing = self.pressed[i]
                 for e in range(first, first + self.list.wall_number[i]):
                     if pressing < row and self.entry.field[pressing] == e:
@@ -641,11 +642,12 @@ class Rows:
                         if ti.static(bool(self.impacts)):
                             self.impacts.begin(row, e_wall, gap, bend, way, self.radius.of(i), self.is_set(p))
                         else:
-                            f, reach = self.state.kick(i), self.state.place(i)
-                            hit, s, m = self.strike(gap, way, bend, u, f, f, e_wall, e, reach.dot(reach))
+                            # On the path on which the loads of the last substep go on: what slides over level walls is borne.
+                            f, reach, borne = self.state.kick(i), self.state.place(i), scale * self.borne[i]
+                            hit, s, m = self.strike(gap, way, bend, u + borne, f + borne, f, e_wall, e, reach.dot(reach))
                             if hit:
                                 n, self.bounce.field[row], self.time.field[row] = m, e_wall, s
-                    self.put(row, face + WALL, e, n, ti.max(gap, 0), bend, p * scale)
+                    self.put(row, face + WALL, e, n, gap, bend, p * scale)
                     if ti.static(w.dev.surface.has_velocity):
                         belt = w.dev.surface.velocity[None]
                         along = self.h() * (belt - belt.dot(n) * n)
@@ -667,6 +669,22 @@ class Rows:
         if lists:
             row += 1
         return row
+
+    @ti.func
+    def level(self, i, end):
+        """Let particle i get as deep into each of its walls as it lies in another that faces the same way, up to the slop.
+
+        So what slides over level walls does not catch on their corners. end: the row behind the last.
+        """
+        deepest, depth, up = -1, ti.cast(0, self.real), 0 * self.state.x[i]
+        for row in range(self.pressed[i], end):
+            if -self.gap.field[row] > depth:
+                deepest, depth, up = row, -self.gap.field[row], self.normal.field[row]
+        depth = ti.min(depth, ti.static(SLOP * BEYOND) * self.size(i))
+        for row in range(self.pressed[i], end):
+            if row != deepest:
+                self.gap.field[row] += depth * ti.max(up.dot(self.normal.field[row]), 0)
+            self.gap.field[row] = ti.max(self.gap.field[row], 0)
 
     @ti.func
     def marked(self, i, row, p):
