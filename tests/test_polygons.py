@@ -356,7 +356,11 @@ def test_bad_loops_are_named():
         (lambda: tv.Polygons([[0, 1, 2], [2, 3, 4]]), r"particle 2 is in loops\[0\] and again in loops\[1\]"),
         (lambda: tv.Polygons([[0, 1, 1]]), r"particle 1 is in loops\[0\] and again in loops\[0\]"),
         (lambda: tv.World(particles, [tv.Polygons([[0, 1, 9]])]), r"loops\[0\]\[2\] = 9, but there are 8"),
-        (lambda: tv.World(particles, [tv.Polygons([[5, 6, 7]])]), r"loops\[0\] encloses an area of 0"),
+        (lambda: tv.World(particles, [tv.Polygons([[5, 6, 7]])]), r"loops\[0\] encloses 0 m"),
+        (
+            lambda: tv.World(tv.Particles(tv.shapes.box((0, 0), (1, 1)).position), [tv.Polygons([range(4)])]),
+            r"not in order .*shape.loops\[0\] \+ n",
+        ),
         (lambda: tv.World(deep, [tv.Polygons([range(8)])]), r"particle 8 starts 0.452 m inside of loops\[0\]"),
         (lambda: tv.World(tv.Particles(np.zeros((3, 3))), [tv.Polygons([[0, 1, 2]])]), "for 2D worlds"),
         (lambda: tv.World(particles, [tv.Polygons([[0, 1, 2]]), tv.Contact()]), "more than one Contact"),

@@ -48,7 +48,10 @@ def laid(loops: list[np.ndarray], x: np.ndarray) -> tuple[np.ndarray, np.ndarray
     if thin.any() or short.any():
         k = int(np.argmax(thin | (np.bincount(owner, short) > 0)))
         if thin[k]:
-            raise ValueError(f"Polygons: loops[{k}] encloses an area of {area[k]:g} m^2; its particles are on a line.")
+            raise ValueError(
+                f"Polygons: loops[{k}] encloses {area[k]:g} m^2; its particles are on a line, or not in order around it. "
+                "A shape has its corners in order in its loops: shape.loops[0] + n for particles from n on."
+            )
         m = int(begin[k] + np.argmin(edge[begin[k] : begin[k + 1]]))
         raise ValueError(f"Polygons: particles {corner[m]} and {after[m]} of loops[{k}] are in the same place.")
     left = area[owner] > 0
