@@ -150,6 +150,12 @@ def whirling():
     return tv.Particles([(0, 0), (1, 0)], pinned=[0], velocity=[(0, 0), (0, 2500.0)]), [tv.Distance([(0, 1)])]
 
 
+def pressed():
+    """Return a disc between walls that are closer than its diameter."""
+    walls = [tv.HalfSpace((0, 1)), tv.HalfSpace((0, -1), -0.15)]
+    return tv.Particles([(0, 0.075)], radius=0.1), [falls(), tv.Contact(), *walls]
+
+
 WRONG = {  # scene, substeps, solver, the flag
     "a linkage at 40 rad/s": (lambda: linkage(40.0), 8, None, "unconverged"),
     "relaxed links under a weight": (lambda: hanging(100, 100.0), 20, tv.Jacobi(), "unconverged"),
@@ -157,6 +163,7 @@ WRONG = {  # scene, substeps, solver, the flag
     "a bullet": (bullet, 20, None, "tunnelling-risk"),
     "a spring that is not resolved": (unresolved, 20, None, "energy-loss"),
     "a whirl": (whirling, 20, None, "turned"),
+    "a disc between walls": (pressed, 20, None, "compressed"),
     "heavy on light at 1 substep": (heavy_on_light, 1, None, "compressed"),
 }
 

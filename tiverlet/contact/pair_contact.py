@@ -257,8 +257,10 @@ class PairContact(Feature):
 
     @ti.func
     def worst_overlap(self, i):
-        """Return the number of contacts that particle i counts for the report, and its worst overlap relative to its size."""
-        return self.dev.geometry.worst_overlap(i)
+        """Return the number of pairs that particle i counts for the report, and its worst overlap relative to its size, in which
+        walls count, too."""
+        touching, worst = self.dev.geometry.worst_overlap(i)
+        return touching, ti.max(worst, ti.cast(self.dev.rows.depth_in_walls(i), ti.f64))
 
 
 def _skin(value):

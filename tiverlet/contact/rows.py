@@ -727,6 +727,16 @@ class Rows:
         return ti.select(push_out < 0, ti.select(radius > 0, ti.static(QUARTER) * radius, self.ahead), push_out * self.h())
 
     @ti.func
+    def depth_in_walls(self, i):
+        """Return how deep particle i is in the walls of its rows, relative to its size."""
+        worst = ti.cast(0, self.real)
+        if ti.static(len(self.walls) > 0):
+            for row in range(self.pressed[i], self.end[i]):
+                gap, _n, _push_out = self.wall_gap(i, self.other.field[row] - WALL)
+                worst = ti.max(worst, -gap / ti.max(self.size(i), FEW))
+        return worst
+
+    @ti.func
     def wall_gap(self, i, face):
         """Return the gap of particle i at a wall at the end of the substep [m], its normal, and at what speed it lets out."""
         gap, n, push_out = ti.cast(1, self.real), 0 * self.state.x[i], ti.cast(-1, self.real)

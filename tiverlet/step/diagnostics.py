@@ -427,7 +427,7 @@ class Reporter:
         need = np.ceil(substeps * overlap / COMPRESSED)  # of order h after impacts, h^2 under loads
         given = [c.push_out for c in self._step.contacts if c.push_out is not None]
         placed = f"; what was placed so parts at push_out = {max(given):g} m/s" if given else ""
-        return f"Use up to {need:.7g} substeps{placed}."
+        return f"Use up to {need:.7g} substeps{placed}. Where they do not help, there is less room than particles need."
 
     def _note(self, flag, first, reach, overlap, moved, tension, stiff, released, residual, substeps) -> str:
         """Return the note of a flag: its meaning and a remedy, with the figures of this frame."""

@@ -17,9 +17,9 @@ class StepReport:
     """The report of the frame that world.step() has just finished.
 
     residual: worst violation of a constraint, relative to its rest value. overlap: of the worst contact, in radii of the
-    smaller particle. contacts: number of overlapping pairs. energy: kinetic and potential energy [J] in the middle of the last
-    substep, where it has an error of second order in the substep, in worlds of orders above 2 too; there, world.velocity is more
-    accurate. Forces without a potential do not count, and stiff springs count with the force that they exert. energy_change:
+    smaller particle; in worlds with contacts, with walls, too. contacts: number of overlapping pairs. energy: kinetic and
+    potential energy [J] in the middle of the last substep, where it has an error of second order in the substep, in worlds of
+    orders above 2 too; there, world.velocity is more accurate. Forces without a potential do not count, and stiff springs count with the force that they exert. energy_change:
     since the frame before [J]. bad: index of the first particle whose state is not finite, or None. broken: number of constraints
     that broke in the frame; world.broken lists them. asleep: number of sleeping particles, see Sleep. turn: 26 or 41 if a
     constraint turned by more than that many degrees in a substep, else 0. tension: (omega h)^2 of the fastest vibration across a
