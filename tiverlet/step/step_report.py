@@ -19,12 +19,12 @@ class StepReport:
     residual: worst violation of a constraint, relative to its rest value. overlap: of the worst contact, in radii of the
     smaller particle; in worlds with contacts, with walls, too. contacts: number of overlapping pairs. energy: kinetic and
     potential energy [J] in the middle of the last substep, where it has an error of second order in the substep, in worlds of
-    orders above 2 too; there, world.velocity is more accurate. Forces without a potential do not count, and stiff springs count with the force that they exert. energy_change:
-    since the frame before [J]. bad: index of the first particle whose state is not finite, or None. broken: number of constraints
-    that broke in the frame; world.broken lists them. asleep: number of sleeping particles, see Sleep. turn: 26 or 41 if a
-    constraint turned by more than that many degrees in a substep, else 0. tension: (omega h)^2 of the fastest vibration across a
-    tension, where a solver converges in a substep; 4 is the limit of stability. tries: how often the frame was computed, see
-    StepController. seconds: run time of the frame.
+    orders above 2 too; there, world.velocity is more accurate. Forces without a potential do not count, and stiff springs
+    count with the force that they exert. energy_change: since the frame before [J]. bad: index of the first particle whose
+    state is not finite, or None. broken: number of constraints that broke in the frame; world.broken lists them. asleep:
+    number of sleeping particles, see Sleep. turn: 26 or 41 if a constraint turned by more than that many degrees in a
+    substep, else 0. tension: (omega h)^2 of the fastest vibration across a tension, where a solver converges in a substep; 4
+    is the limit of stability. tries: how often the frame was computed, see StepController. seconds: run time of the frame.
 
     flags: words for what the user should know. notes: one sentence for each flag, with the cause and a remedy.
         "non-finite"        a position or displacement is NaN or infinite
