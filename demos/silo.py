@@ -39,12 +39,6 @@ def build() -> tv.World:
     return tv.World(start, [tv.Gravity(G), tv.Contact(friction=grip), *walls, bin_], substeps=16)
 
 
-def pressed(world: tv.World) -> np.ndarray:
-    """Return the sum of all normal forces on each grain [N], for its colour."""
-    found = world.contacts
-    return np.bincount(found.pairs.ravel(), np.repeat(found.impulse, 2), len(world.particles)) * 60 * world.substeps
-
-
 def borne(world: tv.World) -> float:
     """Return the share of the grains' weight that the floor carries."""
     p, found = world.particles, world.contacts
@@ -68,7 +62,7 @@ def main(path: str = "silo.rrd", *, seconds: float = 7.0) -> None:
     world = build()
     walls = world.features[2:4]
     shares, out = [], []
-    with tv.Recorder(path, world, every=2, overwrite=True, forces=True, color=("force [N]", 0.0, 2000.0)) as recorder:
+    with tv.Recorder(path, world, every=2, overwrite=True, forces=True, color=("load", 0.0, 2000.0)) as recorder:
         for frame in range(round(60 * seconds)):
             if 45 * SETTLED <= frame < 60 * SETTLED:
                 for wall in walls:
@@ -77,7 +71,7 @@ def main(path: str = "silo.rrd", *, seconds: float = 7.0) -> None:
                 x = world.position
                 world.remove(np.flatnonzero(world.particles.pinned & (np.abs(x[:, 0]) < GATE / 2)))
             report = world.step(1 / 60)
-            recorder.log(**{"force [N]": pressed(world)})
+            recorder.log()
             if 55 * SETTLED <= frame < 60 * SETTLED:
                 shares.append(borne(world))
             out.append(int((world.position[:, 1] < -0.02).sum()))

@@ -16,6 +16,7 @@ from tiverlet.live import scene, session
 from tiverlet.live.server import Server
 from tiverlet.live.session import Session
 from tiverlet.recording import surfaces
+from tiverlet.recording.bodies import bodies
 
 pytest.importorskip("websockets")
 from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
@@ -320,10 +321,10 @@ def test_bodies_and_their_surfaces_are_found(world):
     x = np.concatenate([star, [[3, 0], [4, 0], [4, 1], [3, 1]], [[6, 0], [7, 0], [8, 0]]])
     features = [tv.Area([np.arange(10)]), tv.ShapeMatch([np.arange(10, 14)]), tv.Distance([(14, 15), (15, 16)])]
     w = world(tv.Particles(x), features)
-    assert surfaces.bodies(w).tolist() == [0] * 10 + [10] * 4 + [14] * 3
+    assert bodies(w).tolist() == [0] * 10 + [10] * 4 + [14] * 3
     corners = surfaces.triangles(w)
     areas = surfaces.doubled(x[corners[:, 1]] - x[corners[:, 0]], x[corners[:, 2]] - x[corners[:, 0]]) / 2
-    body = surfaces.bodies(w)[corners[:, 0]]
+    body = bodies(w)[corners[:, 0]]
     assert areas[body == 0].sum() == pytest.approx(w.features[0].rest[0]) and areas[body == 10].sum() == pytest.approx(1)
     assert set(body.tolist()) == {0, 10} and len(corners) == 8 + 2
     # A cube of six tetrahedra has twelve faces; a cloth has two triangles per cell.

@@ -13,12 +13,12 @@ from PIL import Image, ImageDraw
 import tiverlet as tv
 from tests.test_recorder import read
 from tiverlet.live.scene import scene
-from tiverlet.recording import messages, overlays, viewer, watch
+from tiverlet.recording import messages, viewer, watch
 from tiverlet.recording.drawing import view_up
 from tiverlet.recording.exports.geometry import geometry
 from tiverlet.recording.exports.sketch import FINE, Look, Sketch, View
 from tiverlet.recording.fill import Fill, outlines
-from tiverlet.recording.hues import PALETTE
+from tiverlet.recording.hues import PALETTE, ramp
 from tiverlet.recording.layout import SCENE_VIEW, scene_view, unit
 from tiverlet.recording.picture import FLOWN, NEAR, framed
 from tiverlet.recording.rims import rims
@@ -77,7 +77,7 @@ def test_quantities_of_ones_own_are_kept_and_shown(tmp_path):
     np.testing.assert_allclose(height, [recording.position(k)[:, 1] for k in frames], rtol=1e-6)
     packed = np.array(column(path, "world/scene/particles", "Points2D:colors")[-1], dtype=np.uint32)
     drawn = np.stack([packed >> 24, packed >> 16 & 255, packed >> 8 & 255], axis=1)
-    assert (drawn == overlays.ramp(height[-1], 0.0, 0.8)).all()
+    assert (drawn == ramp(height[-1], (0.0, 0.8))).all()
 
 
 def test_quantities_may_have_any_printable_name(tmp_path):
@@ -104,19 +104,15 @@ def test_quantities_may_have_any_printable_name(tmp_path):
 
 
 def test_the_scale_of_colours_goes_from_end_to_end():
-    assert overlays.ramp(np.array([-1.0, 0, 1, 2, np.nan]), 0, 1).tolist() == [
+    assert ramp(np.array([-1.0, 0, 1, 2, np.nan]), (0, 1)).tolist() == [
         [68, 1, 84], [68, 1, 84], [253, 231, 37], [253, 231, 37], [128, 128, 128]
     ]  # fmt: skip
-    np.testing.assert_allclose(
-        overlays.ramp(np.array([0.625]), 0, 1), [[64, 173, 119]], atol=1
-    )  # between the third and the fourth
+    np.testing.assert_allclose(ramp(np.array([0.625]), (0, 1)), [[64, 173, 119]], atol=1)  # between the third and the fourth
 
 
 @pytest.mark.parametrize(
     "call, kind, text",
     [
-        (lambda w, p: tv.Recorder(p, w, color="height"), TypeError, "a name and the numbers of both ends"),
-        (lambda w, p: tv.Recorder(p, w, color=("height", 1, 1)), ValueError, "1 is not less than 1"),
         (lambda w, p: tv.Recorder(p, w, forces="yes"), TypeError, "forces = 'yes'"),
         (lambda w, p: tv.Recorder(p, w).log(energy=1.0), ValueError, "energy is the name of a curve"),
         (lambda w, p: tv.Recorder(p, w).log(heat=[1.0, 2.0]), ValueError, r"heat has the shape \(2,\)"),

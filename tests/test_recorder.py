@@ -9,7 +9,7 @@ import rerun as rr
 
 import tiverlet as tv
 from tiverlet.recording import messages
-from tiverlet.recording.hues import PALETTE, colors
+from tiverlet.recording.hues import PALETTE, by_body
 from tiverlet.recording.lines import Lines, cells, trails
 from tiverlet.recording.strain import LEVELS, LONGER, SCALE, SHORTER, levels
 from tiverlet.recording.surfaces import DARKEST, Surface, triangles
@@ -126,10 +126,10 @@ def test_each_link_is_in_one_strip(count, links):
     assert sorted(link[link >= 0].tolist()) == list(range(len(pairs))) and link[-1] == -1
     for k in np.flatnonzero(link >= 0):
         assert sorted(particles[k : k + 2]) == sorted(pairs[link[k]])
-    level = rng.integers(-1, 3, len(pairs))
-    at, ends, hues = Lines(pairs).strips(level)
+    shades = np.append(SCALE.astype(np.int64)[:3], -1)[rng.integers(-1, 3, len(pairs))]
+    at, ends, hues = Lines(pairs).strips(shades)
     drawn = [(*sorted(p), h) for a, b, h in zip(ends, ends[1:], hues, strict=False) for p in pairwise(at[a:b].tolist())]
-    assert sorted(drawn) == sorted((*sorted(p), SCALE[v]) for p, v in zip(pairs.tolist(), level, strict=True) if v >= 0)
+    assert sorted(drawn) == sorted((*sorted(p), v) for p, v in zip(pairs.tolist(), shades, strict=True) if v >= 0)
 
 
 def test_a_rope_is_one_strip_and_a_sheet_is_one_mesh(world):
@@ -225,10 +225,10 @@ def test_neighbouring_bodies_differ_in_colour_wherever_their_particles_begin(poi
     # Six ropes side by side, and bodies in rows of any length: each differs from all eight around it.
     ropes = [tv.shapes.rope((k, 2), (k, 1), points=points) for k in range(6)]
     both, slices = tv.shapes.join(*ropes)
-    hues = in_lab(colors(tv.World(tv.Particles(both.position), [tv.Distance(both.links)]))[[s.start for s in slices]])
+    hues = in_lab(by_body(tv.World(tv.Particles(both.position), [tv.Distance(both.links)]))[[s.start for s in slices]])
     assert np.linalg.norm(np.diff(hues, axis=0), axis=1).min() > 24
     at = np.stack(np.meshgrid(np.arange(points), np.arange(9)), axis=-1).reshape(-1, 2)
-    lab = in_lab(colors(tv.World(tv.Particles(at)))).reshape(9, points, 3)
+    lab = in_lab(by_body(tv.World(tv.Particles(at)))).reshape(9, points, 3)
     for one, two in ((lab[1:], lab[:-1]), (lab[:, 1:], lab[:, :-1]), (lab[1:, 1:], lab[:-1, :-1]), (lab[1:, :-1], lab[:-1, 1:])):
         assert np.linalg.norm(one - two, axis=2).min() > 24
 
@@ -237,6 +237,6 @@ def test_bodies_have_no_colour_of_strain_and_keep_theirs_when_others_are_added()
     strain = in_lab(np.stack([SCALE >> 24, SCALE >> 16 & 255, SCALE >> 8 & 255], axis=1))
     assert np.linalg.norm(in_lab(PALETTE)[:, None] - strain, axis=2).min() > 24
     world = tv.World(tv.Particles(tv.golden(np.arange(40), dim=2)))
-    before = colors(world)
+    before = by_body(world)
     world.add(tv.Particles([[0.5, 0.5]]))
-    np.testing.assert_array_equal(colors(world)[:40], before)
+    np.testing.assert_array_equal(by_body(world)[:40], before)

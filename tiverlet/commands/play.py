@@ -4,7 +4,7 @@ import argparse
 import runpy
 from typing import Any
 
-from .scripts import as_script, port
+from .scripts import as_script, color, port
 
 ABOUT = "run a demo or script live, and take it by hand"
 
@@ -13,6 +13,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     """Add the script, and options of the page."""
     parser.add_argument("script", help="a .py file with a function play() or build() that returns a world, or the name of a demo")
     parser.add_argument("--record", metavar="FILE.rrd", help="write what happens, the hand included; replays bit for bit")
+    parser.add_argument("--color", type=color, metavar="NAME[,LEAST,MOST]", help="of particles, by a quantity such as speed")
     parser.add_argument("--port", type=port, default=0, help="default: a free one")
     parser.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
 
@@ -25,7 +26,8 @@ def main(args: argparse.Namespace) -> int:
     path = find(args.script)
     with as_script(path):
         world, each_frame = load_world(str(path))
-        play(world, record=args.record, each_frame=each_frame, title=path.stem, port=args.port, browser=args.browser)
+        page = {"title": path.stem, "port": args.port, "browser": args.browser, "color": args.color}
+        play(world, record=args.record, each_frame=each_frame, **page)
     return 0
 
 

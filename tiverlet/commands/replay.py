@@ -6,11 +6,12 @@ import runpy
 from typing import Any
 
 from ..device.language import is_kernel_function
-from .scripts import as_script, port
+from .scripts import as_script, color, port
 
 ABOUT = "view, verify, picture or export a recording"
 
 
+LOOK = ("size", "camera", "theme", "color")
 STATUS = {"intact": 0, "changed": 1, "incomplete": 3}  # 2: unreadable
 
 
@@ -35,10 +36,13 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", type=size, metavar="WxH", help="of --export, of films: pixels, or the width alone")
     parser.add_argument("--camera", type=angles, metavar="A,B", help="of --export, of 3D films: angles to the right and up [rad]")
     parser.add_argument("--theme", help="of --export, of films: dark or light")
+    parser.add_argument(
+        "--color", type=color, metavar="NAME[,LEAST,MOST]", help="of --export: by a quantity such as speed; default as recorded"
+    )
     parser.add_argument("--frame", type=int, action="append", help="of --png; several with a %%d in the name; default the last")
     parser.add_argument("--scene", action="store_true", help="of --png: the scene alone, without curves and text")
     parser.add_argument("--port", type=port, default=9090, help="of --web; default 9090")
-    parser.add_argument("--given", metavar="SCRIPT.py", help="of --verify: where the user's own functions in the scene are")
+    parser.add_argument("--given", metavar="SCRIPT.py", help="where the user's own functions in the scene are")
 
 
 def size(text: str) -> int | tuple[int, int]:
@@ -66,15 +70,15 @@ def main(args: argparse.Namespace) -> int:
         print(e)
         return STATUS["changed"]
     print(recording.text)
+    if args.given:
+        recording = replay(args.file, functions(args.given, recording.scene["needs"]))
     if args.verify:
-        if args.given:
-            recording = replay(args.file, functions(args.given, recording.scene["needs"]))
         verdict = recording.verify()
         print(verdict)
         return STATUS[verdict.kind]
     if args.export:
         out = args.export if "." in args.export else f"{os.path.splitext(args.file)[0]}.{args.export}"
-        shape, look = load(args.shape) if args.shape else None, {"size": args.size, "camera": args.camera, "theme": args.theme}
+        shape, look = load(args.shape) if args.shape else None, {name: vars(args)[name] for name in LOOK}
         written = recording.export(out, shape, motion=args.motion, **look)
         more = f" and {len(written) - 1} more" if len(written) > 1 else ""
         print(f"{written[0]}{more}: {sum(map(os.path.getsize, written))} bytes")

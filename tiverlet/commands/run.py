@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from .scripts import as_script
+from .scripts import as_script, color
 
 ABOUT = "run a demo or script, and record it"
 # The folder beside the package in a checkout, or in the installed package.
@@ -21,6 +21,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("script", help="a .py file, or the name of a demo")
     parser.add_argument("--out", metavar="FILE.rrd", help="default: the name of the script, here")
     parser.add_argument("--live", nargs="?", const=True, default=False, choices=("web",), help="watch it meanwhile")
+    parser.add_argument("--color", type=color, metavar="NAME[,LEAST,MOST]", help="of particles, by a quantity such as speed")
     parser.add_argument("arguments", nargs="*", help="passed on to the script")
 
 
@@ -34,7 +35,7 @@ def main(args: argparse.Namespace) -> int:
     check_replaceable(out)
     if not os.path.isdir(os.path.dirname(os.path.abspath(out))):
         raise FileNotFoundError(f"The folder of {out} does not exist.")
-    with recording(out, args.live) as made:
+    with recording(out, args.live, args.color) as made:
         status = execute(path, args.arguments)
     if made:
         print(f"{replay(out).text} {os.path.getsize(out)} bytes.")
@@ -65,17 +66,17 @@ def find(name: str) -> pathlib.Path:
 
 
 @contextlib.contextmanager
-def recording(out: str, live: bool | str = False) -> Iterator[list[Any]]:
+def recording(out: str, live: bool | str = False, color: Any = None) -> Iterator[list[Any]]:
     """Redirect the first Recorder to `out` while the context lasts.
 
-    A world that is stepped before any Recorder exists gets its own. live: see Recorder.
+    A world that is stepped before any Recorder exists gets its own. live, color: see Recorder.
     """
     import tiverlet
 
     from ..world import World
 
     made: list[Any] = []
-    given: dict[str, Any] = {"overwrite": True, "live": live}
+    given: dict[str, Any] = {"overwrite": True, "live": live} | ({"color": color} if color else {})
     step, recorder = World.step, tiverlet.Recorder
 
     class Redirected(recorder):

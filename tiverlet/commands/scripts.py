@@ -1,4 +1,4 @@
-"""Scripts of the user that commands run, and numbers of ports."""
+"""Scripts of the user that commands run, numbers of ports, and colours."""
 
 import argparse
 import contextlib
@@ -35,3 +35,9 @@ def port(text: str) -> int:
     if not text.isdecimal() or int(text) > 65535:
         raise argparse.ArgumentTypeError(f"{text!r} is no number from 0 to 65535")
     return int(text)
+
+
+def color(text: str) -> str | tuple[str, float, float]:
+    """Return a quantity by which particles are coloured, such as speed or speed,0,2, for argparse."""
+    name, *ends = text.rsplit(",", 2) if text.count(",") > 1 else [text]
+    return (name, float(ends[0]), float(ends[1])) if ends else name

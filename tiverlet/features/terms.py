@@ -8,7 +8,7 @@ and attribute in a clause exists: tests/test_terms.py looks each of them up.
 FEATURES = "forces, constraints and walls are features; write tv.World(particles, features), and read world.features"
 MATERIAL = "it belongs to contacts and walls; write tv.Contact(friction=..., restitution=...)"
 MASSLESS = "walls have no mass: they move as you assign their knobs; bodies that move are made of tv.Particles(position)"
-COLOUR = "pictures colour by body; for a quantity of your own write tv.Recorder(path, world, color=(name, least, most))"
+COLOUR = "it belongs to pictures, by body unless you write tv.Recorder(path, world, color=...) or tv.play(world, color=...)"
 SUBSTEPS = "it is a setting of the world; write world.substeps = 20 or world.iterations = 4"
 ROWS: dict[str, dict[str, str]] = {
     "tiverlet": {

@@ -264,7 +264,7 @@ function drawRims(points) { // the rounded edges of bodies, in the shade of thei
   const ends = new Float32Array(6 * scene.edges.length), colors = new Uint8Array(4 * scene.edges.length);
   scene.edges.forEach(([a, b], j) => {
     for (let c = 0; c < 3; c++) { ends[6 * j + c] = points[3 * a + c]; ends[6 * j + 3 + c] = points[3 * b + c]; }
-    colors.set([...scene.color[a].map((v) => 0.82 * v), 255], 4 * j);
+    colors.set([...mix(a, b).map((v) => 0.82 * v), 255], 4 * j);
   });
   drawLines("rims", ends, colors, new Float32Array(scene.edge_radius.map((r) => -r)));
 }
@@ -272,7 +272,7 @@ function drawRims(points) { // the rounded edges of bodies, in the shade of thei
 function drawMarks(points, n) { // how far particles have turned: a line to the rim of a disc, two spots on a ball, as in recordings
   const spots = new Float32Array(6 * n), flat = scene.dim === 2;
   for (let i = 0; i < n; i++) {
-    const r = scene.covered[i] && !scene.pinned[i] ? 0 : scene.radius[i], c = points.subarray(3 * i, 3 * i + 3);
+    const r = hidden(i) ? 0 : scene.radius[i], c = points.subarray(3 * i, 3 * i + 3);
     if (flat) {
       spots.set([...c, c[0] + r * Math.cos(turned[i]), c[1] + r * Math.sin(turned[i]), 0], 6 * i);
     } else { // the first axis, turned by the quaternion
@@ -343,7 +343,7 @@ function draw() {
   drawn.forEach((k, j) => {
     const [a, b] = scene.links[k];
     for (let c = 0; c < 3; c++) { ends[6 * j + c] = points[3 * a + c]; ends[6 * j + 3 + c] = points[3 * b + c]; }
-    let color = scene.color[a];
+    let color = mix(a, b);
     if (show.strain) {
       const d = Math.hypot(...[0, 1, 2].map((c) => ends[6 * j + c] - ends[6 * j + 3 + c]));
       color = scene.rest[k] ? hue(d / scene.rest[k] - 1) : [170, 172, 182];
@@ -384,7 +384,10 @@ function hear({ data }) {
     const length = new DataView(data).getUint32(0, true), count = scene.dim * scene.radius.length;
     figures = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
     x = new Float32Array(data, 4 + length, count);
-    turned = scene.turns ? new Float32Array(data, 4 + length + 4 * count) : null;
+    const n = scene.radius.length, turns = scene.turns ? (scene.dim === 2 ? n : 4 * n) : 0;
+    turned = turns ? new Float32Array(data, 4 + length + 4 * count, turns) : null;
+    const end = 4 + length + 4 * (count + turns);
+    if (data.byteLength > end) paint(new Uint8Array(data, end));
     frames++;
     dirty = true;
     tell();
@@ -404,6 +407,21 @@ function sort() { // find the links that are drawn: those that are whole, and th
   dirty = true;
 }
 
+// Particles of a surface have its shade in 2D. In 3D they are hidden, except pinned ones.
+const hidden = (i) => scene.covered[i] && !scene.pinned[i];
+const mix = (a, b) => [0, 1, 2].map((k) => (scene.color[3 * a + k] + scene.color[3 * b + k]) / 2); // the colour between two
+
+function paint(colors) { // give particles their colours: red, green and blue of each
+  const hues = new Uint8Array(4 * scene.radius.length);
+  for (let i = 0; 4 * i < hues.length; i++) {
+    for (let k = 0; k < 3; k++) hues[4 * i + k] = colors[3 * i + k];
+    hues[4 * i + 3] = hidden(i) && scene.dim === 2 ? 0 : 255;
+  }
+  scene.color = colors;
+  upload("color", hues);
+  upload("hues", fourfold(hues, 4));
+}
+
 function take(message) {
   const first = !scene;
   scene = message;
@@ -415,15 +433,11 @@ function take(message) {
   sort();
   const dots = scene.radius.map((r) => r > 0 ? r : -3);
   upload("radius", fourfold(new Float32Array(dots), 1));
-  // Particles of a surface have its shade in 2D. In 3D they are hidden, except pinned ones.
-  const under = (i) => scene.covered[i] && !scene.pinned[i];
-  upload("seen", fourfold(new Float32Array(dots.map((r, i) => under(i) && (scene.dim === 3 || r < 0) ? 0 : r)), 1));
-  const hues = new Uint8Array(scene.color.flatMap((c, i) => [...c, under(i) && scene.dim === 2 ? 0 : 255]));
-  upload("color", hues);
-  upload("hues", fourfold(hues, 4));
+  upload("seen", fourfold(new Float32Array(dots.map((r, i) => hidden(i) && (scene.dim === 3 || r < 0) ? 0 : r)), 1));
+  paint(scene.color);
   upload("triangles", new Uint32Array(scene.triangles.flat()), gl.ELEMENT_ARRAY_BUFFER);
   scene.marks = new Uint8Array(scene.radius.flatMap(() => MARK));
-  upload("spots", fourfold(new Float32Array(scene.radius.flatMap((r, i) => Array(2).fill(under(i) ? 0 : SPOT * r))), 1));
+  upload("spots", fourfold(new Float32Array(scene.radius.flatMap((r, i) => Array(2).fill(hidden(i) ? 0 : SPOT * r))), 1));
   upload("spots.color", fourfold(new Uint8Array(scene.radius.flatMap(() => [...MARK, ...MARK])), 4));
   if (first) fit();
 }

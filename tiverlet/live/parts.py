@@ -8,6 +8,7 @@ from ..colliders.collider import Collider
 from ..constraints import Path
 from ..neighbours import Periodic
 from ..recording.drawing import bounds, links
+from ..recording.hues import BY_BODY, Coloring
 from ..recording.images import InBox
 from . import scene
 
@@ -24,8 +25,8 @@ class Parts:
     A page is sent each message once, together with the next frame that it takes. So it misses none, however slow it is.
     """
 
-    def __init__(self, world: "World", title: str, y_down: bool = False):
-        self.world, self._title, self._y_down = world, title, y_down
+    def __init__(self, world: "World", title: str, y_down: bool = False, coloring: Coloring = BY_BODY):
+        self.world, self._title, self._y_down, self.coloring = world, title, y_down, coloring.following(world)
         self._messages: dict[str, str] = {}
         self._extent = bounds(world)  # walls are drawn between these corners, also when particles come and go
         self.regrouped()
@@ -35,7 +36,7 @@ class Parts:
         """Return the messages, by kind."""
         world = self.world
         if "scene" in self._stale:
-            self._messages["scene"] = scene.scene(world, self._title, self._extent, self._y_down)
+            self._messages["scene"] = scene.scene(world, self._title, self._extent, self._y_down, self.coloring)
         if "walls" in self._stale:
             self._messages["walls"] = scene.walls(world, self._extent)
         if "broken" in self._stale and any(f.breaks for _, f in links(world)):

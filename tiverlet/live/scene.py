@@ -14,7 +14,7 @@ from ..constraints.core.length import is_link
 from ..features.feature import Batch
 from ..forces import Hand
 from ..recording.drawing import links, upwards, view_up
-from ..recording.hues import colors
+from ..recording.hues import BY_BODY, Coloring
 from ..recording.images import box_of
 from ..recording.rims import rims
 from ..recording.surfaces import covered, triangles
@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 STEEP = 0.9  # the least cosine of the slope of a floor: 25 degrees
 
 
-def scene(world: "World", title: str, extent: tuple[np.ndarray, np.ndarray], y_down: bool = False) -> str:
+def scene(
+    world: "World", title: str, extent: tuple[np.ndarray, np.ndarray], y_down: bool = False, coloring: Coloring = BY_BODY
+) -> str:
     """Return particles, links, surfaces and the view as JSON. extent: the corners of the view [m]. y_down: see play()."""
     p = world.particles
     found = links(world)
@@ -35,7 +37,8 @@ def scene(world: "World", title: str, extent: tuple[np.ndarray, np.ndarray], y_d
     return json.dumps({
         "kind": "scene", "title": title, "dim": p.dim, "radius": _short(p.radius),
         "pinned": (p.inv_mass == 0).astype(int).tolist(), "turns": p.orientation is not None,
-        "color": colors(world).tolist(), "links": np.concatenate([none, *(f.indices for _, f in found)]).tolist(),
+        "color": coloring.colors(world).ravel().tolist(),
+        "links": np.concatenate([none, *(f.indices for _, f in found)]).tolist(),
         "rest": _short(np.concatenate([np.zeros(0), *rest])), "triangles": corners.tolist(),
         "covered": covered(world, corners).astype(int).tolist(), "edges": edges.tolist(), "edge_radius": _short(radius),
         "low": _short(extent[0]), "high": _short(extent[1]),
@@ -109,15 +112,16 @@ def describe_particle(world: "World", i: int) -> str:
     return "\n".join(lines + ([f"in {', '.join(dict.fromkeys(acts))}"] if acts else []))
 
 
-def frame(world: "World", figures: dict[str, Any], places: np.ndarray) -> bytes:
-    """Return a frame as bytes: the length of the JSON figures (u32, little-endian), the figures, positions in f32, orientations.
+def frame(world: "World", figures: dict[str, Any], places: np.ndarray, coloring: Coloring = BY_BODY) -> bytes:
+    """Return a frame as bytes: the length of the JSON figures (u32, little-endian), the figures, positions in f32, and more.
 
     Figures that are not finite are null. places: where particles are drawn, (n, dim) [m]. Orientations follow in f32 where
-    particles have them: angles in 2D [rad], quaternions (x, y, z, w) in 3D.
+    particles have them: angles in 2D [rad], quaternions (x, y, z, w) in 3D. Last are colours, (n, 3) u8, if a quantity is shown.
     """
     known = {name: v if not isinstance(v, float) or math.isfinite(v) else None for name, v in figures.items()}
     text = json.dumps(known).encode()
     text += b" " * (-len(text) % 4)
     turned = b"" if world.particles.orientation is None else world.orientation.astype("<f4").tobytes()
     with np.errstate(over="ignore"):  # positions of a diverged scene may exceed f32
-        return len(text).to_bytes(4, "little") + text + places.astype("<f4").tobytes() + turned
+        out = len(text).to_bytes(4, "little") + text + places.astype("<f4").tobytes() + turned
+    return out + coloring.colors(world).tobytes() if coloring.name else out

@@ -16,6 +16,7 @@ from ..constraints import Pin
 from ..contact import Polygons
 from ..features.feature import Batch
 from ..forces import Hand
+from ..recording.hues import Coloring
 from ..recording.overlays import checked_y_down
 from ..recording.scene import knobs, set_knobs
 from ..recording.sink import check_replaceable
@@ -42,7 +43,7 @@ class Session:
 
     def __init__(
         self, world: "World", server: Server, *, title: str = "", record: str | os.PathLike | None = None,
-        each_frame: Callable[["World"], None] | None = None, y_down: bool = False,
+        each_frame: Callable[["World"], None] | None = None, y_down: bool = False, color: Any = None,
     ):  # fmt: skip
         self.world, self.server, self.title, self.record, self.each_frame = world, server, title, record, each_frame
         if record is not None:
@@ -59,7 +60,8 @@ class Session:
         self._structure = _structure(world)  # at the start
         self._computed: deque[tuple[float, float]] = deque(maxlen=30)  # for each frame: its begin [s] and computing time [ms]
         self.y_down = checked_y_down("play", world, y_down)
-        self._parts = Parts(world, title, self.y_down)
+        self.color = color
+        self._parts = Parts(world, title, self.y_down, Coloring.checked("play", color, len(world.particles)))
         self._sent = 0.0
         self._holder: Viewer | None = None
         self._recorder: Recorder | None = None
@@ -70,7 +72,7 @@ class Session:
         if self.record is not None:
             from ..recording import Recorder
 
-            self._recorder = Recorder(self.record, self.world, overwrite=True, y_down=self.y_down)
+            self._recorder = Recorder(self.record, self.world, overwrite=True, y_down=self.y_down, color=self.color)
 
     def close(self) -> None:
         """Finish the file, and leave the world."""
@@ -182,7 +184,8 @@ class Session:
         ready = [viewer for viewer in self.server.viewers if viewer.waiting < AHEAD]
         if not ready:
             return
-        parts, message = self._parts.current(), scene.frame(self.world, self._figures(), self._parts.drawn_positions())
+        parts, places = self._parts.current(), self._parts.drawn_positions()
+        message = scene.frame(self.world, self._figures(), places, self._parts.coloring)
         for viewer in ready:
             for kind, part in parts.items():
                 if viewer.known.get(kind) is not part:
@@ -207,7 +210,7 @@ def _structure(world: "World") -> list[Any]:
 @checks.answer_arguments
 def play(
     world: "World", *, record: str | os.PathLike | None = None, each_frame: Callable[["World"], None] | None = None,
-    title: str = "tiverlet", port: int = 0, browser: bool = True, y_down: bool = False,
+    title: str = "tiverlet", port: int = 0, browser: bool = True, y_down: bool = False, color: Any = None,
 ) -> None:  # fmt: skip
     """Run a world in real time in a page of the browser, where the user can drag its particles, until Ctrl-C.
 
@@ -217,7 +220,8 @@ def play(
     record: a file that is written meanwhile, see Recorder. It contains what the hand did, which is computed again bit for bit.
     After a restart the file begins again. each_frame: called with the world before each frame, for example to move walls. title:
     of the page. port: 0 uses a free one. browser: whether to open the page; its address is printed in any case.
-    y_down: whether y points down, as in coordinates of pixels (2D).
+    y_down: whether y points down, as in coordinates of pixels (2D). color: None, by body; or colours (n, 3), a quantity such as
+    "speed", or a function of the world, as in Recorder.
 
     The page is served to this machine only. To watch from another machine, forward the port: ssh -L PORT:127.0.0.1:PORT host, and
     open the address there; over SSH this command is printed. In a notebook the page shows below the cell, which runs until it is
@@ -228,7 +232,7 @@ def play(
     server = Server(port)
     session = None
     try:
-        session = Session(world, server, title=title, record=record, each_frame=each_frame, y_down=y_down)
+        session = Session(world, server, title=title, record=record, each_frame=each_frame, y_down=y_down, color=color)
         _announce(server, browser)
         session.run()
     except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""Draws a world: particles, links coloured by their strain, walls, contacts, breaks."""
+"""Draws a world: particles, links, walls, contacts, breaks."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
@@ -12,16 +12,17 @@ from ..constraints.core.length import is_link
 from ..features.feature import Batch, Feature
 from ..forces import Gravity
 from ..neighbours import Periodic
+from .bodies import bodies
 from .fill import Fill, outlines, within
-from .hues import colors
+from .hues import BY_BODY
 from .images import InBox, box_of, crosses_box
 from .journal import PARTICLES
 from .layout import LEGEND, SCENE, WIDE
 from .lines import Lines
-from .overlays import AHEAD, ARROW, LOAD, Overlays, loads, ramp
+from .overlays import AHEAD, ARROW, LOAD, Overlays, loads
 from .rims import rims
-from .strain import LEVELS, levels
-from .surfaces import Surface, bodies, covered, triangles
+from .strain import LEVELS, SCALE, levels, packed
+from .surfaces import Surface, covered, triangles
 
 if TYPE_CHECKING:
     from ..world import World
@@ -59,7 +60,7 @@ class Drawing:
         self._strip = pyarrow.list_(pyarrow.field("item", point, nullable=False))  # the type of rerun's line strips
         self.bytes = 0
         self.extent, self._overlays = extent, overlays
-        self.hues: np.ndarray | None = None  # colours of particles in the coming frame, if they change
+        self.logged: dict[str, np.ndarray] = {}  # the user's quantities of particles, as logged last
         self.scenes = 0  # the number of the scene that is drawn, from 1 on
         self._in_box = InBox()
         self._touched = self._broke_before = False
@@ -78,20 +79,19 @@ class Drawing:
         Then all of it is logged again, under another name. scenes: the number of scenes so far, of which some may have ended
         before a frame of them was drawn.
         """
-        world, p = self.world, self.world.particles
+        world, p, hues = self.world, self.world.particles, self._paint()
         self._root = f"{SCENE}/scene{scenes - 1}" if scenes > 1 else SCENE
         if self.scenes:
             self._log(SCENE, self._rr.Clear(recursive=True))
         self.scenes = scenes
         self._contacts = len(p) <= FEW and bool(world._runner.step.contacts)
         self._broken = {k: f.broken for k, f in enumerate(world.features) if isinstance(f, Batch) and f.breaks}
-        hues = colors(world)
         self._broke = {k: np.flatnonzero(gone).tolist() for k, gone in self._broken.items() if gone.any()}
         self._join(hues)
         radii = np.where(p.radius > 0, p.radius, POINT)
         if self._surface:
             radii[covered(world, self._surface.triangles) & (p.inv_mass > 0)] = 0.0  # hidden by the surface
-        fixed = {} if self._overlays.color else {"colors": hues}  # static colours would override those of each frame
+        fixed = {} if self._overlays.color.name else {"colors": hues}  # static colours would override those of each frame
         what = [self._points.from_fields(radii=radii, **fixed)]
         what += [self._rr.Mesh3D.from_fields(triangle_indices=self._surface.triangles.astype(np.uint32))] if self._surface else []
         what += [self._strips.from_fields(radii=[-1.2])] if self._lines else []
@@ -113,6 +113,11 @@ class Drawing:
             self.static(
                 f"{LEGEND}/labels", self._rr.Points2D(at + [0, 0.1], colors=[LABEL], labels=labels, radii=[0], show_labels=True)
             )
+
+    def _paint(self) -> np.ndarray:
+        """Return the present colours of particles, (n, 3)."""
+        self._hues = self._overlays.color.colors(self.world, self.logged)
+        return self._hues
 
     def _join(self, hues: np.ndarray) -> None:
         """Collect all links: those that are part of a surface colour it, and the others are drawn as lines."""
@@ -161,14 +166,12 @@ class Drawing:
         """
         # Log everything in one row, so that LZ4 matches the points of lines and sheets with those of the particles.
         colored = {}
-        if self._overlays.color:
-            hues = self.hues
-            if hues is None or len(hues) != len(x32):
-                hues = np.full((len(x32), 3), 128, dtype=np.uint8)
+        if self._overlays.color.name:
+            hues = self._paint()
             colored = {"colors": hues}
             self.bytes += hues.nbytes
-            if self._surface:
-                self._surface.paint(hues)
+            for body in filter(None, (self._surface, self._fill)):
+                body.paint(hues)
         row = [self._points.from_fields(positions=x32, **colored)]
         self.bytes += x32.nbytes
         if len(self._pairs) or self._surface or self._fill:
@@ -205,7 +208,7 @@ class Drawing:
         self._log(f"{self._root}/marks", what)
 
     def _link(self, x: np.ndarray, x32: np.ndarray) -> list[Any]:
-        """Return links, coloured by their strain. Strips go to rerun in its own layout, which is ten times as fast."""
+        """Return links, in the colours of strain or of their ends. Strips have rerun's own layout, which is ten times as fast."""
         r = x[self._pairs[:, 0]] - x[self._pairs[:, 1]]
         with np.errstate(divide="ignore", invalid="ignore"):
             level = levels(np.sqrt(np.einsum("ij,ij->i", r, r)) / self._rest - 1)
@@ -220,7 +223,7 @@ class Drawing:
             row.append(self._rr.Mesh3D.from_fields(vertex_positions=x32, vertex_colors=shades))
             self.bytes += shades.nbytes + x32.nbytes
         if self._lines:
-            particles, ends, shades = self._lines.strips(level[self._line_links])
+            particles, ends, shades = self._lines.strips(self._shades(level[self._line_links]))
             row.append(self._strips.from_fields(strips=self._packed(x32[particles], ends), colors=shades))
             self.bytes += shades.nbytes
         if self._fill:
@@ -229,6 +232,12 @@ class Drawing:
             self._log(f"{self._root}/fill", self._strips.from_fields(strips=self._packed(points, ends), colors=shades))
             self.bytes += shades.nbytes
         return row
+
+    def _shades(self, level: np.ndarray) -> np.ndarray:
+        """Return the colours of links that are lines as i64, (m,): of their strain, or the mean of their ends; -1: not drawn."""
+        by_strain = self._overlays.color is BY_BODY
+        shades = SCALE[level] if by_strain else packed(self._hues[self._pairs[self._line_links]].mean(axis=1))
+        return np.where(level < 0, -1, shades.astype(np.int64))
 
     def _packed(self, points: np.ndarray, ends: np.ndarray) -> Any:
         """Return strips of points (k, dim) in f32, the s-th from ends[s] to ends[s + 1], in rerun's own layout."""
@@ -289,11 +298,6 @@ class Drawing:
                 f"{self._root}/contacts", self._strips.from_fields(strips=strips, radii=radii, colors=[LOAD], **self._above)
             )
             self.bytes += strips.nbytes
-
-    def color(self, values: np.ndarray) -> None:
-        """Set the colours of the coming frames from a quantity of particles, (n,)."""
-        assert self._overlays.color
-        self.hues = ramp(values, *self._overlays.color[1:])
 
     def _breaks(self, x: np.ndarray) -> None:
         """Draw a mark where a constraint broke since the last frame, and add a line to the list of events."""

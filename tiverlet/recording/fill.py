@@ -6,8 +6,8 @@ import numpy as np
 
 from ..constraints import Area
 from ..contact import Polygons
-from .strain import LEVELS, LONGER, SHORTER
-from .surfaces import bodies
+from .bodies import bodies
+from .strain import LEVELS, LONGER, SHORTER, packed
 
 if TYPE_CHECKING:
     from ..world import World
@@ -78,8 +78,14 @@ class Fill:
         filling = np.tile(np.arange(len(loops)), len(INSETS))
         self._shown = np.concatenate([filling, owner[self._edges[:, 0]]])  # the body of each line
         self.radii = np.concatenate([(self._depth * HALF[:, None]).ravel(), rims[1][some]]).astype(np.float32)
-        self._hues = SHADE * hues[self._corner[first]].astype(np.float64)
         self._body = body
+        self.paint(hues)
+
+    def paint(self, hues: np.ndarray) -> None:
+        """Set other colours of the particles, (n, 3); each body has the mean of its corners."""
+        count = np.bincount(self._owner)
+        totals = [np.bincount(self._owner, column) for column in hues[self._corner].T]
+        self._hues = SHADE * np.stack(totals, axis=1) / count[:, None]
 
     def _inwards(self, p: np.ndarray) -> np.ndarray:
         """Return the inward normal of the side that begins at each corner."""
@@ -107,8 +113,7 @@ class Fill:
             np.maximum.at(most, self._body, 2 * np.abs(off) + (off > 0))
             share = np.maximum(0, 3 * (most >> 1) / LEVELS - 2)[:, None]
             hues = hues + share * (np.where((most & 1)[:, None], LONGER, SHORTER) - hues)
-        rgb = np.rint(hues).astype(np.uint32)
-        return (rgb[:, 0] << 24 | rgb[:, 1] << 16 | rgb[:, 2] << 8 | np.uint32(255))[self._shown]
+        return packed(hues)[self._shown]
 
 
 def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..neighbours import Periodic
-from .surfaces import bodies
+from .bodies import bodies
 
 if TYPE_CHECKING:
     from ..world import World

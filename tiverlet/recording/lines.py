@@ -1,11 +1,9 @@
-"""Links as few points: long strips coloured by strain. Also finds which links form a sheet."""
+"""Links as few points: long strips of one colour. Also finds which links form a sheet."""
 
 from collections import defaultdict
 from itertools import combinations
 
 import numpy as np
-
-from .strain import SCALE
 
 FLAT = 0.1  # the diagonals of a cell pass each other within this share of their length
 STRAIGHT = 1e-3  # a link that passes a particle within this share of its length lies on the two links to it
@@ -21,13 +19,13 @@ class Lines:
     def __init__(self, pairs: np.ndarray):
         self.particles, self._link = trails(pairs)
 
-    def strips(self, level: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def strips(self, hues: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the strips of a frame: the particles of all strips, (k,), their ends, (s + 1,), and their colours as u32, (s,).
 
-        Strip k has the particles from ends[k] to ends[k + 1]. level: the colour level of each link, (m,); -1 for one that is not
+        Strip k has the particles from ends[k] to ends[k + 1]. hues: the colour of each link as i64, (m,); -1 for one that is not
         drawn.
         """
-        here = np.where(self._link < 0, -1, level[self._link])  # the level from each particle to the next
+        here = np.where(self._link < 0, -1, hues[self._link])  # the colour from each particle to the next
         edge = np.flatnonzero(np.diff(here, prepend=-1, append=-1))
         begin, end = edge[:-1], edge[1:]
         drawn = here[begin] >= 0 if len(begin) else np.zeros(0, dtype=bool)
@@ -35,7 +33,7 @@ class Lines:
         count = end - begin + 1
         ends = np.concatenate([[0], np.cumsum(count)])
         at = np.arange(ends[-1]) + np.repeat(begin - ends[:-1], count)
-        return self.particles[at], ends, SCALE[here[begin]]
+        return self.particles[at], ends, here[begin].astype(np.uint32)
 
 
 def trails(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ import numpy as np
 from ..colliders.collider import Collider
 from ..constraints import Path
 from .drawing import bounds, links, upwards
-from .hues import colors
+from .hues import by_body
 from .images import InBox
 from .layout import eye_axes
 from .rims import rims
@@ -102,7 +102,7 @@ def picture(world: "World", x: np.ndarray) -> str:
             parts += [_line(strip, GREY, max(1.0, 2 * radius * scale)) for strip in place(strips)] if strips.size else []
     ends = np.concatenate([np.zeros((0, 2), dtype=np.int64), *(f.indices for _, f in links(world))])
     parts += [_line(pair, GREY, 1.0) for pair in place(x[ends[:: -(-len(ends) // MANY) or 1]])]
-    hues, (edges, thick) = colors(world), rims(world)
+    hues, (edges, thick) = by_body(world), rims(world)
     parts += [_line(pair, _hex(hues[i]), 2 * r * scale) for pair, i, r in zip(place(x[edges]), edges[:, 0], thick, strict=True)]
     depth = (x @ view.T)[:, 2] if x.shape[1] == 3 else np.zeros(len(x))
     radii = np.maximum(world.particles.radius * scale, 1.2)

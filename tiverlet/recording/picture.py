@@ -10,10 +10,10 @@ import numpy as np
 
 from ..step.checkpoint import Checkpoint
 from ..step.step_report import StepReport
-from .overlays import Overlays
 
 if TYPE_CHECKING:
     from ..world import World
+    from .overlays import Overlays
 
 NEAR = 0.35  # walls are in view up to this share of the size of the region in which particles moved
 FLOWN = 100.0  # particles beyond this multiple of the scene's size are ignored by the view
@@ -26,7 +26,7 @@ class Picture:
     is drawn on request.
     """
 
-    def __init__(self, world: "World", stream: Any, explained: str, environment: dict[str, Any], overlays: Overlays):
+    def __init__(self, world: "World", stream: Any, explained: str, environment: dict[str, Any], overlays: "Overlays"):
 
         from .curves import Curves
         from .drawing import Drawing, bounds, upwards, view_up
@@ -81,9 +81,7 @@ class Picture:
     def log(self, number: int, values: dict[str, Any]) -> None:
         """Add the user's quantities for the coming frame: numbers, and arrays of one number per particle, (n,)."""
         self.curves.log(number, self.world.time, {name: value for name, value in values.items() if np.ndim(value) == 0})
-        color = self._overlays.color
-        if color and np.ndim(values.get(color[0], 0.0)):
-            self.drawing.color(values[color[0]])
+        self.drawing.logged |= {name: value for name, value in values.items() if np.ndim(value)}
 
     def _frame_all(self, x: np.ndarray) -> None:
         """Extend the region of all particles so far, for layout()."""
@@ -104,7 +102,7 @@ class Picture:
 
 
 def layout(
-    world: "World", overlays: Overlays, seen: tuple[tuple[np.ndarray, np.ndarray], float] | None = None, own: Iterable[str] = ()
+    world: "World", overlays: "Overlays", seen: tuple[tuple[np.ndarray, np.ndarray], float] | None = None, own: Iterable[str] = ()
 ) -> Any:
     """Return the layout in which the viewer opens a recording.
 

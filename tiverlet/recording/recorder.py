@@ -4,7 +4,6 @@ import contextlib
 import os
 import weakref
 import zlib
-from dataclasses import asdict
 from time import perf_counter
 from typing import Any
 
@@ -17,10 +16,12 @@ from ..step import checkpoint
 from ..step.explain import explain
 from ..world import World
 from ..worlds.worlds import Worlds
+from .hues import Coloring
 from .journal import JOURNAL, brief, flags_to_record
 from .journal_writer import Journal
-from .overlays import Overlays, checked_color, checked_quantities, checked_y_down
+from .overlays import Overlays, checked_y_down
 from .picture import Picture, layout
+from .quantities import QUANTITIES, checked_quantities
 from .scene import environment
 from .sink import BACKLOG, CHECK_INTERVAL, SMALL, Sink, file_error
 
@@ -45,9 +46,11 @@ class Recorder:
     file may be replaced; it stays as it is until the new one has its first frame.
 
     strain: whether links and surfaces show their strain. forces: draw the loads of contacts as lines whose width is the load
-    relative to the other loads of the frame. velocities: draw arrows that show the path of the next 0.05 s. color: (name, least,
-    most), a quantity of log() by which particles are coloured. live: show the recording while it is made: True for a window,
-    "web" for a page in the browser, "notebook" below a cell, or the address of a running viewer.
+    relative to the other loads of the frame. velocities: draw arrows that show the path of the next 0.05 s. color: None, by body;
+    or colours (n, 3), a quantity ("speed", "spin", "load", "mass", "radius", "group", or a name that log() is given) or a
+    function of the world, see Coloring.checked; then links and surfaces have the colours of their particles. live: show the
+    recording while it is made: True for a window, "web" for a page in the browser, "notebook" below a cell, or the address of a
+    running viewer.
     y_down: whether y points down in the picture, as in coordinates of pixels (2D); the physics does not depend on it.
 
     The picture has positions (f32), coloured by body; surfaces of bodies that have them; links, coloured by their strain; walls,
@@ -63,8 +66,7 @@ class Recorder:
 
     def __init__(
         self, path, world: World, every: int = 1, budget: int | None = None, overwrite: bool = False, *, strain: bool = True,
-        forces: bool = False, velocities: bool = False, color: tuple[str, float, float] | None = None, live: bool | str = False,
-        y_down: bool = False,
+        forces: bool = False, velocities: bool = False, color: Any = None, live: bool | str = False, y_down: bool = False,
     ):  # fmt: skip
         import rerun as rr
 
@@ -79,7 +81,8 @@ class Recorder:
         flags = {"strain": strain, "forces": forces, "velocities": velocities}
         given = {name: checks.flag("Recorder", name, value) for name, value in flags.items()}
         given["y_down"] = checked_y_down("Recorder", world, y_down)
-        self._overlays = Overlays(color=checked_color(color), **given | ({"strain": False} if color else {}))
+        coloring = Coloring.checked("Recorder", color, len(world.particles), None)
+        self._overlays = Overlays(color=coloring.following(world), **given)
         self._own: dict[str, Any] = {}  # the user's quantities, for the next frame that is drawn
         if path is None and not live:
             raise ValueError("Recorder: path = None is for live recordings; give a file, or live=True.")
@@ -139,7 +142,7 @@ class Recorder:
         self._picture = Picture(world, self._stream, explained, environment(), self._overlays)
         self._sent, self._flushed = perf_counter(), 0
         self._picture.stamp(0)
-        picture_settings = {"title": title, "explained": explained, "overlays": asdict(self._overlays)}
+        picture_settings = {"title": title, "explained": explained, "overlays": self._overlays.stored()}
         self._journal = Journal(world, self._write, picture_settings)
         self._note_state(self._journal.size)
         self._frame(0)
@@ -180,6 +183,7 @@ class Recorder:
         if self._full:
             return
         self._check()
+        self._check_color(quantities)
         if quantities:
             self._own = checked_quantities(quantities, len(self.world.particles))
         self._calls += 1
@@ -222,6 +226,17 @@ class Recorder:
             )
         if self._sink.stream is None:
             raise RuntimeError("Recorder: this recording is closed; make a new Recorder for another file.")
+
+    def _check_color(self, quantities: dict[str, Any]) -> None:
+        """Raise ValueError if log() is not given the quantity of the colours, or is given one that is computed."""
+        color = self._overlays.color
+        if color.function and color.name in quantities:
+            raise ValueError(f"Recorder.log: {color.name} is computed for the colours of the picture; choose another name.")
+        if color.name and not (color.function or self._calls or np.ndim(quantities.get(color.name, 0.0))):
+            raise ValueError(
+                f"Recorder: color = {color.name!r} is neither one of {', '.join(QUANTITIES)} nor given to log(). Write "
+                f"recorder.log(**{{{color.name!r}: ...}}), with a number for each particle."
+            )
 
     def _fail(self) -> None:
         error = self._sink.error
@@ -275,6 +290,8 @@ class Recorder:
         due = picture.drawing.bytes - self._drawn > self._bytes_between_states or sparse
         if number and due and not world._has_new_force:  # a state does not contain the force under which it was computed
             self._note_state(journal.state())
+        if self._overlays.color.function:
+            self._own[self._overlays.color.name] = self._overlays.color.values(world)
         if self._own:
             numbers = {name: value for name, value in self._own.items() if isinstance(value, float)}
             arrays = {name: value for name, value in self._own.items() if not isinstance(value, float)}

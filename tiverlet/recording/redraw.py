@@ -96,7 +96,7 @@ class Redraw:
             self._picture.set_world(world)
             return
         self._rows.log("__properties", rr.archetypes.RecordingInfo(name=self._scene_data["title"]), static=True)
-        overlays = Overlays.of(self._scene_data["overlays"])
+        self._overlays = overlays = Overlays.of(self._scene_data["overlays"])
         self._picture = Picture(world, self._rows, self._scene_data["explained"], self._scene_data["environment"], overlays)
         self.layouts.append(_rows_of(layout(world, overlays)))
 
@@ -172,9 +172,11 @@ class Redraw:
         return None
 
     def logged(self, entry: Entry) -> None:
-        """Add the user's quantities."""
+        """Add the user's quantities; those of every world are computed."""
         assert self._picture
-        self._picture.log(entry.frame, {**entry.data["numbers"], **entry.arrays})
+        computed = {self._overlays.color.name} if self._overlays.color.function else set()
+        arrays = {name: values for name, values in entry.arrays.items() if name not in computed}
+        self._picture.log(entry.frame, {**entry.data["numbers"], **arrays})
 
     def end(self, entry: Entry) -> str | None:
         """Draw the last entry. Returns what is wrong with it, or None."""

@@ -146,13 +146,14 @@ class Replay:
 
         Numbers given to log() are in .curves. Frames with another number of particles than the first are left out.
         """
-        found: dict[str, list[tuple[int, np.ndarray]]] = {}
-        for e in self._entries:
-            for name, values in e.arrays.items() if e.kind == "logged" else ():
-                rows = found.setdefault(name, [])
-                if not rows or len(rows[0][1]) == len(values):
-                    rows.append((e.frame, values))
-        return {name: (np.array([k for k, _ in rows]), np.array([v for _, v in rows])) for name, rows in found.items()}
+        names = dict.fromkeys(name for e in self._entries if e.kind == "logged" for name in e.arrays)
+        found = {name: self.logged(name) for name in names}
+        kept = {name: [row for row in rows if len(row[1]) == len(rows[0][1])] for name, rows in found.items()}
+        return {name: (np.array([k for k, _ in rows]), np.array([v for _, v in rows])) for name, rows in kept.items()}
+
+    def logged(self, name: str) -> list[tuple[int, np.ndarray]]:
+        """Return the frames and the values of a quantity of particles that was logged, or computed for its colours."""
+        return [(e.frame, e.arrays[name]) for e in self._entries if e.kind == "logged" and name in e.arrays]
 
     @_with_clear_errors
     def world(self, frame: int) -> "World":
@@ -336,13 +337,21 @@ class Replay:
         "velocity" (n, dim) [m/s]; "spin" (n,) or (n, 3) [rad/s] where particles spin; "orientation", (n,) [rad] or quaternions
         (n, 4), where it is tracked. All in f64. Raises RuntimeError if a frame does not come out as recorded.
         """
+        for world in self.worlds():
+            names = ("velocity", *(n for n in ("spin", "orientation") if getattr(world.particles, n) is not None))
+            yield {name: np.asarray(getattr(world, name)) for name in names}
+
+    def worlds(self) -> Iterator["World"]:
+        """Compute everything again, and yield the world at each frame drawn; it is closed afterwards.
+
+        Raises RuntimeError if a frame does not come out as recorded.
+        """
         world = None
         try:
             for world, entry in self._run(1, len(self._entries) - 1):
                 if entry.kind == "frame" and entry.frame in self._frames:
                     self._compare(world, entry)
-                    names = ("velocity", *(n for n in ("spin", "orientation") if getattr(world.particles, n) is not None))
-                    yield {name: np.asarray(getattr(world, name)) for name in names}
+                    yield world
         finally:
             if world:
                 world.close()
@@ -379,7 +388,7 @@ class Replay:
 
     def export(
         self, path: str | os.PathLike, shape: Shape | None = None, *, motion: bool = False, size: int | tuple[int, int] | None =
-        None, camera: tuple[float, float] | None = None, theme: str | None = None,
+        None, camera: tuple[float, float] | None = None, theme: str | None = None, color: Any = None,
     ) -> list[str]:  # fmt: skip
         """Write the recording for other programs, in the format of the ending of `path`. Returns the names of the files.
 
@@ -396,6 +405,8 @@ class Replay:
         coordinates; else faces are those of the picture. Features with the user's functions contribute no faces and links.
         motion: whether .npz, .csv, .xyz, .pvd and .usd also hold velocities [m/s], spins [rad/s] and orientations, and spheres
         turn in .glb. The picture does not have them, so all is computed again, see motion().
+        color: as in Recorder; None for the colours of the recording. A quantity that was not recorded is computed again; where
+        it is a colour in .glb, it is that of the last frame. .csv, .npz, .obj and .xyz have no colours.
         Of films: size, their width and height [pixels], or the width alone; camera, the angles [rad] of the eye to the right of
         the front and above the horizon in 3D; theme, "dark" or "light".
 
@@ -406,7 +417,9 @@ class Replay:
         from . import exports  # imported late, since it imports rerun
 
         motion = checks.flag("replay", "motion", motion)
-        return exports.export(self, os.fspath(path), shape=shape, motion=motion or None, size=size, camera=camera, theme=theme)
+        return exports.export(
+            self, os.fspath(path), shape=shape, motion=motion or None, size=size, camera=camera, theme=theme, color=color
+        )
 
 
 @checks.answer_arguments

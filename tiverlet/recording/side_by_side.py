@@ -14,6 +14,7 @@ from ..features.unknown_names import answer_names
 from ..world import World
 from ..worlds.worlds import Worlds
 from . import scene
+from .hues import Coloring
 from .overlays import Overlays
 from .sink import BACKLOG, CHECK_INTERVAL, SMALL, Sink, file_error
 
@@ -33,7 +34,8 @@ class WorldsRecorder:
 
     path: the file; its folder must exist. worlds: the worlds to record. chosen: the numbers of up to 64 of them; the first nine
     by default. every: log only one of so many frames. overwrite: whether an existing file may be replaced. strain, forces,
-    velocities: what is drawn, as in Recorder. If worlds are reset, the time of the recording continues.
+    velocities, color: what is drawn, as in Recorder; colours (n, 3) are those of each world. If worlds are reset, the time of the
+    recording continues.
 
     The file is a picture only: it holds no states to continue from, and tv.replay refuses it. To get states, record one world by
     itself, bit for bit the same: make tv.Recorder(path, worlds[k]), and step that world. Open the file with `rerun four.rrd`.
@@ -44,7 +46,7 @@ class WorldsRecorder:
 
     def __init__(
         self, path, worlds: Worlds, chosen: Iterable[int] | None = None, every: int = 1, overwrite: bool = False, *,
-        strain: bool = True, forces: bool = False, velocities: bool = False,
+        strain: bool = True, forces: bool = False, velocities: bool = False, color: Any = None,
     ):  # fmt: skip
         if not isinstance(worlds, Worlds):
             hint = "; one World is for tv.Recorder(path, world)" if isinstance(worlds, World) else ""
@@ -56,7 +58,9 @@ class WorldsRecorder:
             raise ValueError(f"WorldsRecorder: chosen = {self.chosen}, but it must be 1 to {MOST} numbers, each once.")
         self.every = checks.integer("WorldsRecorder", "every", every, least=1)
         flags = {"strain": strain, "forces": forces, "velocities": velocities}
-        overlays = Overlays(*[checks.flag("WorldsRecorder", name, value) for name, value in flags.items()], color=None)
+        given = {name: checks.flag("WorldsRecorder", name, value) for name, value in flags.items()}
+        (count,) = worlds.each(lambda world: len(world.particles), self.chosen[:1])
+        overlays = Overlays(color=Coloring.checked("WorldsRecorder", color, count), **given)
         folder = os.path.dirname(os.path.abspath(self.path))
         if not os.path.isdir(folder):
             raise ValueError(f"WorldsRecorder: the folder {folder} does not exist. Make it first: os.makedirs({folder!r}).")

@@ -8,12 +8,17 @@ LEVELS = 12  # colours on each side: four to a decade
 NEUTRAL, LONGER, SHORTER = (np.array(c, dtype=np.float64) for c in ([170, 172, 182], [255, 92, 48], [64, 140, 255]))
 
 
+def packed(rgb: np.ndarray) -> np.ndarray:
+    """Return red, green and blue in 0 ... 255, (n, 3), as RGBA in u32, (n,)."""
+    rgb = np.rint(rgb).astype(np.uint32)
+    return rgb[:, 0] << 24 | rgb[:, 1] << 16 | rgb[:, 2] << 8 | np.uint32(255)
+
+
 def _scale() -> np.ndarray:
     """Return RGBA as u32 from the most compressed to the most stretched link: blue, grey at rest, red."""
     side = np.linspace(0.0, 1.0, LEVELS + 1)[:, None]
     shorter, longer = (NEUTRAL + side * (end - NEUTRAL) for end in (SHORTER, LONGER))
-    rgb = np.concatenate([shorter[:0:-1], longer]).round().astype(np.uint32)
-    return rgb[:, 0] << 24 | rgb[:, 1] << 16 | rgb[:, 2] << 8 | np.uint32(255)
+    return packed(np.concatenate([shorter[:0:-1], longer]))
 
 
 SCALE = _scale()

@@ -1,4 +1,4 @@
-"""Bodies and their surfaces, for pictures."""
+"""Surfaces of bodies, for pictures."""
 
 from collections import defaultdict
 from typing import TYPE_CHECKING
@@ -9,7 +9,7 @@ from ..constraints import Area, Dihedral, ShapeMatch, Volume
 from ..contact import Polygons
 from ..features.feature import Batch
 from .lines import cells
-from .strain import LEVELS, LONGER, SHORTER
+from .strain import LEVELS, LONGER, SHORTER, packed
 
 if TYPE_CHECKING:
     from ..world import World
@@ -18,30 +18,6 @@ if TYPE_CHECKING:
 LIGHT, DARKEST = np.array([0.45, 0.35, 0.82]), 0.3  # direction of the light, added to up; brightness of faces edge-on to it
 SHADES = 15
 MOST = 200_000  # most links that are searched for triangles
-
-
-def bodies(world: "World | Parts") -> np.ndarray:
-    """Return the body of each particle, (n,): the lowest number among the particles that constraints and loops join to it."""
-    ends = [np.zeros((0, 2), dtype=np.int64)]
-    for f in world.features:
-        if isinstance(f, Batch) and f.count:
-            members, owner = f.indices.ravel(), f.owner
-            same = owner[1:] == owner[:-1]
-            ends.append(np.stack([members[:-1][same], members[1:][same]], axis=1))
-        elif isinstance(f, Polygons):
-            ends += [np.stack([loop, np.roll(loop, 1)], axis=1) for loop in f.loops]
-    a, b = np.concatenate(ends).T
-    body = np.arange(len(world.particles))
-    while True:  # take the lowest number at each link, then that particle's number: a few rounds suffice even for a chain
-        low = np.minimum(body[a], body[b])
-        new = body.copy()
-        np.minimum.at(new, body[a], low)
-        np.minimum.at(new, body[b], low)
-        while (new != new[new]).any():
-            new = new[new]
-        if (new == body).all():
-            return body
-        body = new
 
 
 def triangles(world: "World | Parts") -> np.ndarray:
@@ -145,8 +121,7 @@ class Surface:
             share = np.maximum(0, 3 * (most >> 1) / LEVELS - 2)[:, None]  # 0 up to 1 % of strain, 1 at 10 %
             hues = hues.copy()
             hues[self._end] += share * (np.where((most & 1)[:, None], LONGER, SHORTER) - hues[self._end])
-        rgb = np.rint(hues * shade[:, None]).astype(np.uint32)
-        return rgb[:, 0] << 24 | rgb[:, 1] << 16 | rgb[:, 2] << 8 | np.uint32(255)
+        return packed(hues * shade[:, None])
 
 
 def cliques(pairs: np.ndarray) -> np.ndarray:

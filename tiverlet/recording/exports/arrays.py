@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..overlays import is_name
+from ..quantities import is_name
 from ..scene import plain
 from .stretch import only
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from ...shapes import Shape
 from ..drawing import view_up
+from ..overlays import Overlays
 from .extras import needed
 from .sketch import Look, Sketch, View, extent
 from .stretch import Stretch, stretches
@@ -24,7 +25,14 @@ RATE = 25  # pictures a second: 40 ms each, which GIF can store exactly, in hund
 
 
 def write(
-    recording: "Replay", path: str, *, shape: Shape | None = None, size: Any = None, camera: Any = None, theme: Any = "dark"
+    recording: "Replay",
+    path: str,
+    *,
+    shape: Shape | None = None,
+    size: Any = None,
+    camera: Any = None,
+    theme: Any = "dark",
+    color: Any = None,
 ) -> list[str]:
     """Write a film in the scene's own time, RATE pictures a second; each picture shows the nearest frame."""
     look = Look.checked(size, camera, theme, recording.scenes[0].entry.arrays["position"].shape[1])
@@ -33,7 +41,7 @@ def write(
     video = _ffmpeg(path) if kind == ".mp4" else ""
     if not len(recording.frames):
         raise ValueError(f"replay: {recording.path} has no frame, so there is nothing for {path}.")
-    pictures = _pictures(recording, shape, image, draw, look)
+    pictures = _pictures(recording, stretches(recording, color=color), shape, image, draw, look)
     first = next(pictures)
     if not video:
         first.save(path, save_all=True, append_images=pictures, duration=1000 // RATE, loop=0)
@@ -58,7 +66,7 @@ def _ffmpeg(path: str) -> str:
     return shutil.which("ffmpeg") or needed("imageio_ffmpeg", path).get_ffmpeg_exe()
 
 
-def _pictures(recording: "Replay", shape: Shape | None, image: Any, draw: Any, look: Look) -> Iterator[Any]:
+def _pictures(recording: "Replay", found: list[Stretch], shape: Shape | None, image: Any, draw: Any, look: Look) -> Iterator[Any]:
     """Yield one picture after the other, all from the same point of view."""
     times = recording.times
     moments = np.arange(times[0], times[-1] + 0.5 / RATE, 1 / RATE)
@@ -66,12 +74,11 @@ def _pictures(recording: "Replay", shape: Shape | None, image: Any, draw: Any, l
     before = after - 1
     nearest = before if len(times) == 1 else np.where(moments - times[before] <= times[after] - moments, before, after)
     wanted = recording.frames[nearest].tolist()
-    found = stretches(recording)
     ends = [extent(s.parts, [x for _, _, x in s]) for s in found]
     low, high = (pick([e[k] for e in ends], axis=0) for k, pick in enumerate((np.min, np.max)))
     if not np.isfinite([low, high]).all():
         raise ValueError(f"replay: {recording.path} has no particles, or positions that are not finite, so there is no picture.")
-    view = View(low, high, view_up(found[0].parts, found[0].entry.data["overlays"].get("y_down", False)), look)
+    view = View(low, high, view_up(found[0].parts, Overlays.of(found[0].entry.data["overlays"]).y_down), look)
     for stretch in found:
         here = set(stretch.frames.tolist())
         yield from _stretch(stretch, shape, [k for k in wanted if k in here], image, draw, view, (low, high))

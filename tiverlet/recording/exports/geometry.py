@@ -7,7 +7,7 @@ import numpy as np
 
 from ...shapes import Shape
 from ..drawing import links, upwards
-from ..hues import colors
+from ..hues import BY_BODY, Coloring
 from ..scene import Parts
 from ..surfaces import covered, triangles
 
@@ -45,7 +45,7 @@ class Geometry:
         return np.concatenate([np.zeros(0, dtype=np.int64), *self.faces])
 
 
-def geometry(parts: Parts, shape: Shape | None = None) -> Geometry:
+def geometry(parts: Parts, shape: Shape | None = None, coloring: Coloring = BY_BODY) -> Geometry:
     """Return the geometry of a scene. shape: provides faces and texture coordinates for the same particles.
 
     Raises ValueError for a shape with another number of points.
@@ -66,7 +66,7 @@ def geometry(parts: Parts, shape: Shape | None = None) -> Geometry:
     within = covered(parts, found)
     bare = np.flatnonzero((particles.radius > 0) & ~within)
     none = np.zeros(0, dtype=np.int64)
-    return without_broken(Geometry(faces, uv, none.reshape(0, 2), none, bare, colors(parts), up), parts, {})
+    return without_broken(Geometry(faces, uv, none.reshape(0, 2), none, bare, coloring.colors(parts), up), parts, {})
 
 
 def without_broken(of: Geometry, parts: Parts, broken: Mapping[int, np.ndarray]) -> Geometry:

@@ -6,6 +6,7 @@ frames. Positions are stored as recorded; a node above them rotates the scene so
 
 import os
 import re
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
@@ -29,15 +30,16 @@ FLOAT, UINT, BYTE = 5126, 5125, 5121  # for types of numbers
 VERTICES, INDICES = 34962, 34963  # for uses of buffers
 
 
-def write(recording: "Replay", path: str, *, shape: Shape | None = None, motion: bool = False) -> list[str]:
+def write(recording: "Replay", path: str, *, shape: Shape | None = None, motion: bool = False, color: Any = None) -> list[str]:
     """Write surfaces with normals, colours and texture coordinates, other links as lines, particles, and walls that may move.
 
-    Particles that no surface hides are spheres of their radii, or points. motion: spheres turn as their orientations do.
+    Particles that no surface hides are spheres of their radii, or points. motion: spheres turn as their orientations do. A vertex
+    has one colour in a file: that of a quantity is of the last frame.
     """
     lib: Any = needed("pygltflib", path)
-    stretch = only(recording, path, "mesh", ".csv, .obj, .pvd, .usd or .xyz", motion)
+    stretch = only(recording, path, "mesh", ".csv, .obj, .pvd, .usd or .xyz", motion, color)
     geometries = [*stretch.geometries(shape)]
-    geometry = geometries[0]
+    geometry = replace(geometries[0], hues=geometries[-1].hues)
     both = [(stretch.flat(x), in_space(moved)) for (_, _, x), moved in zip(stretch, stretch.motion, strict=False)]
     x = np.array([x for x, _ in both], dtype=np.float32)
     if not (x.size and np.isfinite(x).all()):

@@ -115,14 +115,7 @@ class Sketch:
     def __init__(
         self, image: Any, draw: Any, parts: Parts, geometry: Geometry, view: View, extent: tuple[np.ndarray, np.ndarray]
     ):
-        self._image, self._draw, self._parts, self._geometry, self._view, self._extent = (
-            image,
-            draw,
-            parts,
-            geometry,
-            view,
-            extent,
-        )
+        self._image, self._draw, self._parts, self._view, self._extent = image, draw, parts, view, extent
         self._triangles = geometry.around[geometry.corners]
         self._flat = parts.particles.dim == 2
         none = np.zeros((0, 2), dtype=np.int64)
@@ -130,8 +123,8 @@ class Sketch:
         self._surface = Surface(self._triangles, geometry.hues, none, geometry.up) if lit else None
 
     def frame(self, x: np.ndarray, geometry: Geometry) -> Any:
-        """Return the picture of a frame. x: positions [m]. geometry: with the links of the frame, see Stretch.geometries."""
-        view = self._view
+        """Return the picture of a frame. x: positions [m]. geometry: links and colours of the frame, see Stretch.geometries."""
+        view, self._hues = self._view, geometry.hues
         canvas = self._image.new("RGB", tuple(FINE * s for s in view.size), THEMES[view.look.theme][0])
         draw = self._draw.Draw(canvas)
         x = x.astype(np.float64)
@@ -156,7 +149,10 @@ class Sketch:
     def _faces(self, x: np.ndarray) -> list[tuple]:
         if not len(self._triangles):
             return []
-        hues = _bytes(self._surface.colors(x, np.zeros(0))) if self._surface else self._geometry.hues
+        hues = self._hues
+        if self._surface:
+            self._surface.paint(hues)
+            hues = _bytes(self._surface.colors(x, np.zeros(0)))
         return self._mesh(x, self._triangles, np.mean, hues)
 
     def _rims(self, x: np.ndarray) -> list[tuple]:
@@ -167,7 +163,7 @@ class Sketch:
         along = (b - a) / np.maximum(np.linalg.norm(b - a, axis=1), 1e-30)[:, None]
         out = (self._view.scale * radius)[:, None] * np.stack([along[:, 1], -along[:, 0]], axis=1)
         bands = np.concatenate([a + out, b + out, b - out, a - out], axis=1).tolist()
-        hues = map(tuple, self._geometry.hues[edges[:, 0]].tolist())
+        hues = map(tuple, self._hues[edges].mean(axis=1).astype(int).tolist())
         return [(0.0, "face", band, hue, 0) for band, hue in zip(bands, hues, strict=True)] + self._discs(x, edges[:, 0])
 
     def _links(self, x: np.ndarray, links: np.ndarray) -> list[tuple]:
@@ -176,13 +172,15 @@ class Sketch:
         across = crosses_box(box_of(self._parts), x[links[:, 0]] - x[links[:, 1]]) if len(links) else np.zeros(0, dtype=bool)
         for i, j in links[~across].tolist():
             places = [*at[i].tolist(), *at[j].tolist()]
-            out.append(((near[i] + near[j]) / 2, "line", places, tuple(map(int, self._geometry.hues[i])), width))
+            out.append(
+                ((near[i] + near[j]) / 2, "line", places, tuple(self._hues[[i, j]].mean(axis=0).astype(int).tolist()), width)
+            )
         return out
 
     def _discs(self, x: np.ndarray, some: np.ndarray) -> list[tuple]:
         at, near = self._view.place(x)
         radii = np.maximum(self._view.scale * self._parts.particles.radius, self._view.line * DOT / 2)[:, None]
-        boxes, hues = np.concatenate([at - radii, at + radii], axis=1), self._geometry.hues.astype(int)
+        boxes, hues = np.concatenate([at - radii, at + radii], axis=1), self._hues.astype(int)
         return [(near[i], "disc", boxes[i].tolist(), tuple(hues[i].tolist()), 0) for i in some.tolist()]
 
     def _walls(self) -> list[tuple]:

@@ -3,17 +3,21 @@
 import functools
 import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...shapes import Shape
+from ..hues import BY_BODY, Coloring
 from ..journal import Entry
+from ..overlays import Overlays
+from ..quantities import QUANTITIES
 from ..scene import Parts, set_knobs
 from .geometry import Geometry, geometry, without_broken
 
 if TYPE_CHECKING:
+    from ...world import World
     from ..replay import Replay
 
 
@@ -24,6 +28,8 @@ class Stretch:
     entry: the entry of the scene. frames: their numbers. times [s]. knob_changes: the knobs that the user set: before which
     frame, the number of the feature, and the values of its knobs. broken: constraints that broke: before which frame, the number
     of the feature, and those of its constraints. motion: yields what Replay.motion() does for each frame; nothing unless asked.
+    coloring: how particles are coloured. known: yields for each frame what tells their quantity: the world or None, and what was
+    logged.
     """
 
     recording: "Replay"
@@ -33,6 +39,8 @@ class Stretch:
     knob_changes: list[tuple[int, int, dict[str, Any]]]
     broken: list[tuple[int, int, np.ndarray]]
     motion: Iterator[dict[str, np.ndarray]]
+    coloring: Coloring
+    known: "Iterator[tuple[World | None, dict[str, np.ndarray]]]"
 
     def __iter__(self) -> Iterator[tuple[int, float, np.ndarray]]:
         """Yield number, time [s] and positions [m] of each frame."""
@@ -49,11 +57,11 @@ class Stretch:
         return self.recording.parts(self.entry)
 
     def geometry(self, shape: Shape | None) -> Geometry:
-        """Return faces, links, also those that break, and loose particles."""
-        return geometry(self.parts, shape)
+        """Return faces, links, also those that break, and loose particles; in colours by body where these change."""
+        return geometry(self.parts, shape, BY_BODY if self.coloring.name else self.coloring)
 
     def geometries(self, shape: Shape | None) -> Iterator[Geometry]:
-        """Yield the geometry of each frame, without broken links; the same object until more links break."""
+        """Yield the geometry of each frame, without broken links; the same object until more links break or colours change."""
         now, coming = self.geometry(shape), list(self.broken)
         gone: dict[int, np.ndarray] = {}
         for frame in self.frames.tolist():
@@ -62,6 +70,9 @@ class Stretch:
                     _, k, rows = coming.pop(0)
                     gone[k] = np.concatenate([gone.get(k, rows[:0]), rows])
                 now = without_broken(now, self.parts, gone)
+            if self.coloring.name:
+                world, logged = next(self.known)
+                now = replace(now, hues=self.coloring.colors(world or self.parts, logged))
             yield now
 
     def knobs_at(self) -> Callable[[int], None]:
@@ -97,24 +108,48 @@ def in_space(moved: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return out
 
 
-def stretches(recording: "Replay", motion: bool = False) -> list[Stretch]:
-    """Return the stretches of a recording, in order, each to be read once if motion is asked for."""
-    moved = recording.motion() if motion else itertools.repeat({})
+def _known(recording: "Replay", coloring: Coloring) -> "Iterator[tuple[World | None, dict[str, np.ndarray]]]":
+    """Yield for each frame what tells the quantity of its particles: what was logged, else a world that is computed again."""
+    logged = recording.logged(coloring.name) if coloring.function is QUANTITIES.get(coloring.name) else []
+    if coloring.function and not logged:
+        yield from ((world, {}) for world in recording.worlds())
+    values = np.zeros(0)
+    for frame in recording.frames.tolist():
+        while logged and logged[0][0] <= frame:
+            values = logged.pop(0)[1]
+        yield None, {coloring.name: values}
+
+
+def stretches(recording: "Replay", motion: bool = False, color: Any = None) -> list[Stretch]:
+    """Return the stretches of a recording, in order, each to be read once if motion or a quantity's colours are asked for.
+
+    color: see Replay.export().
+    """
+    moved, scenes = recording.motion() if motion else itertools.repeat({}), recording.scenes
+    first = scenes[0].entry
+    coloring = Overlays.of(first.data["overlays"]).color
+    if color is not None:
+        coloring = Coloring.checked("replay", color, len(first.arrays["position"]), recording.quantities)
+    known = _known(recording, coloring)
     times = dict(zip(recording.frames.tolist(), recording.times.tolist(), strict=True))
     out = []
-    for scene in recording.scenes:
+    for scene in scenes:
         if scene.frames:
             moments = np.array([times[k] for k in scene.frames])
-            out.append(Stretch(recording, scene.entry, np.array(scene.frames), moments, scene.knobs, scene.broken, moved))
+            out.append(
+                Stretch(
+                    recording, scene.entry, np.array(scene.frames), moments, scene.knobs, scene.broken, moved, coloring, known
+                )
+            )
     return out
 
 
-def only(recording: "Replay", path: str, what: str, others: str, motion: bool = False) -> Stretch:
+def only(recording: "Replay", path: str, what: str, others: str, motion: bool = False, color: Any = None) -> Stretch:
     """Return the only stretch of a recording; raise ValueError if there are more or none.
 
     what, others: for the message, what needs a single stretch, and which formats can hold several.
     """
-    found = stretches(recording, motion)
+    found = stretches(recording, motion, color)
     if not found:
         raise ValueError(f"replay: {recording.path} has no frame, so there is nothing for {path}.")
     if len(found) > 1:

@@ -21,13 +21,13 @@ RATE = 60  # time codes a second: frames of 1/60 s, as World.run() makes them, h
 THIN = 0.002  # width of lines and of particles without a radius, relative to the size of the scene
 
 
-def write(recording: "Replay", path: str, *, shape: Shape | None = None, motion: bool = False) -> list[str]:
+def write(recording: "Replay", path: str, *, shape: Shape | None = None, motion: bool = False, color: Any = None) -> list[str]:
     """Write surfaces, links, particles and walls, y up; with motion, particles have velocities, spins and orientations.
 
     Lengths are in metres, times in seconds times RATE, spins in rad/s, orientations quaternions (x, y, z, w).
     """
     usd, geom = needed("pxr.Usd", path, "usd"), needed("pxr.UsdGeom", path, "usd")
-    found = stretches(recording, motion)
+    found = stretches(recording, motion, color)
     if not found:
         raise ValueError(f"replay: {recording.path} has no frame, so there is nothing for {path}.")
     stage = usd.Stage.CreateInMemory()
@@ -68,22 +68,23 @@ class _Part:
 
     def write(self) -> None:
         """Write all frames."""
-        of, hues = self.geometry, linear(self.geometry.hues)
+        of = self.geometry
         rows = [(RATE * time, self.stretch.flat(x), in_space(moved)) for (_, time, x), moved in self._frames()]
         x = np.array([x for _, x, _ in rows])
         size = self._thin(x)
         if len(of.faces):
             at = np.unique(of.around)
-            mesh = self._mesh("surfaces", [len(face) for face in of.faces], np.searchsorted(at, of.around), hues[at])
+            mesh = self._mesh("surfaces", [len(face) for face in of.faces], np.searchsorted(at, of.around))
+            self._paint(mesh, at, [code for code, _, _ in rows])
             if any(len(uv) for uv in of.uv):
                 uv = [uv if len(uv) else np.zeros((len(face), 2)) for face, uv in zip(of.faces, of.uv, strict=True)]
                 self._primvar(mesh, "st", "TexCoord2fArray", np.concatenate(uv), "faceVarying")
             self._move(mesh, [(code, x[at]) for code, x, _ in rows])
         if len(of.links):
-            self._links(rows, hues, size)
+            self._links(rows, size)
         single = np.union1d(of.bare, of.loose)
         if len(single):
-            self._particles(rows, single, hues, size)
+            self._particles(rows, single, size)
         for wall in drawn_walls(self.stretch, *extent(self.stretch.parts, x[:, :, : self.stretch.parts.particles.dim])):
             self._wall(wall, [code for code, _, _ in rows], size)
 
@@ -94,7 +95,7 @@ class _Part:
         """Return the width of lines [m]."""
         return THIN * (float(np.ptp(x, axis=(0, 1)).max()) or 1.0) if x.size else THIN
 
-    def _links(self, rows: list[tuple], hues: np.ndarray, size: float) -> None:
+    def _links(self, rows: list[tuple], size: float) -> None:
         """Write links as lines of two points; those that broke are left out."""
         curves = self._curves("links", size)
         before = None
@@ -102,17 +103,17 @@ class _Part:
             if geometry is not before:
                 before, ends = geometry, geometry.links.ravel()
                 curves.CreateCurveVertexCountsAttr().Set(self._array("IntArray", [2] * len(geometry.links)), code)
-                self._primvar(curves, "displayColor", "Color3fArray", hues[ends], "vertex", code)
+                self._primvar(curves, "displayColor", "Color3fArray", linear(geometry.hues)[ends], "vertex", code)
             curves.CreatePointsAttr().Set(self._array("Vec3fArray", x[ends]), code)
 
-    def _particles(self, rows: list[tuple], single: np.ndarray, hues: np.ndarray, size: float) -> None:
+    def _particles(self, rows: list[tuple], single: np.ndarray, size: float) -> None:
         """Write particles that no surface hides as points, with their diameters as widths."""
         points = self.geom.Points.Define(self.stage, f"{self.name}/particles")
         radius = self.stretch.column("radius")[single]
         points.CreateWidthsAttr().Set(self._array("FloatArray", np.where(radius > 0, 2 * radius, size)))
         points.SetWidthsInterpolation("vertex")
         points.CreateIdsAttr().Set(self._array("Int64Array", single))
-        self._primvar(points, "displayColor", "Color3fArray", hues[single], "vertex")
+        self._paint(points, single, [code for code, _, _ in rows])
         self._move(points, [(code, x[single]) for code, x, _ in rows])
         for code, _, moved in rows:
             for name, values in moved.items():
@@ -126,22 +127,28 @@ class _Part:
         """Write a wall as triangles or lines."""
         name, hue = wall.name.replace(" ", "_"), linear(wall.hue)
         if wall.solid:
-            thing = self._mesh(name, [3] * len(wall.parts), wall.parts.ravel(), np.repeat(hue, wall.corners.shape[1], axis=0))
+            thing = self._mesh(name, [3] * len(wall.parts), wall.parts.ravel())
             places = wall.corners
         else:
             thing, places = self._curves(name, size), wall.corners[:, wall.parts.ravel()]
             thing.CreateCurveVertexCountsAttr().Set(self._array("IntArray", [2] * len(wall.parts)))
-            self._primvar(thing, "displayColor", "Color3fArray", hue, "constant")
+        self._primvar(thing, "displayColor", "Color3fArray", hue, "constant")
         self._move(thing, list(zip(codes, places, strict=True)))
 
-    def _mesh(self, name: str, counts: list[int], around: np.ndarray, hues: np.ndarray) -> Any:
+    def _paint(self, thing: Any, at: np.ndarray, codes: list[float]) -> None:
+        """Set the colours of the particles `at` at all time codes; once if they do not change."""
+        for k, (code, of) in enumerate(zip(codes, self.geometries, strict=True)):
+            if not k or of.hues is not self.geometries[k - 1].hues:
+                same = of.hues is self.geometries[-1].hues and not k
+                self._primvar(thing, "displayColor", "Color3fArray", linear(of.hues)[at], "vertex", None if same else code)
+
+    def _mesh(self, name: str, counts: list[int], around: np.ndarray) -> Any:
         """Return a mesh without points. around: vertices of all faces, one face after the other."""
         mesh = self.geom.Mesh.Define(self.stage, f"{self.name}/{name}")
         mesh.CreateSubdivisionSchemeAttr().Set(self.geom.Tokens.none)
         mesh.CreateDoubleSidedAttr().Set(True)
         mesh.CreateFaceVertexCountsAttr().Set(self._array("IntArray", counts))
         mesh.CreateFaceVertexIndicesAttr().Set(self._array("IntArray", around))
-        self._primvar(mesh, "displayColor", "Color3fArray", hues, "vertex")
         return mesh
 
     def _curves(self, name: str, size: float) -> Any:

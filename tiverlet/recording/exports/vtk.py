@@ -6,7 +6,7 @@ They are written without a library. The parts that do not change are formatted o
 import base64
 import os
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -24,10 +24,10 @@ KINDS = {"f4": "Float32", "f8": "Float64", "i4": "Int32", "u1": "UInt8"}
 ORDER = "LittleEndian" if sys.byteorder == "little" else "BigEndian"
 
 
-def write(recording: "Replay", path: str, *, shape: Shape | None = None, motion: bool = False) -> list[str]:
-    """Write points with radius [m], mass [kg] and motion, and cells: faces, other links, loose particles."""
+def write(recording: "Replay", path: str, *, shape: Shape | None = None, motion: bool = False, color: Any = None) -> list[str]:
+    """Write points with radius [m], mass [kg], color and motion, and cells: faces, other links, loose particles."""
     base, out, sets = os.path.splitext(path)[0], [path], []
-    for stretch in stretches(recording, motion):
+    for stretch in stretches(recording, motion, color):
         laid_out = None
         for (frame, time, x), geometry, moved in zip(stretch, stretch.geometries(shape), stretch.motion, strict=False):
             if geometry is not laid_out:
@@ -47,7 +47,7 @@ def write(recording: "Replay", path: str, *, shape: Shape | None = None, motion:
 
 
 def _laid_out(stretch: Stretch, geometry: Geometry) -> tuple[bytes, bytes]:
-    """Return the text that is the same in all files until links break, before motion and positions, and after them."""
+    """Return the text that stays until links break or colours change, before motion and positions, and after them."""
     rows = [*geometry.faces, *geometry.links, *geometry.loose[:, None]]
     kinds = [{3: TRIANGLE, 4: QUAD}.get(len(face), POLYGON) for face in geometry.faces]
     kinds += [LINE] * len(geometry.links) + [VERTEX] * len(geometry.loose)
@@ -57,7 +57,7 @@ def _laid_out(stretch: Stretch, geometry: Geometry) -> tuple[bytes, bytes]:
         f'<VTKFile type="UnstructuredGrid" version="1.0" byte_order="{ORDER}" header_type="UInt64">\n<UnstructuredGrid>\n'
         f'<Piece NumberOfPoints="{len(stretch.column("mass"))}" NumberOfCells="{len(rows)}">\n<PointData>\n'
     ).encode()
-    before += b"".join(_array(name, stretch.column(name)) for name in ("radius", "mass"))
+    before += b"".join(_array(name, stretch.column(name)) for name in ("radius", "mass")) + _array("color", geometry.hues)
     cells = [_array("connectivity", around), _array("offsets", ends), _array("types", np.array(kinds, dtype=np.uint8))]
     after = [b"</Points>\n<Cells>\n", *cells, b"</Cells>\n</Piece>\n</UnstructuredGrid>\n</VTKFile>\n"]
     return before, b"".join(after)
