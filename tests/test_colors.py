@@ -256,8 +256,7 @@ def test_given_colours_end_where_particles_come_or_go_and_quantities_follow(tmp_
     assert unpacked(last).tolist() == [*BY_SPEED[swap:].tolist(), HIGH]
 
 
-def test_a_recording_hides_no_other_quantity_than_it_computes(tmp_path):
-    # What a recording says of a quantity of every world counts for exports only: its picture is checked against the world.
+def test_a_recording_holds_the_quantity_that_it_shows(tmp_path):
     recording = recorded(tmp_path / "a.rrd", "speed")
     frames, speed = recording.quantities["speed"]
     assert frames.tolist() == [0, 1, 2] and speed == pytest.approx(np.tile(SPEED, (3, 1)))

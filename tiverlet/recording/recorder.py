@@ -48,10 +48,10 @@ class Recorder:
     strain: whether links and surfaces show their strain. forces: draw the loads of contacts as lines whose width is the load
     relative to the other loads of the frame. velocities: draw arrows that show the path of the next 0.05 s. color: None, by body;
     or colours (n, 3), a quantity ("speed", "spin", "load", "mass", "radius", "group", or a name that log() is given) or a
-    function of the world, see Coloring.checked; then links and surfaces have the colours of their particles. live: show the
-    recording while it is made: True for a window, "web" for a page in the browser, "notebook" below a cell, or the address of a
-    running viewer.
-    y_down: whether y points down in the picture, as in coordinates of pixels (2D); the physics does not depend on it.
+    function of the world, alone or with the ends of its scale, ("speed", 0, 2); then links and surfaces show no strain, but the
+    colours of their particles. Colours are integers in 0 ... 255 or floats in 0 ... 1. live: show the recording while it is made:
+    True for a window, "web" for a page in the browser, "notebook" below a cell, or the address of a running viewer. y_down:
+    whether y points down in the picture, as in coordinates of pixels (2D); the physics does not depend on it.
 
     The picture has positions (f32), coloured by body; surfaces of bodies that have them; links, coloured by their strain; walls,
     contacts in scenes of up to 1500 particles, breaks, and curves. The file also holds the scene with all arguments, exact

@@ -21,6 +21,7 @@ from ..step.clock import Clock
 from . import journal, rrd, scene
 from .curves import CURVES, SPIN, own_name
 from .journal import Entry
+from .overlays import Overlays
 from .redraw import Redraw, compare
 from .scene import plain
 
@@ -139,6 +140,12 @@ class Replay:
         if zlib.crc32(x.tobytes()) != entry.data["crc"]:
             raise ValueError(f"replay: the picture of frame {frame} in {self.path} is not what was recorded. See .verify().")
         return x
+
+    @property
+    @_with_clear_errors
+    def overlays(self) -> Overlays:
+        """What the Recorder was asked to draw."""
+        return Overlays.of(self.scene["overlays"])
 
     @property
     def quantities(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:

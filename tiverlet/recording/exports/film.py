@@ -13,7 +13,6 @@ import numpy as np
 
 from ...shapes import Shape
 from ..drawing import view_up
-from ..overlays import Overlays
 from .extras import needed
 from .sketch import Look, Sketch, View, extent
 from .stretch import Stretch, stretches
@@ -78,7 +77,7 @@ def _pictures(recording: "Replay", found: list[Stretch], shape: Shape | None, im
     low, high = (pick([e[k] for e in ends], axis=0) for k, pick in enumerate((np.min, np.max)))
     if not np.isfinite([low, high]).all():
         raise ValueError(f"replay: {recording.path} has no particles, or positions that are not finite, so there is no picture.")
-    view = View(low, high, view_up(found[0].parts, Overlays.of(found[0].entry.data["overlays"]).y_down), look)
+    view = View(low, high, view_up(found[0].parts, recording.overlays.y_down), look)
     for stretch in found:
         here = set(stretch.frames.tolist())
         yield from _stretch(stretch, shape, [k for k in wanted if k in here], image, draw, view, (low, high))

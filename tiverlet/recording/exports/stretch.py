@@ -11,7 +11,6 @@ import numpy as np
 from ...shapes import Shape
 from ..hues import BY_BODY, Coloring
 from ..journal import Entry
-from ..overlays import Overlays
 from ..quantities import QUANTITIES
 from ..scene import Parts, set_knobs
 from .geometry import Geometry, geometry, without_broken
@@ -125,15 +124,14 @@ def stretches(recording: "Replay", motion: bool = False, color: Any = None) -> l
 
     color: see Replay.export().
     """
-    moved, scenes = recording.motion() if motion else itertools.repeat({}), recording.scenes
-    first = scenes[0].entry
-    coloring = Overlays.of(first.data["overlays"]).color
+    moved, coloring = recording.motion() if motion else itertools.repeat({}), recording.overlays.color
     if color is not None:
-        coloring = Coloring.checked("replay", color, len(first.arrays["position"]), recording.quantities)
+        count = len(recording.scenes[0].entry.arrays["position"])
+        coloring = Coloring.checked("replay", color, count, recording.quantities)
     known = _known(recording, coloring)
     times = dict(zip(recording.frames.tolist(), recording.times.tolist(), strict=True))
     out = []
-    for scene in scenes:
+    for scene in recording.scenes:
         if scene.frames:
             moments = np.array([times[k] for k in scene.frames])
             out.append(
