@@ -1,4 +1,4 @@
-"""The article's scene: discs of golden-ratio sizes, places and hues fall onto a rope bridge and a chain in a box.
+"""The article's scene: discs of golden-ratio sizes and places fall onto a rope bridge and a chain in a box.
 
     python demos/article.py [article.rrd]
 
