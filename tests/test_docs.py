@@ -90,3 +90,10 @@ def test_every_public_name_says_what_it_is():
     kinds = [kind for kind in vars(tv).values() if inspect.isclass(kind)]
     missing += [f"{kind.__name__}.{knob}" for kind in kinds for knob in knobs_of(kind) if not getattr(kind, knob).__doc__]
     assert not missing
+
+
+def test_pages_are_short():
+    # A page says the law, the options, the limits and how to write one; what is longer is beside the code or generated.
+    long = {str(page): len((ROOT / page).read_bytes()) for page in PAGES if "report" not in page.parts}
+    changes = long.pop("tiverlet/CHANGELOG.md")
+    assert changes <= 12288 and not {page: size for page, size in long.items() if size > 8192}

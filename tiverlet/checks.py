@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -18,6 +18,11 @@ from .features.unknown_names import owners_of, suggest
 ANY = 2**31 - 1  # number of particles, while it is not yet known
 FEW = 16  # numbers that Python examines faster than NumPy, at most
 OF_SHAPE = {"position": "position", "pairs": "links", "triples": "bends", "quads": "quads", "loops": "loops"}  # by argument
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike as ArrayLike
+else:  # prints as its name in signatures, where NumPy's takes 230 characters
+    ArrayLike = type("ArrayLike", (), {"__module__": "builtins"})
 
 Kind = TypeVar("Kind", bound=type)
 Function = TypeVar("Function", bound=Callable[..., Any])

@@ -47,7 +47,7 @@ class World:
     particles: Particles. features: forces, constraints, contacts and walls, in any order; at most one Contact. A feature that is
     not in the list costs nothing.
     substeps: substeps per frame; None for as many as such scenes usually need: 20, or 4 where particles fall freely but for
-    contacts; or "auto" for as many as each frame needs (see StepController); springs of omega dt > 50, dt the frame, are not
+    contacts; or "auto" for as many as each frame needs; springs of omega dt > 50, dt the frame, are not
     resolved, and lose what they vibrate with (flag "energy-loss"). iterations: passes over the constraints in each substep. Both
     may change at any time, without compiling.
     solver: how constraints are solved: Direct for chains, trees and loops; Jacobi, Chebyshev or ConjugateGradient for cloth. None
@@ -60,7 +60,7 @@ class World:
     path: "auto", "fused" (one launch per frame, one thread) or "parallel" (one launch, a team of CPU threads; several launches on
     a GPU). The results are the same bit for bit.
     order: order of the error in the substep: 2; or 4, 6 or 8 in f64, for motion without contacts, walls, damping and limits where
-    every rigid constraint is solved directly. A substep then has 5, 9 or 15 stages, see high_order.py.
+    every rigid constraint is solved directly. A substep then has 5, 9 or 15 stages, see tiverlet/step/README.md.
 
     Raises ValueError or TypeError, naming the argument, the index and the value, before anything is compiled.
     """
@@ -507,7 +507,9 @@ class World:
         self, origin, direction, reach=np.inf, *, radius: float = 0.0, groups=None, skip=(), features: Iterable[Feature] | None =
         None,
     ) -> Hits:  # fmt: skip
-        """Return what each ray hits first: a particle, a link between two particles, or a wall; see Hits.
+        """Return what each ray hits first: a particle, a link between two particles, or a wall.
+
+        The result has distance, point, normal, particle, link, wall and met, with a row for each ray.
 
         origin, direction: (dim,) or (k, dim) [m], as many of both or one for all; a direction has any length above 0. reach:
         number or (k,) [m], the length of a ray. radius: [m] of a ball that is cast instead of a line, to see whether it fits
@@ -606,7 +608,8 @@ class World:
 
     @property
     def broken(self) -> list[tuple[Feature, np.ndarray]]:
-        """What broke in the last frame: features, and the indices of their constraints. For all frames, see feature.broken."""
+        """What broke in the last frame: features, and the indices of their constraints. feature.broken has those of all
+        frames."""
         self._runner.memory.check()
         out = []
         if self._last and self._last.broken:
@@ -690,11 +693,12 @@ class World:
         *,
         extend: Mapping[Feature, Feature] | None = None,
     ) -> Handle:
-        """Add particles and features, between frames. Returns a handle to the particles, see Handle.
+        """Add particles and features, between frames. Returns a handle to the particles.
 
         particles: Particles, or a Shape as it is: particles of 1 kg with its radii, its links and braces rigid, its limits; in a
         world with Polygons its loops, if all particles are on them. They extend rigid features of the world.
 
+        The handle is an array of their indices that stays right when others are removed: world.position[handle].
         The new particles come after the last. Features name all particles by their numbers, so a rope that is added to a world of
         n particles has the links shapes.rope(...).links + n. Rest values that are not given are taken from the present positions.
         Rigid constraints that these positions violate are satisfied before the next frame, without velocity; the frame has the

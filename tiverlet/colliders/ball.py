@@ -1,9 +1,9 @@
 """A ball with particles outside, or inside."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from ..device import inline, ti
 from ..features.arguments import shifted
 from ..features.feature import Knob, Scene
@@ -23,7 +23,7 @@ class Ball(Collider):
 
     center: (dim,) [m], live: assign to it between frames, and the ball moves there during the next frame. radius: R [m], live: it
     changes at once, and particles that are then inside move out at push_out. inside: keep particles in. friction, restitution,
-    push_out, active, events, surface_velocity: see Collider.
+    push_out, active, events, surface_velocity: see tiverlet/colliders/README.md.
 
     A particle that passes through in one substep is caught on the way in: the time when it met the surface is solved for, as for
     pairs. Nothing passes at any speed, and no force can pull a particle through.

@@ -1,9 +1,9 @@
 """A box with particles inside."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from ..device import ti
 from ..features.arguments import shifted
 from ..features.feature import Knob, Scene
@@ -38,7 +38,7 @@ class Box(Collider):
 
     lower, upper: (dim,) [m]; -inf and inf leave a side open. Live: assign to .lower or .upper between frames, and the walls move
     there during the next frame (to or from an open side they jump). friction, restitution, push_out, active, events,
-    surface_velocity: see Collider.
+    surface_velocity: see tiverlet/colliders/README.md.
 
     One-sided: a particle cannot leave at any speed, and no force can pull it out.
     """

@@ -1,9 +1,9 @@
 """A rod with round ends."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from ..device import inline, ti
 from ..features.arguments import shifted
 from ..features.feature import Knob, Scene
@@ -31,7 +31,8 @@ class Capsule(Collider):
     C(x) = |x - q| - (R + r) >= 0 with q the nearest point of the segment; grad C = (x - q) / |x - q|.
 
     a, b: (dim,) [m], live: the ends move to assigned places during the next frame. radius: R [m], above 0,
-    live: it changes at once. friction, restitution, push_out, active, events, surface_velocity, one_way: see Collider.
+    live: it changes at once. friction, restitution, push_out, active, events, surface_velocity, one_way: see
+    tiverlet/colliders/README.md.
 
     A particle that passes through in one substep is caught on the way in, however thin the rod. Its path relative to the rod is
     followed to where it meets the surface. No force can pull a particle through either.

@@ -22,43 +22,12 @@ class Collider(Feature):
     depth (a bad start) is removed at `push_out` [m/s], and gives no more velocity than that. None, the default: 1 m/s, and among
     contacts a quarter of the radius in a substep, without velocity.
 
-    Where one correction may push a particle into a wall again (several walls, a box in whose corners particles bounce),
-    corrections are repeated until none changes anything. The first rounds include friction and bounces. Later rounds leave both
-    out, and are then projections of the displacement, which add no energy. A particle that is still not free, in a wedge, stays
-    where it was at the start of the substep. Where walls that move towards each other leave no room, the last of them
-    prevails. Walls of one kind share code and act together, see WallGroup: kinds in the order of the first wall of each, walls of
-    a kind in the order of the list.
+    Where one correction may push a particle into a wall again, corrections are repeated until none changes anything. The first
+    rounds include friction and bounces; later rounds are projections of the displacement, which add no energy. A particle that is
+    still not free, in a wedge, stays where it was at the start of the substep. Walls of one kind share code and act together, see
+    WallGroup: kinds in the order of the first wall of each, walls of a kind in the order of the list.
 
-    friction: Coulomb, a number or (static, dynamic). The tangential displacement relative to the wall is removed, up to friction
-    times the normal displacement from the wall, so neither coefficient depends on h. A sticking particle returns bit for bit to
-    where it was at the start of the substep, so it does not creep.
-    restitution: 0 ... 1. The time of impact within the substep is solved for, with the acceleration during the substep. The
-    particle leaves at restitution times its velocity at that time, and is placed where it would be at the end of the substep. A
-    particle that rigid links hold takes its body along, see BodyImpacts, unless 8 substeps of forces and links account for its
-    speed. So does one of a rigid ShapeMatch cluster all of whose particles can move and have no other constraint. On springs,
-    in other clusters, on links that share particles with clusters, beside Area of loops, Path or Snap, and where it spins and has
-    friction, a particle bounces alone. With 0, the default, bodies of links stop by the same law where Direct solves all links,
-    or no two share a particle, and clusters there and in worlds without links. Elsewhere links find in later substeps that an
-    end was stopped: an upright rod leaves a floor at 1/4 of its speed, a chain of ten links at 0.6, at any number of substeps.
-    There, 1e-9 stops bodies, as far as passes of the solver converge.
-    For particles that spin, the displacement of the contact point is removed. Then friction = (static, dynamic, rolling,
-    twisting) also resists rolling, by a moment of up to rolling * radius times the normal force, and spinning about the normal,
-    by up to twisting * radius times it; a particle that these moments hold does not roll. With restitution = (normal, tangential)
-    the contact point leaves a bounce across the normal at -tangential times its velocity, as far as friction holds it; 0 grips, 1
-    is a super ball (Garwin 1969).
-    active: whether the wall is present, for a gate that opens and closes. With True or False given it is a switch, which costs
-    nothing to turn. None is always present; switching it off for the first time compiles another scene. Particles inside of a
-    wall that returns are pushed out at push_out.
-    events: whether World.wall_events() reports which particles met and left the wall.
-    one_way: a direction along which particles pass, for platforms: (0, 1) holds particles from above, and lets particles from
-    below through. Particles are held where they touch with a normal to that side. A particle that was inside of the wall at the
-    start of the substep, for whatever reason, is let through until it is free. Fixed, and turned with the wall. Only the position
-    of a particle decides, and among contacts what the wall held in the last substep. Capsule, Polygon and Mesh take it; None is a
-    wall for both sides.
-
-    surface_velocity: (dim,) [m/s], of the surface relative to the wall, for conveyor belts: the wall stays where it is, and
-    friction carries along what lies on it. In the axes of the world; the part along the normal is left out. Live; 0 is a belt at
-    rest. It needs friction. Nothing falls asleep while a surface moves.
+    friction, restitution, push_out, active, events, one_way, surface_velocity: see tiverlet/colliders/README.md.
     """
 
     friction = Knob(lambda f, v: _friction(f, v), "A number, or (static, dynamic, rolling, twisting).")
@@ -69,6 +38,7 @@ class Collider(Feature):
     surface_velocity = Knob(lambda f, v: _surface_velocity(f, v), "Of the surface relative to the wall, (dim,) [m/s].")
     compiled_for = ("has_friction", "has_restitution", "has_switch", "has_surface_velocity", "turns")
     host_only = ("widest",)
+    for_users = ("clearance",)
     one_way: Any = None  # unit vector along which particles pass
     _switch = False  # whether `active` was given
     needs_start_position = False  # needs the exact position at the start of the substep

@@ -1,9 +1,9 @@
 """A plane with particles on one side."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..geometry.intervals import entry, rounding, slab
@@ -19,7 +19,7 @@ class HalfSpace(Collider):
 
     normal: (dim,), any length above 0; offset: [m] along the unit normal, from the origin. offset is live: assign to it between
     frames, and the plane moves there during the next frame. friction, restitution, push_out, active, events, surface_velocity:
-    see Collider.
+    see tiverlet/colliders/README.md.
 
     One-sided: a particle cannot pass at any speed, and no force can pull it through.
     """

@@ -1,9 +1,9 @@
 """A wall along a triangle mesh."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from .collider import Collider
 from .facets import Facets, facet_normals
 from .moving import Moving
@@ -15,14 +15,13 @@ FLAT = 0.999  # cosine between faces whose common edge is not drawn
 class Mesh(Moving):
     """Particles stay outside of a closed triangle mesh, or inside; or on their own side of an open sheet (3D).
 
-    C(x) = dist(x, faces) - (R + r) >= 0, grad C the direction from the nearest point of the mesh (see FacetShape).
+    C(x) = dist(x, faces) - (R + r) >= 0, grad C the direction from the nearest point of the mesh.
 
     vertices: (m, 3) [m]. faces: (k, 3) vertices of each triangle, either way round: they are reordered to face outwards,
     each connected part by itself. A part inside of another one is turned with it: a cavity if it is given the other way round.
     inside: keep particles in. closed: False for a sheet, a thin wall with two sides. radius: R [m], by which the faces are
-    thickened; it must be above 0 for a sheet and points (particles of radius 0). position, rotation: pose of the vertices (see
-    Moving); live.
-    friction, restitution, push_out, active, events, surface_velocity, one_way: see Collider.
+    thickened; it must be above 0 for a sheet and points (particles of radius 0). position, rotation: pose of the vertices; live.
+    friction, restitution, push_out, active, events, surface_velocity, one_way: see tiverlet/colliders/README.md.
 
     Nothing passes, at any speed of the particle or of the wall. The cost for a particle grows with the number of faces around it,
     not with the size of the mesh. Raises ValueError for faces of no area, and for a closed mesh with an edge that does not have

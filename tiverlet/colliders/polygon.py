@@ -1,9 +1,9 @@
 """A wall along a polygon."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from .facets import Facets, facet_normals
 from .moving import Moving
 from .shape import HostShape
@@ -14,12 +14,12 @@ BLOCK = 1 << 20  # pairs of edges that are compared together
 class Polygon(Moving):
     """Particles stay outside of a polygon, or inside; or on their own side of an open line (2D).
 
-    C(x) = dist(x, outline) - (R + r) >= 0, grad C the direction from the nearest point of the outline (see FacetShape).
+    C(x) = dist(x, outline) - (R + r) >= 0, grad C the direction from the nearest point of the outline.
 
     vertices: (m, 2) [m], in order, either way round; outlines may be concave. inside: keep particles in. closed: False for a
     line from the first vertex to the last, a thin wall with two sides. radius: R [m], by which the outline is thickened; it must
-    be above 0 for a line and points (particles of radius 0). position, rotation: pose of the vertices (see Moving); live.
-    friction, restitution, push_out, active, events, surface_velocity, one_way: see Collider.
+    be above 0 for a line and points (particles of radius 0). position, rotation: pose of the vertices; live.
+    friction, restitution, push_out, active, events, surface_velocity, one_way: see tiverlet/colliders/README.md.
 
     Nothing passes, at any speed of the particle or of the wall. Raises ValueError for edges of no length, and for a closed
     outline that has no area or intersects itself.

@@ -3,8 +3,8 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from ..checks import ArrayLike
 from ..device import inline, runtime, ti
 from ..device.language import undecorated
 from ..device.patches.compiler import Compiler
@@ -36,8 +36,8 @@ class Sdf(Moving):
 
     function: a ti.func that takes a position [m] and returns the signed distance to the surface [m], negative inside of the
     solid. Its literals have the world's precision. gradient: a ti.func of the position that returns the gradient; None for
-    central differences. radius: R [m], by which the shape is thickened. position, rotation: pose of the shape (see Moving); live.
-    friction, restitution, push_out, active, events, surface_velocity: see Collider.
+    central differences. radius: R [m], by which the shape is thickened. position, rotation: pose of the shape; live.
+    friction, restitution, push_out, active, events, surface_velocity: see tiverlet/colliders/README.md.
 
         @ti.func
         def torus(p):

@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..geometry.intervals import cross
@@ -31,8 +31,9 @@ class Area(Scalar):
     damping: number or (m,) [N s/m^3], of a dashpot parallel to the spring. break_at: load at which it bursts, number or (m,)
     [N/m].
 
-    `load` is the tension that keeps the area [N/m]; -load is the pressure inside. Second order in h, see Equation. Raises
-    ValueError for loops of fewer than 3 or repeated particles, and for loops of more than 3 in 3D, where they enclose no area.
+    `load` is the tension that keeps the area [N/m]; -load is the pressure inside. Second order in h, see tiverlet/step/README.md.
+    Raises ValueError for loops of fewer than 3 or repeated particles, and for loops of more than 3 in 3D, where they enclose no
+    area.
     """
 
     index_name = "loops"

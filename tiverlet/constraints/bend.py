@@ -3,8 +3,8 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from ..checks import ArrayLike
 from ..features.feature import Knob
 from ..geometry.intervals import cross
 from .core.angle import angles_of_paths

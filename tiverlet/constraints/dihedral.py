@@ -1,8 +1,8 @@
 """Angles between triangles."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from ..checks import ArrayLike
 from .core.angle import REST_ANGLE, DihedralAngle
 from .core.scalar import Scalar
 

@@ -1,7 +1,6 @@
 """Links of given length."""
 
-from numpy.typing import ArrayLike
-
+from ..checks import ArrayLike
 from .core.length import REST_LENGTH, Length
 from .core.scalar import Scalar
 
@@ -19,7 +18,8 @@ class Distance(Scalar):
     the next substep on; see world.broken and .broken. Under a blow a link bears v sqrt(m k), if its period is resolved; a
     rigid one bears about m v / h, which grows with the number of substeps.
 
-    Second order in h, without artificial damping, for every compliance (see Equation). `load` is the tension of each link [N].
+    Second order in h, without artificial damping, for every compliance (see tiverlet/step/README.md). `load` is the tension of
+    each link [N].
     """
 
     measures = Length

@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from ..features.feature import Feature, Knob, Scene
 from ..particles import Particles
 from .core.angle import TURN, DihedralAngle, PathAngle
@@ -21,8 +21,9 @@ class Motor(Scalar):
 
     C(x) = f(x) - rest with the angle f [rad] and its gradients of Bend (triples) or Dihedral (quads). In a substep h the rest
     angle turns by speed h, or by at most speed h towards `angle`. Its multiplier is clamped, |lam| <= torque h^2. Below the
-    largest torque the hinge turns at the given speed; at the limit it exerts the largest torque; see core.drive.Drive. All
-    torques act between its particles, so a motor moves no center of mass and gives no angular momentum.
+    largest torque the hinge turns at the given speed; at the limit it exerts the largest torque; see
+    tiverlet/constraints/README.md. All torques act between its particles, so a motor moves no center of mass and gives no angular
+    momentum.
 
     hinges: (m, 3) particle indices, the corner in the middle, of joints in a plane: a wheel turns by i - j - k where i is on the
     frame, j the hub and k on the wheel. (m, 4) of hinges in 3D: the two ends of the axis, then a particle of either side.

@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from ..features.feature import Knob, Scene
 from ..particles import Particles
 from .core.anchor_passes import AnchorPasses
@@ -33,6 +33,7 @@ class Path(Anchored):
     `length` is the length of the curve [m], `place(s)` its points, `load` the force of the wire on each particle [N].
     """
 
+    for_users = ("length",)
     is_fixed_in_space = True
     each = ("compliance", "damping", "speed", "at")
     speed = Knob(lambda f, v: f._drive("speed", v), "Along the curve [m/s], (m,).")

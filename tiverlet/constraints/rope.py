@@ -1,7 +1,6 @@
 """Links that pull and do not push."""
 
-from numpy.typing import ArrayLike
-
+from ..checks import ArrayLike
 from .core.length import REST_LENGTH, Length
 from .core.scalar import Scalar
 

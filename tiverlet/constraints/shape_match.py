@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from ..features.feature import Batch, Knob, Scene
 from ..geometry.ordered import distinct
 from ..particles import Particles
@@ -21,16 +21,11 @@ class ShapeMatch(Batch):
     C_i(x) = x_i - (c + R q_i) for each particle of a cluster, with the rest shape q, and the center c and rotation R of the
     cluster.
 
-    For rigid clusters, c and R are not the best fit to the predicted positions, which would damp spin in every step. They are
-    chosen so that the correcting forces have no sum and no moment about the positions at the start of the step, as the forces of
-    SHAKE. For a single cluster that is the discrete rigid body of Moser and Veselov (1991): second order, momentum and angular
-    momentum conserved to rounding, no damping. A rotation of more than 90 degrees in a step is limited to 90; above 41 it is
-    flagged.
+    Rigid clusters keep momentum and angular momentum, are second order and undamped (Moser and Veselov 1991).
+    A rotation of more than 41 degrees in a substep has the flag "turned".
 
-    In soft clusters, a spring pulls each particle to its place. Its stiffness is the particle's share, by mass, of the cluster's
-    stiffness, so all deformations of a cluster of mass M have the same frequency sqrt(1 / (compliance M)). From soft to rigid by
-    the law of Spring, with deformations compared in the body frame. Damping acts on the deformation only, not on the rigid
-    motion.
+    In soft clusters, a spring pulls each particle to its place, by its share of the mass: all deformations of a cluster of mass M
+    have the frequency sqrt(1 / (compliance M)). Damping acts on the deformation alone.
 
     clusters: a sequence of index sequences, or (m, k), or one sequence. They may overlap: each pass then moves a particle to the
     mean of its places in them, so rigid lattices give way under loads, as rigid links do under Jacobi. A cluster may be flat, on
@@ -44,11 +39,7 @@ class ShapeMatch(Batch):
 
     `load` is the largest force on a particle of each cluster [N], m omega^2 r where it spins freely.
 
-    A particle that cannot move counts with 1024 times the mass of its cluster. Sums and rotations are f64 in every world: a
-    rotation rounded to f32 would change the spin by 1e-7 of the size in every step, which is large beside a small displacement.
-    In f32, positions x are rounded by about 2^-25 of the size, and displacements d by 2^-25 of themselves. This changes the
-    angular momentum sum m x x d by about 2^-25 of itself in every substep, at random: by 2^-25 sqrt(n) after n of them, 3e-6
-    after 10 s at 1200 per second. "f32-compensated" avoids the error of x, "f64" both (1e-11).
+    In f32, rounding changes the angular momentum by 3e-8 of itself in a substep, at random; "f64" avoids it.
     """
 
     clusters = True

@@ -1,9 +1,9 @@
 """Particles drawn to a regular grid."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from ..device import ti
 from ..features.feature import Feature, Scene
 from ..particles import Particles

@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..geometry.intervals import cross
@@ -31,13 +31,14 @@ class Volume(Scalar):
     compliance: number or (m,) [m^5/N], inverse of the pressure [Pa] per m^3 of missing volume; 0 is rigid.
     damping: number or (m,) [N s/m^5]. break_at: pressure at which it bursts, number or (m,) [Pa].
 
-    `load` is -p, with p the pressure inside [Pa]. Second order in h, see Equation. Bodies of 1e9 m and more exceed the range of
-    f32.
+    `load` is -p, with p the pressure inside [Pa]. Second order in h, see tiverlet/step/README.md. Bodies of 1e9 m and more exceed
+    the range of f32.
 
     Raises ValueError in 2D, and for surfaces with an open edge, an edge of three faces, or only one side; the edge is named.
     """
 
     index_name = "cells"
+    for_users = ("faces",)
     each = (*Scalar.each, "pressure")
     pressure = PRESSURE
     quantity: "Tetrahedra | Surfaces"

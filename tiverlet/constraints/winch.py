@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from ..features.feature import Knob, Scene
 from ..particles import Particles
 from .core.drive import Drive, largest_load
@@ -20,7 +20,7 @@ class Winch(Scalar):
 
     C(x) = |x_i - x_j| - rest <= 0, gradients as in Distance; the multiplier may only pull. In a substep h the length `rest` grows
     by speed h, between `shortest` and `longest`. The pull is clamped, lam <= force h^2. Below the largest force the length
-    changes at the given speed; beyond it the rope runs out; see core.drive.Drive.
+    changes at the given speed; beyond it the rope runs out; see tiverlet/constraints/README.md.
 
     pairs: (m, 2) particle indices.
     speed: number or (m,) [m/s]; positive pays out, negative winds up, 0 holds. Live.

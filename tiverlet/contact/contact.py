@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Knob, Scene
@@ -23,8 +23,8 @@ from .pair_contact import PairContact
 class Contact(PairContact):
     """Contacts of discs and spheres: no two of them overlap.
 
-    C(x) = |x_i - x_j| - (r_i + r_j) >= 0 for all pairs, with Coulomb friction and restitution. See README.md in contact for the
-    law. Above a restitution of 0.97 impacts pass on from particle to particle, as in Newton's cradle.
+    C(x) = |x_i - x_j| - (r_i + r_j) >= 0 for all pairs, with Coulomb friction and restitution. See tiverlet/contact/README.md for
+    the law. Above a restitution of 0.97 impacts pass on from particle to particle, as in Newton's cradle.
 
     friction: Coulomb friction, a number, (static, dynamic) or (static, dynamic, rolling, twisting), or a mapping from pairs of
     groups to these: {(0, 1): 0.5}. Friction turns particles that spin. rolling, twisting: against rolling, a moment of up to
@@ -43,7 +43,7 @@ class Contact(PairContact):
     loads: has no effect any more: all pairs store the load that they bear.
 
     Two particles in the same place part in a direction computed from their indices. Linked particles (Distance, Rope, Spacer) do
-    not touch, nor do particles that a chain of links holds closer than the sum of their radii, see exclusions.py.
+    not touch, nor do particles that a chain of links holds closer than the sum of their radii, see tiverlet/contact/README.md.
     """
 
     def __init__(

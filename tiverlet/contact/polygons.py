@@ -4,9 +4,9 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from ..device import ti
 from ..device.thread_team import Team
 from ..features.extending import extended
@@ -27,7 +27,7 @@ class Polygons(PairContact):
     """Contacts of bodies made of particle loops, and of other particles: vertex against edge, disc against disc (2D).
 
     C(x) = (x_v - (1 - t) x_a - t x_b) . n - (r_v + (1 - t) r_a + t r_b) >= 0 for a vertex v and the edge from a to b of another
-    body. t is the place of v along the edge, n the outward normal. See README.md in contact for the law.
+    body. t is the place of v along the edge, n the outward normal. See tiverlet/contact/README.md.
 
     loops: for each body its particles in order around it, at least 3, either way round. Their radii round the rim. Other
     constraints (Distance, Area, ShapeMatch) hold a body together; it may bend, and stretch by a quarter.

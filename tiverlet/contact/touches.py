@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from .. import checks
+from ..features.row_table import row_table
 from ..features.unknown_names import answer_names
 
 BEFORE, NEVER = 0, -1  # in place of substeps, counted from 1: touched when the frame began; has not touched yet
@@ -48,6 +49,9 @@ class Touches:
     def __len__(self) -> int:
         return len(self.pairs)
 
+    def __repr__(self) -> str:
+        return row_table("Touches", {name: vars(self)[name] for name in ("pairs", "impulse", "speed", "began", "ended", "point")})
+
     def __getitem__(self, rows: Any) -> "Touches":
         """Return some rows, by a mask, indices or a slice."""
         return Touches(*(getattr(self, f.name)[rows] for f in fields(self)))
@@ -88,6 +92,10 @@ class ContactEvents:
 
     def __len__(self) -> int:
         return len(self.touches)
+
+    def __repr__(self) -> str:
+        counts = (f"{len(getattr(self, name))} {name}" for name in ("begun", "ended", "lasting"))
+        return f"ContactEvents: {', '.join(counts)}\n{self.touches!r}"
 
     def among(self, groups: Iterable | None) -> "ContactEvents":
         """Return the contacts between some pairs of groups, None for all."""

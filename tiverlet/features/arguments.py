@@ -105,6 +105,18 @@ def state_alone(self: Any) -> dict[str, Any]:
     return vars(self.copy())
 
 
+def names_for_users(self: Any) -> list[str]:
+    """The __dir__ of classes that record arguments, for completion: what users read and set, not what a world calls.
+
+    These are arguments and knobs, the names in `for_users` of a class and its bases, and all that classes of the user define.
+    """
+    kind, names = type(self), {*inspect.signature(type(self)).parameters, *knobs_of(type(self))}
+    for base in kind.__mro__[:-1]:
+        own = not base.__module__.startswith("tiverlet.")
+        names |= {*vars(base).get("for_users", ()), *(vars(base) if own else ())}
+    return sorted(n for n in names if n[0] != "_" and (n in vars(self) or inspect.getattr_static(kind, n, None) is not None))
+
+
 def refuse_deletion(thing: Any, name: str) -> None:
     """The __delattr__ of classes that record arguments."""
     raise AttributeError(f"{thing!r}.{name} cannot be deleted.")

@@ -33,7 +33,7 @@ from ..device import ti
 from ..device.language import inside_kernel
 from ..device.number import Number
 from .arguments import Knob as Knob
-from .arguments import keep, knobs_of, record_arguments, refuse_deletion, set_attribute, state_alone
+from .arguments import keep, knobs_of, names_for_users, record_arguments, refuse_deletion, set_attribute, state_alone
 from .read_only import as_read_only, assign_whole_advice
 from .unknown_names import answer_names
 
@@ -97,6 +97,7 @@ class Feature:
     )  # fmt: skip
     # Attributes that kernels do not read.
     host_only: tuple[str, ...] = ("start", "periodic", "changed", "moving", "new_force", "arguments", "compiled_so_far")
+    for_users: tuple[str, ...] = ()  # attributes that users read, beside arguments and knobs, see names_for_users()
     uploads_all = False  # upload() and end_motion() also work for many worlds, where knobs have an additional first axis
     compiled_for: tuple[str, ...] = ()  # properties that decide the code of its kernels
     has_own_compile_time = True  # compile times are reported per class
@@ -115,7 +116,7 @@ class Feature:
     start: Any = None  # Particles as they were when it was added; used whenever it is bound again
 
     __setattr__, __delattr__, _keep = set_attribute, refuse_deletion, keep
-    __getstate__ = state_alone
+    __getstate__, __dir__ = state_alone, names_for_users
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -318,6 +319,7 @@ class Batch(Feature):
     code_size = 1.0
     each: tuple[str, ...] = ()  # its arrays with one row per constraint, besides the indices
     rest_name = "rest"  # the argument of __init__ for `rest`
+    for_users = ("broken", "count", "indices", "load", "residual")
     index_name = "indices"  # the argument of __init__ for the indices, in the form of `listing`
 
     @property

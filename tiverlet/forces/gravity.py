@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from ..device import ti
 from ..features.feature import Acceleration, Knob
 from ..particles import Particles

@@ -6,9 +6,9 @@ from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from ..features.feature import Feature, Knob, Scene
 from ..features.regrouping import Regrouping
 from .images import FLOW, GRADIENT, Images
@@ -48,6 +48,7 @@ class Periodic(Feature):
     is_fixed_in_space = True
     compiled_for = ("sheared",)
     host_only = ("low", "high")
+    for_users = ("lengths", "offset", "strain")
     _last_strain_and_offset = 0.0, 0.0
     shear = Knob(lambda f, v: checks.number("Periodic", "shear", v), "Rate of the shear [1/s].")
     code_size = 0.1

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..device import ti
+from ..features.row_table import row_table
 from ..features.unknown_names import answer_names
 
 if TYPE_CHECKING:
@@ -37,6 +38,9 @@ class Contacts:
 
     def __len__(self) -> int:
         return len(self.pairs)
+
+    def __repr__(self) -> str:
+        return row_table("Contacts", {name: vars(self)[name] for name in ("pairs", "overlap", "impulse", "normal", "point")})
 
 
 @ti.data_oriented

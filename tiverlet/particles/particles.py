@@ -1,9 +1,9 @@
 """Particles as the user specifies them: checked arrays."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import checks
+from ..checks import ArrayLike
 from ..features.read_only import read_only, structure_advice
 from ..features.unknown_names import answer_names, no_attribute
 

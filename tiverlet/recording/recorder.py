@@ -58,10 +58,9 @@ class Recorder:
     states to continue from, the hash of every frame drawn, and every step. It holds every knob that the user set and every array
     that the user assigned, also between frames that are not drawn: see tv.replay.
 
-    The file is complete when the block ends. If the process is killed, the first frame and everything up to about the last fifth
-    of a second (for curves, the last second) is in the file and can be replayed; whatever flush() has written is there in any
-    case. Open the file with `rerun rope.rrd`. Raises ValueError and OSError if the file cannot be made, FileExistsError if it
-    exists already, and OSError if it was removed or cannot be written any further; in the last case what it holds can be read.
+    The file is complete when the block ends. If the process is killed, all but about the last second can be replayed; flush()
+    writes what there is. Raises ValueError and OSError if the file cannot be made or written, FileExistsError if it exists
+    already.
     """
 
     def __init__(
@@ -174,7 +173,7 @@ class Recorder:
         """Write the present frame, if it is one of `every`, and quantities of your own.
 
         These are numbers, which become curves, or arrays of one number per particle, (n,), for `color` and for programs that read
-        the file. See Replay.quantities.
+        the file, see tv.replay.
 
             recorder.log(height=float(x[:, 1].max()), heat=heat)
 

@@ -47,13 +47,10 @@ class ConjugateGradient(Solver):
 
     with W_j the diagonal of A = G w G^T and lambda_max the largest eigenvalue of W^-1 A. The condition number is then at most
     steps^2 + 1, for which so many steps suffice, and a link gives way like one of compliance sigma W h^2. The floor stays until
-    particles are put elsewhere. It grows where it is still too low, or where the tension is near the limit of the substep. Each
-    connected part has its own floor, which is raised where a row has more than its share (one over all rows) of the final r . z.
+    particles are put elsewhere. It grows where it is still too low, or where the tension is near the limit of the substep.
 
-    Where rigid constraints contradict each other at the positions given, the right side is partly in the null space of A, where
-    steps give arbitrary multipliers. Then sigma = 1 from the first substep on: it bounds multipliers by those of a Jacobi pass.
-    With more links than needed (braced bodies), rounding of violations is partly in the null space, too. So steps end where all
-    rows are down to rounding and the next direction is in the null space.
+    Where rigid constraints contradict each other at the positions given, sigma = 1 from the first substep on. With more links
+    than needed (braced bodies), steps end where all rows are down to rounding.
 
     steps: of conjugate gradients in an iteration. Ropes, spacers and constraints that are not scalar functions are relaxed as by
     Jacobi beside it.

@@ -71,13 +71,9 @@ class Direct(Solver):
     its pivots span the mass ratio.
 
     A load that cannot be borne to first order (a straight rope between two pins) leaves the tension undetermined with directions
-    at the start of the substep: an arbitrary number, which adds energy. Such a system is detected by a pivot that is a small part
-    of its diagonal, while solutions with directions at the start and at the end disagree about the tension. It is solved with
-    directions at the end, and softened until (omega h)^2 <= 1; so is a system with a transverse (omega h)^2 > 4. It gives way and
-    loses energy, and the flag "softened" says so. Where the substep gets shorter, its tension would grow with 1 / h^2, and with
-    it the energy that is stored. So its violations are removed first, and it bears its load again, if the shorter substep can
-    stand the tension and the scene has lost the energy that this takes. Else it remains as soft as it is, and becomes stiffer
-    slowly, at rest.
+    at the start of the substep. Such a system is solved with directions at the end, and softened until (omega h)^2 <= 1; so is
+    one with a transverse (omega h)^2 > 4. It gives way and loses energy, with the flag "softened", see
+    tiverlet/solvers/README.md.
     """
 
     converges = True

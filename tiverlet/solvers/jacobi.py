@@ -21,7 +21,8 @@ class Jacobi(Solver):
     world is built, power iteration finds the value of the scene as it starts. A relaxation beyond the limit is refused. "auto"
     takes 1.2 / lambda_max, or 1 where constraints are soft (their stiffness would change) or are not scalar functions.
 
-    loads: whether rigid links learn the loads that they bear at rest, and pull with them without being stretched. See KnownLoad.
+    loads: whether rigid links learn the loads that they bear at rest, and pull with them without being stretched. See
+    tiverlet/solvers/README.md.
     """
 
     def __init__(self, relaxation: float | str = 1.0, *, loads: bool = False):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..device import ti
-from ..features.arguments import keep, record_arguments, refuse_deletion, set_attribute
+from ..features.arguments import keep, names_for_users, record_arguments, refuse_deletion, set_attribute
 from ..features.feature import Batch, Scene
 from ..features.unknown_names import answer_names
 from .elimination import plan_of
@@ -52,7 +52,8 @@ class Solver:
     converges = False  # whether it converges within a substep, so that tensions can be too large for the substep
     arguments: Mapping[str, Any] = MappingProxyType({})
     kept_by_world: tuple[str, ...] = ()  # attributes that a world sets
-    __setattr__, __delattr__, _keep = set_attribute, refuse_deletion, keep
+    for_users: tuple[str, ...] = ()  # see names_for_users()
+    __setattr__, __delattr__, _keep, __dir__ = set_attribute, refuse_deletion, keep, names_for_users
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)

@@ -32,27 +32,15 @@ class Sleep(Feature):
     particles has been slow for `time`. A sleeping particle keeps the state of its last substep bit for bit: position,
     displacement, spin, loads, slip of friction. So its energy and momentum do not change, and it continues from this state when
     it wakes. An island wakes as a whole when
+    a moving or a driven particle touches it, the force on one of its particles changes, or one of them is given a velocity or
+    spin. All islands wake before a frame in which a wall is moved, a knob is changed (but the target of a driven particle),
+    positions are assigned, particles or features come or go, or the length of substeps changes; discs and spheres without spin
+    and constraints sleep on where frames are between 0.4 and 2.5 times as long as the last one. What a function of your own reads
+    from a Taichi field is not noticed: after writing it, assign world.position = world.position. Nothing falls asleep while a
+    surface moves.
 
-    - a moving or a driven particle touches it: in that substep, before the contact is solved;
-    - the force on one of its particles differs from the force with which it fell asleep: compared at the end of each frame, for
-      forces that may differ from place to place, or with the time;
-    - one of its particles is given another velocity or spin (all islands wake if this makes a start of the whole world).
-
-    All islands wake before a frame in which a wall is moved, a knob is changed (other than the target of a driven particle), a
-    particle that cannot move is given another spin, positions are assigned, particles or features are added or removed, or the
-    length of substeps changes. Discs and spheres without spin and constraints sleep on where frames are between 0.4 and 2.5 times
-    as long as the last one, as where a loop measures dt. They shake there, so `speed` has to be some centimetres per second. What
-    a Constraint or an Sdf of your own reads from a Taichi field is not noticed: after writing the field, assign
-    world.position = world.position. No island falls asleep while the surface of any wall moves. Compared with a world without
-    Sleep, a sleeping particle is off by less than speed times time, since it would have crept by less.
-
-    Sleep depends on the state alone: it is the same bit for bit on all paths, in clones and in replays. Pinned particles do not
-    join two islands. Particles of motors and winches, and particles that are linked to driven ones, never sleep.
-
-    World.events() reports that sleeping particles go on touching what they touched, without impulses.
-
-    StepReport.asleep is the number of sleeping particles. If all of them sleep, frames are not computed at all. (Box2D and
-    others: sleeping islands.)
+    It is the same bit for bit on all paths, in clones and in replays. Particles of motors and winches, and particles that are
+    linked to driven ones, never sleep. World.events() reports that sleeping particles go on touching, without impulses.
 
     Raises ValueError with a PairForce or a sheared Periodic box, which islands do not take into account, in orders above 2, and
     in Worlds. A world has at most one.

@@ -24,30 +24,10 @@ class StepReport:
     state is not finite, or None. broken: number of constraints that broke in the frame; world.broken lists them. asleep:
     number of sleeping particles, see Sleep. turn: 26 or 41 if a constraint turned by more than that many degrees in a
     substep, else 0. tension: (omega h)^2 of the fastest vibration across a tension, where a solver converges in a substep; 4
-    is the limit of stability. tries: how often the frame was computed, see StepController. seconds: run time of the frame.
+    is the limit of stability. tries: how often the frame was computed under "auto". seconds: run time of the frame.
 
-    flags: words for what the user should know. notes: one sentence for each flag, with the cause and a remedy.
-        "non-finite"        a position or displacement is NaN or infinite
-        "out-of-range"      a coordinate is too large for the precision, or for the cells of the contact grid
-        "tunnelling-risk"   a particle moved by more than its own size in one substep, so it may have passed another
-        "compressed"        a contact overlaps by more than a twentieth of the radius of the smaller particle, and did so
-                            when the frame began
-        "stiff-force"       a force changes too fast for the substep (omega h > 2): one that depends on position makes energy
-                            grow; one that depends on velocity turns motion far too little
-        "energy-gain"       the scene gained more than a tenth of its largest kinetic energy, though nothing does work on it
-        "energy-loss"       a scene of springs, uniform gravity, and walls and contacts without friction and with restitution 1
-                            lost more than a tenth of its largest kinetic energy: springs that the substep does not resolve are
-                            damped by it. Never where anything may take energy out (damping, drag, friction, rigid constraints,
-                            which lose in impacts, sleep), nor with forces that vary in space
-        "softened"          a solver let constraints give way, because their tension is too large for the substep
-        "unconverged"       the residual is above 0.05: a link is off by a twentieth of its length, an angle by 3 degrees
-                            (or large clusters that share particles gained energy, because a substep became shorter)
-        "turned"            a constraint turned by more than 41 degrees in a substep and lost its second order there; a rigid one
-                            dissipates energy, a spring that the substep resolves conserves it on average
-        "moved"             particles violated rigid constraints by a thousandth of their size or more; before the frame they were
-                            moved to meet the constraints, without velocity
-        "substeps-capped"   more substeps were needed, but there are at most 4096, or the budget was spent
-        "stuck"             neither more substeps nor more iterations bring the residual or the overlap to the tolerance
+    flags: words for what the user should know; the table of flags in README.md has all, with what helps. notes: one sentence for
+    each flag, with the cause and a remedy.
     """
 
     time: float

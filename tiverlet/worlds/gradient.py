@@ -47,14 +47,11 @@ def gradient(
     one for each number. The default is eps^(1/3) times the value: 6e-6 in f64, 5e-3 in f32 and f32-compensated. For a value of 0
     it is that share of the parameter's largest number; if all are 0, of 1.
 
-    n numbers take 2n + 1 worlds: (f(p + h) - f(p - h)) / 2h. The error is h^2 f''' / 6, and eps |f| / h of rounding, where eps is
-    the relative rounding error of the figure: about 1e-16 in f64 and 1e-7 in f32, more after many substeps. The default step
-    balances the two where f changes over lengths like p. Give a smaller step where f changes faster, as in chaos. Worlds with
-    equal numbers agree bit for bit, so the derivative with respect to an unused parameter is exactly 0.
+    n numbers take 2n + 1 worlds: (f(p + h) - f(p - h)) / 2h. The error is h^2 f''' / 6, and eps |f| / h of rounding. Give a
+    smaller step where f changes faster than over lengths like p, as in chaos.
 
-    It needs no tape and no memory but that of the worlds, and includes all features: contacts, friction, breaks. Reverse-mode
-    automatic differentiation costs some 3 to 5 runs for any n, and a tape of all substeps. Where the figure jumps or has a kink,
-    as when a contact begins or ends between p - h and p + h, the difference is no derivative: search with many worlds instead.
+    It includes all features: contacts, friction, breaks. Where the figure jumps or has a kink, as when a contact begins or ends
+    between p - h and p + h, the difference is no derivative: search with many worlds instead.
 
     Raises ValueError or TypeError for parameters that are no finite numbers, for steps that are not positive or vanish beside the
     value, for worlds of different structure, and for figures without a row per world.

@@ -53,8 +53,8 @@ class SweepResult(dict[str, np.ndarray]):
 
 @checks.answer_arguments
 def sweep(
-    make: Callable[..., World], parameters: Mapping[str, Any] | Iterable[Mapping[str, Any]],
-    figures: Callable[[Any], Mapping[str, Any]], executor: Any = None, at_once: int = 256, progress: bool = False,
+    make: Callable[..., World], parameters: Mapping[str, Any] | Iterable[Mapping],
+    figures: Callable[[Any], Mapping], executor: Any = None, at_once: int = 256, progress: bool = False,
 ) -> SweepResult:  # fmt: skip
     """Compute figures of one scene for many sets of parameters, here, in processes or on a cluster.
 

@@ -9,6 +9,7 @@ import numpy as np
 from ... import checks
 from ...colliders.collider import Collider
 from ...features.feature import Feature
+from ...features.row_table import row_table
 from ...features.unknown_names import answer_names
 from ...geometry.bounding_tree import BoundingTree, ray_entry_bound
 from ...geometry.intervals import ball, capsule, entry, rounding
@@ -47,6 +48,10 @@ class Hits:
 
     def __len__(self) -> int:
         return len(self.distance)
+
+    def __repr__(self) -> str:
+        names, one = ("distance", "particle", "link", "wall", "normal", "point"), np.ndim(self.distance) == 0
+        return row_table("Hits", {name: np.asarray([vars(self)[name]] if one else vars(self)[name]) for name in names})
 
 
 def ray(
