@@ -337,7 +337,7 @@ def test_what_is_not_live_refuses_and_says_what_is(world):
     made = {name: Scene(lambda *a, **k: None, {name: row}, False).features[name] for name, row in (ROWS3 | ROWS2).items()}
     for name, feature in made.items():
         kind, live = type(feature), knobs_of(type(feature))
-        inner = {k for k in dir(feature) if not k.startswith("_") and not callable(getattr(kind, k, None))}
+        inner = {k for k in {*dir(kind), *vars(feature)} if not k.startswith("_") and not callable(getattr(kind, k, None))}
         names = {*inspect.signature(kind).parameters, *inner} - {*live, *kind.kept_by_world}
         assert names, name
         for attribute in names:
