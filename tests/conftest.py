@@ -41,7 +41,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # ignored in background j
 collect_ignore = [] if patched else ["test_compiling.py", "test_sharing.py"]  # these files test the patches
 # Files that take longest run first: otherwise one worker would still run one of them when the others are done.
 LONG = (
-    "demos", "worlds", "edit_in_place", "determinism", "sleep", "speed", "properties", "periodic", "impacts", "uneven_substeps",
+    "demos", "worlds", "edit_in_place", "determinism", "sleep", "properties", "periodic", "impacts", "uneven_substeps",
     "compiling", "polygons", "guard", "docs", "knobs", "direct", "solvers", "regroup", "loads", "contact", "pairs",
     "conservation", "events", "walls", "spin", "recordings", "sharing", "fuzz", "motors", "extremes", "velocity", "granular",
     "report", "sweep",

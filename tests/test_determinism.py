@@ -10,10 +10,10 @@ import tiverlet as tv
 from tiverlet.device import ti
 from tiverlet.device.patches.compiler import BRIEF, LEAN
 from tiverlet.device.runtime import cores
-from tiverlet.report.speed import counting
 from tiverlet.step import build, diagnostics, step
 
 from .conftest import python
+from .launches import launches
 
 PASS = "solve_constraints apply_corrections"
 SOLVE = "solve_constraints solve_systems update_multipliers apply_constraints"  # the same where links answer contacts: Direct
@@ -246,7 +246,7 @@ def test_launches_count_what_the_scene_needs(world):
         w = world(tv.Particles(x, radius=0.1), features, path=path, substeps=5, iterations=2)
         w.step(0.01)
         w.step(0.01)
-        with counting.launches() as count:
+        with launches() as count:
             w.step(0.01)
         assert count == expected
         total = "1 launch" if path != "launched" else f"{count.total()} launches"
@@ -264,9 +264,9 @@ def test_the_host_asks_once_in_a_frame(world):
     built, frames = w._runner.list_neighbours, 10
     lists: list[None] = []
     w._runner.list_neighbours = lambda: (lists.append(None), built())
-    with counting.launches() as count:
+    with launches() as count:
         for _ in range(frames):
-            w.step(counting.DT)
+            w.step(1 / 60)
     assert count["measure"] == frames + len(lists) and count["build_list"] == len(lists) > 0
     assert count.answers == count["measure"] + count["build_list"]
 

@@ -15,7 +15,8 @@ from tiverlet.features.arguments import knobs_of
 from .conftest import parsed
 
 ROOT = pathlib.Path(__file__).parent.parent
-PAGES = [p.relative_to(ROOT) for p in (ROOT / "README.md", *ROOT.glob("demos/*.md"), *ROOT.glob("tiverlet/**/*.md"))]
+FOLDERS = ("demos/*.md", "tiverlet/**/*.md", "tests/laboratory/README.md")
+PAGES = [p.relative_to(ROOT) for p in (ROOT / "README.md", *(p for f in FOLDERS for p in ROOT.glob(f)))]
 
 
 def blocks(page: pathlib.Path) -> list[str]:

@@ -1,30 +1,16 @@
-"""Grains that spin, against the laws of heaps and silos: the figures of the report, in small scenes."""
-
-import sys
+"""Grains that spin, against the laws of heaps and silos: scenes of the laboratory, made small."""
 
 import numpy as np
 import pytest
 
-from tiverlet.report.accuracy import grains, rolling
-from tiverlet.report.accuracy.grains import SIZE, Silo
+from .laboratory import grains, rolling
+from .laboratory.grains import SIZE, Silo
 
 
 def test_a_super_ball_under_gravity_obeys_its_law():
     # Velocity and spin after three bounces, to rounding (test_spin.py has the other cases).
     for velocity, _place in rolling.own_errors(rolling.super_ball(), "f64", (5, 20)):
         assert velocity <= 1e-12
-
-
-def test_other_engines_are_asked():
-    # pymunk computes the friction that keeps a sphere rolling to rounding; its positions are of first order.
-    given = [rolling.downhill(0.3, 0.3), rolling.super_ball()]
-    assert rolling.engine_errors("pymunk", ["no-such-python"], given, (5,))[0][0].startswith("FileNotFoundError")
-    assert rolling.engine_errors("pymunk", [], given, (5, 10)) == [["not installed"] * 2] * 2
-    pytest.importorskip("pymunk")
-    rolls, bounces = rolling.engine_errors("pymunk", [sys.executable], given, (5, 10))
-    assert bounces == ["no tangential restitution"] * 2
-    assert max(velocity for velocity, _place in rolls) <= 1e-12
-    assert rolls[0][1] / rolls[1][1] == pytest.approx(2, rel=0.05)
 
 
 @pytest.mark.slow
@@ -57,12 +43,3 @@ def test_flow_out_of_a_silo_obeys_beverloo():
         assert found["opening"] == pytest.approx(opening + 0.5)
         rates.append(found["rate"])
     assert 1.92 / 1.2 <= rates[1] / rates[0] <= 2.15 * 1.2
-
-
-def test_fits_find_what_they_are_given():
-    # Data from the laws themselves, with chosen lambda, C and k.
-    heights = np.array([0.5, 1.0, 3.0, 6.0])
-    length, off = grains.saturation(heights, 0.8 / heights * (1 - np.exp(-heights / 0.8)))
-    assert length == pytest.approx(0.8, rel=2e-3) and off <= 1e-3
-    openings = np.array([5.0, 8.0, 12.0])
-    assert grains.beverloo(openings, 0.9 * (openings - 1.4) ** 1.5) == pytest.approx((0.9, 1.4, 1.0))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tiverlet.report.accuracy import granular
+from .laboratory import granular
 
 
 @pytest.mark.slow

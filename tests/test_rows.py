@@ -7,8 +7,9 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.contact.limits import BEYOND, BLOCK, GROUP, LEAST, MET, SLOP
-from tiverlet.device.patches.tracing import launches
 from tiverlet.device.thread_team import launching
+
+from .launches import launches
 
 G, R = 9.81, 0.1
 

@@ -13,11 +13,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("cases", nargs="*", help="names or beginnings of names, such as D01 or S; all without any")
     parser.add_argument("--list", action="store_true", help="list the cases")
     parser.add_argument("--quick", action="store_true", help="a few substeps and one timed run of each")
-    parser.add_argument("--wide", action="store_true", help="print all columns, for screens of 200 characters")
     parser.add_argument("--json", type=output, metavar="FILE", help="write all points, for machines")
-    parser.add_argument("--markdown", type=output, metavar="FILE", help="write the table, and one of all points for each case")
+    parser.add_argument("--markdown", type=output, metavar="FILE", help="write all columns, and all points of each case")
     parser.add_argument("--plot", metavar="FOLDER", help="write a log-log plot of each case (needs matplotlib)")
-    parser.add_argument("--record", type=output, metavar="FILE", help="write the curves for the rerun viewer")
     add_workers(parser)
 
 
@@ -34,14 +32,11 @@ def main(args: argparse.Namespace) -> int:
         return 0
     with workers(args.workers) as executor:
         report = error_vs_time(args.cases or None, quick=args.quick, executor=executor, progress=console.is_terminal)
-    report.every_column = args.wide
     console.print(report)
-    for path, text in ((args.json, report.json), (args.markdown, lambda: report.markdown(every=True))):
+    for path, text in ((args.json, report.json), (args.markdown, report.markdown)):
         if path:
             with open(path, "w", encoding="utf-8") as file:
                 file.write(text())
     if args.plot:
         report.plot(args.plot)
-    if args.record:
-        report.record(args.record)
     return 1 if report.failures else 0

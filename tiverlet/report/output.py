@@ -1,56 +1,72 @@
-"""Output of all reports: text, tables, Markdown, means with errors, numbers for JSON, errors in one line, the machine's name."""
+"""Output of all reports: tables, in a terminal and in Markdown; numbers for JSON; errors in one line; the machine's name."""
 
 import os
 import platform
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from rich.box import SIMPLE
-from rich.console import Console
-from rich.table import Table
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.jupyter import JupyterMixin
+from rich.table import Table as RichTable
 from rich.text import Text
 
-Titled = tuple[str, Sequence[str], Iterable[Sequence[str]]]  # a table: title, column heads, rows of text
 
+@dataclass
+class Table:
+    """A table of text: title, heads of the columns, rows, and lines below.
 
-def text(shown: Any, width: int) -> str:
-    """Return the text that rich's print() shows, in lines of `width` characters."""
-    console = Console(width=width)
-    with console.capture() as out:
-        console.print(shown)
-    return out.get()
+    left: heads of columns that are left-aligned, besides the first and the last. styles: of rows, for rich; none without any.
+    """
 
+    title: str
+    heads: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    notes: Sequence[str] = ()
+    left: Container[str] = ()
+    styles: Sequence[str] = ()
 
-def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Return the lines of a Markdown table."""
-    lines = ["| " + " | ".join(row) + " |" for row in (heads, *rows)]
-    return [lines[0], "|" + "---|" * len(heads), *lines[1:]]
-
-
-def printed(tables: Iterable[Titled], lines: Iterable[str], left: Container[str] = ()) -> Iterator[Table | Text]:
-    """Yield tables, and lines below them, for rich. left: heads of columns that are left-aligned, besides the first."""
-    for title, heads, rows in tables:
-        out = Table(title=title, box=SIMPLE, padding=(0, 1, 0, 0), pad_edge=False)
-        for k, head in enumerate(heads):
-            out.add_column(head, justify="left" if k == 0 or head in left else "right")
-        for row in rows:
-            out.add_row(*map(Text, row))
+    def shown(self) -> Iterator[RichTable | Text]:
+        """Yield the table and its notes, for rich."""
+        out = RichTable(title=Text(self.title), title_justify="left", box=None, padding=(0, 1, 0, 0), pad_edge=False)
+        for k, head in enumerate(self.heads):
+            left = k in (0, len(self.heads) - 1) or head in self.left
+            out.add_column(Text(head), justify="left" if left else "right", overflow="fold")
+        for k, row in enumerate(self.rows):
+            out.add_row(*map(Text, row), style=self.styles[k] if self.styles else "")
         yield out
-    yield from map(Text, lines)
+        yield from map(Text, self.notes)
+
+    def markdown(self) -> str:
+        """Return title, table and notes as Markdown."""
+        lines = ["| " + " | ".join(row) + " |" for row in (self.heads, *self.rows)]
+        lines.insert(1, "|" + "---|" * len(self.heads))
+        return "\n".join([f"**{self.title}**", "", *lines, "", *(f"- {note}" for note in self.notes)]).strip() + "\n"
 
 
-def markdown(tables: Iterable[Titled], lines: Iterable[str]) -> str:
-    """Return tables, and lines below them, as Markdown."""
-    out: list[str] = []
-    for title, heads, rows in tables:
-        out += [f"**{title}**", "", *table(heads, rows), ""]
-    return "\n".join([*out, *(f"- {line}" for line in lines)]) + "\n"
+class Report(JupyterMixin):
+    """A report that is tables. print() and rich show them, .markdown() returns them. width: characters of a line of print()."""
 
+    width = 80
 
-def mean_and_error(values: np.ndarray) -> tuple[float, float]:
-    """Return the mean of independent values and its standard error."""
-    return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
+    def tables(self) -> Iterator[Table]:
+        """Yield the tables."""
+        raise NotImplementedError
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for table in self.tables():
+            yield from table.shown()
+
+    def __str__(self) -> str:
+        console = Console(width=self.width)
+        with console.capture() as out:
+            console.print(self)
+        return out.get()
+
+    def markdown(self) -> str:
+        """Return the tables as Markdown."""
+        return "\n".join(table.markdown() for table in self.tables())
 
 
 def plain(row: dict) -> dict:

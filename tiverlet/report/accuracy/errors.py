@@ -1,16 +1,17 @@
-"""The report of a sweep: fitted orders, comparisons at equal run time, and verdicts, as tables, JSON, plots and a recording."""
+"""The report of a sweep: fitted orders, comparisons at equal run time, and verdicts, as tables, JSON and plots."""
 
 import json
+import os
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.console import Console, ConsoleOptions, RenderResult
-from rich.jupyter import JupyterMixin
-from rich.table import Table
 
-from .. import output
+from ...tools import golden_colors
+from ..output import Report, Table, canvas, plain
+from .baselines import BASELINES
 from .cases import CASES, Case
 
 if TYPE_CHECKING:
@@ -55,15 +56,12 @@ class Summary:
     failures: tuple[str, ...]
 
 
-class ErrorReport(JupyterMixin):
-    """Points of error against run time. print() shows a table; see .markdown(), .json(), .plot(path), .record(path).
+class ErrorReport(Report):
+    """Points of error against run time. print() shows a table; see .markdown(), .json(), .plot(folder).
 
-    every_column: whether print() shows all columns (200 characters), not only those that fit into 80. points: all measured
-    points. missing: curves that could not be measured. omissions: what was left out on purpose. failures: cases that fail, with
-    reasons; empty for a good report.
+    points: all measured points. missing: curves that could not be measured. omissions: what was left out on purpose. failures:
+    cases that fail, with reasons; empty for a good report.
     """
-
-    every_column = False
 
     def __init__(self, cases: list[str], points: "list[Point]", missing: list[Missing], omissions: list[str], machine: str):
         self.cases, self.points, self.missing, self.machine = cases, points, missing, machine
@@ -147,52 +145,29 @@ class ErrorReport(JupyterMixin):
         out = {s.case: s.failures for s in self.summaries if s.failures}
         return out | {m.task: (f"missing: {m.why}",) for m in self.missing}
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield f"[bold]Error against run time[/] ({self.machine})"
-        yield self._wide() if self.every_column else self._narrow()
-        for case, why in self.failures.items():
-            yield f"[red]{case}: {'; '.join(why)}[/]"
-        if not self.every_column and self.summaries:
-            yield (
-                "[dim]error with n substeps of a frame; its order in the substep; run time per simulated second; the error of "
-                "XPBD at the same run time over ours. All columns: --wide, .markdown()[/]"
-            )
-        for line in self.omissions:
-            yield f"left out: {line}"
-
-    def _narrow(self) -> Table:
-        """Return the table of the main columns, in 80 characters."""
-        table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="bold")
-        for k, head in enumerate(SHORT):
-            table.add_column(head, justify="right" if 0 < k < len(SHORT) - 1 else "left", no_wrap=k > 0, overflow="fold")
+    def tables(self) -> Iterator[Table]:
+        """Yield the table of the main columns, in 80 characters."""
+        rows = []
         for s in self.summaries:
-            verdict, unit = "[red]FAIL[/]" if s.failures else "[green]ok[/]", "rel." if s.unit == "relative" else s.unit
-            error, faster = f"{s.error:.1e} {unit[:4]:4}", times(s.in_time and s.in_time[:1])
-            table.add_row(s.case, str(s.substeps), error, ordered(s)[:4], f"{1e3 * s.seconds:.1f}", faster, verdict)
-        return table
+            error = f"{s.error:.1e} {'rel.' if s.unit == 'relative' else s.unit[:4]:4}"
+            verdict, over = "FAIL" if s.failures else "ok", times(s.in_time and s.in_time[:1])
+            rows.append((s.case, str(s.substeps), error, ordered(s)[:4], f"{1e3 * s.seconds:.1f}", over, verdict))
+        notes = [*(f"{case}: {'; '.join(why)}" for case, why in self.failures.items()), LEGEND]
+        notes += [f"left out: {line}" for line in self.omissions]
+        styles = ["red" * bool(s.failures) for s in self.summaries]
+        yield Table(f"Error against run time ({self.machine})", SHORT, rows, notes, (), styles)
 
-    def _wide(self) -> Table:
+    def wide(self) -> Table:
         """Return the table of all columns."""
-        table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
-        for k, head in enumerate(HEADS):
-            last = head == HEADS[-1]
-            table.add_column(head, justify="left" if k < 2 or last else "right", no_wrap=not last)
-        for s in self.summaries:
-            table.add_row(*cells(s), style="red" if s.failures else "")
-        return table
+        return Table("Error against run time", HEADS, [cells(s) for s in self.summaries])
 
-    def __str__(self) -> str:
-        return output.text(self, 200 if self.every_column else 80)
-
-    def markdown(self, every: bool = False) -> str:
-        """Return the table as Markdown. every: also one table of all points for each case."""
-        lines = output.table(HEADS, map(cells, self.summaries))
-        for case in self.cases if every else ():
-            rows = [entry(p) for points in self.curves(case) for p in points]
-            lines += ["", f"**{case}**: {CASES[case].title}", "", *output.table(COLUMNS, rows)]
-        lines += ["", *(f"- missing: {m.task}: {m.why}" for m in self.missing)]
-        lines += [f"- left out: {line}" for line in self.omissions] if every else []
-        return "\n".join(lines).strip() + "\n"
+    def markdown(self) -> str:
+        """Return the table of all columns, one of all points for each case, and what was left out, as Markdown."""
+        out = [self.wide()]
+        for case in self.cases:
+            out.append(Table(f"{case}: {CASES[case].title}", COLUMNS, [entry(p) for some in self.curves(case) for p in some]))
+        out[-1].notes = [*(f"missing: {m.task}: {m.why}" for m in self.missing), *(f"left out: {o}" for o in self.omissions)]
+        return "\n".join(table.markdown() for table in out)
 
     def json(self) -> str:
         """Return the report as JSON."""
@@ -201,7 +176,7 @@ class ErrorReport(JupyterMixin):
             {
                 "machine": self.machine,
                 "cases": cases,
-                "points": [output.plain(asdict(p)) for p in self.points],
+                "points": [plain(asdict(p)) for p in self.points],
                 "orders": {f"{c}, {m}": o for c in self.cases for m in CASES[c].methods if (o := self.order(c, m))},
                 "failures": {k: list(v) for k, v in self.failures.items()},
                 "missing": [asdict(m) for m in self.missing],
@@ -211,35 +186,41 @@ class ErrorReport(JupyterMixin):
         )  # fmt: skip
 
     def plot(self, folder) -> list[str]:
-        """Plot every case log-log, as PNG in `folder`; return the paths. Needs matplotlib (the extra "plots")."""
-        from .figures import plot
+        """Plot each case log-log, as PNG in `folder`; return the paths. Needs matplotlib (the extra "plots").
 
-        return plot(self, folder)
+        Diverged points are crosses at the top edge, baselines are dashed.
+        """
+        Figure = canvas(folder)
+        out = []
+        for name in self.cases:
+            figure = Figure(figsize=(7, 5), layout="constrained")
+            axes, curves = figure.subplots(), self.curves(name)
+            top = max([p.error for c in curves for p in c if not p.diverged and p.error > 0] or [CASES[name].size])
+            for curve, color in zip(curves, golden_colors(max(1, len(curves))) / 255, strict=False):
+                good, lost = [p for p in curve if not p.diverged and p.error > 0], [p for p in curve if p.diverged]
+                label, line = f"{curve[0].method}, {curve[0].precision}", "--" if curve[0].method in BASELINES else "-"
+                axes.loglog([p.seconds for p in good], [p.error for p in good], line, marker="o", ms=4, color=color, label=label)
+                axes.loglog([p.seconds for p in lost], [2 * top] * len(lost), "x", color=color)
+            axes.set(xlabel="run time [s per simulated s]", ylabel=f"error [{CASES[name].unit}]", title=CASES[name].title)
+            axes.grid(True, which="both", alpha=0.2)
+            axes.legend(fontsize=8)
+            out.append(os.path.join(folder, name.replace(":", "_").replace("/", "_") + ".png"))
+            figure.savefig(out[-1], dpi=110)
+        return out
 
-    def record(self, path) -> None:
-        """Write the log-log curves of all cases as a recording for the rerun viewer."""
-        from .figures import record
 
-        record(self, path)
-
-
+LEGEND = (
+    "error with n substeps of a frame; its order in the substep; run time per simulated second; the error of XPBD at the same "
+    "run time over ours. All columns, and all points: --markdown FILE"
+)
 SHORT = ("case", "n", "error", "order", "ms/s", "XPBD", "")  # on a screen
 HEADS = (
     "case", "solver", "substeps", "error", "order", "ms per s", "XPBD / ours", "at equal work", "article / ours", "f32 error",
     "energy drift", "momentum drift", "verdict",
 )  # fmt: skip
 COLUMNS = (
-    "solver",
-    "precision",
-    "substeps",
-    "error",
-    "s per s",
-    "visits per s",
-    "residual",
-    "energy drift",
-    "compile [s]",
-    "flags",
-)
+    "solver", "precision", "substeps", "error", "s per s", "visits per s", "residual", "energy drift", "compile [s]", "flags",
+)  # fmt: skip
 
 
 def fitted(case: Case, points: "list[Point]") -> float | None:

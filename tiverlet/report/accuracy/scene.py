@@ -1,15 +1,12 @@
 """Error against run time of the user's own scene: its reference, the cheapest settings, and the share of f32 in the error."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from rich.console import Console, ConsoleOptions, RenderResult
-from rich.jupyter import JupyterMixin
 from rich.progress import Progress
-from rich.table import Table
 
 from ... import checks
 from ...constraints import ShapeMatch
@@ -17,7 +14,7 @@ from ...constraints.core.scalar import Scalar
 from ...features.feature import Batch
 from ...solvers import Direct, Jacobi
 from ...world import World
-from .. import output
+from ..output import Report, Table, plain
 from .cases.case import rms
 
 EFFORTS = (2, 5, 10, 20, 40, 80, 160)
@@ -61,13 +58,15 @@ class Setting:
         return ", ".join(words)
 
 
-class SceneReport(JupyterMixin):
+class SceneReport(Report):
     """Settings of a scene, with error and cost. print() shows them; see .recommended, .paste, .json(), .markdown().
 
     settings: all that were tried. reference: the settings of the reference. reference_error: its own error [m], estimated from
     its convergence; infinite if it does not converge. tolerance: the requested error [m]. order: the order of convergence.
     motion: root mean square displacement of the reference [m].
     """
+
+    width = 150
 
     def __init__(
         self, settings: list[Setting], reference: str, reference_error: float, order: float, tolerance: float, motion: float
@@ -101,15 +100,12 @@ class SceneReport(JupyterMixin):
         reach = min((s.error for s in self.settings), default=np.inf) + self.reference_error
         return f"# No setting tried is within {self.tolerance:.2g} m; the best reaches {reach:.2g} m. Try more substeps."
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        table = Table(title=f"Error against run time; reference: {self.reference}, itself within {self.reference_error:.1e} m")
-        for head in HEADS:
-            table.add_column(head, justify="left" if head in (HEADS[0], HEADS[-1]) else "right")
-        for s in self.settings:
-            table.add_row(*self.cells(s), style="bold" if s is self.recommended else "" if s.best else "dim")
-        yield table
-        yield f"Observed order: {self.order:.2f}. Tolerance: {self.tolerance:.2g} m. In bold the cheapest setting within it."
-        yield self.paste
+    def tables(self) -> Iterator[Table]:
+        """Yield the table of all settings."""
+        styles = ["bold" if s is self.recommended else "" if s.best else "dim" for s in self.settings]
+        order = f"Observed order: {self.order:.2f}. Tolerance: {self.tolerance:.2g} m. In bold the cheapest setting within it."
+        title = f"Error against run time; reference: {self.reference}, itself within {self.reference_error:.1e} m"
+        yield Table(title, HEADS, [self.cells(s) for s in self.settings], [order, self.paste], (), styles)
 
     def cells(self, s: Setting) -> tuple[str, ...]:
         """Return the table row of a setting; an error near that of the reference is shown as a bound."""
@@ -122,19 +118,11 @@ class SceneReport(JupyterMixin):
             f"{s.energy_change:+.1e}", "*" if s.best else "", " ".join(s.flags),
         )  # fmt: skip
 
-    def __str__(self) -> str:
-        return output.text(self, 150)
-
-    def markdown(self) -> str:
-        """Return the table as Markdown."""
-        lines = output.table(HEADS, map(self.cells, self.settings))
-        return "\n".join([*lines, "", "```python", self.paste, "```"]) + "\n"
-
     def json(self) -> str:
         """Return the report as JSON."""
         names = ("reference", "reference_error", "order", "tolerance", "motion", "converges", "paste")
-        about = output.plain({k: getattr(self, k) for k in names})
-        return json.dumps({**about, "settings": [output.plain(asdict(s)) for s in self.settings]}, indent=1, allow_nan=False)
+        about = plain({k: getattr(self, k) for k in names})
+        return json.dumps({**about, "settings": [plain(asdict(s)) for s in self.settings]}, indent=1, allow_nan=False)
 
 
 HEADS = ("solver", "substeps", "precision", "error [m]", "f32's share", "ms per s", "residual", "energy [J]", "Pareto", "flags")
@@ -181,23 +169,10 @@ def scene_report(
     settings = []
     for solver, precision, r, wrong, rounding, share in made:
         beaten = any(o[2].seconds <= r.seconds and o[3] < wrong for o in made if o[2] is not r)
-        settings.append(
-            Setting(
-                solver,
-                r.substeps,
-                world.iterations,
-                precision,
-                wrong,
-                rounding,
-                share,
-                r.seconds / seconds,
-                not beaten,
-                r.residual,
-                r.energy,
-                r.flags,
-                world.order,
-            )  # fmt: skip
-        )
+        settings.append(Setting(
+            solver, r.substeps, world.iterations, precision, wrong, rounding, share, r.seconds / seconds, not beaten, r.residual,
+            r.energy, r.flags, world.order,
+        ))  # fmt: skip
     settings.sort(key=lambda s: s.seconds)
     name = f"{best}, {finer[-1]} substeps, f64"
     return SceneReport(settings, name, error, order, 1e-3 * motion if tolerance is None else tolerance, motion)

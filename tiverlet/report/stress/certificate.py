@@ -2,24 +2,20 @@
 
 import json
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console, ConsoleOptions, RenderResult
-from rich.jupyter import JupyterMixin
-from rich.table import Table
-
-from .. import output
 from ..jobs import done
-from ..output import error_line
+from ..output import Report, Table, error_line
 from .rows import ROWS, NotAvailable
 
 if TYPE_CHECKING:
     from ...world import World
 
 PASSED, FAILED, ABSENT = "passed", "FAILED", "not available"
+STYLES = {FAILED: "red", ABSENT: "yellow"}
 
 
 @dataclass(frozen=True)
@@ -35,8 +31,10 @@ class Result:
     seconds: float
 
 
-class Certificate(JupyterMixin):
+class Certificate(Report):
     """The results of rows. print() shows a table; see .passed, .markdown(), .json()."""
+
+    width = 160
 
     def __init__(self, results: Sequence[Result]):
         self.results = sorted(results, key=lambda r: r.number)
@@ -52,33 +50,15 @@ class Certificate(JupyterMixin):
         count = {v: sum(r.verdict == v for r in self.results) for v in (PASSED, FAILED, ABSENT)}
         return f"{count[PASSED]} of {len(self.results)} passed, {count[FAILED]} failed, {count[ABSENT]} not available."
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        table = Table(title="Stiff and extreme cases")
-        for head in ("#", "case", "criterion", "figure", "verdict"):
-            table.add_column(head, justify="right" if head == "#" else "left")
-        for r in self.results:
-            style = {FAILED: "red", ABSENT: "yellow"}.get(r.verdict, "")
-            table.add_row(str(r.number), r.what, r.criterion, r.figure, verdict(r), style=style)
-        yield table
-        yield self.summary
-
-    def __str__(self) -> str:
-        return output.text(self, 160)
-
-    def markdown(self) -> str:
-        """Return the table as Markdown."""
-        rows = [(str(r.number), r.what, r.criterion, r.figure, verdict(r)) for r in self.results]
-        lines = output.table(("#", "case", "criterion", "figure", "verdict"), rows)
-        return "\n".join([*lines, "", self.summary]) + "\n"
+    def tables(self) -> Iterator[Table]:
+        """Yield the table of all rows."""
+        rows = [(str(r.number), r.what, r.criterion, r.figure, "; ".join([r.verdict, *r.failing])) for r in self.results]
+        heads, styles = ("#", "case", "criterion", "figure", "verdict"), [STYLES.get(r.verdict, "") for r in self.results]
+        yield Table("Stiff and extreme cases", heads, rows, [self.summary], heads, styles)
 
     def json(self) -> str:
         """Return the certificate as JSON."""
         return json.dumps({"passed": self.passed, "rows": [asdict(r) for r in self.results]}, indent=1)
-
-
-def verdict(r: Result) -> str:
-    """Return a verdict, and the parts of the criterion that do not hold."""
-    return "; ".join([r.verdict, *r.failing])
 
 
 def certify(number: int) -> Result:

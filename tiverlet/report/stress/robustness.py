@@ -2,14 +2,11 @@
 
 import json
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console, ConsoleOptions, RenderResult
-from rich.jupyter import JupyterMixin
-from rich.table import Table
 
 from ... import checks
 from ...colliders import Box, HalfSpace
@@ -20,8 +17,7 @@ from ...forces import Force, Gravity
 from ...measure import kinetic_energy
 from ...particles import Particles
 from ...world import World
-from .. import output
-from ..output import error_line
+from ..output import Report, Table, error_line
 
 if TYPE_CHECKING:
     from ...step.step_report import StepReport
@@ -42,8 +38,10 @@ class Outcome:
     particle: int | None = None
 
 
-class Endurance(JupyterMixin):
+class Endurance(Report):
     """The perturbations that a scene stands and those that break it. print() shows a table; see .breaks, .json()."""
+
+    width = 140
 
     def __init__(self, outcomes: list[Outcome]):
         self.outcomes = outcomes
@@ -58,16 +56,13 @@ class Endurance(JupyterMixin):
         """Whether no perturbation breaks the scene."""
         return not self.breaks
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        table = Table(title="One parameter at a time")
-        for head in ("parameter", "verdict", "how"):
-            table.add_column(head)
-        for o in self.outcomes:
-            table.add_row(o.parameter, o.verdict, o.how, style="red" if o.verdict == BREAKS else "")
-        yield table
-
-    def __str__(self) -> str:
-        return output.text(self, 140)
+    def tables(self) -> Iterator[Table]:
+        """Yield the table of all perturbations."""
+        rows, styles = (
+            [(o.parameter, o.verdict, o.how) for o in self.outcomes],
+            ["red" * (o.verdict == BREAKS) for o in self.outcomes],
+        )
+        yield Table("One parameter at a time", ("parameter", "verdict", "how"), rows, (), ("verdict",), styles)
 
     def json(self) -> str:
         """Return the outcomes as JSON."""

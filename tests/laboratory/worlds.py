@@ -1,7 +1,7 @@
-"""Speed of many worlds in one launch, beside one world, one large world, MuJoCo and Newton.
+"""Many worlds in one launch, beside one world, one large world, MuJoCo and Newton.
 
-`python -m tiverlet report speed worlds`. Every part has its own process, in which the compared runs alternate, so that other load
-on the machine affects all of them alike. Times of a part are medians; ratios are medians of the ratios of turns.
+Every table has its own process, in which the compared runs alternate, so that other load on the machine affects them alike. Times
+are medians; ratios are medians of the ratios of turns.
 """
 
 import importlib.metadata
@@ -9,7 +9,7 @@ import json
 import os
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -18,14 +18,16 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from rich.console import Console, ConsoleOptions, RenderResult
-from rich.jupyter import JupyterMixin
 
-from .. import output
+import tiverlet as tv
+from tiverlet.report.output import Table, error_line
 
-DT = 1 / 60  # [s] of a frame
-TITLE = "many worlds in one launch, beside MuJoCo, Newton and one large world"
-START = "import json, sys; from tiverlet.report.speed.worlds import main; main(json.loads(sys.argv[1]))"
+from ..launches import launches
+from .peers import Newton
+from .processes import started
+from .scenes import DT, SCENES, scattered
+from .speed import powers
+
 METHODS = (
     (2, 20, "f32"), (2, 20, "f64"), (4, 1, "f64"), (4, 2, "f64"), (4, 4, "f64"), (4, 20, "f64"),
     (6, 1, "f64"), (6, 2, "f64"), (8, 1, "f64"),
@@ -36,18 +38,11 @@ FULL: dict[str, Any] = {
     "pendulum": (1, 10, 100, 1000, 10_000), "chain": (1, 10, 100, 1000), "pile": (1, 10, 100, 1000), "count": 1000,
     "seconds": 0.15, "turns": 5, "chains": 200, "discs": 100, "frames": 60, "methods": METHODS,
 }  # fmt: skip
+# Each further order needs its own kernels.
 QUICK = FULL | {
-    "pendulum": (1, 3),
-    "chain": (3,),
-    "pile": (3,),
-    "count": 4,
-    "seconds": 0.01,
-    "turns": 2,
-    "chains": 2,
-    "discs": 10,
-    "frames": 4,
-    "methods": (METHODS[0], METHODS[-1]),  # each further order needs its own kernels
-}
+    "pendulum": (1, 3), "chain": (3,), "pile": (3,), "count": 4, "seconds": 0.01, "turns": 2, "chains": 2, "discs": 10,
+    "frames": 4, "methods": (METHODS[0], METHODS[-1]),
+}  # fmt: skip
 # Seconds over which errors of double pendulums are measured, and samples a second.
 LATE, LOOKS = 3.0, 15
 RATES = (30, 45, 60, 90, 120, 240, 480, 960, 1920, 3840)  # steps a second of MuJoCo; multiples of LOOKS
@@ -63,77 +58,27 @@ SWING = 0.5  # [s] after which errors of chains are compared
 SETTINGS = ((4, 10), (10, 10), (20, 20))  # of Newton: steps of a frame, iterations of each
 
 
-@dataclass(frozen=True)
-class WorldsSpeed(JupyterMixin):
-    """The report: tables by title, each with heads and rows of text. notes: what was left out, and why."""
-
-    machine: str
-    tables: dict[str, tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]]
-    notes: tuple[str, ...]
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield from output.printed(self._titled, self._lines)
-
-    def __str__(self) -> str:
-        return output.text(self, 150)
-
-    @property
-    def missing(self) -> list[str]:
-        """The notes on measurements that failed."""
-        return [note for note in self.notes if note.startswith("Missing")]
-
-    def markdown(self) -> str:
-        """Return tables and notes as Markdown."""
-        return output.markdown(self._titled, self._lines)
-
-    @property
-    def _titled(self) -> list[output.Titled]:
-        return [(title, *table) for title, table in self.tables.items()]
-
-    @property
-    def _lines(self) -> list[str]:
-        return [f"Machine: {self.machine}.", *self.notes]
-
-    def json(self) -> str:
-        """Return the report as JSON."""
-        return json.dumps(asdict(self), indent=1)
-
-
-def worlds(threads: tuple[int, ...] = (), quick: bool = False, peers: bool = True) -> WorldsSpeed:
-    """Measure the speed of many worlds.
-
-    threads: numbers of CPU threads; 1 and all cores by default. quick: tiny sizes. peers: also run MuJoCo and Newton, if they are
-    installed.
-    """
-    from .measure import powers
-    from .processes import started
-
-    cores = threads or tuple(dict.fromkeys((1, powers(os.cpu_count() or 1)[-1])))
-    tables: dict[str, Any] = {}
-    notes: list[str] = []
+def main(args) -> Iterator[Table]:
+    """Yield the tables, of 1 and of all threads by default."""
+    cores = args.threads or tuple(dict.fromkeys((1, powers(os.cpu_count() or 1)[-1])))
     with tempfile.TemporaryDirectory() as cache:
-        for name, part in PARTS.items():
-            if part.peer and not (peers and find_spec(part.peer)):
-                notes.append(f"Left out: {part.peer}, since it is not {'installed' if peers else 'wanted'}.")
+        for name in args.parts or PARTS:
+            part, rows, notes = PARTS[name], [], list(PARTS[name].notes)
+            if part.peer and not find_spec(part.peer):
+                notes.append(f"Left out: {part.peer}, since it is not installed.")
                 if not part.alone:
                     continue
             for count in cores if part.threads else cores[:1]:
-                job = {"part": name, "threads": count, "quick": quick, "peers": peers}
                 try:
-                    with started(START, job, cache) as talker:
-                        rows = talker.ask()
+                    with started("worlds", {"part": name, "threads": count, "quick": args.quick}, cache) as talker:
+                        rows += [(str(count), *row) for row in talker.ask()]
                 except (RuntimeError, OSError) as error:
-                    notes.append(f"Missing: {name} on {count} threads: {output.error_line(error)}")
-                    continue
-                heads, before = tables.get(part.title, (("threads", *part.heads), ()))
-                tables[part.title] = heads, (*before, *((str(count), *row) for row in rows))
-    return WorldsSpeed(output.machine(), tables, (*notes, *LEGEND))
+                    notes.append(f"Missing: {name} on {count} threads: {error_line(error)}")
+            yield Table(part.title, ("threads", *part.heads), rows, notes)
 
 
-def main(job: dict[str, Any]) -> None:
+def process(job: dict[str, Any], imported: float) -> None:
     """Run the process of a part: print the rows of its table as JSON. What libraries print goes to stderr."""
-    import tiverlet as tv
-
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     tv.init(threads=job["threads"])
@@ -160,8 +105,6 @@ def ratio(these: list[float], those: list[float]) -> float:
 
 def hung(links: int, length: float):
     """Build a chain that is released horizontally, held at one end: particles and features."""
-    import tiverlet as tv
-
     x = np.stack([length * np.arange(links + 1), np.zeros(links + 1)], axis=1)
     i = np.arange(links)
     return tv.Particles(x, pinned=[0]), [tv.Gravity(9.81), tv.Distance(np.stack([i, i + 1], axis=1))]
@@ -169,11 +112,6 @@ def hung(links: int, length: float):
 
 def ladder(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
     """Yield the rows of numbers of worlds and particles, each beside the same world alone."""
-    import tiverlet as tv
-
-    from ...device.patches.tracing import launches
-    from .scenes import SCENES
-
     scenes = {
         "pendulum": (lambda: hung(2, 1.0), 20), "chain": (lambda: hung(CHAIN, 0.05), 20),
         "pile": (lambda: SCENES["pile"].build(sizes["discs"]), 8),
@@ -217,8 +155,6 @@ def _fitting(world: Any, seconds: float) -> int:
 
 def pendulums(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
     """Yield the rows of double pendulums by each order, beside the time that MuJoCo takes for the same error."""
-    import tiverlet as tv
-
     count, frames = sizes["count"], 60
     times = np.arange(1, round(LATE * LOOKS) + 1) / LOOKS
     exact = double_pendulum(times)
@@ -229,7 +165,7 @@ def pendulums(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
         track = many.rollout(LATE, DT, every=frames // LOOKS).position[0, :, 1:]
         errors[order, substeps, precision] = float(np.abs(track - exact).max())
         acts[order, substeps, precision] = partial(many.run, frames * DT, DT)
-    theirs = MuJoCo(job["threads"], count) if job["peers"] and find_spec("mujoco") else None
+    theirs = MuJoCo(job["threads"], count) if find_spec("mujoco") else None
     if theirs:
         known = [(rate, float(np.abs(theirs.track(rate, times) - exact).max())) for rate in RATES]
         theirs.run()  # an untimed run, which allocates memory
@@ -248,15 +184,8 @@ def pendulums(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
     if theirs:
         step = median(spent["mujoco"]) / (count * theirs.steps)
         for rate, error in known:
-            yield (
-                f"MuJoCo {theirs.version}",
-                f"{error:.1e}",
-                1 / (step * rate * DT),
-                1e6 * job["threads"] * step * rate * DT,
-                f"{rate}",
-                "",
-                "",
-            )
+            t = step * rate * DT
+            yield (f"MuJoCo {theirs.version}", f"{error:.1e}", 1 / t, 1e6 * job["threads"] * t, f"{rate}", "", "")
 
 
 def rate_for(error: float, known: list[tuple[int, float]]) -> float:
@@ -340,10 +269,6 @@ def double_pendulum(times: np.ndarray, steps: int = 16, stages: int = 8) -> np.n
 
 def chains(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
     """Yield the rows of chains of 20 links, beside Newton's XPBD with all chains in one model."""
-    import tiverlet as tv
-
-    from .peers import Newton
-
     count, frames = sizes["chains"], round(SWING / DT)
     particles, features = hung(CHAIN, 0.05)
     with tv.World(particles, features, substeps=8, order=8, precision="f64") as fine:
@@ -362,7 +287,7 @@ def chains(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
         features[0].copy(), tv.Distance((features[1].indices[None] + n * some).reshape(-1, 2)),
     ]  # fmt: skip
     for setting in SETTINGS if sizes is FULL else SETTINGS[:1]:
-        engine = Newton(*every, 1, setting)
+        engine = Newton(*every, setting)
         for _ in range(frames):
             engine.frame()
         name = f"Newton {importlib.metadata.version('newton')}, {setting[0]} x {setting[1]}"
@@ -376,10 +301,6 @@ def chains(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
 
 def piles(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
     """Yield the rows of many piles beside one pile of all their discs, falling and packed, with the contacts of both."""
-    import tiverlet as tv
-
-    from .scenes import SCENES
-
     count, discs = sizes["count"], sizes["discs"]
     for name, build in (("falling", SCENES["pile"].build), ("packed", packed)):
         with tv.World(*build(discs), substeps=8) as one, tv.World(*build(discs * count), substeps=8) as large:
@@ -404,10 +325,6 @@ def piles(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
 
 def packed(n: int):
     """Build discs that touch each other in rows and columns, in a box that is hardly wider."""
-    import tiverlet as tv
-
-    from .scenes import scattered
-
     side = int(np.ceil(n**0.5))
     i = np.arange(n)
     x = np.stack([i % side, i // side], axis=1) + 0.5 + 0.001 * np.stack([scattered(2 * i + 1), scattered(2 * i + 2)], axis=1)
@@ -416,10 +333,6 @@ def packed(n: int):
 
 def costs(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
     """Yield the rows of memory, first frame, and a reset of half of the worlds."""
-    import tiverlet as tv
-
-    from .scenes import SCENES
-
     count = sizes["count"]
     for name, (particles, features) in (("pendulum", hung(2, 1.0)), ("pile", SCENES["pile"].build(sizes["discs"]))):
         with tv.World(particles, features, substeps=8) as one:
@@ -470,6 +383,7 @@ class Part:
     title: str
     heads: tuple[str, ...]
     rows: Callable[[dict[str, Any], dict[str, Any]], Iterator[tuple]]
+    notes: tuple[str, ...] = ()
     peer: str = ""
     alone: bool = True
     threads: bool = True
@@ -478,54 +392,34 @@ class Part:
 PARTS = {
     "ladder": Part(
         "Worlds and particles",
-        ("scene", "particles", "worlds", "world-frames/s", "us x threads", "alone [us]", "times alone", "Python"),
-        ladder,
+        ("scene", "particles", "worlds", "world-frames/s", "us x threads", "alone [us]", "times alone", "Python"), ladder,
+        ("us x threads: of a frame of one world on one thread. alone: the same world by itself. Python: the rest of a launch.",),
     ),
     "pendulums": Part(
         f"Double pendulums: 1000, error after {LATE:g} s",
         ("method", "error [m]", "world-frames/s", "us x threads", "MuJoCo's steps/s", "its world-frames/s", "times as fast"),
         pendulums,
-        "mujoco",
+        (
+            "Two links of 1 m, 1 kg each, let go of horizontally; the error is the largest of a coordinate at any of 45 times, "
+            "from Lagrange's equations.",
+            "MuJoCo's steps/s: those with which RK4 has the same error, between the steps tried (at the end). Its bodies have "
+            "1e-12 kg m2, and all that they do not need is off.",
+        ), "mujoco",
     ),
     "chains": Part(
-        f"Chains of {CHAIN} links, error after {SWING:g} s",
-        ("method", "error [m]", "world-frames/s", "us"),
-        chains,
-        "newton",
-        alone=False,
-        threads=False,
+        f"Chains of {CHAIN} links, error after {SWING:g} s", ("method", "error [m]", "world-frames/s", "us"), chains,
+        ("Newton: XPBD, springs of 1e6 N/m, all chains in one model, on the one thread of Warp.",),
+        "newton", alone=False, threads=False,
     ),
     "piles": Part(
         "Piles beside one of all their discs",
-        ("start", "piles x discs", "ms", "one [ms]", "ratio", "contacts", "of one", "ratio per contact"),
-        piles,
+        ("start", "piles x discs", "ms", "one [ms]", "ratio", "contacts", "of one", "ratio per contact"), piles,
     ),
     "costs": Part(
         "Memory, start, reset of half of them",
-        (
-            "scene",
-            "worlds",
-            "bytes of one",
-            "of each / one",
-            "resident of each",
-            "first [s]",
-            "kernels",
-            "again [s]",
-            "kernels",
-            "reset [ms]",
-            "next step [ms]",
-        ),  # fmt: skip
-        costs,
+        ("scene", "worlds", "bytes of one", "of each / one", "resident of each", "first [s]", "kernels", "again [s]", "kernels",
+         "reset [ms]", "next step [ms]"), costs,
+        ("of each / one: bytes of fields. resident: what the process grew by. kernels: that were compiled; first: with them.",),
         threads=False,
     ),
-}
-LEGEND = (
-    "world-frames/s: frames of 1/60 s, of all worlds. us x threads: of one of them on one thread. alone: the same world by "
-    "itself, a frame at a time, and how many times as fast many are. Python: the share of one call of so many frames that is not "
-    "its launch.",
-    "Double pendulums: two links of 1 m, 1 kg each, let go of horizontally; the error is the largest of a coordinate at any of "
-    "45 times, from Lagrange's equations. MuJoCo's steps/s: those with which RK4 has the same error, between the steps tried (at "
-    "the end of the table); its bodies have 1e-12 kg m2, and all that they do not need is switched off.",
-    "Newton: XPBD with springs of 1e6 N/m, all chains in one model, on the one thread that Warp has on a CPU.",
-    "of each / one: bytes of fields. resident: what the process grew by. kernels: that were compiled; first: with them.",
-)
+}  # fmt: skip

@@ -1,72 +1,89 @@
-"""Other engines on the same scenes, if they are installed: each in a process that answers the commands of child.py.
+"""Other engines on the same scenes, at the same measured quality or better.
 
 Warp is measured as Newton, which runs on it. The engines compute what the scene has and no more: no friction, no restitution, no
 damping, no sleeping, no spin.
 """
 
 import importlib.metadata
-import importlib.util
-import json
 import os
-import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+import tempfile
+from collections.abc import Iterator
 from importlib import import_module
-from time import perf_counter
+from importlib.util import find_spec
+from statistics import median
 from typing import Any
 
 import numpy as np
 
-from ...colliders import Box
-from ...constraints import Distance
-from ...measure import overlapping
-from .counting import DT
-from .processes import Talker, paths
-from .scenes import SCENES
+from tiverlet.colliders import Box
+from tiverlet.constraints import Distance
+from tiverlet.measure import overlapping
+from tiverlet.report.output import Table, error_line
 
-SIZES = {
-    "pile": 1000,
-    "settled": 1000,
-    "spheres": 1000,
-    "rope": 41,
-}  # particles at which peers are compared; else the nearest measured size
-MEASURE = {"pile": "overlap", "settled": "overlap", "spheres": "overlap", "rope": "residual"}
+from . import processes, speed
+from .scenes import DT, SCENES
+
+# For each scene, the number of particles and the measure of quality.
+COMPARED = {"pile": (1000, "overlap"), "settled": (1000, "overlap"), "spheres": (1000, "overlap"), "rope": (41, "residual")}
 WORDS = {"overlap": "mean overlap", "residual": "worst strain"}
-START = "import json, sys; from tiverlet.report.speed.peers import main; main(json.loads(sys.argv[1]))"
-
-
-@dataclass(frozen=True)
-class Engine:
-    """Another engine. scenes: those that it can run. settings: (steps of a frame, iterations of each), the cheapest first.
-    threads: the most that it can use."""
-
-    name: str
-    scenes: tuple[str, ...]
-    settings: Sequence[tuple[int, int]]
-    threads: int
-
-    def missing(self) -> str:
-        """Return why the engine cannot be run; empty if it can."""
-        return "" if importlib.util.find_spec(self.name) else "it is not installed"
-
-    def version(self) -> str:
-        """Return the installed version."""
-        return importlib.metadata.version(self.name)
-
-    def process(self, scene: str, n: int, threads: int, setting: tuple[int, int]) -> Talker:
-        """Start a process of the engine on a scene."""
-        job = {"peer": self.name, "scene": scene, "n": n, "threads": threads, "setting": setting}
-        return Talker([sys.executable, "-P", "-c", START, json.dumps(job)], {"PYTHONPATH": paths()})
-
-
+# Steps of a frame and iterations of each, the cheapest first.
 LADDER = (
     (1, 1), (1, 5), (1, 10), (2, 10), (4, 5), (4, 10), (8, 5), (8, 10), (16, 5), (16, 10), (20, 20), (40, 20), (40, 50), (80, 50),
 )  # fmt: skip
 SLOWER = 30.0  # times the time of tiverlet, beyond which no further setting is tried
-# Newton gets spheres, because its discs would leave their plane. Warp runs on one thread of a CPU. pymunk is fastest on one:
-# on two, a pile of 1000 took 0.93 ms instead of 0.68, and one of 10 000 as long as on one.
-ENGINES = (Engine("pymunk", ("pile", "settled", "rope"), LADDER, 1), Engine("newton", ("spheres", "rope"), LADDER, 1))
-PEERS = {p.name: p for p in ENGINES}
+# Newton gets spheres, because its discs would leave their plane. Both run on one thread: Warp has one on a CPU, and pymunk is
+# fastest on one.
+RUN = {"pymunk": ("pile", "settled", "rope"), "newton": ("spheres", "rope")}
+HEADS = ("peer", "scene", "particles", "setting", "ms", "ours [ms]", "ratio", "measure", "its", "ours", "as good")
+LEGEND = (
+    "setting: steps of a frame x iterations, the cheapest that is as good as ours by the one measure named (nothing else is made "
+    "equal) or, if none is, the best of those tried. ratio: its time over ours, on one thread."
+)
+
+
+def main(args) -> Iterator[Table]:
+    """Yield the table of all installed engines."""
+    rows, notes = [], [LEGEND]
+    with tempfile.TemporaryDirectory() as folder:
+        for engine, scenes in RUN.items():
+            if not find_spec(engine):
+                notes.append(f"Left out: {engine}, since it is not installed.")
+                continue
+            for scene in (name for name in scenes if name in (args.parts or scenes)):
+                for n in args.sizes or COMPARED[scene][:1]:
+                    try:
+                        rows.append(compared(engine, scene, n, os.path.join(folder, f"{scene}{n}"), args.quick))
+                    except (RuntimeError, OSError) as error:
+                        notes.append(f"Missing: {engine} on {scene}, {n} particles: {error_line(error)}")
+    yield Table("Peers, at the same measured quality or better", HEADS, rows, notes)
+
+
+def compared(engine: str, scene: str, n: int, cache: str, quick: bool) -> list[str]:
+    """Find an engine's cheapest setting that is as good as tiverlet's, or its best; then time both in alternation."""
+    frames, settles, measure = speed.frames_of(scene, n), SCENES[scene].settles, COMPARED[scene][1]
+    rounds = speed.QUICK if quick else (speed.ROUNDS, speed.SECONDS)
+    job: dict[str, Any] = {"engine": engine, "scene": scene, "n": n, "threads": 1}
+    with processes.started("speed", job, cache) as ours:
+        ours.ask()
+        target = processes.quality(ours, frames, settles)[measure]
+        tried: list[tuple[float, tuple[int, int]]] = []
+        fast = ours.ask("run 12")
+        for setting in LADDER:
+            with processes.started("peers", job | {"setting": setting}) as theirs:
+                theirs.ask()
+                tried.append((processes.quality(theirs, frames, settles)[measure], setting))
+                slow = theirs.ask("run 12") > SLOWER * fast
+            if slow or tried[-1][0] <= target:
+                break
+        found, setting = tried[-1] if tried[-1][0] <= target else min(tried)
+        with processes.started("peers", job | {"setting": setting}) as theirs:
+            count = theirs.ask()["particles"]
+            mine, its = map(median, speed.timed([ours, theirs], scene, n, rounds))
+    return [
+        f"{engine} {importlib.metadata.version(engine)}", scene, f"{count:,}", f"{setting[0]} x {setting[1]}",
+        f"{1e3 * its:.3g}", f"{1e3 * mine:.3g}", f"{its / mine:.3g}", WORDS[measure], f"{found:.2e}", f"{target:.2e}",
+        "yes" if found <= target else "no",
+    ]  # fmt: skip
 
 
 class Pymunk:
@@ -75,12 +92,12 @@ class Pymunk:
     Discs are circles that cannot turn, links are pin joints, the box is four segments.
     """
 
-    def __init__(self, particles, features, threads: int, setting: tuple[int, int]):
-        import pymunk  # pyright: ignore[reportMissingImports]
+    def __init__(self, particles, features, setting: tuple[int, int]):
+        pymunk: Any = import_module("pymunk")
 
         self.steps, iterations = setting
-        self.space = space = pymunk.Space(threaded=threads > 1)
-        space.threads, space.iterations, space.gravity = threads, iterations, (0, -9.81)
+        self.space = space = pymunk.Space()
+        space.iterations, space.gravity = iterations, (0, -9.81)
         space.collision_slop = 0.0  # the default leaves 0.1 m of overlap on purpose
         self.bodies = []
         for x, mass, free in zip(particles.position.tolist(), particles.mass.tolist(), particles.inv_mass > 0, strict=True):
@@ -121,7 +138,7 @@ class Newton:
 
     STIFF = 1e6
 
-    def __init__(self, particles, features, threads: int, setting: tuple[int, int]):
+    def __init__(self, particles, features, setting: tuple[int, int]):
         newton: Any = import_module("newton")
         wp: Any = import_module("warp")
 
@@ -170,38 +187,23 @@ class Newton:
 MODELS: dict[str, Any] = {"pymunk": Pymunk, "newton": Newton}
 
 
-def main(job: dict[str, Any]) -> None:
-    """Run the process of a peer: answer commands. What the engine itself prints goes to stderr."""
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)
-
-    def say(what: Any) -> None:
-        """Write one answer, a line of JSON."""
-        print(json.dumps(what), file=answers, flush=True)
-
+def process(job: dict[str, Any], imported: float) -> None:
+    """Run the process of an engine."""
     particles, features = SCENES[job["scene"]].build(job["n"])
-
-    def made():
-        """Return the scene in the peer's engine."""
-        return MODELS[job["peer"]](particles, features, job["threads"], job["setting"])
-
-    engine = made()
-    say({"particles": len(particles)})
     links = [f for f in features if isinstance(f, Distance)]
-    for line in sys.stdin:
-        word, *number = line.split()
-        if word == "run":
-            clock = perf_counter()
-            for _ in range(int(number[0])):
-                engine.frame()
-            say(perf_counter() - clock)
-        elif word == "restart":
-            engine = made()
-            engine.frame()
-            say(0.0)
-        else:
-            x = engine.position()
-            say({"overlap": overlap(x, particles.radius), "residual": max((strain(x, f, particles) for f in links), default=0.0)})
+    engines: list[Any] = []
+
+    def restart() -> None:
+        """Build the scene again."""
+        engines[:] = [MODELS[job["engine"]](particles, features, job["setting"])]
+
+    def quality() -> dict[str, float]:
+        """Return the mean overlap [diameters] and the worst strain."""
+        x = engines[0].position()
+        return {"overlap": overlap(x, particles.radius), "residual": max((strain(x, f, particles) for f in links), default=0.0)}
+
+    restart()
+    processes.answer(lambda: engines[0].frame(), restart, quality, {"particles": len(particles)})
 
 
 def overlap(x: np.ndarray, radius: np.ndarray) -> float:

@@ -6,13 +6,19 @@ that other load on the machine affects all of them alike.
 
 import json
 import tempfile
+from collections.abc import Iterator
 from importlib.util import find_spec
 from statistics import median
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from rich.table import Table
+import numpy as np
+
+import tiverlet as tv
+from tiverlet.report.output import Table
+
+from .processes import started
+from .scenes import DT, SCENES
 
 VARIANTS = {
     "Taichi": {"TIVERLET_COMPILER": "taichi"},
@@ -24,55 +30,35 @@ SIZES = (1000, 10_000, 100_000)
 TURNS = 3  # of the processes; medians count. Without patches a process compiles for a minute, so it runs once, for starts only
 FALLING, SETTLED = (10, 40), (400, 430)  # frames that are timed
 SMALL = 20_000  # discs up to which settled frames are timed, too
-START = """
-from time import perf_counter
-clock = perf_counter()
-import sys, json
-import tiverlet
-seconds = perf_counter() - clock
-from tiverlet.report.speed.compilers import main
-main(json.loads(sys.argv[1]), seconds)
-"""
 
 
-def compilers(sizes: tuple[int, ...] = SIZES) -> "Table":
-    """Return a table of starts, frames and memory by compiler; Quadrants only if it is installed. sizes: discs of the piles."""
-    from rich.table import Table
-
+def main(args) -> Iterator[Table]:
+    """Yield the table of starts, frames and memory by compiler; Quadrants only if it is installed."""
     ways = [way for way in VARIANTS if way.startswith("Taichi") or find_spec("quadrants")]
     found: dict[str, list[dict[str, float]]] = {way: [] for way in ways}
-    for turn in range(TURNS):
+    for turn in range(1 if args.quick else TURNS):
         for way in ways if turn == 0 else [way for way in ways if "no patches" not in way]:
             with tempfile.TemporaryDirectory() as cache:
-                piles = sizes if turn == 0 and "no patches" not in way else ()
-                cold, warm = (measured(way, cache, some) for some in ((), piles))
+                sizes = args.sizes or (SIZES[:1] if args.quick else SIZES)
+                cold, warm = (measured(way, cache, some) for some in ((), sizes if turn == 0 and "no patches" not in way else ()))
                 starts = {"import": warm["import"], "first step, cold": cold["first"], "first step, warm": warm["first"]}
                 found[way].append(starts | {k: v for k, v in {**cold, **warm}.items() if k not in ("import", "first")})
-    table = Table("", *ways, title="Compilers: a pile of 1 000 discs, 1 thread; s, us, ms and MB")
-    for row in found[ways[0]][0]:
-        cells = [[one[row] for one in found[way] if row in one] for way in ways]
-        table.add_row(row, *(f"{median(cell):.3g}" if cell else "" for cell in cells))
-    return table
+    rows = []
+    for name in found[ways[0]][0]:
+        cells = [[one[name] for one in found[way] if name in one] for way in ways]
+        rows.append((name, *(f"{median(cell):.3g}" if cell else "" for cell in cells)))
+    yield Table("Compilers: a pile of 1000 discs, 1 thread; s, us, ms and MB", ("", *ways), rows)
 
 
 def measured(way: str, cache: str, sizes: tuple[int, ...]) -> dict[str, float]:
     """Return the figures that a process of one way measures."""
-    from .processes import started
-
-    with started(START, sizes, cache, **({"TIVERLET_PATCHES": "1"} | VARIANTS[way])) as talker:
+    with started("compilers", {"sizes": sizes}, cache, **({"TIVERLET_PATCHES": "1"} | VARIANTS[way])) as talker:
         return talker.ask()
 
 
-def main(sizes: list[int], imported: float) -> None:
+def process(job: dict[str, Any], imported: float) -> None:
     """Run the process: measure import, first step, frames and memory, and print them as JSON."""
     import resource
-
-    import numpy as np
-
-    import tiverlet as tv
-
-    from .counting import DT
-    from .scenes import SCENES
 
     out: dict[str, Any] = {"import": imported}
     tv.init(threads=1)
@@ -88,7 +74,7 @@ def main(sizes: list[int], imported: float) -> None:
             world.step(DT)
             times.append(perf_counter() - clock)
     out["frame of one particle [us]"] = 1e6 * median(times)
-    for n in sizes:
+    for n in job["sizes"]:
         particles, features = SCENES["pile"].build(n)
         with tv.World(particles, features, substeps=8) as world:
             for name, (begin, end) in (("falling", FALLING), ("settled", SETTLED)):

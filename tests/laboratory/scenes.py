@@ -1,4 +1,4 @@
-"""The scenes that are timed. This module imports nothing that a scene does not need, see stripped.py."""
+"""The scenes that are timed."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,14 +7,15 @@ from typing import Any
 
 import numpy as np
 
+import tiverlet as tv
+
 
 @dataclass(frozen=True)
 class SpeedScene:
     """A scene of any size: build(n) -> (particles, features), of about n particles if a scene cannot have any number.
 
-    sizes, quick: numbers of particles in a full and in a quick report. needs: the files of features that the scene uses; a copy
-    of the package with these alone must run it (None: not tried). settles: untimed frames before the timed ones. in_c:
-    substeps of pile.c, which is the same scene without friction; 0: not run.
+    sizes, quick: numbers of particles in a full and in a quick run. settles: untimed frames before the timed ones. in_c: substeps
+    of pile.c, which is the same scene without friction; 0: not run.
     """
 
     title: str
@@ -22,7 +23,6 @@ class SpeedScene:
     substeps: int
     sizes: tuple[int, ...]
     quick: tuple[int, ...]
-    needs: frozenset[str] | None = None
     settles: int = 0
     in_c: int = 0
 
@@ -40,8 +40,6 @@ def scattered(k: np.ndarray) -> np.ndarray:
 
 def pile(n: int, dim: int = 2):
     """Build discs or spheres that fall from a loose lattice into a wider and higher box, as in pile.c."""
-    import tiverlet as tv
-
     side = ceil(round(n ** (1 / dim), 9))
     i = np.arange(n)
     at = [i % side, i // side] if dim == 2 else [i % side, i // side**2, i // side % side]
@@ -53,16 +51,12 @@ def pile(n: int, dim: int = 2):
 
 def rough(n: int):
     """Build the pile with friction."""
-    import tiverlet as tv
-
     particles, (gravity, box, _) = pile(n)
     return particles, [gravity, tv.Box(box.lower, box.upper, friction=0.5), tv.Contact(friction=0.5)]
 
 
 def cloth(n: int):
     """Build a square cloth, rigid along its threads, soft diagonally, pinned at every 16th particle of every 16th thread."""
-    import tiverlet as tv
-
     side = max(3, round(n**0.5))
     wide = 0.03 * (side - 1)
     sheet = tv.shapes.cloth((0, 0, 0), (wide, 0, 0), (0, 0, wide), (side, side))
@@ -73,8 +67,6 @@ def cloth(n: int):
 
 def ropes(n: int):
     """Build ropes of 1 m and 41 particles that swing from one end: a hundred for n = 4100."""
-    import tiverlet as tv
-
     count, points = max(1, n // LINE), min(n, LINE)
     one = tv.shapes.rope((0, 0), (1, 0), points=points)
     k = np.arange(count)
@@ -86,16 +78,12 @@ def ropes(n: int):
 
 def rope(n: int):
     """Build one rope of 1 m that swings from one end."""
-    import tiverlet as tv
-
     one = tv.shapes.rope((0, 0), (1, 0), points=n)
     return tv.Particles(one.position, mass=0.01, pinned=[0]), [tv.Gravity(9.81), tv.Distance(one.links)]
 
 
 def mixed(n: int):
     """Build discs, ropes of 20 particles and soft balls of 61, which fall on each other in a box, with friction."""
-    import tiverlet as tv
-
     ball = tv.shapes.ball((5.5, 5.5), 4.6, rings=4)
     balls, ropes = max(1, n // 4 // len(ball)), max(1, n // 80)
     discs = max(1, n - balls * len(ball) - 20 * ropes)
@@ -124,10 +112,11 @@ def mixed(n: int):
     return tv.Particles(np.concatenate([x, y, z]), mass=0.02, radius=0.5), features
 
 
+DT = 1 / 60  # [s] of a frame
 LINE = 41  # particles of one of many ropes
 TEN = tuple(10**k for k in range(1, 7))
 SCENES = {
-    "pile": SpeedScene("discs that fall into a box", pile, 8, TEN, (100, 1000), frozenset({"gravity", "box", "contact"}), in_c=8),
+    "pile": SpeedScene("discs that fall into a box", pile, 8, TEN, (100, 1000), in_c=8),
     "settled": SpeedScene("the same discs at rest, after 400 frames", pile, 8, TEN[1:5], (100,), settles=400, in_c=8),
     "rough": SpeedScene(
         "the same with friction, after 1500 frames; C has none, and takes 8", rough, 2, TEN[1:4], (100,), settles=1500, in_c=8
@@ -135,6 +124,6 @@ SCENES = {
     "spheres": SpeedScene("spheres that fall into a box", lambda n: pile(n, 3), 8, TEN, (100, 1000)),
     "cloth": SpeedScene("a cloth that is held here and there", cloth, 20, TEN[1:5], (100, 400)),
     "ropes": SpeedScene("ropes of 40 links", ropes, 20, (10 * LINE, 100 * LINE, 1000 * LINE, 10_000 * LINE), (LINE, 10 * LINE)),
-    "rope": SpeedScene("one rope", rope, 20, (11, LINE, 101, 401), (11, LINE), frozenset({"gravity", "distance"})),
+    "rope": SpeedScene("one rope", rope, 20, (11, LINE, 101, 401), (11, LINE)),
     "mixed": SpeedScene("discs, ropes and soft balls with friction", mixed, 8, TEN[1:5], (100, 400)),
 }

@@ -5,12 +5,12 @@ import os
 import pathlib
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from statistics import mean
-from time import sleep
+from time import perf_counter, sleep
 from typing import Any
 
-ROOT = str(pathlib.Path(__file__).parents[3])
+ROOT = pathlib.Path(__file__).parents[2]
 PATIENCE = 600.0  # [s] to wait for a process to end
 REST = 0.02  # [s] before a turn: OpenMP's threads poll for work for some milliseconds, on the cores of the next process
 
@@ -18,7 +18,7 @@ REST = 0.02  # [s] before a turn: OpenMP's threads poll for work for some millis
 class Talker:
     """A process that answers lines with lines of JSON. ask() raises RuntimeError, with the end of its errors, if it died."""
 
-    def __init__(self, command: Sequence[str], environment: Mapping[str, str]):
+    def __init__(self, command: Sequence[str], **environment: str):
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
             env={**os.environ, **environment},
@@ -55,25 +55,23 @@ class Talker:
             pipe.close()  # type: ignore[union-attr]
 
 
-def started(code: str, job: Any, cache: str, root: str = ROOT, **environment: str) -> Talker:
-    """Start a process that runs code, with a job as its argument.
+def started(module: str, job: dict[str, Any], cache: str = "", **environment: str) -> Talker:
+    """Start a process that times the import of job["import"] (default: tiverlet), and runs main(job, seconds) of a module here.
 
-    cache: the folder in which Taichi or Quadrants stores compiled kernels. root: the folder of the package.
+    cache: the folder in which Taichi or Quadrants stores compiled kernels. The module is imported after the timed import.
     """
+    code = f"""
+import importlib, json, sys, time
+clock = time.perf_counter()
+importlib.import_module({job.get("import", "tiverlet")!r})
+seconds = time.perf_counter() - clock
+from tests.laboratory.{module} import process
+process(json.loads(sys.argv[1]), seconds)
+"""
     keeps = {f"{of}_OFFLINE_CACHE{what}": value for of in ("TI", "QD") for what, value in (("", "1"), ("_FILE_PATH", cache))}
-    return Talker([sys.executable, "-P", "-c", code, json.dumps(job)], {"PYTHONPATH": paths(root), **keeps, **environment})
-
-
-def world(job: Mapping[str, Any], cache: str, root: str = ROOT) -> Talker:
-    """Start the process of a scene, with the package in `root`. cache: the folder in which Taichi stores compiled kernels."""
-    from .child import START
-
-    return started(START, job, cache, root)
-
-
-def paths(root: str = ROOT) -> str:
-    """Return the PYTHONPATH of a process: `root` first."""
-    return os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+    path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    words = [sys.executable, "-P", "-c", code, json.dumps(job)]
+    return Talker(words, PYTHONPATH=path, **(keeps if cache else {}), **environment)
 
 
 def side_by_side(
@@ -123,3 +121,32 @@ def quality(talker: Talker, frames: int, settles: int = 0, looks: int = 6) -> di
         seen.append(talker.ask("quality"))
     touching = [s["overlap"] for s in seen if s["overlap"] > 0]
     return {"overlap": mean(touching) if touching else 0.0, "residual": max(s["residual"] for s in seen)}
+
+
+def answer(frame, restart_, quality_, start: dict[str, Any], more=lambda word: None) -> None:
+    """Run the process of a scene: say `start`, then answer the commands of side_by_side() and quality().
+
+    frame(): computes one. restart_(): restores the start. quality_(): returns the figures of quality(). more(word): answers other
+    words. What an engine itself prints goes to stderr.
+    """
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+
+    def say(what: Any) -> None:
+        """Print one answer, a line of JSON."""
+        print(json.dumps(what), file=answers, flush=True)
+
+    say(start)
+    for line in sys.stdin:
+        word, *number = line.split()
+        if word == "run":
+            clock = perf_counter()
+            for _ in range(int(number[0])):
+                frame()
+            say(perf_counter() - clock)
+        elif word == "restart":
+            restart_()
+            frame()
+            say(0.0)
+        else:
+            say(quality_() if word == "quality" else more(word))

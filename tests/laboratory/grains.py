@@ -1,22 +1,17 @@
-"""Spinning grains compared with known laws: rolling, heaps, drums, silos. `python -m tiverlet.report.accuracy.grains`."""
+"""Spinning grains compared with known laws: heaps, drums, silos."""
 
-import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from rich.console import Console
-from rich.table import Table
 
-from ...colliders import Box, HalfSpace, Polygon
-from ...contact import Contact
-from ...forces import Gravity
-from ...particles import Particles
-from ...world import World
-from ..output import mean_and_error
+from tiverlet import Box, Contact, Gravity, HalfSpace, Particles, Polygon, World
+from tiverlet.report.output import Table
+
 from . import grain_peers, rolling
+from .results import mean_and_error
 
 G, SIZE, SUBSTEPS, FRAME = 9.81, 0.06, 16, 1 / 60  # SIZE: d, the mean diameter of grains [m]
 FRICTIONS, ROLLINGS = (0.1, 0.3, 0.5, 1.0), (0.0, 0.05, 0.1, 0.2)
@@ -342,94 +337,70 @@ def beverloo(openings: ArrayLike, rates: ArrayLike) -> tuple[float, float, float
 
 def with_error(values: np.ndarray) -> str:
     """Return the mean of values and its standard error as text."""
-    mean, error = mean_and_error(values)
-    return f"{mean:.1f} +- {error:.1f}"
+    return "{:.1f} +- {:.1f}".format(*mean_and_error(values))
 
 
 def heaps(n: int, half: float, dim: int, seeds: Sequence[int], rollings: Sequence[float], skaters: bool) -> Table:
     """Return the table of angles of repose. skaters: also measure grains that do not spin."""
-    what = "discs" if dim == 2 else "spheres"
-    table = Table("rolling", title=f"Angle of repose (degrees) of {n} {what}, by friction")
-    for friction in FRICTIONS:
-        table.add_column(str(friction), justify="right")
-    pairs = [(friction, resistance) for resistance in rollings for friction in FRICTIONS]
-    rows = repose(n, half, dim, seeds, pairs).reshape(len(rollings), len(FRICTIONS), -1)
-    for resistance, row in zip(rollings, rows, strict=True):
-        table.add_row(str(resistance), *(with_error(cell) for cell in row))
-    if skaters:
-        pairs = [(friction, 0.0) for friction in FRICTIONS]
-        table.add_row("do not spin", *(with_error(cell) for cell in repose(n, half, dim, seeds, pairs, spins=False)))
-    return table
+    rows = []
+    for name, resistance, spins in [(str(r), r, True) for r in rollings] + [("do not spin", 0.0, False)] * skaters:
+        angles = repose(n, half, dim, seeds, [(friction, resistance) for friction in FRICTIONS], spins)
+        rows.append((name, *map(with_error, angles)))
+    title = f"Angle of repose (degrees) of {n} {'discs' if dim == 2 else 'spheres'}, by friction"
+    return Table(title, ("rolling", *map(str, FRICTIONS)), rows)
 
 
 def drums(seconds: float) -> Table:
     """Return the table of dynamic angles of drums."""
-    table = Table("rolling", "angle (degrees)", title="Drum of 420 discs, friction 0.6, 0.8 rad/s")
-    for resistance in ROLLINGS:
-        angle, error = drum(420, 0.6, resistance, seconds=seconds)
-        table.add_row(str(resistance), f"{angle:.1f} +- {error:.1f}")
-    return table
+    found = [(str(resistance), *drum(420, 0.6, resistance, seconds=seconds)) for resistance in ROLLINGS]
+    rows = [(name, f"{angle:.1f} +- {error:.1f}") for name, angle, error in found]
+    return Table("Drum of 420 discs, friction 0.6, 0.8 rad/s", ("rolling", "angle (degrees)"), rows)
 
 
 def silos(counts: Sequence[int]) -> Table:
-    """Return the table of loads on the floor of silos. counts: numbers of grains."""
-    table = Table("H / width", title="Load on the floor over the weight, silo of 10 diameters, friction 0.5 between grains")
-    columns, heights = [], []
+    """Return the table of loads on the floor of silos, at several heights H. counts: numbers of grains."""
+    rows, notes = [], []
     for friction in (0.0, 0.25, 0.5):
-        name = f"wall {friction}"
-        table.add_column(name, justify="right")
         found = np.array([janssen(Silo(n, 10 * SIZE, wall_friction=friction)) for n in counts])
         heights, shares = found[:, 0] / (10 * SIZE), found[:, 2] / found[:, 1]
-        columns.append([f"{share:.3f}" for share in shares])
+        if not rows:
+            rows.append(("H / width", *(f"{height:.2f}" for height in heights)))
+        rows.append((f"wall {friction}", *(f"{share:.3f}" for share in shares)))
         if friction:
             length, off = saturation(heights, shares)
-            fit = f"lambda {length:.2f} w, K = w / (2 mu lambda) = {1 / (2 * friction * length):.2f}, within {off:.2f}"
-            table.caption = (f"{table.caption}\n" if table.caption else "") + f"{name}: {fit}"
-    for height, *cells in zip(heights, *columns, strict=True):
-        table.add_row(f"{height:.2f}", *cells)
-    return table
+            k = 1 / (2 * friction * length)
+            notes.append(f"wall {friction}: lambda {length:.2f} w, K = w / (2 mu lambda) = {k:.2f}, within {off:.2f}")
+    title = "Load on the floor over the weight, silo of 10 diameters, friction 0.5 between grains"
+    return Table(title, ("grains", *map(str, counts)), rows, notes)
 
 
 def flows(n: int, openings: Sequence[float], resistance: float, pythons: Sequence[str]) -> Table:
     """Return the table of rates of flow, with those of LAMMPS if there is no rolling resistance."""
-    heads = "D / d", "W / (rho sqrt(g) d^1.5)", "fill of the first half / d", "of the second", "W then / W first", "W of LAMMPS"
-    table = Table(*heads, title=f"Flow out of a silo of 30 diameters, {n} discs, friction 0.5, rolling {resistance}")
     silo = Silo(n, 30 * SIZE, rolling=resistance, floor_friction=0.5)
-    rows = {"tiverlet": [flow(silo, opening, 8.0) for opening in openings]}
-    peers = ["-" if resistance else flow_in_lammps(silo, opening, 8.0, pythons) for opening in openings]
-    for row, peer in zip(rows["tiverlet"], peers, strict=True):
-        cells = (f"{row['first']:.0f}", f"{row['second']:.0f}", f"{row['ratio']:.2f}")
-        other = peer if isinstance(peer, str) else f"{peer['rate']:.2f}"
-        table.add_row(f"{row['opening']:.1f}", f"{row['rate']:.2f}", *cells, other)
-    rows["LAMMPS"] = [peer for peer in peers if not isinstance(peer, str)]
-    lines = ["W = C rho sqrt(g) (D - k d)^1.5"]
-    for name, found in rows.items():
+    ours = [flow(silo, opening, 8.0) for opening in openings]
+    peers = [None if resistance else flow_in_lammps(silo, opening, 8.0, pythons) for opening in openings]
+    rows, notes = [], ["W = C rho sqrt(g) (D - k d)^1.5"]
+    for row, peer in zip(ours, peers, strict=True):
+        other = f"{peer['rate']:.2f}" if isinstance(peer, dict) else peer or ""
+        fills = (f"{row['first']:.0f}", f"{row['second']:.0f}", f"{row['ratio']:.2f}")
+        rows.append((f"{row['opening']:.1f}", f"{row['rate']:.2f}", *fills, other))
+    for name, found in (("tiverlet", ours), ("LAMMPS", [peer for peer in peers if isinstance(peer, dict)])):
         if len(found) > 2:
             c, k, square = beverloo([row["opening"] for row in found], [row["rate"] for row in found])
-            lines.append(f"{name}: C = {c:.2f}, k = {k:.2f}, R^2 of W^(2/3) = {square:.4f}")
-    table.caption = "\n".join(lines)
-    return table
+            notes.append(f"{name}: C = {c:.2f}, k = {k:.2f}, R^2 of W^(2/3) = {square:.4f}")
+    heads = "D / d", "W / (rho sqrt(g) d^1.5)", "fill of the first half / d", "of the second", "W then / W first", "W of LAMMPS"
+    return Table(f"Flow out of a silo of 30 diameters, {n} discs, friction 0.5, rolling {resistance}", heads, rows, notes)
 
 
-def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(prog="python -m tiverlet.report.accuracy.grains", description=__doc__)
-    parser.add_argument("--peers", metavar="PYTHON", nargs="*", default=[], help="where else to look for Box2D, LAMMPS, ...")
-    parser.add_argument("--quick", action="store_true", help="single spheres only")
-    given = parser.parse_args()
-    console = Console()
-    pythons = (sys.executable, *given.peers)
-    for table in rolling.tables(pythons, log=console.print):
-        console.print(table)
-    if given.quick:
-        return
-    console.print(heaps(470, 20.0, 2, range(5), ROLLINGS, skaters=True))
-    console.print(heaps(1600, 9.0, 3, range(2), (0.0, 0.1), skaters=False))
-    console.print(drums(10.0))
-    console.print(silos((50, 100, 150, 200, 300, 400, 600)))
-    for resistance in (0.0, 0.1):
-        console.print(flows(1500, (5.0, 6.5, 8.0, 10.0, 12.0), resistance, pythons))
-
-
-if __name__ == "__main__":
-    main()
+def main(args) -> Iterator[Table]:
+    """Yield the tables."""
+    q, openings = args.quick, (5.0, 8.0, 12.0) if args.quick else (5.0, 6.5, 8.0, 10.0, 12.0)
+    parts = {
+        "heaps": lambda: [heaps(470, 20.0, 2, range(1 if q else 5), ROLLINGS, not q)],
+        "pyramids": lambda: [heaps(1600, 9.0, 3, range(1 if q else 2), (0.0, 0.1), False)],
+        "drums": lambda: [drums(4.0 if q else 10.0)],
+        "silos": lambda: [silos((50, 150, 400) if q else (50, 100, 150, 200, 300, 400, 600))],
+        "flows": lambda: [flows(1500, openings, r, (sys.executable, *args.pythons)) for r in (0.0, 0.1)],
+    }
+    for name in args.parts or parts:
+        yield from parts[name]()

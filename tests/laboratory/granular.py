@@ -1,31 +1,20 @@
-"""Piles, gases and packings compared with known results. `python -m tiverlet.report.accuracy.granular`."""
+"""Piles, gases and packings compared with known results."""
 
-import argparse
 import tempfile
+from collections.abc import Iterator
 from time import perf_counter
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
-from ... import measure, tools
-from ...colliders import Box
-from ...contact import Contact
-from ...device import runtime
-from ...forces import Drag
-from ...particles import Particles
-from ...world import World
-from ..output import mean_and_error
-from ..speed import c_baseline, scenes
+from tiverlet import Box, Contact, Drag, Particles, World, measure, tools
+from tiverlet.device import runtime
+from tiverlet.report.output import Table
 
-GASES = (
-    (2, 0.1, 400.0),
-    (2, 0.3, 160.0),
-    (2, 0.5, 80.0),
-    (3, 0.1, 160.0),
-    (3, 0.2, 80.0),
-    (3, 0.3, 80.0),
-)  # dim, fraction, time [s]
+from . import c_baseline, scenes
+from .results import mean_and_error
+
+# dim, fraction, time [s]
+GASES = ((2, 0.1, 400.0), (2, 0.3, 160.0), (2, 0.5, 80.0), (3, 0.1, 160.0), (3, 0.2, 80.0), (3, 0.3, 80.0))
 FRAMES = 120  # of a pile
 BEATS = 0.1, 0.05, 0.025  # substeps over the mean time between two collisions
 
@@ -42,7 +31,7 @@ def lattice(n: int, dim: int, size: float) -> np.ndarray:
 
 
 def pile(n: int, dim: int, substeps: int) -> dict[str, float]:
-    """Drop equal discs or spheres from a loose lattice into a box, as in speed/scenes.py.
+    """Drop equal discs or spheres from a loose lattice into a box, as in scenes.py.
 
     Returns the mean overlap in diameters, the kinetic energy per particle in m g r, and the mean time of a frame [s].
     """
@@ -185,56 +174,61 @@ def packing(n: int, dim: int, speed: float) -> dict[str, float]:
         return {"fraction": len(covered) / len(points) * (1 - overlap) ** dim, "overlap": float(overlap)}
 
 
-def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(prog="python -m tiverlet.report.accuracy.granular", description=__doc__)
-    parser.add_argument("--particles", type=int, default=10_000, help="of the piles (default 10000)")
-    parser.add_argument("--quick", action="store_true", help="piles only")
-    given = parser.parse_args()
-    console = Console()
-    heads = (
-        "dim",
-        "substeps",
-        "mean overlap (% d)",
-        "kinetic energy (m g r)",
-        "ms per frame",
-        "C: mean overlap",
-        "C: ms per frame",
-    )
-    table = Table(*heads, title=f"Piles after {FRAMES} frames")
+def piles(n: int) -> Table:
+    """Return the table of piles of n discs or spheres, and of the same discs in C."""
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
         program, how = c_baseline.build(folder)
-        for dim in (2, 3):
-            for substeps in (4, 8, 20):
-                figures = pile(given.particles, dim, substeps)
-                row = [f"{100 * figures['overlap']:.3f}", f"{figures['energy']:.3g}", f"{1e3 * figures['seconds']:.2f}"]
-                if program and dim == 2:
-                    figures = pile_in_c(program, given.particles, substeps)
-                    row += [f"{100 * figures['overlap']:.3f}", f"{1e3 * figures['seconds']:.2f}"]
-                table.add_row(str(dim), str(substeps), *row)
-    console.print(table)
-    console.print(f"C: {how}, {runtime.threads()} threads")
-    if given.quick:
-        return
-    table = Table("scene", "pressure / known", "<v^4>/<v^2>^2 / Maxwell", title="Elastic gases, 4096 particles")
+        for dim, substeps in ((d, s) for d in (2, 3) for s in (4, 8, 20)):
+            ours, c = pile(n, dim, substeps), pile_in_c(program, n, substeps) if program and dim == 2 else None
+            row = [
+                str(dim),
+                str(substeps),
+                f"{100 * ours['overlap']:.3f}",
+                f"{ours['energy']:.3g}",
+                f"{1e3 * ours['seconds']:.2f}",
+            ]
+            rows.append(row + ([f"{100 * c['overlap']:.3f}", f"{1e3 * c['seconds']:.2f}"] if c else ["", ""]))
+    heads = ("dim", "substeps", "mean overlap (% d)", "kinetic energy (m g r)", "ms per frame", "C: overlap", "C: ms per frame")
+    return Table(f"Piles of {n} after {FRAMES} frames", heads, rows, [f"C: {how}, {runtime.threads()} threads"])
+
+
+def gases(n: int, share: float) -> Table:
+    """Return the table of pressures and speeds of elastic gases of n. share: of the full duration."""
+    rows = []
     for dim, fraction, seconds in GASES:
-        figures = gas(4096, dim, fraction, 0.008, seconds)
-        pressure = f"{figures['pressure']:.4f} +- {figures['error']:.4f}"
-        table.add_row(f"{dim}D, {fraction}", pressure, f"{figures['moment']:.4f}")
-    console.print(table)
-    title = "Energy gained by elastic gases, 1000 particles, in 1000 collisions of each (%)"
-    table = Table("scene", *(f"{beat} of the time between two" for beat in BEATS), "order", title=title)
+        f = gas(n, dim, fraction, 0.008, share * seconds)
+        rows.append((f"{dim}D, {fraction}", f"{f['pressure']:.4f} +- {f['error']:.4f}", f"{f['moment']:.4f}"))
+    return Table(f"Elastic gases, {n} particles", ("scene", "pressure / known", "<v^4>/<v^2>^2 / Maxwell"), rows)
+
+
+def energies(n: int, collisions: float) -> Table:
+    """Return the table of energies that gases of n gain in so many collisions of each particle."""
+    rows = []
     for dim, fraction in ((2, 0.3), (2, 0.5), (3, 0.2), (3, 0.3)):
-        gains = energies_gained(1000, dim, fraction, dict.fromkeys(BEATS, 1000.0))
-        order = np.polyfit(np.log(BEATS), np.log(np.maximum(np.abs(gains), 1e-6)), 1)[0]
-        table.add_row(f"{dim}D, {fraction}", *(f"{100 * gain:.3g}" for gain in gains), f"{order:.1f}")
-    console.print(table)
-    table = Table("dim", "packing fraction", "known", "mean overlap (% d)", title="Jammed packings, 2000 particles")
+        gains = energies_gained(n, dim, fraction, dict.fromkeys(BEATS, collisions))
+        rows.append((f"{dim}D, {fraction}", *(f"{100 * gain:.3g}" for gain in gains)))
+    title = f"Energy gained by elastic gases, {n} particles, in {collisions:g} collisions of each (%)"
+    return Table(title, ("scene", *(f"{beat} of the time between two" for beat in BEATS)), rows)
+
+
+def packings(n: int) -> Table:
+    """Return the table of jammed packings of n."""
+    rows = []
     for dim, known, speed in ((2, "0.842", 0.1), (3, "0.64", 0.05)):
-        figures = packing(2000, dim, speed)
-        table.add_row(str(dim), f"{figures['fraction']:.4f}", known, f"{100 * figures['overlap']:.3f}")
-    console.print(table)
+        f = packing(n, dim, speed)
+        rows.append((str(dim), f"{f['fraction']:.4f}", known, f"{100 * f['overlap']:.3f}"))
+    return Table(f"Jammed packings, {n} particles", ("dim", "packing fraction", "known", "mean overlap (% d)"), rows)
 
 
-if __name__ == "__main__":
-    main()
+def main(args) -> Iterator[Table]:
+    """Yield the tables."""
+    n, q = args.sizes[0] if args.sizes else 0, args.quick
+    parts = {
+        "piles": lambda: piles(n or (1000 if q else 10_000)),
+        "gases": lambda: gases(n or (500 if q else 4096), 0.2 if q else 1.0),
+        "energies": lambda: energies(n or (200 if q else 1000), 100.0 if q else 1000.0),
+        "packings": lambda: packings(n or (500 if q else 2000)),
+    }
+    for name in args.parts or parts:
+        yield parts[name]()

@@ -1,18 +1,15 @@
-"""Gases and shear flows in periodic boxes compared with known results. `python -m tiverlet.report.accuracy.periodic`."""
+"""Gases and shear flows in periodic boxes compared with known results."""
 
-import argparse
+from collections.abc import Iterator
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
-from ...contact import Contact
-from ...features.feature import Feature
-from ...neighbours import Periodic
-from ...particles import Particles
-from ...world import World
-from ..output import mean_and_error
+from tiverlet import Contact, Particles, Periodic, World
+from tiverlet.features.feature import Feature
+from tiverlet.report.output import Table
+
 from .granular import compressibility, lattice, thermal, volume
+from .results import mean_and_error
 
 GASES = ((2, 0.1), (2, 0.3), (2, 0.5), (3, 0.1), (3, 0.2), (3, 0.3))  # dim, fraction
 SHELL = 0.05  # [diameters] width of the first shell of the radial distribution
@@ -125,27 +122,18 @@ def couette(n: int, shear: float, seconds: float, contact: Contact, layers: int 
     return {"slope": slope, "error": error, "off": float(np.abs(np.mean(profiles, axis=0) - y).max()), "momentum": drift}
 
 
-def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(prog="python -m tiverlet.report.accuracy.periodic", description=__doc__)
-    parser.add_argument("--particles", type=int, default=400, help="of each gas (default 400)")
-    parser.add_argument("--seconds", type=float, default=40.0, help="of each gas [s] (default 40)")
-    given = parser.parse_args()
-    console = Console()
-    heads = ("gas", "pressure / known", "g(contact) / known", "D / Enskog's", "energy gained", "momentum gained")
-    table = Table(*heads, title=f"Elastic gases of {given.particles} in periodic boxes")
+def main(args) -> Iterator[Table]:
+    """Yield the tables of gases and of sheared discs."""
+    n, seconds = args.sizes[0] if args.sizes else 100 if args.quick else 400, 4.0 if args.quick else 40.0
+    rows = []
     for dim, fraction in GASES:
-        figures = virial(given.particles, dim, fraction, 0.008, given.seconds)
-        told = [f"{figures[f'{name} mean']:.4f} +- {figures[f'{name} error']:.4f}" for name in ("pressure", "g", "D")]
-        table.add_row(f"{dim}D, {fraction}", *told, f"{figures['energy']:.1e}", f"{figures['momentum']:.1e}")
-    console.print(table)
-    table = Table("contacts", "slope / shear", "worst layer / speed of the boundary", "momentum gained", title="Sheared discs")
+        f = virial(n, dim, fraction, 0.008, seconds)
+        told = [f"{f[f'{name} mean']:.4f} +- {f[f'{name} error']:.4f}" for name in ("pressure", "g", "D")]
+        rows.append((f"{dim}D, {fraction}", *told, f"{f['energy']:.1e}", f"{f['momentum']:.1e}"))
+    heads = ("gas", "pressure / known", "g(contact) / known", "D / Enskog's", "energy gained", "momentum gained")
+    yield Table(f"Elastic gases of {n} in periodic boxes", heads, rows)
+    rows = []
     for name, contact in (("restitution 0.7", Contact(0.0, 0.7)), ("friction 0.5", Contact(0.5, 0.5))):
-        figures = couette(given.particles // 4, 0.5, given.seconds, contact)
-        row = (f"{figures['slope']:.4f} +- {figures['error']:.4f}", f"{figures['off']:.4f}", f"{figures['momentum']:.1e}")
-        table.add_row(name, *row)
-    console.print(table)
-
-
-if __name__ == "__main__":
-    main()
+        f = couette(n // 4, 0.5, seconds, contact)
+        rows.append((name, f"{f['slope']:.4f} +- {f['error']:.4f}", f"{f['off']:.4f}", f"{f['momentum']:.1e}"))
+    yield Table("Sheared discs", ("contacts", "slope / shear", "worst layer / speed of the boundary", "momentum gained"), rows)

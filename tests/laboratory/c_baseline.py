@@ -28,4 +28,4 @@ def build(folder) -> tuple[str | None, str]:
 def started(program: str, n: int, substeps: int, threads: int) -> Talker:
     """Start the program on n discs; see pile.c for its commands."""
     # Each thread has its own core, like Taichi's: Linux wakes threads on one core, and takes milliseconds to move them.
-    return Talker([program, str(n), str(substeps)], {"OMP_NUM_THREADS": str(threads), "OMP_PROC_BIND": "true"})
+    return Talker([program, str(n), str(substeps)], OMP_NUM_THREADS=str(threads), OMP_PROC_BIND="true")

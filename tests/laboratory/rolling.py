@@ -6,20 +6,16 @@ Spheres have k = m r^2 / I = 5/2. They move in a plane, so that 2D engines can b
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from rich.table import Table
 
-from ...colliders import HalfSpace
-from ...contact import Contact
-from ...forces import Gravity
-from ...particles import Particles
-from ...world import World
-from ..output import error_line
+from tiverlet import Contact, Gravity, HalfSpace, Particles, World
+from tiverlet.report.output import Table, error_line
+
 from . import grain_peers
 
 G, K, RADIUS, FRAME = 9.81, 2.5, 0.1, 1 / 60
@@ -227,17 +223,6 @@ def run_engine(engine: str, pythons: Sequence[str], jobs: list[dict]) -> list | 
     return why
 
 
-def engine_errors(engine: str, pythons: Sequence[str], given: Sequence[Case], substeps: Sequence[int] = SUBSTEPS) -> list[list]:
-    """Return the errors of another engine: for each case a list by substeps, of errors or reasons why there are none."""
-    answers = run_engine(engine, pythons, [case.job(n) for n in substeps for case in given])
-    if isinstance(answers, str):
-        return [[answers] * len(substeps) for _ in given]
-    return [
-        [found if isinstance(found, str) else case.errors(found[-1]) for found in answers[k :: len(given)]]
-        for k, case in enumerate(given)
-    ]
-
-
 def order(errors: Sequence[float], substeps: Sequence[int] = SUBSTEPS) -> str:
     """Return the order by least squares as text; empty unless all errors are above rounding and fall."""
     if len(errors) < len(substeps) or not (np.diff(errors) < 0).all() or min(errors) < SMALL:
@@ -245,35 +230,28 @@ def order(errors: Sequence[float], substeps: Sequence[int] = SUBSTEPS) -> str:
     return f"{-np.polyfit(np.log(substeps), np.log(errors), 1)[0]:.1f}"
 
 
-def measured(pythons: Sequence[str], log: Callable[[str], None]) -> dict[str, list[list]]:
-    """Return the errors of each engine, or why there are none: for each case a list with an entry for each of SUBSTEPS."""
-    given, rows = cases(), {}
-    for precision in ("f32", "f64"):
-        log(f"tiverlet, {precision}")
-        rows[f"tiverlet, {precision}"] = [own_errors(case, precision) for case in given]
+def main(args) -> Iterator[Table]:
+    """Yield a table for each case: relative errors of velocity and position by substeps, and their orders."""
+    given, pythons = cases(), (sys.executable, *args.pythons)
+    found: dict[str, list] = {f"tiverlet, {p}": [own_errors(case, p) for case in given] for p in ("f32", "f64")}
     for engine in grain_peers.ENGINES:
-        log(engine)
-        rows[engine] = engine_errors(engine, pythons, given)
-    return rows
-
-
-def tables(pythons: Sequence[str] = (sys.executable,), log: Callable[[str], None] = lambda line: None) -> list[Table]:
-    """Return a table for each case. pythons: interpreters that may have other engines. log: called with progress lines."""
-    rows, out = measured(pythons, log), []
-    for k, case in enumerate(cases()):
-        table = Table("substeps", title=case.title, caption="relative errors of velocity, spin included, and of place")
-        for name in [f"{what}, {n}" for what in ("velocity", "place") for n in SUBSTEPS]:
-            table.add_column(name, justify="right")
-        table.add_column("orders")
-        for name, found in rows.items():
-            numbers = [f for f in found[k] if not isinstance(f, str)]
-            if not numbers:
-                table.add_row(name, found[k][0])
-                continue
-            cells, orders = [], []
+        answers = run_engine(engine, pythons, [case.job(n) for case in given for n in SUBSTEPS])
+        if isinstance(answers, str):
+            found[engine] = [[answers]] * len(given)
+            continue
+        parts = [answers[k : k + len(SUBSTEPS)] for k in range(0, len(answers), len(SUBSTEPS))]
+        found[engine] = [
+            [a if isinstance(a, str) else case.errors(a[-1]) for a in part] for case, part in zip(given, parts, strict=True)
+        ]
+    heads = ("substeps", *(f"{what}, {n}" for what in ("velocity", "place") for n in SUBSTEPS), "orders")
+    note = "relative errors of velocity, spin included, and of place"
+    for k, case in enumerate(given):
+        rows = []
+        for name, errors in ((name, some[k]) for name, some in found.items()):
+            numbers = [e for e in errors if not isinstance(e, str)]
+            cells, orders = [] if numbers else [errors[0]], []
             for column in zip(*numbers, strict=True):
                 cells += [f"{error:.0e}" for error in column] + ["-"] * (len(SUBSTEPS) - len(numbers))
                 orders.append(order(column) or "-")
-            table.add_row(name, *cells, ", ".join(orders))
-        out.append(table)
-    return out
+            rows.append([name, *cells, *[""] * (2 * len(SUBSTEPS) - len(cells)), ", ".join(orders)])
+        yield Table(case.title, heads, rows, [note])

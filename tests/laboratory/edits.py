@@ -1,4 +1,4 @@
-"""Time first steps, copies, and edits of a pile, beside the same edits by other engines.
+"""Time first steps, copies, and edits of a pile, beside the same edits by pymunk and Newton.
 
 Every engine has its own process, tiverlet has two: one with an empty cache, one with the cache that the first has left. An edit
 is timed with the frame that follows it, less an ordinary frame, because an engine may defer its work. Edits are measured in CPU
@@ -6,7 +6,10 @@ time of the host's thread, which other programs disturb less than wall time. Fir
 """
 
 import json
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from importlib.util import find_spec
 from itertools import pairwise
 from statistics import median
 from time import perf_counter, thread_time
@@ -14,62 +17,66 @@ from typing import Any
 
 import numpy as np
 
-from .result import Wait
+import tiverlet as tv
+from tiverlet.report.output import Table
 
-TIMES, QUICK = 30, 5  # repetitions of an edit in a full and in a quick report; the median counts
+from .peers import Newton, Pymunk
+from .processes import started
+from .scenes import DT, SCENES
+
+TIMES, QUICK = 30, 5  # repetitions of an edit, and in a quick run; the median counts
+DISCS = 4000  # of the pile; a tenth in a quick run
 FEW, SOME = 1, 100  # particles that are added and removed
 POINTS, ROPES = 10, 5  # particles of the rope that is added and removed; ropes that stay
-START = """
-from time import perf_counter
-clock = perf_counter()
-import sys, json
-job = json.loads(sys.argv[1])
-__import__(job["engine"])
-seconds = perf_counter() - clock
-from tiverlet.report.speed.waits import main
-main(job, seconds)
-"""
-FIRST = ("import", "build, first step")
+START, SECOND, COPY = "build, first step", "second world, first step", "copy, first step"
 # Target times [s].
 AIMS = {
-    "second world, first step": 0.02, "copy, first step": 0.01, f"add {FEW}": 0.002, f"add {SOME}": 0.002,
-    f"remove {FEW}": 0.002, f"remove {SOME}": 0.002, "add as many again": 0.05, "pin another particle": 0.0002,
-    "take another in hand": 0.0002, "switch a wall": 0.002, "add a rope": 0.002, "remove a rope": 0.002,
+    SECOND: 0.02, COPY: 0.01, f"add {FEW}": 0.002, f"add {SOME}": 0.002, f"remove {FEW}": 0.002, f"remove {SOME}": 0.002,
+    "add as many again": 0.05, "pin another particle": 0.0002, "take another in hand": 0.0002, "switch a wall": 0.002,
+    "add a rope": 0.002, "remove a rope": 0.002,
 }  # fmt: skip
 
 
-def waits(n: int, times: int, cache: str, peers: list[str]) -> list[Wait]:
-    """Return the times of edits of a pile of n discs. times: repetitions. cache: an empty folder. peers: installed engines."""
-    from .processes import started
+def main(args) -> Iterator[Table]:
+    """Yield the table of edits."""
+    times = QUICK if args.quick else TIMES
+    engines = [name for name in ("pymunk", "newton") if find_spec(name)]
+    for n in args.sizes or (DISCS // 10 if args.quick else DISCS,):
+        with tempfile.TemporaryDirectory() as cache:
+            found = {}
+            for name in ("cold", "warm", *engines):
+                engine = name if name in engines else "tiverlet"
+                with started("edits", {"import": engine, "n": n, "times": times}, cache) as talker:
+                    found[name] = talker.ask()
+        rows = [
+            (act, *(f"{1e3 * t:.3g}" if (t := some.get(act)) is not None else "" for some in (AIMS, *found.values())))
+            for act in found["cold"]
+        ]
+        yield Table(f"Edits of a pile of {n} discs [ms]", ("edit", "aim", *found), rows)
 
-    def of(engine: str) -> dict[str, float]:
-        """Return the seconds of each edit by one engine, in its own process."""
-        with started(START, {"engine": engine, "n": n, "times": times}, cache) as talker:
-            return talker.ask()
 
-    cold, warm, theirs = of("tiverlet"), of("tiverlet"), {name: of(name) for name in peers}
-    found = {act: {name: seconds[act] for name, seconds in theirs.items() if act in seconds} for act in cold}
-    return [Wait(act, n, AIMS.get(act), cold[act], warm[act], found[act]) for act in cold]
-
-
-def main(job: dict[str, Any], imported: float) -> None:
+def process(job: dict[str, Any], imported: float) -> None:
     """Run the process of an engine: print the seconds of each edit."""
-    out = {FIRST[0]: imported, **{"tiverlet": ours, "pymunk": pymunks, "newton": newtons}[job["engine"]](job["n"], job["times"])}
-    print(json.dumps(out), flush=True)
+    acts = {"tiverlet": ours, "pymunk": pymunks, "newton": newtons}[job["import"]](job["n"], job["times"])
+    print(json.dumps({"import": imported, **acts}), flush=True)
+
+
+def clocked(act: Callable[[], Any]) -> tuple[Any, float]:
+    """Return the result of a function, and the seconds that it took."""
+    clock = perf_counter()
+    out = act()
+    return out, perf_counter() - clock
 
 
 def pile(n: int):
     """Return particles and features of the pile, and a function that makes further discs above it."""
-    from ...particles import Particles
-    from .scenes import SCENES
-
     particles, features = SCENES["pile"].build(n)
     x, radius = particles.position, float(particles.radius[0])
 
-    def more(k: int, turn: int) -> Particles:
+    def more(k: int, turn: int) -> tv.Particles:
         """Return k more particles above the pile, higher with each turn."""
         place = np.stack([np.arange(k) % 30, np.arange(k) // 30], axis=1) * 2.2 * radius
-        return Particles(place + [x[:, 0].min(), x[:, 1].max() + 3 * radius + turn * 10 * radius], radius=radius)
+        return tv.Particles(place + [x[:, 0].min(), x[:, 1].max() + 3 * radius + turn * 10 * radius], radius=radius)
 
     return particles, features, more
 
@@ -110,76 +117,47 @@ def timed(acts: dict[str, tuple[Act, Act | None]], frame: Callable[[], Any], rou
 
 def ours(n: int, rounds: int) -> dict[str, float]:
     """Return the times of edits by tiverlet, with a pin, a hand and a wall with a switch in the scene."""
-    import tiverlet as tv
-
-    from .counting import DT
-
     particles, features, more = pile(n)
 
-    def built(count: int):
-        """Return a World of the pile with `count` particles, and its wall, hand and pin."""
+    def built(count: int) -> tuple[tv.World, tv.HalfSpace, tv.Hand, tv.Pin]:
+        """Return a World of the pile with `count` particles after its first step, and its wall, hand and pin."""
         some = tv.Particles(particles.position[:count], radius=particles.radius[:count])
-        wall, hand = tv.HalfSpace((0, -1), -1e3, active=True), tv.Hand((0.0, 0.0), rate=0.0)
-        pin = tv.Pin([0])
-        own = [f.copy() for f in features]
-        return tv.World(some, [*own, wall, hand, pin], substeps=8), wall, hand, pin
-
-    clock = perf_counter()
-    world, wall, hand, pin = built(n)
-    world.step(DT)
-    first = perf_counter() - clock
-    clock = perf_counter()
-    with built(n - n // 8)[0] as other:
-        other.step(DT)
-        second = perf_counter() - clock
-    for _ in range(5):
+        wall, hand, pin = tv.HalfSpace((0, -1), -1e3, active=True), tv.Hand((0.0, 0.0), rate=0.0), tv.Pin([0])
+        world = tv.World(some, [*(f.copy() for f in features), wall, hand, pin], substeps=8)
         world.step(DT)
-    clock = perf_counter()
-    with world.clone() as other:
-        other.step(DT)
-        copied = perf_counter() - clock
+        return world, wall, hand, pin
 
-    def frame():
-        """Step one frame."""
-        world.step(DT)
+    (world, wall, hand, pin), first = clocked(lambda: built(n))
+    (other, *_), second = clocked(lambda: built(n - n // 8))
+    other.close()
+    world.run(5 * DT, DT)
+    _, copied = clocked(lambda: world.clone().step(DT))
 
-    def hold(k: int):
+    def hold(k: int) -> None:
         """Let the pin hold another particle where it is."""
         pin.indices, pin.target = [n // 2 + k], world.position[n // 2 + k]
 
-    def take(k: int):
-        """Let the hand pull another particle."""
-        hand.particle = k
-
-    def switch(k: int):
-        """Switch the wall on or off."""
-        wall.active = bool(k % 2)
-
-    def added(k: int):
+    def added(k: int) -> Act:
         """Return an edit that adds k particles above the pile."""
         return lambda turn: world.add(more(k, 0))
 
-    def removed(k: int):
+    def removed(k: int) -> Act:
         """Return an edit that removes the last k particles."""
         return lambda turn: world.remove(np.arange(len(world.particles) - k, len(world.particles)))
 
     acts = {
         f"add {FEW}": (added(FEW), removed(FEW)), f"add {SOME}": (added(SOME), removed(SOME)),
         f"remove {FEW}": (removed(FEW), added(FEW)), f"remove {SOME}": (removed(SOME), added(SOME)),
-        "pin another particle": (hold, None), "take another in hand": (take, None), "switch a wall": (switch, None),
-        "add as many again": (added(n), removed(n)),
+        "pin another particle": (hold, None), "take another in hand": (lambda k: setattr(hand, "particle", k), None),
+        "switch a wall": (lambda k: setattr(wall, "active", bool(k % 2)), None), "add as many again": (added(n), removed(n)),
     }  # fmt: skip
-    found = timed(acts, frame, rounds)
+    found = timed(acts, lambda: world.step(DT), rounds)
     world.close()
-    return {FIRST[1]: first, "second world, first step": second, "copy, first step": copied, **found, **roped(n, rounds)}
+    return {START: first, SECOND: second, COPY: copied, **found, **roped(n, rounds)}
 
 
 def roped(n: int, rounds: int) -> dict[str, float]:
     """Return the times of adding and removing a rope by tiverlet, in the pile with ropes."""
-    import tiverlet as tv
-
-    from .counting import DT
-
     particles, features, _ = pile(n)
     x, radius = particles.position, float(particles.radius[0])
     pairs = np.stack([np.arange(POINTS - 1), np.arange(1, POINTS)], axis=1)
@@ -204,73 +182,66 @@ def roped(n: int, rounds: int) -> dict[str, float]:
 
 def pymunks(n: int, rounds: int) -> dict[str, float]:
     """Return the times of edits by pymunk."""
-    import pymunk  # pyright: ignore[reportMissingImports]
-    from pymunk.constraints import PinJoint, PivotJoint  # pyright: ignore[reportMissingImports]
-
-    from .peers import Pymunk
-
+    pymunk: Any = import_module("pymunk")
     particles, features, more = pile(n)
+    radius = float(particles.radius[0])
 
-    def built():
-        """Return the pile in pymunk."""
-        return Pymunk(particles, features, 1, (8, 10))
+    def built() -> Pymunk:
+        """Return the pile in pymunk after its first frame."""
+        engine = Pymunk(particles, features, (8, 10))
+        engine.frame()
+        return engine
 
-    clock = perf_counter()
-    engine = built()
-    engine.frame()
-    first = perf_counter() - clock
-    clock = perf_counter()
-    built().frame()
-    second = perf_counter() - clock
-    clock = perf_counter()
-    engine.space.copy()
-    engine.frame()
-    copied = perf_counter() - clock
+    engine, first = clocked(built)
+    _, second = clocked(built)
+    _, copied = clocked(lambda: (engine.space.copy(), engine.frame()))
     space, come, grip, tied = engine.space, [], [], []
 
-    def added(k: int):
-        """Return an edit that adds k bodies."""
+    def bodies(x: np.ndarray) -> list[tuple[Any, Any]]:
+        """Return bodies at x and their circles."""
+        out = []
+        for place in x.tolist():
+            body = pymunk.Body(1.0, float("inf"))
+            body.position = tuple(place)
+            out.append((body, pymunk.Circle(body, radius)))
+        return out
 
-        def act(turn: int):
-            """Add the bodies above the pile."""
-            for x in more(k, turn).position.tolist():
-                body = pymunk.Body(1.0, float("inf"))
-                body.position = tuple(x)
-                circle = pymunk.Circle(body, float(particles.radius[0]))
-                space.add(body, circle)
-                come.append((body, circle))
+    def added(k: int) -> Act:
+        """Return an edit that adds k bodies above the pile."""
+
+        def act(turn: int) -> None:
+            """Add the bodies one after the other."""
+            for pair in bodies(more(k, turn).position):
+                space.add(*pair)
+                come.append(pair)
 
         return act
 
-    def removed(k: int):
+    def removed(k: int) -> Act:
         """Return an edit that removes the last k bodies."""
 
-        def act(turn: int):
+        def act(turn: int) -> None:
             """Remove the bodies one after the other."""
             for _ in range(k):
                 space.remove(*come.pop())
 
         return act
 
-    def hold(k: int):
+    def hold(k: int) -> None:
         """Hold another body by a joint."""
         body = engine.bodies[n // 2 + k]
         space.remove(*grip)
-        grip[:] = [PivotJoint(space.static_body, body, tuple(body.position))]
+        grip[:] = [pymunk.PivotJoint(space.static_body, body, tuple(body.position))]
         space.add(*grip)
 
-    def tie(turn: int):
+    def tie(turn: int) -> None:
         """Add the bodies and joints of a rope."""
-        rope = []
-        for place in hung(particles.position, float(particles.radius[0]), ROPES).tolist():
-            body = pymunk.Body(1.0, float("inf"))
-            body.position = tuple(place)
-            rope += [body, pymunk.Circle(body, float(particles.radius[0]))]
-        joints = [PinJoint(a, b) for a, b in pairwise(rope[::2])]
-        tied.append([*rope, *joints])
+        rope = bodies(hung(particles.position, radius, ROPES))
+        joints = [pymunk.PinJoint(a, b) for (a, _), (b, _) in pairwise(rope)]
+        tied.append([part for pair in rope for part in pair] + joints)
         space.add(*tied[-1])
 
-    def untie(turn: int):
+    def untie(turn: int) -> None:
         """Remove the bodies and joints of the last rope."""
         space.remove(*tied.pop())
 
@@ -282,7 +253,7 @@ def pymunks(n: int, rounds: int) -> dict[str, float]:
         "pin another particle": (hold, None), "add as many again": (added(n), removed(n)),
         "add a rope": (tie, untie), "remove a rope": (untie, tie),
     }  # fmt: skip
-    return {FIRST[1]: first, "second world, first step": second, "copy, first step": copied, **timed(acts, engine.frame, rounds)}
+    return {START: first, SECOND: second, COPY: copied, **timed(acts, engine.frame, rounds)}
 
 
 def newtons(n: int, rounds: int) -> dict[str, float]:
@@ -291,48 +262,32 @@ def newtons(n: int, rounds: int) -> dict[str, float]:
     Its models are fixed, except the contents of their arrays: adding or removing particles or springs needs a new model. Pinned
     particles have mass 0. Discs are balls in a plane.
     """
-    from .peers import Newton
-
     particles, features, _ = pile(n)
 
-    def built():
-        """Return the pile in newton, after its first frame."""
-        engine = Newton(particles, features, 1, (8, 2))
+    def built() -> Newton:
+        """Return the pile in newton after its first frame."""
+        engine = Newton(particles, features, (8, 2))
         engine.frame()
         return engine
 
-    clock = perf_counter()
-    engine = built()
-    first = perf_counter() - clock
-    clock = perf_counter()
-    engine.frame()
-    usual = perf_counter() - clock
-    clock = perf_counter()
-    built()
-    again = perf_counter() - clock
-    clock = perf_counter()
-    other = engine.model.state()
-    other.assign(engine.now)
-    engine.now = other
-    engine.frame()
-    copied = perf_counter() - clock
+    def copy() -> None:
+        """Copy the state, and step the copy."""
+        other = engine.model.state()
+        other.assign(engine.now)
+        engine.now = other
+        engine.frame()
+
+    engine, first = clocked(built)
+    _, usual = clocked(engine.frame)
+    _, again = clocked(built)
+    _, copied = clocked(copy)
     inverse, held = engine.model.particle_inv_mass.numpy(), [0, 0.0]  # the array is shared, not copied, on a CPU
 
-    def hold(k: int):
+    def hold(k: int) -> None:
         """Give another particle infinite mass, and the last one its own mass again."""
         inverse[held[0]] = held[1] or inverse[held[0]]
         held[:] = n // 2 + k, float(inverse[n // 2 + k])
         inverse[held[0]] = 0.0
 
-    pinned, times = [], []
-    for k in range(3):
-        clock = thread_time()
-        engine.frame()
-        times.append(thread_time() - clock)
-        clock = thread_time()
-        hold(k)
-        engine.frame()
-        pinned.append(thread_time() - clock)
     edits = {act: again - usual for act in AIMS if act.startswith(("add", "remove"))}
-    edits["pin another particle"] = max(0.0, median(pinned) - median(times))
-    return {FIRST[1]: first, "second world, first step": again, "copy, first step": copied, **edits}
+    return {START: first, SECOND: again, COPY: copied, **edits, **timed({"pin another particle": (hold, None)}, engine.frame, 3)}

@@ -1,0 +1,51 @@
+"""Run one experiment of the laboratory, print its tables and, with --write, keep them in RESULTS.md."""
+
+import argparse
+import shlex
+import sys
+from importlib import import_module
+
+from rich.console import Console
+
+from .results import write
+
+# Each module has main(args) -> an iterator over tables.
+EXPERIMENTS = {
+    "cases": "error against run time of all scenes with known answers (parts: beginnings of cases)",
+    "speed": "frames, starts and memory of scenes of 10 to 1e6 particles, beside the pile in C (parts: scenes)",
+    "peers": "pymunk and Newton on the same scenes, at the same quality (parts: scenes)",
+    "edits": "first steps, copies and edits of a pile, beside pymunk and Newton",
+    "worlds": "many worlds in one launch, beside one world, MuJoCo and Newton (parts: its tables)",
+    "compilers": "Taichi and Quadrants, with patches and without",
+    "steps": "error with up to 5120 substeps, in every precision and order (parts: beginnings of cases)",
+    "granular": "piles, elastic gases and packings beside what is known of them (parts: its tables)",
+    "periodic": "gases and shear flows in periodic boxes beside what is known of them",
+    "rolling": "one or two spinning spheres beside pymunk, Box2D, LAMMPS and Newton",
+    "grains": "heaps, drums and silos of spinning grains, beside LAMMPS (parts: its tables)",
+}
+
+
+def main(words: list[str]) -> None:
+    """Run an experiment."""
+    shown = "\n".join(f"  {name:10} {what}" for name, what in EXPERIMENTS.items())
+    parser = argparse.ArgumentParser(
+        "python -m tests.laboratory", description=__doc__, epilog=shown, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("name", choices=EXPERIMENTS, metavar="NAME", help="an experiment, see below")
+    parser.add_argument("parts", nargs="*", help="some of its scenes, cases or tables; all without any")
+    parser.add_argument("--sizes", type=int, nargs="+", default=(), metavar="N", help="numbers of particles")
+    parser.add_argument("--threads", type=int, nargs="+", default=(), metavar="T", help="numbers of CPU threads")
+    parser.add_argument("--pythons", nargs="+", default=(), metavar="PATH", help="other Pythons in which to look for engines")
+    parser.add_argument("--quick", action="store_true", help="small sizes and few runs")
+    parser.add_argument("--write", action="store_true", help="replace the experiment's section of RESULTS.md")
+    args = parser.parse_args(words)
+    tables, console = [], Console(width=None if sys.stdout.isatty() else 150)
+    for table in import_module(f"tests.laboratory.{args.name}").main(args):
+        console.print(*table.shown(), sep="\n", end="\n\n")
+        tables.append(table)
+    if args.write:
+        write(args.name, f"python -m tests.laboratory {shlex.join(w for w in words if w != '--write')}", tables)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
