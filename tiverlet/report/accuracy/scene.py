@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -156,24 +156,20 @@ def scene_report(
                 rows[repr(solver), precision] = runner.run(solver, precision, some, lambda: bar.advance(shown))
     best, truth, error, order = reference(rows)
     motion = rms(truth, runner.start[0]) if np.isfinite(truth).all() else np.inf
-    made = []
+    settings = []
     for (solver, precision), results in rows.items():
         exact = {r.substeps: r.position for r in rows[solver, "f64"]}
-        for r in results:
-            if r.substeps > efforts[-1]:
-                continue
+        for r in (r for r in results if r.substeps <= efforts[-1]):
             wrong = distance(r.position, truth)
             rounding = distance(r.position, exact[r.substeps]) if precision != "f64" else 0.0
             share = min(1.0, rounding / wrong) if wrong > 0 and np.isfinite(wrong) and np.isfinite(rounding) else 0.0
-            made.append((solver, precision, r, wrong, rounding, share))
-    settings = []
-    for solver, precision, r, wrong, rounding, share in made:
-        beaten = any(o[2].seconds <= r.seconds and o[3] < wrong for o in made if o[2] is not r)
-        settings.append(Setting(
-            solver, r.substeps, world.iterations, precision, wrong, rounding, share, r.seconds / seconds, not beaten, r.residual,
-            r.energy, r.flags, world.order,
-        ))  # fmt: skip
+            settings.append(Setting(
+                solver, r.substeps, world.iterations, precision, wrong, rounding, share, r.seconds / seconds, False, r.residual,
+                r.energy, r.flags, world.order,
+            ))  # fmt: skip
     settings.sort(key=lambda s: s.seconds)
+    beaten = [any(o.seconds <= s.seconds and o.error < s.error for o in settings) for s in settings]
+    settings = [replace(s, best=not some) for s, some in zip(settings, beaten, strict=True)]
     name = f"{best}, {finer[-1]} substeps, f64"
     return SceneReport(settings, name, error, order, 1e-3 * motion if tolerance is None else tolerance, motion)
 

@@ -120,10 +120,7 @@ def _nan() -> Finding:
 
 @row(59, "friction 0, 1e6, < 0, NaN", "frictionless, stick, error, error")
 def _friction() -> Finding:
-    out = refused(
-        (lambda: Contact(friction=-0.1), "at least 0"),
-        (lambda: HalfSpace((0, 1), friction=NAN), "friction"),
-    )
+    out = refused((lambda: Contact(friction=-0.1), "at least 0"), (lambda: HalfSpace((0, 1), friction=NAN), "friction"))
     for mu, way in ((0.0, 2.0), (1e6, 0.0)):
         floor = HalfSpace((0, 1), friction=mu)
         with world(Particles([[0.0, 0.1]], velocity=(2.0, 0.0), radius=0.1), [Gravity(), floor]) as w:

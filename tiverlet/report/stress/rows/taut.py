@@ -169,10 +169,7 @@ def _twice() -> Finding:
     once = links(n - 1)
     for solver in (Direct(), Jacobi()):
         watch.run(
-            "twice",
-            Particles(x, mass=MASS, pinned=[0, n - 1]),
-            [Gravity(G), Distance(np.vstack([once, once]))],
-            solver=solver,
+            "twice", Particles(x, mass=MASS, pinned=[0, n - 1]), [Gravity(G), Distance(np.vstack([once, once]))], solver=solver
         )
         rest = np.r_[np.full(n - 1, 0.0995), np.full(n - 1, 0.1005)]
         watch.run(

@@ -204,8 +204,7 @@ def _deep() -> Finding:
         w.run(4.0)
         energy, limit = kinetic_energy(w), 0.5 * 200 * (4 * 0.5) ** 2
         return Finding(
-            f"{energy:.0f} J (limit {limit:.0f})",
-            {"finite": finite(w), "slow": energy <= limit, "apart": w.last.overlap < 0.2},
+            f"{energy:.0f} J (limit {limit:.0f})", {"finite": finite(w), "slow": energy <= limit, "apart": w.last.overlap < 0.2}
         )
 
 
