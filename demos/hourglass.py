@@ -34,12 +34,12 @@ def build(grains: int = 1000) -> tv.World:
 
 
 def check(world: tv.World) -> None:
-    """Check that every grain is in the glass, and that some have run through."""
+    """Check that every grain is in the glass, and that they have run through."""
     x = world.position
     edge = NECK / 2 + (WIDTH - NECK / 2) * np.abs(x[:, 1]) / TOP
     if not np.isfinite(x).all() or (np.abs(x[:, 0]) > edge + 0.05).any():
         raise SystemExit("a grain is outside of the glass")
-    if not 0.1 < (x[:, 1] < 0).mean():
+    if not 0.9 < (x[:, 1] < 0).mean():
         raise SystemExit("the grains are stuck in the neck")
 
 

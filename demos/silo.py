@@ -13,7 +13,7 @@ import numpy as np
 
 import tiverlet as tv
 
-GRAINS, RADIUS, WIDTH, GATE = 450, 0.03, 0.6, 0.27
+GRAINS, RADIUS, WIDTH, GATE = 450, 0.03, 0.6, 0.36
 G, SETTLED = 9.81, 4.0  # [m/s^2]; time until the gate opens [s], in whose last quarter the walls rise a little
 RISE = 0.02  # speed of the rising walls [m/s]
 
