@@ -124,7 +124,7 @@ def couette(n: int, shear: float, seconds: float, contact: Contact, layers: int 
 
 def main(args) -> Iterator[Table]:
     """Yield the tables of gases and of sheared discs."""
-    n, seconds = args.sizes[0] if args.sizes else 100 if args.quick else 400, 4.0 if args.quick else 40.0
+    n, seconds = args.sizes[0] if args.sizes else 200 if args.quick else 400, 24.0 if args.quick else 40.0
     rows = []
     for dim, fraction in GASES:
         f = virial(n, dim, fraction, 0.008, seconds)
