@@ -52,7 +52,7 @@ def test_the_largest_safe_relaxation_is_stable_and_better(world):
     for solver in (tv.Jacobi(), tv.Jacobi("auto")):
         w = world(tv.Particles(x, mass=1e-3, pinned=[0, 11]), [tv.Gravity(9.81), tv.Distance(pairs)], solver=solver)
         report = w.run(1.0)
-        assert report.energy <= 1e-6 and report.clean
+        assert report.energy <= 1e-6 and report.flags <= {"unconverged"}
         left.append(report.residual)
     assert left[1] < 0.6 * left[0]
 

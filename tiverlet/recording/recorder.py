@@ -45,18 +45,16 @@ class Recorder:
     run, repeatedly if needed, and a warning at the end reports it; all steps stay in the file. overwrite: whether an existing
     file may be replaced; it stays as it is until the new one has its first frame.
 
-    strain: whether links and surfaces show their strain. forces: draw the loads of contacts as lines whose width is the load
-    relative to the other loads of the frame. velocities: draw arrows that show the path of the next 0.05 s. color: None, by body;
-    or colours (n, 3), a quantity ("speed", "spin", "load", "mass", "radius", "group", or a name that log() is given) or a
-    function of the world, alone or with the ends of its scale, ("speed", 0, 2); then links and surfaces show no strain, but the
-    colours of their particles. Colours are integers in 0 ... 255 or floats in 0 ... 1. live: show the recording while it is made:
-    True for a window, "web" for a page in the browser, "notebook" below a cell, or the address of a running viewer. y_down:
-    whether y points down in the picture, as in coordinates of pixels (2D); the physics does not depend on it.
+    strain: whether links and surfaces show their strain. forces: draw the loads of contacts as lines, as wide as they are large.
+    velocities: draw arrows that show the path of the next 0.05 s. color: None, by body; colours (n, 3), integers in 0 ... 255 or
+    floats in 0 ... 1; a quantity ("speed", "spin", "load", "mass", "radius", "group", or a name given to log()) or a function
+    of the world, alone or with the ends of its scale, ("speed", 0, 2). live: show the recording while it is made: True for a
+    window, "web" for a page in the browser, "notebook" below a cell, or the address of a running viewer. y_down: whether y points
+    down in the picture, as in coordinates of pixels (2D).
 
-    The picture has positions (f32), coloured by body; surfaces of bodies that have them; links, coloured by their strain; walls,
-    contacts in scenes of up to 1500 particles, breaks, and curves. The file also holds the scene with all arguments, exact
-    states to continue from, the hash of every frame drawn, and every step. It holds every knob that the user set and every array
-    that the user assigned, also between frames that are not drawn: see tv.replay.
+    The picture has positions (f32), surfaces of bodies, links, walls, contacts in scenes of up to 1500 particles, breaks, and
+    curves. The file also holds the scene with all arguments, exact states to continue from, the hash of every frame drawn, every
+    step, and every knob and array that the user set: see tv.replay.
 
     The file is complete when the block ends. If the process is killed, all but about the last second can be replayed; flush()
     writes what there is. Raises ValueError and OSError if the file cannot be made or written, FileExistsError if it exists
