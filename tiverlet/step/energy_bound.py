@@ -154,7 +154,7 @@ def loss_error(world: "World", extent: np.ndarray, reach: Any) -> float:
     h, inv_mass, x = world._clock.h, world._runner.scene.inv_mass, world.position
     sag = FALL * _masses(world).sum() * np.linalg.norm(extent) * np.linalg.norm(_pull(world))
     out = sag + rounding(world, reach) + initial_margin(inv_mass, extent, h)
-    for f, some in _springs(world):
+    for f, some in springs(world):
         alpha, w = f.compliance[some], f.weights(x)[some]
         s2 = w * h**2 / alpha
         if isinstance(f, Scalar):
@@ -170,10 +170,10 @@ def loss_error(world: "World", extent: np.ndarray, reach: Any) -> float:
 def fastest_spring(world: "World") -> float:
     """Return the angular frequency of the fastest spring [rad/s]."""
     x = world.position
-    return float(np.sqrt(max([(f.weights(x)[some] / f.compliance[some]).max() for f, some in _springs(world)], default=0.0)))
+    return float(np.sqrt(max([(f.weights(x)[some] / f.compliance[some]).max() for f, some in springs(world)], default=0.0)))
 
 
-def _springs(world: "World") -> list[tuple[Any, np.ndarray]]:
+def springs(world: "World") -> list[tuple[Any, np.ndarray]]:
     """Return the batches of springs, and the mask of those constraints in each that can move something."""
     inv_mass = world._runner.scene.inv_mass
     batches = [f for f in world.features if isinstance(f, (Scalar, Anchored))]

@@ -16,6 +16,7 @@ from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.periodic import Periodic
 from ..shapes.shape import morton
 from ..solvers.choice import explain_choice
+from .energy_bound import springs
 from .launcher import STIRRED
 from .sleep import Sleep
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 
 MANY = 10_000  # particles from which their order in memory matters
+PERIOD = 16  # substeps in a period of a spring that see cos(pi / 16) = 0.98 of the peak of a blow
 FLAT = 1e-6  # 1 - cos(slope), up to which a floor is level: a twelfth of a degree
 
 
@@ -126,7 +128,7 @@ def _present(world: "World") -> list[str]:
             out.append(f"{f!r}: nothing, since all radii are 0")
     if world.particles.spins:
         out.append("spin: with friction" + (", and orientations" if world._runner.step.orients else ""))
-    out += _sliding(world)
+    out += [*_sliding(world), *_brittle(world)]
     return out or ["motion in a straight line"]
 
 
@@ -138,6 +140,21 @@ def _sliding(world: "World") -> list[str]:
         return []
     rough = [repr(f) for f in world.features if isinstance(f, Collider) and np.any(f.friction) and not _is_level(f, pull)]
     return [f"{', '.join(rough)}: particles slide down a slope; with tv.Particles(spin=True) they roll"] if rough else []
+
+
+def _brittle(world: "World") -> list[str]:
+    """Return notes on springs that blows may break, and that substeps do not resolve."""
+    out, h = [], world._clock.h or 1 / 60 / world.substeps
+    for f, some in springs(world):
+        some = some & np.isfinite(np.inf if f.break_at is None else f.break_at)
+        omega = np.sqrt((f.weights(world.position)[some] / f.compliance[some]).max(initial=0.0))
+        need = np.ceil(np.round(world.substeps * PERIOD * omega * h / (2 * np.pi), 6))
+        if need > world.substeps:
+            out.append(
+                f"{f!r}: a blow counts with its mean over a substep, less than its peak; {need:.7g} substeps resolve it "
+                f"(omega h = {omega * h:.3g})"
+            )
+    return out
 
 
 def _is_level(wall: Collider, pull: np.ndarray) -> bool:
