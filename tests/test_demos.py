@@ -86,7 +86,7 @@ def test_pay_finds_that_features_only_add(printed):
         ("fit", {"settings": [("THROWS", 60), ("ELITE", 12)]}, "caught in each round"),
         ("pendulums", {"settings": [("SECONDS", 3.0)], "side": 8}, "so a million take"),
         ("stairs", {"built": {"rows": 2}, "seconds": 1.6}, "are down"),
-        ("silo", {"settings": [("GRAINS", 150), ("SETTLED", 1.5)], "seconds": 3.0}, "of the weight"),
+        ("silo", {"settings": [("GRAINS", 250), ("SETTLED", 1.5)], "seconds": 3.0}, "of the weight"),
         ("drum", {"settings": [("GRAINS", 250), ("RADIUS", 0.04)], "seconds": 3.0}, "the heap leans"),
         ("billiards", {}, "all at rest"),
         ("soft", {"seconds": 1.0}, "soft.rrd"),

@@ -251,10 +251,10 @@ def test_constraints_that_are_not_met_are_flagged_with_what_helps(world, solver,
     (note,) = (n for n in found.notes if n.startswith("Constraints are not met:"))
     assert f"off by {100 * found.residual:.3g} %" in note
     need = int(re.findall(r"Use about (\d+) substeps", note)[0])
-    assert 8 < need < 30 and note.split(", or solver=tv.")[1].startswith(repr(advised).partition("(")[0])
+    assert 8 < need < 60 and note.split(", or solver=tv.")[1].startswith(repr(advised).partition("(")[0])
     for better in (worst(solver, need), worst(advised, 8)):
         assert better.residual < 0.11, better
-    assert ("unconverged" in better.flags) == (better.residual > 0.1)
+        assert ("unconverged" in better.flags) == (better.residual > 0.05)
 
 
 @pytest.mark.slow
