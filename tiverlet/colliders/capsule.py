@@ -211,7 +211,7 @@ class Capsule(Collider):
                         going = self.dev.surface.starts_on(i, start_depth, m, depth, n, ends + way)
                 if going:
                     further, closing = 0 * s + 1, -d.dot(m)
-                    if gap < closing * (1 - s):
+                    if closing > 0 and gap < closing * (1 - s):
                         further = s + ti.max(gap, 0) / closing
                     if k == STEPS:
                         further = s
