@@ -146,6 +146,8 @@ def _brittle(world: "World") -> list[str]:
     """Return notes on springs that blows may break, and that substeps do not resolve."""
     out, h = [], world._clock.h or 1 / 60 / world.substeps
     for f, some in springs(world):
+        if not f.breaks:
+            continue
         some = some & np.isfinite(np.inf if f.break_at is None else f.break_at)
         omega = np.sqrt((f.weights(world.position)[some] / f.compliance[some]).max(initial=0.0))
         need = np.ceil(np.round(world.substeps * PERIOD * omega * h / (2 * np.pi), 6))
