@@ -340,9 +340,10 @@ class Edges:
         if b >= 0:
             moves = moves or self.state.moves(b)
         if moves:
-            if b >= 0:
+            borne = self.rows.is_set(self.rows.memory.field[e])
+            if b >= 0 and (borne or self.reaches_edge(v, a, b)):
                 row = self.list_edge(v, a, b, e, row, scale)
-            if row == begin and self.keeps(v, a) and self.radius.of(v) + self.radius.of(a) > 0:
+            if row == begin and self.keeps(v, a) and (borne or self.reaches_disc(v, a)):
                 if self.corner(v, a, 1) > 0 and self.corner(a, v, 1) > 0 and self.tips_cross(v, a, 1) == 0:
                     row = self.rows.find_pair(v, a, e, row, scale)
                     if row > begin:
@@ -351,6 +352,27 @@ class Edges:
             if row == begin:
                 self.rows.forget(e)
         return row
+
+    @ti.func
+    def reaches_edge(self, v, a, b):
+        """Whether list_edge() may list vertex v at the edge from a to b: a fast test, which most entries fail."""
+        dr = self.state.relative_displacement(self.state.d[v] - self.state.d[a], v, a)
+        du = self.state.relative_displacement(self.state.d[b] - self.state.d[a], b, a)
+        r1, u1 = self.state.separation(v, a), self.state.separation(b, a)
+        r0, u0 = r1 - dr, u1 - du
+        length, t0, t1, uu = self.longest[a], r0.dot(u0), r1.dot(u1), ti.max(u0.dot(u0), u1.dot(u1))
+        top = self.radius.of(v) + ti.max(self.radius.of(a), self.radius.of(b)) + ti.static(AHEAD) * self.smaller(v, a)
+        beside = ti.max(t0, t1) >= -uu / 2 and ti.min(t0, t1) <= ti.static(1 + PAST) * uu
+        over = r0.cross(u0)  # height times length
+        return beside and ti.select(over < 0, -over <= length * length / 2, r1.cross(u1) <= top * length)
+
+    @ti.func
+    def reaches_disc(self, v, a):
+        """Whether particles v and a may touch as discs in this substep: a fast test."""
+        distance, r = self.radius.of(v) + self.radius.of(a), self.state.separation(v, a)
+        u = self.state.relative_displacement(self.state.d[v] - self.state.d[a], v, a)
+        far = distance + ti.max(self.rows.ahead, ti.static(SLOP) * distance)
+        return distance > 0 and r.dot(r) <= 2 * (far * far + u.dot(u))
 
     @ti.func
     def list_edge(self, v, a, b, e, row, scale):
@@ -687,11 +709,10 @@ class EdgePairTable:
             r, reach = self.state.separation(v, c), self.radius.of(v) + self.skin
             for k in ti.static(range(2)):
                 other = self.loop[c][k]
-                u, size = self.state.separation(other, c), reach + ti.max(self.radius.of(c), self.radius.of(other))
-                length = u.norm()
-                t, height = r.dot(u), r.cross(u) * (1 - 2 * k)
-                if height >= -(length / 2 + size) * length and height <= size * length:
-                    ends = (PAST * length + size) * length
-                    if t >= -ends and t <= length * length + ends:
-                        out = True
+                u = self.state.separation(other, c)
+                uu, t, height = u.dot(u), r.dot(u), r.cross(u) * (1 - 2 * k)  # the last two times the length
+                size = reach + ti.max(self.radius.of(c), self.radius.of(other))
+                beyond = ti.max(height, -height - uu / 2, t - (1 + PAST) * uu, -t - PAST * uu, 0)
+                if beyond * beyond <= size * size * uu:
+                    out = True
         return out
