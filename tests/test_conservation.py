@@ -47,6 +47,41 @@ def test_momentum_is_conserved_for_ten_thousand_steps(world, precision, limit):
     assert worst <= limit * size and mass.max() / mass.min() == pytest.approx(100, rel=1e-12)
 
 
+@pytest.mark.parametrize("compliance", [0.0, 1e-3])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_clusters_on_links_keep_their_momentum_beside_contacts(world, dim, compliance):
+    # Corners that links or other clusters share have a part of their mass in a cluster's answer. Two bodies, each with a ball on
+    # a link and a second cluster at two of its corners, strike each other without friction.
+    q = np.stack(np.meshgrid(*[[-0.5, 0.5]] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+    n, axes = len(q), np.eye(dim)
+    one = np.concatenate([q, [1.4 * axes[1] + 0.5 * axes[0], 1.3 * axes[0], 1.3 * axes[0] + 0.3 * q[0]]])
+    own = [*range(n)], [0, 1, n + 1, n + 2]
+    x, v = np.concatenate([one - axes[0], 1.2 * axes[0] - one]), np.repeat([axes[0], -axes[0]], n + 3, axis=0)
+    mass = np.random.default_rng(3).uniform(0.5, 2, len(x))
+    clusters = [np.array(c) + k for k in (0, n + 3) for c in own]
+    features = [tv.ShapeMatch(clusters, compliance=compliance), tv.Distance([(n, 0), (2 * n + 3, n + 3)]), tv.Contact()]
+    radius = np.tile([*[0.12] * n, 0.1, 0.05, 0.05], 2)
+    w = world(tv.Particles(x, velocity=v, mass=mass, radius=radius), features, substeps=8, precision="f64")
+    touched = sum(w.step(1 / 60).contacts for _ in range(40))
+    displacement = w._runner.memory.state()["displacement"][: len(x)]
+    np.testing.assert_allclose(mass @ displacement / w._clock.h, mass @ v, atol=1e-9 * mass.sum())
+    assert touched > 0
+
+
+def test_a_ball_hangs_on_a_plank_with_its_weight(world):
+    # J theta'' = m g L, J = sum m x^2 + m L^2, and the ball stays below the corner: theta = m g L t^2 / 2 J for small angles.
+    plank = np.array([[-2.0, -0.1], [2, -0.1], [2, 0.1], [-2, 0.1], [0, 0]])
+    x, mass = np.concatenate([plank, [[2.0, -0.8]]]), np.array([2.0, 2, 2, 2, 1, 1])
+    J = (mass[:5, None] * plank**2).sum() + mass[5] * 4.0
+    for contact in ([], [tv.Contact()]):
+        start = tv.Particles(x, mass=mass, radius=[0, 0, 0, 0, 0, 0.05], pinned=[4])
+        features = [tv.Gravity(9.81), tv.ShapeMatch([range(5)]), tv.Distance([(5, 1)]), *contact]
+        w = world(start, features, substeps=20, precision="f64")
+        w.run(0.2)
+        along = w.position[0] - w.position[1]
+        assert np.arctan2(along[1], -along[0]) == pytest.approx(mass[5] * 9.81 * 2 * 0.2**2 / (2 * J), rel=5e-3)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("what", ["shapes in 3D", "contacts"])
 def test_velocities_have_the_momentum_of_the_motion(world, what):

@@ -214,3 +214,11 @@ def test_a_seesaw_weighs_a_hundred_to_one(world, hold):
         w = world(tv.Particles(x, mass=m, radius=r, pinned=[4]), features, substeps=substeps, precision="f64")
         w.run(0.4)
         assert turned(x[1] - x[0], w.position[1] - w.position[0]) == pytest.approx(right, abs=5e-4)
+        # The same on a hinge: the hub on a link of length 0 to a pin inside of the plank, which the plank's edges do not touch.
+        # Redundant links are relaxed, first order.
+        hinged = tv.Particles([*x, x[4]], mass=[*m, 1], radius=[*r, 0], pinned=[7])
+        w = world(hinged, [*(f.copy() for f in features), tv.Distance([(4, 7)])], substeps=substeps, precision="f64")
+        w.run(0.4)
+        assert turned(x[1] - x[0], w.position[1] - w.position[0]) == pytest.approx(
+            right, abs=5e-4 if hold == "cluster" else 0.07 / substeps
+        )

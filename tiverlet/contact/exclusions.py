@@ -7,7 +7,8 @@ l at the start:
 
 Such a pair overlaps however the chain bends, as long as the links keep their lengths. Examples are a ball and the rope that ends
 inside of it, or a bead and the next but one, if beads are thicker than the links are long. A contact would push against the links
-for ever. Links that are compliant, or can break, do not count.
+for ever. Links that are compliant, or can break, do not count. For a hub inside of a polygon, its depth there stands for its
+radius: so the pin of a hinge touches none of the corners around it.
 """
 
 from collections.abc import Sequence
@@ -17,28 +18,31 @@ import numpy as np
 
 from ..features.feature import Batch
 from ..geometry.ordered import distinct
+from .loops import depth_of
 
 if TYPE_CHECKING:
     from ..particles import Particles
+    from .edges import Outline
 
 DIGIT = 1e-6  # relative tolerance of lengths, for beads that just touch
 FOLDED = 0.25  # radii of the smaller particle: a link that is shorter at the start counts as folded up, and is skipped
 
 
-def excluded_pairs(batches: Sequence[Batch], radius: np.ndarray, body: np.ndarray | None = None) -> np.ndarray:
-    """Return pairs of particles that contacts leave out, (m, 2). radius: (n,) [m].
+def excluded_pairs(batches: Sequence[Batch], radius: np.ndarray, outline: "Outline | None" = None) -> np.ndarray:
+    """Return pairs of particles that contacts leave out, (m, 2). radius: (n,) [m]. outline: None without bodies.
 
-    body: the number of the body of each particle, see Outline, -1 for none; None without bodies. Linked corners of two bodies are
-    not left out: a link fixes their distance, not on which side of an edge of the other body each of them is. Boxes in a row, on
-    two rods each, folded into each other. Only corners whose rims the link holds inside each other are left out. A particle of no
-    body, as the hub of a plank, touches no body whose corners are in its cluster.
+    Linked corners of two bodies are not left out: a link fixes their distance, not on which side of an edge of the other body
+    each of them is. Boxes in a row, on two rods each, folded into each other. Only corners whose rims the link holds inside each
+    other are left out. A particle of no body, as the hub of a plank, touches no body whose corners are in its cluster.
     """
     own = [b.excluded_pairs(b.start) for b in batches]
-    if body is not None:
-        own = [pairs if b.clusters else pairs[~_joins(pairs, b.start, body)] for b, pairs in zip(batches, own, strict=True)]
-        own += [_hubs(b.indices.ravel(), b.owner, body) for b in batches if b.clusters]
     limits = [b.max_distances() for b in batches]
     links, lengths = (np.concatenate(some) for some in zip((np.zeros((0, 2), dtype=np.int32), np.zeros(0)), *limits, strict=True))
+    if outline and batches:
+        body, x = outline.body, batches[0].start.position
+        own = [pairs if b.clusters else pairs[~_joins(pairs, b.start, body)] for b, pairs in zip(batches, own, strict=True)]
+        own += [_hubs(b.indices.ravel(), b.owner, body) for b in batches if b.clusters]
+        own.append(_pins(np.concatenate(own), links, lengths, x, radius, outline))
     return np.concatenate([np.zeros((0, 2), dtype=np.int32), *own, _inside(links, lengths, radius)])
 
 
@@ -57,6 +61,34 @@ def _hubs(who: np.ndarray, owner: np.ndarray, body: np.ndarray) -> np.ndarray:
     each = np.repeat(np.arange(len(inner)), last - first)
     place = np.arange(len(each)) - np.repeat(np.cumsum(last - first) - last, last - first)
     return np.stack([who[inner[each]], who[rim[place]]], axis=1).astype(np.int32)
+
+
+def _pins(
+    pairs: np.ndarray, links: np.ndarray, lengths: np.ndarray, x: np.ndarray, radius: np.ndarray, outline: "Outline"
+) -> np.ndarray:
+    """Return pairs of a particle in no body and a corner of a body in which links of a hub hold it, as the pin of a hinge.
+
+    pairs: (m, 2) that are left out; a hub is left out with all corners of its body. links, lengths: see _inside(). x: (n, 2) [m].
+    """
+    body, out = outline.body, [np.zeros((0, 2), dtype=np.int32)]
+    inner, rim = np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0).T
+    inner, rim = (of[(body[inner] < 0) & (body[rim] >= 0)] for of in (inner, rim))
+    ties, count = np.unique(np.stack([inner, body[rim]], axis=1), axis=0, return_counts=True)
+    for hub, k in ties[count == np.bincount(body[body >= 0])[ties[:, 1]]].tolist():
+        loop = [int(np.argmax(body == k))]
+        while (after := int(outline.ends[loop[-1], 0])) != loop[0]:
+            loop.append(after)
+        depth, way, open_ = depth_of(x[hub], x[loop])[0], {hub: 0.0}, [hub]
+        while open_:
+            i = open_.pop()
+            at, end = np.nonzero(links == i)
+            for j, far in zip(links[at, 1 - end].tolist(), (way[i] + lengths[at]).tolist(), strict=True):
+                if 0 < depth and body[j] < 0 and far <= depth + radius.max() and far < way.get(j, np.inf):
+                    way[j] = far
+                    open_.append(j)
+        held = [j for j, far in way.items() if j != hub and far <= depth + radius[j]]
+        out.append(np.stack([np.repeat(held, len(loop)), np.tile(loop, len(held))], axis=1).astype(np.int32))
+    return np.concatenate(out)
 
 
 def _inside(links: np.ndarray, lengths: np.ndarray, radius: np.ndarray) -> np.ndarray:

@@ -150,7 +150,7 @@ class PairContact(Feature):
         dev.islands = Islands(scene, dev.rows, dev.responses, team)
         dev.impulses = Impulses(scene, dev.rows, dev.responses, team)
         dev.places = Places(scene, dev.rows, dev.responses, dev.impulses, team)
-        linked = excluded_pairs(batches, scene.particles.radius, *([edges.outline.body] if edges else []))
+        linked = excluded_pairs(batches, scene.particles.radius, edges.outline if edges else None)
         dev.events = EventLog(scene, self.table) if dev.has_events else None
         pair_data = [
             dev.rows.memory,

@@ -272,19 +272,23 @@ class ClusterPasses(Passes):
 
     @ti.func
     def turn_answer(self, c, bodies: ti.template()):  # type: ignore[valid-type]
-        """Find how cluster c moves as a rigid body, at the start of the substep or at the time of an impact."""
+        """Find how cluster c moves as a rigid body, at the start of the substep or at the time of an impact.
+
+        What is shared counts with a part of its mass, as in a pass, so that unequal parts take no momentum away.
+        """
         begin, end, i0 = self.corners.starts[c], self.corners.starts[c + 1], self.corners.reference_particle(c)
         total, middle, own = ti.cast(0, ti.f64), self.zero_vector(), self.is_body(c) and self.strength.is_intact(c)
         back = 1 - bodies.rows.when_of(self.corners.members[begin])
         S, A, alpha = middle.outer_product(middle), self.answering[c][0], self.answering[c][1]
         for e in range(begin, end):
-            i, m, r = self.corners.members[e], self.mass_in_fit(e, c), self.relative_position(e, i0, back)
+            i, r = self.corners.members[e], self.relative_position(e, i0, back)
+            m = self.mass_in_pass(e, A, alpha)
+            if self.w.positive(i):
+                m *= A + alpha
             total += m
             middle += m * r
             S += m * r.outer_product(r)
-            self.arm[e], self.weight[e][0], self.weight[e][1] = r, m, 0
-            if self.w.positive(i):
-                self.weight[e][1] = 1 / (A * self.slots.split[i] / self.w.of(i) + alpha)
+            self.arm[e], self.weight[e][0], self.weight[e][1] = r, m, m * self.w.of(i) / (A + alpha)
         middle /= total
         S -= total * middle.outer_product(middle)
         for e in range(begin, end):
@@ -320,9 +324,8 @@ class ClusterPasses(Passes):
             S, A, alpha = self.read_matrix(self.inertia, c), self.answering[c][0], self.answering[c][1]
             X = 0 * S
             for e in range(begin, end):
-                i = self.corners.members[e]
-                step = moved[i] - d[i]
-                move = self.weight[e][0] * ti.cast(step, ti.f64)
+                step = moved[self.corners.members[e]] - d[self.corners.members[e]]
+                move = self.weight[e][0] * (A * ti.cast(step, ti.f64) + alpha * self.answer_of(e))
                 some = some or (step != 0).any()
                 mean += move
                 X += self.arm[e].outer_product(move)
@@ -332,10 +335,17 @@ class ClusterPasses(Passes):
                 for e in range(begin, end):
                     i, place = self.corners.members[e], self.corners.places[e]
                     if place >= 0:
-                        C = ti.cast(moved[i] - d[i], ti.f64) - mean - spin @ self.arm[e]
-                        before = ti.cast(self.slots.answer[place], ti.f64)
-                        change = (A * C + alpha * before) * self.weight[e][1]
+                        C, before = ti.cast(moved[i] - d[i], ti.f64), self.answer_of(e)
+                        change = (A * C + alpha * before - mean - spin @ self.arm[e]) * self.weight[e][1]
                         self.slots.answer[place] = ti.cast(before - change, self.real)
+
+    @ti.func
+    def answer_of(self, e):
+        """Return the answer to corner e so far [m]."""
+        out = self.zero_vector()
+        if self.corners.places[e] >= 0:
+            out = ti.cast(self.slots.answer[self.corners.places[e]], ti.f64)
+        return out
 
     @ti.func
     def end_answer(self, c, rows: ti.template()):  # type: ignore[valid-type]
