@@ -674,7 +674,7 @@ class Rows:
     def level(self, i, end):
         """Let particle i get as deep into each of its walls as it lies in another that faces the same way, up to the slop.
 
-        So what slides over level walls does not catch on their corners. end: the row behind the last.
+        So what slides over level walls does not catch on their corners, nor bounces off them. end: the row behind the last.
         """
         deepest, depth, up = -1, ti.cast(0, self.real), 0 * self.state.x[i]
         for row in range(self.pressed[i], end):
@@ -682,8 +682,13 @@ class Rows:
                 deepest, depth, up = row, -self.gap.field[row], self.normal.field[row]
         depth = ti.min(depth, ti.static(SLOP * BEYOND) * self.size(i))
         for row in range(self.pressed[i], end):
+            n = self.normal.field[row]
             if row != deepest:
-                self.gap.field[row] += depth * ti.max(up.dot(self.normal.field[row]), 0)
+                self.gap.field[row] += depth * ti.max(up.dot(n), 0)
+                if ti.static(self.bounces and not self.impacts):
+                    u = self.state.d[i] - self.moved.field[row]
+                    if self.gap.field[row] + u.dot(n) + self.rise(u.dot(u) - u.dot(n) ** 2, u.dot(n), self.bend.field[row]) > 0:
+                        self.bounce.field[row] = 0
             self.gap.field[row] = ti.max(self.gap.field[row], 0)
 
     @ti.func
