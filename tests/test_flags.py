@@ -189,6 +189,24 @@ def test_a_scene_that_follows_the_advice_of_the_worst_frame_has_no_flag(world, n
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("steps, substeps", [(2, 16), (2, 20), (4, 8)])
+def test_what_is_damped_loses_its_note_with_as_many_substeps_as_that_says(world, steps, substeps):
+    # A chain that swings down. A few steps of conjugate gradients leave it violated, by order h or higher.
+    x, k = np.stack([0.05 * np.arange(30), np.zeros(30)], axis=1), np.arange(29)
+
+    def notes(substeps):
+        features = [falls(), tv.Distance(np.stack([k, k + 1], axis=1))]
+        start = tv.Particles(x, mass=0.01, pinned=[0])
+        w = world(start, features, substeps=substeps, solver=tv.ConjugateGradient(steps), precision="f64")
+        report = w.run(1.0)
+        assert report.clean
+        return report.notes
+
+    (note,) = notes(substeps)
+    assert not notes(int(re.search(r"they are damped.* (\d+) substeps", note)[1]))
+
+
+@pytest.mark.slow
 def test_a_link_that_is_off_by_a_twentieth_is_flagged(world):
     # UNCONVERGED is a twentieth: 4 % are right, 6 % are wrong. The links between pins have 2 (1 + e) in a place of 2.
     for off, flagged in ((0.04, False), (0.06, True)):

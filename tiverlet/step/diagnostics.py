@@ -408,10 +408,10 @@ class Reporter:
         relaxes = slots and (slots.semi_iteration or (slots.system and slots.system.steps))
         if not relaxes or residual <= LOST:
             return ()
-        need = np.ceil(substeps * np.sqrt(residual / LOST)) + 1  # of order h^2 at least
+        need = np.ceil(substeps * residual / LOST)  # of order h or higher
         return (
             f"Constraints are off by {100 * residual:.3g} % of their size; beyond {100 * LOST:g} % they are damped: what turns "
-            f"loses energy and angular momentum. Use about {need:.7g} substeps, or more steps of the solver.",
+            f"loses energy and angular momentum. Use up to {need:.7g} substeps, or more steps of the solver.",
         )
 
     def _less_overlap(self, reach: float, overlap: float, substeps: int) -> str:
