@@ -230,10 +230,8 @@ def test_launches_count_what_the_scene_needs(world):
             {
                 f"integrate ask_for_list {SOLVE}": 5,
                 "ask_for_list start_events find_rows": 5,
-                "relax_impulses": 15,  # three and two at least, after which the host asks whether more are needed
-                "finish_impulses": 5,
-                "relax_places": 10,
-                "apply_corrections": 5,
+                "ask_for_impulses finish_impulses": 5,  # after as many passes as in the frame before, none
+                "ask_for_places apply_corrections": 5,
                 f"ask_for_list {SOLVE}": 5,
                 "ask_for_list apply_corrections": 5,
                 "ask_for_list": 1,
@@ -269,6 +267,27 @@ def test_the_host_asks_once_in_a_frame(world):
             w.step(1 / 60)
     assert count["measure"] == frames + len(lists) and count["build_list"] == len(lists) > 0
     assert count.answers == count["measure"] + count["build_list"]
+
+
+@pytest.mark.slow
+def test_the_host_asks_for_passes_only_where_something_lands(world):
+    # At rest as many passes are launched as the last frame took, and the host reads one result. Where they are too few, the frame
+    # stops and resumes with more; where many are needed, the host asks. The bits are those of a frame that is one launch.
+    x = np.concatenate([[(0.2 * k, 0.1 + 0.2 * j) for j in range(5) for k in range(6)], [(0.55, 3.0)]])
+    made = []
+    for path in ("launched", "fused"):
+        features = [tv.Gravity(), tv.Box((-0.1, 0), (1.1, 9)), tv.Contact()]
+        made.append(world(tv.Particles(x, radius=0.1), features, path=path, substeps=4))
+    launcher, asked, stopped = made[0]._runner.launcher, 0, 0
+    more = launcher.launch_more
+    for _ in range(80):
+        stops = []
+        launcher.launch_more = lambda what, stops=stops: (stops.append(what), more(what))
+        asked += any(launcher.asks.values())
+        hashes = {w.step(1 / 60) and w.hash() for w in made}
+        stopped += bool(stops)
+        assert len(hashes) == 1
+    assert 0 < stopped and 1 < asked < 40
 
 
 @pytest.mark.slow

@@ -89,6 +89,8 @@ class Impulses:
         )
         self.numbers = add("Contact.passes", None, width=5)
         self.flags = add("Contact.flags", None, width=4, kind=ti.i32)
+        # Rounds, passes of impulses and of places that a substep of a frame took at most.
+        self.most: Any = add("Contact.most", None, width=3, kind=ti.i32) if team.launched else None
         self.last_h2 = add("Contact.last_h2", None, state=True)  # h^2 of what rows bore [s^2]; 0 before the first substep
 
     def regroup(self, n: int) -> None:
@@ -100,6 +102,12 @@ class Impulses:
     def going(self):
         """Return 1 while passes go on, else 0."""
         return at(at(self.flags, None), GOING)
+
+    @ti.func
+    def note_turn(self, k: ti.template(), turn):  # type: ignore[valid-type]
+        """On the launched path: note how many passes of a kind this substep took so far."""
+        if ti.static(self.team.launched):
+            self.most[None][k] = ti.max(self.most[None][k], turn)
 
     @inline
     def moving(self):
@@ -382,6 +390,7 @@ class Impulses:
             beta, ahead = 0 * beta, 1 + 0 * ahead
         self.numbers[None][BETA], self.numbers[None][THETA] = beta, ahead
         self.flags[None][TURN] = turn
+        self.note_turn(1, turn)
         most = ti.select(lack > self.numbers[None][LANDING], BOUNCES, PASSES)
         goes_on = turn < most and lack > self.numbers[None][TOLERANCE]
         if ti.static(self.rows.bounces and not self.rows.impacts):  # else rounds have done it
@@ -401,6 +410,7 @@ class Impulses:
         turn = self.flags[None][TURN] + 1
         self.numbers[None][BETA], self.numbers[None][THETA] = self.momentum()
         moves = ti.cast(self.total(LACK) > 0, ti.i32)
+        self.note_turn(2, turn)
         self.flags[None] = [ti.select(turn < most, moves, 0), turn, moves, 0]
 
     @ti.func
@@ -424,6 +434,7 @@ class Impulses:
         What is left where energy is lost, and is little beside all before, is left to the passes. One thread calls it.
         """
         turn = self.flags[None][TURN] + 1
+        self.note_turn(0, turn)
         work = self.total(WORK)
         done = self.numbers[None][TOLERANCE] + work
         goes_on = work > ti.static(ERROR) * done or self.total(LACK) > 0

@@ -17,7 +17,6 @@ from ..neighbours.periodic import Periodic
 from ..shapes.shape import morton
 from ..solvers.choice import explain_choice
 from .energy_bound import springs
-from .launcher import STIRRED
 from .sleep import Sleep
 
 if TYPE_CHECKING:
@@ -92,15 +91,14 @@ def _launches(world: "World") -> str:
         return "1 launch per frame" + f", of {step.team.size} threads" * (step.team.size > 1)
     solved = world.iterations * (step.constraints.steps + 1) if step.constraints.steps else 0
     each = (world.iterations * step.halves if step.particles.acts else 1) + solved
-    waits, least = "one", ""
+    waits = "one"
     if step.has_impacts:  # after each substep the host reads whether linked particles struck anything
         each, waits = each + step.finishes, str(world.substeps + 1)
-    if step.contact_pass.rows:  # after the fewest passes of both stages the host reads whether more are needed
-        fewest = step.contact_pass.rows.impulses.least + STIRRED
-        each, waits, least = each + fewest + 2, str(2 * world.substeps + 1), "at least "
+    if step.contact_pass.rows:
+        each += world._runner.launcher.passes_launched + 2
     more = ", and those behind a stale list again, once it was built" if step.searches else ""
     total = world.substeps * each + 1 + bool(step.searches)
-    return f"{least}{total} launches per frame, of which the host waits for {waits}{more}"
+    return f"{total} launches per frame, of which the host waits for {waits}{more}"
 
 
 def _present(world: "World") -> list[str]:

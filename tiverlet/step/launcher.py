@@ -4,13 +4,13 @@ from typing import TYPE_CHECKING, Any
 
 from ..contact.limits import BOUNCES, GOING, MOVES
 from ..device.language import template
-from .span import Moment, Span
+from .span import IMPULSES, LISTS, MOST, PLACES, ROUNDS, Moment, Span
 
 if TYPE_CHECKING:
     from .runner import Runner
 
-ROUNDS = 2  # rounds of impacts in turn before the host asks whether there are more
-STIRRED = 2  # passes of places before the host asks whether more are needed: mostly none, or one and a look after it
+FEW = 2  # rounds of impacts, passes of places, and times the fewest passes of impulses, that are launched without being asked for
+MANY = {ROUNDS: BOUNCES, IMPULSES: BOUNCES, PLACES: MOVES}  # most of them in a substep
 
 
 class Launcher:
@@ -18,7 +18,10 @@ class Launcher:
 
     Phases of one half of a pass share one launch. Phases that the scene does not need are skipped. If the neighbour list is
     stale, all later launches of the frame do nothing. The host then has the list rebuilt, and launches again from there, see
-    Runner._launch().
+    Runner._launch(). So it is where a substep needs more passes of contacts than were launched.
+
+    passes: how many rounds of impacts, and passes of impulses and of places, are launched in each substep. asks: whether the
+    host then asks for more of them, which few substeps at rest need.
     """
 
     def __init__(self, runner: "Runner"):
@@ -29,6 +32,8 @@ class Launcher:
         self.systems, self.steps = bool(step.constraints.systems), step.constraints.steps
         self.rows, self.impacts = step.contact_pass.rows, step.impacts
         self.looks, self.applies_first = step.looks, step.particles.applies_first
+        self.few = {ROUNDS: FEW, IMPULSES: FEW * self.rows.impulses.least if self.rows else 0, PLACES: FEW}
+        self.passes, self.asks = dict(self.few), dict.fromkeys(self.few, True)
         self.needs_more = True  # whether extra passes of this substep may be needed, see BodyImpacts
         self.waiting: list[str] = []
         self.now: Any = None  # the half of a pass of the waiting phases
@@ -164,33 +169,58 @@ class Launcher:
     def solve_contacts(self, now: Moment) -> None:
         """Add the phases that solve contacts, if there are any. Passes over rows are launches; some do nothing.
 
-        The host asks whether more of them are needed, see repeat().
+        If they were too few, the frame stops, and resumes with more of them.
         """
-        if self.rows and now.it == 0:
+        if not (self.rows and now.it == 0):
+            return
+        what = now.span.what if self.resumes(now) and now.half == now.span.half else LISTS
+        if what == LISTS:
             self.put(now, "start_events")
             self.put(now, "find_rows")
-            if self.rows.in_turn:
-                self.repeat(now, "strike", ROUNDS, BOUNCES)
-                self.put(now, "begin_impulses")
-            self.repeat(now, "relax_impulses", self.rows.impulses.least, BOUNCES)
+        if self.rows.in_turn and what <= ROUNDS:
+            self.repeat(now, "strike", ROUNDS)
+            self.put(now, "ask_for_rounds")
+            self.put(now, "begin_impulses")
+        if what <= IMPULSES:
+            self.repeat(now, "relax_impulses", IMPULSES)
+            self.put(now, "ask_for_impulses")
             self.put(now, "finish_impulses")
-            self.repeat(now, "relax_places", STIRRED, MOVES)
+        self.repeat(now, "relax_places", PLACES)
+        self.put(now, "ask_for_places")
 
-    def repeat(self, now: Moment, name: str, least: int, most: int) -> None:
-        """Launch passes until no further one is needed: the least number, and then each time as many as there were before.
+    def repeat(self, now: Moment, name: str, what: int) -> None:
+        """Launch as many passes as a substep took in the last frame. Where that is many, ask whether they are enough.
 
-        An answer takes the host as long as a few launches, so at most half of them do nothing for it.
+        Then launch each time as many as there were before: an answer takes the host as long as a few launches, and at most half
+        of them do nothing for it.
         """
-        flags, done, more = self.rows.impulses.flags, 0, least
+        done, more = 0, self.passes[what]
+        self.flush()  # also without any pass: the same phases share a launch then, and no kernel is compiled later
         while more:
             for _ in range(more):
                 self.flush()
                 self.put(now, name)
             self.flush()
             done += more
-            more = min(done, most - done)
-            if more and not self.runner.memory.read(flags)[..., GOING].any():
+            more = min(done, MANY[what] - done) if self.asks[what] else 0
+            if more and not self.runner.memory.read(self.rows.impulses.flags)[..., GOING].any():
                 return
+
+    @property
+    def passes_launched(self) -> int:
+        """The number of launches of passes over rows in a substep."""
+        in_turn = self.passes[ROUNDS] + 1 if self.rows.in_turn else 0
+        return in_turn + self.passes[IMPULSES] + self.passes[PLACES]
+
+    def launch_more(self, what: int) -> None:
+        """After a frame stopped because a substep takes more passes than were launched: ask from now on."""
+        self.asks[what], self.passes[what] = True, max(1, self.passes[what])
+
+    def learn(self, data: Any) -> None:
+        """After a frame, by its sheet: launch as many passes in the next one as a substep took at most, if that is few."""
+        for k, what in enumerate(self.passes):
+            most, few = int(data[MOST + k]), self.few[what]
+            self.asks[what], self.passes[what] = most > few, min(most, few)
 
     def apply_corrections(self, now: Moment) -> None:
         """Add the last phase of a pass, if particles have corrections to apply."""

@@ -517,6 +517,7 @@ class RowPass:
     @ti.func
     def relax_places(self, thread):
         """One pass of stage 2."""
+        going = self.going()
         if ti.static(bool(self.answers)):
             n = self.answers.links.n * self.going()
             for r in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
@@ -529,12 +530,13 @@ class RowPass:
         for _ in range(self.team.one(1, thread) * self.going()):
             self.impulses.decide_places(MOVES)
         self.team.wait()
-        n = self.n * self.impulses.moving()
+        going *= self.impulses.moving()
+        n = self.n * going
         for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
             self.places.move(i, self.impulses.numbers[None][BETA])
         self.team.wait()
         if ti.static(self.answers_later):
-            self.move_answers(thread, self.impulses.moving(), False)
+            self.move_answers(thread, going, False)
             for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                 self.places.follow(i)
             self.team.wait()

@@ -20,7 +20,7 @@ from .frames import Frames
 from .impulse import factor_of
 from .integrator import FREE, decay, h2_effective_of, h2_rigid_of, shares_of
 from .launcher import Launcher
-from .span import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Span
+from .span import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, LISTS, MOST, ORIGIN, H, Span
 from .step import frame
 from .step_report import StepReport
 
@@ -544,7 +544,7 @@ class Runner:
             )  # fmt: skip
             self._fused()
             if self._data[HALT]:
-                resumed, begin, half = self.take_halt()
+                resumed, begin, half, _what = self.take_halt()
                 self.grow()
                 self.wake_called(stages, passes, begin, half)
                 continue
@@ -566,21 +566,26 @@ class Runner:
                     clock.h, clock.time, clock.tick, clock.since, clock.d_is_velocity, s, substeps, passes, max(0, half)
                 )
 
-    def take_halt(self) -> tuple[int, int, int]:
-        """Return where the frame stopped (resumed, begin, half of Span), and clear the stop, which the host handles next."""
+    def take_halt(self) -> tuple[int, int, int, int]:
+        """Return where the frame stopped (resumed, begin, half, what of Span), and clear the stop, which the host handles next."""
         self.memory.write(self.step.halt, 0)
-        resumed, begin, half = (int(v) for v in self._data[HALT:ACTIVE_THREADS])
-        return (0, begin, 0) if half == BEFORE else (resumed, begin, half)
+        resumed, begin, half, what = (int(v) for v in self._data[HALT:MOST])
+        return (0, begin, 0, what) if half == BEFORE else (resumed, begin, half, what)
 
     def _launch(self, span: Span) -> None:
-        """Launch a frame phase by phase. At the end, the host reads one result: whether the frame waits for a list."""
+        """Launch a frame phase by phase. At the end, the host reads one result: whether the frame waits for something."""
         try:
             frame(self.launcher, span)
             while self.step.searches and self._data[HALT]:
-                span.resumed, span.begin, span.half = self.take_halt()
-                self.list_neighbours()
-                self.wake_called(span.substeps, span.iterations, span.begin, span.half)
+                span.resumed, span.begin, span.half, span.what = self.take_halt()
+                if span.what == LISTS:
+                    self.list_neighbours()
+                    self.wake_called(span.substeps, span.iterations, span.begin, span.half)
+                else:
+                    self.launcher.launch_more(span.what)
                 frame(self.launcher, span)
+            if span.substeps and self.launcher.rows:
+                self.launcher.learn(self._data)
         except BaseException:  # as signals raise
             self.launcher.waiting.clear()
             if self.step.searches:

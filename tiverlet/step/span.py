@@ -5,6 +5,7 @@ from struct import Struct
 from ..device import at, inline, record, ti
 
 BEFORE = -1  # the `half` of a substep that has not begun
+LISTS, ROUNDS, IMPULSES, PLACES = range(4)  # what a frame stopped for: lists; or, where phases are launched, more passes
 
 
 @record
@@ -15,17 +16,17 @@ class Span:
     substeps so far, and since the last start. fresh: whether displacements hold velocities. owed: the kick by rigid constraints
     that these velocities lack, as a time [s]. state_origin: how the state came about, see Diagnostics. substeps, iterations: of
     the frame. begin, until: the substeps of this launch. part: iterations in the last of them. resumed: 1 if substep `begin` was
-    interrupted before its half of a pass number `half`.
+    interrupted before its half of a pass number `half`, or in it, by `what`, see LISTS.
     """
 
     def __init__(
         self, h64, start, end, tick, since, fresh, owed, state_origin, substeps, iterations, begin=0, half=0, resumed=0, until=1,
-        part=1, thread=0, sheet=None,
+        part=1, thread=0, sheet=None, what=0,
     ):  # fmt: skip
         self.h64, self.start, self.end, self.tick, self.since, self.fresh = h64, start, end, tick, since, fresh
         self.owed, self.state_origin = owed, state_origin
         self.substeps, self.iterations, self.begin, self.half = substeps, iterations, begin, half
-        self.resumed, self.until, self.part, self.thread, self.sheet = resumed, until, part, thread, sheet
+        self.resumed, self.until, self.part, self.thread, self.sheet, self.what = resumed, until, part, thread, sheet, what
 
 
 @record
@@ -62,10 +63,11 @@ class Moment:
 
 
 # The sheet of a frame is one array, since each further array costs 0.25 us per launch. First the figures of the report, see
-# Diagnostics. Then how the frame ended: whether it stopped, in which substep, before which half of a pass; and how many threads
-# of the team were active. Then its arguments, see Span, with the number of the first thread.
+# Diagnostics. Then how the frame ended: whether it stopped, in which substep, before which half of a pass, and for what; how many
+# rounds of impacts and passes of impulses and of places a substep took at most; and how many threads of the team were active.
+# Then its arguments, see Span, with the number of the first thread.
 FIGURES = 15
-HALT, ACTIVE_THREADS = FIGURES, FIGURES + 3
+HALT, MOST, ACTIVE_THREADS = FIGURES, FIGURES + 4, FIGURES + 7
 GIVEN = tuple(range(ACTIVE_THREADS + 1, ACTIVE_THREADS + 17))
 H, START, END, TICK, SINCE, FRESH, OWED, SUBSTEPS, ITERATIONS, BEGIN, HALF, RESUMED, FIRST, ORIGIN, UNTIL, PART = GIVEN
 SHEET = PART + 1

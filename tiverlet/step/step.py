@@ -17,7 +17,7 @@ from .break_pass import BreakPass
 from .constraint_pass import ConstraintPass
 from .contact_pass import ContactPass
 from .particle_pass import ParticlePass
-from .span import ACTIVE_THREADS, BEFORE, FIRST, HALT, Moment, Span, integer, span_on
+from .span import ACTIVE_THREADS, BEFORE, FIRST, HALT, IMPULSES, LISTS, MOST, PLACES, ROUNDS, Moment, Span, integer, span_on
 
 if TYPE_CHECKING:
     from ..colliders.collider import Collider
@@ -118,7 +118,7 @@ class Step:
         self.listed_forces = [f for f in self.pair_forces if f.dev.search]
         self.searches = [*([search] if search else []), *(f.dev.search for f in self.listed_forces)]
         if self.searches:
-            self.halt = scene.memory.field("halt", None, width=3, kind=ti.i32)
+            self.halt = scene.memory.field("halt", None, width=4, kind=ti.i32)
             if self.launched:
                 team.halt = self.halt
 
@@ -256,7 +256,7 @@ class Step:
             if f.dev.list.stale[None] != 0:
                 f.dev.search.build(now.thread)
                 if f.dev.list.need[None] > f.dev.list.capacity:
-                    self.halt[None] = [1, now.s, BEFORE]  # all write the same
+                    self.halt[None] = [1, now.s, BEFORE, LISTS]  # all write the same
         self.team.wait()
 
     @ti.func
@@ -276,7 +276,7 @@ class Step:
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, now.thread)):
                 if f.dev.list.stale[None] != 0:
-                    self.halt[None] = [1, now.s, BEFORE]
+                    self.halt[None] = [1, now.s, BEFORE, LISTS]
 
     @ti.func
     def sum_pair_forces(self, now):
@@ -342,7 +342,7 @@ class Step:
             if self.has_pass(now) and self.sleepers.count[None] > 0:
                 self.look_for_sleepers(self.pass_of(now, half))
                 if self.sleepers.calls[None] != 0:
-                    self.halt[None] = [1, now.s, half]
+                    self.halt[None] = [1, now.s, half, LISTS]
 
     @ti.func
     def rebuild_stale(self, now, half):
@@ -353,7 +353,7 @@ class Step:
             if self.is_stale() != 0:
                 self.list_particles(now.thread)
                 if self.search.list.need[None] > self.search.list.capacity:
-                    self.halt[None] = [1, now.s, half]  # all write the same
+                    self.halt[None] = [1, now.s, half, LISTS]  # all write the same
 
     @called
     @ti.func
@@ -375,7 +375,7 @@ class Step:
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, now.thread)):
             if self.sleepers.calls[None] != 0:
-                self.halt[None] = [1, now.s, now.half]
+                self.halt[None] = [1, now.s, now.half, LISTS]
 
     @ti.func
     def ask_for_list(self, now):
@@ -383,7 +383,7 @@ class Step:
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, now.thread)):
             if self.is_stale() != 0:
-                self.halt[None] = [1, now.s, now.half]
+                self.halt[None] = [1, now.s, now.half, LISTS]
 
     @ti.func
     def solve_constraints(self, now):
@@ -456,6 +456,29 @@ class Step:
             self.contact_pass.rows.begin_impulses(now)
 
     @ti.func
+    def ask_for_passes(self, now, what: ti.template()):  # type: ignore[valid-type]
+        """On the launched path: stop the frame if more passes are needed than were launched, so that the host launches them."""
+        ti.loop_config(serialize=True)
+        for _ in range(self.team.one(1, now.thread)):
+            if self.contact_pass.rows.impulses.going() != 0:
+                self.halt[None] = [1, now.s, now.half, what]
+
+    @ti.func
+    def ask_for_rounds(self, now):
+        """The same for rounds of impacts in turn."""
+        self.ask_for_passes(now, ROUNDS)
+
+    @ti.func
+    def ask_for_impulses(self, now):
+        """The same for passes of impulses."""
+        self.ask_for_passes(now, IMPULSES)
+
+    @ti.func
+    def ask_for_places(self, now):
+        """The same for passes of places."""
+        self.ask_for_passes(now, PLACES)
+
+    @ti.func
     def strike(self, now):
         """On the launched path: one round of impacts in turn."""
         self.contact_pass.rows.strike(now.thread)
@@ -526,10 +549,15 @@ class Step:
 
     @ti.func
     def write_halt(self, sheet: ti.template()):  # type: ignore[valid-type]
-        """Write to the sheet whether and where the frame stopped, for the host to grow or build a list."""
+        """Write to the sheet whether and where the frame stopped, and for what, and how many passes a substep took at most."""
         if ti.static(len(self.searches) > 0):
-            for k in ti.static(range(3)):
+            for k in ti.static(range(4)):
                 sheet[HALT + k] = self.halt[None][k]
+            if ti.static(self.launched and bool(self.contact_pass.rows)):
+                for k in ti.static(range(3)):
+                    sheet[MOST + k] = self.contact_pass.rows.impulses.most[None][k]
+                if self.halted() == 0:
+                    self.contact_pass.rows.impulses.most[None] = [0, 0, 0]
 
     @ti.func
     def halted(self):
