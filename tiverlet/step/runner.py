@@ -567,7 +567,7 @@ class Runner:
                 )
 
     def take_halt(self) -> tuple[int, int, int, int]:
-        """Return where the frame stopped (resumed, begin, half, what of Span), and clear the stop, which the host handles next."""
+        """Return where the frame stopped (resumed, begin, half, what of Span), and clear the stop, for the host to handle."""
         self.memory.write(self.step.halt, 0)
         resumed, begin, half, what = (int(v) for v in self._data[HALT:MOST])
         return (0, begin, 0, what) if half == BEFORE else (resumed, begin, half, what)
