@@ -21,6 +21,7 @@ EXPERIMENTS = {
     "granular": "piles, elastic gases and packings beside what is known of them (parts: its tables)",
     "periodic": "gases and shear flows in periodic boxes beside what is known of them",
     "rolling": "one or two spinning spheres beside pymunk, Box2D, LAMMPS and Newton",
+    "gpu": "what runs on a GPU, with which bits, how fast, and how often the host waits (parts: its tables)",
     "grains": "heaps, drums and silos of spinning grains, beside LAMMPS (parts: its tables)",
 }
 

@@ -134,11 +134,11 @@ class Pymunk:
 
 
 class Newton:
-    """A scene in Newton: XPBD on Warp, on the CPU. Links are springs of 1e6 N/m, the box is six planes."""
+    """A scene in Newton: XPBD on Warp. Links are springs of 1e6 N/m, the box is six planes."""
 
     STIFF = 1e6
 
-    def __init__(self, particles, features, setting: tuple[int, int]):
+    def __init__(self, particles, features, setting: tuple[int, int], device: str = "cpu"):
         newton: Any = import_module("newton")
         wp: Any = import_module("warp")
 
@@ -160,8 +160,8 @@ class Newton:
                     for sign, at in ((1.0, low[axis]), (-1.0, high[axis])):
                         normal = [sign * (k == axis) for k in range(3)]
                         builder.add_shape_plane(plane=(*normal, -sign * at), width=0.0, length=0.0)
-        with wp.ScopedDevice("cpu"):
-            self.model = model = builder.finalize(device="cpu")
+        with wp.ScopedDevice(device):
+            self.model = model = builder.finalize(device=device)
             model.particle_mu = model.soft_contact_mu = 0.0
             if not particles.radius.any():
                 model.particle_grid = None
