@@ -49,7 +49,7 @@ def grains(n: int, dim: int = 2):
 def boxes(n: int):
     """Build towers of boxes as bodies of four particles each."""
     one, count = tv.shapes.box((0, 0), (1, 1)), max(1, n // 4)
-    pile, _ = tv.shapes.join(*(one.moved((1.5 * (k // 8), k % 8)) for k in range(count)))
+    pile, _ = tv.shapes.join(*(one.moved((1.5 * (k // 8), 0.5 + k % 8)) for k in range(count)))
     loops = [np.asarray(one.loops[0]) + 4 * k for k in range(count)]
     return tv.Particles(pile.position), [tv.Gravity(9.81), tv.HalfSpace((0, 1)), tv.ShapeMatch(loops), tv.Polygons(loops)]
 
