@@ -153,16 +153,18 @@ def _worlds(args, arch: str, end: float) -> Table:
 
 def _tests(args, arch: str, end: float) -> Table:
     """Run a part of the tests on the device."""
-    rows = []
-    for file in TESTS[: 1 if args.quick else None]:
-        words = [sys.executable, "-m", "pytest", "-o", "addopts=", "-q", "-m", "not slow", "-p", "no:cacheprovider", file]
-        options: Any = {"cwd": ROOT, "env": os.environ | {"TIVERLET_ARCH": arch}, "capture_output": True, "text": True}
+    test = [sys.executable, "-m", "pytest", "-o", "addopts=", "-q", "-m", "not slow", "-p", "no:cacheprovider"]
+    stress = f"import sys, tiverlet; tiverlet.init(arch={arch!r}); from tiverlet.__main__ import main; main(sys.argv[1:])"
+    runs = {file: [*test, file] for file in TESTS}
+    runs["stress"] = [sys.executable, "-c", stress, "stress", "--workers", "1", *map(str, range(1, 21))]
+    rows, options = [], {"cwd": ROOT, "env": os.environ | {"TIVERLET_ARCH": arch}, "capture_output": True, "text": True}
+    for name in [TESTS[0], "stress"] if args.quick else runs:
         try:
-            ran = subprocess.run(words, **options, timeout=max(1, end - perf_counter()))
-            rows.append((file, (ran.stdout.splitlines() or ["nothing"])[-1]))
+            ran: Any = subprocess.run(runs[name], **options, timeout=max(1, end - perf_counter()))  # type: ignore[call-overload]
+            rows.append((name, (ran.stdout.split("\n\n")[-1].strip().splitlines() or [ran.stderr[-100:]])[-1]))
         except subprocess.TimeoutExpired:
-            rows.append((file, "no time left"))
-    return Table("Tests", ("file", "result"), rows, [])
+            rows.append((name, "no time left"))
+    return Table("Tests, and the first 20 rows of stress", ("what", "result"), rows, [])
 
 
 def process(job: dict[str, Any]) -> None:
