@@ -61,8 +61,11 @@ def test_a_rope_on_a_drum_holds_and_slips_by_the_capstan_equation(world, substep
         features = [tv.Gravity(G), tv.Distance(links), tv.Ball((0, 0), 0.5, friction=friction), tv.Contact()]
         w = world(tv.Particles(x, mass=mass, radius=0.01), features, substeps=substeps)
         w.run(0.3)
+        assert "creeps" not in w.explain()
         right = capstan_fall(ratio, friction, bead, turns, hang, 0.3)
         assert x[-1, 1] - w.position[-1, 1] == pytest.approx(right, rel=0.04 if substeps == 20 else 0.015, abs=1e-5)
+    drum = tv.Ball((0, 0), 0.5, friction=0.3)  # without contacts it creeps, which is told
+    assert f"{drum!r}: what constraints hold creeps under loads" in world(w.particles, [tv.Distance(links), drum]).explain()
 
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])

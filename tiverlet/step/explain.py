@@ -126,7 +126,7 @@ def _present(world: "World") -> list[str]:
             out.append(f"{f!r}: nothing, since all radii are 0")
     if world.particles.spins:
         out.append("spin: with friction" + (", and orientations" if world._runner.step.orients else ""))
-    out += [*_sliding(world), *_brittle(world)]
+    out += [*_sliding(world), *_creeping(world), *_brittle(world)]
     return out or ["motion in a straight line"]
 
 
@@ -138,6 +138,14 @@ def _sliding(world: "World") -> list[str]:
         return []
     rough = [repr(f) for f in world.features if isinstance(f, Collider) and np.any(f.friction) and not _is_level(f, pull)]
     return [f"{', '.join(rough)}: particles slide down a slope; with tv.Particles(spin=True) they roll"] if rough else []
+
+
+def _creeping(world: "World") -> list[str]:
+    """Return a note on walls with friction where no contacts are solved, on which what constraints hold creeps under loads."""
+    rough = [repr(f) for f in world.features if isinstance(f, Collider) and np.any(f.friction)]
+    if not rough or not world._runner.step.batches or world._runner.step.contact_pass.rows:
+        return []
+    return [f"{', '.join(rough)}: what constraints hold creeps under loads; beside tv.Contact(), with radii, friction holds it"]
 
 
 def _brittle(world: "World") -> list[str]:
