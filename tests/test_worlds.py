@@ -451,7 +451,7 @@ def test_fields_of_many_take_what_those_of_each_alone_do(taichi):
         with tv.Worlds(world, 100) as many:
             told = sum(size for name, size in many.fields.items() if name.startswith("frames."))
             assert sum(many.fields.values()) - told <= 100 * sum(world.clone(path="fused").fields.values()) + 4
-            assert told == 100 * (35 + 4) * 8 + 4
+            assert told == 100 * (39 + 4) * 8 + 4
 
 
 class Tensor:
