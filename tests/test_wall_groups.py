@@ -60,6 +60,7 @@ def moved(walls, k):
         wall.push_out = 0.5 + k
 
 
+ROUGH = {"friction": 0.3, "restitution": 0.5, "active": True}
 KINDS = [("capsule", 2), ("capsule", 3), ("ball", 2), ("half-space", 2), ("box", 3), ("polygon", 2), ("mesh", 3)]
 
 
@@ -75,8 +76,7 @@ def run(kind, dim, options):
         return groups, world.position.copy(), world.velocity.copy()
 
 
-@pytest.mark.parametrize(("kind", "dim"), KINDS)
-@pytest.mark.parametrize("options", [{}, {"friction": 0.3, "restitution": 0.5, "active": True}], ids=["plain", "rough"])
+@pytest.mark.parametrize(("kind", "dim", "options"), [("box", 2, {}), ("capsule", 2, {}), *((*kind, ROUGH) for kind in KINDS)])
 def test_walls_that_share_code_act_as_walls_with_code_of_their_own(kind, dim, options, monkeypatch):
     groups, x, v = run(kind, dim, options)
     assert groups == 2 - (kind == "box" and not options)
@@ -87,7 +87,7 @@ def test_walls_that_share_code_act_as_walls_with_code_of_their_own(kind, dim, op
     np.testing.assert_array_equal(v, u)
 
 
-@pytest.mark.parametrize(("kind", "dim", "n"), [*((*kind, 40) for kind in KINDS), ("capsule", 3, 1200), ("polygon", 2, 1200)])
+@pytest.mark.parametrize(("kind", "dim", "n"), [*((*kind, 40) for kind in KINDS), ("polygon", 2, 1200)])
 def test_contacts_with_walls_that_share_code_are_the_same_rows(kind, dim, n, monkeypatch):
     def heap():
         walls = pegs(kind, dim, 4, friction=0.3)
