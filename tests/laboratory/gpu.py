@@ -4,6 +4,7 @@ The architecture is TIVERLET_ARCH, else CUDA or Metal, else the CPU with frames 
 which tries the whole script. Every row has a process of its own, and only so many seconds.
 """
 
+import contextlib
 import json
 import os
 import subprocess
@@ -106,10 +107,9 @@ def _bits(args, arch: str, end: float) -> Table:
         if not all(isinstance(one, list) for one in out):
             rows.append((name, *(one if isinstance(one, str) else "ran" for one in out)))
             continue
-        same = sum(np.cumprod([a == b for a, b in zip(out[0][0], out[2][0], strict=True)]))
-        rows.append(
-            (name, "the same" if out[0][0] == out[1][0] else "differ", f"{same} of {len(out[0][0])}", out[0][1] or "none")
-        )
+        (hashes, flags), (again, _), (host, _) = out
+        same = sum(np.cumprod([a == b for a, b in zip(hashes, host, strict=True)]))
+        rows.append((name, "the same" if hashes == again else "differ", f"{same} of {len(host)}", flags or "none"))
     return Table("Bits of 400 particles in 30 frames", ("scene", "two runs", "frames as on the CPU", "flags"), rows, [])
 
 
@@ -181,10 +181,8 @@ def _made(job: dict[str, Any]) -> tv.World:
     build, substeps = BUILD[job["scene"]]
     particles, features = build(job["n"])
     path = {"fused": "fused", "cpu": "parallel"}.get(job["arch"], "auto")
-    if job["arch"] == "cpu":
-        with thread_team.launching():
-            return tv.World(particles, features, substeps=substeps, path=path)
-    return tv.World(particles, features, substeps=substeps, path=path)
+    with thread_team.launching() if job["arch"] == "cpu" else contextlib.nullcontext():
+        return tv.World(particles, features, substeps=substeps, path=path)
 
 
 def _hashes(job: dict[str, Any]) -> Any:

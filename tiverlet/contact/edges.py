@@ -354,11 +354,16 @@ class Edges:
         return row
 
     @ti.func
-    def reaches_edge(self, v, a, b):
-        """Whether list_edge() may list vertex v at the edge from a to b: a fast test, which most entries fail."""
+    def vertex_and_edge(self, v, a, b):
+        """Return x_v - x_a and x_b - x_a at the end of the substep, and by how much each changes in it [m]."""
         dr = self.state.relative_displacement(self.state.d[v] - self.state.d[a], v, a)
         du = self.state.relative_displacement(self.state.d[b] - self.state.d[a], b, a)
-        r1, u1 = self.state.separation(v, a), self.state.separation(b, a)
+        return self.state.separation(v, a), self.state.separation(b, a), dr, du
+
+    @ti.func
+    def reaches_edge(self, v, a, b):
+        """Whether list_edge() may list vertex v at the edge from a to b: a fast test, which most entries fail."""
+        r1, u1, dr, du = self.vertex_and_edge(v, a, b)
         r0, u0 = r1 - dr, u1 - du
         length, t0, t1, uu = self.longest[a], r0.dot(u0), r1.dot(u1), ti.max(u0.dot(u0), u1.dot(u1))
         top = self.radius.of(v) + ti.max(self.radius.of(a), self.radius.of(b)) + ti.static(AHEAD) * self.smaller(v, a)
@@ -377,9 +382,7 @@ class Edges:
     @ti.func
     def list_edge(self, v, a, b, e, row, scale):
         """List the contact of vertex v with the edge from a to b if it may press. Returns the next free row."""
-        dr = self.state.relative_displacement(self.state.d[v] - self.state.d[a], v, a)
-        du = self.state.relative_displacement(self.state.d[b] - self.state.d[a], b, a)
-        r1, u1 = self.state.separation(v, a), self.state.separation(b, a)
+        r1, u1, dr, du = self.vertex_and_edge(v, a, b)
         r0, u0 = r1 - dr, u1 - du
         uu = u0.dot(u0)
         n, t, s, lists, size = 0 * r0, 0 * uu, 0 * uu, False, self.smaller(v, a)

@@ -70,23 +70,24 @@ def _pins(
 
     pairs: (m, 2) that are left out; a hub is left out with all corners of its body. links, lengths: see _inside(). x: (n, 2) [m].
     """
-    body, out = outline.body, [np.zeros((0, 2), dtype=np.int32)]
+    body, size, out = outline.body, radius.copy(), [np.zeros((0, 2), dtype=np.int32)]
+    apart = (body[links] < 0).all(axis=1)
+    links, lengths = links[apart], lengths[apart]
     inner, rim = np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0).T
-    inner, rim = (of[(body[inner] < 0) & (body[rim] >= 0)] for of in (inner, rim))
-    ties, count = np.unique(np.stack([inner, body[rim]], axis=1), axis=0, return_counts=True)
+    some = (body[inner] < 0) & (body[rim] >= 0) & np.isin(inner, links)
+    ties, count = np.unique(np.stack([inner, body[rim]], axis=1)[some], axis=0, return_counts=True)
+    hubs = []
     for hub, k in ties[count == np.bincount(body[body >= 0])[ties[:, 1]]].tolist():
         loop = [int(np.argmax(body == k))]
         while (after := int(outline.ends[loop[-1], 0])) != loop[0]:
             loop.append(after)
-        depth, way, open_ = depth_of(x[hub], x[loop])[0], {hub: 0.0}, [hub]
-        while open_:
-            i = open_.pop()
-            at, end = np.nonzero(links == i)
-            for j, far in zip(links[at, 1 - end].tolist(), (way[i] + lengths[at]).tolist(), strict=True):
-                if 0 < depth and body[j] < 0 and far <= depth + radius.max() and far < way.get(j, np.inf):
-                    way[j] = far
-                    open_.append(j)
-        held = [j for j, far in way.items() if j != hub and far <= depth + radius[j]]
+        depth, _edge = depth_of(x[hub], x[loop])
+        if depth > 0:
+            hubs.append((hub, loop))
+            size[hub] = depth
+    near = np.concatenate([links[lengths <= size[links].sum(axis=1)], _inside(links, lengths, size)])
+    for hub, loop in hubs:
+        held = near[(near == hub).any(axis=1)].sum(axis=1) - hub
         out.append(np.stack([np.repeat(held, len(loop)), np.tile(loop, len(held))], axis=1).astype(np.int32))
     return np.concatenate(out)
 
@@ -97,7 +98,7 @@ def _inside(links: np.ndarray, lengths: np.ndarray, radius: np.ndarray) -> np.nd
     links: (m, 2). lengths: (m,) [m]. radius: (n,) [m]. Paths start at the larger particle of a pair, and end when they are longer
     than its diameter.
     """
-    some = lengths > FOLDED * radius[links].min(axis=1)
+    some = lengths >= FOLDED * radius[links].min(axis=1)
     if lengths[some].min(initial=np.inf) > (1 + DIGIT) * radius.max(initial=0.0):
         return np.zeros((0, 2), dtype=np.int32)
     i, j = np.concatenate([links[some], links[some][:, ::-1]]).T.astype(np.int64)

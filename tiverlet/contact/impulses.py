@@ -36,6 +36,7 @@ from .limits import (
     GOING,
     GROUP,
     HITS,
+    IMPULSES,
     KINETIC,
     LACK,
     LANDING,
@@ -47,8 +48,10 @@ from .limits import (
     MOMENTUM,
     OWN,
     PASSES,
+    PLACES,
     RELAXATION,
     ROUNDING,
+    ROUNDS,
     ROWS,
     SCALE,
     SHARE,
@@ -390,7 +393,7 @@ class Impulses:
             beta, ahead = 0 * beta, 1 + 0 * ahead
         self.numbers[None][BETA], self.numbers[None][THETA] = beta, ahead
         self.flags[None][TURN] = turn
-        self.note_turn(1, turn)
+        self.note_turn(IMPULSES, turn)
         most = ti.select(lack > self.numbers[None][LANDING], BOUNCES, PASSES)
         goes_on = turn < most and lack > self.numbers[None][TOLERANCE]
         if ti.static(self.rows.bounces and not self.rows.impacts):  # else rounds have done it
@@ -410,7 +413,7 @@ class Impulses:
         turn = self.flags[None][TURN] + 1
         self.numbers[None][BETA], self.numbers[None][THETA] = self.momentum()
         moves = ti.cast(self.total(LACK) > 0, ti.i32)
-        self.note_turn(2, turn)
+        self.note_turn(PLACES, turn)
         self.flags[None] = [ti.select(turn < most, moves, 0), turn, moves, 0]
 
     @ti.func
@@ -434,7 +437,7 @@ class Impulses:
         What is left where energy is lost, and is little beside all before, is left to the passes. One thread calls it.
         """
         turn = self.flags[None][TURN] + 1
-        self.note_turn(0, turn)
+        self.note_turn(ROUNDS, turn)
         work = self.total(WORK)
         done = self.numbers[None][TOLERANCE] + work
         goes_on = work > ti.static(ERROR) * done or self.total(LACK) > 0

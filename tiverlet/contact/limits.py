@@ -31,6 +31,7 @@ LACK, UPHILL, WORK, LOAD, ROWS, FORCE, HITS, WRONG, KINETIC = SUMS = range(9)  #
 # Numbers of the passes. LANDING: what rows lack in impacts. ALLOWED: work per impulse that is rounding [m]
 BETA, THETA, TOLERANCE, LANDING, ALLOWED = range(5)
 H, BEGIN, END, SCALE, WHOLE, SHARES = TIMES = range(6)  # what rows know of a substep, see Rows.times
+ROUNDS, IMPULSES, PLACES = range(3)  # kinds of passes: of impacts in turn, of stage 1, of stage 2
 GOING, TURN, GAINS, STRUCK = range(4)  # whether another pass follows, its number, whether any particle gains energy, or bounces
 THROWN = 0.5  # of the median radius: how far impacts in turn may throw something in a substep and it still meets others
 NEVER = 3.0  # a time after the substep

@@ -63,7 +63,7 @@ def waits(some: np.ndarray) -> np.ndarray:
     return some[:, HALT] != 0
 
 
-def resume(row: np.ndarray, resumed: int, begin: int, half: int, _what: int) -> None:
+def resume(row: np.ndarray, resumed: int, begin: int, half: int) -> None:
     """Set a sheet so that its frame resumes in the substep, and before the half of a pass, in which it stopped."""
     row[RESUMED], row[BEGIN], row[HALF] = resumed, begin, half
 

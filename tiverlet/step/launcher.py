@@ -2,9 +2,9 @@
 
 from typing import TYPE_CHECKING, Any
 
-from ..contact.limits import BOUNCES, GOING, MOVES
+from ..contact.limits import BOUNCES, GOING, IMPULSES, MOVES, PLACES, ROUNDS
 from ..device.language import template
-from .span import IMPULSES, LISTS, MOST, PLACES, ROUNDS, Moment, Span
+from .span import LISTS, MOST, Moment, Span
 
 if TYPE_CHECKING:
     from .runner import Runner
@@ -20,8 +20,8 @@ class Launcher:
     stale, all later launches of the frame do nothing. The host then has the list rebuilt, and launches again from there, see
     Runner._launch(). So it is where a substep needs more passes of contacts than were launched.
 
-    passes: how many rounds of impacts, and passes of impulses and of places, are launched in each substep. asks: whether the
-    host then asks for more of them, which few substeps at rest need.
+    taken: how many rounds of impacts, and passes of impulses and of places, a substep of the last frame took at most. few: how
+    many of each are launched at most without asking for more, which no substep at rest needs.
     """
 
     def __init__(self, runner: "Runner"):
@@ -33,7 +33,7 @@ class Launcher:
         self.rows, self.impacts = step.contact_pass.rows, step.impacts
         self.looks, self.applies_first = step.looks, step.particles.applies_first
         self.few = {ROUNDS: FEW, IMPULSES: FEW * self.rows.impulses.least if self.rows else 0, PLACES: FEW}
-        self.passes, self.asks = dict(self.few), dict.fromkeys(self.few, True)
+        self.taken = dict(MANY)
         self.needs_more = True  # whether extra passes of this substep may be needed, see BodyImpacts
         self.waiting: list[str] = []
         self.now: Any = None  # the half of a pass of the waiting phases
@@ -194,7 +194,7 @@ class Launcher:
         Then launch each time as many as there were before: an answer takes the host as long as a few launches, and at most half
         of them do nothing for it.
         """
-        done, more = 0, self.passes[what]
+        done, more = 0, self.passes(what)
         self.flush()  # also without any pass: the same phases share a launch then, and no kernel is compiled later
         while more:
             for _ in range(more):
@@ -202,25 +202,28 @@ class Launcher:
                 self.put(now, name)
             self.flush()
             done += more
-            more = min(done, MANY[what] - done) if self.asks[what] else 0
+            more = min(done, MANY[what] - done) if self.taken[what] > self.few[what] else 0
             if more and not self.runner.memory.read(self.rows.impulses.flags)[..., GOING].any():
                 return
+
+    def passes(self, what: int) -> int:
+        """Return how many passes of a kind are launched at once in a substep."""
+        return min(self.taken[what], self.few[what])
 
     @property
     def passes_launched(self) -> int:
         """The number of launches of passes over rows in a substep."""
-        in_turn = self.passes[ROUNDS] + 1 if self.rows.in_turn else 0
-        return in_turn + self.passes[IMPULSES] + self.passes[PLACES]
+        in_turn = self.passes(ROUNDS) + 1 if self.rows.in_turn else 0
+        return in_turn + self.passes(IMPULSES) + self.passes(PLACES)
 
     def launch_more(self, what: int) -> None:
         """After a frame stopped because a substep takes more passes than were launched: ask from now on."""
-        self.asks[what], self.passes[what] = True, max(1, self.passes[what])
+        self.taken[what] = MANY[what]
 
     def learn(self, data: Any) -> None:
-        """After a frame, by its sheet: launch as many passes in the next one as a substep took at most, if that is few."""
-        for k, what in enumerate(self.passes):
-            most, few = int(data[MOST + k]), self.few[what]
-            self.asks[what], self.passes[what] = most > few, min(most, few)
+        """After a frame: take from its sheet how many passes a substep took."""
+        for what in self.taken:
+            self.taken[what] = int(data[MOST + what])
 
     def apply_corrections(self, now: Moment) -> None:
         """Add the last phase of a pass, if particles have corrections to apply."""

@@ -519,7 +519,7 @@ class RowPass:
         """One pass of stage 2."""
         going = self.going()
         if ti.static(bool(self.answers)):
-            n = self.answers.links.n * self.going()
+            n = self.answers.links.n * going
             for r in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                 self.answers.links.relax_place(r, self.bodies)
             self.team.wait()

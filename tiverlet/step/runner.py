@@ -544,7 +544,7 @@ class Runner:
             )  # fmt: skip
             self._fused()
             if self._data[HALT]:
-                resumed, begin, half, _what = self.take_halt()
+                resumed, begin, half = self.take_halt()[:3]
                 self.grow()
                 self.wake_called(stages, passes, begin, half)
                 continue

@@ -5,7 +5,7 @@ from struct import Struct
 from ..device import at, inline, record, ti
 
 BEFORE = -1  # the `half` of a substep that has not begun
-LISTS, ROUNDS, IMPULSES, PLACES = range(4)  # what a frame stopped for: lists; or, where phases are launched, more passes
+LISTS = -1  # what a frame stopped for; where phases are launched, it may be more passes of a kind, see contact/limits.py
 
 
 @record
@@ -21,7 +21,7 @@ class Span:
 
     def __init__(
         self, h64, start, end, tick, since, fresh, owed, state_origin, substeps, iterations, begin=0, half=0, resumed=0, until=1,
-        part=1, thread=0, sheet=None, what=0,
+        part=1, thread=0, sheet=None, what=LISTS,
     ):  # fmt: skip
         self.h64, self.start, self.end, self.tick, self.since, self.fresh = h64, start, end, tick, since, fresh
         self.owed, self.state_origin = owed, state_origin

@@ -8,6 +8,7 @@ the integrator.
 
 from typing import TYPE_CHECKING, Any
 
+from ..contact.limits import IMPULSES, PLACES, ROUNDS
 from ..device import called, runtime, ti
 from ..device.number import OnDevice, read_all
 from ..device.thread_team import LEAST, Team
@@ -17,7 +18,7 @@ from .break_pass import BreakPass
 from .constraint_pass import ConstraintPass
 from .contact_pass import ContactPass
 from .particle_pass import ParticlePass
-from .span import ACTIVE_THREADS, BEFORE, FIRST, HALT, IMPULSES, LISTS, MOST, PLACES, ROUNDS, Moment, Span, integer, span_on
+from .span import ACTIVE_THREADS, BEFORE, FIRST, HALT, LISTS, MOST, Moment, Span, integer, span_on
 
 if TYPE_CHECKING:
     from ..colliders.collider import Collider

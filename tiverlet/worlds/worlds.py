@@ -336,7 +336,7 @@ class Worlds:
             for k in some:
                 with self._as_world(k):
                     runner.sheet[:] = sheets[k]
-                    kernel.resume(sheets[k], *runner.take_halt())
+                    kernel.resume(sheets[k], *runner.take_halt()[:3])
                     runner.grow()
                     runner.invalidate()
             memory.write(self._kernels.sheet, sheets)
