@@ -38,6 +38,7 @@ LEAST_SOFTNESS = 2e-12  # of the largest diagonal: the least softness, so that n
 # made it softer, REGAIN of its softness in a substep. At rest, where violations change by less than STILL in one of the longer
 # substeps, it recovers for nothing, by RECOVERY in this time; violations then change half as fast as they may.
 REGAIN, RECOVERY, STILL = 2.0**-4, 2.0**-14, 2.0**-12
+SLIGHT = 2e-5  # strain up to which giving way is not told: a straight rope that is so much longer sags by 0.3 % of its length
 UNBORNE = 1e30  # (omega h)^2 of a tension that is undetermined
 MANY = 600  # rows of a part, up to which it may stiffen
 GONE = 0.1  # of its violations: what may be left of them a substep after they seem to have been removed
@@ -593,6 +594,15 @@ class Elimination(System):
         return worst
 
     @ti.func
+    def strain(self, begin, end, softness):
+        """Return the largest violation by which rows hold their multipliers, relative to their sizes."""
+        out = ti.cast(0, ti.f64)
+        for r in range(begin, end):
+            if self.scale[r] != 0:
+                out = ti.max(out, softness * ti.abs(self.lam[r] + self.step[r]) * self.inverse_size[r] / self.scale[r])
+        return out
+
+    @ti.func
     def clear_steps(self, begin, end):
         """Set all steps to 0."""
         for r in range(begin, end):
@@ -697,7 +707,7 @@ class Elimination(System):
             if not self.state.awake(self.representative[b]):
                 end = begin
         zero = ti.cast(0, ti.f64)
-        softness, least, inverse, tension_at_start, total_at_start = zero, zero, zero, zero, zero
+        softness, least, inverse, tension_at_start, total_at_start, reported = zero, zero, zero, zero, zero, zero
         stage, k, bound, soft, longer = FORWARD, 0, True, self.softness(b, begin, end), 1 + zero
         if soft > 0:
             longer = soft / kick
@@ -724,8 +734,7 @@ class Elimination(System):
                     self.refine_violations(begin, end)
                     stage = FORWARD
                 elif hard == 2:
-                    ti.atomic_max(self.tension[None], ti.cast(TENSEST, ti.f64))
-                    softness, stage = LEAST_SOFTNESS * most, GIVE_WAY
+                    reported, softness, stage = TENSEST + zero, LEAST_SOFTNESS * most, GIVE_WAY
                     self.softened[b][3] = UNBORNE
                     self.end_newton(b)
                 else:
@@ -738,19 +747,22 @@ class Elimination(System):
                 else:
                     # A load that more substeps do not help to bear is reported as just unstable, TENSEST.
                     reported = ti.select(bound, tension_at_start, ti.min(tension, TENSEST))
-                    ti.atomic_max(self.tension[None], ti.select(longer > 1, ti.min(reported, TENSEST), reported))
+                    reported = ti.select(longer > 1, ti.min(reported, TENSEST), reported)
                     softness, stage = LEAST_SOFTNESS * most, GIVE_WAY
                     self.softened[b][3] = ti.select(bound, tension_at_start, tension) / longer
                     self.end_newton(b)
                     if longer * self.earlier_tension(begin, end) > SOFTENED_TO:
                         self.clear_steps(begin, end)
+                        ti.atomic_max(self.tension[None], reported)
                         stage = DONE
             else:
                 k += 1
                 if k == ROUNDS or (tension <= SOFTENED_TO and (k == 1 or k > 3 or tension > 0.8 * SOFTENED_TO)):
+                    gives = k == ROUNDS or self.strain(begin, end, softness) > SLIGHT
                     self.use_end_directions(begin, end)
                     self.limit_tensions(begin, end, longer)
                     self.record_softness(b, soft, k > 1)
+                    ti.atomic_max(self.tension[None], ti.select(gives, reported, tension / longer))
                     stage = DONE
                 else:
                     new = softness + stiffness * (tension / SOFTENED_TO - 1)

@@ -366,15 +366,16 @@ class Rows:
         self.corners = [some[b.owner] for b, some in self.active]
         if borne is not None:
             found = [C - np.clip(C, np.minimum(some, 0), np.maximum(some, 0)) for C, some in zip(found, borne, strict=True)]
-        self.C, self.close = (
-            np.concatenate([v[some] for v, some in zip(values, active, strict=True)]) for values in (found, self.sizes)
+        none, nobody = np.zeros(0), np.zeros(0, dtype=np.int64)  # there may be no batches
+        self.C, self.close, W = (
+            np.concatenate([none, *(v[some] for v, some in zip(values, active, strict=True))])
+            for values in (found, self.sizes, self.weights)
         )
-        self.who = np.concatenate([b.indices.ravel()[some] for b, some in zip(batches, self.corners, strict=True)])
-        counts = np.concatenate([np.bincount(b.owner, minlength=b.count)[some] for b, some in self.active])
+        self.who = np.concatenate([nobody, *(b.indices.ravel()[some] for b, some in zip(batches, self.corners, strict=True))])
+        counts = np.concatenate([nobody, *(np.bincount(b.owner, minlength=b.count)[some] for b, some in self.active)])
         self.row = np.repeat(np.arange(len(self.C)), counts)
         self.first = np.cumsum(counts) - counts  # corner of each row
-        self.J = np.concatenate([g[some] for g, some in zip(gradients, self.corners, strict=True)])
-        W = np.concatenate([v[some] for v, some in zip(self.weights, active, strict=True)])
+        self.J = np.concatenate([x[:0], *(g[some] for g, some in zip(gradients, self.corners, strict=True))])
         self.scale = np.divide(1, np.sqrt(W), out=np.zeros(len(W)), where=W > 0)
 
     def _weights(self, gradients: list[np.ndarray]) -> list[np.ndarray]:

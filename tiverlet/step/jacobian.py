@@ -1,5 +1,6 @@
 """The Jacobian of constraints, stored by corners, and the least moves along it in the metric of the masses."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -51,7 +52,7 @@ class Jacobian:
 
 def summed(values: np.ndarray, who: np.ndarray, count: int) -> np.ndarray:
     """Return the sums of values (numbers, vectors or matrices) by particle or body who[k], (count, ...)."""
-    sums = [np.bincount(who, column, minlength=count) for column in values.reshape(len(values), -1).T]
+    sums = [np.bincount(who, column, minlength=count) for column in values.reshape(len(values), math.prod(values.shape[1:])).T]
     return np.stack(sums, axis=1).reshape(count, *values.shape[1:])
 
 
