@@ -358,3 +358,18 @@ def test_bad_arguments_are_refused(world):
     ):
         with pytest.raises(ValueError, match=message):
             wrong()
+
+
+def test_a_motor_turns_a_braced_square(world):
+    # Links that others imply are noted by their lengths when a world is built, which the angle of a motor is none of. The square
+    # turns about a corner, with the inertia 4 m a^2 of its three other corners: w = T t / I, up to the speed of the motor.
+    square = [[0.0, 0], [1, 0], [1, 1], [0, 1], [-1, 0]]
+    motor = tv.Motor([(4, 0, 1)], 2.0, torque=4.0)
+    w = world(
+        tv.Particles(square, pinned=[0, 4]), [tv.Distance([(i, j) for i in range(4) for j in range(i)]), motor], substeps=20
+    )
+    assert "Solved by Direct" in w.explain()
+    w.run(1.0)
+    np.testing.assert_allclose(np.linalg.norm(w.velocity[:4], axis=1), np.array([0, 1, 2**0.5, 1]), rtol=1e-3)
+    w.run(2.0)
+    np.testing.assert_allclose(np.linalg.norm(w.velocity[:4], axis=1), 2 * np.array([0, 1, 2**0.5, 1]), rtol=1e-3)
