@@ -43,10 +43,9 @@ ROOM = {True: (6.5, 14), False: (12, 32)}
 # particles (1200 with constraints) 0.55 and 0.35; of ropes with 205 (405) 0.18 and 0.18, with 820 (1620) 0.64 and 0.40.
 CROSSOVER = 1000
 # Code sizes, in multiples of a Distance in 2D, from which kernels are long, or endless. A hundred figures on stairs (13) compile
-# in 13 to 17 s with Taichi's simplifier and in 5 s without, and frames take as long. An hourglass (6) takes 6.5 s, and 3.0 s
-# without the search for equal expressions; frames then take 1 to 3 % longer. Discs, ropes and soft balls (5.6) take 8.2 and
-# 3.1 s, but frames 6 to 11 % longer; a pile (3.6) takes 1.9 s, and frames 8 % longer: these two are compiled with the search.
-LONG, ENDLESS = 5.8, 10.0
+# in 13 to 17 s with Taichi's simplifier and in 5 s without, and frames take as long. A pile of 1000 (3.6) takes 5.3 to 7 s, and
+# 3.5 to 4.5 s without the search for equal expressions; frames of 6 ms then take 2 to 8 % longer, those of 4000 a fifth.
+LONG, ENDLESS = 3.5, 10.0
 USUAL = 20  # substeps of a frame in scenes with constraints, or forces that change
 GRAINS = 4  # where contacts are rows, and particles fall freely between them, which is exact
 MANY = 4 * FEW  # particles from which frames take so long that the search pays for long kernels

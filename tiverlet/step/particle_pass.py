@@ -374,7 +374,7 @@ class ParticlePass:
         """
         reaction, part = 0 * self.state.d[i], 1 + 0 * h
         if ti.static(self.held):
-            reaction = self.slots.total_of(i)
+            reaction = self.slots.reaction_of(i)
         for c in ti.static(self.contacts):
             reaction += firm * c.reaction(i, h, soft)
         if ti.static(len(self.walls) > 0):
