@@ -231,8 +231,7 @@ class Links:
         self.violation[r] = (left + u + self.violation[r]) * touched
         batch.dev.equation.touched[c] = touched
         if self.stiff[r] > 0:
-            steady = self.rows.is_steady(weight * ti.abs(mu - self.start[r]), weight * ti.abs(mu), slight)
-            batch.dev.equation.take_answer(c, mu, not steady)
+            batch.dev.equation.take_answer(c, mu, self.start[r], weight, slight, self.rows)
             if self.is_alone(batch, c):
                 batch.dev.equation.answered[c] = lam + mu
         elif self.begin[r] < self.begin[r + 1]:

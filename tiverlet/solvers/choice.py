@@ -23,9 +23,9 @@ MANY_STIFF = 200  # stiff constraints from which conjugate gradients are worth t
 # Stiff constraints in a piece from which they count: in a pile of braced boxes Jacobi is best at equal time, 6e-3.
 LARGE_PIECE = 25
 CG_STEPS = 5  # of conjugate gradients: at equal time, residuals of 5 to 20 steps are about the same; 5 take the least of a frame
-# Products in the elimination of a constraint, on average, from which conjugate gradients take half of its time or less: a chain
-# has 1, a ladder 6, a wheel of 12 spokes 36, a net of 7 x 7 46. In that net they leave a strain of 3e-3, elimination 5e-6.
-DEAR = 40
+# Products of an elimination that take as long as conjugate gradients: for each constraint, and for each system. A chain has 1 for
+# each constraint, a ladder 6, a wheel of 12 spokes 36, nets of 8 x 8 and 9 x 9 60 and 75.
+PRODUCTS, OVERHEAD = 50, 2000
 CHAIN = 2  # width of chains, trees, loops, joints of up to 3 rods
 MOST_TRIED = 2000  # constraints in a piece up to which it is tried as wider: refusing a larger net would take long
 
@@ -36,19 +36,17 @@ def choose_solver(batches: "list[Batch]", scene: "Scene", answers: bool) -> Solv
     Direct solves what hangs together in systems up to its usual width: chains, trees, ladders, trusses, wheels, bodies. Its
     residual is some 1e-6 of the length of a link, that of Jacobi a hundredth, in one to two times the time. Single links, too,
     where they `answer` contacts, unless they join clusters: they answer after each pass of contacts then. ConjugateGradient
-    solves what is wider, such as cloth and nets, where that is more of the stiff constraints, or MANY_STIFF, in pieces of
-    LARGE_PIECE or more; and nets that are DEAR to eliminate. Its residual is an eighth of that of Jacobi with as many substeps.
-    Jacobi is left with few or soft links, and with what starts violated: such constraints may contradict each other; relaxed,
-    they settle on a compromise.
+    solves what is wider or faster by it, such as cloth and nets, where that is more of the stiff constraints, or MANY_STIFF, in
+    pieces of LARGE_PIECE or more. Its residual is an eighth of that of Jacobi with as many substeps. Jacobi is left with few or
+    soft links, and with what starts violated: such constraints may contradict each other; relaxed, they settle on a compromise.
     """
     links = solvable(batches)
     if not links:
         return Jacobi()
     pieces = Pieces(links, scene, [b for b in batches if b.clusters])
-    direct, taken, dear = pieces.choose_direct(answers)
+    direct, taken = pieces.choose_direct(answers)
     left, solved = pieces.count_stiff(~taken), pieces.count_stiff(taken)
-    wide = left >= min(MANY_STIFF, max(solved, 1)) or dear and solved > 0
-    if wide and all(_may_iterate(b, scene) for b in links):
+    if left >= min(MANY_STIFF, max(solved, 1)) and all(_may_iterate(b, scene) for b in links):
         return ConjugateGradient(CG_STEPS)
     return direct or Jacobi()
 
@@ -107,16 +105,16 @@ class Pieces:
         """Return for each constraint, (m,), whether its piece has any constraint in the mask `some`, (m,)."""
         return np.bincount(self.piece, weights=some & self.acts, minlength=self.count)[self.piece] > 0
 
-    def choose_direct(self, answers: bool) -> tuple[Direct | None, np.ndarray, bool]:
-        """Return Direct, or None where it would take nothing; a mask of the constraints that it takes, (m,); whether it is DEAR.
+    def choose_direct(self, answers: bool) -> tuple[Direct | None, np.ndarray]:
+        """Return Direct, or None where it would take nothing; and a mask of the constraints that it is best for, (m,).
 
         Systems wider than CHAIN are for stiff constraints and ropes. Single links are taken where they answer contacts.
         """
         taken = np.zeros(self.count, dtype=bool)
         if np.bincount(self.item[self.solved[self.owner]], minlength=1).max() <= 1:  # which cannot contradict each other
-            return Direct(CHAIN) if answers and self.may_eliminate and not self.shares else None, self.solved, False
+            return Direct(CHAIN) if answers and self.may_eliminate and not self.shares else None, self.solved
         if self.is_off or not self.may_eliminate:
-            return None, taken, False
+            return None, taken
         longest, needed = np.bincount(self.piece[self.acts], minlength=1).max(), ~self.implied[self.owner]
         for width in (CHAIN,) if longest > MOST_TRIED else (WIDTH, CHAIN):
             found = plan(self.count, self.owner[needed], self.item[needed], width)
@@ -126,8 +124,10 @@ class Pieces:
         taken[found.rows] = True
         taken |= self.implied & self._any(taken)
         crowd = np.bincount(self.item[(taken & self.solved)[self.owner]], minlength=1)
-        direct = Direct(max([CHAIN, *found.widths])) if crowd.max() > 1 else None
-        return direct, taken, len(found.update) > DEAR * len(found.rows)
+        rows, products = np.diff(found.part_begin), np.diff(found.update_begin[found.part_begin])
+        dear = np.repeat(products > PRODUCTS * rows + OVERHEAD, rows)
+        taken &= ~self._any(np.isin(np.arange(self.count), found.rows[dear]))
+        return (Direct(max([CHAIN, *found.widths])) if crowd.max() > 1 else None), taken
 
     def count_stiff(self, some: np.ndarray) -> int:
         """Return how many in the mask `some` are stiff, two-sided, and in pieces with LARGE_PIECE or more of these."""

@@ -156,7 +156,6 @@ class Elimination(System):
             self.added, self.turned_to = (
                 scene.memory.field(f"system.{k}", found.parts, kind=ti.f64) for k in ("added", "turned_to")
             )
-            self.struck = scene.memory.field("system.struck", found.parts, kind=ti.i32)  # whether answers came of a blow
             inside = self.row_slots(scalars, slots)
             self.corner_begin = ints("corner_begin", np.searchsorted(inside[:, 0], np.arange(len(rows) + 1)))
             self.corner = ints("corner", inside[:, 1])
@@ -164,10 +163,8 @@ class Elimination(System):
         who[slot] = item
         self.particle_of, self.w, self.inverse_size = ints("who", who), scene.state.w, reals("close")
         self.refines = scene.order == 2 and not self.limits_steps and not self.has_shared_particles
-        if self.refines or self.answers:
-            self.part_of = ints("part_of", self._part)
         if self.refines:
-            self.newton = ints("newton", np.full(found.parts, UNKNOWN))
+            self.part_of, self.newton = ints("part_of", self._part), ints("newton", np.full(found.parts, UNKNOWN))
             near = np.zeros(len(scene.inv_mass))
             for b in scalars:
                 inside = self.row(b) >= 0
@@ -389,16 +386,6 @@ class Elimination(System):
         return hard
 
     @ti.func
-    def note_blow(self, r):
-        """Note that what the part of row r answered came of a blow. One row decides for all, whose loads may cancel."""
-        self.struck[self.part_of[r]] = 1
-
-    @ti.func
-    def is_struck(self, r):
-        """Whether what the part of row r answered came of a blow."""
-        return self.struck[self.part_of[r]] != 0
-
-    @ti.func
     def corner_particle(self, q):
         """Return the particle at corner q, in the order of rows."""
         return self.particle_of[self.corner[q]]
@@ -415,7 +402,7 @@ class Elimination(System):
     @ti.func
     def begin_answer(self, b):
         """Before contacts are solved: part b has answered nothing, and has its directions at the start of the substep."""
-        self.turned_to[b], self.struck[b] = 0, 0
+        self.turned_to[b] = 0
         for r in range(self.part_begin[b], self.part_begin[b + 1]):
             self.answer[r], self.solution[r], self.gap[r] = 0, self.lam[r] + self.step[r], 0
             if ti.static(self.one_sided):

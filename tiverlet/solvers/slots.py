@@ -71,9 +71,6 @@ class Slots:
             self.broken, self.breaks = memory.field("slots.broken", None, kind=ti.i32), Breaks(scene)
         self.system: Any = solver.system(scene, batches, self)
         self.has_system = bool(self.system)
-        self.turns = self.has_system and not self.system.steps
-        if self.turns:  # by how much the move that a corner's load makes has turned in the last substep, see reaction_of()
-            self.turning = memory.field("slots.turning", self.total, width=state.dim)
         self.refines = self.has_system and self.system.refines
         # Whether a substep satisfies constraints up to rounding.
         scalars = solvable(batches)
@@ -257,22 +254,6 @@ class Slots:
         for s in range(self.begin[i], self.begin[i + 1]):
             total += self.move[s]
         return total
-
-    @ti.func
-    def reaction_of(self, i):
-        """Return the same for reactions, along the directions at the end of the substep.
-
-        Where a structure has a link too many, or is straight, loads of many times the forces cancel along the directions at its
-        start. What then is more than twice of what moved the particle in the substep is an error of directions.
-        """
-        now = self.total_of(i)
-        if ti.static(self.turns):
-            turned = 0 * now
-            for s in range(self.begin[i], self.begin[i + 1]):
-                turned += self.turning[s]
-            if now.norm() > 2 * (now + turned).norm():
-                now += turned
-        return now
 
     @ti.func
     def correction_of(self, i):

@@ -185,7 +185,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     state.remember(
         memory,
         has_friction or rows or any(w.needs_start_position for w in walls) or scene.bounces,
-        bounces or bool(scene.impacts) or rows,
+        bounces or bool(scene.impacts) or rows or bool(scene.slots and scene.slots.has_system),
         bounces,
     )
     for feature in of(Batch):

@@ -335,10 +335,6 @@ class RowPass:
         if ti.static(bool(self.answers)):
             for f in ti.static(self.in_systems):
                 for c in range(self.team.chunk_begin(f.count, thread), self.team.chunk_end(f.count, thread)):
-                    f.dev.note_blow(c, self.rows)
-            self.team.wait()
-            for f in ti.static(self.in_systems):
-                for c in range(self.team.chunk_begin(f.count, thread), self.team.chunk_end(f.count, thread)):
                     f.dev.end_answer(c, self.rows)
             self.team.wait()
             for system in ti.static(self.answers.systems):

@@ -140,8 +140,8 @@ class CornerPasses(Passes):
         return violation, A, alpha, lam, W, n, g, turn * ti.cast(self.quantity.direction_reliable(f, f0), ti.i32), f - f0
 
     @ti.func
-    def note_blow(self, c, rows: ti.template()):  # type: ignore[valid-type]
-        """Note that what the system answered came of a blow, unless the part of constraint c is steady."""
+    def end_answer(self, c, rows: ti.template()):  # type: ignore[valid-type]
+        """Add what the system answered to the impulses of contacts to the multiplier."""
         if self.row[c] >= 0:
             weight, slight = ti.cast(0, self.real), ti.cast(0, self.real)
             for k in ti.static(range(self.arity)):
@@ -150,16 +150,8 @@ class CornerPasses(Passes):
                     g = self.slots.system.gradient[place]
                     weight += self.w.of(i) * g.dot(g)
                     slight += g.norm() * rows.kick(i).norm()
-            mu, before = ti.cast(self.slots.system.answer[self.row[c]], self.real), rows.scale() * self.equation.answered[c]
-            if not rows.is_steady(weight * ti.abs(mu - before), weight * ti.abs(mu), slight):
-                self.slots.system.note_blow(self.row[c])
-
-    @ti.func
-    def end_answer(self, c, rows: ti.template()):  # type: ignore[valid-type]
-        """Add what the system answered to the impulses of contacts to the multiplier."""
-        if self.row[c] >= 0:
             mu = ti.cast(self.slots.system.answer[self.row[c]], self.real)
-            self.equation.take_answer(c, mu, self.slots.system.is_struck(self.row[c]))
+            self.equation.take_answer(c, mu, rows.scale() * self.equation.answered[c], weight, slight, rows)
 
     @ti.func
     def motion(self, c, n, together):
@@ -440,13 +432,6 @@ class CornerPasses(Passes):
                 pull += ti.select(firm == 0, 0 * firm, soft - firm) * self.known.given[c]
         for k in ti.static(range(self.arity)):
             self.corners.write_move(c, k, self.w.of(self.corners.member(c, k)) * pull * g[k, :])
-        if ti.static(self.slots.turns):
-            _, before = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 1))
-            for k in ti.static(range(self.arity)):
-                if self.corners.places[c][k] >= 0:
-                    self.slots.turning[self.corners.places[c][k]] = (
-                        self.w.of(self.corners.member(c, k)) * pull * (before[k, :] - g[k, :])
-                    )
 
     @ti.func
     def overload(self, c, h2_rigid, h2_effective):

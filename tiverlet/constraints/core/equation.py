@@ -193,11 +193,15 @@ class Equation:
         return size
 
     @ti.func
-    def take_answer(self, c, mu, is_blow):
-        """Add the answer mu to impulses of contacts to the multiplier. is_blow: whether they are over."""
+    def take_answer(self, c, mu, before, weight, slight, rows: ti.template()):  # type: ignore[valid-type]
+        """Add the answer mu to impulses of contacts to the multiplier. Unless it is steady, it came of a blow, which is over.
+
+        before: of the last substep. weight: by how much a multiplier of 1 changes f. slight: by how much forces change it.
+        """
         self.lam[c] = self.lam[c] + mu
         self.answered[c] = mu
-        self.blow[c] = ti.select(is_blow, mu, 0 * mu)
+        steady = rows.is_steady(weight * ti.abs(mu - before), weight * ti.abs(mu), slight)
+        self.blow[c] = ti.select(steady, 0 * mu, mu)
 
     @ti.func
     def spring_force(self, c, f, f0, w, W, h, soft):

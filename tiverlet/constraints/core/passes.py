@@ -70,10 +70,6 @@ class Passes:
         """Answer moves of its corners by impulses of contacts, `moved` - d: add to Slots.answer how far it moves them."""
 
     @ti.func
-    def note_blow(self, c, rows: ti.template()):  # type: ignore[valid-type]
-        """Where a system answered: note that the answer came of a blow, unless it is steady."""
-
-    @ti.func
     def end_answer(self, c, rows: ti.template()):  # type: ignore[valid-type]
         """Add the answer of constraint c to its multiplier, and tell the part that came of a blow."""
 
