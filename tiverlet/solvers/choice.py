@@ -38,7 +38,8 @@ def choose_solver(batches: "list[Batch]", scene: "Scene", answers: bool) -> Solv
     where they `answer` contacts, unless they join clusters: they answer after each pass of contacts then. ConjugateGradient
     solves what is wider or faster by it, such as cloth and nets, where that is more of the stiff constraints, or MANY_STIFF, in
     pieces of LARGE_PIECE or more. Its residual is an eighth of that of Jacobi with as many substeps. Jacobi is left with few or
-    soft links, and with what starts violated: such constraints may contradict each other; relaxed, they settle on a compromise.
+    soft links, and with what starts violated or is inside of a cluster: such constraints may contradict others; relaxed, they
+    settle on a compromise.
     """
     links = solvable(batches)
     if not links:
@@ -92,10 +93,11 @@ class Pieces:
         self.piece = components(self.count, self.owner, self.item)
         self.acts = np.bincount(self.owner, minlength=self.count) > 0
         held = np.isin(self.item, np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in clusters)]))
-        twice = self._any(np.bincount(self.owner, held, self.count) > 0)  # pieces of particles that clusters hold, too
+        shared = np.bincount(self.owner, held, self.count)  # corners that clusters hold, too
+        twice, inside = self._any(shared > 0), self.acts & (shared == np.bincount(self.owner, minlength=self.count))
         self.implied, self.shares = implied_links(links, scene) & ~twice, bool(twice.any())
         off = np.concatenate([_is_violated(b) for b in links])
-        self.may_eliminate, self.is_off = all(_may_eliminate(b, scene) for b in links), bool(off.any())
+        self.may_eliminate, self.is_off = all(_may_eliminate(b, scene) for b in links), bool((off | inside).any())
         degree = np.bincount(np.concatenate([b.indices.ravel() for b in links]), minlength=len(w))
         self.solved = self.acts & ~np.concatenate([b.relaxed_alone(scene) for b in links])
         stiff = np.concatenate([_stiff(b, degree * w) for b in links]) & self.solved

@@ -38,7 +38,8 @@ LEAST_SOFTNESS = 2e-12  # of the largest diagonal: the least softness, so that n
 # made it softer, REGAIN of its softness in a substep. At rest, where violations change by less than STILL in one of the longer
 # substeps, it recovers for nothing, by RECOVERY in this time; violations then change half as fast as they may.
 REGAIN, RECOVERY, STILL = 2.0**-4, 2.0**-14, 2.0**-12
-SLIGHT = 2e-5  # strain up to which giving way is not told: a straight rope that is so much longer sags by 0.3 % of its length
+# Strain up to which giving way is not told where no tension bears the load: a straight rope so much longer sags by 0.3 %.
+SLIGHT = 2e-5
 UNBORNE = 1e30  # (omega h)^2 of a tension that is undetermined
 MANY = 600  # rows of a part, up to which it may stiffen
 GONE = 0.1  # of its violations: what may be left of them a substep after they seem to have been removed
@@ -734,7 +735,7 @@ class Elimination(System):
                     self.refine_violations(begin, end)
                     stage = FORWARD
                 elif hard == 2:
-                    reported, softness, stage = TENSEST + zero, LEAST_SOFTNESS * most, GIVE_WAY
+                    reported, bound, softness, stage = TENSEST + zero, False, LEAST_SOFTNESS * most, GIVE_WAY
                     self.softened[b][3] = UNBORNE
                     self.end_newton(b)
                 else:
@@ -758,7 +759,7 @@ class Elimination(System):
             else:
                 k += 1
                 if k == ROUNDS or (tension <= SOFTENED_TO and (k == 1 or k > 3 or tension > 0.8 * SOFTENED_TO)):
-                    gives = k == ROUNDS or self.strain(begin, end, softness) > SLIGHT
+                    gives = bound or k == ROUNDS or self.strain(begin, end, softness) > SLIGHT
                     self.use_end_directions(begin, end)
                     self.limit_tensions(begin, end, longer)
                     self.record_softness(b, soft, k > 1)
