@@ -34,7 +34,7 @@ def choose_solver(batches: "list[Batch]", scene: "Scene", answers: bool) -> Solv
     """Return the default solver: the one that leaves few stiff constraints to Jacobi.
 
     Direct solves what hangs together in systems up to its usual width: chains, trees, ladders, trusses, wheels, bodies. Its
-    residual is some 1e-6 of the length of a link, that of Jacobi a hundredth, in one to two times the time. Single links, too,
+    residual is some 1e-6 of the length of a link, that of Jacobi a hundredth, in one to four times the time. Single links, too,
     where they `answer` contacts, unless they join clusters: they answer after each pass of contacts then. ConjugateGradient
     solves what is wider or faster by it, such as cloth and nets, where that is more of the stiff constraints, or MANY_STIFF, in
     pieces of LARGE_PIECE or more. Its residual is an eighth of that of Jacobi with as many substeps. Jacobi is left with few or

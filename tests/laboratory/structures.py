@@ -1,0 +1,56 @@
+"""What hangs by ropes and bars: the strain of its links against the time of a frame, by solver, load and substeps."""
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+import tiverlet as tv
+from tiverlet.report.output import Table
+
+from ..test_structures import LINK, STRUCTURES, built, strain
+
+HEADS = (
+    "solver",
+    "substeps",
+    "load [links]",
+    "strain",
+    "worst structure",
+    "ms a frame",
+    "energy gained [m g L]",
+    "flags, frames",
+)
+SOLVERS = {"default": None, "Jacobi": tv.Jacobi(), "ConjugateGradient(5)": tv.ConjugateGradient(5), "Direct": tv.Direct()}
+NOTES = ["2 s of swinging; the largest strain after the first second. A load of 1 is the mass of a point between two links."]
+
+
+def main(args) -> Iterator[Table]:
+    """Yield a table for bars, and one for ropes."""
+    for link in (tv.Distance, tv.Rope):
+        some = list(rows(link, (20,) if args.quick else (4, 8, 20)))
+        yield Table(f"Structures of {link.__name__}", HEADS, some, NOTES)
+
+
+def rows(link, substeps) -> Iterator[tuple]:
+    """Yield a row for each solver, number of substeps and load."""
+    for n in substeps:
+        for load in (1, 30, 1000):
+            for name, solver in SOLVERS.items():
+                worst, where, spent, gained, flags = 0.0, "", 0.0, 0.0, set()
+                for dim, builds in STRUCTURES.items():
+                    w, pairs = built(tv.World, dim, link, (load * LINK,), substeps=n, solver=solver)
+                    lengths, energy, first = strain(w, pairs, 1.0) + 1, w.step(1 / 60).energy, 0.0
+                    for k in range(119):
+                        begin = time.process_time()
+                        report = w.step(1 / 60)
+                        first += time.process_time() - begin
+                        gained = max(gained, (report.energy - energy) / (9.81 * 3.0 * w.particles.mass.sum()))
+                        flags |= {(dim, k, flag) for flag in report.flags}
+                        off = strain(w, pairs, lengths)
+                        off = np.abs(off) if link is tv.Distance else np.maximum(off, 0.0)
+                        if k >= 60 and off.max() > worst:
+                            worst = float(off.max())
+                            where = builds[int((w.position[pairs[off.argmax(), 0]][0] + 2.0) // 6.0)].__name__
+                    spent += first / 119
+                told = ", ".join(f"{f} {sum(f == g for *_, g in flags)}" for f in sorted({f for *_, f in flags}))
+                yield name, str(n), str(load), f"{worst:.0e}", where, f"{1e3 * spent:.2f}", f"{gained:.0e}", told or "none"
