@@ -1,5 +1,6 @@
 """The choice of the default solver."""
 
+from collections import defaultdict
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -93,8 +94,7 @@ class Pieces:
         self.piece = components(self.count, self.owner, self.item)
         self.acts = np.bincount(self.owner, minlength=self.count) > 0
         held = np.isin(self.item, np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in clusters)]))
-        shared = np.bincount(self.owner, held, self.count)  # corners that clusters hold, too
-        twice, inside = self._any(shared > 0), self.acts & (shared == np.bincount(self.owner, minlength=self.count))
+        twice, inside = self._any(np.bincount(self.owner, held, self.count) > 0), self._inside(held, clusters)
         self.implied, self.shares = implied_links(links, scene) & ~twice, bool(twice.any())
         off = np.concatenate([_is_violated(b) for b in links])
         self.may_eliminate, self.is_off = all(_may_eliminate(b, scene) for b in links), bool((off | inside).any())
@@ -106,6 +106,16 @@ class Pieces:
     def _any(self, some: np.ndarray) -> np.ndarray:
         """Return for each constraint, (m,), whether its piece has any constraint in the mask `some`, (m,)."""
         return np.bincount(self.piece, weights=some & self.acts, minlength=self.count)[self.piece] > 0
+
+    def _inside(self, held: np.ndarray, clusters: "list[Batch]") -> np.ndarray:
+        """Return which constraints have several corners, and all of them in one cluster, (m,). held: mask of corners in any."""
+        holds, common = defaultdict(set), dict[int, set]()
+        for k, b in enumerate(clusters):
+            for i, cluster in zip(b.indices.ravel().tolist(), b.owner.tolist(), strict=True):
+                holds[i].add((k, cluster))
+        for c, i in zip(self.owner.tolist(), self.item.tolist(), strict=True) if held.any() else ():
+            common[c] = common.get(c, holds[i]) & holds[i]
+        return np.array([bool(common.get(c)) for c in range(self.count)]) & (np.bincount(self.owner, minlength=self.count) > 1)
 
     def choose_direct(self, answers: bool) -> tuple[Direct | None, np.ndarray]:
         """Return Direct, or None where it would take nothing; and a mask of the constraints that it is best for, (m,).

@@ -397,12 +397,13 @@ class ParticlePass:
                 if impacts.reached[i] != 0:
                     part = 0 * part
             reaction += part * push
-        if ti.static(self.held and self.state.befores):
-            force = h * h * self.forces.accelerate(i, self.state.place(i), self.state.d[i] / h, t, self.forces.pull(t))
-            most = 2 * ((self.state.d[i] - self.state.before[i]).norm() + force.norm())
-            size = reaction.norm()
-            if size > most:
-                reaction *= most / size
+        if ti.static(self.held):
+            if ti.static(self.slots.has_system and self.state.befores):
+                force = h * h * self.forces.accelerate(i, self.state.place(i), self.state.d[i] / h, t, self.forces.pull(t))
+                most = 2 * ((self.state.d[i] - self.state.before[i]).norm() + force.norm())
+                size = reaction.norm()
+                if size > most:
+                    reaction *= most / size
         return reaction, part
 
     @ti.func

@@ -268,8 +268,7 @@ class Scalar(Batch):
     @property
     def _implying(self) -> bytes | None:
         """The lengths and compliances for which links imply others; None where none does."""
-        may_imply = self.arity == 2 and not self.driven
-        system = self.scene.slots.system if self.scene and self.solvable_together and may_imply else None
+        system = self.scene.slots.system if self.scene and self.solvable_together and not self.driven else None
         return self.compliance.tobytes() + self.goal.tobytes() if system and system.has_implied else None
 
     def acts_as_force(self, scene: Scene) -> np.ndarray:
