@@ -22,7 +22,7 @@ EXPERIMENTS = {
     "periodic": "gases and shear flows in periodic boxes beside what is known of them",
     "rolling": "one or two spinning spheres beside pymunk, Box2D, LAMMPS and Newton",
     "gpu": "what runs on a GPU, with which bits, how fast, and how often the host waits (parts: its tables)",
-    "piles": "piles of discs and boxes beside Box2D and pymunk, frame by frame (parts: discs, equal discs, boxes, towers)",
+    "piles": "piles of discs and boxes beside Box2D and pymunk, in turns (parts: discs, equal discs, boxes, towers)",
     "structures": "ladders, bridges, wheels, tents on ropes: strain against run time, by solver and load",
     "grains": "heaps, drums and silos of spinning grains, beside LAMMPS (parts: its tables)",
 }

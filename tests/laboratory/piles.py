@@ -45,6 +45,15 @@ class Scene:
             self.corners, self.width = (square * size) @ turn + (at * [1.5, 1.4] + 0.9)[:, None], 1.5 * side + 0.5
         self.x = self.corners.mean(axis=1)
 
+    @property
+    def walls(self) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+        """The ends of the floor and of the two walls."""
+        return [((0, 0), (self.width, 0)), ((0, 0), (0, 1000)), ((self.width, 0), (self.width, 1000))]
+
+    def outline(self, k: int) -> list[tuple[float, ...]]:
+        """Return the corners of box k relative to its place."""
+        return [tuple(map(float, c)) for c in self.corners[k] - self.x[k]]
+
     def overlaps(self, x: np.ndarray, angle: np.ndarray) -> np.ndarray:
         """Return by how much bodies overlap at places x (n, 2), and turned by angles (n,), see NOTES."""
         if self.discs:
@@ -98,14 +107,14 @@ class Box2D:
         self.world.sleeping_enabled = False
         law = b2.shape_def(density=1.0, material=b2.surface_material(friction=FRICTION))
         ground = self.world.create_static_body(position=(0, 0))
-        for a, b in (((0, 0), (scene.width, 0)), ((0, 0), (0, 1000)), ((scene.width, 0), (scene.width, 1000))):
+        for a, b in scene.walls:
             ground.create_shape(law, b2.segment(a, b))
         self.bodies = [self.world.create_dynamic_body(position=tuple(map(float, x))) for x in scene.x]
         for k, body in enumerate(self.bodies):
             if scene.discs:
                 body.create_shape(law, b2.circle((0, 0), float(scene.radius[k])))
             else:
-                body.create_shape(law, b2.polygon([tuple(map(float, c)) for c in scene.corners[k] - scene.x[k]]))
+                body.create_shape(law, b2.polygon(scene.outline(k)))
 
     def step(self) -> None:
         self.world.step(FRAME, self.steps)
@@ -126,15 +135,14 @@ class Pymunk:
         pymunk: Any = import_module("pymunk")
         self.space, self.steps = pymunk.Space(), steps
         self.space.gravity, self.space.iterations = (0, -G), 10
-        ends = (((0, 0), (scene.width, 0)), ((0, 0), (0, 1000)), ((scene.width, 0), (scene.width, 1000)))
-        shapes: list[Any] = [pymunk.Segment(self.space.static_body, a, b, 0) for a, b in ends]
+        shapes: list[Any] = [pymunk.Segment(self.space.static_body, a, b, 0) for a, b in scene.walls]
         self.bodies = [pymunk.Body() for _ in scene.x]
         for k, body in enumerate(self.bodies):
             body.position = tuple(map(float, scene.x[k]))
             if scene.discs:
                 shapes.append(pymunk.Circle(body, float(scene.radius[k])))
             else:
-                shapes.append(pymunk.Poly(body, [tuple(map(float, c)) for c in scene.corners[k] - scene.x[k]]))
+                shapes.append(pymunk.Poly(body, scene.outline(k)))
         for shape in shapes:
             shape.friction, shape.density = FRICTION**0.5, 1.0  # pymunk multiplies those of the two
         self.space.add(*self.bodies, *shapes)

@@ -39,11 +39,11 @@ def rows(link, substeps) -> Iterator[tuple]:
                 worst, where, spent, gained, flags = 0.0, "", 0.0, 0.0, set()
                 for dim, builds in STRUCTURES.items():
                     w, pairs = built(tv.World, dim, link, (load * LINK,), substeps=n, solver=solver)
-                    lengths, energy, first = strain(w, pairs, 1.0) + 1, w.step(1 / 60).energy, 0.0
+                    lengths, energy = strain(w, pairs, 1.0) + 1, w.step(1 / 60).energy
                     for k in range(119):
                         begin = time.process_time()
                         report = w.step(1 / 60)
-                        first += time.process_time() - begin
+                        spent += (time.process_time() - begin) / 119
                         gained = max(gained, (report.energy - energy) / (9.81 * 3.0 * w.particles.mass.sum()))
                         flags |= {(dim, k, flag) for flag in report.flags}
                         off = strain(w, pairs, lengths)
@@ -51,6 +51,5 @@ def rows(link, substeps) -> Iterator[tuple]:
                         if k >= 60 and off.max() > worst:
                             worst = float(off.max())
                             where = builds[int((w.position[pairs[off.argmax(), 0]][0] + 2.0) // 6.0)].__name__
-                    spent += first / 119
                 told = ", ".join(f"{f} {sum(f == g for *_, g in flags)}" for f in sorted({f for *_, f in flags}))
                 yield name, str(n), str(load), f"{worst:.0e}", where, f"{1e3 * spent:.2f}", f"{gained:.0e}", told or "none"

@@ -90,7 +90,7 @@ class Pieces:
         w, counts = scene.inv_mass, [b.count for b in links]
         owner, item = corners_of(links)
         free = w[item] > 0
-        self.dim, self.count, self.owner, self.item = scene.particles.dim, sum(counts), owner[free], item[free]
+        self.count, self.owner, self.item = sum(counts), owner[free], item[free]
         self.piece = components(self.count, self.owner, self.item)
         self.acts = np.bincount(self.owner, minlength=self.count) > 0
         held = np.isin(self.item, np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in clusters)]))
