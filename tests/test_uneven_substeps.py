@@ -5,7 +5,6 @@ import pytest
 
 import tiverlet as tv
 from tiverlet import shapes as S
-from tiverlet.step.solids import Solids
 
 G, R = 10.0, 0.5
 
@@ -173,30 +172,6 @@ def test_a_cluster_on_a_floor_gains_none(world, compliance):
     for frame in range(150):
         w.substeps = (1, 16)[frame // 9 % 2]
         assert w.step(1 / 60).energy <= start * (1 + 1e-3)
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_moves_of_whole_bodies(world, dim):
-    # The projection on rigid motions in the metric of the masses is idempotent and symmetric in that metric. It keeps momentum
-    # and angular momentum. A body that is moved as a whole is in its shape.
-    rng = np.random.default_rng(dim)
-    x, mass = rng.standard_normal((9, dim)), rng.uniform(0.5, 2, 9)
-    w = world(tv.Particles(x, mass=mass), [tv.ShapeMatch([range(5), range(5, 8)])], precision="f64")
-    w.step(1e-3)
-    solids = Solids.rigid(w._runner.batches, w._runner.scene.inv_mass)
-    whole = solids.whole(x)
-    p, q = rng.standard_normal((2, 9, dim))
-    np.testing.assert_allclose(whole(whole(p)), whole(p), atol=1e-12)
-    assert (mass[:, None] * p * whole(q)).sum() == pytest.approx((mass[:, None] * whole(p) * q).sum(), abs=1e-12)
-    for some in (slice(5), slice(5, 8)):
-        m, r = mass[some, None], x[some]
-        np.testing.assert_allclose((m * whole(p)[some]).sum(axis=0), (m * p[some]).sum(axis=0), atol=1e-12)
-        moment = (m[:, :, None] * (r[:, :, None] * (whole(p) - p)[some][:, None, :])).sum(axis=0)
-        np.testing.assert_allclose(moment, moment.T, atol=1e-12)
-    assert (whole(p)[8] == p[8]).all()
-    turn = np.linalg.qr(rng.standard_normal((dim, dim)))[0]
-    turn[:, 0] *= np.linalg.det(turn)
-    np.testing.assert_allclose(solids.fitted(x @ turn + 1.0)[:8], (x @ turn + 1.0)[:8], atol=1e-9)
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ from .particles import Particles, at_rest, in_range, spin_of
 from .shapes import Shape
 from .solvers.jacobi import Jacobi
 from .solvers.solver import Solver
-from .step import checkpoint, edit_scene, energy_bound, impulse, initial_violation, placing
+from .step import checkpoint, edit_scene, energy_bound, impulse, placing, violations
 from .step.adaptive import StepController
 from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver, usual_substeps
 from .step.build_again import Rebuild
@@ -197,7 +197,7 @@ class World:
         Call it before knobs are uploaded, or the state is copied: it compares the knobs with those on the device.
         """
         waiting, clock = [f for f in self._features if f.changed and isinstance(f, Batch) and f.soft], self._clock
-        first = initial_violation.first_stiffened(waiting, self.position) if waiting else None
+        first = violations.first_stiffened(waiting, self.position) if waiting else None
         if first is not None:
             clock.energy = clock.moved_mask = None
             clock.first_moved = first if clock.first_moved is None else min(first, clock.first_moved)

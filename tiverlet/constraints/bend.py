@@ -61,7 +61,7 @@ class Bend(Scalar):
     def straight(self) -> np.ndarray:
         """Which paths in 3D are to be straight now, so that they may bend in any direction, (m,). See BendAngle."""
         if self.start.dim == 2:
-            return super().straight
+            return np.zeros(self.count, dtype=bool)
         return self.scene.memory.read(self.dev.equation.rest)[: self.count] == 0
 
     def _sides(self, position: np.ndarray) -> np.ndarray:

@@ -28,6 +28,7 @@ class Function(Quantity):
     for the first corner. size: of the scene part that f acts on [m]. All but the unit are known only once there are particles.
     """
 
+    foreign = True
     size: Any  # on the device
 
     def __init__(self, members: Any, unit: float | None, derivative: Any = None, origin: Any = None, size: float = 0.0):

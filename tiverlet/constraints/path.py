@@ -114,10 +114,6 @@ class Path(Anchored):
                 f"Path: particle {self.indices[k, 0]} starts {off[k]:.3g} m off the curve, and is moved to {at}. Start it there."
             )
 
-    def tangents(self, x: np.ndarray) -> np.ndarray:
-        """Return the tangents of the curve at the points nearest to x."""
-        return self.curve.tangent(self.curve.nearest(x))
-
     def start_offset(self, position: np.ndarray) -> np.ndarray:
         """Return C at the start, (m, dim)."""
         return position[self.indices[:, 0]] - self.curve.at(self._start)

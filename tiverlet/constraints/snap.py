@@ -128,10 +128,6 @@ class Snap(Anchored):
         x = position[self.indices[:, 0]]
         return x - self.node(x)
 
-    def across(self, x: np.ndarray) -> np.ndarray:
-        """Return the projectors on the axes of the grid that are not free, (m, dim, dim)."""
-        return np.broadcast_to(np.diag(np.isfinite(self._spacing) * 1.0), (len(x), *2 * x.shape[1:]))
-
     def place_of(self, scene: Scene, passes: AnchorPasses) -> "Nodes":
         """Make the nodes of the particles, on the device."""
         free = np.isinf(self._spacing)

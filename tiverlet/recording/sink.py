@@ -248,12 +248,15 @@ class Sink:
         """End the file. Calling it twice, or in a forked child, does nothing."""
         if self.forked():
             return
-        stream, self.stream = self.stream, None
-        if stream is not None:
-            stream.disconnect()
+        if self.stream is not None:
+            import rerun_bindings as rerun
+
+            self.stream.disconnect()
             if self._copy:
                 self._copy.join(WAIT)
             self._file.close()
+            self.stream = None
+            rerun.flush_and_cleanup_orphaned_recordings()  # ends the threads of what Python no longer refers to
 
 
 def is_recording(path: str) -> bool:

@@ -41,7 +41,6 @@ REGAIN, RECOVERY, STILL = 2.0**-4, 2.0**-14, 2.0**-12
 # Strain up to which giving way is not told where no tension bears the load: a straight rope so much longer sags by 0.3 %.
 SLIGHT = 2e-5
 UNBORNE = 1e30  # (omega h)^2 of a tension that is undetermined
-MANY = 600  # rows of a part, up to which it may stiffen
 GONE = 0.1  # of its violations: what may be left of them a substep after they seem to have been removed
 SOFTENED = "system.softened"  # a field, by its name in recordings
 
@@ -210,52 +209,6 @@ class Elimination(System):
         """Whether parts gave way in a longer substep, and may bear their loads in this one."""
         return bool(self._can_stiffen().any())
 
-    def stiffen(self, x: np.ndarray, h: float, energy: float) -> bool:
-        """Let the parts that can stiffen bear their loads again in substeps h [s], of particles at x, (n, dim) [m].
-
-        energy: the most that violations may add when they are removed in one substep [J]. Returns whether the parts do.
-        """
-        some = self._can_stiffen()
-        done = self._stored(np.flatnonzero(some), x, h) <= energy
-        if done:
-            state = self.memory.read(self.softened)
-            state[some] = 0.0
-            self.memory.write(self.softened, state)
-        return done
-
-    def _stored(self, parts: np.ndarray, x: np.ndarray, h: float) -> float:
-        """Return the energy that the violations of parts at x add if one substep h [s] removes them, sum C^2 / 2 W h^2 [J].
-
-        It is infinite for more than MANY rows, and where a pivot of the matrix J w J^T is small: some load is hardly borne there.
-        """
-        C, corners, stored = np.zeros(self.plan.part_begin[-1]), [], 0.0
-        for b in self._scalars:
-            row, violation = self.row(b), b.violation(x)
-            some = (row >= 0) & (row < len(C)) & ~b.broken
-            C[row[some]] = (violation if b.side == 0 else np.maximum(b.side * violation, 0.0))[some]
-            who = b.indices[some]
-            corners.append((np.repeat(row[some], who.shape[1]), who.ravel(), b.gradients(x)[some].reshape(-1, x.shape[1])))
-        row, who, gradient = (np.concatenate(each) for each in zip(*corners, strict=True))
-        for begin, end in zip(self.plan.part_begin[parts], self.plan.part_begin[parts + 1], strict=True):
-            if end - begin > MANY:
-                return np.inf
-            own = (row >= begin) & (row < end) & (self.inv_mass[who] > 0)
-            particles, local = np.unique(who[own], return_inverse=True)
-            J = np.zeros((end - begin, len(particles), x.shape[1]))
-            np.add.at(J, (row[own] - begin, local), gradient[own])
-            J = (J * np.sqrt(self.inv_mass[particles])[:, None]).reshape(end - begin, -1)
-            acts = J.any(axis=1)
-            A = J[acts] @ J[acts].T
-            W = np.diag(A)
-            try:
-                pivots = np.diag(np.linalg.cholesky(A)) ** 2
-            except np.linalg.LinAlgError:  # not positive definite
-                return np.inf
-            if not (pivots > SMALL_PIVOT * W).all():
-                return np.inf
-            stored += float((C[begin:end][acts] ** 2 / W).sum()) / (2 * h * h)
-        return stored
-
     @property
     def keeps_softness_of_longer(self) -> bool:
         """Whether a part is softened for a longer substep than the present one, so that shorter ones do not help."""
@@ -263,7 +216,7 @@ class Elimination(System):
 
     def gives_way(self, batch: Batch) -> np.ndarray:
         """Return a mask of the constraints of a batch in parts that give way, (m,)."""
-        soft = self.memory.read(self.softened)[:, 0] != 0
+        soft = (self.memory.read(self.softened)[:, 0] != 0) & ~self._can_stiffen()
         parts = soft[self._part]
         row = self.row(batch)
         return parts[row] & (row >= 0)

@@ -134,11 +134,6 @@ class System:
         """Return a mask of the constraints of a batch in parts that give way, (m,)."""
         return np.zeros(batch.count, dtype=bool)
 
-    def stiffen(self, x: np.ndarray, h: float, energy: float) -> bool:
-        """Let the parts that can stiffen bear their loads again in substeps h [s], of particles at x, (n, dim) [m]. energy: the
-        most that violations may add when they are removed in one substep [J]. Returns whether the parts do."""
-        return False
-
     def keep_softness(self, ratio: float) -> None:
         """Keep parts that give way as soft as they are, where the next substep is `ratio` times as long as the last one."""
 

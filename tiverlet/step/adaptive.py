@@ -359,7 +359,7 @@ def pumps(energies: list[float], kinetic: float) -> bool:
     """Whether the last doubling of the effort added more energy than the one before, and led beyond the bound.
 
     energies: before the frame, then after each try [J]. The bound follows from all but the last two of them, see energy_limit().
-    Violations that could not be removed first act as springs, which a shorter substep makes stiffer, see leftover.py.
+    Violations that could not be removed first act as springs, which a shorter substep makes stiffer, see settling.py.
     """
     if len(energies) < 4:
         return False

@@ -32,7 +32,7 @@ def energy_floor(bound: Any, kinetic: Any, energy: Any) -> Any:
 
 
 def initial_margin(inv_mass: np.ndarray, extent: np.ndarray, h: Any) -> Any:
-    """The kinetic energy that initial violations may become [J]: initial_violation.py leaves up to MET of the extent (..., dim)
+    """The kinetic energy that initial violations may become [J]: settling.py leaves up to MET of the extent (..., dim)
     [m], and a substep of h [s] removes it. Numbers or arrays."""
     return (MET * np.linalg.norm(extent, axis=-1) / h) ** 2 * (1 / inv_mass[inv_mass > 0]).sum() / 2
 

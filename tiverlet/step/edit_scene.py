@@ -20,7 +20,7 @@ from ..features.feature import Batch, Feature
 from ..neighbours.periodic import Periodic
 from ..particles import Particles
 from ..shapes import Shape
-from . import added_shape, edit_in_place, impulse, initial_violation, solids
+from . import added_shape, edit_in_place, impulse, solids, violations
 from .build import check_settings, checked_features, listed
 from .sleep import Sleep
 
@@ -220,7 +220,7 @@ def _first_off(world: Any, new: list[Feature]) -> int | None:
     """Return the first particle of added rigid constraints and clusters that are violated; None where none is."""
     x, w = world.position, world._runner.scene.inv_mass
     clusters = [f for f in new if isinstance(f, Batch) and f.acts]
-    off = [initial_violation.first_off(new, x), solids.first_off(clusters, w, x)]
+    off = [violations.first_off(new, x), solids.first_off(clusters, w, x)]
     return min((i for i in off if i is not None), default=None)
 
 

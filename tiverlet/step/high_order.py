@@ -127,13 +127,14 @@ class Composition:
         """
         whole, g = span.h64 / self.first, self.table[s % self.stages]
         substep, substeps = s // self.stages, span.substeps // self.stages
-        fraction = ti.Vector([(substep + g[2]) / substeps, (substep + g[3]) / substeps])
+        fraction = ti.Vector([(substep + g[2]) / substeps, (substep + g[3]) / substeps, (g[3] - g[2]) / substeps])
         return g[0] * whole, g[1] * whole, span.start + (substep + g[2]) * whole, fraction
 
     @ti.func
     def frame_fraction(self, s, substeps):
-        """Return the fractions of the frame at the begin and the end of substep s."""
-        return ti.Vector([ti.cast(s, self.real) / substeps, ti.cast(s + 1, self.real) / substeps])
+        """Return the fractions of the frame at the begin and the end of substep s, and its share of the frame."""
+        begin, end = ti.cast(s, self.real) / substeps, ti.cast(s + 1, self.real) / substeps
+        return ti.Vector([begin, end, end - begin])
 
     @ti.func
     def h2_effective(self, h, fresh):
@@ -185,7 +186,7 @@ class Probe:
         ti.loop_config(serialize=True)
         for _ in range(1):
             span = Span(h, t, t, 0, 0, 0, 0.0, 0, 1, passes, part=passes)
-            substep(self.step, Moment(span, 0, h, last, t, 0, ti.Vector([1.0, end]), final=1))
+            substep(self.step, Moment(span, 0, h, last, t, 0, ti.Vector([1.0, end, end - 1.0]), final=1))
 
 
 def fastest(batches: list[Any], scene: Scene) -> float:

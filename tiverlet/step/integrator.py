@@ -7,6 +7,7 @@ import numpy as np
 from ..device import ti
 from ..features.feature import Acceleration, Scene
 from ..tools import golden_steps
+from .span import ENDLESS
 
 if TYPE_CHECKING:
     from .clock import Clock
@@ -181,8 +182,12 @@ class Verlet:
 
     @ti.func
     def frame_fraction(self, s, substeps):
-        """Return the fractions of the frame at the start and the end of substep s."""
-        return ti.Vector([ti.cast(s, self.real) / substeps, ti.cast(s + 1, self.real) / substeps])
+        """Return the fractions of the frame at the start and the end of substep s, and its share of the frame.
+
+        In an endless frame each substep counts as a frame.
+        """
+        begin, end = ti.cast(s, self.real) / substeps, ti.cast(s + 1, self.real) / substeps
+        return ti.Vector([begin, end, ti.select(substeps < ti.static(ENDLESS), end - begin, 1)])
 
     @ti.func
     def advance(self, first, end, now):

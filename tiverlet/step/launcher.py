@@ -84,7 +84,9 @@ class Launcher:
         """Whether this is a substep, not the round after all substeps."""
         return now.s < now.span.substeps
 
-    ends_substep = has_pass
+    def ends_substep(self, now: Moment) -> bool:
+        """Whether all passes of the substep are done."""
+        return now.s < now.span.substeps and now.span.part == now.span.iterations
 
     def ends_frame(self, now: Moment) -> bool:
         """Whether all substeps are done."""
@@ -96,7 +98,8 @@ class Launcher:
 
     def last_half(self, now: Moment) -> int:
         """Return the half of a pass before which the substep ends. The round after all substeps has one half, for the list."""
-        passes = now.span.iterations + (self.impacts.passes if self.impacts else 0)
+        extra = self.impacts.passes if self.impacts and now.span.part == now.span.iterations else 0
+        passes = now.span.part + extra
         return passes * self.halves if now.s < now.span.substeps else 1
 
     def is_regular(self, now: Moment, half: int) -> bool:

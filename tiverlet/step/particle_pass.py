@@ -330,29 +330,6 @@ class ParticlePass:
             wall.confine(i, radius, h, frame_fraction, mode)
 
     @ti.func
-    def stop(self, i, move):
-        """Stop particle i at walls, after the host moved it by `move` from x0. Only its position changes: no time passes."""
-        d = self.state.d[i]
-        d_low = ti.zero(d)
-        if ti.static(self.state.carries):
-            d_low = self.state.d_low[i]
-        before = ti.zero(d)
-        if ti.static(self.state.befores):
-            before = self.state.before[i]
-        self.state.d[i] = move
-        moving = True
-        for k in range(ROUNDS + 1):
-            if moving:
-                if k == ROUNDS:
-                    self.cancel_move(i)
-                moving = not self.touch_all(i, 0 * d[0], ti.Vector([0, 0], self.real), FRICTIONLESS)
-        self.state.d[i] = d
-        if ti.static(self.state.carries):
-            self.state.d_low[i] = d_low
-        if ti.static(self.state.befores):
-            self.state.before[i] = before
-
-    @ti.func
     def cancel_move(self, i):
         """Move particle i back to where it was at the start of the substep, at rest."""
         if ti.static(self.state.starts):

@@ -277,7 +277,7 @@ class RowPass:
             fresh = now.fresh if ti.static(self.particles.integrator.half_kick) else 0
             h2_effective, share = (
                 self.particles.integrator.h2_effective(now.h, fresh),
-                now.frame_fraction[1] - now.frame_fraction[0],
+                now.frame_fraction[2],
             )
             if fresh != 0 and now.span.owed > 0:
                 fresh = RESTARTED

@@ -13,14 +13,14 @@ from ..device.interrupts import deferred_signals
 from ..device.memory import Rows, numbers_of
 from ..device.patches.compiler import CachedLaunch
 from ..particles.spin import moments_of_inertia
-from . import high_order, initial_shape, initial_violation, leftover, softness
+from . import high_order, settling, softness, violations
 from .clock import Clock, initial_margin
 from .diagnostics import BARE, EXTENT, STARTED, STEPPED, UNSTEPPED
 from .frames import Frames
 from .impulse import factor_of
 from .integrator import FREE, decay, h2_effective_of, h2_rigid_of, shares_of
 from .launcher import Launcher
-from .span import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, LISTS, MOST, ORIGIN, H, Span
+from .span import ACTIVE_THREADS, BEFORE, END, ENDLESS, GIVE, HALT, LISTS, MOST, ORIGIN, H, Span
 from .step import frame
 from .step_report import StepReport
 
@@ -150,7 +150,7 @@ class Runner:
         """The first half of begin(). Returns whether the second half is needed: the state has changed and must be diagnosed."""
         adapts, passes = passes is not None, passes or iterations
         h, clock, self.released, self.jumped = dt / substeps * self.integrator.first, self.clock, 0.0, False
-        drag = decay(sum(f.rate for f in self.drags), h) if self.drags else None
+        drag = self._drag(h)
         if h == clock.h and drag == clock.drag and not clock.d_is_velocity and clock.first_moved is None:
             if clock.softness > 1 or passes != clock.iterations:
                 with self.memory.compiler():
@@ -169,13 +169,13 @@ class Runner:
             if first is not None:
                 for b in self.driven:
                     b.start_at(self.scene.state.get(self.memory), first)
-                self._note_moved(initial_shape.restore(self, first))  # before its deformation passes for what passes have left
+                self._note_moved(settling.settle(self, first, dt))  # before what is violated passes for what passes have left
             if h != clock.h or drag != clock.drag:
                 if self.scene.slots and self.scene.slots.system and clock.h:
                     self.scene.slots.system.keep_softness(h / clock.h)
-                settles = h < clock.h and first is None and self.scene.slots and not (self.probe or keeps)
-                if settles and leftover.remove(self, h, dt != clock.frame[1], adapts):
+                if self._relieves(h, dt, keeps, adapts) and settling.relieve(self, h, dt):
                     self.set_softness(1.0)
+                    self._forget_system()
                 else:
                     softness.keep(self, h, dt, passes, adapts)
                 if asleep is not None and keeps:
@@ -185,17 +185,33 @@ class Runner:
             if clock.d_is_velocity and not (keeps and goes_on):
                 clock.since = 0
             if first is not None:
-                ratio = h / (clock.h or h)
-                self._note_moved(initial_violation.move_to_curves(self.scene, self.batches, first))
-                self._note_moved(initial_violation.remove(self.scene, self.batches, first, ratio, self.stop_at_walls))
                 bare = first < self.n and not any((b.indices >= first).any() for b in self.batches)
-                if self.scene.slots.system and not bare:  # particles added without constraints do not concern it
-                    system, x = self.scene.slots.system, self.scene.state.get(self.memory)
-                    left = initial_violation.left(self.batches, x) if system.steps else []
-                    self.released = max(self.released, *(float(share.max()) for _, share in left), 0.0)
-                    system.forget(left)
+                if not bare:  # particles added without constraints do not concern it
+                    self._forget_system()
             self.set_substep(h, drag)
         return True
+
+    def _relieves(self, h: float, dt: float, keeps: bool, adapts: bool) -> bool:
+        """Whether what longer substeps have left settles before substeps h [s].
+
+        Not so where a loop measures dt, nor where violations are what drives lag behind, unless `adapts`.
+        """
+        slots, clock = self.scene.slots, self.clock
+        if not (slots and h < clock.h) or keeps or self.probe or clock.first_moved is not None:
+            return False
+        steady = dt == clock.frame[1] and not (self.driven or self.ramping)
+        return adapts or steady or bool(slots.system and slots.system.can_stiffen)
+
+    def _forget_system(self) -> None:
+        """Let a system forget what it has learnt from earlier positions."""
+        if system := self.scene.slots.system:
+            left = violations.left(self.batches, self.scene.state.get(self.memory)) if system.steps else []
+            self.released = max(self.released, *(float(share.max()) for _, share in left), 0.0)
+            system.forget(left)
+
+    def _drag(self, h: float) -> list[float] | None:
+        """The factors of drag for substeps h [s]; None without drag."""
+        return decay(sum(f.rate for f in self.drags), h) if self.drags else None
 
     def set_softness(self, times: float) -> None:
         """Make links `times` as soft as passes make them, see softness.py."""
@@ -229,7 +245,7 @@ class Runner:
         """Note how far particles were moved to meet their constraints, (n,) [m], and the violation that was removed, if any."""
         if removed is not None:
             way, share = removed
-            seen = float(way.max()) if share > initial_violation.SEEN else 0.0
+            seen = float(way.max()) if share > violations.SEEN else 0.0
             self.moved, self.clock.moved_mask = max(self.moved, seen), None
             self.jumped = self.jumped or (bool((way > self.scene.particles.radius).any()) and seen > 0)
             self.invalidate()
@@ -275,7 +291,7 @@ class Runner:
     def _jump(self) -> None:
         """Set new rest values at once in bodies of which a particle was placed; elsewhere they change during the frame."""
         if self.ramping and self.clock.first_moved is not None:
-            tied = initial_violation.tied(self.scene, self.batches, self.clock.first_moved)
+            tied = violations.tied(self.scene, self.batches, self.clock.first_moved)
             for b in self.ramping:
                 b.ramp.jump_to_goals(np.bincount(b.owner, tied[b.indices.ravel()], minlength=b.count) > 0)
 
@@ -331,7 +347,7 @@ class Runner:
 
     def forget_loads(self, position: np.ndarray) -> None:
         """Before positions are set: forget the known loads of constraints and contacts that the new positions change."""
-        initial_violation.forget(self.scene, self.batches, position)
+        violations.forget(self.scene, self.batches, position)
         if self.springs:
             self._forget_springs(self.scene.state.get(self.memory), position)
 
@@ -397,16 +413,10 @@ class Runner:
 
     def compile_for_repeats(self) -> None:
         """Compile what frames may need that are repeated with other substeps, so that no frame of a game waits for it later."""
-        if (self.linked or self.step.contacts) and not self.probe:
+        slots = self.scene.slots
+        if slots and slots.sags_anywhere and not (self.springs or self.probe):
             with self.memory.compiler():
-                self.stop_at_walls(self.scene.state.get(self.memory))
-                if self.scene.slots and self.scene.slots.sags_anywhere and not self.springs:
-                    self._velocities()
-
-    def stop_at_walls(self, before: np.ndarray) -> None:
-        """Stop particles at walls that the host has moved from `before`, (n, dim); with memory.compiler()."""
-        if self.step.walls:
-            self.step.stop_moved(before)
+                self._velocities()
 
     def velocity(
         self,
@@ -519,6 +529,33 @@ class Runner:
 
     # Launches.
 
+    def run_no_time(self, h: float) -> None:
+        """Run one pass of a substep h [s] that does not end, in an endless frame, from displacements that are velocities.
+
+        So no target comes nearer, nothing breaks, and there are no events.
+        """
+        clock = self.clock
+        for semi_iteration in self.semi_iterations:
+            semi_iteration.prepare(1)
+        self.set_substep(h, self._drag(h))
+        clock.d_is_velocity, clock.owed, clock.tick = True, 0.0, (clock.tick + 1) % 2**31
+        span = Span(h, clock.time, clock.time, clock.tick, clock.since, True, 0.0, STEPPED, ENDLESS * self.integrator.stages, 2)
+        if self.launched:
+            with self.memory.compiler():
+                self._launch(span)
+            return
+        self.team.rejoin(self._data[ACTIVE_THREADS])
+        while True:
+            GIVE(
+                self._given, 0, h, span.start, span.end, span.tick, span.since, True, 0.0, span.substeps, span.iterations,
+                span.begin, span.half, span.resumed, 0, STEPPED, span.until, span.part,
+            )  # fmt: skip
+            self._fused()
+            if not self._data[HALT]:
+                return
+            span.resumed, span.begin, span.half = self.take_halt()[:3]
+            self.grow()
+
     def run(self, substeps: int, iterations: int, end: float, state_origin: int) -> None:
         """Run all substeps of a frame, and the diagnostics."""
         clock, stages = self.clock, self.integrator.stages * substeps
@@ -576,6 +613,7 @@ class Runner:
         """Launch a frame phase by phase. At the end, the host reads one result: whether the frame waits for something."""
         try:
             frame(self.launcher, span)
+            self.launcher.flush()
             while self.step.searches and self._data[HALT]:
                 span.resumed, span.begin, span.half, span.what = self.take_halt()
                 if span.what == LISTS:

@@ -10,7 +10,8 @@ them. So stiffness is state:
 Then links are as soft as in the longest recent substep, and nothing has to move. s is 1 again in a substep that is longer than
 all before, which takes energy out. Otherwise it approaches 1, (s - 1)' = -(s - 1) / SETTLE, which lifts what sags. So a frame
 adds a share dt / SETTLE of the energy that violations store, but not while the scene would have more energy than ever. Where a
-loop measures dt, links wait until no frame has been about as long for HOLD. What needs no such time is in leftover.py.
+loop measures dt, links wait until no frame has been about as long for HOLD. What "auto" and systems need not wait for is
+in settling.py.
 """
 
 from math import exp
@@ -95,11 +96,13 @@ def needs_no_care(runner: "Runner", s: float) -> bool:
     x = runner.scene.state.get(memory)
     if not (np.abs(x) < LARGEST).all():  # or NaN
         return False
-    solids = Solids.rigid(batches, w)
-    far = float(solids.far(solids.copies.lift(x)).max(initial=0.0)) if solids.count else 0.0
+    solids = Solids(batches, w)
+    far = float(solids.far(x).max(initial=0.0)) if solids.count else 0.0
     if not any(b.soft or b.breaks for b in batches) and max(worst(batches, x), far) <= TINY / s:
         return True
     if any(isinstance(b, Anchored) or (b.clusters and b.soft) for b in batches) or not far <= CONVERGED * solids.worst:
+        return False
+    if worst(batches, x) > CONVERGED:  # an impact left it
         return False
     split, stores, one = memory.read(runner.scene.slots.split), 0.0, 0.0
     for b in batches:

@@ -5,6 +5,7 @@ from struct import Struct
 from ..device import at, inline, record, ti
 
 BEFORE = -1  # the `half` of a substep that has not begun
+ENDLESS = 1 << 20  # substeps of a frame in which nothing comes nearer to its target, and each substep counts as a frame
 LISTS = -1  # what a frame stopped for; where phases are launched, it may be more passes of a kind, see contact/limits.py
 
 
@@ -34,8 +35,8 @@ class Moment:
     """The substep, and the pass over the constraints, in which a phase runs.
 
     s, h, last, time: number of the substep, its length, the length of the one before, its beginning [s]. frame_fraction: where it
-    begins and ends in the frame. fresh: whether it is a start. final: whether
-    it is the last of the frame. it: number of the pass. first: whether multipliers begin in this pass. checks_list: whether the
+    begins and ends in the frame, and its share of the frame. fresh: whether it is a start. final: whether it is the last one. it:
+    number of the pass. first: whether multipliers begin in this pass. checks_list: whether the
     pass ends with a check for a stale list (every substep begins with one, too). half: number of the half, counted through all
     passes. newton: the Newton step within the pass, 0 or 1.
     """

@@ -575,26 +575,6 @@ class Step:
         return self.searches[k].list.need[None]
 
     @ti.kernel
-    def stop_moved(self, old: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
-        """Stop particles at walls, posed as at the beginning of a frame, after the host moved them from `old`, (n, dim)."""
-        for group in ti.static(self.posed):
-            for _ in range(1):
-                group.pose(ti.Vector([0, 0], self.real), True)
-        for i in range(self.n):
-            move = ti.zero(self.state.d[i])
-            for k in ti.static(range(self.dim)):
-                way = ti.cast(self.state.x[i][k], ti.f64) - old[i, k]
-                if ti.static(self.state.sums):
-                    way += self.state.low[i][k]
-                move[k] = ti.cast(way, self.real)
-                if ti.static(self.state.starts):
-                    self.state.x0[i][k] = ti.cast(old[i, k], self.real)
-                    if ti.static(self.state.sums):
-                        self.state.low0[i][k] = ti.cast(old[i, k] - self.state.x0[i][k], self.real)
-            if self.state.w.positive(i) and (move != 0).any():
-                self.particles.stop(i, move)
-
-    @ti.kernel
     def to_velocity(self, given: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """Turn displacements into velocities, for a start with another h or another state. given: h, t, soft, and alone, see
         Passes.push_spring_force().

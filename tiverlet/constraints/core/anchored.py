@@ -92,15 +92,6 @@ class Anchored(Batch):
         """Return C at positions (n, dim), with the places where the coming frame begins, (m, dim)."""
         raise NotImplementedError
 
-    def tangents(self, x: np.ndarray) -> np.ndarray:
-        """Return unit vectors along which particles at x (m, dim) can move under rigid constraints; 0 where there is none."""
-        return np.zeros_like(x)
-
-    def across(self, x: np.ndarray) -> np.ndarray:
-        """Return the projectors on the directions in which particles at x (m, dim) are held, (m, dim, dim)."""
-        along = self.tangents(x)
-        return np.eye(x.shape[1]) - along[:, :, None] * along[:, None, :]
-
     def weights(self, position: np.ndarray) -> np.ndarray:
         """Return the inverse masses of the particles, (m,)."""
         return self.scene.inv_mass[self.indices[:, 0]]

@@ -64,7 +64,7 @@ class CornerPasses(Passes):
         if ti.static(self.equation.ramp.is_allocated):
             if first != 0:
                 self.equation.ramp.update_rest(c, frame_fraction)
-        share = frame_fraction[1] - frame_fraction[0]
+        share = frame_fraction[2]
         violation, A, alpha, lam, W, n, g, turn, moved = self.linearise(c, h, h2_effective, share, first, fresh)
         step = ti.cast(1, self.real)
         if ti.static(bool(self.impacts)):

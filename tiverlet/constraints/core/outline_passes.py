@@ -96,7 +96,7 @@ class OutlinePasses(Passes):
         f, f0, w, W, turn, extent, move = self.sum_blocks(c)
         violation, A, alpha, lam, W = self.equation.terms(c, f, f0, w, W, h, h2_effective, first, fresh)
         if ti.static(self.limit.acts):
-            violation -= A * self.equation.postpone(c, f0, W, frame_fraction[1] - frame_fraction[0], first)
+            violation -= A * self.equation.postpone(c, f0, W, frame_fraction[2], first)
         new = self.equation.jacobi_update(c, violation, A, alpha, lam, W, turn)
         new = self.limit.limit_collapse(lam, new, self.equation.rest[c], extent, move)
         self.equation.lam[c], self.change[c], self.use_current_gradient[c] = new, new - lam, turn == FAR

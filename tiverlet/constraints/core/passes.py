@@ -25,7 +25,7 @@ class Passes:
         """Do one Jacobi correction in a substep of h [s]: write the move of each corner, its inverse mass included.
 
         h2_effective: what a constant acceleration adds to the displacement, per m/s^2: h^2, half of it at a start, less with
-        drag [s^2]. frame_fraction: where in the frame the substep starts and ends, for targets that move.
+        drag [s^2]. frame_fraction: where in the frame the substep starts and ends, and its share of it.
         first: 1 in the first iteration of a substep. fresh: 1 at a start, the first substep after velocities were set.
         """
 

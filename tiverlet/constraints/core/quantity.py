@@ -34,6 +34,7 @@ class Quantity:
     curved = False  # whether f is so curved that a Newton step from afar is meaningless
     collapses = 0  # the power of a length that f is, where gradients vanish with the size of the body; else 0
     transcends = False  # needs angles, cube roots or exponentials, which SPIR-V has for f32 only
+    foreign = False  # whether f is the user's own, of which nothing is known
     centred = False  # whether f is measured from a value that moves with the rest value
     state: Any  # set by bind() for the device, as are the next three
     real: Any

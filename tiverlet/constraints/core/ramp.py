@@ -69,6 +69,11 @@ class Ramp:
         goals = [goal for _, goal, _ in self._batch.tracks()]
         self.put([np.where(some, goal, now) for now, goal in zip(self.now(), goals, strict=True)])
 
+    def hold(self) -> None:
+        """Let rest values stay where they are until they start to move."""
+        if self.is_allocated:
+            self._write_goals(self.now(), self.now())
+
     def start_moving(self) -> bool:
         """Start moving rest values, so that they reach their goals as the coming frame ends.
 

@@ -167,11 +167,6 @@ class Scalar(Batch):
         return self.dev.equation.ramp if "equation" in vars(self.dev) else None
 
     @property
-    def straight(self) -> np.ndarray:
-        """Which constraints keep paths in 3D straight, which may bend in two directions, (m,): some of a Bend do."""
-        return np.zeros(self.count, dtype=bool)
-
-    @property
     def rest_now(self) -> np.ndarray:
         """The rest values of the state, (m,): before a ramp, those at which it begins."""
         return self.ramp.now()[0] if self.ramp and self.ramp.under_way else self.goal
