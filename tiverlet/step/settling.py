@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from .runner import Runner
 
 TINY = 2.0**-36  # of a frame: what forces and springs do in such a substep is below rounding
-LOOK = 64  # passes between two looks at violations, each in a substep of its own, since its direction is that at the start
-DONE = 1e-10  # of its size: a violation with which it ends, beside rounding
+LOOK = 64  # passes between two looks at violations, at first fewer; each is a substep, whose direction is that at its start
+DONE = 1e-10  # of its size: a violation with which it ends, beside rounding of coordinates and of itself
 HALVINGS = 64  # at most, of a way by which functions of the user are further from their rest; then of each single pass
 BETTER, PATIENCE = 0.99, 16  # a violation that falls more slowly in so many looks has come as low as it can,
 LESS = 0.01  # of what would become of violations if nothing settled: what is worth it
 SLIGHT = 1e-3  # of the largest kinetic energy: what violations may become
 STILL = 1e-4  # if its body also moves by no more of its way in a look
 QUICK = 200  # looks, at most, where substeps get shorter
-MOST, WORK = 1000, 2_000_000  # looks, and particles and constraints in all looks, at most: a second or two
+MOST, WORK = 300, 2_000_000  # looks, and particles and constraints in all looks, at most: a second or two
 
 
 def relieve(runner: "Runner", h: float, dt: float) -> bool:
@@ -137,11 +137,11 @@ def _passed(
     # Nesterov's steps, but for walls and contacts, which would send off what goes on by itself, and conjugate gradients.
     speeds = not (runner.step.walls or runner.step.contacts or (runner.scene.slots.system and runner.scene.slots.system.steps))
     most = min(QUICK if hurries else MOST, max(PATIENCE, WORK // (runner.n + bodies.count)))
-    new, history, many, pace = x, [bodies.far(x, 0.0, DONE) * going], True, 0
+    new, history, many, pace = x, [bodies.far(x, 0.0, DONE + bodies.digit) * going], True, 0
     for _ in range(most):
         state.put(memory, new)
         last = new
-        for _ in range(LOOK if many else 1):
+        for _ in range(min(LOOK, 4 << len(history)) if many else 1):
             runner.run_no_time(dt * TINY)
             if speeds and many:
                 before, new, pace = new, state.get(memory), pace + 1
@@ -149,7 +149,7 @@ def _passed(
         new = state.get(memory) if not (speeds and many) else new
         new = np.where(np.isfinite(new), new, last)
         for k in range(HALVINGS):
-            left = bodies.far(new, 0.0, DONE) * going
+            left = bodies.far(new, 0.0, DONE + bodies.digit) * going
             worse = ~(left[2] <= history[-1][2])[bodies.body][:, None]
             if not worse.any():
                 break

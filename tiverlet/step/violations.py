@@ -32,6 +32,7 @@ class Bodies:
         self.of = np.split(label, np.cumsum([b.count for b in self.batches])[:-1])
         self.solids = Solids(self.batches, scene.inv_mass)
         self.rounding = ROUNDING[ti.f64 if scene.state.sums else scene.real]
+        self.digit = ROUNDING[scene.real]  # with which the device computes violations, relative to their sizes
 
     def with_any(self, some: np.ndarray | None) -> np.ndarray:
         """Return a mask of the bodies whose constraints have any particle in the mask `some`, (n,); None for all."""
