@@ -134,14 +134,21 @@ def _passed(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return where passes move the bodies in the mask `going` from x, (n, dim), and what they leave violated, as far() does."""
     state, memory, some = runner.scene.state, runner.memory, going[bodies.body]
+    # Nesterov's steps, only near a rest: elsewhere they throw off what has no direction, and what walls cannot call back.
+    speeds = hurries and not (
+        runner.step.walls or runner.step.contacts or (runner.scene.slots.system and runner.scene.slots.system.steps)
+    )
     most = min(QUICK if hurries else MOST, max(PATIENCE, WORK // (runner.n + bodies.count)))
-    new, history, many = x, [bodies.far(x, 0.0, DONE + bodies.digit) * going], True
+    new, history, many, pace = x, [bodies.far(x, 0.0, DONE + bodies.digit) * going], True, 0
     for _ in range(most):
         state.put(memory, new)
         last = new
         for _ in range(min(LOOK, 4 << len(history)) if many else 1):
             runner.run_no_time(dt * TINY)
-        new = state.get(memory)
+            if speeds and many:
+                before, new, pace = new, state.get(memory), pace + 1
+                state.put(memory, np.where(some[:, None], new + pace / (pace + 3) * (new - before), new))
+        new = state.get(memory) if not (speeds and many) else new
         new = np.where(np.isfinite(new), new, last)
         for k in range(HALVINGS):
             left = bodies.far(new, 0.0, DONE + bodies.digit) * going
@@ -149,11 +156,14 @@ def _passed(
             if not worse.any():
                 break
             new, many = np.where(worse, (new + last) / 2 if k < HALVINGS - 2 else last, new), False
+        pace = pace if (left[1] <= history[-1][1]).all() else 0
         history.append(left)
         stands = len(history) > PATIENCE and (left[1] >= BETTER**2 * history[-PATIENCE][1]).all()
         stands = stands and _longest(new - last, some) <= STILL * _longest(new - x, some)
-        if not left.any() or stands:
+        if not left.any() or (stands and not speeds):
             break
+        if stands:  # what contradicts itself comes to rest by plain passes
+            speeds, history = False, history[-1:]
     return np.where(some[:, None], new, x), history[-1][0]
 
 
