@@ -57,17 +57,11 @@ class Bend(Scalar):
         """Return the gradients of the angles, (m, 3, dim), with the sign that the angles have on the device."""
         return self._sides(position)[:, None, None] * super().gradients(position)
 
-    @property
-    def straight(self) -> np.ndarray:
-        """Which paths in 3D are to be straight now, so that they may bend in any direction, (m,). See BendAngle."""
-        if self.start.dim == 2:
-            return np.zeros(self.count, dtype=bool)
-        return self.scene.memory.read(self.dev.equation.rest)[: self.count] == 0
-
     def _sides(self, position: np.ndarray) -> np.ndarray:
         """Return -1 for paths that bend the other way than about their remembered axis, else 1, (m,)."""
         if not hasattr(vars(self.dev).get("quantity"), "axis"):
             return np.ones(self.count)
         x, axis = self.placed(position), self.scene.memory.read(self.dev.quantity.axis)[: self.count]
         along = (cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 1]) * axis).sum(axis=1)
-        return np.where(self.straight & (along < 0), -1.0, 1.0)
+        straight = self.scene.memory.read(self.dev.equation.rest)[: self.count] == 0
+        return np.where(straight & (along < 0), -1.0, 1.0)

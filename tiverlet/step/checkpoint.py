@@ -13,6 +13,7 @@ from .clock import Clock
 
 if TYPE_CHECKING:
     from ..world import World
+    from .runner import Runner
 
 PAIRS, PAIR = "Contact.pairs", "Contact."  # name of the array of pairs with data; prefix of the names of these data
 RESTS = "rests."  # prefix of rest values while knobs wait, before a ramp to new values; the number of the feature follows
@@ -40,11 +41,31 @@ def state(world: "World", pairs: bool = True) -> dict[str, np.ndarray]:
     Of the neighbour list, this is the data of its pairs, not the layout. pairs: False leaves these data out, which takes a
     fraction of the time; a difference in them appears in the positions of the next frame.
     """
-    out = {name: values for memory in world._runner.memories for name, values in memory.state().items()}
-    if world._runner.search and pairs:
-        out[PAIRS], carried = world._runner.search.list.persistent_data()
-        out.update((f"{PAIR}{name}", values) for name, values in carried.items())
+    out = fields(world._runner, pairs)
     return out | {f"{RESTS}{k}": np.stack(f.ramp.now()) for k, f in enumerate(world.features) if f.ramp and f.ramp.has_pending}
+
+
+def fields(runner: "Runner", pairs: bool = True) -> dict[str, np.ndarray]:
+    """Return the same for a runner, without rest values before a ramp."""
+    out = {name: values for memory in runner.memories for name, values in memory.state().items()}
+    if runner.search and pairs:
+        out[PAIRS], carried = runner.search.list.persistent_data()
+        out.update((f"{PAIR}{name}", values) for name, values in carried.items())
+    return out
+
+
+def put_fields(runner: "Runner", values: dict[str, np.ndarray]) -> None:
+    """Write back what fields() or state() returned, bit for bit, and forget the events since then."""
+    stores = list(map(id, runner.memories))
+    for memory in runner.memories:
+        memory.restore(values)
+    if runner.search:
+        runner.search.list.restore(values[PAIRS], {piece.name: values[name] for name, piece in _pieces(runner).items()})
+    for log in runner.logs:
+        log.forget()
+    runner.invalidate()
+    if list(map(id, runner.memories)) != stores:
+        runner.renew()  # fields were allocated
 
 
 def keep(world: "World", pairs: bool = True) -> Checkpoint:
@@ -70,7 +91,7 @@ def _hashed(world: "World", values: dict[str, np.ndarray]) -> dict[str, np.ndarr
     that are 0. Pairs whose data are for reports alone are left out, too: whether a pair that has just bounced is on the list
     depends on the skin.
     """
-    late, pieces = _late(world), _pieces(world)
+    late, pieces = _late(world), _pieces(world._runner)
     told = {e.name for memory in world._runner.memories for e in memory.entries if e.for_reports}
     told |= {name for name, piece in pieces.items() if piece.for_reports}
     out = {n: v for n, v in values.items() if not (n in told or n.startswith(RESTS) or (n in late and not v.any()))}
@@ -88,9 +109,9 @@ def _late(world: "World") -> set[str]:
     return set(slots.system.late) if slots and slots.system else set()
 
 
-def _pieces(world: "World") -> dict[str, Any]:
+def _pieces(runner: "Runner") -> dict[str, Any]:
     """Return the data of pairs that are part of the state (PairData), by name."""
-    return {f"{PAIR}{piece.name}": piece for piece in world._runner.search.list.persistent} if world._runner.search else {}
+    return {f"{PAIR}{piece.name}": piece for piece in runner.search.list.persistent} if runner.search else {}
 
 
 def flags(world: "World") -> list[list[bool]]:
@@ -101,22 +122,13 @@ def flags(world: "World") -> list[list[bool]]:
 def put_back(world: "World", kept: Checkpoint) -> None:
     """Return to an earlier state, bit for bit."""
     world._runner.set_substep(kept.clock.h, kept.clock.drag)
-    search, stores = world._runner.search, list(map(id, world._runner.memories))
-    for memory in world._runner.memories:
-        memory.restore(kept.values)
-    if search:
-        search.list.restore(kept.values[PAIRS], {piece.name: kept.values[name] for name, piece in _pieces(world).items()})
+    put_fields(world._runner, kept.values)
     for k, f in enumerate(world.features):
         if f"{RESTS}{k}" in kept.values:
             f.ramp.put(kept.values[f"{RESTS}{k}"])
-    for log in world._runner.logs:
-        log.forget()
-    world._runner.invalidate()
     if world._runner.sleep:
         world._runner.sleep.rests = False
         world._runner.sleepers.review()
-    if list(map(id, world._runner.memories)) != stores:
-        world._runner.renew()  # fields were allocated
     if world._clock.softness != kept.clock.softness:
         world._runner.set_softness(kept.clock.softness)
     world._clock.put_back(kept.clock)
@@ -137,7 +149,7 @@ def check(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
     """Raise ValueError unless a state from elsewhere fits the world, above all the values that kernels use as indices."""
     present = keep(world)
     rests = {f"{RESTS}{k}": f.ramp.shape for k, f in enumerate(world.features) if f.ramp}
-    late, pieces = _late(world), _pieces(world)
+    late, pieces = _late(world), _pieces(world._runner)
     optional = late | rests.keys()
     if set(present.values) - optional != set(kept.values) - optional:
         raise ValueError("The state is not one of this scene: it has other fields.")

@@ -612,8 +612,7 @@ class Runner:
     def _launch(self, span: Span) -> None:
         """Launch a frame phase by phase. At the end, the host reads one result: whether the frame waits for something."""
         try:
-            frame(self.launcher, span)
-            self.launcher.flush()
+            self._launch_phases(span)
             while self.step.searches and self._data[HALT]:
                 span.resumed, span.begin, span.half, span.what = self.take_halt()
                 if span.what == LISTS:
@@ -621,14 +620,21 @@ class Runner:
                     self.wake_called(span.substeps, span.iterations, span.begin, span.half)
                 else:
                     self.launcher.launch_more(span.what)
-                frame(self.launcher, span)
-            if span.substeps and self.launcher.rows:
+                self._launch_phases(span)
+            if span.until > span.substeps > 0 and self.launcher.rows:
                 self.launcher.learn(self._data)
         except BaseException:  # as signals raise
             self.launcher.waiting.clear()
             if self.step.searches:
                 self.memory.write(self.step.halt, 0)
             raise
+
+    def _launch_phases(self, span: Span) -> None:
+        """Launch the phases of a frame. Where no report tells it, ask whether it stopped."""
+        frame(self.launcher, span)
+        self.launcher.flush()
+        if self.step.searches and span.until <= span.substeps:
+            self.sheet[HALT:MOST] = self.memory.read(self.step.halt).ravel()
 
     def measure(self, end: float, state_origin: int) -> None:
         """Launch the diagnostics alone."""

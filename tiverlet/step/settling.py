@@ -13,10 +13,11 @@ nothing left to do there. In a running world, part of a violation bears the load
 Where substeps get shorter, what long ones have left violated, by impacts or where systems gave way, settles, too. See relieve().
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .checkpoint import fields, put_fields
 from .clock import CHANGED
 from .softness import stored
 from .violations import ENOUGH, SEEN, Bodies
@@ -44,27 +45,32 @@ def relieve(runner: "Runner", h: float, dt: float) -> bool:
     that are solved exactly have no softness.
     """
     clock, state, memory, system = runner.clock, runner.scene.state, runner.memory, runner.scene.slots.system
-    bodies, exact = Bodies(runner.scene, runner.batches), bool(system) and not system.steps
-    otherwise = bodies.energy(state.get(memory), h) if exact else 0.0  # what exact systems, which nothing softens, make of it
-    if exact and otherwise <= SLIGHT * clock.kinetic:
+    bodies, x, exact = Bodies(runner.scene, runner.batches), state.get(memory), bool(system) and not system.steps
+    otherwise = bodies.energy(x, h) if exact else 0.0  # what exact systems, which nothing softens, make of it
+    if not np.isfinite(x).all() or (exact and otherwise <= SLIGHT * clock.kinetic):
+        return False
+    going = bodies.far(x, (h / clock.h) ** 2 / clock.softness)[0] > (0.0 if exact else SEEN)
+    if not exact:
+        going &= bodies.with_any(_held(runner))
+    if not going.any():
         return False
     before = clock.energy if clock.energy is not None else _energy(runner)
     supply = max(before, clock.bound) if clock.bound is not None else before + stored(runner)
-    kept, borne = _keep(runner), (h / clock.h) ** 2 / clock.softness
-    moved = settle(runner, 0, dt, 0.0 if exact else SEEN, borne, None if exact else _held(runner), True)
-    if moved is None:
-        return False
-    left = bodies.energy(state.get(memory), h) * clock.softness
+    far, new = _settled(runner, bodies, going, x, dt, hurries=True)
+    state.put(memory, new)
+    left = bodies.energy(new, h) * clock.softness
     due = _energy(runner) + left - supply if clock.bound != CHANGED else 0.0
-    some, w, d = moved[0] > 0, runner.scene.inv_mass, memory.read(state.d)
+    some, w, d = (new != x).any(axis=1), runner.scene.inv_mass, memory.read(state.d)
     m = np.divide(some, w, out=np.zeros(len(w)), where=w > 0)
     kinetic = float(m @ (d[: runner.n].astype(np.float64) ** 2).sum(axis=1)) / 2
     if due > kinetic + LESS * otherwise:
-        _put_back(runner, *kept)
+        state.put(memory, x)
+        runner.invalidate()
         return False
     if due > 0 and kinetic > 0:
         d[: runner.n][some] *= max(1 - due / kinetic, 0.0) ** 0.5
         memory.write(state.d, d)
+    bodies.forget_loads(going & (far > ENOUGH))
     clock.energy = None
     return True
 
@@ -83,35 +89,34 @@ def _energy(runner: "Runner") -> float:
     return runner.report().energy
 
 
-def settle(
-    runner: "Runner",
-    placed: int,
-    dt: float,
-    least: float = 0.0,
-    borne: float = 1.0,
-    held: np.ndarray | None = None,
-    hurries: bool = False,
-) -> tuple[np.ndarray, float] | None:
+def settle(runner: "Runner", placed: int, dt: float) -> tuple[np.ndarray, float] | None:
     """Move bodies with any particle from `placed` on to where their rigid constraints are met, or as near as they come.
 
-    Displacements hold velocities. dt: of the coming frame [s]. least: a violation that is no reason to move; borne: the part that
-    stays of what bears a load. held: a mask of particles, (n,); only bodies with any of them move. hurries: whether to end after
-    QUICK looks. Returns how far each particle moved, (n,) [m], and the largest violation that was removed, as a share of the size
-    of its constraint or cluster; None if nothing moved.
+    Displacements hold velocities. dt: of the coming frame [s]. Returns how far each particle moved, (n,) [m], and the largest
+    violation that was removed, as a share of the size of its constraint or cluster; None if nothing moved.
     """
     state, memory = runner.scene.state, runner.memory
     x = state.get(memory)
     if not np.isfinite(x).all():
         return None
     bodies = Bodies(runner.scene, runner.batches)
-    going = (
-        bodies.with_any(held)
-        & (bodies.far(x, borne)[0] > least)
-        & (np.bincount(bodies.body[placed:], minlength=bodies.count) > 0)
-    )
+    going = (bodies.far(x)[0] > 0) & (np.bincount(bodies.body[placed:], minlength=bodies.count) > 0)
     if not going.any():
         return None
-    far, kept = bodies.far(x, 0.0)[0] * going, _keep(runner)
+    far, new = _settled(runner, bodies, going, x, dt, hurries=False)
+    state.put(memory, new)
+    bodies.forget_loads(going & (far > ENOUGH))
+    return np.linalg.norm(new - x, axis=1), float(far.max())
+
+
+def _settled(
+    runner: "Runner", bodies: Bodies, going: np.ndarray, x: np.ndarray, dt: float, hurries: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far the bodies in the mask `going` are from their rest at x, (n, dim), and where they settle, (n, dim).
+
+    hurries: whether to end after QUICK looks. The state is as before.
+    """
+    far, clock, values = bodies.far(x, 0.0)[0] * going, runner.clock.copy(), fields(runner)
     for b in runner.ramping:
         b.ramp.hold()
     if system := runner.scene.slots.system:
@@ -123,10 +128,11 @@ def settle(
     if (arcs != new).any():
         arcs, less = _passed(runner, bodies, stuck, arcs, dt, hurries)
         new = np.where((less < BETTER * left)[bodies.body][:, None], arcs, new)
-    _put_back(runner, *kept)
-    state.put(memory, new)
-    bodies.forget_loads(going & (far > ENOUGH))
-    return np.linalg.norm(new - x, axis=1), float(far.max())
+    put_fields(runner, values)
+    runner.set_substep(clock.h, clock.drag)
+    runner.set_softness(clock.softness)
+    runner.clock.put_back(clock)
+    return far, new
 
 
 def _passed(
@@ -170,23 +176,3 @@ def _passed(
 def _longest(way: np.ndarray, some: np.ndarray) -> float:
     """Return the length of the longest way, (n, dim), of the particles in the mask `some`."""
     return float(np.linalg.norm(way[some], axis=1).max())
-
-
-def _keep(runner: "Runner") -> tuple[Any, ...]:
-    """Return a copy of all that substeps change."""
-    lists = [(search.list, search.list.persistent_data()) for search in runner.step.searches if search.list.store]
-    return runner.clock.copy(), [(memory, memory.state()) for memory in runner.memories], lists
-
-
-def _put_back(runner: "Runner", clock: Any, states: list[Any], lists: list[Any]) -> None:
-    """Restore what _keep() returned."""
-    for memory, values in states:
-        memory.restore(values)
-    for each, (pairs, values) in lists:
-        each.restore(pairs, values)
-    for log in runner.logs:
-        log.forget()
-    runner.invalidate()
-    runner.set_substep(clock.h, clock.drag)
-    runner.set_softness(clock.softness)
-    runner.clock.put_back(clock)

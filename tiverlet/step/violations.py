@@ -1,6 +1,7 @@
 """How far rigid constraints and clusters are from being met, as the host sees it: what has to settle, and what is left then."""
 
 from collections.abc import Sequence
+from typing import TypeGuard
 
 import numpy as np
 
@@ -31,13 +32,12 @@ class Bodies:
         label, self.body = bodies_of(self.count - 1, *corners_of(self.batches), scene.inv_mass)
         self.of = np.split(label, np.cumsum([b.count for b in self.batches])[:-1])
         self.solids = Solids(self.batches, scene.inv_mass)
+        self.close = {b: b.inverse_size(b.start.position) for b in self.batches if isinstance(b, Scalar)}
         self.rounding = ROUNDING[ti.f64 if scene.state.sums else scene.real]
         self.digit = ROUNDING[scene.real]  # with which the device computes violations, relative to their sizes
 
-    def with_any(self, some: np.ndarray | None) -> np.ndarray:
-        """Return a mask of the bodies whose constraints have any particle in the mask `some`, (n,); None for all."""
-        if some is None:
-            return np.ones(self.count, dtype=bool)
+    def with_any(self, some: np.ndarray) -> np.ndarray:
+        """Return a mask of the bodies whose constraints have any particle in the mask `some`, (n,)."""
         out = np.zeros(self.count, dtype=bool)
         for b, of in zip(self.batches, self.of, strict=True):
             out[of[b.owner[some[b.indices.ravel()]]]] = True
@@ -52,7 +52,7 @@ class Bodies:
         strain, out, dim = np.zeros((2, self.count)), x.copy(), x.shape[1]  # sums over links, and their numbers
         for b, of in zip(self.batches, self.of, strict=True):
             if isinstance(b, Scalar) and b.arity == 2:
-                C = b.violation(x) * b.inverse_size(b.start.position) * (b.compliance == 0) * ~b.broken
+                C = b.violation(x) * self.close[b] * (b.compliance == 0) * ~b.broken
                 strain += [np.bincount(of, np.maximum(-C, 0), self.count), np.bincount(of, minlength=self.count)]
         strain = strain[0] / np.maximum(strain[1], 1)
         for k in np.flatnonzero(strain > SEEN):
@@ -82,7 +82,7 @@ class Bodies:
         """
         out = np.zeros((3, self.count))
         for b, of in zip(self.batches, self.of, strict=True):
-            if isinstance(b, Scalar) and (b.compliance == 0).any():
+            if _is_rigid(b):
                 share = self._share(b, x, borne, met)
                 np.maximum.at(out[0], of, share)
                 out[1 : 2 + b.quantity.foreign] += np.bincount(of, share**2, self.count)
@@ -100,7 +100,7 @@ class Bodies:
 
     def _share(self, b: Scalar, x: np.ndarray, borne: float, met: float) -> np.ndarray:
         """Return the same for the constraints of a batch, (m,)."""
-        C, close = b.violation(x), b.inverse_size(b.start.position)
+        C, close = b.violation(x), self.close[b]
         acts = (b.compliance == 0) & ~b.broken & ~b.immovable(self.scene.inv_mass) & (C * b.side >= 0)
         C = np.where(acts, C, 0.0)
         if borne and (C != 0).any():
@@ -116,7 +116,7 @@ class Bodies:
         """Return what rigid constraints violated at x, (n, dim), become if one substep h [s] removes them by themselves [J]."""
         split, out = self.scene.memory.read(self.scene.slots.split)[: len(x)].astype(np.float64), 0.0
         for b in self.batches:
-            if isinstance(b, Scalar) and (b.compliance == 0).any():
+            if _is_rigid(b):
                 C, W = b.violation(x), b.weights(x, split)
                 some = (b.compliance == 0) & ~b.broken & (C * b.side >= 0) & (W > 0)
                 out += float((C[some] ** 2 / W[some]).sum())
@@ -127,11 +127,8 @@ class Bodies:
     def forget_loads(self, some: np.ndarray) -> None:
         """Forget the loads of rigid constraints of the bodies in the mask `some`, which bear none at their new places yet."""
         for b, of in zip(self.batches, self.of, strict=True):
-            if isinstance(b, Scalar) and (b.compliance == 0).any() and (here := some[of]).any():
-                lam = self.scene.memory.read(b.dev.equation.lam)
-                lam[: b.count][here] = 0.0
-                self.scene.memory.write(b.dev.equation.lam, lam)
-                b.forget_loads(here)
+            if _is_rigid(b) and (here := some[of]).any():
+                _forget(b, here)
 
 
 def _borne(scene: Scene, b: Scalar, x: np.ndarray, C: np.ndarray) -> np.ndarray:
@@ -148,19 +145,23 @@ def _borne(scene: Scene, b: Scalar, x: np.ndarray, C: np.ndarray) -> np.ndarray:
 def forget(scene: Scene, batches: list[Batch], x: np.ndarray) -> None:
     """Reset the known loads of constraints whose violation changes, before particles are put to x, (n, dim) [m]."""
     for b in _rigid(batches):
-        lam = scene.memory.read(b.dev.equation.lam)
-        if lam.any():
+        if scene.memory.read(b.dev.equation.lam).any():
             old = scene.state.get(scene.memory)
-            off = np.abs(b.violation(x) - b.violation(old)) * b.inverse_size(b.start.position) > SEEN
-            lam[: b.count][off] = 0.0
-            scene.memory.write(b.dev.equation.lam, lam)
-            b.forget_loads(off)
+            _forget(b, np.abs(b.violation(x) - b.violation(old)) * b.inverse_size(b.start.position) > SEEN)
+
+
+def _forget(b: Scalar, some: np.ndarray) -> None:
+    """Forget the loads of the constraints in the mask `some`, (m,)."""
+    lam = b.scene.memory.read(b.dev.equation.lam)
+    lam[: b.count][some] = 0.0
+    b.scene.memory.write(b.dev.equation.lam, lam)
+    b.forget_loads(some)
 
 
 def left(batches: list[Batch], x: np.ndarray) -> list[tuple[Batch, np.ndarray]]:
     """Return the violations of rigid two-sided constraints at x, (n, dim), by batch: shares of their sizes, (m,), 0 up to SEEN.
 
-    Constraints that remove() leaves violated contradict each other.
+    Constraints that are violated after settling contradict each other.
     """
     some = [b for b in _rigid(batches) if b.side == 0]
     off = [(b, np.abs(b.violation(x) * b.inverse_size(x) * (b.compliance == 0) * ~b.broken)) for b in some]
@@ -201,7 +202,12 @@ def _off_corners(batch: Scalar, x: np.ndarray, some: np.ndarray) -> list[int]:
 
 def _rigid(batches: list[Batch]) -> list[Scalar]:
     """Return the batches with rigid constraints."""
-    return [b for b in batches if isinstance(b, Scalar) and b.count and (b.compliance == 0).any()]
+    return [b for b in batches if b.count and _is_rigid(b)]
+
+
+def _is_rigid(b: Batch) -> TypeGuard[Scalar]:
+    """Whether a batch is one of numbers, some of which are rigid."""
+    return isinstance(b, Scalar) and bool((b.compliance == 0).any())
 
 
 def tied(scene: Scene, batches: list[Batch], placed: int) -> np.ndarray:
