@@ -368,6 +368,6 @@ def test_what_settles_among_contacts_has_the_same_bits_on_all_paths(world):
         pulled[1:40, 0] += np.linspace(0, 6, 39)
         w.position = pulled
         report = w.step(1 / 60)
-        assert "moved" in report.flags and np.abs(features[1].violation(w.position)).max() < 1e-4
+        assert "moved" in report.flags and np.abs(features[1].violation(w.position)).max() < 2e-4  # 2e-3 of a link
         found.append((first, w.hash()))
     assert found[0] == found[1] == found[2]

@@ -71,20 +71,22 @@ def hung(world, solver, n=10, **settings):
 
 @pytest.mark.slow
 def test_conjugate_gradients_reach_the_direct_solution(world):
-    # Two Newton steps, each with the same linear system. Enough steps of conjugate gradients give the direct solution; before
-    # that, each comes nearer.
+    # Two Newton steps, each with the same linear system. Enough steps of conjugate gradients give the direct solution but for
+    # what the floor lets sag, sigma W h^2 F in a link: with sigma = 1.2 lambda / 60^2 < 1.4e-3, W = 2 / m, F < 10 m g, 8e-7 m.
+    # Before that, each comes nearer.
     direct, many = (hung(world, s, substeps=10, iterations=2) for s in (tv.Direct(width=100), tv.ConjugateGradient(60)))
     few = hung(world, tv.ConjugateGradient(8), substeps=10)
     for w in (direct, many, few):
         w.run(0.5)
     assert direct.last.residual < 1e-5 and many.last.clean
-    np.testing.assert_allclose(many.position, direct.position, atol=1e-7)
+    np.testing.assert_allclose(many.position, direct.position, atol=8e-7)
     assert 1e-5 < np.abs(few.position - direct.position).max() < 1e-2 and few.last.residual < 1e-2
     assert abs(many.last.energy) < 2e-3  # of m g L = 9.81: SHAKE neither gains nor loses
 
 
 def test_converged_cloth_from_soft_to_rigid(world):
-    # Springs in the same system as rigid links: the static stretch is alpha F after one iteration.
+    # Springs in the same system as rigid links: the static stretch is alpha F after one iteration, and what the floor lets sag,
+    # 1.4e-3 * 2 / m * h^2 * 6 m g < 5e-7 m.
     n = 6
     x, pairs = cloth(n)
     alpha = np.where(np.arange(len(pairs)) % 2, 1e-3, 0.0)
@@ -97,7 +99,7 @@ def test_converged_cloth_from_soft_to_rigid(world):
         )  # fmt: skip
         w.run(0.3)
         made.append((w.position, link.load))
-    np.testing.assert_allclose(made[0][0], made[1][0], atol=1e-8)
+    np.testing.assert_allclose(made[0][0], made[1][0], atol=5e-7)
     np.testing.assert_allclose(made[0][1], made[1][1], atol=1e-5 * np.abs(made[0][1]).max())
 
 

@@ -115,8 +115,8 @@ class CGSystem(System):
         self.noise, self.above_noise = self.reals("noise"), self.reals("loud", BLOCKS)  # r z of rounding; 1 if a row is above it
         self.null = max(REDUNDANT, NULL * self.epsilon)
         self.rounding = self.epsilon ** (2 if scene.state.compensated else 1)  # of positions
-        least = 1.2 * largest_eigenvalue(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
-        self.least = self.memory.number(least, scene.real)
+        self._least = 1.2 * largest_eigenvalue(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
+        self.least = self.memory.number(self._least, scene.real)
         _, part, _ = distinct(components(len(rows), row[free], who[free]))
         self._part_of = np.zeros(scene.particles.count, dtype=np.int32)  # the part of each particle, counted from 1; 0: none
         self._part_of[who[free]] = part[row[free]] + 1
@@ -131,10 +131,10 @@ class CGSystem(System):
         """Declare a field of real numbers, one for each row."""
         return self.memory.field(f"system.{name}", self.rows)
 
-    @property
-    def greatest_floor(self) -> float:
-        """The largest of the floors of all parts."""
-        return float(self.memory.read(self.floor).max(initial=0.0))
+    def sag(self, batch: "Batch") -> np.ndarray:
+        """Return the floor of the part of each constraint of a batch, (m,); 1 for those that are relaxed alone."""
+        row, floor = self.row(batch), np.maximum(self.memory.read(self.floor), self._least)
+        return np.where(row < 0, 1.0, floor[self.memory.read(self.representative)[row]])
 
     def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
         """Reset the floors, because steps may converge from the new positions.
@@ -157,9 +157,14 @@ class CGSystem(System):
         zero = 0 * violation
         self.step[r] = ti.select(W > 0, ti.cast(0, ti.f64), -ti.cast(lam, ti.f64))
         self.residual[r] = ti.select(W > 0, -violation / A, zero)
-        self.shift[r] = ti.select(W > 0, alpha / A + ti.cast(self.floor[self.representative[r]], self.real) * W, zero)
+        self.shift[r] = ti.select(W > 0, alpha / A + self.floor_of(self.representative[r]) * W, zero)
         self.inverse_diagonal[r] = ti.select(W > 0, 1 / (W + self.shift[r]), zero)
         self.direction[r] = self.inverse_diagonal[r] * self.residual[r]
+
+    @ti.func
+    def floor_of(self, i):
+        """Return the floor of the part of particle i."""
+        return ti.max(ti.cast(self.floor[i], self.real), self.least)
 
     @ti.func
     def set_gradient(self, place, i, gradient):
@@ -219,7 +224,7 @@ class CGSystem(System):
         self.team.wait()
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             if self.floor_too_low[self.part_of[i]] != 0:
-                self.floor[i] = ti.max(self.least, ti.min(GROWTH * self.floor[i], HIGHEST))
+                self.floor[i] = ti.min(GROWTH * self.floor_of(i), HIGHEST)
         self.team.wait()
         for p in range(self.team.chunk_begin(self.part_count, thread), self.team.chunk_end(self.part_count, thread)):
             self.floor_too_low[p] = 0

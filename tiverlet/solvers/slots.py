@@ -137,6 +137,10 @@ class Slots:
         if self.system and self.system.has_shared_particles:
             memory.write(self.system.blocks_of, self._blocks * np.where(self.shared, softness, 1.0))
 
+    def sag(self, batch: Batch) -> np.ndarray:
+        """Return sigma, (m,), where each constraint of a batch holds a load F by a violation sigma W h^2 F."""
+        return self.system.sag(batch) if self.system else np.ones(batch.count)
+
     @property
     def sags_anywhere(self) -> bool:
         """Whether any constraint bears loads by a violation."""

@@ -36,7 +36,6 @@ class System:
     answers = False  # whether parts answer the impulses of contacts, see Elimination.answer_part()
     steps = 0  # iterations of a pass, by start(), iterate() and end(); 0 for a solution by solve()
     refines = False  # whether parts may take a second Newton step in a pass, see takes_step() and is_unmet()
-    greatest_floor: float = 0.0  # sigma, by which rows hold a load F by a violation sigma W h^2 F
     can_stiffen: Any = False  # whether parts gave way in a longer substep, and may bear their loads in this one
     keeps_softness_of_longer: Any = False  # whether a part is softened for a longer substep, so that shorter ones do not help
     has_implied = False  # whether rows are links that others imply, which take no step
@@ -129,6 +128,10 @@ class System:
 
         off: for some batches, (m,), the violations of rigid constraints that cannot be removed at the new positions.
         """
+
+    def sag(self, batch: "Batch") -> np.ndarray:
+        """Return sigma, (m,), where each constraint of a batch holds a load F by a violation sigma W h^2 F: 1 by itself."""
+        return np.where(self.row(batch) < 0, 1.0, 0.0)
 
     def gives_way(self, batch: "Batch") -> np.ndarray:
         """Return a mask of the constraints of a batch in parts that give way, (m,)."""

@@ -119,7 +119,8 @@ class StepController:
             took = perf_counter() - begun
             self.learn(took / (n * k))
             motion, missed = motion_error(world) if tolerance else 0.0, energy_bound.missed(world, report, energy)
-            figures, risks = judge(report, tolerance, tension(world, report), motion, stiffness(world), damping(world, n), missed)
+            errors = tension(world, report), motion, stiffness(world), damping(world, n), missed
+            figures, risks = judge(report, tolerance, world._clock.softness, *errors)
             if tries.record(figures, risks, report.energy, world._runner.sheet.item(KINETIC)):
                 break
             if not tries.verdict and perf_counter() + 2 * took > end:
@@ -368,17 +369,21 @@ def pumps(energies: list[float], kinetic: float) -> bool:
 
 
 def judge(
-    report: StepReport, tolerance: float | None, tension: float, motion: float, stiffness: float, damping: float, missed: float
+    report: StepReport, tolerance: float | None, softness: float, tension: float, motion: float, stiffness: float, damping: float,
+    missed: float,
 ) -> tuple[Figures, set[str]]:  # fmt: skip
     """Return residual, overlap, tension, motion, stiffness, damping and energy relative to their aims (1: just met), and the
-    risks that shorter substeps must remove."""
+    risks that shorter substeps must remove.
+
+    softness: of links, which bear loads as in longer substeps at first. So much of a violation is not the fault of this frame.
+    """
     risks = set(report.flags & RISKS)
     if report.turn:
         risks.add("turned")
     if report.tension > TENSEST:
         risks.add("softened")
     ratios = (
-        report.residual / (tolerance or RESIDUAL),
+        report.residual / softness / (tolerance or RESIDUAL),
         report.overlap / (tolerance or OVERLAP),
         tension / TENSION,
         motion / (tolerance or RESIDUAL),

@@ -169,15 +169,14 @@ class Runner:
             if first is not None:
                 for b in self.driven:
                     b.start_at(self.scene.state.get(self.memory), first)
-                self._note_moved(settling.settle(self, first, dt))  # before what is violated passes for what passes have left
+                self._note_moved(settling.settle(self, first, h, dt))  # before what is violated passes for what passes have left
             if h != clock.h or drag != clock.drag:
                 if self.scene.slots and self.scene.slots.system and clock.h:
                     self.scene.slots.system.keep_softness(h / clock.h)
-                if self._relieves(h, dt, keeps, adapts) and settling.relieve(self, h, dt):
-                    self.set_softness(1.0)
+                less = settling.relieve(self, h, dt) if self._relieves(h, dt, keeps, adapts) else 1.0
+                if less < 1:
                     self._forget_system()
-                else:
-                    softness.keep(self, h, dt, passes, adapts)
+                softness.keep(self, h, dt, passes, adapts, less)
                 if asleep is not None and keeps:
                     self._sleep_on(*asleep, h / clock.h)
                 elif asleep is not None:
@@ -197,10 +196,10 @@ class Runner:
         Not so where a loop measures dt, nor where violations are what drives lag behind, unless `adapts`.
         """
         slots, clock = self.scene.slots, self.clock
-        if not (slots and h < clock.h) or keeps or self.probe or clock.first_moved is not None:
+        if not slots or h >= clock.h or keeps or self.probe or clock.first_moved is not None:
             return False
         steady = dt == clock.frame[1] and not (self.driven or self.ramping)
-        return adapts or steady or bool(slots.system and slots.system.can_stiffen)
+        return adapts or bool(slots.system and (slots.system.can_stiffen or (steady and not slots.system.steps)))
 
     def _forget_system(self) -> None:
         """Let a system forget what it has learnt from earlier positions."""

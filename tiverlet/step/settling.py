@@ -6,7 +6,8 @@ length. These are passes of the step, with all constraints, contacts and walls, 
 have no time to move anything in them, nothing breaks, and there are no events. Of the bodies that settle, positions are kept; all
 else, velocities and loads, contacts, and other bodies, is as before.
 
-They end where violations are down to rounding, or where bodies stand still. Straight and flat bodies whose links are too long
+They end where violations are down to rounding, or where passes would move bodies by next to nothing in the coming frame. Without
+walls and contacts, they are mixed, which takes a tenth of them (`anderson.py`). Straight and flat bodies whose links are too long
 bulge first, as they have no direction to give way in. Constraints that contradict each other stay violated, and passes have
 nothing left to do there. In a running world, part of a violation bears the load of the last substep, and is no reason to move.
 
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .anderson import Anderson
 from .checkpoint import fields, put_fields
 from .clock import CHANGED
 from .softness import stored
@@ -26,53 +28,54 @@ if TYPE_CHECKING:
     from .runner import Runner
 
 TINY = 2.0**-36  # of a frame: what forces and springs do in such a substep is below rounding
-LOOK = 64  # passes between two looks at violations, at first fewer; each is a substep, whose direction is that at its start
+FIRST, LOOK = 4, 64  # passes between two looks at violations; each is a substep, whose direction is that at its start
 DONE = 1e-10  # of its size: a violation with which it ends, beside rounding of coordinates and of itself
 HALVINGS = 64  # at most, of a way by which functions of the user are further from their rest; then of each single pass
-BETTER, PATIENCE = 0.99, 16  # a violation that falls more slowly in so many looks has come as low as it can,
+BETTER = 0.99  # of what is violated: what bulging has to leave at most
 LESS = 0.01  # of what would become of violations if nothing settled: what is worth it
 SLIGHT = 1e-3  # of the largest kinetic energy: what violations may become
-STILL = 1e-4  # if its body also moves by no more of its way in a look
-QUICK = 200  # looks, at most, where substeps get shorter
-MOST, WORK = 1000, 2_000_000  # looks, and particles and constraints in all looks, at most: a second or two
+STILL = 1e-3  # of the way of a body, or of its least constraint: what the coming frame may move it yet
+LEAST, MOST, WORK = 16, 1000, 2_000_000  # looks, at least and at most; particles and constraints in all of them
 
 
-def relieve(runner: "Runner", h: float, dt: float) -> bool:
-    """Settle what longer substeps than h [s] have left violated. Returns whether it did.
+def relieve(runner: "Runner", h: float, dt: float) -> float:
+    """Settle what longer substeps than h [s] have left violated. Returns the part of what it stores that is left: 1 for all.
 
     It lifts bodies as far as the scene has had that energy before; for more, the motion of what moves pays, or nothing settles.
-    Bodies that nothing holds stay soft instead, see softness.py: drawn together, they would lose angular momentum. Only systems
-    that are solved exactly have no softness.
+    Bodies that nothing holds stay soft instead, see softness.py: drawn together, they would lose angular momentum. Only rows that
+    are solved exactly have no softness, and what is left of their violations becomes motion.
     """
     clock, state, memory, system = runner.clock, runner.scene.state, runner.memory, runner.scene.slots.system
     bodies, x, exact = Bodies(runner.scene, runner.batches), state.get(memory), bool(system) and not system.steps
-    otherwise = bodies.energy(x, h) if exact else 0.0  # what exact systems, which nothing softens, make of it
+    otherwise = bodies.energy(x, h)
     if not np.isfinite(x).all() or (exact and otherwise <= SLIGHT * clock.kinetic):
-        return False
+        return 1.0
     going = bodies.far(x, (h / clock.h) ** 2 / clock.softness)[0] > (0.0 if exact else SEEN)
     if not exact:
         going &= bodies.with_any(_held(runner))
     if not going.any():
-        return False
+        return 1.0
     before = clock.energy if clock.energy is not None else _energy(runner)
     supply = max(before, clock.bound) if clock.bound is not None else before + stored(runner)
-    far, new = _settled(runner, bodies, going, x, dt, hurries=True)
+    store = stored(runner)
+    far, new = _settled(runner, bodies, going, x, h, dt)
     state.put(memory, new)
-    left = bodies.energy(new, h) * clock.softness
-    due = _energy(runner) + left - supply if clock.bound != CHANGED else 0.0
+    energy = _energy(runner)
+    due = energy + bodies.energy(new, h) - supply if clock.bound != CHANGED else 0.0
     some, w, d = (new != x).any(axis=1), runner.scene.inv_mass, memory.read(state.d)
     m = np.divide(some, w, out=np.zeros(len(w)), where=w > 0)
     kinetic = float(m @ (d[: runner.n].astype(np.float64) ** 2).sum(axis=1)) / 2
     if due > kinetic + LESS * otherwise:
         state.put(memory, x)
         runner.invalidate()
-        return False
+        return 1.0
     if due > 0 and kinetic > 0:
         d[: runner.n][some] *= max(1 - due / kinetic, 0.0) ** 0.5
         memory.write(state.d, d)
+    left = stored(runner) / store if store > 0 else 0.0
     bodies.forget_loads(going & (far > ENOUGH))
-    clock.energy = None
-    return True
+    clock.energy = energy - max(due, 0.0)  # for softness.py; it is computed again before the frame
+    return min(left, 1 - LESS)
 
 
 def _held(runner: "Runner") -> np.ndarray:
@@ -89,10 +92,10 @@ def _energy(runner: "Runner") -> float:
     return runner.report().energy
 
 
-def settle(runner: "Runner", placed: int, dt: float) -> tuple[np.ndarray, float] | None:
+def settle(runner: "Runner", placed: int, h: float, dt: float) -> tuple[np.ndarray, float] | None:
     """Move bodies with any particle from `placed` on to where their rigid constraints are met, or as near as they come.
 
-    Displacements hold velocities. dt: of the coming frame [s]. Returns how far each particle moved, (n,) [m], and the largest
+    Displacements hold velocities. h, dt: of the coming frame [s]. Returns how far each particle moved, (n,) [m], and the largest
     violation that was removed, as a share of the size of its constraint or cluster; None if nothing moved.
     """
     state, memory = runner.scene.state, runner.memory
@@ -103,18 +106,18 @@ def settle(runner: "Runner", placed: int, dt: float) -> tuple[np.ndarray, float]
     going = (bodies.far(x)[0] > 0) & (np.bincount(bodies.body[placed:], minlength=bodies.count) > 0)
     if not going.any():
         return None
-    far, new = _settled(runner, bodies, going, x, dt, hurries=False)
+    far, new = _settled(runner, bodies, going, x, h, dt)
     state.put(memory, new)
     bodies.forget_loads(going & (far > ENOUGH))
     return np.linalg.norm(new - x, axis=1), float(far.max())
 
 
 def _settled(
-    runner: "Runner", bodies: Bodies, going: np.ndarray, x: np.ndarray, dt: float, hurries: bool
+    runner: "Runner", bodies: Bodies, going: np.ndarray, x: np.ndarray, h: float, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return how far the bodies in the mask `going` are from their rest at x, (n, dim), and where they settle, (n, dim).
 
-    hurries: whether to end after QUICK looks. The state is as before.
+    The state is as before.
     """
     far, clock, values = bodies.far(x, 0.0)[0] * going, runner.clock.copy(), fields(runner)
     for b in runner.ramping:
@@ -122,11 +125,11 @@ def _settled(
     if system := runner.scene.slots.system:
         system.forget()  # which parts give way
     runner.set_softness(1.0)
-    new, left = _passed(runner, bodies, going, np.where(going[bodies.body][:, None], bodies.bulged(x), x), dt, hurries)
+    new, left = _passed(runner, bodies, going, np.where(going[bodies.body][:, None], bodies.bulged(x), x), h, dt)
     stuck = left > SEEN
     arcs = np.where(stuck[bodies.body][:, None], bodies.bulged(new), new)
     if (arcs != new).any():
-        arcs, less = _passed(runner, bodies, stuck, arcs, dt, hurries)
+        arcs, less = _passed(runner, bodies, stuck, arcs, h, dt)
         new = np.where((less < BETTER * left)[bodies.body][:, None], arcs, new)
     put_fields(runner, values)
     runner.set_substep(clock.h, clock.drag)
@@ -136,43 +139,36 @@ def _settled(
 
 
 def _passed(
-    runner: "Runner", bodies: Bodies, going: np.ndarray, x: np.ndarray, dt: float, hurries: bool
+    runner: "Runner", bodies: Bodies, going: np.ndarray, x: np.ndarray, h: float, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return where passes move the bodies in the mask `going` from x, (n, dim), and what they leave violated, as far() does."""
-    state, memory, some = runner.scene.state, runner.memory, going[bodies.body]
-    # Nesterov's steps, only near a rest: elsewhere they throw off what has no direction, and what walls cannot call back.
-    speeds = hurries and not (
-        runner.step.walls or runner.step.contacts or (runner.scene.slots.system and runner.scene.slots.system.steps)
-    )
-    most = min(QUICK if hurries else MOST, max(PATIENCE, WORK // (runner.n + bodies.count)))
-    new, history, many, pace = x, [bodies.far(x, 0.0, DONE + bodies.digit) * going], True, 0
-    for _ in range(most):
+    state, memory, some, most = runner.scene.state, runner.memory, going.copy(), max(LEAST, WORK // (runner.n + bodies.count))
+    mixes = not (runner.step.walls or runner.step.contacts)  # which do not call back what a mix has put behind them
+    frame = (dt / h) ** 2 / 2  # a pass that repeats in each substep moves particles by so many times its move in a frame
+    new, left, mixing = x, bodies.far(x, 0.0, DONE + bodies.digit), Anderson(bodies)
+    plain, many = x, True
+    for look in range(min(most, MOST)):
         state.put(memory, new)
-        last = new
-        for _ in range(min(LOOK, 4 << len(history)) if many else 1):
+        last, passes = new, min(LOOK, FIRST << min(look, 8)) if many else 1
+        for _ in range(passes):
             runner.run_no_time(dt * TINY)
-            if speeds and many:
-                before, new, pace = new, state.get(memory), pace + 1
-                state.put(memory, np.where(some[:, None], new + pace / (pace + 3) * (new - before), new))
-        new = state.get(memory) if not (speeds and many) else new
-        new = np.where(np.isfinite(new), new, last)
+        new = state.get(memory)
+        new = np.where((some[bodies.body] & np.isfinite(new).all(axis=1))[:, None], new, last)
         for k in range(HALVINGS):
-            left = bodies.far(new, 0.0, DONE + bodies.digit) * going
-            worse = ~(left[2] <= history[-1][2])[bodies.body][:, None]
+            now = bodies.far(new, 0.0, DONE + bodies.digit)
+            worse = ~(now[2] <= left[2])[bodies.body][:, None]
             if not worse.any():
                 break
             new, many = np.where(worse, (new + last) / 2 if k < HALVINGS - 2 else last, new), False
-        pace = pace if (left[1] <= history[-1][1]).all() else 0
-        history.append(left)
-        stands = len(history) > PATIENCE and (left[1] >= BETTER**2 * history[-PATIENCE][1]).all()
-        stands = stands and _longest(new - last, some) <= STILL * _longest(new - x, some)
-        if not left.any() or (stands and not speeds):
+        if last is not plain and ((now[1] > left[1]) & some).any():  # of no use: where passes alone had come is better
+            new, last = plain, plain
+            mixing.forget()
+            continue
+        left, plain = now, new
+        way = np.minimum(bodies.longest(new - x), bodies.size)
+        some &= (left[0] > 0) & (frame / passes * bodies.longest(new - last) > STILL * way)
+        if not some.any():
             break
-        if stands:  # what contradicts itself comes to rest by plain passes
-            speeds, history = False, history[-1:]
-    return np.where(some[:, None], new, x), history[-1][0]
-
-
-def _longest(way: np.ndarray, some: np.ndarray) -> float:
-    """Return the length of the longest way, (n, dim), of the particles in the mask `some`."""
-    return float(np.linalg.norm(way[some], axis=1).max())
+        if mixes and many and passes == LOOK:
+            new = np.where(some[bodies.body][:, None], mixing.next(last, new), new)
+    return plain, left[0] * going

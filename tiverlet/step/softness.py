@@ -53,17 +53,18 @@ def _growth(runner: "Runner", h: float, iterations: int) -> float:
     return (h / runner.clock.h) ** 2 * runner.clock.iterations / iterations
 
 
-def keep(runner: "Runner", h: float, dt: float, iterations: int, adapts: bool = False) -> None:
+def keep(runner: "Runner", h: float, dt: float, iterations: int, adapts: bool = False, left: float = 1.0) -> None:
     """Keep links as soft as they are where the coming frame of dt [s] has so many passes of substeps h [s], but for what they
     stiffen in a frame.
 
-    adapts: whether substeps are chosen for accuracy. Then links stiffen as far as the energy allows.
+    adapts: whether substeps are chosen for accuracy. Then links stiffen as far as the energy allows. left: the part of what they
+    stored that is left, where violations have just settled. By so much links may stiffen at once.
     """
     clock = runner.clock
     if not acts(runner, h, iterations):
         return
     growth, measured = _growth(runner, h, iterations), dt != clock.frame[1]
-    s = max(1.0, clock.softness / growth)
+    s = max(1.0, clock.softness * left / growth)
     if s > 1 and clock.softness == 1 and needs_no_care(runner, s):
         s = 1.0
     elif measured and growth >= NEAR**2 * clock.softness:
@@ -108,7 +109,7 @@ def needs_no_care(runner: "Runner", s: float) -> bool:
     for b in batches:
         if isinstance(b, Scalar) and b.count:
             one += float((b.weights(x, split) * (h * b.load) ** 2).sum()) / 2
-            stores += _stored_in(b, x)
+            stores += _stored_in(b, b.violation(x) * ~b.broken, np.zeros(b.count))
     return stores <= CONVERGED * one
 
 
@@ -128,7 +129,8 @@ def stored(runner: "Runner") -> float:
     x, split = runner.scene.state.get(memory), memory.read(runner.scene.slots.split)
     for b in runner.batches:
         if isinstance(b, Scalar) and b.count:
-            out += _stored_in(b, x)
+            S = runner.scene.slots.sag(b) * b.weights(x, split) * h * h / runner.clock.iterations
+            out += _stored_in(b, b.violation(x) * ~b.broken, S)
         elif isinstance(b, Anchored) or b.clusters:
             who = b.indices.ravel()
             lam = memory.read(b.dev.lam if isinstance(b, Anchored) else b.dev.pull)[: len(who)].astype(np.float64)
@@ -138,7 +140,10 @@ def stored(runner: "Runner") -> float:
     return out
 
 
-def _stored_in(batch: Scalar, x: np.ndarray) -> float:
-    """Return the same for scalar constraints, sum |F C| / 2 [J]."""
-    F = batch.load
-    return float(np.maximum(np.abs(F * batch.violation(x)) - batch.compliance * F * F, 0.0).sum()) / 2
+def _stored_in(b: Scalar, C: np.ndarray, S: np.ndarray) -> float:
+    """Return the same for scalar constraints, which hold a load F by C = (alpha + S) F, sum (C - alpha F) F / 2 [J].
+
+    F is the load of the last substep, or that of C, whichever stores more: a step that was taken back leaves the first at 0.
+    """
+    F = np.divide(np.where(C * b.side < 0, 0.0, C), b.compliance + S, out=np.zeros(b.count), where=S > 0)
+    return float(np.maximum(S * F**2, np.abs(b.load * C) - b.compliance * b.load**2).sum()) / 2

@@ -1,6 +1,7 @@
 """How far rigid constraints and clusters are from being met, as the host sees it: what has to settle, and what is left then."""
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import TypeGuard
 
 import numpy as np
@@ -36,11 +37,28 @@ class Bodies:
         self.rounding = ROUNDING[ti.f64 if scene.state.sums else scene.real]
         self.digit = ROUNDING[scene.real]  # with which the device computes violations, relative to their sizes
 
+    @cached_property
+    def size(self) -> np.ndarray:
+        """The least size of a constraint of each body [m], (bodies,)."""
+        out = np.full(self.count, np.inf)
+        for b, of in zip(self.batches, self.of, strict=True):
+            if isinstance(b, Scalar):
+                np.minimum.at(out, of, np.divide(1, self.close[b], out=np.full(b.count, np.inf), where=self.close[b] > 0))
+        if self.solids.count:
+            np.minimum.at(out, self.body[self.solids.who], self.solids.radius)
+        return out
+
     def with_any(self, some: np.ndarray) -> np.ndarray:
         """Return a mask of the bodies whose constraints have any particle in the mask `some`, (n,)."""
         out = np.zeros(self.count, dtype=bool)
         for b, of in zip(self.batches, self.of, strict=True):
             out[of[b.owner[some[b.indices.ravel()]]]] = True
+        return out
+
+    def longest(self, way: np.ndarray) -> np.ndarray:
+        """Return the longest of the ways, (n, dim), of the particles of each body, (bodies,)."""
+        out = np.zeros(self.count)
+        np.maximum.at(out, self.body, np.linalg.norm(way, axis=1))
         return out
 
     def bulged(self, x: np.ndarray) -> np.ndarray:
@@ -113,15 +131,16 @@ class Bodies:
         return np.where(share > met + self.rounding * np.sqrt(far) * close, share, 0.0)
 
     def energy(self, x: np.ndarray, h: float) -> float:
-        """Return what rigid constraints violated at x, (n, dim), become if one substep h [s] removes them by themselves [J]."""
+        """Return what rigid constraints violated at x, (n, dim), become if one substep h [s] removes them by themselves [J].
+
+        Only those that a system solves exactly count: others stay as soft as they are.
+        """
         split, out = self.scene.memory.read(self.scene.slots.split)[: len(x)].astype(np.float64), 0.0
         for b in self.batches:
             if _is_rigid(b):
                 C, W = b.violation(x), b.weights(x, split)
-                some = (b.compliance == 0) & ~b.broken & (C * b.side >= 0) & (W > 0)
+                some = (b.compliance == 0) & ~b.broken & (C * b.side >= 0) & (W > 0) & (self.scene.slots.sag(b) == 0)
                 out += float((C[some] ** 2 / W[some]).sum())
-        if self.solids.count:
-            out += float((self.solids.m * self.solids.free * (self.solids.far(x) * self.solids.radius) ** 2).sum())
         return out / (2 * h * h)
 
     def forget_loads(self, some: np.ndarray) -> None:
@@ -137,7 +156,7 @@ def _borne(scene: Scene, b: Scalar, x: np.ndarray, C: np.ndarray) -> np.ndarray:
     W, lam = b.weights(x, scene.memory.read(slots.split)[: len(x)].astype(np.float64)), b.sagging
     held = -np.sign(lam) * np.minimum(W * np.abs(lam), np.abs(C))
     if slots.system:  # systems bear loads without violations, but where they give way or are not solved exactly
-        soft = (slots.system.gives_way(b) | (slots.system.greatest_floor > 0)) & (lam != 0)
+        soft = (slots.system.gives_way(b) | (slots.sag(b) > 0)) & (lam != 0)
         held = np.where(slots.rows(b) < 0, held, np.where(soft, C, 0.0))
     return np.clip(held, np.minimum(C, 0), np.maximum(C, 0))
 
