@@ -40,14 +40,15 @@ class ConjugateGradient(Solver):
     blocks, in f64, so results are the same bit for bit on any number of threads.
 
     If steps end before they have converged, their result differs in every substep. It acts as a spring whose stiffness jumps,
-    which adds energy. Where constraints contradict each other (a row of links drawn straight between two pins), steps never
-    converge. So once r . z has not fallen to a hundredth at the end of an iteration, the diagonal gets a floor,
+    which adds energy. So the diagonal has a floor,
 
         alpha'_j + sigma W_j,   sigma = lambda_max / steps^2
 
     with W_j the diagonal of A = G w G^T and lambda_max the largest eigenvalue of W^-1 A. The condition number is then at most
-    steps^2 + 1, for which so many steps suffice, and a link gives way like one of compliance sigma W h^2. The floor stays until
-    particles are put elsewhere. It grows where it is still too low, or where the tension is near the limit of the substep.
+    steps^2 + 1, for which so many steps suffice, and a link gives way like one of compliance sigma W h^2. It stays as soft where
+    the substep gets shorter, see `softness.py`. The floor grows where r . z has not fallen to a hundredth at the end of an
+    iteration, as where constraints contradict each other (a row of links drawn straight between two pins), or where the tension
+    is near the limit of the substep, until particles are put elsewhere.
 
     Where rigid constraints contradict each other at the positions given, sigma = 1 from the first substep on. With more links
     than needed (braced bodies), steps end where all rows are down to rounding.
