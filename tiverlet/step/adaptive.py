@@ -120,7 +120,9 @@ class StepController:
             self.learn(took / (n * k))
             motion, missed = motion_error(world) if tolerance else 0.0, energy_bound.missed(world, report, energy)
             errors = tension(world, report), motion, stiffness(world), damping(world, n), missed
-            figures, risks = judge(report, tolerance, world._clock.softness, *errors)
+            # What clusters store is estimated too low, see stored(): so they may not lean on it.
+            softness = 1.0 if any(b.clusters for b in world._runner.batches) else world._clock.softness
+            figures, risks = judge(report, tolerance, softness, *errors)
             if tries.record(figures, risks, report.energy, world._runner.sheet.item(KINETIC)):
                 break
             if not tries.verdict and perf_counter() + 2 * took > end:
@@ -130,7 +132,9 @@ class StepController:
             world._runner.begin(dt, tries.substeps, world.iterations, tries.iterations)
         self.substeps, self.iterations, self.stuck = n, k, tries.stuck  # so that the next frames do not try in vain
         self.plan_next_frame(world.iterations, max(figures), tries.verdict, tries.count)
-        return with_verdict(report, max(figures), risks, tries.verdict, tries.count)
+        off = report.residual / (tolerance or RESIDUAL)
+        verdict = "stuck" if tries.verdict == "good" and off > 1 else tries.verdict  # links stiffen as energy allows
+        return with_verdict(report, max(*figures, off), risks, verdict, tries.count)
 
     def prepare(self, iterations: int, dt: float, tolerance: float | None, budget: float | None) -> None:
         """Choose the substeps and iterations of the first try."""
