@@ -199,7 +199,7 @@ class Runner:
         if not slots or h >= clock.h or keeps or self.probe or clock.first_moved is not None:
             return False
         steady = dt == clock.frame[1] and not (self.driven or self.ramping)
-        return adapts or bool(slots.system and (slots.system.can_stiffen or (steady and not slots.system.steps)))
+        return adapts or steady or bool(slots.system and slots.system.can_stiffen)
 
     def _forget_system(self) -> None:
         """Let a system forget what it has learnt from earlier positions."""

@@ -34,7 +34,8 @@ HALVINGS = 64  # at most, of a way by which functions of the user are further fr
 BETTER = 0.99  # of what is violated: what bulging has to leave at most
 LESS = 0.01  # of what would become of violations if nothing settled: what is worth it
 SLIGHT = 1e-3  # of the largest kinetic energy: what violations may become
-STILL = 1e-3  # of the way of a body, or of its least constraint: what the coming frame may move it yet
+STILL = 1e-8  # of the way of a body, or of its least constraint: what the coming frame may move it yet
+ROUGHLY = 1e-3  # the same for conjugate gradients, which solve nets: a taut one comes to rest as 1 / n only
 LEAST, MOST, WORK = 16, 1000, 2_000_000  # looks, at least and at most; particles and constraints in all of them
 
 
@@ -47,8 +48,8 @@ def relieve(runner: "Runner", h: float, dt: float) -> float:
     """
     clock, state, memory, system = runner.clock, runner.scene.state, runner.memory, runner.scene.slots.system
     bodies, x, exact = Bodies(runner.scene, runner.batches), state.get(memory), bool(system) and not system.steps
-    otherwise = bodies.energy(x, h)
-    if not np.isfinite(x).all() or (exact and otherwise <= SLIGHT * clock.kinetic):
+    otherwise = bodies.energy(x, h) if np.isfinite(x).all() else np.nan
+    if not np.isfinite(otherwise) or (exact and otherwise <= SLIGHT * clock.kinetic):
         return 1.0
     going = bodies.far(x, (h / clock.h) ** 2 / clock.softness)[0] > (0.0 if exact else SEEN)
     if not exact:
@@ -146,7 +147,8 @@ def _passed(
     mixes = not (runner.step.walls or runner.step.contacts)  # which do not call back what a mix has put behind them
     frame = (dt / h) ** 2 / 2  # a pass that repeats in each substep moves particles by so many times its move in a frame
     new, left, mixing = x, bodies.far(x, 0.0, DONE + bodies.digit), Anderson(bodies)
-    plain, many = x, True
+    digit = bodies.digit * np.abs(x).max()  # of coordinates: a move that says nothing
+    plain, many, still = x, True, ROUGHLY if (system := runner.scene.slots.system) and system.steps else STILL
     for look in range(min(most, MOST)):
         state.put(memory, new)
         last, passes = new, min(LOOK, FIRST << min(look, 8)) if many else 1
@@ -165,8 +167,8 @@ def _passed(
             mixing.forget()
             continue
         left, plain = now, new
-        way = np.minimum(bodies.longest(new - x), bodies.size)
-        some &= (left[0] > 0) & (frame / passes * bodies.longest(new - last) > STILL * way)
+        move, way = bodies.longest(new - last), np.minimum(bodies.longest(new - x), bodies.size)
+        some &= (left[0] > 0) & (move > digit) & (frame / passes * move > still * way)
         if not some.any():
             break
         if mixes and many and passes == LOOK:

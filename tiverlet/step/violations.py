@@ -133,7 +133,7 @@ class Bodies:
     def energy(self, x: np.ndarray, h: float) -> float:
         """Return what rigid constraints violated at x, (n, dim), become if one substep h [s] removes them by themselves [J].
 
-        Only those that a system solves exactly count: others stay as soft as they are.
+        Clusters count, and what a system solves exactly: others stay as soft as they are.
         """
         split, out = self.scene.memory.read(self.scene.slots.split)[: len(x)].astype(np.float64), 0.0
         for b in self.batches:
@@ -141,6 +141,8 @@ class Bodies:
                 C, W = b.violation(x), b.weights(x, split)
                 some = (b.compliance == 0) & ~b.broken & (C * b.side >= 0) & (W > 0) & (self.scene.slots.sag(b) == 0)
                 out += float((C[some] ** 2 / W[some]).sum())
+        if self.solids.count:
+            out += float((self.solids.m * self.solids.free * (self.solids.far(x) * self.solids.radius) ** 2).sum())
         return out / (2 * h * h)
 
     def forget_loads(self, some: np.ndarray) -> None:
