@@ -173,3 +173,36 @@ def test_a_step_that_fails_is_recorded_as_it_is(w, tmp_path):
     assert recording.verify()
     with recording.world(6) as again:
         assert again.hash() == end
+
+
+def test_another_thread_that_looks_on_changes_nothing_and_sees_whole_frames(w):
+    def go_on(look=None):
+        """Return where the particles are after each frame, while another thread looks on."""
+        checkpoint.put_back(w, start)
+        w.substeps, done, seen = 400, threading.Event(), []
+
+        def watch():
+            while not done.is_set():
+                seen.append(look())
+
+        thread = threading.Thread(target=watch) if look else None
+        places = [w.position]
+        if thread:
+            thread.start()
+        for _ in range(50):
+            w.velocity = w.velocity + [0.01, 0.02]
+            w.step(1 / 60)
+            places.append(w.position)
+        done.set()
+        if thread:
+            thread.join()
+        return places, seen
+
+    start = checkpoint.keep(w)
+    alone, _ = go_on()
+    for look in (lambda: w.near([(0.5, 0.5)], 1.0), lambda: w.contacts, lambda: w.ray((0.5, 2.5), (0, -1)), lambda: w.velocity):
+        beside, seen = go_on(look)
+        np.testing.assert_array_equal(beside, alone)
+        assert len(seen) > 5
+    frames = {x.tobytes() for x in alone}
+    assert all(x.tobytes() in frames for x in go_on(lambda: w.position)[1])

@@ -15,7 +15,7 @@ from .contact.pair_contact import PairContact
 from .contact.rays import Hits, inside, ray
 from .contact.touches import ContactEvents, Told, joined, joined_events, no_events
 from .device.copies import Copies
-from .device.interrupts import deferred_signals
+from .device.interrupts import deferred_signals, in_turn
 from .features.feature import Acceleration, Batch, Feature
 from .features.read_only import assign_whole_advice, read_only, structure_advice
 from .features.unknown_names import answer_names, suggest
@@ -147,6 +147,7 @@ class World:
         piles that stand by friction creep where a frame is less than 0.4 or more than 2.5 times as long as the last one: use one
         dt, and take as many steps of it as the clock asks for.
         A signal such as Ctrl-C is handled after the frame. A frame that takes seconds is undone at once if the handler raises.
+        Other threads that read the world wait for the end of the frame.
         """
         self._runner.memory.check()
         dt = checks.number("World.step", "dt", dt, above=0.0)
@@ -339,6 +340,7 @@ class World:
 
     # Other worlds.
 
+    @in_turn
     def hash(self) -> str:
         """Return the SHA-256 of the exact state: equal if and only if two worlds of one scene continue alike, bit for bit."""
         return checkpoint.digest(self, checkpoint.keep(self))
@@ -350,6 +352,7 @@ class World:
     # State.
 
     @property
+    @in_turn
     def position(self) -> np.ndarray:
         """Positions [m], (n, dim), a read-only copy in f64. Assign an array to move particles; velocities are kept."""
         return read_only(self._runner.scene.state.get(self._runner.memory), assign_whole_advice("World", "position"))
@@ -465,6 +468,7 @@ class World:
             clock.energy = None
 
     @property
+    @in_turn
     def orientation(self) -> np.ndarray:
         """Orientations, a read-only copy: angles (n,) in 2D [rad], unit quaternions (n, 4) (x, y, z, w) in 3D."""
         if self._particles.orientation is None:
@@ -562,7 +566,7 @@ class World:
             self._runner.list_neighbours()
             if self._runner.step.launched:
                 self._runner.diagnose_state()  # measures contacts; on other paths list_neighbours() has called it
-        return contact.found(self.position, self._clock.h or 1.0)
+            return contact.found(self.position, self._clock.h or 1.0)
 
     def events(self, groups: Iterable | None = None) -> ContactEvents:
         """Return the contacts of particles that began, ended and lasted in the last step. Needs Contact(events=True) or sensors.
@@ -590,6 +594,7 @@ class World:
             raise RuntimeError("World.wall_events: no wall tells of them. Write, for one, tv.Box(lower, upper, events=True).")
         return self._all_events()[1]
 
+    @in_turn
     def _all_events(self) -> Told:
         """Return the events of particles, and those of walls; no events where nothing records them."""
         if self._events is not None:
@@ -607,6 +612,7 @@ class World:
         return joined_events(told, self._ended)
 
     @property
+    @in_turn
     def broken(self) -> list[tuple[Feature, np.ndarray]]:
         """What broke in the last frame: features, and the indices of their constraints. feature.broken has those of all
         frames."""

@@ -1,11 +1,13 @@
-"""Safe handling of Ctrl-C: a change of a world is either complete or not made.
+"""Safe handling of Ctrl-C and threads: a change of a world is either complete or not made, and nothing comes in between.
 
 Python may call a signal handler between any two instructions. An exception from the handler could leave a world with the
 positions of one frame and the time of another. So while a world changes, signals are noted, and their handlers run afterwards.
+Other threads that change a world, or ask what only the device knows, wait for their turn.
 """
 
 import _signal  # type: ignore[import]  # `signal` wraps this module and takes ten times as long
 import functools
+import os
 import signal
 import threading
 from _thread import interrupt_main
@@ -14,15 +16,15 @@ from threading import get_ident
 from types import FrameType
 from typing import Any
 
+_turns = threading.RLock()
 SIGNALS = tuple(int(getattr(signal, name)) for name in ("SIGINT", "SIGTERM", "SIGALRM") if hasattr(signal, name))
 
 
 class DeferredSignals:
-    """A context, `with deferred_signals:`, that no signal handler may interrupt.
+    """A context, `with deferred_signals:`, that no signal handler may interrupt, and that one thread at a time may be in.
 
-    Python runs handlers in the main thread, so the context does nothing in other threads. Only handlers written in Python can
-    raise, so only these are deferred. Contexts may be nested: handlers run after the outermost one. Entering and leaving takes
-    0.8 us.
+    Python runs handlers in the main thread, so only there are they deferred, and only those written in Python, as others cannot
+    raise. Contexts may be nested: handlers run after the outermost one. Entering and leaving takes 0.9 us.
     """
 
     def __init__(self):
@@ -30,24 +32,27 @@ class DeferredSignals:
         self._depth = 0  # how many contexts are open, in the main thread
         self._handlers: dict[int, Any] = {}  # the deferred handlers, by signal
         self._noted: set[int] = set()  # signals received meanwhile
+        if hasattr(os, "register_at_fork"):
+            os.register_at_fork(after_in_child=self._begin_anew)
 
     def __enter__(self) -> None:
-        if get_ident() != self._main:
-            return
-        if not self._depth:
-            self._noted.clear()
-            try:
-                for number in SIGNALS:
-                    handler = _signal.getsignal(number)
-                    if callable(handler):
-                        self._handlers[number] = handler
-                        _signal.signal(number, self._note)
-            except BaseException:  # raised by a handler that is not deferred yet
-                self._restore()
-                raise
-        self._depth += 1
+        if get_ident() == self._main:
+            if not self._depth:
+                self._noted.clear()
+                try:
+                    for number in SIGNALS:
+                        handler = _signal.getsignal(number)
+                        if callable(handler):
+                            self._handlers[number] = handler
+                            _signal.signal(number, self._note)
+                except BaseException:  # raised by a handler that is not deferred yet
+                    self._restore()
+                    raise
+            self._depth += 1
+        _turns.acquire()  # while no handler can raise, here and below
 
     def __exit__(self, *exc) -> None:
+        _turns.release()
         if get_ident() != self._main:
             return
         self._depth -= 1
@@ -62,6 +67,14 @@ class DeferredSignals:
             while self._noted:
                 number = self._noted.pop()
                 self._handlers[number](number, None)
+
+    def _begin_anew(self) -> None:
+        """In a child process: none of the threads that may be in the context is there but the one that forks."""
+        _turns._at_fork_reinit()  # type: ignore[attr-defined]
+        self._depth = self._depth if self._main == get_ident() else 0
+        self._main = get_ident()
+        for _ in range(self._depth):
+            _turns.acquire()
 
     def _restore(self) -> None:
         try:
@@ -78,6 +91,18 @@ class DeferredSignals:
 
 
 deferred_signals = DeferredSignals()
+
+
+def in_turn(function: Callable) -> Callable:
+    """Return the function wrapped so that no other thread changes a world meanwhile. Takes 0.1 us."""
+
+    @functools.wraps(function)
+    def waiting(*args, **kwargs):
+        """Call the function once no other thread changes a world."""
+        with _turns:
+            return function(*args, **kwargs)
+
+    return waiting
 
 
 def uninterrupted(function: Callable) -> Callable:

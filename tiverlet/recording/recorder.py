@@ -120,7 +120,7 @@ class Recorder:
             from . import watch
 
             watch.below_the_cell(self._stream)
-            self._stream.send_blueprint(opens)
+            self._sink.show(opens, at_once=True)
         try:
             self._begin(title)
         except BaseException:

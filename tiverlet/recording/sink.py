@@ -1,5 +1,6 @@
 """The path of a recording from rerun to its file."""
 
+import contextlib
 import errno
 import hashlib
 import os
@@ -7,6 +8,7 @@ import select
 import stat
 import threading
 import uuid
+from collections.abc import Iterator
 from time import monotonic, sleep
 from typing import Any
 
@@ -20,6 +22,30 @@ CHECK_INTERVAL = 0.2  # [s] between checks that the file still exists
 BACKLOG = 32 << 20  # most bytes waiting to be written
 SMALL = 2 << 20  # a file of fewer bytes is rewritten when it is closed: rows take less when put together
 TICK = 0.1  # [s] rerun's interval of sending rows older than that, so a row waits for at most two intervals
+
+
+class _Layout:
+    """A layout that keeps the stream which rerun makes of it."""
+
+    def __init__(self, blueprint: Any):
+        self.blueprint, self.stream = blueprint.to_blueprint(), None
+
+    def to_blueprint(self) -> "_Layout":
+        """Return itself, as rerun's layouts do."""
+        return self
+
+    def _log_to_stream(self, stream: Any) -> None:
+        self.stream = stream
+        self.blueprint._log_to_stream(stream)
+
+
+@contextlib.contextmanager
+def lent_to_rerun(blueprint: Any) -> Iterator[Any]:
+    """Lend a layout to rerun (0.41), and end its stream, whose two threads and memory would stay for good."""
+    lent = _Layout(blueprint)
+    yield lent
+    if lent.stream:
+        lent.stream.disconnect()
 
 
 class Sink:
@@ -73,10 +99,11 @@ class Sink:
     def _open(self, path: str, blueprint: Any, viewer: str | None) -> None:
         import rerun as rr
 
-        if viewer is None:
-            self.stream.save(path, default_blueprint=blueprint)
-        else:
-            self.stream.set_sinks(rr.FileSink(path), rr.GrpcSink(viewer), default_blueprint=blueprint)
+        with lent_to_rerun(blueprint) as lent:
+            if viewer is None:
+                self.stream.save(path, default_blueprint=lent)
+            else:
+                self.stream.set_sinks(rr.FileSink(path), rr.GrpcSink(viewer), default_blueprint=lent)
 
     def _create(self, overwrite: bool) -> Any:
         check_ending(self.path)
@@ -178,9 +205,10 @@ class Sink:
         self._sum.update(data)
         self.bytes += len(data)
 
-    def show(self, blueprint: Any) -> None:
-        """Set the layout in which the recording opens, unless the user has made one."""
-        self.stream.send_blueprint(blueprint, make_active=False)
+    def show(self, blueprint: Any, at_once: bool = False) -> None:
+        """Set the layout in which the recording opens, unless the user has made one; at_once: also if he has."""
+        with lent_to_rerun(blueprint) as lent:
+            self.stream.send_blueprint(lent, make_active=at_once)
 
     def thin(self, stride: int) -> bool:
         """Keep the picture of one of `stride` frames: rewrite the file, and replace the old one by it.
