@@ -183,11 +183,11 @@ class State:
             x += self.low0[i]
         return x
 
-    def remember(self, memory: "Memory", start: bool, before: bool, lifts: bool) -> None:
+    def remember(self, memory: "Memory", start: bool, before: bool, lifts: bool, kept: bool) -> None:
         """Declare what friction, swept walls and impacts need.
 
         start, before: position and displacement at the start of the substep. lifts: whether particles that bounced may not be
-        where their displacement says.
+        where their displacement says. kept: whether velocities depend on `before`, so that it belongs to the state.
         """
         self.starts, self.befores, self.lifts = start, before, lifts
         if start:
@@ -195,7 +195,7 @@ class State:
             if self.sums:
                 self.low0 = memory.field("position_low_at_start", self.number, width=self.dim)
         if before:
-            self.before = memory.field("displacement_at_start", self.number, width=self.dim)
+            self.before = memory.field("displacement_at_start", self.number, width=self.dim, state=kept)
 
     @inline
     def kick(self, i):

@@ -70,14 +70,6 @@ class Drive:
         """Return the current rest values, (m,)."""
         return self._memory.read(self.target)
 
-    def is_at_limit(self, lam: ti.Field) -> np.ndarray:
-        """Return which multipliers of the field `lam` have reached the largest, (m,).
-
-        These constraints act as forces and hold nothing.
-        """
-        most = self._memory.read(self.most) if self.capped else np.inf
-        return np.abs(self._memory.read(lam)) >= most
-
     def put(self, values: np.ndarray) -> None:
         """Continue from these rest values, (m,)."""
         self._memory.write(self.target, values)
