@@ -46,8 +46,8 @@ class World:
 
     particles: Particles. features: forces, constraints, contacts and walls, in any order; at most one Contact. A feature that is
     not in the list costs nothing.
-    substeps: substeps per frame; None for as many as such scenes usually need: 20, or 4 where particles fall freely but for
-    contacts; or "auto" for as many as each frame needs; springs of omega dt > 50, dt the frame, are not
+    substeps: substeps per frame; None for as many as such scenes usually need: 20, or 4 where particles and rigid clusters fall
+    freely but for contacts; or "auto" for as many as each frame needs; springs of omega dt > 50, dt the frame, are not
     resolved, and lose what they vibrate with (flag "energy-loss"). iterations: passes over the constraints in each substep. Both
     may change at any time, without compiling.
     solver: how constraints are solved: Direct for chains, trees and loops; Jacobi, Chebyshev or ConjugateGradient for cloth. None

@@ -4,6 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+import numpy as np
+
 from ..colliders.body_impacts import BodyImpacts, can_have_impacts, stops_bodies
 from ..colliders.collider import Collider
 from ..colliders.wall_group import grouped
@@ -47,7 +49,7 @@ CROSSOVER = 1000
 # 3.5 to 4.5 s without the search for equal expressions; frames of 6 ms then take 2 to 8 % longer, those of 4000 a fifth.
 LONG, ENDLESS = 3.5, 10.0
 USUAL = 20  # substeps of a frame in scenes with constraints, or forces that change
-GRAINS = 4  # where contacts are rows, and particles fall freely between them, which is exact
+GRAINS = 4  # where contacts are rows, and particles and rigid bodies fall freely between them, which is exact, or nearly
 MANY = 4 * FEW  # particles from which frames take so long that the search pays for long kernels
 # From so many copies of a small world on, its kernels are simplified if they are smaller than MIDDLING, since they run so often.
 # Frames of a double pendulum (1.3) take 8 to 13 % less, of 100 discs (3.6) 5 to 17 %, of discs, ropes and soft balls (6) 5 %;
@@ -247,9 +249,15 @@ def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
 def usual_substeps(features: tuple[Feature, ...]) -> int:
     """Return how many substeps frames have where the user does not say."""
     rows = any(isinstance(f, PairContact) for f in features)
-    linked = any(isinstance(f, Batch) and not f.is_kinematic for f in features)
+    bodies = are_separate_bodies([f for f in features if isinstance(f, Batch) and not f.is_kinematic])
     free = all((f.common and f.steady) or not f.accelerates for f in features if isinstance(f, Acceleration))
-    return GRAINS if rows and free and not linked else USUAL
+    return GRAINS if rows and free and bodies else USUAL
+
+
+def are_separate_bodies(batches: list[Any]) -> bool:
+    """Whether all of these constraints are rigid clusters, each of particles of its own."""
+    rigid = all(b.clusters and not (b.soft or b.breaks) for b in batches)
+    return rigid and bool((np.bincount(np.concatenate([[0], *(b.members.indices + 1 for b in batches)])) <= 1).all())
 
 
 def listed(who: str, features: Any) -> tuple[Feature, ...]:
