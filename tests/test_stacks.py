@@ -139,7 +139,7 @@ def test_friction_holds_far_from_the_origin(what, substeps):
 
 
 def test_scenes_take_as_many_substeps_as_they_need():
-    # 4 where particles and rigid bodies fall freely between contacts, which is exact but for turns, by phi with sin phi = omega h:
+    # 4 where particles and rigid bodies fall freely between contacts. That is exact but for turns, by phi with sin phi = omega h:
     # (omega h)^2 / 6 of an angle is too much. Links, and clusters that share particles or give way, take 20.
     squares, discs = [SQUARE, SQUARE + (2, 0)], tv.Particles(np.concatenate([SQUARE, SQUARE + (2, 0)]), radius=0.1)
     loops = [[0, 1, 2, 3], [4, 5, 6, 7]]
