@@ -37,7 +37,6 @@ SLIGHT = 1e-3  # of the largest kinetic energy: what violations may become
 STILL = 1e-8  # of the way of a body, or of its least constraint: what the coming frame may move it yet
 ROUGHLY = 1e-3  # the same for conjugate gradients, which solve nets: a taut one comes to rest as 1 / n only
 LEAST, MOST, WORK = 16, 1000, 2_000_000  # looks, at least and at most; particles and constraints in all of them
-RELIEF = 100  # looks at most where what does not settle may stay soft instead
 
 
 def relieve(runner: "Runner", h: float, dt: float) -> float:
@@ -60,7 +59,7 @@ def relieve(runner: "Runner", h: float, dt: float) -> float:
     before = clock.energy if clock.energy is not None else _energy(runner)
     supply = max(before, clock.bound) if clock.bound is not None else before + stored(runner)
     store = stored(runner)
-    far, new = _settled(runner, bodies, going, x, h, dt, MOST if exact else RELIEF)
+    far, new = _settled(runner, bodies, going, x, h, dt)
     state.put(memory, new)
     energy = _energy(runner)
     due = energy + bodies.energy(new, h) - supply if clock.bound != CHANGED else 0.0
@@ -115,10 +114,9 @@ def settle(runner: "Runner", placed: int, h: float, dt: float) -> tuple[np.ndarr
 
 
 def _settled(
-    runner: "Runner", bodies: Bodies, going: np.ndarray, x: np.ndarray, h: float, dt: float, looks: int = MOST
+    runner: "Runner", bodies: Bodies, going: np.ndarray, x: np.ndarray, h: float, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far the bodies in the mask `going` are from their rest at x, (n, dim), and where they settle, (n, dim), within
-    so many looks.
+    """Return how far the bodies in the mask `going` are from their rest at x, (n, dim), and where they settle, (n, dim).
 
     The state is as before.
     """
@@ -128,11 +126,11 @@ def _settled(
     if system := runner.scene.slots.system:
         system.forget()  # which parts give way
     runner.set_softness(1.0)
-    new, left = _passed(runner, bodies, going, np.where(going[bodies.body][:, None], bodies.bulged(x), x), h, dt, looks)
+    new, left = _passed(runner, bodies, going, np.where(going[bodies.body][:, None], bodies.bulged(x), x), h, dt)
     stuck = left > SEEN
     arcs = np.where(stuck[bodies.body][:, None], bodies.bulged(new), new)
     if (arcs != new).any():
-        arcs, less = _passed(runner, bodies, stuck, arcs, h, dt, looks)
+        arcs, less = _passed(runner, bodies, stuck, arcs, h, dt)
         new = np.where((less < BETTER * left)[bodies.body][:, None], arcs, new)
     put_fields(runner, values)
     runner.set_substep(clock.h, clock.drag)
@@ -142,7 +140,7 @@ def _settled(
 
 
 def _passed(
-    runner: "Runner", bodies: Bodies, going: np.ndarray, x: np.ndarray, h: float, dt: float, looks: int
+    runner: "Runner", bodies: Bodies, going: np.ndarray, x: np.ndarray, h: float, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return where passes move the bodies in the mask `going` from x, (n, dim), and what they leave violated, as far() does."""
     state, memory, some, most = runner.scene.state, runner.memory, going.copy(), max(LEAST, WORK // (runner.n + bodies.count))
@@ -151,7 +149,7 @@ def _passed(
     new, left, mixing = x, bodies.far(x, 0.0, DONE + bodies.digit), Anderson(bodies)
     digit = bodies.digit * np.abs(x).max()  # of coordinates: a move that says nothing
     plain, many, still = x, True, ROUGHLY if (system := runner.scene.slots.system) and system.steps else STILL
-    for look in range(min(most, looks)):
+    for look in range(min(most, MOST)):
         state.put(memory, new)
         last, passes = new, min(LOOK, FIRST << min(look, 8)) if many else 1
         for _ in range(passes):
