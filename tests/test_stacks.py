@@ -141,8 +141,8 @@ def test_friction_holds_far_from_the_origin(what, substeps):
 def test_scenes_take_as_many_substeps_as_they_need():
     # 4 where particles and rigid bodies fall freely between contacts. That is exact but for turns, by phi with sin phi = omega h:
     # (omega h)^2 / 6 of an angle is too much. Links, and clusters that share particles or give way, take 20.
-    squares, discs = [SQUARE, SQUARE + (2, 0)], tv.Particles(np.concatenate([SQUARE, SQUARE + (2, 0)]), radius=0.1)
-    loops = [[0, 1, 2, 3], [4, 5, 6, 7]]
+    squares, loops = np.concatenate([SQUARE, SQUARE + (2, 0)]), [[0, 1, 2, 3], [4, 5, 6, 7]]
+    discs = tv.Particles(squares, radius=0.1)
     for few, *features in (
         (True,), (True, tv.ShapeMatch(loops)), (True, tv.ShapeMatch(loops[:1]), tv.ShapeMatch(loops[1:])),
         (False, tv.ShapeMatch(loops), tv.ShapeMatch([[0, 4]])), (False, tv.ShapeMatch(loops, compliance=1e-4)),
@@ -152,10 +152,10 @@ def test_scenes_take_as_many_substeps_as_they_need():
             assert w.substeps == (4 if few else 20), features
     omega, v, t = 5.0, np.array([1.0, 4.0]), 1.0
     speed = v + omega * np.stack([-SQUARE[:, 1], SQUARE[:, 0]], axis=1)
-    start = tv.Particles(np.concatenate(squares), velocity=np.concatenate([speed, speed]))
+    start = tv.Particles(squares, velocity=np.concatenate([speed, speed]))
     with tv.World(start, [tv.Gravity(9.81), tv.Polygons(loops), tv.ShapeMatch(loops)], precision="f64") as w:
         w.run(t)
-        ways = v * t - (0, 9.81 * t**2 / 2)
-        off = w.position - np.concatenate([turned(SQUARE, omega * t) + ways, turned(SQUARE, omega * t) + ways + (2, 0)])
+        end = turned(SQUARE, omega * t) + v * t - (0, 9.81 * t**2 / 2)
+        off = w.position - np.concatenate([end, end + (2, 0)])
         turn = omega * t * (omega / 60 / w.substeps) ** 2 / 6
         assert np.hypot(*off.T).max() == pytest.approx(0.5**0.5 * turn, rel=0.01)

@@ -17,6 +17,8 @@ from types import FrameType
 from typing import Any
 
 _turns = threading.RLock()
+if hasattr(os, "register_at_fork"):  # a fork waits for its turn, too: the child has none of the threads that may have one
+    os.register_at_fork(before=_turns.acquire, after_in_parent=_turns.release, after_in_child=_turns.release)
 SIGNALS = tuple(int(getattr(signal, name)) for name in ("SIGINT", "SIGTERM", "SIGALRM") if hasattr(signal, name))
 
 
@@ -32,8 +34,6 @@ class DeferredSignals:
         self._depth = 0  # how many contexts are open, in the main thread
         self._handlers: dict[int, Any] = {}  # the deferred handlers, by signal
         self._noted: set[int] = set()  # signals received meanwhile
-        if hasattr(os, "register_at_fork"):
-            os.register_at_fork(after_in_child=self._begin_anew)
 
     def __enter__(self) -> None:
         if get_ident() == self._main:
@@ -68,14 +68,6 @@ class DeferredSignals:
                 number = self._noted.pop()
                 self._handlers[number](number, None)
 
-    def _begin_anew(self) -> None:
-        """In a child process: none of the threads that may be in the context is there but the one that forks."""
-        _turns._at_fork_reinit()  # type: ignore[attr-defined]
-        self._depth = self._depth if self._main == get_ident() else 0
-        self._main = get_ident()
-        for _ in range(self._depth):
-            _turns.acquire()
-
     def _restore(self) -> None:
         try:
             while self._handlers:
@@ -93,25 +85,22 @@ class DeferredSignals:
 deferred_signals = DeferredSignals()
 
 
-def in_turn(function: Callable) -> Callable:
-    """Return the function wrapped so that no other thread changes a world meanwhile. Takes 0.1 us."""
+def within(context: Any) -> Callable[[Callable], Callable]:
+    """Return a decorator for functions that run within a context."""
 
-    @functools.wraps(function)
-    def waiting(*args, **kwargs):
-        """Call the function once no other thread changes a world."""
-        with _turns:
-            return function(*args, **kwargs)
+    def wrapped(function: Callable) -> Callable:
+        """Return the function, run within the context."""
 
-    return waiting
+        @functools.wraps(function)
+        def guarded(*args, **kwargs):
+            """Call the function within the context."""
+            with context:
+                return function(*args, **kwargs)
+
+        return guarded
+
+    return wrapped
 
 
-def uninterrupted(function: Callable) -> Callable:
-    """Return the function wrapped so that no signal handler interrupts it."""
-
-    @functools.wraps(function)
-    def guarded(*args, **kwargs):
-        """Call the function with signal handlers deferred."""
-        with deferred_signals:
-            return function(*args, **kwargs)
-
-    return guarded
+uninterrupted = within(deferred_signals)  # no signal handler comes in between, nor another thread
+in_turn = within(_turns)  # no other thread changes a world meanwhile; takes 0.1 us

@@ -1,6 +1,5 @@
 """The path of a recording from rerun to its file."""
 
-import contextlib
 import errno
 import hashlib
 import os
@@ -8,7 +7,6 @@ import select
 import stat
 import threading
 import uuid
-from collections.abc import Iterator
 from time import monotonic, sleep
 from typing import Any
 
@@ -24,28 +22,29 @@ SMALL = 2 << 20  # a file of fewer bytes is rewritten when it is closed: rows ta
 TICK = 0.1  # [s] rerun's interval of sending rows older than that, so a row waits for at most two intervals
 
 
-class _Layout:
-    """A layout that keeps the stream which rerun makes of it."""
+class Lent:
+    """A layout that is lent to rerun (0.41), `with Lent(layout) as lent:`.
 
-    def __init__(self, blueprint: Any):
-        self.blueprint, self.stream = blueprint.to_blueprint(), None
+    At the end the stream ends that rerun made of it, whose two threads and memory would stay for good.
+    """
 
-    def to_blueprint(self) -> "_Layout":
+    def __init__(self, layout: Any):
+        self._layout, self._stream = layout.to_blueprint(), None
+
+    def __enter__(self) -> "Lent":
+        return self
+
+    def __exit__(self, *exc) -> None:
+        if self._stream:
+            self._stream.disconnect()
+
+    def to_blueprint(self) -> "Lent":
         """Return itself, as rerun's layouts do."""
         return self
 
     def _log_to_stream(self, stream: Any) -> None:
-        self.stream = stream
-        self.blueprint._log_to_stream(stream)
-
-
-@contextlib.contextmanager
-def lent_to_rerun(blueprint: Any) -> Iterator[Any]:
-    """Lend a layout to rerun (0.41), and end its stream, whose two threads and memory would stay for good."""
-    lent = _Layout(blueprint)
-    yield lent
-    if lent.stream:
-        lent.stream.disconnect()
+        self._stream = stream
+        self._layout._log_to_stream(stream)
 
 
 class Sink:
@@ -99,7 +98,7 @@ class Sink:
     def _open(self, path: str, blueprint: Any, viewer: str | None) -> None:
         import rerun as rr
 
-        with lent_to_rerun(blueprint) as lent:
+        with Lent(blueprint) as lent:
             if viewer is None:
                 self.stream.save(path, default_blueprint=lent)
             else:
@@ -207,7 +206,7 @@ class Sink:
 
     def show(self, blueprint: Any, at_once: bool = False) -> None:
         """Set the layout in which the recording opens, unless the user has made one; at_once: also if he has."""
-        with lent_to_rerun(blueprint) as lent:
+        with Lent(blueprint) as lent:
             self.stream.send_blueprint(lent, make_active=at_once)
 
     def thin(self, stride: int) -> bool:

@@ -46,9 +46,9 @@ class ConjugateGradient(Solver):
 
     with W_j the diagonal of A = G w G^T and lambda_max the largest eigenvalue of W^-1 A. The condition number is then at most
     steps^2 + 1, for which so many steps suffice, and a link gives way like one of compliance sigma W h^2. It stays as soft where
-    the substep gets shorter. The floor grows where r . z has not fallen to a hundredth at the end of an
-    iteration, as where constraints contradict each other (a row of links drawn straight between two pins), or where the tension
-    is near the limit of the substep, until particles are put elsewhere.
+    the substep gets shorter. The floor grows where r . z has not fallen to a hundredth at the end of an iteration, as where
+    constraints contradict each other (a row of links drawn straight between two pins), or where the tension is near the limit of
+    the substep, until particles are put elsewhere.
 
     Where rigid constraints contradict each other at the positions given, sigma = 1 from the first substep on. With more links
     than needed (braced bodies), steps end where all rows are down to rounding.

@@ -249,15 +249,16 @@ def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
 def usual_substeps(features: tuple[Feature, ...]) -> int:
     """Return how many substeps frames have where the user does not say."""
     rows = any(isinstance(f, PairContact) for f in features)
-    bodies = are_separate_bodies([f for f in features if isinstance(f, Batch) and not f.is_kinematic])
+    bodies = _are_separate_bodies([f for f in features if isinstance(f, Batch) and not f.is_kinematic])
     free = all((f.common and f.steady) or not f.accelerates for f in features if isinstance(f, Acceleration))
     return GRAINS if rows and free and bodies else USUAL
 
 
-def are_separate_bodies(batches: list[Any]) -> bool:
+def _are_separate_bodies(batches: list[Any]) -> bool:
     """Whether all of these constraints are rigid clusters, each of particles of its own."""
-    rigid = all(b.clusters and not (b.soft or b.breaks) for b in batches)
-    return rigid and bool((np.bincount(np.concatenate([[0], *(b.members.indices + 1 for b in batches)])) <= 1).all())
+    if not all(b.clusters and not (b.soft or b.breaks) for b in batches):
+        return False
+    return not batches or bool((np.bincount(np.concatenate([b.members.indices for b in batches])) <= 1).all())
 
 
 def listed(who: str, features: Any) -> tuple[Feature, ...]:

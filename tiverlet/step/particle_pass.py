@@ -375,7 +375,7 @@ class ParticlePass:
                     part = 0 * part
             reaction += part * push
         if ti.static(self.held):
-            if ti.static(self.slots.has_system and self.state.befores):
+            if ti.static(self.slots.has_system):
                 force = h * h * self.forces.accelerate(i, self.state.place(i), self.state.d[i] / h, t, self.forces.pull(t))
                 most = 2 * ((self.state.d[i] - self.state.before[i]).norm() + force.norm())
                 size = reaction.norm()
