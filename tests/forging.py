@@ -7,9 +7,26 @@ import struct
 import numpy as np
 import pyarrow as pa
 
+import tiverlet as tv
 from tiverlet.recording import journal, reader
 
+PLACES = {"particles": "world/scene/particles", "positions": "Points2D:positions", "links": "LineStrips2D:strips"}
 NEVER = "7fffffffffffffffffffffffffffffff"  # an id higher than all others
+
+
+def record(path, frames=6):
+    """Make a small recording of everything that is drawn, in which a knob changes; return its path."""
+    rope, gravity = tv.shapes.rope((0.0, 1.0), (1.0, 1.0), 6), tv.Gravity(9.81)
+    features = [gravity, tv.Distance(rope.links), tv.Contact(), tv.Box((-2.0, 0.0), (2.0, 3.0))]
+    particles = tv.Particles(rope.position, pinned=[0], radius=0.11)
+    with tv.World(particles, features, substeps=4, path="fused") as world, tv.Recorder(path, world) as recorder:
+        for frame in range(frames):
+            if frame == 4:
+                gravity.g = 5.0
+            world.step(1 / 60)
+            recorder.log()
+            recorder.flush()
+    return path
 
 
 def varint(n):

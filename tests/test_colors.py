@@ -16,7 +16,6 @@ from tests.test_recorder import read
 from tiverlet.__main__ import main
 from tiverlet.live.session import Session
 from tiverlet.recording.exports.geometry import linear
-from tiverlet.recording.fill import SHADE, Fill
 from tiverlet.recording.hues import Coloring, by_body
 from tiverlet.recording.quantities import QUANTITIES
 
@@ -55,6 +54,8 @@ CHOICES = {
     "a function and its range": ([upwards, 0, 2.0], BY_SPEED),
 }
 choices = pytest.mark.parametrize("color, wanted", CHOICES.values(), ids=CHOICES)
+some = ["floats", "a function and its range"]
+both = pytest.mark.parametrize("color, wanted", [CHOICES[name] for name in some], ids=some)
 
 
 def recorded(path, color, frames: int = 2) -> tv.recording.Replay:
@@ -76,7 +77,7 @@ def test_a_recording_and_what_is_exported_from_it_have_the_colours_that_were_cho
     assert_exports(recording, tmp_path, {}, wanted)
 
 
-@choices
+@both
 def test_exports_have_the_colours_that_they_are_asked_for(color, wanted, tmp_path):
     # The recording has others; a quantity that is not in it is computed again.
     assert_exports(recorded(tmp_path / "a.rrd", None), tmp_path, {"color": color}, wanted)
@@ -110,7 +111,7 @@ def assert_exports(recording, folder, choice, wanted):
         assert meshio.read(folder / f"a_{k:04d}.vtu").point_data["color"].tolist() == wanted.tolist()
 
 
-@choices
+@both
 def test_usd_has_the_colours_of_each_frame(color, wanted, tmp_path):
     usd, geom = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdGeom")
     recorded(tmp_path / "a.rrd", None).export(tmp_path / "a.usda", color=color)
@@ -121,7 +122,7 @@ def test_usd_has_the_colours_of_each_frame(color, wanted, tmp_path):
             np.testing.assert_allclose(np.array(shown.Get(code)), linear(of), atol=1e-6)
 
 
-@choices
+@both
 def test_a_page_has_the_colours_that_were_chosen(color, wanted):
     said: list = []
     page = SimpleNamespace(waiting=0, known={}, send=said.append)
@@ -139,7 +140,7 @@ def test_a_page_has_the_colours_that_were_chosen(color, wanted):
 
 
 @pytest.mark.slow
-@choices
+@both
 def test_worlds_side_by_side_have_the_colours_that_were_chosen(color, wanted, tmp_path):
     with tv.Worlds(scene(), 2) as many, tv.WorldsRecorder(tmp_path / "a.rrd", many, color=color) as recorder:
         many.step(1 / 60)
@@ -147,15 +148,6 @@ def test_worlds_side_by_side_have_the_colours_that_were_chosen(color, wanted, tm
     for k in range(2):
         drawn = read(tmp_path / "a.rrd", f"/worlds/{k}/world/scene/particles", "Points2D:colors")
         assert {tuple(map(tuple, unpacked(row).tolist())) for row in drawn.values() if row} == {(*map(tuple, wanted.tolist()),)}
-
-
-def test_bodies_have_the_mean_colour_of_their_corners():
-    x = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
-    hues = np.array([[0, 0, 100], [100, 0, 100], [200, 40, 100], [100, 40, 100]])
-    none = np.zeros(0, dtype=np.int64)
-    fill = Fill([np.arange(4)], x, np.zeros((4, 3)), none, (np.stack([np.arange(4), (np.arange(4) + 1) % 4], axis=1), np.ones(4)))
-    fill.paint(hues)
-    assert unpacked(fill.colors(none)).tolist() == [(SHADE * np.array([100, 20, 100])).tolist()] * 7  # three lines and four rims
 
 
 def test_without_a_range_each_frame_has_its_own_and_what_is_not_finite_is_grey():
@@ -166,6 +158,7 @@ def test_without_a_range_each_frame_has_its_own_and_what_is_not_finite_is_grey()
         assert Coloring.checked("", None, 5).colors(world).tolist() == by_body(world).tolist()
 
 
+@pytest.mark.slow
 def test_every_named_quantity_is_what_it_says():
     # A disc of 2 kg rests on a pinned one; the load between them is its weight.
     particles = tv.Particles([[0.0, 0.0], [0.0, 0.2], [9.0, 0.0]], mass=[1, 2, 3], radius=0.1, pinned=[0], spin=[0, 0, -4.0],

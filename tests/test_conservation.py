@@ -47,8 +47,8 @@ def test_momentum_is_conserved_for_ten_thousand_steps(world, precision, limit):
     assert worst <= limit * size and mass.max() / mass.min() == pytest.approx(100, rel=1e-12)
 
 
-@pytest.mark.parametrize("compliance", [0.0, 1e-3])
-@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.slow
+@pytest.mark.parametrize("dim, compliance", [(2, 1e-3), (3, 0.0)])
 def test_clusters_on_links_keep_their_momentum_beside_contacts(world, dim, compliance):
     # Corners that links or other clusters share have a part of their mass in a cluster's answer. Two bodies, each with a ball on
     # a link and a second cluster at two of its corners, strike each other without friction.
@@ -73,13 +73,12 @@ def test_a_ball_hangs_on_a_plank_with_its_weight(world):
     plank = np.array([[-2.0, -0.1], [2, -0.1], [2, 0.1], [-2, 0.1], [0, 0]])
     x, mass = np.concatenate([plank, [[2.0, -0.8]]]), np.array([2.0, 2, 2, 2, 1, 1])
     J = (mass[:5, None] * plank**2).sum() + mass[5] * 4.0
-    for contact in ([], [tv.Contact()]):
-        start = tv.Particles(x, mass=mass, radius=[0, 0, 0, 0, 0, 0.05], pinned=[4])
-        features = [tv.Gravity(9.81), tv.ShapeMatch([range(5)]), tv.Distance([(5, 1)]), *contact]
-        w = world(start, features, substeps=20, precision="f64")
-        w.run(0.2)
-        along = w.position[0] - w.position[1]
-        assert np.arctan2(along[1], -along[0]) == pytest.approx(mass[5] * 9.81 * 2 * 0.2**2 / (2 * J), rel=5e-3)
+    start = tv.Particles(x, mass=mass, radius=[0, 0, 0, 0, 0, 0.05], pinned=[4])
+    features = [tv.Gravity(9.81), tv.ShapeMatch([range(5)]), tv.Distance([(5, 1)]), tv.Contact()]
+    w = world(start, features, substeps=20, precision="f64")
+    w.run(0.2)
+    along = w.position[0] - w.position[1]
+    assert np.arctan2(along[1], -along[0]) == pytest.approx(mass[5] * 9.81 * 2 * 0.2**2 / (2 * J), rel=5e-3)
 
 
 @pytest.mark.slow
@@ -161,14 +160,13 @@ def test_what_slides_over_a_disc_is_second_order(world):
     assert abs(late[0]) < 1e-5 * until and np.abs(gained).max() < 1e-5 * g
 
 
-@pytest.mark.parametrize("others", [False, True])
-def test_what_runs_round_in_a_ring_keeps_its_speed(world, others):
+def test_what_runs_round_in_a_ring_keeps_its_speed(world):
     # All chords from one point of a circle to the next are as long as the first one, to rounding. The first is longer by
     # (v h / R)^2 / 8 than the displacement without the ring. At 200 m/s the particle climbs by 14 m/s a substep, far above
     # push_out.
     for speed, substeps in ((5.0, 1), (5.0, 8), (200.0, 20)):
         ring, start = tv.Ball((0, 0), 1.0, inside=True), tv.Particles([(0.0, -1.0)], velocity=(speed, 0.0))
-        w = world(start, [ring, tv.Box((-2, -2), (2, 2))] if others else [ring], substeps=substeps, precision="f64")
+        w = world(start, [ring, tv.Box((-2, -2), (2, 2))], substeps=substeps, precision="f64")
         w.step(1 / 60)
         first = np.linalg.norm(w.velocity)
         w.run(2.0)
@@ -194,20 +192,6 @@ def test_a_loop_without_friction_is_second_order(world):
     for errors in (late, gained):
         assert np.log2(abs(errors[0] / errors[3])) / 3 > 1.8
     assert abs(late[2]) < 1e-4 * until and np.abs(gained).max() < 5e-3 * g * radius
-
-
-def test_momentum_is_not_conserved_by_averaging_here(world):
-    # Shows that the momentum test can fail: dividing a particle's sum by its number of links, not its mass, breaks the balance.
-    x, v, mass, pairs, *_ = net(2, seed=4)
-    count = np.bincount(pairs.ravel(), minlength=len(x))
-    i, j = pairs.T
-    r = x[i] - x[j]
-    C = np.linalg.norm(r, axis=1) - 1.0
-    push = -(C / (1 / mass[i] + 1 / mass[j]))[:, None] * r / np.linalg.norm(r, axis=1)[:, None]
-    move = np.zeros_like(x)
-    np.add.at(move, i, push / mass[i][:, None])
-    np.add.at(move, j, -push / mass[j][:, None])
-    assert np.abs(mass @ move).max() < 1e-12 < np.abs(mass @ (move / np.maximum(count, 1)[:, None])).max()
 
 
 class Scene:

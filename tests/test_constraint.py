@@ -55,9 +55,8 @@ def test_a_length_of_ones_own_is_a_distance(world):
 def test_what_has_no_direction_says_how_far_it_is_off(world):
     # Central differences of |a - b| at a = b are 0: a rigid link of L m cannot open there, and its residual is all of L. A spring
     # has no force there, as F = -C grad C / alpha says, and no residual. Constraints between fixed particles have no residual.
-    pairs, links = [[0, 1], [2, 3], [4, 5]], []
-    for rest in (2.0, 1.0):
-        links.append(tv.Constraint(length, pairs, rest, compliance=[0.0, 1e-3, 0.0]))
+    pairs = [[0, 1], [2, 3], [4, 5]]
+    links = [tv.Constraint(length, pairs, rest, compliance=[0.0, 1e-3, 0.0]) for rest in (2.0, 1.0)]
     apart = tv.Constraint(length, [[0, 1]], 0.5, side=1)
     with pytest.warns(UserWarning, match="cannot move"):
         w = world(tv.Particles(np.zeros((6, 2)), pinned=[4, 5]), [*links, apart], precision="f64")
@@ -141,7 +140,7 @@ def difference(a, b, c):
     return (b - a).norm() - (c - b).norm()
 
 
-@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("size", [1e-3, 1e3])
 def test_rest_values_that_are_rounding_are_no_size(world, size):
     # Two equal sides differ by 1e-16 of their length or not at all, and a flat tetrahedron has 1e-18 of its edge cubed.
     # Residuals are relative to the size of f, extent times |grad f|, so they are some digits of f32.
@@ -166,7 +165,7 @@ def off_circle(a):
     return a.norm() - 2.0
 
 
-@pytest.mark.parametrize("substeps", [8, 20, "auto"])
+@pytest.mark.parametrize("substeps", [8, "auto"])
 def test_a_rest_value_at_a_kink_pulls_together(world, substeps):
     # Four particles fall into one place, from rest, and go on with the momentum that they have. A function that crosses 0 has no
     # kink there, wherever the particle starts; it stays second order, solved with the others.

@@ -9,15 +9,12 @@ import pytest
 import tiverlet as tv
 from tiverlet.device import ti
 from tiverlet.device.patches.compiler import BRIEF, LEAN
-from tiverlet.device.runtime import cores
 from tiverlet.step import build, diagnostics, step
 
 from .conftest import python
 from .launches import launches
 
-PASS = "solve_constraints apply_corrections"
 SOLVE = "solve_constraints solve_systems update_multipliers apply_constraints"  # the same where links answer contacts: Direct
-DEMOS = pathlib.Path(__file__).parent.parent / "demos"
 
 
 @pytest.mark.slow
@@ -40,46 +37,19 @@ def test_what_a_gpu_sums_up_is_the_same(world, monkeypatch):
     np.testing.assert_allclose(figures, others, rtol=1e-12)  # all that is summed up, and the largest of all that is
 
 
-def hashes(code: str, runs: str) -> list[str]:
-    """Return the hashes that results() yields in another process, which restarts Taichi for each of `runs`: (threads, path)."""
-    loop = f"for threads, path in {runs}:\n    tv.init(threads=threads)\n"
-    return python(code + loop + "    for sha in results(path):\n        print(sha)\n    ti.reset()\n").stdout.split()
-
-
-@pytest.mark.slow
-def test_the_articles_scene_has_the_same_bits_on_1_and_8_threads():
-    # Also twice in a row. The discs are so few that none overlap at the start, in which case all kernels would be compiled
-    # twice, and that the team has two of the eight threads.
-    code = f"""
-import sys
-sys.path.insert(0, {str(DEMOS)!r})
-from tiverlet.device import ti
-import tiverlet as tv
-import article
-def results(path):
-    for _ in range(1 if path == "parallel" else 2):
-        scene = article.build(discs=140, path=path)
-        for _ in range(120):
-            article.lead(scene)
-            scene.world.step(1 / 60)
-        assert scene.world.last.contacts > 100
-        yield scene.world.hash()
-        scene.world.close()
-"""
-    made = hashes(code, '((8, "parallel"), (1, "fused"))')
-    assert len(made) == 3 and len(made[0]) == 64 and len(set(made)) == 1
-
-
 @pytest.mark.slow
 def test_systems_have_the_same_bits_on_1_and_8_threads():
     # Sums over all constraints, as conjugate gradients compute them beside contacts, and systems that several threads solve:
     # cloth that falls on a ball, with hail on it, and ropes. On one thread they run phase by phase, as on a GPU. Jacobi is
-    # tested on all paths below, Chebyshev in test_solvers.py.
+    # tested on all paths below, Chebyshev in test_solvers.py. Compiled as small worlds are: a third of the time, the same bits.
     code = """
 import numpy as np
 import pytest
 from tiverlet.device import ti
+from tiverlet.device.patches.compiler import BRIEF
+from tiverlet.step import build
 import tiverlet as tv
+build._passes = lambda *_: BRIEF
 k = np.arange(900).reshape(30, 30)
 net = np.vstack([np.stack([k[:, :-1].ravel(), k[:, 1:].ravel()], 1), np.stack([k[:-1].ravel(), k[1:].ravel()], 1)])
 ropes = np.stack([k[:, :-1].ravel(), k[:, 1:].ravel()], 1)
@@ -98,9 +68,13 @@ def results(path):
         with tv.World(start, features, solver=solver, path=path, substeps=5, iterations=4) as world:
             met = sum(world.step(1 / 60).contacts for _ in range(6))
             assert met > 10 or not more
-            yield world.hash()
+            print(world.hash())
+for threads in (1, 8):
+    tv.init(threads=threads)
+    results("parallel")
+    ti.reset()
 """
-    made = hashes(code, '((1, "parallel"), (8, "parallel"))')
+    made = python(code).stdout.split()
     assert len(made) == 4 and made[0] != made[1] and made[:2] == made[2:]
 
 
@@ -138,39 +112,28 @@ def apart(r):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("acting", [True, False], ids=["forces and contacts", "constraints"])
-def test_all_paths_have_the_same_bits(world, acting):
-    # Two scenes, since compile time grows faster than the number of features. Three dimensions are tested by the fuzzer; spins,
-    # events, sleep and bodies of loops in test_sleep.py. A column
-    # stands on the first disc.
+def test_all_paths_have_the_same_bits(world):
+    # Forces, walls and constraints; contacts, spins, events and sleep are in test_sleep.py, three dimensions in the fuzzer. The
+    # particles of a column fall on the box.
     n = 160
     x = tv.golden(np.arange(n), dim=2) * [4, 1.6]
     x[:4] = [1.0, 7.0] + np.outer(np.arange(4), [0.0, 0.16])
     pairs = np.stack([np.arange(8, n - 1, 2), np.arange(9, n, 2)], axis=1)
     soft, made = np.where(np.arange(len(pairs)) % 2, 1e-4, 0.0), []
     for path in ("fused", "parallel", "launched"):
-        if acting:
-            features = [
-                tv.Gravity(9.81), tv.Drag(0.1), tv.Force(wild), tv.Hand((1.0, 1.0), 7), tv.PairForce(apart, 0.2),
-                tv.Contact(), tv.Box((0, 0), (4, 9)), tv.HalfSpace((0.2, 1), 0.1),
-            ]  # fmt: skip
-        else:
-            features = [
-                tv.Gravity(9.81), tv.Distance(pairs, compliance=soft, damping=1.0, break_at=np.where(soft > 0, 200.0, np.inf)),
-                tv.Rope(pairs[:20] + 50, 0.5), tv.Pin([0]), tv.Pin([4], (1, 1), compliance=1e-3), tv.Pin([5], (1, 2)),
-            ]  # fmt: skip
-        w = world(
-            tv.Particles(x, radius=0.08, mass=1 + np.arange(n) % 5, pinned=[0] if acting else ()), features, path=path,
-            precision="f32" if acting else "f32-compensated", substeps=7, iterations=2,
-        )  # fmt: skip
-        w.run(0.6)
+        links = tv.Distance(pairs, compliance=soft, damping=1.0, break_at=np.where(soft > 0, 200.0, np.inf))
+        features = [
+            tv.Gravity(9.81), tv.Drag(0.1), tv.Force(wild), tv.Hand((1.0, 1.0), 7), tv.PairForce(apart, 0.2),
+            tv.Box((0, 0), (4, 9)), tv.HalfSpace((0.2, 1), 0.1), links, tv.Rope(pairs[:20] + 50, 0.5), tv.Pin([0]),
+            tv.Pin([4], (1, 1), compliance=1e-3), tv.Pin([5], (1, 2)),
+        ]  # fmt: skip
+        start = tv.Particles(x, radius=0.08, mass=1 + np.arange(n) % 5)
+        w = world(start, features, path=path, precision="f32-compensated", substeps=7, iterations=2)
+        w.run(0.3)
         w.substeps = 9
-        w.run(0.5)
+        w.run(0.2)
         made.append((w.hash(), w.last.energy, w.last.residual, w.last.overlap))
-        if acting:
-            assert w.last.contacts > 60 and (w._runner.search.list.persistent_data()[1]["push"] > 0).any()
-        else:
-            assert 0 < features[1].broken.sum() < len(pairs)
+        assert 0 < links.broken.sum() < len(pairs)
     assert made[0] == made[1] == made[2]
 
 
@@ -223,7 +186,6 @@ def test_launches_count_what_the_scene_needs(world):
     x = np.array([[0.0, 0.0], [1.0, 0.0], *([0.5 * k, 5.0] for k in range(198))])
     for features, path, expected in (
         ([tv.Gravity(1.0)], "launched", {"integrate": 5, "measure": 1}),
-        ([tv.Gravity(1.0), tv.Distance([[0, 1]])], "launched", {f"integrate {PASS}": 5, PASS: 5, "measure": 1}),
         (
             [tv.Gravity(1.0), tv.Distance([[0, 1]]), tv.Contact(friction=0.1, restitution=0.5)],
             "launched",
@@ -238,7 +200,6 @@ def test_launches_count_what_the_scene_needs(world):
                 "measure": 1,
             },
         ),
-        ([tv.Gravity(1.0), tv.Distance([[0, 1]])], "parallel" if cores() > 1 else "fused", {"fused": 1}),
         ([tv.Gravity(1.0), tv.Distance([[0, 1]])], "fused", {"fused": 1}),
     ):
         w = world(tv.Particles(x, radius=0.1), features, path=path, substeps=5, iterations=2)
@@ -267,27 +228,6 @@ def test_the_host_asks_once_in_a_frame(world):
             w.step(1 / 60)
     assert count["measure"] == frames + len(lists) and count["build_list"] == len(lists) > 0
     assert count.answers == count["measure"] + count["build_list"]
-
-
-@pytest.mark.slow
-def test_the_host_asks_for_passes_only_where_something_lands(world):
-    # At rest as many passes are launched as the last frame took, and the host reads one result. Where they are too few, the frame
-    # stops and resumes with more; where many are needed, the host asks. The bits are those of a frame that is one launch.
-    x = np.concatenate([[(0.2 * k, 0.1 + 0.2 * j) for j in range(5) for k in range(6)], [(0.55, 3.0)]])
-    made = []
-    for path in ("launched", "fused"):
-        features = [tv.Gravity(), tv.Box((-0.1, 0), (1.1, 9)), tv.Contact()]
-        made.append(world(tv.Particles(x, radius=0.1), features, path=path, substeps=4))
-    launcher, asked, stopped = made[0]._runner.launcher, 0, 0
-    more = launcher.launch_more
-    for _ in range(80):
-        stops = []
-        launcher.launch_more = lambda what, stops=stops: (stops.append(what), more(what))
-        asked += any(launcher.taken[what] > few for what, few in launcher.few.items())
-        hashes = {w.step(1 / 60) and w.hash() for w in made}
-        stopped += bool(stops)
-        assert len(hashes) == 1
-    assert 0 < stopped and 1 < asked < 40
 
 
 @pytest.mark.slow

@@ -118,14 +118,12 @@ def test_what_works_is_no_fault(world):
     # Work is done on particles by lifting, throwing, turning or wind, by stronger gravity, a moving wall or pin, or particles
     # added with a velocity. None of it is flagged.
     gravity, pin = tv.Gravity(9.81), tv.Pin([0])
-    wall = tv.Capsule((-5.0, -1.0), (5.0, -1.0), 0.2)
     lift = tv.Polygon([[-2, -0.4], [2, -0.4], [2, -0.2], [-2, -0.2]])
     link = tv.Distance([[0, 1]], compliance=1e-3)
     scenes = {
         "force": world(*pair(tv.Force(wind))),
-        "wind": world(*pair(tv.Wind((20.0, 0.0), 1.0))),
         "winch": world(*pair(gravity, tv.Winch([[0, 1]], speed=-1.0), pinned=[0])),
-        "gravity": world(*pair(g := tv.Gravity(1.0), wall.copy())),
+        "gravity": world(*pair(g := tv.Gravity(1.0))),
         "pin": world(*pair(pin, tv.Distance([[0, 1]]))),
         "wall": world(*pair(tv.Gravity(9.81), lift)),
         "rest": world(*pair(link)),
@@ -145,25 +143,17 @@ def test_what_works_is_no_fault(world):
             report = w.step(1 / 60)
             assert FLAG not in report.flags, (name, k, before, report)
     gained = {name: w.last.energy for name, w in scenes.items()}
-    assert all(gained[name] > 0.1 for name in ("force", "wind", "winch", "pin", "wall", "rest", "edited", "thrown")), gained
+    assert all(gained[name] > 0.1 for name in ("force", "winch", "pin", "wall", "rest", "edited", "thrown")), gained
 
 
-@pytest.mark.parametrize("place", ["alone", "one of many"])
-def test_what_works_from_the_first_frame_on_is_no_fault(world, place):
+def test_what_works_from_the_first_frame_on_is_no_fault(world):
     # A wall is lifted, or turned, before the first step.
     for knob, value in (("position", (0.0, 0.3)), ("rotation", 0.3)):
         lift = tv.Polygon([[-2, -0.4], [2, -0.4], [2, -0.1], [-2, -0.1]])
         w = world(*pair(tv.Gravity(9.81), lift), substeps=8)
-        many = tv.Worlds(w, 2) if place == "one of many" else None
-        if many:
-            many.set(lift, **{knob: [value, getattr(lift, knob)]})
-        else:
-            setattr(lift, knob, value)
+        setattr(lift, knob, value)
         for _ in range(5):
-            assert FLAG not in (many or w).step(1 / 60).flags
-        if many:
-            assert many.position[0, 1, 1] > many.position[1, 1, 1] + 0.1
-            many.close()
+            assert FLAG not in w.step(1 / 60).flags
 
 
 def test_what_overlaps_parts_without_a_word(world):
@@ -203,7 +193,6 @@ def test_less_of_a_force_is_less_to_lose(world):
         assert FLAG in w.run(1.0).flags
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("place", ["alone", "one of many"])
 def test_what_springs_lose_to_the_substep_is_told(world, place):
     # Two discs of 1 kg vibrate with C^2 / 2 alpha, C = 0.1 m. At omega h = sqrt(2 / alpha) h = 0.012 this stays; at 1.2 a period

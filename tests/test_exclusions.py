@@ -44,11 +44,10 @@ def swing(world, contact: bool, ball: float, bead: float, **settings):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("ball", "bead"), [(0.3, 0.04), (0.3, 0.15)])
-def test_a_ball_on_a_rope_swings_as_without_contacts(world, ball, bead):
+def test_a_ball_on_a_rope_swings_as_without_contacts(world):
     # The ball covers the end of the rope, and beads of radius above 1/7 m overlap the next but one. No contact could part them.
     for substeps in (20, "auto"):
-        there, without = (swing(world, contact, ball, bead, substeps=substeps) for contact in (True, False))
+        there, without = (swing(world, contact, 0.3, 0.15, substeps=substeps) for contact in (True, False))
         for _ in range(90):
             report = there.step(1 / 60)
             without.step(1 / 60)

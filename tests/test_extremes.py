@@ -1,7 +1,5 @@
 """Rows of the stiff and extreme matrix, by number, and aspects of them that the report does not check."""
 
-import contextlib
-
 import numpy as np
 import pytest
 
@@ -13,15 +11,15 @@ from tiverlet.report.stress.rows.motion import check_nan_flag
 from .chains import beyond
 from .conftest import ARCH, CASES, case, figures, pendulums, rerun, rms
 
-DOORS = (10, 13, 19, 20, 28, 38, 59, 60, 63, 65, 66)
-MOTION = (4, 6, 7, 11, 18, 29, 37, 50, 51, 52, 61, 62, 67)
+DOORS = (28, 38, 59, 60, 65)
+MOTION = (4, 6, 7, 11, 18, 29, 37, 50, 52, 61, 62)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", DOORS + MOTION)
 def test_rows_pass(number, briefly):
-    # All rows take minutes: python -m tiverlet stress. Other tests cover further rows by name: 2 test_chains.py, 15 and 17
-    # test_properties.py, 22 test_direct.py, 45, 48 and 82 test_contact.py, 55 test_bodies.py.
+    # All rows take minutes: python -m tiverlet stress. Other tests cover further rows by name: 2 test_chains.py, 10, 13, 19, 20,
+    # 63 and 66 test_checks.py, 15 and 17 test_properties.py, 22 test_direct.py, 45, 48 and 82 test_contact.py, 55 test_bodies.py.
     result = certify(number)
     if ARCH not in tv.runtime.LLVM and any(ARCH in why for why in result.failing):  # the architecture does not support it
         pytest.skip(str(result.failing))
@@ -98,14 +96,6 @@ def test_12_one_substep_of_a_tenth_of_a_second(world, solver):
                     assert rms(w.position[part][at], want) == pytest.approx(known, rel=1e-6), name
 
 
-def test_18_a_whip_asks_for_more_substeps(world):
-    x, mass, pairs = pendulums("D06_chain100")
-    start = tv.Particles(x, mass=mass, pinned=[0])
-    w = world(start, [tv.Gravity(9.81), tv.Distance(pairs)], substeps=4, iterations=10, solver=tv.Jacobi())
-    report = w.run(1.5)
-    assert "turned" in report.flags and "more substeps" in " ".join(report.notes)
-
-
 def test_36_nothing_and_almost_nothing(world):
     one = [[1.0, 2.0]]
     for x, path in ((np.zeros((0, 3)), "parallel"), (one, "fused")):
@@ -119,14 +109,8 @@ def test_36_nothing_and_almost_nothing(world):
     np.testing.assert_array_equal(w.position, one)
 
 
-def test_29_out_of_the_range_of_cells_is_flagged(world):
-    w = world(tv.Particles([[0.0, 0], [1, 0]], radius=0.1, velocity=(1e6, 0)), [tv.Contact()], substeps=1)
-    assert "out-of-range" in w.step(1.5).flags
-
-
-@pytest.mark.parametrize("path", ["parallel", "launched"])
-def test_50_nan_is_flagged_on_both_paths(path):
-    with thread_team.launching() if path == "launched" else contextlib.nullcontext():
+def test_50_nan_is_flagged_in_launches():
+    with thread_team.launching():
         found = check_nan_flag(tv.Box((-9, -9), (99, 99)), path="parallel")
     assert all(found.values()), found
 

@@ -29,40 +29,19 @@ def hanging(links, weight):
     return tv.Particles(x, mass=mass, pinned=[0]), [falls(), tv.Distance(pairs)]
 
 
-def ladder():
-    """Return a rope ladder with a man on its last rung."""
-    k, x = np.arange(10), np.stack(np.meshgrid([0.0, 0.4], -0.3 * np.arange(11)), axis=-1).reshape(-1, 2)
-    sides = np.concatenate([2 * k[:, None] + (0, 2), 2 * k[:, None] + (1, 3)])
-    mass = np.append(np.ones(21), 35.0)
-    return tv.Particles(x, mass=mass, pinned=[0, 1]), [falls(), tv.Rope(sides), tv.Distance(2 * k[:, None] + (2, 3))]
+def heap(x, radius, high=99.0, belt=0.0, **particles):
+    """Return discs or balls of unequal radii on a floor, or between two: one structure for many scenes."""
+    along, up = np.eye(len(x[0]))[:2]
+    walls = [tv.HalfSpace(up, friction=0.5, surface_velocity=belt * along), tv.HalfSpace(-up, -high, friction=0.5)]
+    return tv.Particles(x, radius=radius, spin=True, **particles), [tv.Gravity(-G * up), tv.Contact(friction=0.5), *walls]
 
 
-def poured(dim):
+def poured(dim, belt=0.0):
     """Return grains of many sizes that fall on a floor."""
     rng, n = np.random.default_rng(1), 40
     x = rng.uniform(-0.4, 0.4, (n, dim))
     x[:, 1] = 0.1 * np.arange(n) + 0.2
-    up = np.eye(dim)[1]
-    particles = tv.Particles(x, radius=rng.uniform(0.04, 0.1, n), spin=True)
-    return particles, [tv.Gravity(-G * up), tv.Contact(friction=0.5), tv.HalfSpace(up, friction=0.5)]
-
-
-def boxes():
-    """Return a stack of boxes that drop onto each other by 1 cm."""
-    y, corner = 0.51 * np.arange(4) + 0.01, np.array([(-0.25, 0), (0.25, 0), (0.25, 0.5), (-0.25, 0.5)])
-    x = (corner + np.stack([np.zeros(4), y], axis=1)[:, None]).reshape(-1, 2)
-    loops = np.arange(16).reshape(4, 4).tolist()
-    floor = tv.HalfSpace((0, 1), friction=0.5)
-    return tv.Particles(x), [falls(), tv.ShapeMatch(loops), tv.Polygons(loops, friction=0.5), floor]
-
-
-def cradle():
-    """Return five balls on threads, of which one is drawn aside."""
-    x = np.array([(0.2 * k, y) for y in (0.0, 1.0) for k in range(5)])
-    x[0] = -np.sin(0.7), 1 - np.cos(0.7)
-    threads = tv.Distance([(k, k + 5) for k in range(5)], 1.0)
-    particles = tv.Particles(x, radius=[0.1] * 5 + [0.0] * 5, pinned=range(5, 10))
-    return particles, [falls(), threads, tv.Contact(restitution=1.0)]
+    return heap(x, rng.uniform(0.04, 0.1, n), belt=belt, mass=rng.uniform(1, 2, n))
 
 
 def soft():
@@ -73,49 +52,19 @@ def soft():
     return tv.Particles(x + [0, 0.3], radius=0.05, mass=0.1), [falls(), springs, tv.Contact(), tv.HalfSpace((0, 1))]
 
 
-def drifting():
-    """Return discs that drift through a periodic box, and hit each other."""
-    x = np.random.default_rng(0).uniform(0, 2, (20, 2))
-    return tv.Particles(x, radius=0.02, velocity=(1.5, 0.3)), [tv.Periodic((0, 0), (2, 2)), tv.Contact()]
-
-
-def seesaw():
-    """Return a plank on a pin, with a disc on one end, and a heavier one that falls on the other."""
-    x = [(-1, 0), (0, 0), (1, 0), (-1, 0.2), (1, 1.5)]
-    plank = tv.Distance([(0, 1), (1, 2), (0, 2)])
-    particles = tv.Particles(x, radius=[0.05, 0.05, 0.05, 0.1, 0.1], pinned=[1], mass=[0.1, 0.1, 0.1, 1, 2])
-    return particles, [falls(), plank, tv.Contact(friction=0.3)]
-
-
-def belt():
-    """Return discs that a belt takes along."""
-    floor = tv.HalfSpace((0, 1), friction=0.5, surface_velocity=(2, 0))
-    return tv.Particles([(0, 0.1), (-2, 0.1)], radius=0.1, spin=True), [falls(), floor, tv.Contact(friction=0.5)]
-
-
 def heavy_on_light():
     """Return discs of 1, 1000 and 1e5 kg on each other."""
-    x = [(0, 0.1), (0, 0.3), (0, 0.5)]
-    return tv.Particles(x, radius=0.1, mass=[1, 1000, 1e5]), [falls(), tv.Contact(), tv.HalfSpace((0, 1))]
+    return heap([(0, 0.1), (0, 0.3), (0, 0.51)], [0.1, 0.1, 0.11], mass=[1, 1000, 1e5])
 
 
-RIGHT = {  # scene, substeps
-    "a pendulum": (lambda: hanging(1, 1.0), 20),
+RIGHT = {  # scene, substeps; test_shapes.py has rigid links with contacts, test_polygons.py boxes
     "a chain that whips": (lambda: hanging(20, 0.05), 20),
     "a weight on a chain": (lambda: hanging(20, 10.0), 20),
-    "a rope ladder": (ladder, 20),
-    "a linkage at 6 rad/s": (lambda: linkage(6.0), 20),
     "a linkage at 20 rad/s": (lambda: linkage(20.0), 20),
-    "grains in 2D": (lambda: poured(2), 20),
     "grains in 3D": (lambda: poured(3), 20),
     "grains at 4 substeps": (lambda: poured(2), 4),
-    "boxes": (boxes, 20),
-    "boxes at 4 substeps": (boxes, 4),
-    "a cradle": (cradle, 20),
     "a soft body": (soft, 20),
-    "a periodic box": (drifting, 20),
-    "a seesaw": (seesaw, 20),
-    "a belt": (belt, 20),
+    "a belt": (lambda: poured(2, 2.0), 20),
     "heavy on light": (heavy_on_light, 20),
 }
 
@@ -125,14 +74,14 @@ RIGHT = {  # scene, substeps
 def test_a_scene_that_moves_as_it_should_has_no_flag(world, name):
     make, substeps = RIGHT[name]
     w = world(*make(), substeps=substeps)
-    for _ in range(150):
+    for _ in range(100):
         report = w.step(1 / 60)
         assert report.clean, report.notes
 
 
 def bullet():
     """Return a disc that flies by 330 of its diameters in a substep."""
-    return tv.Particles([(0, 0), (2, 0)], radius=0.01, velocity=[(400, 0), (0, 0)]), [tv.Contact()]
+    return heap([(0, 9), (2, 9)], [0.01, 0.011], velocity=[(400, 0), (0, 0)], mass=[1, 2])
 
 
 def unresolved():
@@ -151,9 +100,8 @@ def whirling():
 
 
 def pressed():
-    """Return a disc between walls that are closer than its diameter."""
-    walls = [tv.HalfSpace((0, 1)), tv.HalfSpace((0, -1), -0.15)]
-    return tv.Particles([(0, 0.075)], radius=0.1), [falls(), tv.Contact(), *walls]
+    """Return a disc between walls that are closer than its diameter, and a smaller one."""
+    return heap([(0, 0.075), (5, 0.075)], [0.1, 0.05], 0.15, mass=[1, 2])
 
 
 WRONG = {  # scene, substeps, solver, the flag
@@ -189,7 +137,7 @@ def test_a_scene_that_follows_the_advice_of_the_worst_frame_has_no_flag(world, n
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("steps, substeps", [(2, 18), (2, 22), (4, 10)])
+@pytest.mark.parametrize("steps, substeps", [(2, 18), (4, 10)])
 def test_what_is_damped_loses_its_note_with_as_many_substeps_as_that_says(world, steps, substeps):
     # A chain that swings down. A few steps of conjugate gradients leave it violated, by order h or higher.
     x, k = np.stack([0.05 * np.arange(30), np.zeros(30)], axis=1), np.arange(29)

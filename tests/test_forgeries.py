@@ -17,15 +17,12 @@ from tiverlet.__main__ import main
 from tiverlet.features import material
 from tiverlet.recording import reader, viewer
 
-from . import forging, recordings_campaign
-from .forging import FORGERIES, Forgery
-
-PLACES = recordings_campaign.PLACES
+from .forging import FORGERIES, PLACES, Forgery, packed, record
 
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory):
-    return recordings_campaign.record(tmp_path_factory.mktemp("forged") / "a.rrd")
+    return record(tmp_path_factory.mktemp("forged") / "a.rrd")
 
 
 @pytest.fixture
@@ -35,7 +32,7 @@ def quick(read_here, built_once):
 
 @pytest.mark.slow
 def test_forgeries_are_named(original, quick, tmp_path):
-    assert tv.replay(original).verify()
+    assert tv.replay(Forgery(original).save(tmp_path / "b.rrd")).verify()
     passed = {}
     for name in FORGERIES:
         forged = Forgery(original)
@@ -51,8 +48,18 @@ def test_forgeries_are_named(original, quick, tmp_path):
 
 
 @pytest.mark.slow
-def test_what_was_not_forged_is_intact(original, quick, tmp_path):
-    assert tv.replay(Forgery(original).save(tmp_path / "b.rrd")).verify()
+def test_what_is_damaged_is_never_intact(original, quick, tmp_path):
+    # One byte of the file is changed, or the file is cut short, at random places; and its end record is missing.
+    rng, whole, path = np.random.default_rng(0), original.read_bytes(), tmp_path / "b.rrd"
+    for k, at in enumerate(rng.integers(0, len(whole), 20)):
+        changed = bytearray(whole)
+        changed[at] ^= int(rng.integers(1, 256))
+        path.write_bytes(changed if k % 4 else whole[:at])
+        try:
+            recording = tv.replay(path)
+            assert not recording.complete or not recording.verify(), (k, at)
+        except ValueError as e:
+            assert "replay: " in str(e), (k, at)
     open_ended = tv.replay(Forgery(original).save(tmp_path / "c.rrd", seal=False)).verify()
     assert open_ended.kind == "incomplete" and open_ended.frames == open_ended.of
 
@@ -120,7 +127,7 @@ def test_what_a_file_asks_for_is_bounded(original, tmp_path):
     taker = reader.Reader(out, False)
     taker.stores.append(reader.store_of(fields[1]))
     with pytest.raises(reader.Damaged, match="unpack to"):
-        taker.chunk(forging.packed({**fields, 2: 2, 3: 1 << 36, 5: b"x" * 5000}))
+        taker.chunk(packed({**fields, 2: 2, 3: 1 << 36, 5: b"x" * 5000}))
     with pytest.raises(reader.Damaged, match="MB"):
         out.put(b"x" * 1001)
     out.close()

@@ -31,19 +31,6 @@ def test_whip_and_mass_ratios_from_one_substep(world):
         assert w.last.tries == 1  # the controller has settled
 
 
-def test_it_finds_the_moment_that_needs_more(world):
-    # D04 passes a fold between 0.5 and 0.75 s: 20 substeps in each of 45 frames end half a metre off. A third of them, where
-    # the controller puts them, end within 5 cm.
-    name, scene = "D04_mueller_heavy", Scene()
-    scene.begin[name] = 0
-    w = hung(world, name, substeps=20)
-    assert scene.error(rerun(w, 0.75), name, 0.75) > 0.3
-    rerun(w, 1 / 60, substeps="auto")
-    w.velocity, w.position = w.particles.velocity, w.particles.position
-    total = sum(w.step(1 / 60).substeps for _ in range(45))
-    assert scene.error(w, name, 0.75) < 5e-2 and total < 450
-
-
 @pytest.mark.slow
 def test_undoing_a_frame_leaves_no_trace(world):
     # A frame that was made three times equals, bit for bit, one with the final number of substeps. Moving targets, contacts
@@ -93,6 +80,11 @@ def test_tolerance_is_met_with_less_where_less_is_needed(world):
     assert w.substeps == 20  # the user's own number stays
 
 
+def anew(w, x, v=0.0, substeps="auto"):
+    """Put a world back to positions and velocities, with a new controller."""
+    w.velocity, w.position, w._controller, w.substeps = v + 0 * x, x, StepController(), substeps
+
+
 def test_a_tolerance_is_one_of_the_motion(world):
     # Direct solutions leave no residual, but a rod that turns by phi in a substep turns too fast or too slowly by phi^2 / 24.
     # This error is relative: in 2 s of the double pendulum D01 it becomes about ten times as much in metres, for any tolerance.
@@ -100,7 +92,7 @@ def test_a_tolerance_is_one_of_the_motion(world):
     name, scene = "D01_double_pendulum", Scene()
     w, scene.begin[name] = hung(world, name, substeps="auto"), 0
     for tolerance in (1e-4, 1e-5, 2e-6):
-        w.velocity, w.position, w._controller = w.particles.velocity, w.particles.position, StepController()
+        anew(w, w.particles.position)
         assert w.run(2.0, tolerance=tolerance).clean
         assert 3 * tolerance < scene.error(w, name, 2.0) < 15 * tolerance
 
@@ -112,7 +104,7 @@ def test_a_tolerance_is_one_of_vibrations(world):
     x, omega = np.array([[0.0, 0.0], [1.0 + a, 0.0]]), k**0.5
     w = world(tv.Particles(x, pinned=[0]), [tv.Distance([(0, 1)], 1.0, compliance=1 / k)], precision="f64", substeps="auto")
     for tolerance in (1e-3, 1e-5):
-        w.velocity, w.position, w._controller = 0 * x, x, StepController()
+        anew(w, x)
         assert w.run(t, tolerance=tolerance).clean
         assert abs(w.position[1, 0] - 1 - a * np.cos(omega * t)) < (1 + a) * tolerance * omega * t
 
@@ -126,7 +118,7 @@ def test_a_tolerance_is_one_of_beads_on_curves(world):
     w.run(1.0)
     want = w.position.copy()
     for tolerance in (1e-4, 1e-6):
-        w.velocity, w.position, w._controller = 0 * x, x, StepController()
+        anew(w, x, substeps=w.substeps)
         assert w.run(1.0, tolerance=tolerance).clean
         assert np.abs(w.position - want).max() < 4 * tolerance
 
@@ -137,8 +129,7 @@ def test_a_tolerance_is_one_of_the_energy_of_rigid_bodies(world):
     w = world(tv.Particles(x, pinned=[0]), [tv.Gravity(9.81), tv.ShapeMatch([range(15)])], substeps="auto")
     supply, used = 9.81 * 14 * 0.4, []
     for tolerance in (None, 1e-4, 1e-5):
-        w.velocity, w.position, w._controller = 0 * x, x, StepController()
-        w.substeps = "auto"
+        anew(w, x)
         energy = [w.step(1 / 60, tolerance=tolerance).energy for _ in range(60)]
         used.append((np.max(energy) - 9.81 * x[1:, 1].sum()) / supply)
     assert used[0] > 3e-3 and used[1] < 1e-3 and used[2] < 1e-4, used
@@ -157,42 +148,7 @@ def test_what_no_effort_improves_is_said_and_not_tried_each_time(world):
     assert w.position[1] == pytest.approx([1.5, 0.0], abs=2e-2)
 
 
-def test_a_shorter_substep_does_not_turn_a_sag_into_energy(world):
-    # Row 74. One pass holds the load of a braced cantilever by a violation ~ h^2, as a spring of stiffness ~ 1 / h^2 would: 512
-    # substeps after 64 would multiply its energy by 64. So links stay as soft as they were, and stiffen within seconds. Whatever
-    # the substeps do, the energy does not exceed that at the start.
-    k = np.arange(20).reshape(10, 2)
-    x = np.stack(np.meshgrid(np.arange(10), np.arange(2), indexing="ij"), axis=2).reshape(-1, 2) * 0.1
-    ends = [(k[:-1], k[1:]), (k[:, :-1], k[:, 1:]), (k[:-1, :-1], k[1:, 1:]), (k[:-1, 1:], k[1:, :-1])]
-    pairs = np.vstack([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in ends])
-    w = world(tv.Particles(x, mass=0.01, pinned=[0, 1]), [tv.Gravity(9.81), tv.Distance(pairs)], solver=tv.Jacobi())
-    start = 0.01 * 9.81 * x[2:, 1].sum()
-    for plan in (("auto",) * 90, (64,) * 30 + (512,) * 10, (8,) * 20 + (200,) * 300):
-        w.velocity, w.position = np.zeros_like(x), x
-        for w.substeps in plan:
-            report = w.step(1 / 60)
-            assert report.energy <= start + 1e-3 * 0.01 * 9.81 * 18, (plan[0], report)
-        assert report.residual <= 1e-2
-
-
-def test_no_change_of_the_substep_brings_in_energy(world):
-    # A net between four pins has no direction to sag in, and its violation under load is large: 0.1 of its links at 2 substeps,
-    # whose energy 200 substeps would multiply by 10^4. The same holds for violations of hardly resolved springs. Substeps
-    # change by ones or all at once, back and forth, or under "auto": passive scenes never exceed their energy at the start.
-    n, m = 7, 1e-3
-    sheet, k = tv.shapes.net((0, 0, 0), (1, 0, 0), (0, 0, 1), (n, n)), np.arange(n * n).reshape(n, n)
-    link = tv.Distance(sheet.links, compliance=1e-3)
-    start = tv.Particles(sheet.position, mass=m, pinned=[k[0, 0], k[0, -1], k[-1, 0], k[-1, -1]])
-    w = world(start, [tv.Gravity(9.81), link], solver=tv.Jacobi())
-    down = [round(20 * 1.2**-f) for f in range(12)]
-    for link.compliance in (1e-3, 0.0):
-        for plan in (["auto"] * 40, [2] * 12 + [200] * 6, 2 * (down + down[::-1])):
-            w.velocity, w.position, w._controller = 0 * sheet.position, sheet.position, StepController()
-            for w.substeps in plan:
-                report = w.step(1 / 60)
-                assert report.energy <= 1e-3 * m * 9.81 * n**2, (link.compliance[0], plan[-1], report)
-
-
+@pytest.mark.slow
 def test_no_change_of_the_substep_brings_in_energy_of_bodies(world):
     # Cantilevers of loops of four corners that keep their areas, beside rigid links, and of rigid clusters that share corners.
     # Without a projection, what passes leave undone becomes 2.4 and 0.5 m g L under "auto", without a flag, and 120 and 310 m g L
@@ -205,8 +161,8 @@ def test_no_change_of_the_substep_brings_in_energy_of_bodies(world):
     start = tv.Particles(np.concatenate([x, x + [2.0, 0]]), mass=0.01, pinned=[0, 1, 16, 17])
     w = world(start, features, solver=tv.Jacobi())
     energy = 0.01 * 9.81 * start.position[~start.pinned, 1].sum()
-    for plan in (["auto"] * 150, [2] * 40 + [100] * 10):
-        w.velocity, w.position, w._controller = 0 * start.position, start.position, StepController()
+    for plan in (["auto"] * 60, [2] * 40 + [100] * 10):
+        anew(w, start.position)
         for w.substeps in plan:
             report = w.step(1 / 60)
             assert report.energy <= energy + 1e-3 * 0.01 * 9.81 * 14 * 0.7, (plan[-1], report)
@@ -230,25 +186,16 @@ def test_no_change_of_the_substep_brings_in_energy_of_rods_in_3d(world):
         assert w.step(dt).energy <= most
 
 
-@pytest.mark.parametrize("what", ["springs in 3D", "a rope"])
-def test_a_body_turns_on_where_the_substep_changes(world, what):
+def test_a_body_turns_on_where_the_substep_changes(world):
     # Sum m x x v is kept to rounding in free flight. A rotating body is stretched by its substep, and drawn together when the
     # substep gets shorter. At constant velocities that would cost a third of the momentum in 10 s, and half of the energy.
-    # As links stay soft and stiffen again, 30 changes take 8 % of the energy of the rope.
-    if what == "springs in 3D":
-        body = tv.shapes.truss((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3), (2, 2, 2))
-        links = tv.Distance(np.concatenate([body.links, body.braces]), compliance=1e-3)
-        v, plan = np.cross([0.0, 3.0, 6.0], body.position), (4, 4, 8, 8)
-    else:
-        body = tv.shapes.rope((-1, 0), (1, 0), points=21)
-        links = tv.Distance(body.links)
-        v = 5 * np.stack([-body.position[:, 1], body.position[:, 0]], axis=1)
-        plan = (4,) * 4 + (20,) * 4
-    start = tv.Particles(body.position, velocity=v, mass=1 / len(v))
-    w = world(start, [links], substeps=plan[0], precision="f64", solver=tv.Jacobi())
+    body = tv.shapes.truss((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3), (2, 2, 2))
+    links = tv.Distance(np.concatenate([body.links, body.braces]), compliance=1e-3)
+    start = tv.Particles(body.position, velocity=np.cross([0.0, 3.0, 6.0], body.position), mass=1 / len(body.position))
+    w = world(start, [links], substeps=4, precision="f64", solver=tv.Jacobi())
     turning, energy = np.linalg.norm(tv.measure.angular_momentum(w)), w.step(1 / 60).energy
     for k in range(120):
-        w.substeps = plan[k % len(plan)]
+        w.substeps = (4, 4, 8, 8)[k % 4]
         report = w.step(1 / 60)
     assert np.linalg.norm(tv.measure.angular_momentum(w)) == pytest.approx(turning, rel=1e-10)
     assert report.energy == pytest.approx(energy, rel=0.1) and report.flags <= {"unconverged"}
@@ -256,18 +203,16 @@ def test_a_body_turns_on_where_the_substep_changes(world, what):
 
 def test_the_order_of_constraints_does_not_matter_where_the_substep_changes(world):
     # A door with a stop: the corners of the link are the last two of the angle before it. If rows of the projection were taken
-    # for equal, they would have the corners of the other: an IndexError, or with more links another motion, 0.22 J off.
-    for links, far in (([(1, 2)], 2), ([(1, 2), (2, 3), (3, 4)], 4)):
-        x = np.stack([np.arange(far + 1.0) - 1, np.zeros(far + 1)], axis=1)
-        ends = []
-        for way in (1, -1):
-            features = [tv.AngleLimit([(0, 1, 2)], -0.4, 0.4), tv.Distance(links)][::way]
-            w = world(tv.Particles(x, pinned=(0, 1)), [tv.Gravity(9.81), *features], substeps=5, precision="f64")
-            for substeps in (3, 20, 3, 80, 3, 20):
-                w.substeps = substeps
-                w.run(1 / 6)
-            ends.append(w.position)
-        assert np.abs(ends[0] - ends[1]).max() < 1e-9, far
+    # for equal, they would have the corners of the other: another motion, 0.22 J off.
+    x, ends = np.stack([np.arange(5.0) - 1, np.zeros(5)], axis=1), []
+    for way in (1, -1):
+        features = [tv.AngleLimit([(0, 1, 2)], -0.4, 0.4), tv.Distance([(1, 2), (2, 3), (3, 4)])][::way]
+        w = world(tv.Particles(x, pinned=(0, 1)), [tv.Gravity(9.81), *features], substeps=5, precision="f64")
+        for substeps in (3, 20, 3, 80, 3, 20):
+            w.substeps = substeps
+            w.run(1 / 6)
+        ends.append(w.position)
+    assert np.abs(ends[0] - ends[1]).max() < 1e-9
 
 
 def test_a_scene_does_not_go_to_and_fro_between_two_substeps(world):
@@ -282,8 +227,7 @@ def test_a_scene_does_not_go_to_and_fro_between_two_substeps(world):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("contact", [[], [tv.Contact(restitution=1.0)]])
-def test_springs_between_elastic_walls_keep_their_energy(world, contact):
+def test_springs_between_elastic_walls_keep_their_energy(world):
     # Dimers of 1 kg discs in an elastic box. The law of springs takes 2 pi s^5 of its energy from a vibration in each period,
     # with s = omega h: at one substep a frame, in which no other figure has anything to find, 34 to 12 % were left after 5 s.
     # From theta > 0.99 on, springs are rigid in impacts, which leaves Newton's law for rigid bodies, right to O(h).
@@ -292,12 +236,13 @@ def test_springs_between_elastic_walls_keep_their_energy(world, contact):
     arm = 0.25 * np.stack([np.cos(a), np.sin(a)], axis=1)
     x, v = np.stack([center - arm, center + arm], axis=1).reshape(-1, 2), rng.normal(size=(24, 2))
     bonds, box = tv.Distance(np.arange(24).reshape(-1, 2), compliance=1e-4), tv.Box((0, 0), (4, 3), restitution=1.0)
-    w = world(tv.Particles(x, velocity=v, radius=0.1), [bonds, box, *contact], substeps="auto", precision="f64")
-    for stiffness, share, most in ((1e2, 0.02, 32), (1e3, 0.01, 32), (1e4, 0.01, 64), (1e8, 0.1, 32)):
+    w = world(
+        tv.Particles(x, velocity=v, radius=0.1), [bonds, box, tv.Contact(restitution=1.0)], substeps="auto", precision="f64"
+    )
+    for stiffness, share, most in ((1e4, 0.01, 64), (1e8, 0.1, 32)):
         bonds.compliance = 1 / stiffness
-        w.velocity, w.position, w._controller = v, x, StepController()
-        w.substeps = "auto"
-        reports = [w.step(1 / 60) for _ in range(300)]
+        anew(w, x, v)
+        reports = [w.step(1 / 60) for _ in range(200)]
         assert all(abs(r.energy / reports[0].energy - 1) < share for r in reports), stiffness
         assert max(r.substeps for r in reports) <= most and not any(r.flags for r in reports)
 
@@ -308,8 +253,7 @@ def test_a_spring_oscillates_on_under_auto(world):
     x, pin = np.array([[0.1, 0.0]]), tv.Pin([0], (0.0, 0.0), compliance=1e-3)
     w = world(tv.Particles(x), [pin], substeps="auto")
     for pin.compliance in (1e-3, 1e-5):
-        w.velocity, w.position, w._controller = 0 * x, x, StepController()
-        w.substeps = "auto"
+        anew(w, x)
         assert w.run(4.0).energy == pytest.approx(0.005 / pin.compliance[0], rel=0.01)
 
 
@@ -342,19 +286,16 @@ def test_a_truss_on_a_roller_settles(world):
     assert np.count_nonzero(np.diff(used)) < 12 and len(set(used[-150:])) == 1
 
 
-@pytest.mark.parametrize("solver", [tv.Jacobi(), None])
-@pytest.mark.parametrize("compliance", [1e-9, 1e-4])
-def test_a_stiff_pin_is_no_spring_where_the_substep_gets_shorter(world, solver, compliance):
+@pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Direct()], ids=repr)
+def test_a_stiff_pin_is_no_spring_where_the_substep_gets_shorter(world, solver):
     # A rope that hangs by a stiff spring, which the passes leave stretched by what a substep moves the rope. A substep an eighth
     # as long would be a spring 64 times as stiff: 45 J of sag became 1035 J, with 11 J 240 under Direct(). The pin goes on to
     # bear the rope's weight, 11 m g, and what lifts a sag of up to 0.6 m within some 2 s. The scene never has more than at the
     # start, and then rests where it rests at 8 substeps.
     rope = tv.shapes.rope((0, 0), (0, -1), points=11)
-    pin, m = tv.Pin([0], compliance=compliance), 1.0
+    pin, m = tv.Pin([0], compliance=1e-9), 1.0
     features = [tv.Gravity(9.81), tv.Drag(3.0), tv.Distance(rope.links), pin]
-    w = world(
-        tv.Particles(rope.position, mass=m), features, substeps=1, precision="f64", **({"solver": solver} if solver else {})
-    )
+    w = world(tv.Particles(rope.position, mass=m), features, substeps=1, precision="f64", solver=solver)
     start = w.step(1 / 60).energy
     w.run(10.0)
     w.substeps = 8
@@ -381,24 +322,7 @@ def test_a_bead_stays_on_its_wire_where_the_substep_gets_shorter(world):
     assert abs(tv.measure.momentum(w)[0]) < 1e-9 and highest < 0.05 * 29.4
 
 
-def test_a_shorter_substep_makes_no_energy_of_large_clusters(world):
-    # Two clusters of 4 x 16 that share a row sag by a violation of order h^2, which a shorter substep must not turn into energy.
-    g = np.stack(np.meshgrid(np.arange(31), np.arange(4), indexing="ij"), axis=-1).reshape(-1, 2)
-    clusters = [np.flatnonzero((g[:, 0] >= k) & (g[:, 0] < k + 16)).tolist() for k in (0, 15)]
-    beam = tv.Particles(0.1 * g, mass=0.01, pinned=np.flatnonzero(g[:, 0] == 0))
-    w = world(beam, [tv.Gravity(9.81), tv.ShapeMatch(clusters)], substeps=2)
-    scale = 0.01 * len(g) * 9.81 * 3.1
-    start = w.step(1 / 60).energy
-    for substeps in (2, 20):
-        w.substeps = substeps
-        reports = [w.step(1 / 60) for _ in range(60)]
-        gain = (max(r.energy for r in reports) - start) / scale
-        assert gain < 1e-3, (substeps, gain)
-    w._runner.memory.write(w._runner.scene.state.x, np.where(np.arange(len(g))[:, None] == 70, np.nan, w.position))
-    w.substeps = 40
-    assert "non-finite" in w.step(1 / 60).flags  # and no cluster is fitted to NaN
-
-
+@pytest.mark.slow
 def test_a_shorter_substep_makes_no_energy_of_a_large_outline(world):
     # A ring of 320 links around an area hangs from one of its points, and two substeps let it sag to several times its length.
     # 32 substeps would make 159 J of that. It is lifted by less than it fell.
@@ -441,6 +365,13 @@ def test_too_much_for_the_budget_is_said(world):
         assert report.flags - {"unconverged"} == {"substeps-capped"} and report.tries == 1 and "budget" in report.notes[-1]
     rich = [w.step(1 / 60, budget=0.05) for _ in range(10)]
     assert max(r.substeps for r in rich) > 64  # all that fits: a substep of 40 links takes some microseconds
+    for wrong in (0, -1e-3, np.nan, np.inf):
+        with pytest.raises(ValueError, match="tolerance"):
+            w.step(1 / 60, tolerance=wrong)
+        with pytest.raises(ValueError, match="budget"):
+            w.step(1 / 60, budget=wrong)
+    with pytest.raises(ValueError, match="substeps = 'adaptive', but it must be an integer of at least 1, \"auto\" or None"):
+        w.substeps = "adaptive"
 
 
 def test_a_clone_goes_on_alike_and_paths_agree(world):
@@ -455,17 +386,6 @@ def test_a_clone_goes_on_alike_and_paths_agree(world):
     assert a.hash() == b.hash() and a.substeps == b.substeps
     b.close()
     fixed.close()
-
-
-def test_wrong_aims_are_refused(world):
-    w = world(tv.Particles([(0, 0)]))
-    for wrong in (0, -1e-3, np.nan, np.inf):
-        with pytest.raises(ValueError, match="tolerance"):
-            w.step(1 / 60, tolerance=wrong)
-        with pytest.raises(ValueError, match="budget"):
-            w.step(1 / 60, budget=wrong)
-    with pytest.raises(ValueError, match="substeps = 'adaptive', but it must be an integer of at least 1, \"auto\" or None"):
-        w.substeps = "adaptive"
 
 
 S, END = 0.1, 0.35  # [m]: where the Lennard-Jones force is 0, and where it ends
@@ -496,51 +416,18 @@ def fall_energy(r):
     return -0.01 / ti.sqrt(r.norm_sqr() + 1e-4)
 
 
-@ti.func
-def spring(r):
-    """Return the force of a spring of 300 N/m."""
-    return -300.0 * r
-
-
-@ti.func
-def well(x):
-    return -300.0 * x
-
-
-@pytest.mark.parametrize("forces", ["a field", "all pairs", "near pairs", "both"])
-def test_stiffness_of_forces_is_that_of_the_stiffest(world, forces):
-    # omega^2 = k w in a field F = -k x, and (w_1 + w_2) k for two particles that pull each other by k r. For more particles it
-    # is the sum over all others, at most twice too large. It depends neither on other particles nor on a common velocity.
-    k, h, mass = 300.0, 1e-3, np.array([0.5, 2.0, 1.0])
-    features = {
-        "a field": [tv.Force(well)], "all pairs": [tv.PairForce(spring)], "near pairs": [tv.PairForce(spring, 1.0)],
-        "both": [tv.Force(well), tv.PairForce(spring)],
-    }[forces]  # fmt: skip
-    x, v = np.array([[0.0, 0.0], [0.5, 0.1], [9.0, 0.0]]), np.array([[0.3, 0.1], [-0.2, 0.4], [0.0, -7.0]])
-    w = world(tv.Particles(x, velocity=v + 20.0, mass=mass), features, substeps=1, precision="f64")
-    w.step(h)
-    found = w._runner.diagnostics.force_stiffness(h, w.time)
-    field, pairs = k / mass, k / mass[:, None] + k / mass
-    pairs *= 1 - np.eye(3)
-    if forces == "near pairs":
-        pairs[:, 2] = pairs[2] = 0
-    exact = {"a field": field, "both": field + pairs.sum(axis=1)}.get(forces, pairs.sum(axis=1)).max() * h * h
-    assert abs(found / exact - 1) < 1e-9
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("precision", ["f32", "f64"])
-def test_bodies_that_collide_or_fly_by_keep_their_energy(world, precision):
+def test_bodies_that_collide_or_fly_by_keep_their_energy(world):
     # E(t) = E(0) up to what frames may miss. Only the stiffness of forces reveals these errors. Without it "auto" goes down to
     # one substep, which gives two atoms, or 48, 1e7 to 1e15 J, and 20 bodies 1.8 J instead of 1.3 J.
     rng = np.random.default_rng(3)
     grid = np.stack(np.meshgrid(0.25 * np.arange(8), 0.25 * np.arange(6)), axis=-1).reshape(-1, 2)
     box, force = tv.Box((-1, -1.2), (3, 2.8), restitution=1.0), tv.PairForce(collide, END, potential=collide_energy)
-    gas = world(tv.Particles(grid, velocity=rng.normal(size=grid.shape)), [force, box], substeps="auto", precision=precision)
+    gas = world(tv.Particles(grid, velocity=rng.normal(size=grid.shape)), [force, box], substeps="auto")
     bodies = tv.Particles(np.random.default_rng(1).normal(size=(20, 3)))
-    stars = world(bodies, [tv.PairForce(fall, potential=fall_energy)], substeps="auto", precision=precision)
+    stars = world(bodies, [tv.PairForce(fall, potential=fall_energy)], substeps="auto")
     for w in (gas, stars):
-        reports = [w.step(1 / 60) for _ in range(600)]
+        reports = [w.step(1 / 60) for _ in range(300)]
         energy, flags = np.array([r.energy for r in reports]), set().union(*[r.flags for r in reports])
         assert np.abs(energy - energy[0]).max() < 0.03 * w._clock.kinetic and not flags
         assert np.mean([r.substeps * r.tries for r in reports]) < 50  # not all frames have as many substeps as the worst
@@ -605,16 +492,6 @@ def test_energy_that_no_substep_mends_costs_no_more(world):
     assert max(r.substeps for r in reports) <= 16 and max(r.tries for r in reports) <= 4
 
 
-def test_an_infinite_tension_makes_a_note(world):
-    link = tv.Distance([[0, 1]])
-    w = world(tv.Particles([[0.0, 0.0], [1.0, 0.0]], pinned=[0]), [tv.Gravity(), link], solver=tv.Direct())
-    w.step(1 / 60)
-    reporter = w._runner.diagnostics.report
-    reporter.figures[9] = np.inf
-    report, _ = reporter(w.time, 1 / 1200, 20, 1, None, 0.0, 0.0, 0.0)
-    assert report.flags == {"softened"} and "Use about inf substeps" in report.notes[0]
-
-
 def test_what_an_impact_left_of_a_link_is_no_spring_where_a_wall_holds_it(world):
     # Three masses, one above another, fall on the lowest one in frames of one substep. Walls leave impacts to links where Jacobi
     # solves several of a particle, and these are then off by C = 0.39 L. Substeps that are 64 times shorter would turn that into
@@ -656,16 +533,15 @@ def test_motors_and_muscles_go_on_where_the_substep_gets_shorter(world):
                 assert w.velocity[7] @ along / np.linalg.norm(along) == pytest.approx(-0.5, rel=most), frame
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_what_stands_stays_on_its_feet_where_the_substep_gets_shorter(world, dim):
+def test_what_stands_stays_on_its_feet_where_the_substep_gets_shorter(world):
     # A block of links, twice as high as wide, on a slope of 15 degrees with friction 0.6 > tan 15: its weight acts through
     # 2 tan 15 = 0.54 half widths from the middle, so all feet bear some of it, and none leaves the ground or walks. The links
     # between feet are stretched by e, which friction bears. What takes that out lifts a foot by less than it had sagged, and the
     # block does not walk: half a second later each foot is on the ground and has moved by less than that.
-    corners = np.indices((2,) * dim).reshape(dim, -1).T * [1.0, 2.0, 1.0][:dim]
+    corners = np.indices((2, 2, 2)).reshape(3, -1).T * [1.0, 2.0, 1.0]
     slope, pairs = np.radians(15.0), np.stack(np.triu_indices(len(corners), 1), axis=1)
-    down = np.array([np.sin(slope), -np.cos(slope), 0.0])[:dim]
-    floor, up = tv.HalfSpace((0, 1, 0)[:dim], friction=0.6), corners[:, 1] == 0
+    down = np.array([np.sin(slope), -np.cos(slope), 0.0])
+    floor, up = tv.HalfSpace((0, 1, 0), friction=0.6), corners[:, 1] == 0
     w = world(tv.Particles(corners), [tv.Gravity(9.81 * down), tv.Distance(pairs), floor], substeps=2, precision="f64")
     for turns in ((2, 30), (4, 100)):
         for _ in range(3):
@@ -681,24 +557,7 @@ def test_what_stands_stays_on_its_feet_where_the_substep_gets_shorter(world, dim
             assert w.position[up, 1].max() < 0.02 * sag and np.abs(moved[:, 0]).max() < sag
 
 
-def test_a_plate_bent_over_a_ball_is_no_spring(world):
-    # A braced plate falls on a ball and bends at 2 substeps: links are off by 6 % of their length. Straightening it sends its
-    # middle into the ball, and the ball sends it back. Without a limit, each round leaves more violation than before, and 64
-    # substeps make 12000 J of 104 J. Where the ball holds the middle, the rims are lifted instead, by less than they fell.
-    c = tv.shapes.cloth((-0.8, 0.8, -0.8), (1.6, 0, 0), (0, 0, 1.6), points=(5, 5))
-    links = tv.Distance(np.concatenate([c.links, c.braces]))
-    w = world(
-        tv.Particles(c.position, radius=0.04), [tv.Gravity(9.81), links, tv.Ball((0, 0, 0), 0.5)],
-        substeps=2, solver=tv.ConjugateGradient(), precision="f64",
-    )  # fmt: skip
-    start = 25 * 9.81 * 0.8
-    bent = [w.step(1 / 60) for _ in range(20)][-1]
-    assert bent.residual > 0.05 and bent.energy < start
-    w.substeps = 64
-    report = w.step(1 / 60)
-    assert report.residual < bent.residual / 2 and report.energy < start
-
-
+@pytest.mark.slow
 def test_a_cloth_that_hangs_over_a_ball_goes_where_its_links_are_met(world):
     # A cloth, pinned at two corners, falls over a ball. If the ball sends it back in the first round of the projection, the
     # second round corrects that. If the second round were ignored and all undone, 64 substeps would make 33 J of 7 J.
@@ -709,31 +568,6 @@ def test_a_cloth_that_hangs_over_a_ball_goes_where_its_links_are_met(world):
     for substeps in (2, 8, 64):
         w.substeps = substeps
         assert max(w.step(1 / 60).energy for _ in range(13)) < start
-
-
-@pytest.mark.slow
-def test_a_sheet_of_threads_and_soft_braces_gains_no_energy(world):
-    # Threads and soft braces fall from two corners and contradict each other, under "auto".
-    n = 16
-    sheet = tv.shapes.cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (n, n))
-    features = [tv.Gravity(9.81), tv.Distance(sheet.links), tv.Distance(sheet.braces, compliance=0.1, damping=0.002)]
-    w = world(tv.Particles(sheet.position, mass=0.5 / n**2, pinned=[0, n - 1]), features, substeps="auto")
-    energy = [w.step(1 / 60).energy for _ in range(30)]
-    assert max(energy) < 1e-3 * w._clock.kinetic
-
-
-def test_how_fast_a_sheet_flies_does_not_matter_where_the_substep_gets_shorter(world):
-    # The same inner energy, E - m v^2 / 2, at 0 and at 300 m/s, to the rounding of both.
-    sheet = tv.shapes.cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (8, 8))
-    left = []
-    for speed in (0.0, 300.0):
-        v = 2 * np.sin(np.arange(192.0)).reshape(64, 3)
-        features = [tv.Distance(sheet.links), tv.Distance(sheet.braces)]
-        w = world(tv.Particles(sheet.position, velocity=v + [speed, 0, 0], mass=0.01), features, substeps=2, precision="f64")
-        for w.substeps in (2, 2, 200, 200):
-            drift = np.array([speed, 0, 0]) + v.mean(axis=0)
-            left.append(w.step(1 / 60).energy - 0.32 * drift @ drift)
-    assert left[:4] == pytest.approx(left[4:], rel=0.05, abs=1e-4)
 
 
 def test_few_substeps_that_do_not_help_are_not_the_last_word(world):

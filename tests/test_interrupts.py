@@ -100,7 +100,7 @@ def in_parts(w, passes, frames):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("passes", [1, 2, 5, 7])
+@pytest.mark.parametrize("passes", [1, 5])
 def test_long_frames_in_several_launches_have_the_same_bits(w, passes):
     whole, parted = in_parts(w, passes, 12)  # of 12 passes each
     assert whole == parted
@@ -108,12 +108,11 @@ def test_long_frames_in_several_launches_have_the_same_bits(w, passes):
 
 @pytest.mark.slow
 def test_long_frames_of_a_team_and_of_high_order():
-    # For a team, the code between two passes is the same whatever features there are; discs and a rope stand for all.
-    chain = [tv.Gravity(), tv.Distance([(0, 1)])]
-    discs = tv.Particles([[0.0, 0.0], [0.3, 0.0], [0.05, 0.4]], radius=0.16, pinned=[0])
+    # For a team, the code between two passes is the same whatever features there are; a rope stands for all.
+    chain, start = [tv.Gravity(), tv.Distance([(0, 1)])], tv.Particles([[0, 0], [1, 0]], pinned=[0])
     with (
-        tv.World(discs, [*(f.copy() for f in chain), tv.Contact()], iterations=3, substeps=4, path="parallel") as team,
-        tv.World(tv.Particles([[0, 0], [1, 0]], pinned=[0]), chain, order=4, precision="f64") as precise,
+        tv.World(start, [f.copy() for f in chain], iterations=3, substeps=4, path="parallel") as team,
+        tv.World(start, chain, order=4, precision="f64") as precise,
     ):
         for some in (team, precise):
             whole, parted = in_parts(some, 5, 4)

@@ -23,8 +23,7 @@ def net(dim, seed=0):
     return x, rng.normal(size=(n, dim)), mass, pairs, rest, alpha, damping
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("iterations", [1, 4])
+@pytest.mark.parametrize("dim, iterations", [(2, 4), (3, 1)])
 def test_kernels_agree_with_the_prototype(world, dim, iterations):
     x, v, mass, pairs, rest, alpha, damping = net(dim)
     g = np.array([0.5, -9.81, 1.0][:dim])
@@ -44,14 +43,9 @@ def test_kernels_agree_with_the_prototype(world, dim, iterations):
     np.testing.assert_array_equal(made.position[:2], x[:2])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name, efforts",
-    [("N10_alpha1e-3", ((20, 4), (20, 16), (50, 4))), ("N100_alpha1e-5", ((50, 40),))],
-)
-def test_static_elongation_is_alpha_times_load(world, name, efforts):
+def test_static_elongation_is_alpha_times_load(world):
     # Link k from the bottom carries k m g, so it stretches by alpha k m g, for any substeps and iterations that converge.
-    c = case(f"R11_elastic_rope_{name}")
+    c = case("R11_elastic_rope_N10_alpha1e-3")
     p, n = c["params"], c["params"]["links"]
     k = np.arange(n)
     loads = p["m"] * p["g"] * (n - k)
@@ -59,7 +53,7 @@ def test_static_elongation_is_alpha_times_load(world, name, efforts):
     link = tv.Distance(np.stack([k, k + 1], axis=1), p["rest"], compliance=p["alpha"])
     start = tv.Particles(np.stack([np.zeros(n + 1), -depth], axis=1), mass=p["m"], pinned=[0])
     w = world(start, [tv.Gravity(p["g"]), link, tv.Drag(10.0)], precision="f64")
-    for substeps, iterations in efforts:
+    for substeps, iterations in ((20, 4), (20, 16), (50, 4)):
         rerun(w, 4.0, substeps=substeps, iterations=iterations)
         total = -w.position[-1, 1] - n * p["rest"]
         assert total == pytest.approx(c["values"]["total_elongation"], rel=1e-8)
@@ -83,13 +77,7 @@ def test_compliance_from_1e_minus_12_to_1e12(world):
     want[soft] *= 1 + (fast * np.exp(slow * t) - slow * np.exp(fast * t)) / (slow - fast)
     want[alpha >= 1e5] = g / c * (t + np.expm1(-c * t) / c)
     for precision in ("f64", "f32"):
-        w = world(
-            start,
-            [tv.Gravity(g), link.copy(), tv.Drag(c)],
-            substeps=20,
-            iterations=4,
-            precision=precision,
-        )
+        w = world(start, [tv.Gravity(g), link.copy(), tv.Drag(c)], substeps=20, iterations=4, precision=precision)
         w.run(t)
         stretch = -w.position[m:, 1] - 1.0
         assert np.isfinite(w.position).all() and not w.last.flags and (np.diff(stretch) >= -2e-7).all()
@@ -107,16 +95,15 @@ def test_compliance_from_1e_minus_12_to_1e12(world):
                 np.testing.assert_allclose(w.features[1].load, g, rtol=1e-9)
 
 
-@pytest.mark.parametrize("precision", ["f32", "f64"])
-def test_every_compliance_is_stable(world, precision):
+def test_every_compliance_is_stable(world):
     # Kinetic energy never exceeds the work of gravity, with one Jacobi pass, from rigid to soft. One chain per compliance.
     n, alphas = 21, (0.0, 1e-12, 1e-9, 1e-6, 1e-5, 1e-4, 1e-3, 1e-1, 1e12)
     x = np.concatenate([np.stack([np.arange(n) * 0.05, np.full(n, 10.0 * c)], axis=1) for c in range(len(alphas))])
     k = np.concatenate([np.arange(n - 1) + n * c for c in range(len(alphas))])
     link = tv.Distance(np.stack([k, k + 1], axis=1), compliance=np.repeat(alphas, n - 1))
     start = tv.Particles(x, mass=0.1, pinned=np.arange(len(alphas)) * n)
-    w = world(start, [tv.Gravity(9.81), link], substeps=4, precision=precision, solver=tv.Jacobi())
-    for _ in range(360):
+    w = world(start, [tv.Gravity(9.81), link], substeps=4, solver=tv.Jacobi())
+    for _ in range(240):
         w.step(1 / 60)
         supplied = 0.1 * 9.81 * (x - w.position)[:, 1].reshape(-1, n).sum(axis=1)
         speed = w._runner.memory.state()["displacement"].astype(np.float64) * 240
@@ -128,12 +115,8 @@ def test_dashpot(world):
     # x'' = -(k x + c x') / m: x = x0 e^(-z w t) (cos + z w / wd sin), second order.
     p, want = case("R05_damped_oscillator")["params"], case("R05_damped_oscillator")["values"]
     link = tv.Distance([[0, 1]], rest=5.0, compliance=1 / p["k"], damping=p["c"])
-    w = world(
-        tv.Particles([[0.0, 0], [5 + p["x0"], 0]], mass=[1, p["m"]], pinned=[0]),
-        [link],
-        iterations=3,
-        precision="f64",
-    )
+    start = tv.Particles([[0.0, 0], [5 + p["x0"], 0]], mass=[1, p["m"]], pinned=[0])
+    w = world(start, [link], iterations=3, precision="f64")
     errors = [abs(rerun(w, p["T"], substeps=n).position[1, 0] - 5 - want["x_T"]) for n in (10, 20, 40)]
     assert 1.9 <= order(errors) <= 2.1 and errors[1] <= 1e-4
 
@@ -153,12 +136,7 @@ def test_compliance_does_not_damp(world):
 def test_ropes_pull_and_spacers_push(world):
     # The end of a rope falls freely until the rope is taut, then stops. From then on it swings like the end of a rigid link.
     rope = tv.Rope([[0, 1]], length=1.0)
-    w = world(
-        tv.Particles([[0, 0], [0.0, -0.5]], pinned=[0]),
-        [tv.Gravity(9.81), rope],
-        substeps=100,
-        precision="f64",
-    )
+    w = world(tv.Particles([[0, 0], [0.0, -0.5]], pinned=[0]), [tv.Gravity(9.81), rope], substeps=100, precision="f64")
     w.run(0.3, dt=0.01)
     assert w.position[1, 1] == pytest.approx(-0.5 - 9.81 * 0.3**2 / 2, rel=1e-12)
     w.run(1.0, dt=0.01)
@@ -171,12 +149,7 @@ def test_ropes_pull_and_spacers_push(world):
         s.run(1.0)
     np.testing.assert_allclose(swings[0].position, swings[1].position, atol=1e-9)
     spacer = tv.Spacer([[0, 1]], 1.0)
-    w = world(
-        tv.Particles([[0, 0], [0.0, 2.0]], pinned=[0]),
-        [tv.Gravity(9.81), spacer],
-        substeps=50,
-        precision="f64",
-    )
+    w = world(tv.Particles([[0, 0], [0.0, 2.0]], pinned=[0]), [tv.Gravity(9.81), spacer], substeps=50, precision="f64")
     w.run(2.0)
     assert w.position[1, 1] == pytest.approx(1.0, abs=1e-5) and spacer.load[0] == pytest.approx(-9.81, rel=1e-3)
     # A soft rope is a bungee: released at its length, the end falls to twice the static stretch and comes back.
@@ -191,11 +164,7 @@ def test_ropes_pull_and_spacers_push(world):
 
 def test_rest_lengths_are_live(world):
     link = tv.Distance([[0, 1]])
-    w = world(
-        tv.Particles([[0, 0], [0, -1.0]], pinned=[0]),
-        [tv.Gravity(9.81), link, tv.Drag(20.0)],
-        precision="f64",
-    )
+    w = world(tv.Particles([[0, 0], [0, -1.0]], pinned=[0]), [tv.Gravity(9.81), link, tv.Drag(20.0)], precision="f64")
     w.run(0.5)
     link.rest = 0.5
     w.run(2.0)

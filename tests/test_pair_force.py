@@ -159,7 +159,7 @@ def test_hashes_know_nothing_of_who_is_listed(world, tmp_path):
     with tv.Recorder(tmp_path / "far.rrd", w) as recorder:
         w.run(2.5, recorder=recorder)
     recording = tv.replay(tmp_path / "far.rrd", given=[short])
-    for frame in range(1, 150, 12):
+    for frame in range(1, 150, 48):
         recording.world(frame).close()
 
 

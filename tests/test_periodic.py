@@ -59,7 +59,6 @@ BOXES = {  # lengths, axes, shear, radii; several sizes of cells wherever that m
     "2D, more cells than buckets": ((300.0, 160.0), (0, 1), 0.0, MIXED),
     "2D, x alone": ((5.0, 4.0), (0,), 0.0, (0.3,)),
     "2D, sheared": ((8.0, 7.0), (0, 1), 1.5, MIXED),
-    "2D, sheared, launched": ((8.0, 7.0), (0, 1), 1.5, MIXED),
     "2D, sheared, one cell": ((3.0, 1.35), (0, 1), -5.0, MIXED),
     "2D, sheared, more cells than buckets": ((300.0, 160.0), (0, 1), 0.3, MIXED),
     "3D, sheared": ((4.0, 3.0, 2.5), (0, 1, 2), 2.0, (0.3,)),
@@ -71,14 +70,14 @@ BOXES = {  # lengths, axes, shear, radii; several sizes of cells wherever that m
 def test_no_pair_is_missed_whichever_image_is_near(world, name):
     length, axes, shear, radii = BOXES[name]
     length, rng = np.array(length), np.random.default_rng(0)
-    dim, n, path = len(length), 60, "launched" if name.endswith("launched") else "fused"
+    dim, n = len(length), 60
     x = rng.uniform(-2, 3, (n, dim)) * np.where(np.isin(np.arange(dim), axes), length, length / 5)
     if name.endswith("buckets"):
         x = rng.integers(-3, 4, (n, dim)) * length + rng.uniform(-1.2, 1.2, (n, dim))  # around a corner of the box
     radius, v = rng.choice(radii, n), rng.normal(size=(n, dim))
     v[:, 0] += shear * x[:, 1]
     box = tv.Periodic(np.zeros(dim), length, axes, shear=shear)
-    w = world(tv.Particles(x, velocity=v, radius=radius), [tv.Contact(), box], substeps=4, path=path)
+    w = world(tv.Particles(x, velocity=v, radius=radius), [tv.Contact(), box], substeps=4)
     found = 0
     for frame in range(8):
         w.step(DT)
@@ -94,10 +93,6 @@ def test_no_pair_is_missed_whichever_image_is_near(world, name):
             assert set(map(tuple, pairs[depth > 1e-4].tolist())) == there
             np.testing.assert_allclose(depth.sum(), contacts.overlap[contacts.overlap > 0].sum(), atol=1e-3)
     assert found > 10 and np.isclose(box.strain, shear * 8 * DT)
-    if path == "launched":  # the same bits
-        twin = world(tv.Particles(x, velocity=v, radius=radius), [tv.Contact(), box.copy()], substeps=4)
-        twin.run(8 * DT)
-        assert twin.hash() == w.hash()
 
 
 @pytest.mark.parametrize("contact", [True, False])
@@ -154,28 +149,25 @@ def test_where_the_box_begins_and_which_image_is_followed_changes_nothing(world,
 
 @pytest.mark.slow
 def test_a_collision_across_the_boundary_is_that_with_the_image(world):
-    # Two discs, one at the top and one at the bottom of the box. The other world has no box, and the second disc is its own image
-    # there, a box higher: faster by shear times that height, and farther by the strain so far. They meet after about 0.25 s.
-    length, shear = np.array([5.0, 4.0]), 0.8
-    x, v = np.array([[1.0, 3.7], [1.3 - 1.28 * shear, 0.4]]), np.array([[0.2, 0.5], [-0.1, -0.4]])
-    contact = {"friction": 0.4, "restitution": 0.6}
-    w = world(
-        tv.Particles(x, velocity=v, radius=0.25, mass=[1, 2]), [tv.Periodic((0, 0), length, shear=shear), tv.Contact(**contact)],
-        precision="f64",
-    )  # fmt: skip
-    image = np.array([0.0, length[1]])
-    faster = np.array([shear * length[1], 0.0])
-    alone = world(
-        tv.Particles(x + [[0, 0], image], velocity=v + [[0, 0], faster], radius=0.25, mass=[1, 2]), [tv.Contact(**contact)],
-        precision="f64",
-    )  # fmt: skip
-    for _ in range(20):
-        w.step(DT)
-        alone.step(DT)
-    t, close = w.time, 1e-11
-    assert np.abs(alone.velocity[0] - v[0]).max() > 0.1
-    np.testing.assert_allclose(w.velocity, alone.velocity - [[0, 0], faster], atol=close)
-    np.testing.assert_allclose(w.position, alone.position - [[0, 0], image + faster * t], atol=close)
+    # Two discs, one at the top and one at the bottom of the box. Without a box, the second disc is its own image, a box higher:
+    # faster by shear times that height, and farther by the strain so far. They meet after t: |r + t u| = 0.5. There the impulse
+    # along the normal is m (1 + e) u_n, and across it friction stops the slip or is mu times that.
+    length, shear, mu, e = np.array([5.0, 4.0]), 0.8, 0.4, 0.6
+    x, v, m = np.array([[1.0, 3.7], [1.3 - 1.28 * shear, 0.4]]), np.array([[0.2, 0.5], [-0.1, -0.4]]), np.array([1.0, 2.0])
+    features = [tv.Periodic((0, 0), length, shear=shear), tv.Contact(mu, e)]
+    w = world(tv.Particles(x, velocity=v, radius=0.25, mass=m), features, precision="f64")
+    w.run(1 / 3)
+    image, faster = np.array([0.0, length[1]]), np.array([shear * length[1], 0.0])
+    r, u = x[0] - x[1] - image, v[0] - v[1] - faster
+    a, b, c = u @ u, r @ u, r @ r - 0.5**2
+    t = (-b - np.sqrt(b * b - a * c)) / a
+    n, reduced = (r + t * u) / 0.5, m.prod() / m.sum()
+    slip, push = u - (u @ n) * n, -reduced * (1 + e) * (u @ n)
+    drag = -slip * min(reduced, mu * push / np.linalg.norm(slip))
+    after = v + np.array([[1.0], [-1.0]]) * (push * n + drag) / m[:, None]
+    assert 0.2 < t < 0.3
+    np.testing.assert_allclose(w.velocity, after, atol=1e-11)
+    np.testing.assert_allclose(w.position, x + t * v + (w.time - t) * after, atol=1e-11)
 
 
 def test_a_ring_around_the_box_swings_as_a_periodic_chain(world):
@@ -195,14 +187,13 @@ def test_a_ring_around_the_box_swings_as_a_periodic_chain(world):
     np.testing.assert_allclose(w.position[:, 1], 0.5, atol=1e-12)
 
 
-@pytest.mark.parametrize("rigid", [True, False])
-def test_a_closed_chain_with_bends_rests_as_it_was_put(world, rigid):
+def test_a_closed_chain_with_bends_rests_as_it_was_put(world):
     # A chain straight around the box: all lengths and angles are met, also across the boundary, so only its centre moves.
     n = 16
     links = np.stack([np.arange(n), (np.arange(n) + 1) % n], axis=1)
     bends = np.stack([np.arange(n), (np.arange(n) + 1) % n, (np.arange(n) + 2) % n], axis=1)
     x = np.stack([np.arange(n) * 0.25, np.full(n, 0.5)], axis=1)
-    chain = tv.Distance(links, compliance=0 if rigid else 1e-3)
+    chain = tv.Distance(links)
     w = world(
         tv.Particles(x, velocity=(1.3, 0.4)), [tv.Periodic((0, 0), (4, 1)), chain, tv.Bend(bends, compliance=1e-2)],
         precision="f64",
@@ -300,32 +291,26 @@ def test_many_worlds_have_boxes_of_their_own():
         np.testing.assert_allclose(many.each(strain), np.array([1.5, 2.5, -1.5]) * DT, rtol=1e-12)
 
 
-@pytest.mark.parametrize("make", [
-    lambda at: tv.Ball(at, 0.5, restitution=1.0),
-    lambda at: tv.Capsule(at - [0, 0.3], at + [0, 0.3], 0.5, restitution=1.0),
-    lambda at: tv.Polygon(at + np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]), restitution=1.0),
-])  # fmt: skip
-def test_obstacles_meet_images(world, make):
-    # A disc of radius 0.1 flies around the box, 4 m long, until it meets an obstacle that reaches 0.5 m from its centre, and
-    # back.
-    w = world(
-        tv.Particles([[3.0, 1.0], [11.0, -1.0]], velocity=[(2.0, 0.0), (2.0, 0.0)], radius=0.1),
-        [tv.Periodic((0, 0), (4, 2)), make(np.array([1.5, 1.0]))], precision="f64",
-    )  # fmt: skip
+def test_obstacles_meet_images(world):
+    # Discs of radius 0.1 fly around the box, 4 m long, until they meet an obstacle that reaches 0.5 m from its centre, and back:
+    # from x = 3 m they fly 1.9 m of their 4 m to the image of the obstacle, at 5.5 - 0.6 = 4.9 m, and 2.1 m back.
+    square = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    obstacles = [
+        tv.Ball((1.5, 1.0), 0.5, restitution=1.0), tv.Capsule((1.5, 2.7), (1.5, 3.3), 0.5, restitution=1.0),
+        tv.Polygon(square + (1.5, 5.0), restitution=1.0),
+    ]  # fmt: skip
+    x = np.concatenate([[(3.0, y), (11.0, y - 6.0)] for y in (1.0, 3.0, 5.0)])
+    w = world(tv.Particles(x, velocity=(2.0, 0.0), radius=0.1), [tv.Periodic((0, 0), (4, 6)), *obstacles], precision="f64")
     w.run(2.0)
-    # From x = 3 m it flies 1.9 m of its 4 m to the image of the obstacle, at 5.5 - 0.6 = 4.9 m, and 2.1 m back.
-    np.testing.assert_allclose(w.position, [[2.8, 1.0], [10.8, -1.0]], atol=1e-9)
-    np.testing.assert_allclose(w.velocity, [[-2, 0], [-2, 0]], atol=1e-9)
+    np.testing.assert_allclose(w.position, x - (0.2, 0.0), atol=1e-9)
+    np.testing.assert_allclose(w.velocity, np.tile([-2, 0], (6, 1)), atol=1e-9)
 
 
-def test_a_floor_under_a_periodic_pile(world):
+def test_a_floor_under_a_periodic_box(world):
     # Walls along other axes: a particle that slides out on the right comes in on the left, and stays on the floor.
     x = np.stack([np.arange(8) * 0.5 + 0.25, 0.2 + 0.01 * np.arange(8)], axis=1)
-    box = tv.Periodic((0, -9), (4, 9), (0,))
-    w = world(
-        tv.Particles(x, velocity=(3.0, 0.0), radius=0.2),
-        [tv.Gravity(), box, tv.Contact(), tv.Box((-np.inf, 0), (np.inf, 5)), tv.HalfSpace((0, 1), 0.0)],
-    )  # fmt: skip
+    walls = [tv.Box((-np.inf, 0), (np.inf, 5)), tv.HalfSpace((0, 1), 0.0)]
+    w = world(tv.Particles(x, velocity=(3.0, 0.0), radius=0.2), [tv.Gravity(), tv.Periodic((0, -9), (4, 9), (0,)), *walls])
     w.run(2.0)
     np.testing.assert_allclose(w.position[:, 1], 0.2, atol=1e-3)
     np.testing.assert_allclose(w.position[:, 0] - x[:, 0], 3.0 * w.time, atol=2e-5)
@@ -383,15 +368,6 @@ def test_lengths_are_refused_while_it_runs(world):
                 feature.rest = length
     assert links.rest == 0.5 and ropes.rest == 0.7 and w.step(1 / 60).clean
     links.rest = 0.74
-
-
-@pytest.mark.parametrize("count", [0, 1])
-def test_none_and_one(world, count):
-    particles = tv.Particles(np.full((count, 2), 0.9), velocity=(1.0, 0.0), radius=0.1)
-    w = world(particles, [tv.Periodic((0, 0), (1, 1)), tv.Contact()], precision="f64")
-    report = w.run(0.2)
-    assert report.clean and report.contacts == 0
-    np.testing.assert_allclose(w.position, np.full((count, 2), 0.9) + [0.2, 0], atol=1e-6)
 
 
 def test_f32_with_low_words_is_as_good_a_hundred_boxes_away(world):

@@ -59,13 +59,12 @@ def test_loads_that_passes_bear_stay(world):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Direct()], ids=str)
-def test_links_that_come_later_bring_no_energy(world, solver):
+def test_links_that_come_later_bring_no_energy(world):
     # A tie that is a fifth too short is added to a hanging rope: the rope bulges there and is lifted, and nothing flies off. In a
     # frame it falls to 0.16 m/s. A pass would move particles by up to 0.05 m in a substep, 600 m/s at 200 substeps, and leave
     # 84 J.
     x = row()[:, ::-1] * [1, -1]
-    w = world(tv.Particles(x, mass=M, pinned=[0]), [tv.Gravity(G), tv.Distance(line(N))], solver=solver, precision="f64")
+    w = world(tv.Particles(x, mass=M, pinned=[0]), [tv.Gravity(G), tv.Distance(line(N))], solver=tv.Direct(), precision="f64")
     for substeps in (20, 200):
         w.substeps, w.velocity, w.position = substeps, np.zeros_like(x), x
         w.run(0.1)
@@ -116,7 +115,7 @@ def softly_held(world, **settings):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("substeps", [2, 20, 200])
+@pytest.mark.parametrize("substeps", [2, 200])
 def test_springs_that_become_rigid_bring_no_energy(world, substeps):
     # What a spring of 0.01 m/N has given way by under 9.81 N is 0.1 m, which a pass would take out in one substep: up to 4e6 J,
     # of a square that its floor sent off, without a flag. They go to where they are met, as if they were placed, and stay there,
@@ -141,7 +140,6 @@ def test_springs_that_become_rigid_bring_no_energy(world, substeps):
     assert np.abs(w.velocity).max() < 0.01 + G * h / 8
 
 
-@pytest.mark.slow
 def test_each_of_many_worlds_meets_what_becomes_rigid_in_it(world):
     w = softly_held(world, substeps=20)
     w.run(0.5)
@@ -181,9 +179,7 @@ def lattice(dim, size, step):
     return 0.2 * g, [c.tolist() for c in corners if step == 1 or g[c[0]].sum() % 2 == 0]
 
 
-@pytest.mark.parametrize(
-    "dim, step, substeps", [(2, 1, 2), (2, 1, "auto"), (2, 2, 20), pytest.param(3, 1, 200, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("dim, step, substeps", [(2, 1, 2), pytest.param(3, 1, 200, marks=pytest.mark.slow)])
 def test_lattices_that_become_rigid_gain_no_energy(world, dim, step, substeps):
     # All clusters of a lattice together are one rigid body, or, if they share corners only, bodies on hinges. Soft ones that hang
     # from a corner and turn about it go to their rigid shape with the velocities that they have: their energy is m g y there, and
@@ -301,26 +297,21 @@ def test_what_is_placed_has_no_speed(world):
         w.place(w.features[0], g=1.0)
 
 
-def pile_beside_a_chain(world, **settings):
+def pile_beside_a_chain(world):
     """Return a world with a heap of discs, events, and a chain that hangs beside it."""
     n, links = 20, np.stack([np.arange(20, 27), np.arange(21, 28)], axis=1)
     heap = np.stack([0.11 * (np.arange(n) % 5), 0.06 + 0.11 * (np.arange(n) // 5)], axis=1)
     chain = np.stack([np.full(8, 3.0), 1.0 - 0.1 * np.arange(8)], axis=1)
-    features = [
-        tv.Gravity(G),
-        tv.Contact(friction=0.4, events=True),
-        tv.Box((-0.05, 0), (5, 5)),
-        tv.Distance(links, 0.1),
-        tv.Drag(0.2),
-    ]
-    return world(tv.Particles(np.vstack([heap, chain]), radius=0.05, pinned=[20]), features, substeps=4, **settings)
+    contact = tv.Contact(friction=0.4, events=True)
+    features = [tv.Gravity(G), contact, tv.Box((-0.05, 0), (5, 5)), tv.Distance(links, 0.1), tv.Drag(0.2)]
+    return world(tv.Particles(np.vstack([heap, chain]), radius=0.05, pinned=[20]), features, substeps=4)
 
 
-@pytest.mark.parametrize("precision", ["f32", "f64"])
-def test_what_settles_changes_no_bit_elsewhere(world, precision):
+@pytest.mark.slow
+def test_what_settles_changes_no_bit_elsewhere(world):
     # A chain is pulled out of shape beside a heap. It settles; positions, velocities, contacts and events of the heap are those
     # of a world in which the same positions were assigned.
-    a, b = (pile_beside_a_chain(world, precision=precision) for _ in range(2))
+    a, b = (pile_beside_a_chain(world) for _ in range(2))
     for w in (a, b):
         w.run(0.5)
     x = a.position.copy()
@@ -338,18 +329,15 @@ def test_what_settles_changes_no_bit_elsewhere(world, precision):
 
 def test_what_settles_stays_on_its_side_of_walls(world):
     # A square of links and diagonals that are 1.3 times as long stands on a floor beside a wall, and hangs by a rope that is too
-    # short: it grows away from both, and nothing is inside of a wall at any time, with contacts or without.
-    for more in ([], [tv.Contact()]):
-        x = np.vstack([SQUARE + (0.0, 0.0), [(0.25, 2.0)]])
-        pairs = [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3)]
-        links = tv.Distance(pairs, [0.65] * 4 + [0.65 * np.sqrt(2)] * 2)
-        w = world(
-            tv.Particles(x, radius=0.0 if not more else 0.01, pinned=[4]),
-            [tv.Gravity(G), links, tv.Rope([[2, 4], [3, 4]], 1.45), tv.Box((0, 0), (9, 9)), *more], precision="f64",
-        )  # fmt: skip
-        report = w.step(1 / 60)
-        assert "moved" in report.flags and w.position.min() > -1e-6 and np.abs(w.velocity).max() < 2 * G / 60
-        assert np.abs(links.violation(w.position)).max() < 1e-3 * 0.65
+    # short: it grows away from both, and nothing is inside of a wall at any time.
+    x = np.vstack([SQUARE + (0.0, 0.0), [(0.25, 2.0)]])
+    pairs = [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3)]
+    links = tv.Distance(pairs, [0.65] * 4 + [0.65 * np.sqrt(2)] * 2)
+    features = [tv.Gravity(G), links, tv.Rope([[2, 4], [3, 4]], 1.45), tv.Box((0, 0), (9, 9)), tv.Contact()]
+    w = world(tv.Particles(x, radius=0.01, pinned=[4]), features, precision="f64")
+    report = w.step(1 / 60)
+    assert "moved" in report.flags and w.position.min() > -1e-6 and np.abs(w.velocity).max() < 2 * G / 60
+    assert np.abs(links.violation(w.position)).max() < 1e-3 * 0.65
 
 
 @pytest.mark.slow
@@ -359,8 +347,9 @@ def test_what_settles_among_contacts_has_the_same_bits_on_all_paths(world):
     # times in between. Later it is pulled apart again.
     x = np.vstack([0.3 * np.stack([np.arange(40), np.zeros(40)], axis=1), (0, 0.3) + tv.golden(np.arange(60), dim=2) * (4, 1.2)])
     links, found = np.stack([np.arange(39), np.arange(1, 40)], axis=1), []
-    for path in ("fused", "parallel", "launched"):
-        features = [tv.Gravity(G), tv.Distance(links, 0.1), tv.Contact(friction=0.3), tv.Box((-5, -0.5), (9, 9))]
+    for path in ("fused", "launched"):
+        contact = tv.Contact(friction=0.4, events=True)  # the structure of pile_beside_a_chain()
+        features = [tv.Gravity(G), contact, tv.Box((-5, -0.5), (9, 9)), tv.Distance(links, 0.1), tv.Drag(0.2)]
         w = world(tv.Particles(x, radius=0.045, pinned=[0]), features, substeps=4, path=path)
         w.step(1 / 60)
         first = w.hash()
@@ -368,6 +357,6 @@ def test_what_settles_among_contacts_has_the_same_bits_on_all_paths(world):
         pulled[1:40, 0] += np.linspace(0, 6, 39)
         w.position = pulled
         report = w.step(1 / 60)
-        assert "moved" in report.flags and np.abs(features[1].violation(w.position)).max() < 2e-4  # 2e-3 of a link
+        assert "moved" in report.flags and np.abs(features[3].violation(w.position)).max() < 2e-4  # 2e-3 of a link
         found.append((first, w.hash()))
-    assert found[0] == found[1] == found[2]
+    assert found[0] == found[1]

@@ -12,13 +12,12 @@ import tiverlet as tv
 from tiverlet import constraints
 from tiverlet.step import checkpoint
 
-from .bad_starts import BadStart
+from . import bad_starts
 from .conftest import order, rms, unprojected
 from .rows import OTHERS, PATH, ROWS, TETRA, WINGS, Row
 
 BLOCKS = ("met", "off", "turned", "held", "stuck", "soft", "free", "swing", "loaded", "weak")
 MASS = np.array([1.0, 2.5, 0.7, 4.0])
-OWN = ("Bend 3D", "AngleLimit 3D", "Area of loops 2D")  # with fields of their own; the others have those of Distance, or fewer
 IN_BATCHES = ("Bend 3D", "Volume of surfaces")  # tested in two batches of one world, see Row.like
 
 
@@ -234,17 +233,9 @@ def test_the_tables_hold_every_constraint():
     named = {name.split()[0].rstrip(",") for name in (*ROWS, *OTHERS)}
     assert named == set(constraints.__all__) and all(reason for *_, reason in OTHERS.values())
 
-    def fields(row):
-        one = row.make(np.arange(len(row.points))[None], np.zeros(1), compliance=[1e-2], damping=[1.0], break_at=1e9)
-        with tv.World(tv.Particles(row.points), [one]) as w:
-            return {field.partition(".")[2] for field in w.fields if not field.startswith("numbers.")}
-
-    plain = fields(ROWS["Distance 3D"])
-    assert {name for name, row in ROWS.items() if not fields(row) <= plain} == {*OWN}
-
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["Bend 3D", *OTHERS])
+@pytest.mark.parametrize("name", ["Bend 3D", *(name for name in OTHERS if name not in ("Motor of quads", "Path, driven"))])
 def test_a_batch_is_its_constraints_and_a_clone_is_its_world(world, name):
     # Two constraints in one batch, the second one of a Row soft. Then each alone, among the particles of both: in a batch of its
     # own where the code of batches differs (see Row.like), else in a world of its own, which reuses the kernels of the first.
@@ -299,7 +290,7 @@ def degenerate(row: Row) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.parametrize("name", [name for name in ROWS if name[:4] not in ("Rope", "Spac")])  # which are as Distance
 def test_nothing_explodes_where_a_constraint_has_no_direction(world, name):
     # Rows 15, 17, 54, 56: no NaN, and no particle moves further than its corners are apart, or than the constraint demands.
     row = ROWS[name]
@@ -324,16 +315,13 @@ def test_nothing_explodes_where_a_constraint_has_no_direction(world, name):
 
 
 FLAT = WINGS[[0, 3, 1, 2], :2]
-SOFT = {  # constraints that may be soft, and are no row of ROWS
+SPRUNG = ("Distance 3D", "Rope 2D", "AngleLimit 3D", "Dihedral 3D", "Area of loops 2D", "Constraint 3D")  # one of each kind
+SOFT = {  # constraints that may be soft, and are no row of ROWS; a Snap is as a Pin, Motor and Winch are as Bend and Rope
     "Pin": (FLAT[:1], lambda c, x, **soft: tv.Pin(c[:, 0], x[:, 0], **soft)),
-    "Snap": (FLAT[:1], lambda c, x, **soft: tv.Snap(c[:, 0], 100.0, x[0, 0], **soft)),
     "Path": (
         FLAT[:1], lambda c, x, **soft: tv.Path(c[:, 0], [x[0, 0] - (9, 0), x[0, 0] + (9, 0)], smooth=False, **soft)
     ),
-    "ShapeMatch 2D": (FLAT, lambda c, x, **soft: tv.ShapeMatch(c, x.reshape(-1, 2), **soft)),
     "ShapeMatch 3D": (WINGS, lambda c, x, **soft: tv.ShapeMatch(c, x.reshape(-1, 3), **soft)),
-    "Motor": (FLAT[:3], lambda c, x, **soft: tv.Motor(c, 0.0, **soft)),
-    "Winch": (FLAT[:2], lambda c, x, **soft: tv.Winch(c, 0.0, **soft)),
     "Volume of surfaces": (WINGS, lambda c, x, **soft: tv.Volume(np.concatenate([row[TETRA] for row in c]), **soft)),
 }  # fmt: skip
 STIFF = np.array([0.02, 0.05, 0.1, 0.2, 0.32, 0.5, 0.8, 1.3, 2.0, 5.0, 20.0])  # omega h, about, at 20 substeps
@@ -354,7 +342,7 @@ def springs(name: str) -> tuple[tv.Particles, list]:
         probe.prepare(tv.Particles(x.reshape(-1, dim)), np.ones(blocks * k))
         slopes, rest = probe.gradients(x.reshape(-1, dim)), probe.violation(x.reshape(-1, dim))
         size = (slopes**2).reshape(blocks, -1).sum(axis=1)
-        if name not in ("Rope 2D", "AngleLimit 3D", "Spacer 2D"):  # one-sided constraints just touch
+        if ROWS[name].bilateral:  # one-sided constraints just touch
             rest[: len(STIFF)] -= 0.1 * ROWS[name].off
         alpha = np.append(size[: len(STIFF)] / (1200 * STIFF) ** 2, [0.0, 1e-2])
         damping = np.append(np.zeros(len(STIFF) + 1), 3.0)
@@ -366,7 +354,7 @@ def springs(name: str) -> tuple[tv.Particles, list]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*ROWS, *SOFT])
+@pytest.mark.parametrize("name", [*SPRUNG, *SOFT])
 def test_starts_from_velocities_that_were_read_change_nothing(world, name):
     # Without gravity a block has the energy of its start. Starts from the velocities that are read, after each frame, may neither
     # pump a spring nor brake it by more than 1 - (1 - (omega h)^4 / 16). With the force of the substep before in them, they would
@@ -400,23 +388,22 @@ def test_starts_from_velocities_that_were_read_change_nothing(world, name):
 @pytest.mark.parametrize(
     ("dim", "solver", "settings"),
     [
-        (2, tv.Chebyshev(), [(20, 8), (100, 1)]),  # a single pass of Chebyshev is one of Jacobi
-        (2, tv.ConjugateGradient(), [(1, 1)]),
-        (3, tv.Direct(), [(100, 1)]),
+        (2, tv.ConjugateGradient(), (1, 1)),
+        (3, tv.Direct(), (100, 1)),
     ],
-    ids=["2D, Chebyshev", "2D, ConjugateGradient", "3D, Direct"],
+    ids=["2D, ConjugateGradient", "3D, Direct"],
 )
-def test_no_bad_start_flies(world, dim, solver, settings):
+def test_no_bad_start_flies(world, monkeypatch, dim, solver, settings):
     # Rigid constraints that nothing in the scene pulled apart have no energy to give, at any number of substeps. The violation
     # that is left before the first substep is removed at a third of its size per frame: 2 sizes in 6 frames, after the 2 that it
     # takes to meet the constraints. Passes alone would move bodies by their size in a substep: 600 sizes at 100 substeps.
-    bad = BadStart(dim)
+    # In space: what is not in the plane, and rods.
+    monkeypatch.setitem(bad_starts.BODIES, 3, bad_starts.SOLID | {"rods": bad_starts.BOTH["rods"]})
+    bad, (substeps, passes) = bad_starts.BadStart(dim), settings
     start = tv.Particles(bad.position, pinned=bad.pinned, mass=0.1)
-    w = world(start, bad.features, precision="f64", solver=solver)
-    for substeps, passes in settings:
-        w.velocity, w.position, w.substeps, w.iterations = np.zeros_like(bad.position), bad.position, substeps, passes
-        for frame in range(6):
-            report = w.step(1 / 60)
-            assert (bad.far(w.position) < 4).all() and ("moved" in report.flags) == (frame == 0)
-        assert "unconverged" in report.flags  # some constraints contradict each other
+    w = world(start, bad.features, precision="f64", solver=solver, substeps=substeps, iterations=passes)
+    for frame in range(6):
+        report = w.step(1 / 60)
+        assert (bad.far(w.position) < 4).all() and ("moved" in report.flags) == (frame == 0)
+    assert "unconverged" in report.flags  # some constraints contradict each other
     leave_nothing_behind(w)

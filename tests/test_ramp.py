@@ -14,16 +14,13 @@ def pendulum(world, *features, **options):
     return world(tv.Particles([[0.0, 0], [L, 0]], mass=M, pinned=[0]), [tv.Gravity(0.0), *features], **options)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Direct()], ids=str)
-def test_a_link_is_drawn_in_at_the_speed_of_the_frame(world, solver):
+def test_a_link_is_drawn_in_at_the_speed_of_the_frame(world):
     # The rest length goes from L to 0.9 L in a frame, so the particle moves at u = 0.1 L / dt and has m u^2 / 2, for any number
     # of substeps. A jump would be made in one substep, with m (0.1 L / h)^2 / 2. Then the particle stands still, because a link
     # also holds.
     link = tv.Distance([[0, 1]])
-    w = pendulum(world, link, solver=solver, precision="f64")
+    w = pendulum(world, link, solver=tv.Direct(), precision="f64")
     w.step(DT)
-    assert not any("rest_at" in name for name in w.fields)
     length = L
     for substeps in (1, 7, 200):
         w.substeps = substeps

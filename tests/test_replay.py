@@ -95,23 +95,23 @@ def bodies(precision="f32-compensated", **settings):
     return tv.World(tv.Particles(position), features, precision=precision, **settings)
 
 
-def swing(precision):
-    """Return a small scene whose state is more than positions: contacts with friction, a spring, moving targets."""
-    rope = S.rope((0, 0), (1, 0), 5)
+def swing(substeps, precision="f32"):
+    """Return a scene whose state is more than positions: contacts with friction, springs, a function, a moving target."""
+    rope, discs = S.rope((0, 1), (1, 1), points=8), np.stack([0.11 * np.arange(6), np.full(6, 0.05)], axis=1)
     features = [
-        tv.Gravity(9.81), tv.Distance(rope.links, compliance=1e-4), tv.Box((-2, -0.2), (2, 2), friction=0.3),
-        tv.Contact(friction=0.4), tv.Pin([0], (0.0, 0.0)),
+        tv.Gravity(9.81), tv.Distance(rope.links, compliance=1e-4), tv.Box((-2, 0), (2, 2), friction=0.3),
+        tv.Contact(friction=0.3), tv.Force(swirl), tv.Pin([0], (0.0, 1.0)),
     ]  # fmt: skip
-    x = np.concatenate([rope.position, [[0.5, 0.07], [0.62, 0.09]]])
-    return tv.World(tv.Particles(x, radius=0.05), features, substeps=4, precision=precision)
+    particles = tv.Particles(np.concatenate([rope.position, discs]), radius=0.05)
+    return tv.World(particles, features, substeps=substeps, precision=precision)
 
 
-def race(precision):
+def race(substeps, precision):
     """Return a scene in 3D: drag, a driven bead, a link that breaks."""
     x = np.array([[0, 1, 0], [0, 0, 0], [0, 0, 1], [0, 0, 2]], dtype=float)
     bead = tv.Path([0], [(0, 1, 0), (1, 1, 1), (2, 1, 0)], at=0.0)
     features = [tv.Gravity(9.81), tv.Drag(0.2), tv.Distance([(1, 2), (2, 3)], break_at=[np.inf, 2.0]), bead]
-    return tv.World(tv.Particles(x, pinned=[1]), features, substeps=4, precision=precision)
+    return tv.World(tv.Particles(x, pinned=[1]), features, substeps=substeps, precision=precision)
 
 
 def drive(world: tv.World, recorder: tv.Recorder, frames: int = 12) -> None:
@@ -167,13 +167,13 @@ def test_every_feature_is_built_again_from_its_description():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("build, precision", [(swing, "f64"), (race, "f32-compensated")])
+@pytest.mark.parametrize("build, precision", [(swing, "f32"), (race, "f32-compensated")])
 def test_round_trip(build, precision, tmp_path, built_once):
     path = tmp_path / "a.rrd"
-    with build(precision) as world, tv.Recorder(path, world) as recorder:
+    with build(4, precision) as world, tv.Recorder(path, world) as recorder:
         drive(world, recorder)
         end = world.hash()
-    recording = tv.replay(path)
+    recording = tv.replay(path, [swirl])
     assert recording.complete and list(recording.frames) == [*range(12)]
     verdict = recording.verify()
     assert verdict and verdict.frames == 12, verdict
@@ -183,15 +183,8 @@ def test_round_trip(build, precision, tmp_path, built_once):
 @pytest.mark.slow
 def test_a_world_that_is_saved_and_loaded_continues_bit_for_bit(tmp_path):
     # While a rope swings under "auto", falls on discs, and gravity waits to change; with a function of the user's.
-    path, rope = tmp_path / "saved.rrd", S.rope((0, 1), (1, 1), points=8)
-
-    def build():
-        discs = np.stack([0.11 * np.arange(6), np.full(6, 0.05)], axis=1)
-        particles = tv.Particles(np.concatenate([rope.position, discs]), radius=0.05, pinned=[0])
-        walls = [tv.Box((-1, 0), (2, 2)), tv.Contact(friction=0.3)]
-        return tv.World(particles, [tv.Gravity(), tv.Distance(rope.links), tv.Force(swirl), *walls], substeps="auto")
-
-    worlds = [build(), build()]
+    path = tmp_path / "saved.rrd"
+    worlds = [swing("auto"), swing("auto")]
     for world in worlds:
         world.run(0.5)
         world.features[0].g = 5.0
@@ -211,17 +204,6 @@ def test_a_world_that_is_saved_and_loaded_continues_bit_for_bit(tmp_path):
     with tv.Recorder(tmp_path / "run.rrd", loaded) as recorder:
         loaded.run(0.1, recorder=recorder)
     assert tv.load(tmp_path / "run.rrd", given=[swirl]).hash() == loaded.hash()
-
-
-def test_an_empty_world_is_replayed(tmp_path):
-    with tv.World(tv.Particles(np.zeros((0, 3))), [tv.Gravity()]) as world, tv.Recorder(tmp_path / "e.rrd", world) as recorder:
-        for _ in range(3):
-            world.step(1 / 60)
-            recorder.log()
-    recording = tv.replay(tmp_path / "e.rrd")
-    assert list(recording.frames) == [0, 1, 2, 3] and recording.position(3).shape == (0, 3) and recording.verify()
-    with pytest.raises(TypeError, match="frame"):  # the call is wrong, not the file
-        recording.world()  # type: ignore[call-arg]
 
 
 def test_what_comes_and_goes_is_replayed(world, tmp_path):
@@ -247,6 +229,7 @@ def test_what_comes_and_goes_is_replayed(world, tmp_path):
         recording.export("c.npz")
 
 
+@pytest.mark.slow
 def test_what_auto_tried_in_vain_is_replayed(world, tmp_path):
     # What the controller stores about a frame that nothing improves is hashed; from a file it returns as Python numbers.
     features = [tv.Gravity(), tv.HalfSpace((0, 1), 0), tv.Contact()]

@@ -190,27 +190,6 @@ PLANTS = {
         "error_vs_time('D01', methods=['Jacobi'], precisions=('f64',), efforts=(20, 40, 80), baselines=False, runs=1)",
         [("constraints/core/corner_passes.py", "n = self.quantity.measure(c, start)", "n = self.quantity.measure(c, now)")],
     ),
-    "averaging by the count of constraints": (
-        "error_vs_time('M01', precisions=('f64',), efforts=(20,), baselines=False, runs=1)",
-        [
-            ("solvers/slots.py", "scene.count, values=blocks * inv_mass)", "scene.count, values=inv_mass)"),
-            (
-                "solvers/slots.py",
-                "        return total\n",
-                "        return total / ti.max(self.begin[i + 1] - self.begin[i], 1)\n",
-            ),
-        ],
-    ),
-    "one contact in a hundred dropped": (
-        "stress(rows=[30])",
-        [
-            (
-                "neighbours/neighbour_search.py",
-                "< far * far, ti.i32) & ti.cast(i != j, ti.i32)",
-                "< far * far, ti.i32) & ti.cast((i + j) % 100 != 7, ti.i32)",
-            )
-        ],
-    ),
     "gravity lost in f32": (
         "stress(rows=[11])",
         [

@@ -56,15 +56,15 @@ FAN, SIMPLEX = [(-0.5, 0), (0.5, 0), (0, -1)], [(0, 0, 0), (1, 0, 0), (0, 0, 1),
 def all_kinds(dim):
     """Return bodies whose weight is borne by each kind of rigid constraint, at an arm of 1 m where it is a moment."""
     bodies = Bodies(dim)
-    for make in (tv.Distance, tv.Rope, lambda p: tv.Winch(p, 0.0), lambda p: tv.Constraint(length, p, rest=2.0)):
-        bodies.put(HANGING, make, WEIGHT)
-    bodies.put([(0, 0), (0, 2)], lambda pairs: tv.Spacer(pairs, 2.0), WEIGHT)
     bodies.put(BENT, tv.Bend, WEIGHT)
     bodies.put(BENT, lambda triples: tv.AngleLimit(triples, np.pi / 2, 3.0), WEIGHT)
     bodies.put([(0, 0), (0, -1), (0, -2)], lambda three: tv.ShapeMatch(three[:, 1:]), WEIGHT, held=1)
     bodies.features.append(tv.Distance([(len(bodies.x) - 3, len(bodies.x) - 2)]))  # the link from which the cluster hangs
     bodies.loads.append(2 * WEIGHT)
     if dim == 2:
+        for make in (tv.Distance, tv.Rope, lambda p: tv.Winch(p, 0.0), lambda p: tv.Constraint(length, p, rest=2.0)):
+            bodies.put(HANGING, make, WEIGHT)
+        bodies.put([(0, 0), (0, 2)], lambda pairs: tv.Spacer(pairs, 2.0), WEIGHT)
         bodies.put(BENT, lambda hinges: tv.Motor(hinges, 0.0), WEIGHT)
         bodies.put(FAN, tv.Area, 2 * WEIGHT)  # the area changes by 1 / 2 m^2 per m
         bodies.put([(0, -2)], lambda one: tv.Path(one[:, 0], [(0, -2), (1e3, -2)], smooth=False), WEIGHT, held=0)
@@ -124,14 +124,14 @@ BREAKING = [  # corners, the feature that holds them, its load, the number of pi
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", ["fused", "launched", "many"])
+@pytest.mark.parametrize("path", ["fused", "many"])
 def test_only_what_is_too_weak_breaks_where_the_substep_changes(world, path):
     # Two of each kind: one can bear a thousandth more than it has to, the other a thousandth less. None: velocities are given.
     bodies = Bodies(2)
     kinds = [bodies.put(corners, make, load, held, copies=2) for corners, make, load, held in BREAKING]
     upper = bodies.features[-1].indices.reshape(2, 2)[:, 0]
     bodies.features.append(tv.Distance(np.stack([upper - 1, upper], axis=1)))
-    with bodies.world(world, iterations=60, path="fused" if path == "many" else path) as made:
+    with bodies.world(world, iterations=60, path="fused") as made:
         made.step(H)
         for ratio in (*RATIOS, None):
             with tv.Worlds(made, 2) if path == "many" else made.clone() as w:
@@ -178,12 +178,11 @@ def test_rounding_breaks_nothing_and_holds_nothing(world):
     assert broken(w) == len(kinds) * [[True, True]]
 
 
-@pytest.mark.parametrize("angle", [60, 90, 120])
-def test_a_pendulum_breaks_at_its_strength_under_auto(world, angle):
+def test_a_pendulum_breaks_at_its_strength_under_auto(world):
     # Released at rest at an angle a, the pendulum pulls with T = m g (3 cos b - 2 cos a) at b, and most at its lowest point. The
     # load of a substep is the mean over a time around it that is at most a frame. So the link breaks within a frame of where T
     # passes its strength. A link that is stronger than the largest T, by more than the error of the motion, holds.
-    a = np.radians(angle)
+    a = np.radians(120)
     top = 3 - 2 * np.cos(a)
     links = [tv.Distance([(0, 1)], break_at=share * top * G) for share in (0.6, 0.8, 0.95, 1.02)]
     for link, share in zip(links, (0.6, 0.8, 0.95, 1.02), strict=True):
@@ -234,44 +233,45 @@ def test_a_start_gives_the_impulse_of_a_whole_frame(world, restitution):
         w.position, w.velocity = start.position, start.velocity  # another start
 
 
-def falling(kind):
-    """Return what falls, for world(): particles from 1 m up at 3 m/s, and the features that hold them together."""
-    square = [(0, 0), (0.5, 0.05), (0.45, 0.55), (-0.05, 0.5)]
-    sides, loop = [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3)], [[0, 1, 2, 3]]
-    x, features = {
-        "disc": ([(0, 0)], [tv.Contact()]),
-        "dumbbell": ([(0, 0), (0.5, 0.3)], [tv.Distance([(0, 1)]), tv.Contact()]),
-        "rope": ([(0, 0.2 * k) for k in range(8)], [tv.Distance([(k, k + 1) for k in range(7)]), tv.Contact()]),
-        "truss": (square, [tv.Distance(sides), tv.Contact()]),
-        "cluster": (square, [tv.ShapeMatch(loop), tv.Contact()]),
-        "box": (square, [tv.ShapeMatch(loop), tv.Polygons(loop)]),
-    }[kind]
-    radius = 0.0 if kind == "box" else 0.05
-    return tv.Particles(np.add(x, (0.0, 1.0)), radius=radius, mass=MASS, velocity=(1.0, -3.0)), features
+SIDES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3)])
+BLOCK = [(0, 0), (0.5, 0.05), (0.45, 0.55), (-0.05, 0.5)]
+ROPE = [(0, 0.2 * k) for k in range(8)]
+FALLING = {  # a floor, bodies of one world, and what holds their particles, numbered from 0
+    "discs": (
+        tv.Capsule((-9, -1), (40, -1), 1.0, events=True),
+        [BLOCK, BLOCK, [(0, 0)], [(0, 0), (0.5, 0.3)], ROPE],
+        lambda: [
+            tv.Distance(np.concatenate([SIDES, [(9, 10)], [(11 + k, 12 + k) for k in range(7)]])),
+            tv.ShapeMatch([range(4, 8)]),
+            tv.Contact(),
+        ],
+    ),
+    "outline": (tv.HalfSpace((0, 1), events=True), [BLOCK], lambda: [tv.ShapeMatch([range(4)]), tv.Polygons([range(4)])]),
+}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["disc", "dumbbell", "rope", "truss", "cluster", "box"])
+@pytest.mark.parametrize("kind", FALLING)
 def test_walls_give_all_the_momentum_of_a_landing(world, kind):
     # sum J = sum m (v - v_0) + m g t, whatever lands, on a plane as on a rod. An impulse counts until the middle of the last
-    # substep, and a velocity until its end, with half of a kick: m g h / 2 for each particle.
-    up = np.array([0.0, 1.0])
-    for floor in (tv.HalfSpace(up, events=True), tv.Capsule((-9, -1), (9, -1), 1.0, events=True)):
-        for n in (2, 60):
-            start, features = falling(kind)
-            w = world(start, [tv.Gravity(G), *features, floor.copy()], substeps=n, precision="f64")
-            given = 0.0
-            for _ in range(90):
-                w.step(1 / 60)
-                given += w.wall_events().touches.impulse.sum()
-            count = len(w.position)
-            gained = MASS * (w.velocity - start.velocity)[:, 1].sum() + count * WEIGHT * w.time
-            assert abs(given - gained) < 1.1 * count * WEIGHT / 60 / n / 2 + 1e-9, (type(floor).__name__, n)
+    # substep, and a velocity until its end, with half of a kick: m g h / 2 for each particle. Bodies are 6 m apart.
+    floor, bodies, held = FALLING[kind]
+    x = np.concatenate([np.add(body, (6.0 * k, 1.0)) for k, body in enumerate(bodies)])
+    start = tv.Particles(x, radius=0.05 if kind == "discs" else 0.0, mass=MASS, velocity=(1.0, -3.0))
+    for substeps in (2, 60):
+        w = world(start, [tv.Gravity(G), *held(), floor.copy()], substeps=substeps, precision="f64")
+        given, sizes = np.zeros(len(x)), np.array([len(body) for body in bodies])
+        for _ in range(90):
+            w.step(1 / 60)
+            touches = w.wall_events().touches
+            np.add.at(given, touches.pairs[:, 0], touches.impulse)
+        gained = MASS * (w.velocity - start.velocity)[:, 1] + WEIGHT * w.time
+        off = np.add.reduceat(given - gained, np.cumsum([0, *sizes[:-1]]))
+        assert (np.abs(off) < 1.1 * sizes * WEIGHT / 60 / substeps / 2 + 1e-9).all(), off
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [tv.Distance, tv.Rope])
-@pytest.mark.parametrize("substeps", [4, 20, 60])
+@pytest.mark.parametrize(("make", "substeps"), [(tv.Distance, 4), (tv.Rope, 60)])
 def test_a_blow_breaks_a_spring_that_is_weaker_than_its_peak(world, make, substeps):
     # A weight at v on a spring k at its rest length: F = m g + sqrt((m g)^2 + k m v^2) at most. N = 16 substeps in a period
     # 2 pi sqrt(m / k) see at least cos(pi / N) = 0.98 of it.
@@ -300,7 +300,7 @@ def test_what_sags_holds_where_the_substep_gets_shorter(world):
     # A pass holds a moment by a sag that falls with h^2: 1e-4 rad here. In a substep of a half to a tenth of the length, this sag
     # would be 4 to 100 times the moment. It stays that moment, but for what vibrates, and in the end without.
     particles = tv.Particles([(0, 1), (0, 0), (1, 0), (2, 0)], mass=[1, 1, 2, 1], pinned=[0, 1])
-    for ratio in (2, 4, 10):
+    for ratio in (2, 10):
         angles = tv.Bend([[0, 1, 2], [1, 2, 3]], break_at=np.inf)
         w = world(particles, [tv.Gravity(G), tv.Distance([[1, 2], [2, 3]]), angles], precision="f64")
         w.run(2.0)
@@ -338,8 +338,7 @@ def test_what_is_moved_steadily_bears_its_weight_in_f32(world):
         np.testing.assert_allclose([f.load[0] for f in bodies.features[:6]], expected, rtol=1e-3)
 
 
-@pytest.mark.parametrize("path", ["fused", "parallel"])
-@pytest.mark.parametrize("substeps", [4, 20])
+@pytest.mark.parametrize(("substeps", "path"), [(4, "fused"), (20, "launched")])
 def test_what_breaks_first_unloads_the_others(world, path, substeps):
     # 20 kg on a chain of 20 links that bear 50 N each: the uppermost one bears most, 216 N, and breaks. The rest falls freely.
     x, k = np.stack([np.zeros(21), -0.1 * np.arange(21)], axis=1), np.arange(20)

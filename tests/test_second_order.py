@@ -48,21 +48,6 @@ def test_pendulum_state(world):
     assert w.features[1].load[1] == pytest.approx(9.81 * v["tension_over_mg"], rel=1e-2)  # half a step late
 
 
-@pytest.mark.parametrize("precision", ["f32", "f32-compensated"])
-def test_pendulum_in_f32_stays_near_f64(world, precision):
-    v = case("R06b_pendulum_state")["values"]["90deg_t10"]
-    made = []
-    for p in (precision, "f64"):
-        w = world(
-            tv.Particles([[0, 0], [1.0, 0]], pinned=[0]),
-            [tv.Gravity(9.81), tv.Distance([[0, 1]])],
-            precision=p,
-        )
-        made.append(rerun(w, 10.0, substeps=10).position)
-    assert rms(made[0][1], [v["x"], v["y"]]) <= 3e-4
-    assert rms(made[0], made[1]) <= 2e-4  # row 68: the floor of f32, numerics 4.6
-
-
 def test_compensated_pendulum_far_from_the_origin(world):
     # Row 27: at 1e4 m an ulp of f32 is 1 mm, at 1e6 m 6 cm, and (position, previous position) would lose the motion altogether.
     # With the low word the error, including that of the method, is at most 2e-4 m for h = 1/600 to 1e-4.
@@ -84,22 +69,6 @@ def test_double_pendulum(world):
     known = figures(name, 2.0, 20)
     assert errors[0] <= known["SHAKE-direct"] and errors[0] * 100 <= known["XPBD-GS"]
     assert rms(rerun(w, 5.0, substeps=20, iterations=1).position[1:], late) <= 6.3e-4  # numerics 4.4, SHAKE-Jacobi
-
-
-def test_triple_pendulum_with_one_jacobi_pass(world):
-    name = "D03_mueller_triple"
-    w = hang(world, name)
-    for substeps, figure in ((20, 2.6e-2), (50, 4.1e-3), (100, 1.0e-3)):
-        error = rms(rerun(w, 1.0, substeps=substeps).position[1:], case(name)["values"]["t1.0"]["xy"])
-        assert float(f"{error:.1e}") <= figure  # numerics 4.4 gives two digits
-
-
-def test_triple_pendulum_keeps_its_energy(world):
-    # The public challenge: XPBD keeps 52 % after 10 s of the energy above the lowest state, in which all links hang down.
-    w = rerun(hang(world, "D03_mueller_triple"), 10.0, substeps=50)
-    p = case("D03_mueller_triple")["params"]
-    lowest = -p["g"] * np.array(p["masses"]) @ np.cumsum(p["lengths"])
-    assert 0.995 <= (w.last.energy - lowest) / (p["energy0"] - lowest) <= 1.0
 
 
 def test_spherical_pendulum(world):
@@ -142,15 +111,14 @@ def test_elastic_pendulum(world):
     assert errors[0] * 100 <= 1.2e-2
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_a_free_rod_spins_for_ever(world, dim):
+def test_a_free_rod_spins_for_ever(world):
     # Row 44 and S09: with PBD's direction, 60 to 76 % of the spin would be lost in these times.
-    x = np.array([[0.25, 0, 0], [-0.75, 0, 0]])[:, :dim]
+    x, across = np.array([[0.25, 0, 0], [-0.75, 0, 0]]), np.array([[0, 0.25, 0], [0, -0.75, 0]])
     start = tv.Particles(x, mass=[3.0, 1.0])
     w = world(start, [tv.Distance([[0, 1]])], substeps=10, precision="f64", solver=tv.Jacobi())
     for (omega, h, t), iterations in product([(50.0, 1e-3, 1.0), (10.0, 1 / 600, 10.0), (100.0, 1 / 1200, 1.0)], (1, 3)):
         w.iterations = iterations
-        w.velocity, w.position = omega * np.array([[0, 0.25, 0], [0, -0.75, 0]])[:, :dim], x
+        w.velocity, w.position = omega * across, x
         w.step(10 * h)
         turn = []
         for _ in range(2):
@@ -170,7 +138,7 @@ def test_a_free_rod_spins_for_ever(world, dim):
     # change of h. With the force along the direction at the start of the substep, the momentum would be off by
     # (omega h)^2 / 2 = 3e-4.
     omega, h, w.iterations = 37.0, 7e-4, 3
-    w.velocity, w.position = omega * np.array([[0, 0.25, 0], [0, -0.75, 0]])[:, :dim], x
+    w.velocity, w.position = omega * across, x
     for substeps in (1, 1, 1, 2, 2, 1, 3):
         w.substeps = substeps
         w.step(h)

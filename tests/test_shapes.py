@@ -182,7 +182,7 @@ def test_joining():
         S.join()
 
 
-@pytest.mark.parametrize("name", ["ball 3D", "balloon", "blob", "rope", "cloth 3D"])
+@pytest.mark.parametrize("name", ["ball 3D", "blob", "rope"])
 @pytest.mark.parametrize("ending, binary", [("obj", False), ("ply", False), ("ply", True)])
 def test_files_there_and_back(tmp_path, name, ending, binary):
     body, path = BODIES[name], tmp_path / f"body.{ending}"
@@ -261,24 +261,17 @@ def test_files_that_are_refused(tmp_path, name, text, message):
         S.load(tmp_path / name)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [(0.4, 0.2), (0.5, 0.3, 0.4)])
-def test_boxes_have_their_size_and_stand_on_their_sides(size):
-    # Two boxes, one on the other, on a floor: their centers come to rest at a half and one and a half of their height.
-    dim = len(size)
-    both, slices = S.join(*(S.box([0, y * size[1], 0][:dim], size, radius=0.05) for y in (0.55, 1.6)))
-    for s in slices:
-        x, r = both.position[s], both.radius[s, None]
-        np.testing.assert_allclose((x + r).max(axis=0) - (x - r).min(axis=0), size)
-    groups = [np.arange(s.start, s.stop) for s in slices]
-    contact = tv.Polygons(both.loops, friction=0.5) if dim == 2 else tv.Contact(friction=0.5)
-    walls = [tv.ShapeMatch(groups), contact, tv.HalfSpace([0, 1, 0][:dim])]
-    world = tv.World(tv.Particles(both.position, radius=both.radius), [tv.Gravity(), *walls], substeps=8)
-    world.run(1.5)
-    middle = [world.position[s].mean(axis=0) for s in slices]
-    np.testing.assert_allclose(middle, [[0, h * size[1], 0][:dim] for h in (0.5, 1.5)], atol=2e-3)
-    for k in range(3 if dim == 3 else 0):  # spheres are at most two radii apart along each axis
-        assert np.diff(np.unique(both.position[slices[0], k])).max() <= 2 * 0.05 + 1e-12
+def test_boxes_have_their_size_and_even_sides(size):
+    # Each side has as much at its very edge as the opposite one, and spheres are at most two radii apart along each axis.
+    box = S.box(np.zeros(len(size)), size, radius=0.05)
+    x, r = box.position, box.radius[:, None]
+    np.testing.assert_allclose((x + r).max(axis=0), np.array(size) / 2)
+    np.testing.assert_allclose((x - r).min(axis=0), -np.array(size) / 2)
+    low, high = ((side - extreme(side, axis=0) == 0).sum(axis=0) for side, extreme in ((x, np.min), (x, np.max)))
+    assert (low == high).all() and low.min() >= 2 ** (len(size) - 1)
+    for k in range(3 if len(size) == 3 else 0):
+        assert np.diff(np.unique(x[:, k])).max() <= 2 * 0.05 + 1e-12
 
 
 @pytest.mark.parametrize(
@@ -310,7 +303,7 @@ def test_bodies_that_are_refused(make, message):
         make()
 
 
-@pytest.mark.parametrize("spacing", [0.3, 0.2, 0.15, 0.09, 0.08])
+@pytest.mark.parametrize("spacing", [0.3, 0.2, 0.08])
 @pytest.mark.parametrize("outline", ["square", "L", "circle"])
 def test_a_blob_fills_outlines_whose_points_lie_on_lines_and_circles(outline, spacing):
     """The areas of the triangles add up to that inside of the outline, and n - edges + faces = 1 (Euler), at any spacing."""
@@ -328,16 +321,22 @@ def test_a_blob_fills_outlines_whose_points_lie_on_lines_and_circles(outline, sp
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["rope", "bridge", "tree 2D", "ball 2D", "ball 3D", "blob", "cloth 3D", "balloon", "ragdoll 2D", "ragdoll 3D"]
+    "names",
+    [("rope", "bridge", "tree 2D", "ball 2D", "blob", "ragdoll 2D"), ("ball 3D", "cloth 3D", "balloon", "ragdoll 3D")],
+    ids=["2D", "3D"],
 )
-def test_shapes_work_as_they_come(name, world):
-    """Each with its own constraints, thick enough to touch itself, falls on a floor at the default settings: no flag."""
-    s = BODIES[name]
-    links = np.concatenate([s.links, s.braces])
-    dim, short = s.position.shape[1], np.linalg.norm(s.position[links[:, 0]] - s.position[links[:, 1]], axis=1).min()
-    up = np.eye(dim)[1]
-    features = [tv.Gravity(9.81 * -up), tv.Distance(links), tv.HalfSpace(up, s.position[:, 1].min() - 1.0), tv.Contact()]
-    features += [tv.AngleLimit(s.limits, s.lower, s.upper)] if len(s.limits) else []
-    features += [tv.Area(list(s.loops))] if s.loops else []
-    w = world(tv.Particles(s.position, radius=s.radius if s.radius.any() else 0.4 * short), features)
-    assert not w.run(2.0).flags
+def test_shapes_work_as_they_come(names, world):
+    """With their own constraints, thick enough to touch themselves, they fall on a floor at the default settings: no flag."""
+    parts, radii = [], []
+    for k, name in enumerate(names):
+        s = BODIES[name]
+        links = s.position[np.concatenate([s.links, s.braces])]
+        short = np.linalg.norm(links[:, 0] - links[:, 1], axis=1).min()
+        parts.append(s.moved([20.0 * k, 1.0 - s.position[:, 1].min(), 0][: s.position.shape[1]]))
+        radii.append(s.radius if s.radius.any() else np.full(len(s), 0.4 * short))
+    s, _ = S.join(*parts)
+    up = np.eye(s.position.shape[1])[1]
+    features = [tv.Gravity(9.81 * -up), tv.Distance(np.concatenate([s.links, s.braces])), tv.HalfSpace(up), tv.Contact()]
+    features += [tv.AngleLimit(s.limits, s.lower, s.upper), *([tv.Area(list(s.loops))] if s.loops else [])]
+    w = world(tv.Particles(s.position, radius=np.concatenate(radii)), features)
+    assert not w.run(1.2).flags

@@ -8,12 +8,12 @@ import tiverlet as tv
 G, SUBSTEPS = 9.81, 8
 
 
-def net(world, solver=None, iterations=1, drag=1.0, compliance=0.0, **settings):
+def net(world, solver=None, iterations=1, drag=1.0, **settings):
     """Return a net of 11 x 11 in 2D that hangs by its upper corners."""
     shape = tv.shapes.net((0, 0), (1, 0), (0, 1), points=(11, 11))
     corners = np.flatnonzero((shape.position[:, 1] == 1) & np.isin(shape.position[:, 0], (0, 1)))
     particles = tv.Particles(shape.position, mass=0.01, pinned=corners)
-    features = [tv.Gravity(G), tv.Distance(shape.links, compliance=compliance), *([tv.Drag(drag)] if drag else [])]
+    features = [tv.Gravity(G), tv.Distance(shape.links), tv.Drag(drag)]
     return world(particles, features, solver=solver, iterations=iterations, substeps=SUBSTEPS, **settings)
 
 
@@ -50,10 +50,7 @@ def truss(world):
 
 
 SCENES = {
-    "net": net,
-    "net, Jacobi": lambda world: net(world, tv.Jacobi()),
     "net, Chebyshev": lambda world: net(world, tv.Chebyshev(), 4),
-    "net of springs": lambda world: net(world, compliance=1e-5),
     "cloth": cloth,
     "rope": rope,
     "beam": beam,
@@ -77,7 +74,7 @@ def test_what_hangs_or_stands_comes_to_rest(world, scene):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver, iterations", [(None, 1), (tv.Jacobi(), 1), (tv.Chebyshev(), 4)], ids=repr)
+@pytest.mark.parametrize("solver, iterations", [(None, 1), (tv.Jacobi(), 1)], ids=repr)
 def test_a_net_rests_where_it_does_in_the_longest_frames(world, solver, iterations):
     # s W h^2 is that of the longer frames, and so is the sag s W h^2 F, but for less than a move g h^2 k of row k in a substep.
     long, short, turns = (net(world, solver, iterations, drag=3.0, precision="f64") for _ in range(3))
@@ -97,13 +94,14 @@ def test_a_net_rests_where_it_does_in_the_longest_frames(world, solver, iteratio
     assert max(speeds[60:]) < 2 * sag + G / 60 / SUBSTEPS
 
 
+@pytest.mark.slow
 def test_uneven_frames_lend_no_energy_to_what_swings(world):
     # An undamped net that is let go level, in frames of which a slow machine makes some longer. Links stiffen after these.
     # They do so slowly, and only while the net, with what links store, has less energy than at the start.
     shape = tv.shapes.net((0, 0), (1, 0), (0, -1), points=(9, 9))
     x = np.stack([shape.position[:, 0], 0 * shape.position[:, 0], -shape.position[:, 1]], axis=1)
     start = tv.Particles(x, mass=0.01, pinned=np.flatnonzero((x[:, 2] == 0) & np.isin(x[:, 0], (0, 1))))
-    for solver, substeps in ((tv.ConjugateGradient(5), SUBSTEPS), (tv.Jacobi(), SUBSTEPS), (tv.Jacobi(), 2)):
+    for solver, substeps in ((tv.ConjugateGradient(5), SUBSTEPS), (tv.Jacobi(), 2)):
         w = world(start, [tv.Gravity((0, -G, 0)), tv.Distance(shape.links)], solver=solver, substeps=substeps)
         for frame in range(600):
             report = w.step(1 / 30 if frame % 240 == 0 else 1 / 60)
@@ -143,10 +141,10 @@ def braced(n, height):
 
 def sheet(world, solver=None):
     """Return a taut net between four pins, and m g L."""
-    shape = tv.shapes.net((0, 0, 0), (1, 0, 0), (0, 1, 0), points=(7, 7))
+    shape = tv.shapes.net((0, 0, 0), (1, 0, 0), (0, 1, 0), points=(5, 5))
     corners = np.flatnonzero(np.isin(shape.position, (0, 1))[:, :2].all(axis=1))
-    features = [tv.Gravity((0, 0, -G)), tv.Distance(shape.links)]
-    return world(tv.Particles(shape.position, mass=0.02, pinned=corners), features, solver=solver or tv.Jacobi()), 0.98 * G
+    features = [tv.Gravity((0, 0, -G)), tv.Distance(shape.links), tv.Drag(0.0)]
+    return world(tv.Particles(shape.position, mass=0.02, pinned=corners), features, solver=solver or tv.Jacobi()), 0.5 * G
 
 
 def block(world):
@@ -156,24 +154,18 @@ def block(world):
     return world(tv.Particles(np.concatenate([x, y + [0.1, 0]]), mass=0.1, radius=0.05), features), 3.2 * G * 2
 
 
-def standing(world):
-    """Return a braced beam that falls on the ground, and m g L."""
-    x, links = braced(8, 0.5)
-    return world(tv.Particles(x, mass=0.1), [tv.Gravity(G), tv.Distance(links), tv.HalfSpace((0, 1))]), 1.6 * G * 2
-
-
 def jelly(world, *features):
     """Return clusters that share their corners and fall on the ground, and m g L."""
     x = 0.2 * np.stack([np.arange(25) // 5, np.arange(25) % 5 + 2.5], axis=1)
     squares = [[5 * i + j + k for k in (0, 1, 5, 6)] for i in range(4) for j in range(4)]
-    features = [tv.Gravity(G), tv.ShapeMatch(squares), tv.HalfSpace((0, 1)), *features]
+    features = [tv.Gravity(G), tv.ShapeMatch(squares), tv.HalfSpace((0, 1)), *features, tv.Drag(0.0)]
     return world(tv.Particles(x, mass=0.1, radius=0.05), features), 2.5 * G
 
 
 def weight(world):
     """Return a chain that Jacobi solves, with a weight of 200 links, and m g L."""
     x = np.stack([0.05 * np.arange(25), np.zeros(25)], axis=1)
-    features = [tv.Gravity(G), tv.Distance(np.stack([np.arange(24), np.arange(1, 25)], axis=1))]
+    features = [tv.Gravity(G), tv.Distance(np.stack([np.arange(24), np.arange(1, 25)], axis=1)), tv.Drag(0.0)]
     return world(tv.Particles(x, mass=[0.05] * 24 + [10.0], pinned=[0]), features, solver=tv.Jacobi()), 11.2 * G * 1.2
 
 
@@ -186,16 +178,17 @@ def pinned(world):
 
 PASSIVE = {
     "net": sheet, "net by gradients": lambda world: sheet(world, tv.ConjugateGradient(5)),
-    "beams among contacts": block, "beam": standing, "jelly": jelly, "weight": weight, "springs": pinned,
+    "beams among contacts": block, "jelly": jelly, "weight": weight, "springs": pinned,
     "jelly among contacts": lambda world: jelly(world, tv.Contact(friction=0.3)),
 }  # fmt: skip
+DRAWN = np.random.default_rng(0).random(15)  # each holds for four frames, since what settles may take a second
 SCHEDULES = {
-    "random": lambda k, rng: (int(2 ** rng.uniform(0, 6)), 1 / 60),
-    "in turns": lambda k, rng: ([2, 32, 5, 17, 1, 64][k // 10 % 6], 1 / 60),
-    "once": lambda k, rng: (2 if k < 60 else 64, 1 / 60),
-    "auto": lambda k, rng: ("auto", 1 / 60),
-    "uneven": lambda k, rng: (8, 2 ** rng.uniform(-1, 1) / 60),
-    "a hitch": lambda k, rng: (8, 0.1 if k == 60 else 1 / 60),
+    "random": lambda k: (int(64 ** DRAWN[k // 4]), 1 / 60),
+    "in turns": lambda k: ([2, 32, 5, 17, 1, 64][k // 10 % 6], 1 / 60),
+    "once": lambda k: (2 if k < 30 else 64, 1 / 60),
+    "auto": lambda k: ("auto", 1 / 60),
+    "uneven": lambda k: (8, 4 ** (DRAWN[k // 4] - 0.5) / 60),
+    "a hitch": lambda k: (8, 0.1 if k == 30 else 1 / 60),
 }
 
 
@@ -208,11 +201,10 @@ def test_no_schedule_of_substeps_brings_in_energy(world, scene):
     w, size = PASSIVE[scene](world)
     x, v = w.position, w.velocity
     for name, schedule in SCHEDULES.items():
-        w.position, w.velocity, rng = x, v, np.random.default_rng(0)
-        start = None
-        for k in range(180):
-            w.substeps, dt = schedule(k, rng)
-            twin = w.clone() if k % (9 if name == "random" else 60) == 8 else None
+        w.position, w.velocity, start = x, v, None
+        for k in range(20 if name == "auto" else 60):
+            w.substeps, dt = schedule(k)
+            twin = w.clone() if k % (20 if name == "random" else 60) == 8 else None
             energy = w.step(dt).energy
             if twin:
                 twin.step(dt)
@@ -222,11 +214,12 @@ def test_no_schedule_of_substeps_brings_in_energy(world, scene):
             assert energy < start + 1e-3 * size, (name, k, (energy - start) / size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["net", "jelly", "weight"])
 def test_what_sags_rests_where_it_would_after_a_change(world, scene):
     # 1 / 32 of the substep makes the sag 1 / 1000; some seconds later nothing tells that it was larger.
     w, _ = PASSIVE[scene](world)
-    w.add(features=[tv.Drag(5.0)])
+    w.features[-1].rate = 5.0
     x, ends = w.position, []
     for before in (2, 64):
         w.position, w.velocity = x, np.zeros_like(x)

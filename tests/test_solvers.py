@@ -7,7 +7,6 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.device import ti
-from tiverlet.report.accuracy import points
 from tiverlet.solvers.solver import SemiIteration, Solver
 from tiverlet.solvers.spectrum import largest_eigenvalue
 
@@ -25,10 +24,9 @@ def cloth(n, shear=False):
     return np.stack([column, 0 * row, row], axis=1) / (n - 1), np.vstack(pairs)
 
 
-@pytest.mark.parametrize("shear, figure", [(False, 0.66), (True, 0.53)])
-def test_largest_eigenvalue_of_a_net(world, shear, figure):
-    # Numerics 4.3: 0.66 for a square net, 0.53 for cloth with shear; the dense matrix has the same eigenvalue.
-    x, pairs = cloth(12, shear)
+def test_largest_eigenvalue_of_a_net(world):
+    # Numerics 4.3: 0.53 for cloth with shear; the dense matrix has the same eigenvalue.
+    x, pairs = cloth(12, shear=True)
     w = world(tv.Particles(x, pinned=np.arange(12)), [tv.Gravity(9.81), tv.Distance(pairs)], solver=tv.Jacobi("auto"))
     r = x[pairs[:, 0]] - x[pairs[:, 1]]
     r /= np.linalg.norm(r, axis=1)[:, None]
@@ -41,9 +39,11 @@ def test_largest_eigenvalue_of_a_net(world, shear, figure):
     A = np.einsum("jia,i,kia->jk", G, inv, G)[np.ix_(alive, alive)] / np.sqrt(np.outer(D[alive], D[alive]))
     value = float(np.linalg.eigvalsh(A).max())
     assert largest_eigenvalue(w._runner.scene, [w.features[1]], split) == pytest.approx(value, rel=1e-3)
-    assert value == pytest.approx(figure, rel=0.03)
+    assert value == pytest.approx(0.53, rel=0.03)
     assert w._runner.scene.slots.relaxation == pytest.approx(1.2 / value, rel=1e-3)
     assert f"relaxation {1.2 / value:.3g}" in w.explain()
+    springs = world(tv.Particles(np.eye(2)), [tv.Distance([[0, 1]], compliance=1e-3)], solver=tv.Jacobi("auto"))
+    assert springs._runner.scene.slots.relaxation == 1.0  # which more would change
 
 
 def test_the_largest_safe_relaxation_is_stable_and_better(world):
@@ -55,11 +55,6 @@ def test_the_largest_safe_relaxation_is_stable_and_better(world):
         assert report.energy <= 1e-6 and report.flags <= {"unconverged"}
         left.append(report.residual)
     assert left[1] < 0.6 * left[0]
-
-
-def test_auto_is_one_where_springs_would_change(world):
-    w = world(tv.Particles(np.eye(2)), [tv.Distance([[0, 1]], compliance=1e-3)], solver=tv.Jacobi("auto"))
-    assert w._runner.scene.slots.relaxation == 1.0
 
 
 def hung(world, solver, n=10, **settings):
@@ -171,7 +166,6 @@ POLYNOMIALS = [
     (tv.Jacobi(1.2), lambda solver, eigenvalue, k: (1 - solver.relaxation * eigenvalue) ** k),
     (Damped(), lambda solver, eigenvalue, k: (1 - eigenvalue / 2) ** k),
     (tv.Chebyshev(), chebyshev),
-    (tv.Chebyshev(kappa=5), chebyshev),
     (HeavyBall(), recursive),
 ]
 
@@ -218,7 +212,7 @@ def test_64_chebyshev_refuses_what_is_unstable(world):
 def test_chebyshev_has_the_same_bits_on_all_paths(world):
     # For systems see test_determinism.py.
     hashes = []
-    for path in ("fused", "parallel", "launched"):
+    for path in ("fused", "launched"):
         x, pairs = cloth(8)
         features = [tv.Gravity(9.81), tv.Distance(pairs), tv.Rope([[0, 9], [63, 54]])]
         w = world(tv.Particles(x, pinned=np.arange(8)), features, solver=tv.Chebyshev(), path=path, iterations=4, substeps=3)
@@ -226,13 +220,6 @@ def test_chebyshev_has_the_same_bits_on_all_paths(world):
         assert w.last.residual < 0.2 and "non-finite" not in w.last.flags
         hashes.append(w.hash())
     assert len(set(hashes)) == 1
-
-
-def test_elimination_leaves_less_than_a_pass_of_relaxation():
-    # Numerics 4.1, on a chain of ten at 20 substeps: elimination leaves orders of magnitude less, at 2.5 times the work.
-    one, all_ = (points.curve(points.Task("D05_chain10", name, efforts=(20,), runs=1))[0] for name in ("Jacobi", "Direct"))
-    assert one.visits == 20 * 60 * 10 and all_.visits == 2.5 * one.visits
-    assert all_.residual < 1e-3 * one.residual and not all_.flags
 
 
 @pytest.mark.slow
@@ -263,8 +250,7 @@ def test_constraints_that_are_not_met_are_flagged_with_what_helps(world, solver,
 @pytest.mark.parametrize(
     "solver, precision, pins",
     [
-        (tv.ConjugateGradient(6), "f32", [0, 132]),
-        (tv.ConjugateGradient(), "f64", [0, 11, 132, 143]),
+        (tv.ConjugateGradient(), "f32", [0, 11, 132, 143]),
         (tv.Chebyshev(), "f32", [0, 132]),
     ],
 )
@@ -282,25 +268,6 @@ def test_what_is_drawn_straight_between_pins_gains_no_energy(world, solver, prec
         most = max(w.step(1 / 60).energy for _ in range(40))
         assert most < 1e-3 * 0.144 * 9.81, substeps
         assert substeps == 2 or "unconverged" not in w.last.flags
-
-
-@pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Chebyshev(), tv.ConjugateGradient(5)], ids=str)
-def test_frames_that_a_loop_measures_do_not_wait_for_links(world, solver, monkeypatch):
-    # A net that hangs by its upper edge; frames are up to a tenth longer or shorter than 1/60 s. What passes leave as violations
-    # stays, and does not settle. The net sags by Z = D h^2 F. However it shakes, it does not
-    # get back more than the work of this sag, F Z.
-    x, pairs = cloth(12)
-    net, pinned = tv.Distance(pairs), np.flatnonzero(x[:, 2] == x[:, 2].max())
-    start = tv.Particles(x[:, [0, 2]], mass=0.1, pinned=pinned)
-    w = world(start, [tv.Gravity(9.81), tv.Drag(3.0), net], solver=solver, precision="f64")
-    rest = w.run(6.0).energy
-    violation = np.linalg.norm(w.position[pairs[:, 0]] - w.position[pairs[:, 1]], axis=1) - 1 / 11
-    sag = np.abs(net.load * violation).sum()
-    monkeypatch.setattr("tiverlet.step.settling.settle", None)
-    rng = np.random.default_rng(0)
-    for _ in range(240):
-        report = w.step(rng.uniform(0.9, 1.1) / 60)
-        assert report.clean and report.energy < rest + sag
 
 
 @pytest.mark.parametrize("solver, iterations", [(tv.Direct(), 1), (tv.Chebyshev(), 4)])
@@ -375,29 +342,7 @@ def test_a_contradictory_rope_softens_no_other_links(world):
     assert w.features[1].residual @ rest[n:] > 0.999 * 0.05 and np.abs(w.velocity).max() < 0.1  # as soft as before
 
 
-def test_contradictory_links_stay_where_they_are(world):
-    """A rope that is 5 % too short for its two pins has no solution; at the least squares of its violations it pulls at nothing.
-
-    It hangs at rest, and its residual and the first frame report it. A rope that fits is not affected.
-    """
-    rope = tv.shapes.rope((0, 2), (1, 2), points=12)
-    for rest in (0.95 / 11, 1 / 11, None):
-        for substeps in (20, 200):
-            w = world(
-                tv.Particles(rope.position, mass=0.05, pinned=[0, 11]),
-                [tv.Gravity(), tv.Distance(rope.links, rest)],
-                substeps=substeps,
-                solver=tv.ConjugateGradient(),
-            )
-            first = w.step(1 / 60)
-            w.run(0.1)
-            assert np.abs(w.velocity).max() < 9.81 * 0.12  # no faster than free fall in that time
-            assert ("unconverged" in first.flags) == (rest == 0.95 / 11)
-            if rest == 0.95 / 11:  # shared alike by all links: the least possible largest violation
-                assert 0.999 * 0.05 / 0.95 < w.last.residual < 0.07
-
-
-@pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Chebyshev(), tv.ConjugateGradient(5)], ids=repr)
+@pytest.mark.parametrize("solver", [tv.Jacobi(), tv.ConjugateGradient(5)], ids=repr)
 def test_contradictory_links_start_where_they_pull_at_nothing(world, solver):
     """A triangle of 1, 1 and 3 m starts on a line, each link off by 1/3 m, where its links pull at nothing.
 
@@ -456,8 +401,7 @@ def test_what_few_steps_take_from_rotations_is_told(world):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", [tv.Jacobi(), tv.ConjugateGradient(5)], ids=repr)
-@pytest.mark.parametrize("cause", ["length", "placed"])
+@pytest.mark.parametrize(("solver", "cause"), [(tv.Jacobi(), "length"), (tv.ConjugateGradient(5), "placed")], ids=str)
 def test_soft_bodies_gain_no_energy_where_frames_are_starts(world, solver, cause):
     # A free cube of springs, each of which a substep resolves, (omega h)^2 = w h^2 / alpha = 0.17, while 14 of them act on a
     # particle together. A start is a frame of another length, by 1e-6 here, or one before which any particle was placed. With
@@ -467,11 +411,11 @@ def test_soft_bodies_gain_no_energy_where_frames_are_starts(world, solver, cause
     pairs, n = np.concatenate([truss.links, truss.braces]), len(truss.position)
     v = np.concatenate([np.random.default_rng(1).normal(size=(n, 3)) * 1e-3, np.zeros((1, 3))])
     start = tv.Particles(np.concatenate([truss.position, [[3.0, 0.0, 0.0]]]), mass=0.05, velocity=v, pinned=[n])
-    for compliance, damping, iterations, precision in ((1e-3, 0.0, 1, "f64"), (1e-3, 0.5, 2, "f32"), (1e-4, 0.0, 1, "f32")):
+    for compliance, damping, iterations in ((1e-3, 0.5, 2), (1e-4, 0.0, 1)):
         ends = []
         for starts in (False, True):
             link = tv.Distance(pairs, compliance=compliance, damping=damping)
-            w = world(start, [link], substeps=8, iterations=iterations, precision=precision, solver=solver)
+            w = world(start, [link], substeps=8, iterations=iterations, solver=solver)
             energy = []
             for k in range(120):
                 if starts and cause == "placed":

@@ -414,13 +414,10 @@ def test_none_and_some_that_spin(world):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dim", [2, 3])
-def test_recordings_show_angular_momentum(world, dim, tmp_path, read_here):
+def test_recordings_show_angular_momentum(world, tmp_path, read_here):
     # Two spinning particles collide: the curve is that of measure, but for half a substep, and constant to rounding in f64.
-    x = np.zeros((2, dim))
-    x[1, :2] = 0.5, 0.07
-    v, spin = [np.eye(dim)[0], -np.eye(dim)[0]], turning(3.0, dim)
-    start = tv.Particles(x, velocity=v, radius=[0.1, 0.09], mass=[1.0, 1.2], spin=spin)
+    x, v = [(0.0, 0.0), (0.5, 0.07)], [(1.0, 0.0), (-1.0, 0.0)]
+    start = tv.Particles(x, velocity=v, radius=[0.1, 0.09], mass=[1.0, 1.2], spin=3.0)
     w = free(world, start, (0.5, 0.5), (0.7, 0.3))
     about = tv.measure.angular_momentum(w)
     with tv.Recorder(tmp_path / "spin.rrd", w) as recorder:
@@ -429,12 +426,10 @@ def test_recordings_show_angular_momentum(world, dim, tmp_path, read_here):
             recorder.log()
     recording = tv.replay(tmp_path / "spin.rrd")
     assert recording.verify()
-    if dim == 2:  # compiles in half of the time
-        with tv.Worlds(w, 2) as many:
-            w.position, many.position = start.position, start.position
-            w.velocity, many.velocity = start.velocity, start.velocity
-            for one in (w, many):
-                one.run(0.5)
-            assert many.hash(1) == w.hash() and (many[0].spin == w.spin).all() and (w.spin != start.spin).all()
-    for axis, want in zip("z" if dim == 2 else "xyz", about, strict=True):
-        np.testing.assert_allclose(recording.curves[f"angular momentum/{axis}"][1], want, atol=1e-14)
+    np.testing.assert_allclose(recording.curves["angular momentum/z"][1], about[0], atol=1e-14)
+    with tv.Worlds(w, 2) as many:
+        w.position, many.position = start.position, start.position
+        w.velocity, many.velocity = start.velocity, start.velocity
+        for one in (w, many):
+            one.run(0.5)
+        assert many.hash(1) == w.hash() and (many[0].spin == w.spin).all() and (w.spin != start.spin).all()

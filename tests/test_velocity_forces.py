@@ -47,7 +47,7 @@ def turned(z, omega_h, n):
     return z * np.exp(-2j * np.arctan(omega_h / 2) * n)
 
 
-@pytest.mark.parametrize("precision, limit", [("f64", 1e-12), ("f32", 2e-5), ("f32-compensated", 2e-5)])
+@pytest.mark.parametrize("precision, limit", [("f64", 1e-12), ("f32", 2e-5)])
 def test_a_magnet_keeps_the_speed_whatever_the_substep(world, precision, limit):
     # v_n = d_n / h + h a(v_n) / 2 means (1 + i omega h / 2) v_n = d_n / h and d_(n+1) / h = (1 - i omega h / 2) v_n. So v turns
     # by 2 arctan(omega h / 2), and x is on a circle of radius |v| / omega (1 + (omega h)^2 / 4).

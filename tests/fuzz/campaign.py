@@ -65,7 +65,7 @@ class Searcher:
         find, events = self.found or (None, [])
         return f"{find}\n\n{script(self.structure, events)}"
 
-    def search(self, number: int, each: int) -> None:
+    def search(self, number: int, each: int, way: twins.Way | None = None) -> None:
         """Run scenes until one of them is a find, and shrink it."""
 
         @seed(number)
@@ -82,17 +82,16 @@ class Searcher:
         try:
             test()
             if self.trial and self.last:
-                self.others(number)
+                self.others(way or twins.WAYS[number % len(twins.WAYS)])
         except (Find, Flaky, FlakyFailure):  # flaky: a find that does not recur, as where bits differ
             pass
         finally:
             if self.trial:
                 self.trial.close()
 
-    def others(self, number: int) -> None:
-        """Run the last scene again in another way, which is compiled for it: one way per structure."""
+    def others(self, way: twins.Way) -> None:
+        """Run the last scene again in another way, which is compiled for it."""
         events = [Set(None, e.name, 3) if isinstance(e, Set) and e.name == "substeps" else e for e in self.last]
-        way = twins.WAYS[number % len(twins.WAYS)]
         try:
             way(self.trial, events)
         except Refused:
@@ -126,11 +125,11 @@ def smaller(structure: Structure, events: list[Event], kind: str) -> tuple[Struc
     return structure, events
 
 
-def search(number: int, k: int, each: int, kinds: set[str] | None = None) -> Searcher:
-    """Run scenes of structure k of a campaign until one is a find of these kinds (None: any)."""
+def search(number: int, k: int, each: int, kinds: set[str] | None = None, way: twins.Way | None = None) -> Searcher:
+    """Run scenes of structure k of a campaign until one is a find of these kinds (None: any), and the last in another way."""
     structure = drawn(number * 100_003 + k, 8)[random.Random(k).randrange(8) - 8]
     searcher = Searcher(structure, kinds)
-    searcher.search(k, each)
+    searcher.search(k, each, way)
     return searcher
 
 

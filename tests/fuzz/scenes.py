@@ -120,42 +120,7 @@ class Step:
         return f"print(world.step({text(self.dt)}))"
 
 
-@dataclass(frozen=True)
-class Add:
-    """Particles and features that are added between frames."""
-
-    particles: Call
-    features: tuple[Call, ...]
-
-    def do(self, world: tv.World, features: list[Any]) -> None:
-        """Add them."""
-        came = [f.make() for f in self.features]
-        world.add(self.particles.make(), came)
-        features += came
-
-    def line(self) -> str:
-        """Return the addition as code."""
-        came = ", ".join(map(str, self.features))
-        return f"features += [{came}]\nworld.add({self.particles}, features[len(features) - {len(self.features)} :])"
-
-
-@dataclass(frozen=True)
-class Remove:
-    """Particles and a feature that are removed between frames."""
-
-    particles: list[int]
-    feature: int | None
-
-    def do(self, world: tv.World, features: list[Any]) -> None:
-        """Remove them."""
-        world.remove(self.particles, [] if self.feature is None else [features[self.feature]])
-
-    def line(self) -> str:
-        """Return the removal as code."""
-        return f"world.remove({self.particles}, [{'' if self.feature is None else f'features[{self.feature}]'}])"
-
-
-Event = Set | Step | Add | Remove
+Event = Set | Step
 
 
 def script(structure: Structure, events: list[Event], says: str = "") -> str:
@@ -600,7 +565,7 @@ def placed(kind: str, x: np.ndarray, seed: int) -> np.ndarray:
 
 
 @st.composite
-def happenings(draw, structure: Structure, regroup: bool = False) -> list[Event]:
+def happenings(draw, structure: Structure) -> list[Event]:
     """Draw what happens in a world of this structure: settings, positions, velocities, frames, knobs."""
     x, out = structure.position, []
     seeds = st.integers(0, 1000)

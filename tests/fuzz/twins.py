@@ -3,6 +3,7 @@
 import os
 import tempfile
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -33,12 +34,12 @@ def same(what: str, a: str, b: str) -> None:
         raise Find("twin", f"{what} has other bits: {a[:12]}, {b[:12]}")
 
 
-def by_path(trial: Trial, events: list[Event]) -> None:
-    """Compare the fused path with the launched one, as on a GPU."""
+def by_path(trial: Trial, events: list[Event], path: str = "launched") -> None:
+    """Compare with another path: many launches, as on a GPU, unless the scene has that path."""
     settings = trial.structure.settings
     if settings.get("order", 2) > 2:
         return
-    path = "launched" if settings["path"] == "fused" else "fused"
+    path = "fused" if settings["path"] == path else path
     other = Trial(Structure(trial.structure.particles, trial.structure.features, settings | {"path": path}))
     try:
         same(f'path="{path}"', trial.replay(events), other.replay(events))
@@ -48,15 +49,7 @@ def by_path(trial: Trial, events: list[Event]) -> None:
 
 def by_threads(trial: Trial, events: list[Event]) -> None:
     """Compare one thread with a team of threads."""
-    settings = trial.structure.settings
-    if settings.get("order", 2) > 2:
-        return
-    path = "parallel" if settings["path"] != "parallel" else "fused"
-    other = Trial(Structure(trial.structure.particles, trial.structure.features, settings | {"path": path}))
-    try:
-        same(f'path="{path}"', trial.replay(events), other.replay(events))
-    finally:
-        other.close()
+    by_path(trial, events, "parallel")
 
 
 def by_clone(trial: Trial, events: list[Event]) -> None:
@@ -201,4 +194,5 @@ def by_questions(trial: Trial, events: list[Event]) -> None:
         raise Find("twin", f"inside {held.tolist()}, rays from {points.tolist()} along {ways.tolist()}: {hits}, {first}")
 
 
-WAYS = (by_path, by_threads, by_clone, by_copies, by_recording, by_company, by_questions)
+Way = Callable[[Trial, list[Event]], None]
+WAYS: tuple[Way, ...] = (by_path, by_threads, by_clone, by_copies, by_recording, by_company, by_questions)
