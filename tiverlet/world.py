@@ -147,7 +147,7 @@ class World:
         piles that stand by friction creep where a frame is less than 0.4 or more than 2.5 times as long as the last one: use one
         dt, and take as many steps of it as the clock asks for.
         A signal such as Ctrl-C is handled after the frame. A frame that takes seconds is undone at once if the handler raises.
-        Other threads that read the world wait for the end of the frame.
+        Other threads that read the world or its features wait for the end of the frame.
         """
         self._runner.memory.check()
         dt = checks.number("World.step", "dt", dt, above=0.0)

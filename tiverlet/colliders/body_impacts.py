@@ -133,7 +133,7 @@ class BodyImpacts:
             if ti.static(batch.clusters):
                 kind = ti.select(batch.dev.is_body(c), IN_CLUSTER, IN_SHARED)
                 for e in range(batch.dev.corners.starts[c], batch.dev.corners.starts[c + 1]):
-                    if self.state.w.positive(batch.dev.corners.members[e]):
+                    if self.state.w[batch.dev.corners.members[e]] > 0:
                         ti.atomic_max(self.rigid[batch.dev.corners.members[e]], kind)
             for k in ti.static(range(batch.arity)):
                 ti.atomic_max(self.rigid[batch.dev.corners.member(c, k)], LINKED)

@@ -276,7 +276,7 @@ class Surface:
         r N, both are solved for together. A particle that sticks stops as long as that moment holds it; one that rolls on does so
         against it.
         """
-        k, s = self.spin.inverse_inertia.of(i), self.spin.s[i]
+        k, s = self.spin.inverse_inertia[i], self.spin.s[i]
         most, least = self.static() * support, self.dynamic() * support
         slip = across - self.spin.surface(s, n)
         if ti.static(self.turns):

@@ -6,6 +6,7 @@ import numpy as np
 
 from .. import checks
 from ..checks import ArrayLike
+from ..device.interrupts import in_turn
 from ..features.feature import Batch, Knob, Scene
 from ..geometry.ordered import distinct
 from ..particles import Particles
@@ -166,6 +167,7 @@ class ShapeMatch(Batch):
         self.changed = False
 
     @property
+    @in_turn
     def load(self) -> np.ndarray:
         """The largest force on a particle of each cluster during the last substep [N], (m,)."""
         if not self.count:

@@ -85,7 +85,7 @@ class Answers:
         if ti.static(self.in_turn):
             self.given[i] = 0 * self.state.d[i]
         if ti.static(self.has_clusters):
-            self.mobility[i] = self.shared[i] = self.state.w.of(i)
+            self.mobility[i] = self.shared[i] = self.state.w[i]
 
     @ti.func
     def body(self, i):

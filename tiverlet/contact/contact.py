@@ -131,7 +131,7 @@ class Contact(PairContact):
         j, out = self.dev.list.neighbour[e], -1
         if not self.dev.state.awake(j):
             met = self.dev.geometry.push_each_other(i, j, margin)
-            if not self.dev.w.positive(i):
+            if self.dev.w[i] == 0:
                 r, distance = self.dev.state.separation(i, j) - self.dev.state.d[i], self.dev.geometry.contact_distance(i, j)
                 met = met or r.dot(r) < distance * distance
             out = ti.select(met, j, -1)

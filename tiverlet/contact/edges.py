@@ -568,7 +568,7 @@ class Edges:
         """Find the contacts at present in which particle i is the vertex, or one of two discs."""
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             j = self.list.neighbour[e]
-            overlap, n, t = 0 * self.w.of(i) - 1, 0 * self.state.x[i], 0 * self.w.of(i)
+            overlap, n, t = 0 * self.w[i] - 1, 0 * self.state.x[i], 0 * self.w[i]
             if self.after(j) >= 0:
                 overlap, n, t = self.covers(i, j, 0)
             if overlap <= 0 and self.keeps(i, j):
@@ -604,7 +604,7 @@ class Edges:
         its edge is too long for the list."""
         d, limit, after, out = self.state.d[i], ti.cast(self.stride, self.real), self.after(i), 0
         if after < 0:
-            limit = ti.min(limit, self.radius.stride(i) if ti.static(self.radius.discs) else limit)
+            limit = ti.min(limit, self.radius.stride(i))
         else:
             u = self.state.separation(after, i)
             if u.dot(u) > self.longest[i] ** 2:
@@ -631,7 +631,7 @@ class Edges:
     def pressed_particle(self, j):
         """Return the particle that moves with disc j or the edge from j: j, or the other end if j cannot move."""
         out = j
-        if not self.w.positive(j) and self.after(j) >= 0:
+        if self.w[j] == 0 and self.after(j) >= 0:
             out = self.after(j)
         return out
 

@@ -96,7 +96,7 @@ class EventLog:
 
         Both particles of a pair call it, unless one cannot move. Only one of them writes.
         """
-        if i < j or not self.state.w.positive(j):
+        if i < j or self.state.w[j] == 0:
             self.write(i, j, e, n, impulse, final)
 
     @ti.func

@@ -535,7 +535,7 @@ class Impulses:
             self.rows.borne[i] = change - push - self.excess(change - push + kick, change + kick)
             if ti.static(self.bodies.spins):
                 turn = self.bodies.new_s[i] - self.bodies.spin.s[i]
-                blow = -(w * self.bodies.spin.inverse_inertia.of(i)) * self.bodies.moment[i]
+                blow = -(w * self.bodies.spin.inverse_inertia[i]) * self.bodies.moment[i]
                 self.rows.turned[i] = turn - blow - self.excess(turn - blow, turn)
         for row in range(self.rows.begin[i], self.rows.end[i]):
             e, p = self.rows.entry.field[row], self.rows.p.field[row]

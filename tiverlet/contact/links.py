@@ -219,7 +219,7 @@ class Links:
         for e in range(self.begin[r], self.begin[r + 1]):
             i, g = self.particle[e], self.gradient[self.slot[e]]
             u += g.dot(bodies.new[i] - self.state.d[i])
-            weight += self.state.w.of(i) * g.dot(g)
+            weight += self.state.w[i] * g.dot(g)
             slight += g.norm() * self.rows.kick(i).norm()
         left, rigid = batch.dev.equation.left[c], True
         if ti.static(batch.dev.spring.soft):

@@ -123,16 +123,12 @@ class DiscGeometry:
         if self.impulse.width:  # the whole impulse, on the side of its owner
             n = between(x[pairs[:, 0]], x[pairs[:, 1]], self.scene.periodic)
             push = np.abs((push * n).sum(axis=1)) / np.maximum(np.linalg.norm(n, axis=1), 1e-30)
-        if self.search.has_static:
-            # A static particle does not store its push, nor keep a far pair on its list. The other particle of the pair does.
-            n = len(self.scene.particles)
-            keys, which = np.unique(pairs.min(axis=1) * n + pairs.max(axis=1), return_inverse=True)
-            pairs, most = np.stack(np.divmod(keys, n), axis=1), np.zeros(len(keys))
-            np.maximum.at(most, which.ravel(), push)
-            push = most
-        else:
-            low = pairs[:, 0] < pairs[:, 1]
-            pairs, push = pairs[low], push[low]
+        # A static particle does not store its push, nor keep a far pair on its list. The other particle of the pair does.
+        n = len(self.scene.particles)
+        keys, which = np.unique(pairs.min(axis=1) * n + pairs.max(axis=1), return_inverse=True)
+        pairs, most = np.stack(np.divmod(keys, max(n, 1)), axis=1), np.zeros(len(keys))
+        np.maximum.at(most, which.ravel(), push)
+        push = most
         if self.senses:
             touch = self.search.table.pushing(self.scene.particles.group, pairs)
             pairs, push = pairs[touch], push[touch]

@@ -219,7 +219,7 @@ class Polygons(PairContact):
         other, before = self.dev.geometry.pressed_particle(j), self.dev.geometry.before(i)
         if not self.dev.state.awake(other):
             met = self.dev.geometry.touches(i, j, margin)
-            if not self.dev.w.positive(i):
+            if self.dev.w[i] == 0:
                 met = met or self.dev.rows.is_set(self.dev.rows.memory.field[e])
             if met:
                 out = other

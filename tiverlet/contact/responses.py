@@ -42,11 +42,8 @@ class Responses:
     @inline
     def compliance(self, i):
         """Return by how much a unit impulse along a normal moves particle i [1/kg]."""
-        return (
-            self.state.w.of(i)
-            if not self.state.sleepers
-            else ti.select(self.state.moves(i), self.state.w.of(i), 0 * self.state.w.of(i))
-        )
+        w = at(self.state.w, i)
+        return ti.select(self.state.sleepers.awake(i), w, 0 * w) if self.state.sleepers else w
 
     @ti.func
     def mobility(self, i):
@@ -82,13 +79,13 @@ class Responses:
         """Return the same for tangential impulses at the point of contact of particle i [1/kg]."""
         out = self.split(i)
         if ti.static(self.spins):  # moments against rolling share the spin
-            out += self.rows.share[i] * (self.compliance(i) * self.rows.times[None][SHARES] * self.spin.inverse_inertia.of(i))
+            out += self.rows.share[i] * (self.compliance(i) * self.rows.times[None][SHARES] * self.spin.inverse_inertia[i])
         return out
 
     @ti.func
     def turning_compliance(self, i):
         """Return by how much a unit moment over the radius turns the surface of particle i [1/kg]."""
-        return self.compliance(i) * self.spin.inverse_inertia.of(i)
+        return self.compliance(i) * self.spin.inverse_inertia[i]
 
     @inline
     def body(self, i):
@@ -138,7 +135,7 @@ class Responses:
             if ti.static(self.answers.answer_later):
                 self.new[i] = self.new[i] + self.answers.beyond(i)
         if ti.static(self.spins):
-            self.new_s[i] = self.spin.s[i] - (w * self.spin.inverse_inertia.of(i)) * m
+            self.new_s[i] = self.spin.s[i] - (w * self.spin.inverse_inertia[i]) * m
 
     @ti.func
     def answer_of_constraints(self, i):
@@ -178,7 +175,7 @@ class Responses:
             if ti.static(bool(self.answers)):  # links that turn do no work, nor do those that rows complete
                 work += self.answers.links.completing_work(i) - d.dot(self.answer_of_constraints(i)) / w
             if ti.static(self.spins):
-                k, s = self.spin.inverse_inertia.of(i), self.spin.s[i]
+                k, s = self.spin.inverse_inertia[i], self.spin.s[i]
                 if k > 0:
                     turn = self.new_s[i] - s
                     work += s.dot(turn) / (w * k)

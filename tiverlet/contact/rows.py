@@ -46,6 +46,11 @@ if TYPE_CHECKING:
     from .narrow_phase import DiscGeometry
 
 
+# In which turn a particle lists a pair, by where the other one is: in a piece before, behind it in the same piece, in a piece
+# behind, or where impulses do not move it. The last is for pairs that the other particle lists.
+BEFORE, MOVED, BEHIND, HELD, LISTED = range(5)
+
+
 class Rows:
     """The rows of one world.
 
@@ -126,7 +131,6 @@ class Rows:
             self.across = Column("row_across", self.dim)  # tangential displacement that the points which touch aim at [m]
             self.columns += [self.f, self.f_step, self.arms, self.rolling, self.turn_stiff, self.across]
         self.divided = (team.size > 1 or team.launched) and not edges
-        self.has_still = bool((scene.inv_mass == 0).any()) or bool(scene.state.sleepers)  # particles that impulses do not move
         # H: the substep [s]. BEGIN, END: the fractions of the frame at its ends. SCALE: by how much what rows bore is scaled.
         # WHOLE: the part of State.kick() that the substep adds to displacements. SHARES: spin_shares().
         self.times = add("Contact.times", None, width=len(TIMES))
@@ -359,35 +363,33 @@ class Rows:
     def find_pairs(self, i, begin, end, row, scale):
         """List the rows of pairs of particle i. Returns the row behind the last."""
         first, number = self.list.first[i], self.list.number[i]
-        if ti.static(self.divided):
+        for turn in range(ti.static(4 if self.divided else 2)):
+            kind = turn if ti.static(self.divided) else 2 * turn + 1
+            if kind == MOVED:
+                self.own[i] = row
             for e in range(first, first + number):
                 j = self.list.neighbour[e]
-                if j < begin:
-                    if self.state.moves(j):
-                        row = self.find_pair(i, j, e, row, scale)
-        self.own[i] = row
-        for e in range(first, first + number):
-            j = self.list.neighbour[e]
-            if i < j < end:
-                if self.state.moves(j):
+                if self.kind_of(i, j, begin, end) == kind:
                     before = row
                     row = self.find_pair(i, j, e, row, scale)
-                    if row > before:
+                    if kind == MOVED and row > before:
                         self.share[j] = self.share[j] + 1
                         self.spread[j] = self.spread[j] + self.square(self.normal.field[before])
-        self.kept[i] = row
-        if ti.static(self.divided):
-            for e in range(first, first + number):
-                j = self.list.neighbour[e]
-                if j >= end:
-                    if self.state.moves(j):
-                        row = self.find_pair(i, j, e, row, scale)
-        if ti.static(self.has_still):
-            for e in range(first, first + number):
-                j = self.list.neighbour[e]
-                if not self.state.moves(j):
-                    row = self.find_pair(i, j, e, row, scale)
+            if kind == MOVED:
+                self.kept[i] = row
         return row
+
+    @ti.func
+    def kind_of(self, i, j, begin, end):
+        """Return in which turn particle i lists its pair with j; LISTED where j lists it."""
+        out = MOVED
+        if ti.static(self.divided):
+            out = ti.select(j < begin, BEFORE, ti.select(j < end, MOVED, BEHIND))
+        if out == MOVED and j < i:
+            out = LISTED
+        if not self.state.moves(j):
+            out = HELD
+        return out
 
     @ti.func
     def square(self, n):
@@ -424,15 +426,14 @@ class Rows:
 
         It is times h^2 [kg m^2]."""
         out, pressed = ti.cast(0, ti.f64), self.pressed[i]
-        if ti.static(self.has_still):
-            for row in range(self.kept[i], pressed):
-                p = self.vector(self.p.field[row], self.normal.field[row])
-                for k in ti.static(range(self.ends)):
-                    if not self.state.moves(self.pressed_on(row, k)):
-                        out += self.part(row, k) * p.dot(self.state.d[self.pressed_on(row, k)])
-                if ti.static(bool(self.edges)):
-                    if not self.state.moves(i):
-                        out -= p.dot(self.state.d[i])
+        for row in range(self.kept[i], pressed):
+            p = self.vector(self.p.field[row], self.normal.field[row])
+            for k in ti.static(range(self.ends)):
+                if not self.state.moves(self.pressed_on(row, k)):
+                    out += self.part(row, k) * p.dot(self.state.d[self.pressed_on(row, k)])
+            if ti.static(bool(self.edges)):
+                if not self.state.moves(i):
+                    out -= p.dot(self.state.d[i])
         if ti.static(self.sheared):
             for row in range(self.own[i], pressed):
                 sheared = self.state.relative_displacement(0 * self.state.d[i], i, self.other.field[row])
@@ -723,7 +724,7 @@ class Rows:
             ahead = (self.state.d[i] - moved).dot(n)
             for group in ti.static(self.logging):
                 if group.has_face(side):
-                    push = p * self.state.w.of(i)
+                    push = p * self.state.w[i]
                     group.wall.dev.log.record(i, -(self.gap.field[row] + ahead), n, push, -ahead, moved, self.h(), False)
 
     @ti.func

@@ -17,6 +17,7 @@ import numpy as np
 from . import language, layout, runtime
 from .copies import Copies
 from .host_copy import Entry, Transfer
+from .interrupts import in_turn
 from .language import ti
 from .layout import WIDE, Declared, Layout
 from .members import Members
@@ -448,6 +449,7 @@ class Memory:
             self._load(entries, parts)
         self.choose(None)
 
+    @in_turn
     def read(self, field, kind: Any = None) -> np.ndarray:
         """Return a copy of a whole field, in its own type unless `kind` is given.
 
@@ -485,12 +487,14 @@ class Memory:
         view = self._host_views().get(id(self._find(field)))
         return self.read(field) if view is None else view
 
+    @in_turn
     def rows(self, some: Rows, *fields) -> list[np.ndarray]:
         """Return some elements of fields, which the caller must not change. For a single world (not one of many copies)."""
         self.check()
         views, entries = self._host_views(), [self.entries[self._at[id(field)]] for field in fields]
         return [(views[id(e)] if views else self._dump([e])[0])[some] for e in entries]
 
+    @in_turn
     def state(self) -> dict[str, np.ndarray]:
         """Return copies of the fields that make up the exact state, by name."""
         self.check()

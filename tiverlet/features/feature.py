@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..device import ti
+from ..device.interrupts import in_turn
 from ..device.language import inside_kernel
 from ..device.number import Number
 from .arguments import Knob as Knob
@@ -338,6 +339,7 @@ class Batch(Feature):
         return self.dev.corners.count if inside_kernel() else self.members.count
 
     @property
+    @in_turn
     def residual(self) -> np.ndarray:
         """The violation of each constraint after the last substep, (m,), relative as in StepReport.residual; 0 if broken."""
         if not self.count:

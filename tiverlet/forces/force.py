@@ -62,4 +62,4 @@ class Force(Acceleration):
             out = self.force(self.function(x, v, t))
         else:
             out = self.force(self.function(x, v, t, i))
-        return self.dev.w.of(i) * out
+        return self.dev.w[i] * out

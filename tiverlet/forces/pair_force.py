@@ -171,7 +171,7 @@ class PairForce(Acceleration):
         whether a far particle is listed.
         """
         self.dev.last[i] = self.dev.now[i]
-        total, w = ti.Vector.zero(self.dev.real, self.dev.dim), self.dev.w.of(i)
+        total, w = ti.Vector.zero(self.dev.real, self.dev.dim), self.dev.w[i]
         if w > 0:
             if ti.static(self.listed):
                 for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
@@ -197,7 +197,7 @@ class PairForce(Acceleration):
         )
         out, uu = 0 * r[0], u.norm_sqr()
         if uu > 0:
-            out = (self.dev.w.of(i) + self.dev.w.of(j)) * (self.pull(i, j, r) - self.pull(i, j, r - u)).norm() / ti.sqrt(uu)
+            out = (self.dev.w[i] + self.dev.w[j]) * (self.pull(i, j, r) - self.pull(i, j, r - u)).norm() / ti.sqrt(uu)
         return out
 
     @ti.func
@@ -226,7 +226,7 @@ class PairForce(Acceleration):
                 out = ti.cast(self.checked_energy(self.potential_of(way)), ti.f64)
             else:
                 out = ti.cast(self.checked_energy(self.potential_of(way, low, high)), ti.f64)
-            if self.dev.w.positive(j):
+            if self.dev.w[j] > 0:
                 out *= 0.5
         return out
 

@@ -91,7 +91,6 @@ class NeighbourSearch:
         if self.sheared:
             self.strain_at_build = add("grid.built_strain", None, kind=ti.f64)
             self.farthest = number(float(self.cells.sizes.max()), real)
-        self.has_static = bool((scene.inv_mass == 0).any())  # whether there may be pairs in which neither particle can move
         self.has_excluded = len(linked) > 0
         if self.has_excluded:
             self._excluded_pairs, begin = _in_both_orders(linked, n)
@@ -124,14 +123,9 @@ class NeighbourSearch:
         reach = 0 * radius if reach is None else reach
         n, store = change.now.count, self.list.store
         room = store is not None and store.has_room(self.list.room + (self.list.network_size + 1) * (n + 1))
-        static = bool((change.inv_mass == 0).any()) == self.has_static
         finds_all = not self.several_levels and not self.state.images and not reach.any()
         return (
-            room
-            and static
-            and not self.team.launched
-            and finds_all == self.finds_all_neighbours
-            and self.cells.can_regroup(radius, reach)
+            room and not self.team.launched and finds_all == self.finds_all_neighbours and self.cells.can_regroup(radius, reach)
         )
 
     def regroup(
@@ -375,7 +369,7 @@ class NeighbourSearch:
     @ti.func
     def scan_walls(self, i, what, start, used):
         """Find the faces of walls that are near particle i, or bore something on it. Arguments as those of scan()."""
-        if self.state.w.positive(i):
+        if self.state.w[i] > 0:
             for group in ti.static(self.walls):
                 k = -1
                 while k < group.count():
@@ -411,9 +405,8 @@ class NeighbourSearch:
         """Return 1 if a pair with difference r [m] belongs on the list: near, movable, not excluded."""
         far = self.table.cutoff(self.radius, i, j) + ti.cast(self.skin, self.real)
         yes = ti.cast(r.dot(r) < far * far, ti.i32) & ti.cast(i != j, ti.i32)
-        if ti.static(self.has_static):
-            if yes != 0:
-                yes = ti.cast(self.state.w.of(i) + self.state.w.of(j) > 0, ti.i32)
+        if yes != 0:
+            yes = ti.cast(self.state.w[i] + self.state.w[j] > 0, ti.i32)
         if ti.static(not self.table.uniform):
             if yes != 0:
                 yes = ti.cast(self.table.of(i, j)[TOUCH] > 0, ti.i32)

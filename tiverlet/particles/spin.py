@@ -9,7 +9,6 @@ from ..device.memory import Memory
 from ..device.number import Number
 from ..features.regrouping import Regrouping
 from .particles import Particles, at_rest
-from .per_particle import PerParticle
 
 
 class Spin:
@@ -30,40 +29,31 @@ class Spin:
         n, self.dim, self.real = particles.count, particles.dim, memory.real
         self.axes, self.radius = particles.axes, particles.radius
         self.s = memory.field("spin", number, width=self.axes, values=self.from_rates(particles.spin), state=True)
-        self.inverse_inertia = PerParticle(memory, "spin_share", inverse_inertias(particles, inv_mass), number)
+        self.inverse_inertia = memory.field("spin_share", number, values=inverse_inertias(particles, inv_mass))
         self.orients = particles.orientation is not None
         if self.orients:
             width = 1 if self.dim == 2 else 4
             turned = np.asarray(particles.orientation).reshape(n, width)
             self.orientation = memory.field("orientation", number, width=width, kind=ti.f64, values=turned, state=True)
-            self.inverse_radius = PerParticle(memory, "inverse_radius", inverse(particles.radius), number)
+            self.inverse_radius = memory.field("inverse_radius", number, values=inverse(particles.radius))
 
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether particles can be added and removed in place."""
-        now = change.now
-        if (now.orientation is not None) != self.orients or not self.inverse_inertia.can_assign(
-            inverse_inertias(now, change.inv_mass)
-        ):
-            return False
-        return not self.orients or self.inverse_radius.can_assign(inverse(now.radius))
+        return (change.now.orientation is not None) == self.orients
 
     def regroup(self, memory: Memory, change: Regrouping) -> None:
         """Set spin and orientation of added particles, see State.regroup()."""
         now, first = change.now, change.kept
         self.radius = now.radius
-        self.inverse_inertia.assign(memory, inverse_inertias(now, change.inv_mass))
+        memory.write(self.inverse_inertia, inverse_inertias(now, change.inv_mass))
         memory.write_from(self.s, first, self.from_rates(now.spin)[first:])
         if self.orients:
-            self.inverse_radius.assign(memory, inverse(now.radius))
+            memory.write(self.inverse_radius, inverse(now.radius))
             memory.write_from(self.orientation, first, np.asarray(now.orientation).reshape(now.count, -1)[first:])
 
-    def can_set_inverse_mass(self, particles: Particles, inv_mass: np.ndarray) -> bool:
-        """Whether other inverse masses of the same particles can be written in place."""
-        return self.inverse_inertia.can_assign(inverse_inertias(particles, inv_mass))
-
     def set_inverse_mass(self, memory: Memory, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Write other inverse masses, for which can_set_inverse_mass() is true."""
-        self.inverse_inertia.assign(memory, inverse_inertias(particles, inv_mass))
+        """Write other inverse masses of the same particles."""
+        memory.write(self.inverse_inertia, inverse_inertias(particles, inv_mass))
 
     def from_rates(self, rates: Any) -> np.ndarray:
         """Convert angular velocities [rad/s] to r omega [m/s], (n, axes)."""
@@ -106,7 +96,7 @@ class Spin:
     @ti.func
     def energy(self, i):
         """Return I phi^2 / 2 of particle i per mass [m^2], f64."""
-        k, s, out = self.inverse_inertia.of(i), self.s[i] * ti.cast(1, ti.f64), ti.cast(0, ti.f64)
+        k, s, out = self.inverse_inertia[i], self.s[i] * ti.cast(1, ti.f64), ti.cast(0, ti.f64)
         if k > 0:
             out = 0.5 * s.dot(s) / k
         return out
@@ -124,7 +114,7 @@ class Spin:
     @ti.func
     def update_orientation(self, i):
         """Update the orientation at the end of a substep. In 3D q' = (phi / |phi| sin |phi| / 2, cos |phi| / 2) q."""
-        phi = self.inverse_radius.of(i) * self.s[i]
+        phi = self.inverse_radius[i] * self.s[i]
         if ti.static(self.dim == 2):
             self.orientation[i] = self.orientation[i] + ti.cast(phi, ti.f64)
         else:

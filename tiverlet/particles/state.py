@@ -6,7 +6,6 @@ import numpy as np
 
 from ..device import at, inline, ti
 from ..features.regrouping import Regrouping
-from .per_particle import PerParticle
 
 if TYPE_CHECKING:
     from ..device.memory import Memory, Rows
@@ -39,7 +38,7 @@ class State:
         self.number = memory.number(n)  # of particles
         self.x = memory.field("position", self.number, width=dim, values=particles.position, state=True)
         self.d = memory.field("displacement", self.number, width=dim, values=particles.velocity, state=True)
-        self.w = PerParticle(memory, "inv_mass", inv_mass, self.number)
+        self.w = memory.field("inv_mass", self.number, values=inv_mass)
         self.sums = self.subtracts_low = compensated  # sums: whether x has two words
         if compensated:
             self._add_low(memory, particles)
@@ -58,13 +57,12 @@ class State:
 
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether particles can be added and removed in place."""
-        spins = change.now.spins == self.spins and (not self.spins or self.spin.can_regroup(change))
-        return spins and self.w.can_assign(change.inv_mass)
+        return change.now.spins == self.spins and (not self.spins or self.spin.can_regroup(change))
 
     def regroup(self, memory: "Memory", change: Regrouping) -> None:
         """Set position and velocity of added particles. `memory` already holds only the rows of the remaining ones."""
         self.count, first = change.now.count, change.kept
-        self.w.assign(memory, change.inv_mass)
+        memory.write(self.w, change.inv_mass)
         x = change.now.position[first:]
         memory.write_from(self.x, first, x)
         memory.write_from(self.d, first, change.now.velocity[first:])
@@ -73,14 +71,11 @@ class State:
         if self.spins:
             self.spin.regroup(memory, change)
 
-    def can_set_inverse_mass(self, particles: "Particles", inv_mass: np.ndarray) -> bool:
-        """Whether other inverse masses can be written in place, if as many are 0 as before."""
-        return not self.w.uniform and (not self.spins or self.spin.can_set_inverse_mass(particles, inv_mass))
-
     def set_inverse_mass(self, memory: "Memory", particles: "Particles", inv_mass: np.ndarray, *some: "Rows") -> None:
-        """Write other inverse masses, for which can_set_inverse_mass() is true. some: the particles whose inverse mass may
-        differ."""
-        self.w.change(memory, inv_mass, *some)
+        """Write other inverse masses of the same particles. some: those whose inverse mass may differ."""
+        w = memory.view(self.w)
+        for rows in some:
+            w[rows] = inv_mass[rows]
         if self.spins:
             self.spin.set_inverse_mass(memory, particles, inv_mass)
 
@@ -117,8 +112,8 @@ class State:
     def moves(self, i):
         """Whether particle i can move, and is awake."""
         if not self.sleepers:
-            return self.w.positive(i)
-        return ti.select(self.sleepers.awake(i), self.w.of(i), ti.cast(0, self.real)) > 0
+            return at(self.w, i) > 0
+        return ti.select(self.sleepers.awake(i), at(self.w, i), ti.cast(0, self.real)) > 0
 
     @inline
     def any_awake(self, begin, end):

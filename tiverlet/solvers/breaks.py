@@ -33,7 +33,7 @@ class Breaks:
     def compare(self, loop: ti.template(), i, overload, number):  # type: ignore[valid-type]
         """Compare the overload of a constraint, by its number, with others at particle i. Returns 1 if none comes before it."""
         out = 1
-        if self.w.positive(i):
+        if self.w[i] > 0:
             if ti.static(loop == LARGEST):
                 ti.atomic_max(self.largest[i], overload)
                 self.first[i] = NONE

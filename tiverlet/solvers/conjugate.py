@@ -243,7 +243,7 @@ class CGSystem(System):
     def compute_moves(self, thread):
         """Compute w G^T d, the move of each particle along the direction."""
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-            if self.w.positive(i):
+            if self.w[i] > 0:
                 total = ti.Vector.zero(self.real, self.dim)
                 for s in range(self.begin[i], self.begin[i + 1]):
                     r = self.row_of[s]

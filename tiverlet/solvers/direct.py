@@ -290,7 +290,7 @@ class Elimination(System):
     def move_at_end(self, s):
         """Return the move of the corner with slot s for a multiplier of 1, along the gradient at the end of the substep."""
         i = self.particle_of[s]
-        move = self.gradient[s] * self.w.of(i)
+        move = self.gradient[s] * self.w[i]
         if ti.static(self.has_shared_particles):
             move /= self.blocks_of[i]
         return move

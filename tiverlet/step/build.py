@@ -213,9 +213,8 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         step.sleep = SleepPass(step, state.sleepers, drivers, batches)
     diagnostics = Diagnostics(step, solver)
     if search and contact:
-        search.list.allocate(
-            int(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.neighbours_per_particle)) + 64
-        )
+        room = ROOM[bool((particles.radius == particles.radius[:1]).all())][particles.dim - 2]
+        search.list.allocate(int(len(particles) * max(room, contact.neighbours_per_particle)) + 64)
     for each, room in searches:
         if each:
             each.list.allocate(len(particles) * room + 64)

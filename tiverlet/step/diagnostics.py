@@ -99,10 +99,10 @@ class Diagnostics:
         Second order in the middle of a substep, where d / h is the velocity.
         """
         out, kinetic = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
-        if self.state.w.positive(i):
+        if self.state.w[i] > 0:
             out, kinetic = self.energy_per_mass(i, x, scale, back)
-            out /= self.state.w.of(i)
-            kinetic /= self.state.w.of(i)
+            out /= self.state.w[i]
+            kinetic /= self.state.w[i]
             for f in ti.static(self.measured):
                 out += f.energy(i, back)
         return out, kinetic
@@ -130,7 +130,7 @@ class Diagnostics:
         """
         d = self.state.d[i]
         dd, out = d.dot(d), ti.cast(0, ti.f64)
-        if dd > 0 and self.state.w.positive(i):
+        if dd > 0 and self.state.w[i] > 0:
             out = -self.step.integrator.forces.change_along(i, x, d, h, t).dot(d) / dd * h * h
             if ti.static(self.step.integrator.uses_velocity):
                 out = ti.max(out, ti.cast(self.step.integrator.forces.velocity_stiffness(i, x, d / h, t, h), ti.f64))
@@ -140,10 +140,10 @@ class Diagnostics:
     def pair_stiffness(self, i, h):
         """Return the share of particle i in the two sums of the Rayleigh quotient of pair forces, taken over all particles."""
         d, change, moved = self.state.d[i] * ti.cast(1, ti.f64), ti.cast(0, ti.f64), ti.cast(0, ti.f64)
-        if self.state.w.positive(i):
+        if self.state.w[i] > 0:
             for f in ti.static(self.pair_forces):
-                change -= h * h * (f.dev.now[i] - f.dev.last[i]).dot(d) / self.state.w.of(i)
-            moved = d.dot(d) / self.state.w.of(i)
+                change -= h * h * (f.dev.now[i] - f.dev.last[i]).dot(d) / self.state.w[i]
+            moved = d.dot(d) / self.state.w[i]
         return change, moved
 
     @ti.func

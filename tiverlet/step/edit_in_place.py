@@ -83,7 +83,7 @@ def planned(
         work += sum(more.count for more in bound.more.values())
     if not world._scale.holds(Scale(count, work)):
         return None
-    if not (scene.state.can_regroup(change) and (scene.radius is None or scene.radius.can_assign(now.radius))):
+    if not scene.state.can_regroup(change):
         return None
     if not all(f.can_regroup(change) for f in world.features if not (bound and f in bound.kept)):
         return None
@@ -163,8 +163,6 @@ def grabbing(world: Any) -> Grab | None:
         inv_mass = inv_mass.copy()
         inv_mass[before] = world._particles.inv_mass[before]
         inv_mass[after] = 0.0
-        if not scene.state.can_set_inverse_mass(world._particles, inv_mass) or (runner.search and not runner.search.has_static):
-            return None
         for b in runner.batches:
             if (inv_mass[b.indices] != scene.inv_mass[b.indices]).any():
                 return None

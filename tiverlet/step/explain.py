@@ -206,8 +206,7 @@ def _absent(world: "World") -> list[str]:
             "compliance and its history: every constraint is rigid",
         ),
         (not step.breakers, "loads compared and breaks counted: no constraint has break_at"),
-        (step.scene.radius is None or step.scene.radius.uniform, "field of radii: all are equal or none is needed"),
-        (step.state.w.uniform, "field of masses: all are equal"),
+        (step.scene.radius is None, "radii: nothing touches"),
         (not step.state.sums, "low words: precision is not f32-compensated, and no chain is solved to rounding"),
     ]
     return [text for missing, text in rows if missing] or ["nothing"]

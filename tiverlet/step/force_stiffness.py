@@ -41,7 +41,7 @@ class ForceStiffness:
     def measure(self, h64: ti.f64, t64: ti.f64, out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """Write the largest omega^2 of all particles to `out`."""
         for i in range(self.n):
-            if self.state.w.positive(i):
+            if self.state.w[i] > 0:
                 most = ti.cast(self.of(i, ti.cast(h64, self.real), ti.cast(t64, self.real)), ti.f64)
                 if most > out[0]:  # rarely true, so threads seldom wait for the atomic operation
                     ti.atomic_max(out[0], most)

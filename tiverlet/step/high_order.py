@@ -153,7 +153,7 @@ class Composition:
 
         starts: 1 in a start, the first stage after velocities were set; there d holds the velocity.
         """
-        if self.state.w.of(i) > 0:
+        if self.state.w[i] > 0:
             d = self.state.d[i]
             a = self.forces.accelerate(i, self.state.place(i), 0 * d, t, self.forces.pull(t))
             if ti.static(self.springs_pull):

@@ -326,7 +326,7 @@ class Verlet:
         """
         d = self.state.d[i]
         v = d / h
-        if self.state.w.positive(i):
+        if self.state.w[i] > 0:
             force = h * h * self.acceleration_at(i, h, t, 0, self.forces.pull(t)) + reaction
             if ti.static(self.decays):
                 v = (self.decay[None][0] * d + self.decay[None][3] * force) / h

@@ -264,7 +264,7 @@ class SleepPass:
         for b in range((self.n + (BLOCK - 1)) // BLOCK):
             awake, ready = 0, 0
             for i in range(b * BLOCK, ti.min((b + 1) * BLOCK, self.n)):
-                if self.state.w.positive(i):
+                if self.state.w[i] > 0:
                     if self.sleepers.awake(i):
                         awake += 1
                         self.time_still(i, sheet[DT], sheet[H])
@@ -348,7 +348,7 @@ class SleepPass:
     @ti.func
     def drifts(self, i):
         """Whether particle i can move, and is awake."""
-        return self.state.w.positive(i) and self.sleepers.awake(i)
+        return self.state.w[i] > 0 and self.sleepers.awake(i)
 
     @ti.func
     def note_blocks(self):

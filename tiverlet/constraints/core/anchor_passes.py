@@ -67,7 +67,7 @@ class AnchorPasses(Passes):
     @ti.func
     def solve(self, c, h, h2_effective, frame_fraction, first, fresh):
         """Return the multiplier before and after a pass, and the size of the violation that the pass removes."""
-        w = self.w.of(self.corners.member(c, 0))
+        w = self.w[self.corners.member(c, 0)]
         C, C0 = self.place.offsets(c, frame_fraction, first, fresh)
         lam, B = self.lam[c], 0 * C
         if first != 0:
@@ -92,12 +92,12 @@ class AnchorPasses(Passes):
         """Draw the particle to its place."""
         lam, new, size = self.solve(c, h, h2_effective, frame_fraction, first, fresh)
         self.lam[c] = new
-        self.corners.write_move(c, 0, self.w.of(self.corners.member(c, 0)) * (new - lam))
+        self.corners.write_move(c, 0, self.w[self.corners.member(c, 0)] * (new - lam))
 
     @ti.func
     def begin_answer(self, c, h, h2_effective, fresh, bodies: ti.template()):  # type: ignore[valid-type]
         """Store the law of this substep."""
-        w = self.w.of(self.corners.member(c, 0))
+        w = self.w[self.corners.member(c, 0)]
         alpha, A = 0 * w, 1 + 0 * w
         if ti.static(self.spring.soft):
             alpha = self.spring.alpha[c] / h2_effective
@@ -109,7 +109,7 @@ class AnchorPasses(Passes):
         """Hold the particle against a move: A (its move) + alpha' (answer / w) = 0."""
         i, place = self.corners.member(c, 0), self.corners.places[c][0]
         if place >= 0:
-            A, alpha, w, before = self.law_now[c][0], self.law_now[c][1], self.w.of(i), self.slots.answer[place]
+            A, alpha, w, before = self.law_now[c][0], self.law_now[c][1], self.w[i], self.slots.answer[place]
             change = (A * w * (moved[i] - d[i]) + alpha * before) / (A * self.slots.split[i] + alpha)
             self.slots.answer[place] = before - change
 
@@ -118,7 +118,7 @@ class AnchorPasses(Passes):
         """Add the answer to the multiplier. Unless it is steady, it came of a blow."""
         i, place = self.corners.member(c, 0), self.corners.places[c][0]
         if place >= 0:
-            answer, impulse = self.slots.answer[place], self.slots.answer[place] / self.w.of(i)
+            answer, impulse = self.slots.answer[place], self.slots.answer[place] / self.w[i]
             change = (answer - rows.scale() * self.answered[c]).norm()
             self.answered[c] = answer
             self.blow[c] = ti.select(rows.is_steady(change, answer.norm(), rows.kick(i).norm()), 0 * impulse, impulse)
@@ -129,7 +129,7 @@ class AnchorPasses(Passes):
         """Push h^2 times the spring acceleration, as in CornerPasses, for each axis."""
         move = ti.Vector.zero(self.real, self.state.dim)
         if ti.static(self.spring.soft):
-            w, alpha = self.w.of(self.corners.member(c, 0)), self.spring.alpha[c]
+            w, alpha = self.w[self.corners.member(c, 0)], self.spring.alpha[c]
             if w > 0 and alpha > 0:
                 C = self.place.offset_now(c, 0)
                 rate = self.place.offset_change(c) / h
@@ -140,7 +140,7 @@ class AnchorPasses(Passes):
     def push_reaction(self, c, h, firm, soft):
         """Push the reaction, as in CornerPasses, for each axis."""
         i = self.corners.member(c, 0)
-        w, lam = self.w.of(i), self.lam[c]
+        w, lam = self.w[i], self.lam[c]
         if ti.static(self.slots.answers):
             lam -= self.blow[c]
         pull = firm * lam
@@ -165,7 +165,7 @@ class AnchorPasses(Passes):
             if alpha > 0:
                 C = self.place.offset_now(c, back)
                 out = ti.cast(C.dot(C) / (2 * alpha), ti.f64)
-                pull, w = ti.cast(self.lam[c], ti.f64), self.w.of(self.corners.member(c, 0))
+                pull, w = ti.cast(self.lam[c], ti.f64), self.w[self.corners.member(c, 0)]
                 force = ti.math.length(pull)
                 out *= self.spring.bearing_share(force * alpha, h2_effective, residual * self.size.now)
                 if h2_effective > 0:

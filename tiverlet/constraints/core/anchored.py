@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ... import checks
+from ...device.interrupts import in_turn
 from ...features.feature import Batch, Feature, Knob, Scene
 from ...features.regrouping import Regrouping
 from .anchor_passes import AnchorPasses, Place
@@ -105,6 +106,7 @@ class Anchored(Batch):
         return AnchorPasses(scene, self, self.start_offset(self.start.position))
 
     @property
+    @in_turn
     def load(self) -> np.ndarray:
         """The force on each particle during the last substep [N], (m, dim)."""
         if not self.count:

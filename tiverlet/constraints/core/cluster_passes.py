@@ -111,7 +111,7 @@ class ClusterPasses(Passes):
     def mass_in_pass(self, e, A, alpha_prime):
         """Return mu of corner e in a pass: its mass, times its move for a violation of 1."""
         i = self.corners.members[e]
-        w, mu = self.w.of(i), ti.cast(HEAVY * self.mass[self.corners.owner[e]], ti.f64)
+        w, mu = self.w[i], ti.cast(HEAVY * self.mass[self.corners.owner[e]], ti.f64)
         if w > 0:
             mu = 1 / ti.cast(A * self.slots.split[i] + alpha_prime * w, ti.f64)
         return mu
@@ -124,7 +124,7 @@ class ClusterPasses(Passes):
     @ti.func
     def mass_of(self, e, c, heavy):
         """Return the mass of corner e, `heavy` times that of its cluster c for a particle that cannot move."""
-        w, mu = self.w.of(self.corners.members[e]), ti.cast(heavy * self.mass[c], ti.f64)
+        w, mu = self.w[self.corners.members[e]], ti.cast(heavy * self.mass[c], ti.f64)
         if w > 0:
             mu = ti.cast(1, ti.f64) / w
         return mu
@@ -213,7 +213,7 @@ class ClusterPasses(Passes):
         out = True
         for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
             i = self.corners.members[e]
-            w = self.w.of(i)
+            w = self.w[i]
             out = out and (w == 0 or self.slots.split[i] < 2 * w)
         return out
 
@@ -283,12 +283,12 @@ class ClusterPasses(Passes):
         for e in range(begin, end):
             i, r = self.corners.members[e], self.relative_position(e, i0, back)
             m = self.mass_in_pass(e, A, alpha)
-            if self.w.positive(i):
+            if self.w[i] > 0:
                 m *= A + alpha
             total += m
             middle += m * r
             S += m * r.outer_product(r)
-            self.arm[e], self.weight[e][0], self.weight[e][1] = r, m, m * self.w.of(i) / (A + alpha)
+            self.arm[e], self.weight[e][0], self.weight[e][1] = r, m, m * self.w[i] / (A + alpha)
         middle /= total
         S -= total * middle.outer_product(middle)
         for e in range(begin, end):
@@ -299,7 +299,7 @@ class ClusterPasses(Passes):
             give, rows, arm, turns, free = alpha / (A + alpha), 0 * total, self.zero_vector(), 0 * total, 0 * A
             for e in range(begin, end):
                 i, turning = self.corners.members[e], rotation.turning_compliance(S, self.arm[e])
-                w, body = self.w.of(i), ti.cast(1 / total + turning, self.real)
+                w, body = self.w[i], ti.cast(1 / total + turning, self.real)
                 bodies.answers.mobility[i] = give * w + (1 - give) * ti.min(body, w)
                 rows += self.pressed[e]
                 arm += self.pressed[e] * self.arm[e]
@@ -313,7 +313,7 @@ class ClusterPasses(Passes):
                 shared = ti.min(ti.cast(largest / rows, self.real), free)
             for e in range(begin, end):
                 i = self.corners.members[e]
-                bodies.answers.shared[i] = give * self.w.of(i) + (1 - give) * shared
+                bodies.answers.shared[i] = give * self.w[i] + (1 - give) * shared
 
     @ti.func
     def answer(self, c, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]
@@ -354,7 +354,7 @@ class ClusterPasses(Passes):
         for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
             i, place = self.corners.members[e], self.corners.places[e]
             if place >= 0:
-                answer, m = self.slots.answer[place], 1 / self.w.of(i)
+                answer, m = self.slots.answer[place], 1 / self.w[i]
                 change += m * (answer - rows.scale() * self.answered[e]).norm()
                 size += m * answer.norm()
                 slight += m * rows.kick(i).norm()
@@ -390,7 +390,7 @@ class ClusterPasses(Passes):
         S = mean.outer_product(mean)
         X = 0 * S
         for e in range(begin, end):
-            held = held or self.w.of(self.corners.members[e]) == 0
+            held = held or self.w[self.corners.members[e]] == 0
             m, r, move = (
                 self.mass_in_fit(e, c),
                 self.relative_position(e, i0, 0),
@@ -420,7 +420,7 @@ class ClusterPasses(Passes):
             pull -= ti.cast(self.blow[e], ti.f64)
         move = firm * pull
         if ti.static(self.spring.soft):
-            w, mass = self.w.of(self.corners.members[e]), self.mass[c]
+            w, mass = self.w[self.corners.members[e]], self.mass[c]
             if self.spring.alpha[c] > 0:
                 move = soft * pull
                 if w > 0 and self.strength.is_intact(c):
@@ -476,7 +476,7 @@ class ClusterPasses(Passes):
     def move_to_place(self, e, h, h2_effective, first, fresh):
         """Move corner e towards its place."""
         c, i = self.corners.owner[e], self.corners.members[e]
-        w, relaxation = self.w.of(i), self.slots.relaxation
+        w, relaxation = self.w[i], self.slots.relaxation
         if first > 0:
             self.pull[e] = ti.cast(self.zero_vector(), self.real)
         if not self.strength.is_intact(c):
@@ -541,8 +541,8 @@ class ClusterPasses(Passes):
             per_newton = self.spring.multiplier_per_newton(c, w, h2_rigid, h2_effective)
             for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
                 i = self.corners.members[e]
-                if self.w.of(i) > 0:
-                    past = self.strength.add_excess(c, e, self.pull[e] / self.w.of(i), per_newton)
+                if self.w[i] > 0:
+                    past = self.strength.add_excess(c, e, self.pull[e] / self.w[i], per_newton)
                     if past > self.strength.rounding(c, i, i0):
                         out = ti.max(out, self.strength.overload_by(c, past, per_newton))
         return out
@@ -561,7 +561,7 @@ class ClusterPasses(Passes):
             total += self.mass_in_fit(e, c)
             mean += self.mass_in_fit(e, c) * self.offset_of(e, c)
         for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
-            if self.w.of(self.corners.members[e]) > 0 and holds:
+            if self.w[self.corners.members[e]] > 0 and holds:
                 C = self.offset_of(e, c) - mean / total  # positions are relative to a particle that has moved since
                 if ti.static(self.spring.soft):
                     C = self.soft_violation(e, c, C, rigid, soft, alpha_prime)
@@ -582,13 +582,13 @@ class ClusterPasses(Passes):
                 most, borne = ti.cast(0, self.real), ti.cast(0, ti.f64)
                 for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
                     C = self.relative_position(e, i0, back) - s - R @ (self.shape[e] - q)
-                    if self.w.of(self.corners.members[e]) > 0:
-                        out += C.dot(C) / (2 * alpha * mass * self.w.of(self.corners.members[e]))
+                    if self.w[self.corners.members[e]] > 0:
+                        out += C.dot(C) / (2 * alpha * mass * self.w[self.corners.members[e]])
                         most = ti.max(most, self.pull[e].norm())
                         pull = ti.cast(self.pull[e].norm(), ti.f64)
                         if h2_effective > 0:
                             pull /= h2_effective
-                        borne += pull * pull * alpha * mass / (2 * self.w.of(self.corners.members[e]))
+                        borne += pull * pull * alpha * mass / (2 * self.w[self.corners.members[e]])
                 out *= self.spring.bearing_share(most * alpha * mass, h2_effective, residual * self.size[c])
                 out = self.spring.energy(c, 1 / mass, h2_effective, out, borne)
         return out

@@ -81,7 +81,7 @@ class CornerPasses(Passes):
                         violation += self.known_violation(c, violation - moved, W, h, h2_effective)
                 step = self.relax_alone(c, violation, A, alpha, lam, W, n, turn, share, first)
         for k in ti.static(range(self.arity)):
-            self.corners.write_move(c, k, self.w.of(self.corners.member(c, k)) * step * n[k, :])
+            self.corners.write_move(c, k, self.w[self.corners.member(c, k)] * step * n[k, :])
 
     @ti.func
     def linearise(self, c, h, h2_effective, share, first, fresh):
@@ -102,7 +102,7 @@ class CornerPasses(Passes):
         for k in ti.static(range(self.arity)):
             i = self.corners.member(c, k)
             gg, split = g[k, :].dot(g[k, :]), self.slots.split[i]
-            w += self.w.of(i) * gg
+            w += self.w[i] * gg
             both += split * g[k, :].dot(n[k, :])
             here += split * gg
             there += split * n[k, :].dot(n[k, :])
@@ -148,7 +148,7 @@ class CornerPasses(Passes):
                 i, place = self.corners.member(c, k), self.corners.places[c][k]
                 if place >= 0:
                     g = self.slots.system.gradient[place]
-                    weight += self.w.of(i) * g.dot(g)
+                    weight += self.w[i] * g.dot(g)
                     slight += g.norm() * rows.kick(i).norm()
             mu = ti.cast(self.slots.system.answer[self.row[c]], self.real)
             self.equation.take_answer(c, mu, rows.scale() * self.equation.answered[c], weight, slight, rows)
@@ -167,10 +167,10 @@ class CornerPasses(Passes):
             j, split = self.corners.member(c, 0), self.slots.split[i]
             move = self.state.relative_displacement(self.state.d[i] - self.state.d[j], i, j)
             if together != 0:
-                split = self.w.of(i) * (self.slots.begin[i + 1] - self.slots.begin[i])
+                split = self.w[i] * (self.slots.begin[i + 1] - self.slots.begin[i])
             u += n[k, :].dot(move)
             W += split * n[k, :].dot(n[k, :])
-            longest = ti.max(longest, self.w.of(i) * n[k, :].norm())
+            longest = ti.max(longest, self.w[i] * n[k, :].norm())
             fastest = ti.max(fastest, move.norm_sqr())
         if ti.static(self.equation.driven):
             u -= self.drive.step[c]
@@ -226,7 +226,7 @@ class CornerPasses(Passes):
         if ti.static(self.quantity.collapses > 0):
             move = ti.cast(0, self.real)
             for k in ti.static(range(self.arity)):
-                w = self.w.of(self.corners.member(c, k))
+                w = self.w[self.corners.member(c, k)]
                 move += w * w * n[k, :].dot(n[k, :])
             new = self.limit.limit_collapse(
                 lam, new, self.equation.rest[c], self.relative_corners.relative_positions(c, 0).norm_sqr(), move
@@ -262,7 +262,7 @@ class CornerPasses(Passes):
             if not out:
                 g, w = self.quantity.measure(c, self.relative_corners.now_and_start(c)[1])[1], ti.cast(0, self.real)
                 for k in ti.static(range(self.arity)):
-                    w += self.w.of(self.corners.member(c, k)) * g[k, :].dot(g[k, :])
+                    w += self.w[self.corners.member(c, k)] * g[k, :].dot(g[k, :])
                 out = w > 0 and stiff(self.spring.alpha[c], h, w) > FIRM
         return out
 
@@ -388,7 +388,7 @@ class CornerPasses(Passes):
             f0, _ = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 1))
         for k in ti.static(range(self.arity)):
             i, gg = self.corners.member(c, k), g[k, :].dot(g[k, :])
-            w += self.w.of(i) * gg
+            w += self.w[i] * gg
             W += self.slots.split[i] * gg
         if alone == 0 or not self.is_outside_systems(c):
             W = w
@@ -397,7 +397,7 @@ class CornerPasses(Passes):
             if self.spring.is_rigid(c):
                 force = -self.known.load[c]
         for k in ti.static(range(self.arity)):
-            self.corners.write_move(c, k, h * h * self.w.of(self.corners.member(c, k)) * force * g[k, :])
+            self.corners.write_move(c, k, h * h * self.w[self.corners.member(c, k)] * force * g[k, :])
 
     @ti.func
     def note_spring_turn(self, c):
@@ -420,7 +420,7 @@ class CornerPasses(Passes):
             f = self.quantity.unwrap(f, self.equation.rest[c])
             for k in ti.static(range(self.arity)):
                 i, gg = self.corners.member(c, k), g[k, :].dot(g[k, :])
-                w += self.w.of(i) * gg
+                w += self.w[i] * gg
                 W += self.slots.split[i] * gg
         pull = self.equation.reaction(c, f, w, W, h, firm, soft)
         if ti.static(bool(self.impacts)):
@@ -431,7 +431,7 @@ class CornerPasses(Passes):
             if self.spring.is_rigid(c):
                 pull += ti.select(firm == 0, 0 * firm, soft - firm) * self.known.given[c]
         for k in ti.static(range(self.arity)):
-            self.corners.write_move(c, k, self.w.of(self.corners.member(c, k)) * pull * g[k, :])
+            self.corners.write_move(c, k, self.w[self.corners.member(c, k)] * pull * g[k, :])
 
     @ti.func
     def overload(self, c, h2_rigid, h2_effective):
@@ -476,9 +476,9 @@ class CornerPasses(Passes):
         w, W, free = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
         for k in ti.static(range(self.arity)):
             i, gg = self.corners.member(c, k), g[k, :].dot(g[k, :])
-            w += self.w.of(i) * gg
+            w += self.w[i] * gg
             W += self.slots.split[i] * gg
-            free += self.w.of(i)
+            free += self.w[i]
         violation, A, alpha, lam, W = self.equation.terms(c, f, f, w, W, h, h2_effective, 0, fresh)
         violation = self.equation.all_violation(c, violation, A)
         left = self.equation.removable_violation(c, violation, A, alpha, lam, W)
@@ -503,5 +503,5 @@ class CornerPasses(Passes):
         _, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
         w = ti.cast(0, self.real)
         for k in ti.static(range(self.arity)):
-            w += self.w.of(self.corners.member(c, k)) * g[k, :].dot(g[k, :])
+            w += self.w[self.corners.member(c, k)] * g[k, :].dot(g[k, :])
         return w

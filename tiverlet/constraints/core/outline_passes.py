@@ -47,12 +47,12 @@ class OutlinePasses(Passes):
             g, n = self.quantity.slope(e, 0), self.quantity.slope(e, 1)
             sums[0] += self.corners.relative_position(e, i0, 0).dot(g)
             sums[1] += self.corners.relative_position(e, i0, 1).dot(n)
-            sums[2] += self.w.of(i) * g.dot(g)
+            sums[2] += self.w[i] * g.dot(g)
             sums[3] += self.slots.split[i] * g.dot(n)
             sums[4] += self.slots.split[i] * g.dot(g)
             sums[5] += self.slots.split[i] * n.dot(n)
             sums[6] += self.corners.relative_position(e, i0, 0).norm_sqr()
-            sums[7] += self.w.of(i) * self.w.of(i) * ti.max(g.dot(g), n.dot(n))
+            sums[7] += self.w[i] * self.w[i] * ti.max(g.dot(g), n.dot(n))
             self.start[e] = n
         self.sums[b] = sums
 
@@ -80,7 +80,7 @@ class OutlinePasses(Passes):
             i, g, n = self.corners.members[e], self.quantity.slope(e, 0), self.start[e]
             f += self.corners.relative_position(e, i0, 0).dot(g) / self.dim
             f0 += self.corners.relative_position(e, i0, 1).dot(n) / self.dim
-            w += self.w.of(i) * g.dot(g)
+            w += self.w[i] * g.dot(g)
             W += self.slots.split[i] * g.dot(g if self.use_current_gradient[c] != 0 else n)
         violation, A, alpha, lam, W = self.equation.terms(c, f, f0, w, W, h, h2_effective, 0, fresh)
         if ti.static(self.limit.acts):
@@ -108,7 +108,7 @@ class OutlinePasses(Passes):
         n = self.start[e]
         if self.use_current_gradient[c] != 0:
             n = self.quantity.slope(e, 0)
-        self.corners.write_move(e, self.w.of(self.corners.members[e]) * self.change[c] * n)
+        self.corners.write_move(e, self.w[self.corners.members[e]] * self.change[c] * n)
 
     @ti.func
     def push_spring_force(self, c, h, soft, alone):
@@ -124,11 +124,11 @@ class OutlinePasses(Passes):
             for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
                 i, g = self.corners.members[e], self.quantity.slope(e, 0)
                 f += self.corners.relative_position(e, i0, 0).dot(g) / self.dim
-                w += self.w.of(i) * g.dot(g)
+                w += self.w[i] * g.dot(g)
                 W += self.slots.split[i] * g.dot(g)
         pull = self.equation.reaction(c, f, w, W, h, firm, soft)
         for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
-            self.corners.write_move(e, self.w.of(self.corners.members[e]) * pull * self.quantity.slope(e, 0))
+            self.corners.write_move(e, self.w[self.corners.members[e]] * pull * self.quantity.slope(e, 0))
 
     @ti.func
     def overload(self, c, h2_rigid, h2_effective):
@@ -164,7 +164,7 @@ class OutlinePasses(Passes):
         left = self.equation.removable_violation(c, violation, A, alpha, lam, W)
         if w == 0:  # collapsed, or static
             for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
-                if self.w.of(self.corners.members[e]) > 0 and self.strength.is_intact(c):
+                if self.w[self.corners.members[e]] > 0 and self.strength.is_intact(c):
                     left = ti.abs(f - self.equation.rest[c])
         return left / self.equation.residual_scale(c)
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ... import checks
+from ...device.interrupts import in_turn
 from ...features.feature import Batch, Knob, Scene
 from ...features.read_only import as_read_only, assign_whole_advice
 from ...features.regrouping import Regrouping
@@ -357,6 +358,7 @@ class Scalar(Batch):
             self.dev.strength.upload(self.break_at)
 
     @property
+    @in_turn
     def load(self) -> np.ndarray:
         """The force in each constraint during the last substep [N], (m,); positive where it pulls (f above rest).
 
