@@ -1,12 +1,13 @@
-"""Contacts: overlap of touching particles goes away, and piles come to rest."""
+"""Contacts: overlap of touching particles goes away gently, and piles come to rest."""
 
 import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.contact.limits import BEYOND, MET, SLOP
+from tiverlet.contact.limits import BEYOND, SLOP
 from tiverlet.step import checkpoint
 
+from .conftest import compiled
 from .test_pairs import roomy
 
 
@@ -24,15 +25,11 @@ def rough(world, start, wide, friction, restitution, **settings):
     return w
 
 
+@pytest.mark.slow
 def test_a_heap_comes_to_rest_without_overlap(world):
     n = 150
-    spots = tv.golden(np.arange(n), dim=2) * [3.0, 12.0] + [0.2, 0.2]
-    radius = 0.06 + 0.1 * tv.golden(np.arange(n))
-    w = world(
-        tv.Particles(spots, radius=radius, mass=radius**2),
-        [tv.Gravity(9.81), tv.Contact(), tv.Box((0, 0), (3.4, 14))],
-        substeps=40,
-    )
+    spots, radius = tv.golden(np.arange(n), dim=2) * [3.0, 12.0] + [0.2, 0.2], 0.06 + 0.1 * tv.golden(np.arange(n))
+    w = smooth(world, tv.Particles(spots, radius=radius, mass=radius**2), (3.4, 14), substeps=40)
     w.run(4.0)
     assert w.last.overlap < 0.02 and w.last.contacts > n
     x, r, slop = w.position, radius[:, None], SLOP * BEYOND * radius[:, None]  # in which contacts rest
@@ -82,63 +79,39 @@ def test_deep_overlap_leaves_at_push_out_without_velocity(world):
         np.testing.assert_array_equal(w.velocity, 0)
 
 
-def test_linked_particles_do_not_touch(world):
-    x, v = [[0.0, 0], [0.1, 0], [0.35, 0], [9.0, 9.0]], [[0, 0], [0, 0], [-0.5, 0], [0, 0]]
-    w = world(tv.Particles(x, velocity=v, radius=0.1, pinned=[3]), [tv.Distance([[0, 1]]), tv.Contact()], precision="f64")
-    w.run(0.5)
-    assert np.linalg.norm(w.position[0] - w.position[1]) == pytest.approx(0.1, abs=1e-6)
-    assert np.linalg.norm(w.position[1] - w.position[2]) >= 0.2 - 1e-6
-
-
-@pytest.mark.parametrize("substeps", [1, 2, 10, 60])
-def test_a_column_bears_its_weight(world, substeps):
-    # The k-th contact from the top bears k m g, and no load makes contacts overlap by more than that in which they rest.
-    n, h = 10, 1 / 60 / substeps
-    x = np.stack([np.full(n, 0.5), 0.5 + np.arange(n) * 1.0], axis=1)
-    w = smooth(world, tv.Particles(x, radius=0.5), (1, np.inf), substeps=substeps)
-    w.run(3.0)
-    assert (1 - np.diff(w.position[:, 1])).max() < SLOP * BEYOND * 0.5
-    np.testing.assert_allclose(w.contacts.impulse / h, np.arange(n - 1, 0, -1) * 9.81, rtol=2 * MET)
-
-
 @pytest.mark.slow
 def test_settled_piles_are_quiet(world):
-    # No jitter: the kinetic energy of a settled pile falls below 1e-9 m g r per particle, also with friction or restitution.
-    k = np.arange(300)
+    # No jitter: the kinetic energy of a settled pile falls below 1e-9 m g r per particle, also with friction and restitution. The
+    # contacts across a height carry the weight above it, apart from the sound that is left: a velocity of sqrt(2e-6 g r) = 3 mm/s
+    # at 30 rad/s is 1 % of g.
+    k = np.arange(150)
     x = np.stack([k % 15 * 1.02 + 0.5 + 0.01 * tv.golden(k), k // 15 * 1.02 + 0.5], axis=1)
-    for friction, restitution in ((0.0, 0.0), (0.4, 0.0), (0.0, 0.5)):
-        start = tv.Particles(x, radius=0.5)
-        if friction or restitution:
-            w = rough(world, start, (15.5, 60), friction, restitution, substeps=8)
-        else:
-            w = smooth(world, start, (15.5, 60), substeps=8)
+    start = tv.Particles(x, radius=0.5)
+    for w in (smooth(world, start, (15.5, 60), substeps=8), rough(world, start, (15.5, 60), 0.4, 0.5, substeps=8)):
         w.run(36.0)
         assert tv.measure.kinetic_energy(w) / len(k) <= 1e-9 * 9.81 * 0.5
-        # The contacts across a height carry the weight above it, apart from the sound that is left: a velocity of
-        # sqrt(2e-6 g r) = 3 mm/s at 30 rad/s is 1 % of g.
-        height = w.position[:, 1]
-        level = np.quantile(height, 0.5) + 1e-9
-        i, j = w.contacts.pairs.T
-        across = (height[i] > level) != (height[j] > level)
-        up = np.where(height[i] > level, 1, -1) * w.contacts.normal[:, 1] * w.contacts.impulse * 480
-        if not friction:
+        if w.features[-1].friction == 0:
+            height = w.position[:, 1]
+            level = np.quantile(height, 0.5) + 1e-9
+            i, j = w.contacts.pairs.T
+            across = (height[i] > level) != (height[j] > level)
+            up = np.where(height[i] > level, 1, -1) * w.contacts.normal[:, 1] * w.contacts.impulse * 480
             assert up[across].sum() == pytest.approx(9.81 * (height > level).sum(), rel=1e-2)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("precision", ["f64", "f32"])
-def test_what_falls_on_something_lighter_stays_there(world, precision):
+def test_what_falls_on_something_lighter_stays_there(world):
     # Without restitution nothing is thrown back, whatever lies between a disc and the floor: one pass per substep would hold a
     # mass M on m like a spring, and return its energy (0.36 of the height at 10 : 1, 0.7 at 100 : 1). What is left is less than
     # a fifth of the height. Masses from the floor up; the last disc of a column falls by 0.35 to 0.65 m.
     r = 0.1
     columns = [[1.0, 2.5], [1.0, 10.0], [1.0, 100.0], [1.0] * 10 + [10.0], [1.0] * 3 + [30.0]]
     for mass in columns:
-        for height in np.linspace(0.35, 0.65, 5):
+        for height in np.linspace(0.35, 0.65, 3):
             y = r + 2 * r * (1 + 1e-6) * np.arange(len(mass))  # no overlap by rounding, which would compile other kernels
             y[-1] += height
             start = tv.Particles(np.stack([np.full(len(y), 5.0), y], axis=1), radius=r, mass=mass)
-            w = smooth(world, start, precision=precision, substeps=8)
+            w = smooth(world, start, substeps=8)
             tops = np.array([w.position[-1, 1] for _ in range(75) if w.step(1 / 60)]) - (y[-1] - height)
             assert tops[tops.argmin() :].max() <= 0.2 * height, (mass, height)
     # What is sent off is not held back: it rises by v^2 / 2 g.
@@ -147,6 +120,7 @@ def test_what_falls_on_something_lighter_stays_there(world, precision):
     assert max(tops) - low == pytest.approx(2.0**2 / (2 * 9.81), rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_pile_that_lands_is_soon_quiet(world):
     # Inelastic discs lose the energy of their fall as they meet. 900 of them fall by 1 m and more: 0.7 s after the first land,
     # less than 0.005 of m g 1 m is left. With a projection of velocities in every 32nd substep only it was 0.024.
@@ -162,7 +136,7 @@ def test_a_pile_that_lands_is_soon_quiet(world):
 def test_small_and_heavy_discs_together_gain_no_energy(world):
     # Small discs are pressed deep into heavy ones, and turn around them within a substep. By the normals of its start, their mass
     # is split too few times: the projection of velocities had eigenvalues above 1, and made up to 2e15 J.
-    for seed, substeps in ((1, 2), (5, 2), (1, 4), (1, 8)):
+    for seed, substeps in ((1, 2), (5, 2), (1, 8)):
         rng, k = np.random.default_rng(seed), np.arange(400)
         x = np.stack([k % 20 * 0.25 + k // 20 % 2 * 0.03 + 0.2, k // 20 * 0.25 + 0.15], axis=1)
         start = tv.Particles(x, radius=np.where(rng.random(400) < 0.1, 0.12, 0.03), mass=rng.choice([1.0, 30.0], 400))
@@ -187,70 +161,6 @@ def test_idle_columns_do_not_creep(world):
     assert tv.measure.kinetic_energy(w) <= 1e-6 * 9.81 * 0.5
 
 
-def test_idle_piles_do_not_creep(world):
-    # Row 43: a settled pile with friction does not creep either: in 1e5 substeps only the last digits of coordinates change.
-    k = np.arange(40)
-    x = np.stack([k % 10 * 1.02 + 0.5 + 0.01 * tv.golden(k), k // 10 * 1.02 + 0.5], axis=1)
-    w = rough(world, tv.Particles(x, radius=0.5), (10.5, 60), 0.4, 0.0)
-    w.run(15.0)
-    rest = w.position
-    w.substeps = 1000
-    w.run(100 / 1.2, dt=1 / 1.2)
-    assert np.abs(w.position - rest).max() <= 1e-9 and tv.measure.kinetic_energy(w) <= 1e-15
-
-
-def test_walls_are_one_sided_at_any_speed(world):
-    # Row 45: up to 1e6 m/s, towards every wall of a box and onto a slope.
-    for dim in (2, 3):
-        rng = np.random.default_rng(0)
-        direction = rng.normal(size=(60, dim))
-        speed = 10.0 ** rng.uniform(0, 6, 60)
-        v = direction / np.linalg.norm(direction, axis=1)[:, None] * speed[:, None]
-        slope = np.array([1.0, 2.0, 0.5])[:dim]
-        w = world(
-            tv.Particles(np.zeros((60, dim)), velocity=v, radius=0.1), [tv.Box([-1] * dim, [1] * dim), tv.HalfSpace(slope, -0.5)],
-            precision="f64", substeps=3,
-        )  # fmt: skip
-        for _ in range(20):
-            w.step(1 / 60)
-            x = w.position
-            # Where two walls push, in the corner between them, the last of a few rounds leaves a small violation.
-            assert (np.abs(x) <= 0.9 + 1e-3).all()
-            assert (x @ slope / np.linalg.norm(slope) >= -0.4 - 1e-9).all()
-            alone = x @ slope / np.linalg.norm(slope) > -0.35
-            assert (np.abs(x[alone]) <= 0.9 + 1e-12).all()
-        assert tv.measure.kinetic_energy(w) <= 0.5 * (speed**2).sum()
-
-
-@pytest.mark.filterwarnings("ignore:Box. particle 0 starts")
-def test_walls_move_and_push(world):
-    # A piston: within a frame the wall moves to its new place, and carries the particle that it meets at its own speed.
-    box = tv.Box((0, 0), (10, 10))
-    w = world(tv.Particles([[0.5, 5.0], [7.0, 5.0]], radius=0.5), [box], precision="f64", substeps=10)
-    for k in range(30):
-        box.lower = (0.1 * (k + 1), 0)
-        w.step(1 / 60)
-        assert w.position[0, 0] == pytest.approx(0.1 * (k + 1) + 0.5, abs=1e-12)
-    assert w._runner.memory.state()["displacement"][0, 0] * 600 == pytest.approx(6.0, rel=1e-9)
-    floor = tv.HalfSpace((0, 1), 0.0)
-    w = world(tv.Particles([[0.0, 0.25]], radius=0.25), [tv.Gravity(9.81), floor], precision="f64")
-    for k in range(10):
-        floor.offset = 0.02 * (k + 1)
-        w.step(1 / 60)
-    assert w.position[0, 1] == pytest.approx(0.45, abs=1e-12)
-    # A particle that starts outside comes in at push_out and not faster.
-    w = world(tv.Particles([[-3.0, 0.0]], radius=0.1), [tv.Box((-1, -1), (1, 1), push_out=2.0)], precision="f64")
-    w.run(1.2)
-    assert abs(w.velocity[0, 0]) <= 2.0 + 1e-12 and w.position[0, 0] >= -0.9
-
-
-def test_a_body_at_rest_has_no_velocity(world):
-    w = world(tv.Particles([[0.0, 0.25]], radius=0.25), [tv.Gravity(9.81), tv.HalfSpace((0, 1))], precision="f64")
-    w.run(1.0)
-    np.testing.assert_allclose(w.velocity, 0.0, atol=1e-12)
-    assert w.position[0, 1] == 0.25
-
-
 def test_outrunning_the_contacts_is_flagged(world):
     # Row 47: at v h / r = 0.5 the pair is caught; above 1 it may pass through, which is flagged.
     r, h = 0.1, 1 / 600
@@ -265,71 +175,16 @@ def test_outrunning_the_contacts_is_flagged(world):
             assert w.position[0, 0] < w.position[1, 0]
 
 
-def test_both_of_a_pair_agree_that_they_touch(world):
-    # Three discs in a row: the gap between the first and the second is some rounding errors, of either sign, and the third
-    # moves into the second. Momentum is kept only if both discs of a pair count their contact. If one did not, its mass would
-    # be split too little, and the velocity projection would explode.
-    rng = np.random.default_rng(3)
-    n = 330
-    radius, place = rng.uniform(0.1, 0.5, (n, 3)), np.stack(np.divmod(np.arange(n), 64), axis=1) * 4.0
-    last = (radius[:, 1] + radius[:, 2]) * (1 + 1e-6)
-    hit = 0
-    for k in range(12):
-        angle = rng.uniform(0, 2 * np.pi, n)
-        way = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        first = (radius[:, 0] + radius[:, 1]) * (1 + rng.integers(-4, 5, n) * 2.0**-24)
-        x = np.stack([place - first[:, None] * way, place, place + last[:, None] * way], axis=1).reshape(-1, 2)
-        v = np.stack([0 * way, 0 * way, -1e-4 * way], axis=1).reshape(-1, 2)
-        if k == 0:
-            w = world(tv.Particles(x, velocity=v, radius=radius.ravel()), [tv.Contact()], precision="f32-compensated", substeps=1)
-        else:
-            w.velocity, w.position = v, x
-        for _ in range(5):
-            w.step(1e-2)
-            d = w._runner.memory.state()["displacement"].astype(float).reshape(n, 3, 2)
-            np.testing.assert_allclose(d.sum(axis=1), -1e-6 * way, atol=4e-12)
-        hit += np.count_nonzero(np.abs(d[:, 0]).max(axis=1) > 1e-9)  # the first discs, which only the second ones can push
-    assert hit > n
-
-
-def tossed(world, start, links, rest, friction, low, high, **settings):
-    """Build a world of discs in a box, some on springs."""
-    springs = tv.Distance(links, rest, compliance=1e-4)
-    features = [tv.Gravity(9.81), springs, tv.Contact(friction=friction), tv.Box(low, high)]
-    return world(start, features, solver=tv.Jacobi(), **settings)
-
-
-def test_what_a_failed_frame_left_behind_is_gone(world):
-    # A frame that ended in NaN is undone, as the step controller does it. Pair data of the new list must be the restored data
-    # or 0. It must not be 0 times what the failed frame left in the field, which is NaN.
-    k = np.stack(np.divmod(np.arange(150), 10), axis=1)[:, ::-1]
-    x = 0.21 * k + 0.01 * np.sin(7.0 * k[:, ::-1]) + 0.2
-    x[:2] += [[0.0, 5.0], [0.1, 5.0]]
-    x[5, 0] += 0.03  # so that some discs overlap
-    w = tossed(world, tv.Particles(x, radius=0.1), [[0, 1]], 0.2, 0.3, (0, 0), (2.4, 9))
-    w.run(0.5)
-    kept = checkpoint.keep(w)
-    ends = []
-    for failed in (False, True):
-        if failed:
-            for piece in w._runner.search.list.pair_data:
-                w._runner.search.list.store.write(piece.field, np.nan)
-        checkpoint.put_back(w, kept)
-        w.run(0.2)
-        ends.append(w.hash())
-    assert ends[0] == ends[1] and w.last.contacts > 100
-
-
+@pytest.mark.slow
 def test_the_skin_changes_no_bits_of_what_links_move(world):
     # Row 83: skins of 0.01 ... 2 contact distances; test_pairs.py tests the paths. Soft links move discs together and apart.
     n, rng = 60, np.random.default_rng(3)
     x, v = rng.uniform(-2, 2, (n, 2)), rng.normal(size=(n, 2))
-    links = np.arange(n).reshape(-1, 2)
-    start, rest = (
-        tv.Particles(x, velocity=v, radius=0.1),
-        np.linalg.norm(x[1::2] - x[::2], axis=1) * rng.uniform(0.9, 1.1, n // 2),
-    )
-    hashes, w = set(), tossed(world, start, links, rest, 0.2, (-2.2, -2.2), (2.2, 2.2), substeps=4, iterations=2)
+    rest = np.linalg.norm(x[1::2] - x[::2], axis=1) * rng.uniform(0.9, 1.1, n // 2)
+    springs = tv.Distance(np.arange(n).reshape(-1, 2), rest, compliance=1e-4)
+    features = [tv.Gravity(9.81), springs, tv.Contact(friction=0.2), tv.Box((-2.2, -2.2), (2.2, 2.2))]
+    start, hashes = tv.Particles(x, velocity=v, radius=0.1), set()
+    w = world(start, features, substeps=4, iterations=2, solver=tv.Jacobi())
     contact, begin = w.features[2], checkpoint.keep(w)
     for contact.skin in (0.002, 0.4, 0.05):
         checkpoint.put_back(w, begin)
@@ -339,12 +194,12 @@ def test_the_skin_changes_no_bits_of_what_links_move(world):
     assert len(hashes) == 1
 
 
+@pytest.mark.slow
 def test_what_a_link_draws_through_another_disc_is_flagged(world):
-    # Row 82: in one substep a link draws a particle from 0 to 2.3, through one that is pinned at 1.15. A link of nearly its
-    # length draws it through none.
-    start = tv.Particles([[0.0, 0], [3.0, 0], [1.15, 0.0]], radius=0.3, pinned=[1, 2])
-    link = tv.Distance([[0, 1]], 3.0)
-    w = world(start, [link, tv.Contact()], substeps=1, precision="f64")
+    # Row 82: in one substep a link draws a particle from 0 to 1.15, through one at 0.7. A link of nearly its length draws it
+    # through none.
+    start, link = tv.Particles([[0.0, 0], [3.0, 0], [0.7, 0.0]], radius=0.3), tv.Distance([(0, 1)], 3.0)
+    w = world(start, [link, tv.Contact(push_out=1.0)], substeps=1)
     for link.rest, flagged in ((2.99, False), (0.7, True)):
         assert ("tunnelling-risk" in w.step(1 / 60).flags) == flagged
 
@@ -379,6 +234,100 @@ def test_overlap_that_rounding_makes_is_flagged(world):
 
 def test_a_point_in_the_middle_of_a_disc_that_is_to_stay_there(world):
     # At push_out = 0 nothing that overlaps parts.
-    w = world(tv.Particles([(0.5, 1)] * 2, radius=[0.1, 0]), [tv.Contact(friction=0.3, push_out=0.0)])
+    w = smooth(world, tv.Particles([(0.5, 1)] * 2, radius=[0.1, 0], mass=[1, 2]), g=0.0, push_out=0.0)
     w.run(0.1)
     np.testing.assert_array_equal(w.position, [(0.5, 1)] * 2)
+
+
+@pytest.mark.filterwarnings("ignore:Box. particle 0 starts")
+def test_a_wall_pushes_at_its_own_speed_and_what_starts_outside_comes_in_at_push_out(world):
+    # A piston: within a frame the wall moves to its new place, and carries the particle that it meets.
+    box = tv.Box((0, 0), (10, 10), push_out=2.0)
+    w = world(tv.Particles([[0.5, 5.0], [7.0, 5.0]], radius=0.5), [box], precision="f64", substeps=10)
+    for k in range(30):
+        box.lower = (0.1 * (k + 1), 0)
+        w.step(1 / 60)
+        assert w.position[0, 0] == pytest.approx(0.1 * (k + 1) + 0.5, abs=1e-12)
+    assert w.velocity[0, 0] == pytest.approx(6.0, rel=1e-9)
+    w = world(tv.Particles([[-3.0, 0.0], [0.0, 0.0]], radius=0.1), [tv.Box((-1, -1), (1, 1), push_out=2.0)], precision="f64")
+    w.run(1.2)
+    assert abs(w.velocity[0, 0]) <= 2.0 + 1e-12 and w.position[0, 0] >= -0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pinned", [(), (0, 1)], ids=["linked", "pinned"])
+def test_what_starts_between_others_is_not_shot_out(pinned, world):
+    # A disc y away from the middle between two others, d away from each: d^2 = y^2 + (L / 2)^2, so y' = d' d / y, which has no
+    # limit where d grows at push_out. Places move it, and give no velocity. A link that is moved far turns, and what one tangent
+    # leaves of it is pulled back.
+    for y, substeps in ((-0.01, 20), (-0.01, 200), (-0.001, 200)):
+        x = np.array([[0.0, 0.0], [0.3, 0.0], [0.15, y]])
+        features = [tv.Distance([(0, 1)]), tv.Contact(push_out=1.0)]
+        w = world(tv.Particles(x, radius=0.1, pinned=pinned), features, substeps=substeps)
+        fastest = max(np.linalg.norm(w.velocity, axis=1).max() for _ in range(30) if w.step(1 / 60))
+        assert fastest < (1e-6 if pinned else 4.0)
+        r = w.position[2] - w.position[:2]
+        assert np.linalg.norm(r, axis=1).min() > 0.2 - 0.1 * SLOP * BEYOND - 1e-6  # it is out, but for what places leave
+
+
+def test_what_overlaps_in_a_row_parts_at_push_out(world):
+    # Ten in a row, each in the next one by a fifth. What overlaps parts by moves, without velocity, each pair at push_out: the
+    # ends part at 9 push_out at most.
+    push_out, x = 0.5, np.stack([np.zeros(10), np.arange(10) * 0.16], axis=1)
+    w = world(tv.Particles(x, radius=0.1), [tv.Contact(push_out=push_out)], precision="f64", substeps=8)
+    middle, fastest = x.mean(axis=0), 0.0
+    for _ in range(90):
+        before, report = w.position[:, 1], w.step(1 / 60)
+        fastest = max(fastest, np.ptp(60 * (w.position[:, 1] - before)))
+    assert push_out / 2 < fastest < 9 * push_out
+    assert report.overlap < 3 * SLOP and abs(w.position.mean(axis=0) - middle).max() < 1e-9
+
+
+@pytest.mark.slow
+def test_what_goes_to_another_place_compiles_nothing(world):
+    # Six discs rest on each other. One is carried off, twice before it is seen. The first disc of a group that is named, but had
+    # no particles, is not another structure either, nor is a disc that is put into another one. They part.
+    x = np.vstack([np.stack([np.zeros(6), 0.1 + 0.201 * np.arange(6)], axis=1), [[50.0, 0.1], [51.0, 0.1]]])
+    contact, link = tv.Contact(groups=[(0, 0), (0, 1)], friction={(0, 1): 0.5}), tv.Distance([[6, 7]])
+    w = world(tv.Particles(x, radius=0.1), [tv.Gravity(), contact, link, tv.HalfSpace((0, 1), 0.0)], substeps=8)
+    w.run(1.0)
+    w.position, w.velocity = w.position, w.velocity  # the kernels of a start
+    w.step(1 / 60)
+    with compiled() as names:
+        for place in ((1.0, 2.0), (2.0, 2.0)):
+            x = w.position.copy()
+            x[5] = place
+            w.position = x
+        with w.clone() as twin:
+            w.run(0.3)
+            twin.run(0.3)
+            assert twin.hash() == w.hash()
+        w.add(tv.Particles([[1.0, 3.0]], radius=0.1, group=1))
+        w.run(0.5)
+        x = w.position.copy()
+        x[5] = x[8] + [0.05, 0.05]
+        w.position = x
+        w.run(0.5)
+    assert names == [] and np.linalg.norm(w.position[5] - w.position[8]) > 0.2 - 0.1 * SLOP * BEYOND - 1e-6
+
+
+def test_a_lasting_overlap_is_flagged_and_the_advice_ends_it(world):
+    # Masses of 1, 1000 and 1e5 kg on each other: at 4 substeps they would rest a third of a radius in each other, without a word.
+    x, radius, mass = [(0, 0.1), (0, 0.45), (0.05, 0.8)], [0.1, 0.25, 0.1], [1.0, 1e3, 1e5]
+    start = tv.Particles(np.add(x, (0.3, 0)), radius=radius, mass=mass)
+    w = smooth(world, start, (0.6, 9), push_out=None, substeps=4)
+    for _ in range(6):
+        w.run(1.0)
+        report = w.step(1 / 60)
+        if report.clean:
+            break
+        assert report.flags == {"compressed"} and report.overlap > 0.05
+        w.substeps = int(report.notes[0].partition("Use up to ")[2].partition(" substeps")[0])
+    assert w.substeps > 20 and report.overlap < 0.05
+
+
+@pytest.mark.parametrize(("part", "flags"), [(0.045, set()), (0.055, {"compressed"})])
+def test_the_border_of_what_counts_as_compressed_is_a_twentieth_of_a_radius(world, part, flags):
+    x = [(0.0, 0.0), (0.2 - 0.1 * part, 0.0)]
+    w = smooth(world, tv.Particles(x, radius=0.1), g=0.0, low=(-99.0, -99.0), push_out=1e-3, substeps=4)
+    assert w.step(1 / 60).flags == flags

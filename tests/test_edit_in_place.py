@@ -297,6 +297,22 @@ def test_an_edit_makes_and_compiles_nothing():
     w.close()
 
 
+def test_radii_masses_and_pins_are_values():
+    # A world of equal discs takes others, and ones that are held, without other kernels. What is free falls by g t^2 / 2.
+    start = tv.Particles([(0.5, 0.5), (0.8, 0.5)], radius=0.05, mass=1.0)
+    others = dict(radius=0.07), dict(mass=3.0), dict(pinned=[0])
+    with tv.World(start, [tv.Gravity(9.81), tv.Contact(friction=0.3), tv.Box((0, 0), (2, 2))]) as w:
+        w.run(0.1)
+        w.velocity = w.velocity
+        with compiled() as names:
+            for k, other in enumerate(others):
+                w.add(tv.Particles([(0.3 + 0.3 * k, 1.5)], **{"radius": 0.05, "mass": 1.0, **other}))
+                report = w.run(0.1)
+        assert names == [] and not report.flags
+        t = np.array([0.3, 0.2, 0.0])
+        np.testing.assert_allclose(w.position[2:, 1], 1.5 - 9.81 * t**2 / 2, atol=1e-6)
+
+
 def test_memory_that_stays_for_what_went_is_shown_and_given_back():
     w, more = discs()
     w.step(1 / 60)

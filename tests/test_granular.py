@@ -14,21 +14,13 @@ def test_gas_of_discs():
 
 
 @pytest.mark.slow
-def test_gas_of_spheres():
-    # R23: Z = (1 + phi + phi^2 - phi^3) / (1 - phi)^3; R24: 5/3.
-    figures = granular.gas(980, 3, 0.3, 0.01, 120.0)
-    assert figures["pressure"] == pytest.approx(1, abs=0.03)
-    assert figures["moment"] == pytest.approx(1, abs=0.02)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dim, fraction", [(2, 0.5), (3, 0.3)])
-def test_energy_of_a_gas(dim, fraction):
+@pytest.mark.parametrize("dim, fraction, collisions", [(2, 0.5, 1000), (3, 0.3, 100)])
+def test_energy_of_a_gas(dim, fraction, collisions):
     # R23: 1000 collisions per particle at 12 substeps between two, to the rounding of f32: 1e4 substeps, each of which may
     # change an energy by 1e-7. At 3 to 1 substeps no energy is created either. But a wall pushes out a particle that was thrown
     # into it in the same substep, at push_out at most, which is no bounce: within 1 % in 100 collisions.
-    exact, *rough = granular.energies_gained(512, dim, fraction, {0.08: 1000, 0.34: 100, 0.5: 100, 1.0: 100})
-    assert exact == pytest.approx(0, abs=1e-5) and rough == pytest.approx([0, 0, 0], abs=0.01)
+    exact, *rough = granular.energies_gained(512, dim, fraction, {0.08: collisions, 0.34: 100, 1.0: 100})
+    assert exact == pytest.approx(0, abs=1e-8 * collisions) and rough == pytest.approx([0, 0], abs=0.01)
 
 
 @pytest.mark.slow
@@ -38,7 +30,6 @@ def test_discs_jam_where_they_should():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dim", [2, 3])
-def test_a_fallen_pile_hardly_overlaps(dim):
+def test_a_fallen_pile_hardly_overlaps():
     # 120 frames at 20 substeps: 0.2 % of the diameter on average.
-    assert granular.pile(900, dim, 20)["overlap"] <= 2e-3
+    assert granular.pile(900, 3, 20)["overlap"] <= 2e-3

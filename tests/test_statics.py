@@ -1,4 +1,4 @@
-"""Statics of bodies: stacks and heaps of Polygons give way to nothing at rest, and bear what statics says."""
+"""Statics of bodies: stacks and heaps of Polygons neither drift nor sink nor give way, and bear what statics says."""
 
 from typing import Any
 
@@ -31,11 +31,12 @@ def tossed(columns, rows):
 
 def standing(
     world, shapes, mass: Any = 1.0, friction: object = 0.5, pinned=(), discs=(), low=(-99, 0), high=(99, 99),
-    restitution=0.0, velocity=0.0, links=False, **settings
+    velocity=0.0, links=False, **settings
 ):  # fmt: skip
     """Return a world of rigid bodies of these masses on a floor, and the particles of each.
 
-    Friction is set after the build, and all have a pinned particle out of the way, so that worlds share compiled kernels.
+    Friction is set after the build, and all have a pinned particle out of the way, which differs from the others: worlds of one
+    precision and kind of ties share kernels.
     """
     loops = [4 * k + np.arange(4) for k in range(len(shapes))]
     x = np.concatenate([*shapes, np.reshape(discs, (-1, 2)), [(90.0, 90.0)]])
@@ -45,11 +46,40 @@ def standing(
     corners = np.array(loops)
     sides = np.concatenate([corners[:, [k, m]] for k, m in ((0, 1), (1, 2), (2, 3), (3, 0), (0, 2))])
     ties: Any = tv.Distance(sides) if links else tv.ShapeMatch(loops)
-    polygons, box = tv.Polygons(loops, friction=0.5, restitution=restitution), tv.Box(low, high, friction=0.5)
+    polygons, box = tv.Polygons(loops, friction=0.5), tv.Box(low, high, friction=0.5)
     start = tv.Particles(x, mass=each, radius=radius, pinned=held, velocity=velocity)
     w = world(start, [tv.Gravity(G), polygons, ties, box], **({"substeps": 8, "precision": "f64"} | settings))
     polygons.friction = box.friction = friction  # type: ignore[assignment]
     return w, loops
+
+
+def turned(points, angle):
+    """Turn points about the origin."""
+    c, s = np.cos(angle), np.sin(angle)
+    return points @ np.array([[c, s], [-s, c]])
+
+
+def arch(stones):
+    """Return half a ring of stones between the radii 2 and 2.6 m."""
+    at = np.linspace(np.pi, 0, stones + 1)
+    inner, outer = (r * np.stack([np.cos(at), np.sin(at)], axis=1) for r in (2.0, 2.6))
+    return [np.array([inner[k], inner[k + 1], outer[k + 1], outer[k]]) for k in range(stones)]
+
+
+def cards():
+    """Return a house of cards: two tents with a card across, and a tent on it. Cards are 1 m by 4 cm, at 75 degrees."""
+    length, thick, angle = 1.0, 0.04, np.radians(75)
+
+    def tent(x, y):
+        out = []
+        for turn, side in ((angle, np.max), (np.pi - angle, np.min)):
+            card = turned(block(length, thick, 0), turn)
+            out.append(card - (side(card[:, 0]), card[:, 1].min()) + (x, y))
+        return out
+
+    width, height = length * np.cos(angle) + thick * np.sin(angle), np.max(tent(0, 0)[0][:, 1])
+    roof = block(2 * width + 0.6, thick, (width, height + thick / 2))
+    return [*tent(0, 0), *tent(2 * width, 0), roof, *tent(width, height + thick)]
 
 
 def bent(w, loops):
@@ -131,7 +161,6 @@ def test_friction_bears_its_load_on_a_slope(world):
     assert bent(w, loops) < 1e-8
 
 
-@pytest.mark.slow
 def test_loads_are_gone_with_what_bore_them(world):
     # The floor goes: boxes fall as one, but for the loads of at most one more substep.
     w, loops = standing(world, column(5), substeps=8)
@@ -176,18 +205,6 @@ def test_a_lift_carries_a_stack(world):
     assert bent(w, loops) < 1e-3 and w.position[:-1, 1].min() == pytest.approx(y, abs=1e-9)
 
 
-@pytest.mark.slow
-def test_a_column_stands_whatever_the_substep(world):
-    # A load is a force: what was borne at 40 substeps a frame bears five boxes at 2 substeps.
-    w, loops = standing(world, column(5), substeps=40, precision="f32")
-    w.run(8.0)
-    w.substeps = 2
-    w.run(12.0)
-    assert bent(w, loops) < 1e-4 and np.abs(w.velocity).max() < 1e-3
-    assert np.abs(w.position[:20] - np.concatenate(column(5))).max() < 1e-3
-
-
-@pytest.mark.slow
 def test_a_heap_with_discs_hardly_overlaps(world):
     # 24 boxes and 12 discs between rough walls. Energy never rises above the start.
     discs = np.stack([0.8 + 0.9 * (np.arange(12) % 6), 9.0 + 0.9 * (np.arange(12) // 6)], axis=1)
@@ -199,31 +216,112 @@ def test_a_heap_with_discs_hardly_overlaps(world):
     assert w.contacts.overlap.max() < 0.009 * 0.5 and bent(w, loops) < 1e-4
 
 
+PYRAMID = [block(1.0, 1.0, (1.05 * (k - (10 - r) / 2), 0.5 + r)) for r in range(10) for k in range(10 - r)]
+STRUCTURES = {
+    "tower": (column(20, 0.0), 1.0, False, 4), "tower on links": (column(20, 0.0), 1.0, True, 4),
+    "pyramid under 100 kg": (PYRAMID, [*np.ones(54), 100.0], False, 8), "arch": (arch(9), 1.0, False, 4),
+    "house of cards": (cards(), 1.0, False, 8),
+}  # fmt: skip
+
+
 @pytest.mark.slow
-def test_a_box_that_bounces_comes_to_rest_under_its_weight(world):
-    # A box falls on a pinned one and leaves at e times its speed. Later it rests.
-    shapes = [block(3.0, 1.0, (0.0, 0.5)), block(1.0, 1.0, (0.0, 2.0))]
-    w, loops = standing(world, shapes, pinned=(0,), restitution=0.6)
-    frames = [w.position for _ in range(60) if w.step(1 / 60)]
-    w.run(20.0)
-    assert w.contacts.impulse.sum() * 480 == pytest.approx(G, rel=1e-6) and bent(w, loops) < 1e-8
-    assert max(x[4:8, 1].min() for x in frames[30:]) == pytest.approx(1.0 + 0.36 * 0.5, abs=0.02)
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_what_stands_stays(world, name):
+    # No body moves: in f32 within a few digits of the coordinates, 20 m * 2^-24 = 1e-6 m, and for links ten times as far.
+    shapes, mass, links, substeps = STRUCTURES[name]
+    how = {"links": links, "precision": "f64" if links else "f32", "substeps": substeps}
+    w, _ = standing(world, shapes, mass, 0.8, **how)
+    w.run(3.0)
+    start = w.position.copy()
+    for _ in range(600):
+        w.step(1 / 60)
+        assert not w.last.flags
+    assert np.abs(w.position - start).max() < (4e-5 if links else 4e-6)
+    assert np.abs(start[:-1] - np.concatenate(shapes)).max() < 2e-3
+
+
+@pytest.mark.slow
+def test_towers_far_out_stand_for_a_minute(world):
+    # Towers of 20 boxes, up to 60 m from the origin in f32: the top may move by 1e-3 of a box for each box below it. Loads are
+    # forces: what was borne at 40 substeps a frame is borne at 4.
+    shapes = [box + (15 * k, 0) for k in range(5) for box in column(20, 0.0)]
+    w, loops = standing(world, shapes, friction=0.8, precision="f32", substeps=40)
+    w.run(1.0)
+    w.substeps = 4
+    w.run(60.0)
+    assert np.abs(w.position[:-1, 0] - np.concatenate(shapes)[:, 0]).max() < 20e-3 and bent(w, loops) < 1e-4
+
+
+@pytest.mark.parametrize("depth", [1e-5, 1e-3])
+def test_overlap_of_corners_gives_no_momentum(world, depth):
+    # Overlap is no reason for an impulse, wherever corners meet: boxes in each other lie still under their weight. Where one box
+    # begins beside the other one, and leans over it, their corners cross. Overlap is below 3 slops, which places leave. In a
+    # substep passes leave 5e-4 of g h for each row.
+    leans, square = [(0, 0), (1.5, 0), (0, 1.5), (-1.5, 0), (0, -1.5), (4, 4), (-4, -4)], block(1.0, 1.0, 0)
+    places = [(sign * shift, *lean) for shift in (0, 1e-14, 1e-13) for sign in (1, -1) for lean in leans]
+    shapes = []
+    for k, (shift, below, above) in enumerate(places):
+        lower, upper = turned(square + (0.5, -0.5), below * shift / depth), turned(square + 0.5, above * shift / depth)
+        shapes += [lower + (1.5 * k - 0.5, 1), upper + (1.5 * k - 0.5 + shift, 1 - depth)]
+    w, _ = standing(world, shapes, friction=0.8)
+    start = w.position.copy()
+    for _ in range(10):
+        w.step(1 / 60)
+        assert np.abs(w.velocity).max() < 0.02 * G / 480
+    assert np.abs(w.position - start).max() < 1e-6
+
+
+@pytest.mark.parametrize("substeps", [20, 200])
+@pytest.mark.parametrize("what", ["point", "box"])
+def test_friction_holds_far_from_the_origin(world, what, substeps):
+    # The slope is 0.3 < friction 0.6. In f32 at 50 m a digit is 4e-6 m, 60 times g h^2 at 200 substeps.
+    tilted = G * np.array([-0.3, -1.0]) / np.hypot(1.0, 0.3)
+    if what == "point":
+        floor = tv.HalfSpace((0, 1), friction=0.6)
+        w = world(tv.Particles([[50.0, 0.0]], radius=0.0), [tv.Gravity(tilted), floor], substeps=substeps)
+    else:
+        w, _ = standing(world, [block(1.0, 1.0, (50.0, 0.5))], friction=0.6, precision="f32", substeps=substeps)
+        w.features[0].g = tilted  # type: ignore[attr-defined]
+    w.run(1.0)
+    start = w.position.copy()
+    w.run(5.0)
+    assert np.abs(w.position - start).max() < 1e-8
+
+
+def test_bodies_that_fly_turn_to_second_order(world):
+    # Free flight is exact but for turns, by phi with sin phi = omega h: (omega h)^2 / 6 of an angle is too much.
+    omega, v, t, square = 5.0, np.array([1.0, 4.0]), 1.0, block(1.0, 1.0, 0)
+    speed = np.r_[np.tile(v + omega * np.stack([-square[:, 1], square[:, 0]], axis=1), (2, 1)), [(0, 0)]]
+    w, _ = standing(world, [square + (0, 20), square + (2, 20)], velocity=speed)
+    w.run(t)
+    end = turned(square, omega * t) + v * t + (0, 20 - G * t**2 / 2)
+    off = w.position[:-1] - np.concatenate([end, end + (2, 0)])
+    assert np.hypot(*off.T).max() == pytest.approx(0.5**0.5 * omega * t * (omega / 480) ** 2 / 6, rel=0.01)
+
+
+def test_scenes_take_as_many_substeps_as_they_need(world):
+    # 4 where particles and rigid bodies fall freely between contacts. Links, and clusters that share particles or give way, take
+    # 20.
+    squares, loops = np.concatenate([block(1, 1, 0), block(1, 1, (2, 0))]), [[0, 1, 2, 3], [4, 5, 6, 7]]
+    for few, *features in (
+        (True,), (True, tv.ShapeMatch(loops)), (True, tv.ShapeMatch(loops[:1]), tv.ShapeMatch(loops[1:])),
+        (False, tv.ShapeMatch(loops), tv.ShapeMatch([[0, 4]])), (False, tv.ShapeMatch(loops, compliance=1e-4)),
+        (False, tv.ShapeMatch(loops), tv.Distance([(0, 4)])), (False, tv.ShapeMatch(loops), tv.Attractor((0, 0), 1.0)),
+    ):  # fmt: skip
+        w = world(tv.Particles(squares, radius=0.1), [tv.Gravity(), tv.Contact(), *features])
+        assert w.substeps == (4 if few else 20), features
 
 
 @pytest.mark.slow
 def test_loads_are_of_the_state(world):
-    # Both paths, clones and Worlds have the same bits.
+    # Clones and teams of threads have the same bits.
     hashes = []
     for path in ("fused", "parallel"):
         w, _ = standing(world, tossed(3, 3), low=(0, 0), high=(5, 99), precision="f32", path=path)
         w.run(6.0)
-        hashes.append(w.hash())
-        with w.clone() as other, tv.Worlds(w, 2) as many:
-            for each in (w, other, many):
-                for _ in range(20):
-                    each.step(1 / 60)
+        with w.clone() as other:
+            for each in (w, other):
+                each.run(0.3)
             assert other.hash() == w.hash()
-            np.testing.assert_array_equal(many.position[1], w.position)
+        hashes.append(w.hash())
     assert hashes[0] == hashes[1]
-    with pytest.raises(TypeError, match="loads"):
-        tv.Polygons([[0, 1, 2]], loads="yes")  # type: ignore[arg-type]

@@ -113,12 +113,3 @@ def test_wrong_belts_are_refused():
         tv.World(particles, [tv.HalfSpace((0, 1), friction=0.5, surface_velocity=(1.0, 0.0, 0.0))])
     with pytest.raises(ValueError, match=r"surface_velocity\[1\] = nan"):
         tv.HalfSpace((0, 1), friction=0.5, surface_velocity=(1.0, np.nan))
-
-
-def test_many_worlds_have_belts_of_their_own(world):
-    floor = tv.HalfSpace((0, 1), friction=MU, surface_velocity=(V, 0.0))
-    many = tv.Worlds(world(tv.Particles([[0.0, R]], radius=R), [tv.Gravity(), floor]), 3)
-    many.set(floor, surface_velocity=np.array([(-V, 0.0), (0.0, 0.0), (V / 2, 0.0)]))
-    many.run(0.5)
-    assert many.velocity[:, 0, 0] == pytest.approx([-V, 0.0, V / 2], abs=1e-5)
-    many.close()

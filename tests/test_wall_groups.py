@@ -5,7 +5,6 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.colliders.collider import Collider
-from tiverlet.colliders.wall_tree import MEMBER, SKIP, tree_nodes
 from tiverlet.device import layout
 from tiverlet.device.memory import Memory
 
@@ -60,49 +59,52 @@ def moved(walls, k):
         wall.push_out = 0.5 + k
 
 
-ROUGH = {"friction": 0.3, "restitution": 0.5, "active": True}
-KINDS = [("capsule", 2), ("capsule", 3), ("ball", 2), ("half-space", 2), ("box", 3), ("polygon", 2), ("mesh", 3)]
+ROUGH: dict = {"friction": 0.3, "restitution": 0.5, "active": True}
 
 
-def run(kind, dim, options):
-    """Run a scene in which walls move, and return its positions."""
-    walls = pegs(kind, dim, 4, **options)
-    features = [tv.Gravity((0, -9.81, 0)[:dim]), tv.Box(np.zeros(dim), np.ones(dim)), *walls]
-    with tv.World(grains(dim), features, substeps=6) as world:
+def run(kinds, dim=2, n=40, contact=(), path="auto", **options):
+    """Run a scene in which walls move, two of each kind. Returns the number of groups, positions and velocities."""
+    walls = [wall for kind in kinds for wall in pegs(kind, dim, 2, **options)]
+    features = [tv.Gravity((0, -9.81, 0)[:dim]), tv.Box(np.zeros(dim), np.ones(dim)), *walls, *(c.copy() for c in contact)]
+    with tv.World(grains(dim, n), features, substeps=6, path=path) as world:
         for k in range(6):
             world.step(1 / 60)
             moved(walls, k % 3)
-        groups = len(world._runner.scene.walls)
-        return groups, world.position.copy(), world.velocity.copy()
+        return len(world._runner.scene.walls), world.position.copy(), world.velocity.copy()
 
 
-@pytest.mark.parametrize(("kind", "dim", "options"), [("box", 2, {}), ("capsule", 2, {}), *((*kind, ROUGH) for kind in KINDS)])
-def test_walls_that_share_code_act_as_walls_with_code_of_their_own(kind, dim, options, monkeypatch):
-    groups, x, v = run(kind, dim, options)
-    assert groups == 2 - (kind == "box" and not options)
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "kinds, dim, more",
+    [
+        (("box",), 2, {}),
+        (("capsule", "ball", "half-space", "polygon"), 2, ROUGH),
+        (("box", "mesh"), 3, ROUGH),
+        (("polygon",), 2, {"contact": [tv.Contact(friction=0.4)], "friction": 0.3}),
+        (("capsule",), 2, {"n": 3000, "path": "parallel", "friction": 0.2}),
+    ],
+    ids=["smooth", "rough", "rough in space", "as rows", "parallel"],
+)
+def test_walls_that_share_code_act_as_walls_with_code_of_their_own(kinds, dim, more, monkeypatch):
+    groups, *ends = run(kinds, dim, **more)
+    assert groups == len(kinds) + (kinds != ("box",))  # the box around is of the kind of the smooth ones
     monkeypatch.setattr(Collider, "code_key", None)
-    alone, y, u = run(kind, dim, options)
-    assert alone == 5
-    np.testing.assert_array_equal(x, y)
-    np.testing.assert_array_equal(v, u)
+    alone, *same = run(kinds, dim, **more)
+    assert alone == 2 * len(kinds) + 1
+    np.testing.assert_array_equal(ends, same)
 
 
-@pytest.mark.parametrize(("kind", "dim", "n"), [*((*kind, 40) for kind in KINDS), ("polygon", 2, 1200)])
-def test_contacts_with_walls_that_share_code_are_the_same_rows(kind, dim, n, monkeypatch):
-    def heap():
-        walls = pegs(kind, dim, 4, friction=0.3)
-        features = [tv.Gravity((0, -9.81, 0)[:dim]), tv.Box(np.zeros(dim), np.ones(dim)), *walls, tv.Contact(friction=0.4)]
-        with tv.World(grains(dim, n), features, substeps=6) as world:
-            for k in range(6):
-                world.step(1 / 60)
-                moved(walls, k % 3)
-            return world.position.copy()
-
-    x = heap()
-    monkeypatch.setattr(Collider, "code_key", None)
-    np.testing.assert_array_equal(x, heap())
+@pytest.mark.slow
+def test_members_where_the_host_has_no_access_to_fields(monkeypatch):
+    # As on a GPU: kernels copy whole fields.
+    ends = run(["polygon"], friction=0.3)
+    monkeypatch.setattr(Memory, "_host_views", lambda memory: {})
+    with layout.unshared():
+        same = run(["polygon"], friction=0.3)
+    np.testing.assert_array_equal(ends[1], same[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_seam_between_facets_in_a_plane_is_no_step(dim):
     if dim == 2:
@@ -135,6 +137,7 @@ def test_discs_at_rest_in_a_trough_of_facets_as_rows():
         assert np.abs(world.velocity).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_a_wall_that_moves_meets_a_particle_at_rest_as_a_row():
     rod = tv.Capsule((-1, -1.0), (-1, 1), 0.1)
     with tv.World(tv.Particles([[0.0, 0.0], [3, 3]], radius=0.1), [rod, tv.Contact()], substeps=10) as world:
@@ -144,28 +147,15 @@ def test_a_wall_that_moves_meets_a_particle_at_rest_as_a_row():
         assert world.position[0, 0] == pytest.approx(0.4, abs=1e-2)
 
 
-def test_members_where_the_host_has_no_access_to_fields(monkeypatch):
-    # As on a GPU: kernels copy whole fields.
-    _, x, _ = run("polygon", 2, {"friction": 0.3})
-    monkeypatch.setattr(Memory, "_host_views", lambda memory: {})
-    with layout.unshared():
-        _, y, _ = run("polygon", 2, {"friction": 0.3})
-    np.testing.assert_array_equal(x, y)
-
-
-@pytest.mark.parametrize("path", ["parallel", "fused"])
-def test_walls_that_share_code_on_both_paths(path, monkeypatch):
-    def crowd():
-        walls = pegs("capsule", 2, 5, friction=0.2)
-        with tv.World(grains(2, 3000), [tv.Gravity((0, -9.81)), *walls], substeps=4, path=path) as world:
-            for k in range(3):
-                world.step(1 / 60)
-                moved(walls, k)
-            return world.position.copy()
-
-    x = crowd()
-    monkeypatch.setattr(Collider, "code_key", None)
-    np.testing.assert_array_equal(x, crowd())
+@pytest.mark.slow
+def test_the_first_frame_finds_each_of_several_walls():
+    # What lies on one of two walls of one kind is borne from the first substep on.
+    tile, x = np.array([[0.0, -0.2], [1.0, -0.2], [1.0, 0.0], [0.0, 0.0]]), [[0.5, 0.1], [10.5, 0.1]]
+    walls = [wall for k in (0, 1) for wall in (tv.Capsule((k, -0.1), (k + 1, -0.1), 0.1), tv.Polygon(tile + (10 + k, 0)))]
+    with tv.World(tv.Particles(x, radius=0.1), [tv.Gravity(9.81), tv.Contact(), *walls], substeps=4) as world:
+        for _ in range(6):
+            world.step(1 / 60)
+            np.testing.assert_allclose(world.position, x, atol=1e-7)
 
 
 def test_walls_that_differ_in_code_are_in_different_groups():
@@ -177,6 +167,7 @@ def test_walls_that_differ_in_code_are_in_different_groups():
         assert [len(group.walls) for group in world._runner.scene.walls] == [2, 2, 2, 1, 2, 2, 1, 1]
 
 
+@pytest.mark.slow
 def test_members_are_added_and_removed_and_keep_their_places():
     walls = pegs("capsule")
     with tv.World(grains(), walls, substeps=6) as world:
@@ -226,6 +217,7 @@ def test_worlds_give_members_knobs_of_their_own():
                 np.testing.assert_array_equal(many.position[k], alone.position)
 
 
+@pytest.mark.slow
 def test_a_recording_with_members_is_replayed(tmp_path):
     walls = pegs("capsule", m=5, friction=0.2)
     with tv.World(grains(), [tv.Gravity((0, -9.81)), *walls], substeps=6) as world:
@@ -252,9 +244,3 @@ def test_the_number_of_members_is_no_part_of_the_code():
             times.append(dict(world._runner.memory.compiler.times.kernels))
     assert times[0]
     assert not times[1]
-
-
-def test_tree_lists_every_member_once():
-    rows = tree_nodes(np.random.default_rng(0).normal(size=(13, 3)))
-    assert sorted(rows[rows[:, MEMBER] >= 0, MEMBER]) == list(range(13))
-    assert rows[0, SKIP] == len(rows) == 25

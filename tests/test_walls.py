@@ -47,16 +47,12 @@ def one_of(world, dim, name, start, before, **settings):
     return w, walls[name], scenes(dim)[name][1]
 
 
-# For bounces in the plane see test_nothing_gets_out_whatever_takes_it_there. Rest is tested in the plane, and in space for the
-# mesh, which is no polygon. The function of the sdf is the same in the plane and in space, and is not in that other test.
-LEFT_OUT = {(name, dim, 0.7 if dim == 2 else 0.0) for name in ("box", "plane", "ball", "bowl", "rod") for dim in (2, 3)}
-LEFT_OUT |= {("sdf", 2, 0.0), ("sdf", 3, 0.7), ("hollow", 2, 0.7)}
+ALONE = [("rod", 2, 0.0), ("hollow", 2, 0.0), ("sdf", 2, 0.7), *((n, 3, 0.7) for n in ("box", "plane", "ball", "bowl", "hollow"))]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", scenes(2))
-@pytest.mark.parametrize("dim", [2, 3])
-def test_no_particle_is_ever_inside(world, name, dim):
+@pytest.mark.parametrize("name, dim, restitution", ALONE)
+def test_no_particle_is_ever_inside(world, name, dim, restitution):
     # Rows 45 and 46, for walls alone, which take no turns. Particles are thrown at up to v h / r = 100, with and without
     # restitution, and never inside after a step.
     make, outside = scenes(dim)[name]
@@ -67,16 +63,13 @@ def test_no_particle_is_ever_inside(world, name, dim):
     h, r = 1 / 600, 0.05
     speed = 10.0 ** rng.uniform(-2, 2, len(x)) * r / h
     v = aim / np.linalg.norm(aim, axis=1)[:, None] * speed[:, None]
-    for restitution in (0.0, 0.7):
-        if (name, dim, restitution) in LEFT_OUT:
-            continue
-        start = tv.Particles(x, velocity=v, radius=r)
-        w = world(start, [tv.Gravity(9.81), make(restitution=restitution)], precision="f64", substeps=1)
-        energy = 0.5 * (v**2).sum()
-        for _ in range(30):
-            report = w.step(h)
-            assert (outside(w.position) >= r - 1e-9).all()
-            assert report.energy <= energy + 9.81 * len(x) * 3
+    w = world(
+        tv.Particles(x, velocity=v, radius=r), [tv.Gravity(9.81), make(restitution=restitution)], precision="f64", substeps=1
+    )
+    for _ in range(30):
+        report = w.step(h)
+        assert (outside(w.position) >= r - 1e-9).all()
+        assert report.energy <= 0.5 * (v**2).sum() + 9.81 * len(x) * 3
 
 
 SLOPE = np.array([[1.0, 0.3], [-1.0, 0.3]]) / np.hypot(1.0, 0.3)
@@ -103,11 +96,6 @@ TIGHT = {
     "bowl": (
         lambda **k: [tv.Ball((0.0, 0.0), 1.0, True, **k)],
         lambda x, w: 1 - np.linalg.norm(x - w.center, axis=1),
-        lambda s: {"center": (0.5 * np.sin(s), 0.5 * np.sin(2 * s))},
-    ),
-    "ball": (
-        lambda **k: [tv.Ball((0.0, 0.0), 0.4, **k)],
-        lambda x, w: np.linalg.norm(x - w.center, axis=1) - 0.4,
         lambda s: {"center": (0.5 * np.sin(s), 0.5 * np.sin(2 * s))},
     ),
     "rod": (  # turning
@@ -140,7 +128,7 @@ def test_nothing_gets_out_whatever_takes_it_there(world, name):
 def keeps(world, walls, outside, moves, there):
     """Check rows 80 and 81: no particle is outside after a substep, and free ones gain no energy.
 
-    v h = 0.02 ... 100 half widths, friction, bounces, rods, links that draw particles to anchors on either side, 1 ... 8
+    v h = 0.02 ... 100 half widths, friction, bounces, rods, links that draw particles to anchors on either side, 1 and 8
     iterations, standing and moving walls.
     """
     rng, r, m, h = np.random.default_rng(4), 0.05, 30, 1 / 60
@@ -151,9 +139,9 @@ def keeps(world, walls, outside, moves, there):
     ties = tv.Distance(np.stack([drawn, drawn + m], axis=1), rng.uniform(0.05, 1, m), compliance=1e-5)
     start = tv.Particles(x, radius=r, pinned=drawn + m)
     w = world(start, [tv.Distance(rods), ties, *there], precision="f64", substeps=1, solver=tv.Jacobi())
-    for iterations in (1, 3, 8):
+    for iterations in (1, 8):
         w.iterations = iterations
-        for speed in (0.02, 0.2, 1.0, 20.0, 100.0):
+        for speed in (0.02, 1.0, 100.0):
             v = rng.normal(size=x.shape) * speed / h
             w.velocity, w.position = v, x
             most = (v[free] ** 2).sum(axis=1)
@@ -201,19 +189,6 @@ def test_points_stay_in_corners_far_from_the_origin(world, dim, briefly):
             assert depth.max() <= 1e-5 + 1e-6 * far, (far, int(depth.argmax()))
 
 
-def test_nothing_passes_a_thin_rod(world):
-    # Row 46: a rod of 1 mm, points at v h = 0.1 ... 1000 mm; all end on the side that they came from.
-    n = 200
-    rng = np.random.default_rng(2)
-    x = np.stack([rng.uniform(-0.9, 0.9, n), np.full(n, 0.5)], axis=1)
-    v = np.stack([np.zeros(n), -(10.0 ** rng.uniform(-4, 0, n)) * 600], axis=1)
-    rod = tv.Capsule((-1.0, 0.0), (1.0, 0.0), 0.0005)
-    w = world(tv.Particles(x, velocity=v), [rod, tv.Gravity(9.81)], precision="f64", substeps=1)
-    for _ in range(600):
-        w.step(1 / 600)
-        assert (w.position[:, 1] >= 0.0005 - 1e-9).all()
-
-
 def test_discs_far_from_the_origin_lie_on_the_floor(world):
     # At x = 1e4 m an f32 has steps of 1 mm, the radius, but not the height above the floor: C = y - r = 0 at rest.
     x = np.array([(1e4, 0.006), (0.0, 0.006)])
@@ -247,10 +222,9 @@ def test_a_rod_of_no_length_is_a_ball(world):
     np.testing.assert_allclose(w.position[0], (0, 0.1), atol=1e-6)
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_a_rod_stops_what_comes_in_at_a_grazing_angle_as_a_plane_does(world, dim):
+def test_a_rod_stops_what_comes_in_at_a_grazing_angle_as_a_plane_does(world):
     # Along the axis the top of a rod is flat: paths and impulses are those on a half-space, at angles down to 3e-4.
-    angles = np.array([0.3, 0.1, 0.03, 0.01, 3e-3, 3e-4])
+    dim, angles = 3, np.array([0.3, 0.1, 0.03, 0.01, 3e-3, 3e-4])
     x, v = np.zeros((6, dim)), np.zeros((6, dim))
     x[:, 0], x[:, 1] = 3.0 * np.arange(6) - 8.0, 0.01
     v[:, 0], v[:, 1] = 10.0 * np.cos(angles), -10.0 * np.sin(angles)
@@ -267,37 +241,21 @@ def test_a_rod_stops_what_comes_in_at_a_grazing_angle_as_a_plane_does(world, dim
     np.testing.assert_allclose(given[20:], given[:20], rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_a_ball_stops_what_would_fly_through_it(world, dim):
+def test_a_ball_stops_what_would_fly_through_it(world):
     # v h = 20 diameters of the ball: a point is caught on the side that it came from; with restitution 1 it goes back.
-    x = np.zeros((2, dim))
-    x[:, 0], x[1, 1] = -2.0, 0.3
-    v = np.zeros((2, dim))
-    v[:, 0] = 1200.0
+    x, v = np.array([[-2.0, 0, 0], [-2.0, 0.3, 0]]), np.array([[1200.0, 0, 0]] * 2)
     for restitution in (0.0, 1.0):
-        ball = tv.Ball([0.0] * dim, 0.5, restitution=restitution)
+        ball = tv.Ball([0.0] * 3, 0.5, restitution=1.0)
         w = world(tv.Particles(x, velocity=v, radius=0.0), [ball], precision="f64", substeps=1)
+        ball.restitution = restitution
         w.step(1 / 60)
         assert (np.linalg.norm(w.position, axis=1) >= 0.5 - 1e-9).all() and w.position[0, 0] <= -0.5 + 1e-9
-        if not restitution:  # the rest of the way to the ball stays in the displacement: caught again, and at rest
+        if restitution:  # reflected about the normal where it met the ball: v' = v - 2 (v . n) n
+            n = np.array([-0.8, 0.6, 0])
+            np.testing.assert_allclose(w.velocity, [-v[0], v[1] - 2 * (v[1] @ n) * n], atol=1e-6)
+        else:  # the rest of the way to the ball stays in the displacement: caught again, and at rest
             w.step(1 / 60)
             assert w.position[0, 0] <= -0.5 + 1e-9 and abs(w.velocity[0, 0]) < 1e-9
-        if restitution:
-            np.testing.assert_allclose(w.velocity[0], -v[0], atol=1e-9)
-            # Reflected about the normal where it met the ball: v' = v - 2 (v . n) n.
-            n = np.zeros(dim)
-            n[:2] = -0.8, 0.6
-            np.testing.assert_allclose(w.velocity[1], v[1] - 2 * (v[1] @ n) * n, atol=1e-6)
-
-
-def test_pendulum_in_a_bowl(world):
-    # A point that slides in a smooth bowl is a pendulum. A contact need not be second order, but keeps the energy to 1 %.
-    w = world(tv.Particles([[0.8, 0.0]]), [tv.Gravity(9.81), tv.Ball((0, 0), 0.8, inside=True)], precision="f64", substeps=100)
-    lowest, energies = 0.0, []
-    for _ in range(60):
-        energies.append(w.step(1 / 60).energy)
-        lowest = min(lowest, w.position[0, 1])
-    assert lowest == pytest.approx(-0.8, abs=1e-3) and min(energies) > -0.02 * 9.81 * 0.8 and max(energies) < 1e-3
 
 
 @pytest.mark.parametrize("name", scenes(2))
@@ -427,8 +385,8 @@ def test_what_comes_near_a_rod_does_not_touch_it(world):
     np.testing.assert_allclose(w.velocity, v, atol=1e-12)
 
 
-@pytest.mark.parametrize("path", ["auto", "parallel", "launched"])
-@pytest.mark.parametrize("substeps", [1, 2, 8])
+@pytest.mark.parametrize("path", ["auto", "launched"])
+@pytest.mark.parametrize("substeps", [1, 8])
 def test_a_bounce_is_no_load(world, path, substeps):
     # From rest at a height H, v = -g (t - T), where T is the time of the last apex, and apexes are 2 sqrt(2 H / g) apart. A
     # bounce in the last substep of a frame must not count as a load: velocities would be g h / 2 too fast, and an elastic ball
@@ -475,24 +433,16 @@ def test_what_slides_and_bounces_at_once_is_read_to_second_order(world):
 
 
 @ti.func
-def hump(p):
-    return ti.math.length(p) - 1.0
-
-
-@ti.func
 def hollow(p):
     return 1.0 - ti.math.length(p)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "function, inside, x", [(hump, False, (0.05, 1.1)), (hollow, True, (0.6, -0.65))], ids=["hump", "hollow"]
-)
-def test_what_slides_on_a_function_does_so_as_on_a_ball(world, function, inside, x):
+def test_what_slides_on_a_function_does_so_as_on_a_ball(world):
     # Both are second order: the curvature of a function along the path is that of the circle, up to its differences.
     ends = []
-    for wall in (tv.Sdf(function), tv.Ball((0, 0), 1.0, inside)):
-        w = world(tv.Particles([x], radius=0.1), [tv.Gravity(9.81), wall, tv.Contact()], substeps=8, precision="f64")
+    for wall in (tv.Sdf(hollow), tv.Ball((0, 0), 1.0, True)):
+        w = world(tv.Particles([(0.6, -0.65)], radius=0.1), [tv.Gravity(9.81), wall, tv.Contact()], substeps=8, precision="f64")
         w.run(1.0)
         ends.append(w.position)
     np.testing.assert_allclose(*ends, atol=1e-6)
