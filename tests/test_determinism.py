@@ -154,7 +154,7 @@ def test_what_is_absent_has_no_field_and_no_kernel(world):
     # per particle is stored only where masses differ, as with a pinned particle.
     plain = world(tv.Particles(np.zeros((10, 2))), [])
     names = {name.split(".")[0] for name in plain.fields}
-    assert names == {"position", "displacement", "numbers"}
+    assert names == {"position", "displacement", "inv_mass", "numbers"}
     adds = {
         "Gravity": ([tv.Gravity(1.0)], {"Gravity"}),
         "Drag": ([tv.Drag(1.0)], {"decay"}),

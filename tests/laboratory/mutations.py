@@ -9,6 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from tiverlet.report.output import Table
@@ -137,35 +138,39 @@ FAULTS = (
 def main(args) -> Iterator[Table]:
     """Yield a table of the faults (parts: beginnings of commits), and of the tests that notice each."""
     some = [f for f in FAULTS if not args.parts or any(f.commit.startswith(p) or p in f.what for p in args.parts)]
-    with tempfile.TemporaryDirectory() as folder:
-        rows = [_row(f, pathlib.Path(folder)) for f in some]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        rows = list(pool.map(_row, some))
     caught = sum(row[3] != "no test" for row in rows)
     heads = ("mended in", "fault", "files of tests", "noticed by", "s")
     yield Table("Faults put back", heads, rows, [f"{caught} of {len(rows)} are noticed."])
 
 
-def _row(fault: Fault, folder: pathlib.Path) -> tuple[str, ...]:
+def _row(fault: Fault) -> tuple[str, ...]:
     """Return the row of a fault: it is put into a copy of the package, and its tests run until one fails."""
-    for name in ("tiverlet", "tests", "demos"):
-        shutil.rmtree(folder / name, ignore_errors=True)
-        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(ROOT / "pyproject.toml", folder)
-    path = folder / "tiverlet" / fault.file
-    text = path.read_text()
-    if text.count(fault.now) != 1:
-        raise ValueError(f"mutations: {fault.file} has {text.count(fault.now)} times what {fault.commit} mended: {fault.now!r}")
-    path.write_text(text.replace(fault.now, fault.then))
-    files, begin, said = [f"tests/test_{name}.py" for name in fault.tests.split()], time.perf_counter(), ""
-    for file in files:
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "", "-n", "0", "-p", "no:cacheprovider", file]
-        try:
-            done = subprocess.run(
-                command, cwd=folder, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True, text=True, timeout=LIMIT
+    begin = time.perf_counter()
+    with tempfile.TemporaryDirectory() as name:
+        folder = pathlib.Path(name)
+        for part in ("tiverlet", "tests", "demos"):
+            shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copy(ROOT / "pyproject.toml", folder)
+        path = folder / "tiverlet" / fault.file
+        text = path.read_text()
+        if text.count(fault.now) != 1:
+            raise ValueError(
+                f"mutations: {fault.file} has {text.count(fault.now)} times what {fault.commit} mended: {fault.now!r}"
             )
-            said = done.stdout + done.stderr
-        except subprocess.TimeoutExpired:
-            said = f"FAILED {file}::in {LIMIT} s"
-        if found := re.search(r"^(?:FAILED|ERROR) (?:tests/)?(\S+)", said, re.MULTILINE):
-            break
-    test = found.group(1) if found else "no test"
-    return fault.commit, fault.what, fault.tests, test, f"{time.perf_counter() - begin:.0f}"
+        path.write_text(text.replace(fault.now, fault.then))
+        found = next(filter(None, (_failing(folder, f"tests/test_{test}.py") for test in fault.tests.split())), "no test")
+    return fault.commit, fault.what, fault.tests, found, f"{time.perf_counter() - begin:.0f}"
+
+
+def _failing(folder: pathlib.Path, file: str) -> str:
+    """Return the first test of a file that fails; an empty string where all pass."""
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "", "-n", "0", "-p", "no:cacheprovider", file]
+    given = os.environ | {"PYTHONPATH": str(folder)}
+    try:
+        done = subprocess.run(command, cwd=folder, env=given, capture_output=True, text=True, timeout=LIMIT)
+    except subprocess.TimeoutExpired:
+        return f"{file}, which does not end"
+    found = re.search(r"^(?:FAILED|ERROR) (?:tests/)?(\S+)", done.stdout, re.MULTILINE)
+    return found.group(1) if found else ""
