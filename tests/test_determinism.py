@@ -150,8 +150,7 @@ def test_what_is_no_number_is_hashed_alike(world):
 
 @pytest.mark.filterwarnings("ignore:Contact. all radii are 0")
 def test_what_is_absent_has_no_field_and_no_kernel(world):
-    # A point in free flight has position, displacement and counts. Each feature adds its own fields and nothing else. A mass
-    # per particle is stored only where masses differ, as with a pinned particle.
+    # A point in free flight has position, displacement, mass and counts. Each feature adds its own fields and nothing else.
     plain = world(tv.Particles(np.zeros((10, 2))), [])
     names = {name.split(".")[0] for name in plain.fields}
     assert names == {"position", "displacement", "inv_mass", "numbers"}
@@ -159,10 +158,10 @@ def test_what_is_absent_has_no_field_and_no_kernel(world):
         "Gravity": ([tv.Gravity(1.0)], {"Gravity"}),
         "Drag": ([tv.Drag(1.0)], {"decay"}),
         "Wind": ([tv.Wind((1, 0), 1.0)], {"Wind", "decay"}),
-        "Box": ([tv.Box((-1, -1), (1, 1))], {"Box", "thrust"}),
-        "HalfSpace": ([tv.HalfSpace((0, 1), -1)], {"HalfSpace", "thrust"}),
-        "Polygon": ([tv.Polygon([[1, 1], [2, 1], [1, 2]])], {"Polygon", "thrust", "position_at_start"}),
-        "Pin": ([tv.Pin([0])], {"Pin", "inv_mass"}),
+        "Box": ([tv.Box((-1, -1), (1, 1))], {"Box", "radius", "thrust"}),
+        "HalfSpace": ([tv.HalfSpace((0, 1), -1)], {"HalfSpace", "radius", "thrust"}),
+        "Polygon": ([tv.Polygon([[1, 1], [2, 1], [1, 2]])], {"Polygon", "radius", "thrust", "position_at_start"}),
+        "Pin": ([tv.Pin([0])], {"Pin"}),
         "Distance": ([tv.Distance([[0, 1]], 0.1)], {"Distance", "slots", "position_low", "displacement_low"}),
         "empty Distance": ([tv.Distance(np.zeros((0, 2), int))], set()),
         "Contact of points": ([tv.Contact()], set()),
@@ -174,9 +173,6 @@ def test_what_is_absent_has_no_field_and_no_kernel(world):
     soft = world(tv.Particles(np.zeros((10, 2))), [tv.Distance([[0, 1]], 0.1, compliance=1.0)])
     only = set(soft.fields) - set(rigid.fields)
     assert only == {"Distance.compliance", "Distance.last", "Distance.history", "Distance.offset"}
-    mixed = world(tv.Particles(10 * np.arange(20.0).reshape(10, 2), radius=np.arange(10) + 1.0), [tv.Contact()])
-    assert "radius" in mixed.fields
-    assert "Contact.shrunk" not in mixed.fields
 
 
 @pytest.mark.slow
