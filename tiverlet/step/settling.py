@@ -37,12 +37,14 @@ SLIGHT = 1e-3  # of the largest kinetic energy: what violations may become
 STILL = 1e-8  # of the way of a body, or of its least constraint: what the coming frame may move it yet
 ROUGHLY = 1e-3  # the same for conjugate gradients, which solve nets: a taut one comes to rest as 1 / n only
 LEAST, MOST, WORK = 16, 1000, 2_000_000  # looks, at least and at most; particles and constraints in all of them
+SOFT = 30  # looks at most where what is left stays soft: a taut net comes to rest as 1 / n only
 
 
 def relieve(runner: "Runner", h: float, dt: float) -> float:
     """Settle what longer substeps than h [s] have left violated. Returns the part of what it stores that is left: 1 for all.
 
-    It lifts bodies as far as the scene has had that energy before; for more, the motion of what moves pays, or nothing settles.
+    It lifts bodies as far as the scene has had that energy before, with what stays stored; for more, the motion of what moves
+    pays, or nothing settles.
     Bodies that nothing holds stay soft instead, see softness.py: drawn together, they would lose angular momentum. Only rows that
     are solved exactly have no softness, and what is left of their violations becomes motion.
     """
@@ -57,12 +59,12 @@ def relieve(runner: "Runner", h: float, dt: float) -> float:
     if not going.any():
         return 1.0
     before = clock.energy if clock.energy is not None else _energy(runner)
-    supply = max(before, clock.bound) if clock.bound is not None else before + stored(runner)
     store = stored(runner)
-    far, new = _settled(runner, bodies, going, x, h, dt)
+    supply = before + store if clock.bound is None else max(before + store, clock.bound)
+    far, new = _settled(runner, bodies, going, x, h, dt, MOST if system else SOFT)
     state.put(memory, new)
-    energy = _energy(runner)
-    due = energy + bodies.energy(new, h) - supply if clock.bound != CHANGED else 0.0
+    energy, kept = _energy(runner), stored(runner)
+    due = energy + bodies.energy(new, h) + kept - supply if clock.bound != CHANGED else 0.0
     some, w, d = (new != x).any(axis=1), runner.scene.inv_mass, memory.read(state.d)
     m = np.divide(some, w, out=np.zeros(len(w)), where=w > 0)
     kinetic = float(m @ (d[: runner.n].astype(np.float64) ** 2).sum(axis=1)) / 2
@@ -73,10 +75,9 @@ def relieve(runner: "Runner", h: float, dt: float) -> float:
     if due > 0 and kinetic > 0:
         d[: runner.n][some] *= max(1 - due / kinetic, 0.0) ** 0.5
         memory.write(state.d, d)
-    left = stored(runner) / store if store > 0 else 0.0
     bodies.forget_loads(going & (far > ENOUGH))
     clock.energy = energy - max(due, 0.0)  # for softness.py; it is computed again before the frame
-    return min(left, 1 - LESS)
+    return min(kept / store if store > 0 else 0.0, 1 - LESS)
 
 
 def _held(runner: "Runner") -> np.ndarray:
@@ -114,7 +115,7 @@ def settle(runner: "Runner", placed: int, h: float, dt: float) -> tuple[np.ndarr
 
 
 def _settled(
-    runner: "Runner", bodies: Bodies, going: np.ndarray, x: np.ndarray, h: float, dt: float
+    runner: "Runner", bodies: Bodies, going: np.ndarray, x: np.ndarray, h: float, dt: float, looks: int = MOST
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return how far the bodies in the mask `going` are from their rest at x, (n, dim), and where they settle, (n, dim).
 
@@ -126,11 +127,11 @@ def _settled(
     if system := runner.scene.slots.system:
         system.forget()  # which parts give way
     runner.set_softness(1.0)
-    new, left = _passed(runner, bodies, going, np.where(going[bodies.body][:, None], bodies.bulged(x), x), h, dt)
+    new, left = _passed(runner, bodies, going, np.where(going[bodies.body][:, None], bodies.bulged(x), x), h, dt, looks)
     stuck = left > SEEN
     arcs = np.where(stuck[bodies.body][:, None], bodies.bulged(new), new)
     if (arcs != new).any():
-        arcs, less = _passed(runner, bodies, stuck, arcs, h, dt)
+        arcs, less = _passed(runner, bodies, stuck, arcs, h, dt, looks)
         new = np.where((less < BETTER * left)[bodies.body][:, None], arcs, new)
     put_fields(runner, values)
     runner.set_substep(clock.h, clock.drag)
@@ -140,7 +141,7 @@ def _settled(
 
 
 def _passed(
-    runner: "Runner", bodies: Bodies, going: np.ndarray, x: np.ndarray, h: float, dt: float
+    runner: "Runner", bodies: Bodies, going: np.ndarray, x: np.ndarray, h: float, dt: float, looks: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return where passes move the bodies in the mask `going` from x, (n, dim), and what they leave violated, as far() does."""
     state, memory, some, most = runner.scene.state, runner.memory, going.copy(), max(LEAST, WORK // (runner.n + bodies.count))
@@ -149,7 +150,7 @@ def _passed(
     new, left, mixing = x, bodies.far(x, 0.0, DONE + bodies.digit), Anderson(bodies)
     digit = bodies.digit * np.abs(x).max()  # of coordinates: a move that says nothing
     plain, many, still = x, True, ROUGHLY if (system := runner.scene.slots.system) and system.steps else STILL
-    for look in range(min(most, MOST)):
+    for look in range(min(most, looks)):
         state.put(memory, new)
         last, passes = new, min(LOOK, FIRST << min(look, 8)) if many else 1
         for _ in range(passes):
