@@ -128,7 +128,7 @@ FAULTS = (
     Fault("90f9d8ee", "what violations store is counted half", "step/softness.py",
           "out += _stored_in(b, b.violation(x) * ~b.broken, S)", "out += _stored_in(b, b.violation(x) * ~b.broken, S) / 4",
           "softness uneven_substeps guard"),
-    Fault("this", "what stays stored is no part of what settling may cost", "step/settling.py",
+    Fault("b3affc6c", "what stays stored is no part of what settling may cost", "step/settling.py",
           "bodies.energy(new, h) + kept - supply", "bodies.energy(new, h) - supply", "softness"),
     Fault("614ec68b", "faces are not renumbered where walls go", "step/build_again.py",
           "face[kept] = WALL + now[wall][: len(kept)]", "face[kept] = WALL + kept", "regroup edit_in_place"),
