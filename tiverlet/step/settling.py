@@ -61,7 +61,7 @@ def relieve(runner: "Runner", h: float, dt: float) -> float:
     before = clock.energy if clock.energy is not None else _energy(runner)
     store = stored(runner)
     supply = before + store if clock.bound is None else max(before + store, clock.bound)
-    far, new = _settled(runner, bodies, going, x, h, dt, MOST if system else SOFT)
+    far, new = _settled(runner, bodies, going, x, h, dt, MOST if exact else SOFT)
     state.put(memory, new)
     energy, kept = _energy(runner), stored(runner)
     due = energy + bodies.energy(new, h) + kept - supply if clock.bound != CHANGED else 0.0
