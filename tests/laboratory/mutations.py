@@ -163,6 +163,7 @@ def _row(fault: Fault) -> tuple[str, ...]:
             )
         path.write_text(text.replace(fault.now, fault.then))
         found = next(filter(None, (_failing(folder, f"tests/test_{test}.py") for test in fault.tests.split())), "no test")
+    print(f"{fault.commit} {fault.what}: {found}", file=sys.stderr, flush=True)
     return fault.commit, fault.what, fault.tests, found, f"{time.perf_counter() - begin:.0f}"
 
 
