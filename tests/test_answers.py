@@ -144,6 +144,7 @@ def flat(kind) -> dict:
     return {"dim": 3, "precision": "f32"} if kind == "conjugate" else {"dim": 2, "precision": "f64"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_rod_that_strikes_a_wall_with_one_end_turns_by_newtons_law(world, kind):
     """A rod of two particles m along the wall, one radius larger, so that one end strikes first with speed v.

@@ -68,6 +68,7 @@ def test_clusters_on_links_keep_their_momentum_beside_contacts(world, dim, compl
     assert touched > 0
 
 
+@pytest.mark.slow
 def test_a_ball_hangs_on_a_plank_with_its_weight(world):
     # J theta'' = m g L, J = sum m x^2 + m L^2, and the ball stays below the corner: theta = m g L t^2 / 2 J for small angles.
     plank = np.array([[-2.0, -0.1], [2, -0.1], [2, 0.1], [-2, 0.1], [0, 0]])

@@ -297,6 +297,7 @@ def test_an_edit_makes_and_compiles_nothing():
     w.close()
 
 
+@pytest.mark.slow
 def test_radii_masses_and_pins_are_values():
     # A world of equal discs takes others, and ones that are held, without other kernels. What is free falls by g t^2 / 2.
     start = tv.Particles([(0.5, 0.5), (0.8, 0.5)], radius=0.05, mass=1.0)

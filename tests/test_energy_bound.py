@@ -156,6 +156,7 @@ def test_what_works_from_the_first_frame_on_is_no_fault(world):
             assert FLAG not in w.step(1 / 60).flags
 
 
+@pytest.mark.slow
 def test_what_overlaps_parts_without_a_word(world):
     # Particles placed inside each other or inside a wall are pushed out. That energy was in the overlap, and is not flagged,
     # even if velocities are assigned or a particle is removed meanwhile, or a wall is switched on again.
@@ -193,6 +194,7 @@ def test_less_of_a_force_is_less_to_lose(world):
         assert FLAG in w.run(1.0).flags
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["alone", "one of many"])
 def test_what_springs_lose_to_the_substep_is_told(world, place):
     # Two discs of 1 kg vibrate with C^2 / 2 alpha, C = 0.1 m. At omega h = sqrt(2 / alpha) h = 0.012 this stays; at 1.2 a period

@@ -104,6 +104,7 @@ def brute(x, old, v, gravity, h, particles, before):
     return ahead, np.stack([i, j], axis=1), n, -(d * n).sum(1) / h, np.abs(c) > 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 def test_what_brute_force_finds(world, dim):
     # With one substep per frame, x_(n+1) = 2 x_n - x_(n-1) + g h^2 (Verlet) gives free flight; the pairs that overlap there
@@ -277,6 +278,7 @@ def test_recorded_cloned_edited(world, tmp_path, monkeypatch):
         assert rows(before[(before >= 0).all(axis=1)]) == known != set()
 
 
+@pytest.mark.slow
 def test_each_pair_that_begins_ends(world):
     # Whatever is removed: sum of begun - ended = pairs that touch now, by groups, too; in a clone made after the edit as well.
     start = tv.Particles(
@@ -314,6 +316,7 @@ def test_each_pair_that_begins_ends(world):
     assert count(w, w._all_events()[1]) == [0, 0, 0]
 
 
+@pytest.mark.slow
 def test_what_is_held_and_let_go(world):
     # Only the particle of a pair that can move writes it. When the other one is released, the pair continues as one contact.
     pin = tv.Pin([0], (0.0, -98.9))
@@ -329,6 +332,7 @@ def test_what_is_held_and_let_go(world):
         np.testing.assert_allclose(w.events().touches.impulse, 9.81 / 60, rtol=0.3)
 
 
+@pytest.mark.slow
 def test_a_corner_presses_from_both_sides(world):
     # The sum of impulses along normals is the change of momentum: m a dt for a particle that leans into a corner of one wall,
     # -m v for one that flies into it within a frame. If the first normal served for all of the impulse, a floor would bear 153
@@ -346,6 +350,7 @@ def test_a_corner_presses_from_both_sides(world):
         np.testing.assert_allclose(np.linalg.norm(touches.normal, axis=1), 1, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_where_lists_grow(world):
     # 60 sensors, all within each other, and discs that fly through them in one frame: more pairs than there is room for at first.
     k = np.arange(60)

@@ -96,6 +96,7 @@ def test_12_one_substep_of_a_tenth_of_a_second(world, solver):
                     assert rms(w.position[part][at], want) == pytest.approx(known, rel=1e-6), name
 
 
+@pytest.mark.slow
 def test_36_nothing_and_almost_nothing(world):
     one = [[1.0, 2.0]]
     for x, path in ((np.zeros((0, 3)), "parallel"), (one, "fused")):

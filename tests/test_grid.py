@@ -142,6 +142,7 @@ def test_what_pairs_carry_goes_with_them(world):
     assert made[0] == made[1]
 
 
+@pytest.mark.slow
 def test_a_question_changes_no_bit_of_what_follows(world):
     # The state after a frame is a function of the state before it, x' = F(x): of the slip that each pair has, not of the list in
     # which it is stored. world.contacts has that list built anew, as recordings do. Discs land with friction, so impacts take the

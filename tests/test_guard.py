@@ -168,6 +168,7 @@ def test_no_change_of_the_substep_brings_in_energy_of_bodies(world):
             assert report.energy <= energy + 1e-3 * 0.01 * 9.81 * 14 * 0.7, (plan[-1], report)
 
 
+@pytest.mark.slow
 def test_no_change_of_the_substep_brings_in_energy_of_rods_in_3d(world):
     # Cantilevers of rigid angles that start straight, where the angle of a path in 3D has no gradient by differences; one of them
     # also vibrates across. The projection of angles in their present planes alone leaves their sag, which becomes 2.6 J of the
@@ -201,6 +202,7 @@ def test_a_body_turns_on_where_the_substep_changes(world):
     assert report.energy == pytest.approx(energy, rel=0.1) and report.flags <= {"unconverged"}
 
 
+@pytest.mark.slow
 def test_the_order_of_constraints_does_not_matter_where_the_substep_changes(world):
     # A door with a stop: the corners of the link are the last two of the angle before it. If rows of the projection were taken
     # for equal, they would have the corners of the other: another motion, 0.22 J off.
@@ -570,6 +572,7 @@ def test_a_cloth_that_hangs_over_a_ball_goes_where_its_links_are_met(world):
         assert max(w.step(1 / 60).energy for _ in range(13)) < start
 
 
+@pytest.mark.slow
 def test_few_substeps_that_do_not_help_are_not_the_last_word(world):
     """A figure lands on straight legs: two and four substeps leave as much violation as one, and 16 do not."""
     s = tv.shapes.ragdoll((0, 0.5))

@@ -502,6 +502,7 @@ def test_a_force_that_changes_starts_from_velocities(world):
     assert errors[-1] < 1e-4 and 1.9 <= order(errors) <= 2.1
 
 
+@pytest.mark.slow
 def test_forces_that_change_disturb_nothing_that_they_do_not_reach(world):
     # Where a force changes from a to a', d grows by h^2 (a - a') / 2, which keeps v = d / h + h a / 2. So what falls freely goes
     # by x += v T + g T^2 / 2, v += g T in each frame T, in which g is constant. A pile on which the same forces act goes on bit

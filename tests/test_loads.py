@@ -18,6 +18,7 @@ def smooth(world, x, mass, pinned=(), high=(99.0, 99.0), **settings):
     return world(particles, features, precision="f64", **settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("substeps", [1, 8])
 def test_a_column_bears_what_is_above(world, substeps):
     # A contact bears the weight of all discs above it, and the ground bears all, at any substep, which may change on the way.
@@ -64,6 +65,7 @@ def test_each_contact_of_a_pyramid_bears_what_statics_says(world):
     np.testing.assert_allclose(found.impulse * 480, borne, atol=LOADS * borne.max())
 
 
+@pytest.mark.slow
 def test_walls_bear_the_weight(world):
     # Smooth sides bear no weight: the floor bears sum f = N m g, and opposite sides bear the same.
     n, dim, rng = 3, 3, np.random.default_rng(0)

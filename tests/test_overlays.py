@@ -217,6 +217,7 @@ def winding(x, points):
     return (side > 0).all(axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Distance. pairs.3. = .3, 0. is off by 0.16:UserWarning")
 def test_a_body_shows_the_worst_strain_of_its_links(tmp_path):
     # One rod of a square is a tenth too long: the body is red. As it is one body, its diagonal is not drawn as a line.
@@ -315,6 +316,7 @@ def test_notebooks_show_worlds_reports_features_and_recordings(tmp_path):
     assert solid._repr_html_().count("<circle") == 2
 
 
+@pytest.mark.slow
 def test_y_points_down_where_the_view_is_asked_for_it(tmp_path):
     # A disc below another one in coordinates of pixels: lower in the picture where y points down. The physics is the same.
     hashes = []

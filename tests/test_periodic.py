@@ -95,6 +95,7 @@ def test_no_pair_is_missed_whichever_image_is_near(world, name):
     assert found > 10 and np.isclose(box.strain, shear * 8 * DT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("contact", [True, False])
 def test_queries_find_the_nearest_image(world, contact):
     rng, length = np.random.default_rng(1), np.array([4.0, 3.0])
@@ -204,6 +205,7 @@ def test_a_closed_chain_with_bends_rests_as_it_was_put(world):
     assert w.last and w.last.clean and w.last.residual < 1e-9
 
 
+@pytest.mark.slow
 def test_an_elastic_gas_keeps_energy_and_momentum(world):
     n, length = 5, 6.0
     x = (np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) * length / n
@@ -370,6 +372,7 @@ def test_lengths_are_refused_while_it_runs(world):
     links.rest = 0.74
 
 
+@pytest.mark.slow
 def test_f32_with_low_words_is_as_good_a_hundred_boxes_away(world):
     # Particles a hundred boxes from each other: f32 resolves their positions to 3e-5 m, with low words to 1e-9 m.
     x = np.stack(np.meshgrid(np.arange(5), np.arange(5)), -1).reshape(-1, 2) * 0.8 + 0.4

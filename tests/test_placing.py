@@ -140,6 +140,7 @@ def test_springs_that_become_rigid_bring_no_energy(world, substeps):
     assert np.abs(w.velocity).max() < 0.01 + G * h / 8
 
 
+@pytest.mark.slow
 def test_each_of_many_worlds_meets_what_becomes_rigid_in_it(world):
     w = softly_held(world, substeps=20)
     w.run(0.5)
@@ -247,6 +248,7 @@ def scene():
     return tv.Particles(x, radius=0.1), features
 
 
+@pytest.mark.slow
 def test_a_shifted_scene_goes_on_as_it_was(world, tmp_path):
     # Everything but the origin stays: floating origin. In f64, 1000 m away, positions agree to the digits that are left there.
     by = np.array([-1024.0, -256.0])
@@ -327,6 +329,7 @@ def test_what_settles_changes_no_bit_elsewhere(world):
     assert np.abs(a.features[3].violation(a.position)).max() < 1e-4 and np.abs(a.velocity[20:]).max() < 3 * G / 60
 
 
+@pytest.mark.slow
 def test_what_settles_stays_on_its_side_of_walls(world):
     # A square of links and diagonals that are 1.3 times as long stands on a floor beside a wall, and hangs by a rope that is too
     # short: it grows away from both, and nothing is inside of a wall at any time.

@@ -361,6 +361,7 @@ def sat(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
     return best
 
 
+@pytest.mark.slow
 def test_corners_that_cross_part_over_the_nearer_edge(world):
     # Two sharp corners have passed each other: no vertex is inside of the other body, but edges cross. Two wedges part soonest
     # over one of their edges (separating axes), and contacts have to find it. They conserve momentum, and angular momentum but

@@ -112,6 +112,7 @@ def test_a_path_is_recorded_to_and_a_recorder_that_logs_nothing_says_so(world, t
     assert len(tv.replay(tmp_path / "b.rrd").frames) == 7 and tv.replay(tmp_path / "b.rrd").world(6).hash() == w.hash()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="threads are counted on Linux")
 def test_threads_of_a_closed_recorder_end(world, tmp_path):
     # rerun keeps two threads for each stream, of which a file has three. Those of a recorder end when the next one closes.

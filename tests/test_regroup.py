@@ -270,6 +270,7 @@ def test_a_clone_parts_what_came_into_others_as_the_world_does(world):
     np.testing.assert_array_equal(twin.position[:-1], w.position)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["wall", "floor", "last"])
 def test_loads_stay_with_their_walls_where_walls_come_and_go(world, which):
     # habitat-sim#801, reactphysics3d#235: what lay on a floor that is removed hangs in the air. Here it fell on with the load of

@@ -296,6 +296,7 @@ def test_springs_whose_blows_substeps_do_not_resolve_are_named(world):
     assert "a blow counts" not in w.explain()
 
 
+@pytest.mark.slow
 def test_what_sags_holds_where_the_substep_gets_shorter(world):
     # A pass holds a moment by a sag that falls with h^2: 1e-4 rad here. In a substep of a half to a tenth of the length, this sag
     # would be 4 to 100 times the moment. It stays that moment, but for what vibrates, and in the end without.
@@ -338,6 +339,7 @@ def test_what_is_moved_steadily_bears_its_weight_in_f32(world):
         np.testing.assert_allclose([f.load[0] for f in bodies.features[:6]], expected, rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("substeps", "path"), [(4, "fused"), (20, "launched")])
 def test_what_breaks_first_unloads_the_others(world, path, substeps):
     # 20 kg on a chain of 20 links that bear 50 N each: the uppermost one bears most, 216 N, and breaks. The rest falls freely.

@@ -199,6 +199,7 @@ def test_what_sleeps_goes_on_touching(world):
         follow(w, touching)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_sleeps_and_a_stack_that_wakes(world):
     # Overlaps of a sleeping sensor begin and end as if it were awake. A pair that wakes in the middle of a frame has not met
     # again: the speed at which it came together is 0.

@@ -79,6 +79,7 @@ def test_conjugate_gradients_reach_the_direct_solution(world):
     assert abs(many.last.energy) < 2e-3  # of m g L = 9.81: SHAKE neither gains nor loses
 
 
+@pytest.mark.slow
 def test_converged_cloth_from_soft_to_rigid(world):
     # Springs in the same system as rigid links: the static stretch is alpha F after one iteration, and what the floor lets sag,
     # 1.4e-3 * 2 / m * h^2 * 6 m g < 5e-7 m.
@@ -270,6 +271,7 @@ def test_what_is_drawn_straight_between_pins_gains_no_energy(world, solver, prec
         assert substeps == 2 or "unconverged" not in w.last.flags
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver, iterations", [(tv.Direct(), 1), (tv.Chebyshev(), 4)])
 def test_links_of_length_0_bring_in_no_energy(world, solver, iterations):
     # A straight chain between two pins, held by links of length 0, whose direction differs in every pass. A solver must not use

@@ -212,6 +212,7 @@ def test_what_rolls_off_another_does_so_to_second_order(world):
     assert np.abs(errors[-1]).max() <= 1e-4
 
 
+@pytest.mark.slow
 def test_a_swarm_keeps_angular_momentum_and_loses_energy(world):
     # Pairs that bounce keep momentum and angular momentum to rounding. Where two strike a particle in the same substep, angular
     # momentum is off by the cross product of what both do in a part of it, O(h); this is rarer with more substeps. Energy only

@@ -256,6 +256,7 @@ def test_spins_and_throws_survive_what_comes_next(world):
     assert w.velocity[0] == pytest.approx([3, 4 - fallen]) and w.velocity[1] == pytest.approx([0, 0])
 
 
+@pytest.mark.slow
 def test_what_breaks_flies_on_with_the_velocity_that_is_read(world):
     # x + v t - g t^2 / 2, to rounding, also from the substep in which it breaks: half a kick of what broke is not to come.
     # A rigid link, a spring, an area and a cluster, each held by pinned particles.
