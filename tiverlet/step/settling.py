@@ -60,7 +60,7 @@ def relieve(runner: "Runner", h: float, dt: float) -> float:
         return 1.0
     before = clock.energy if clock.energy is not None else _energy(runner)
     store = stored(runner)
-    supply = before + store if clock.bound is None else max(before + store, clock.bound)
+    supply = before + store if clock.bound is None else max(before, clock.bound)
     far, new = _settled(runner, bodies, going, x, h, dt, MOST if exact else SOFT)
     state.put(memory, new)
     energy, kept = _energy(runner), stored(runner)
