@@ -127,7 +127,7 @@ def test_bricks_hang_over_by_the_harmonic_series_and_no_further(world, substeps)
         w = boxes(world, np.array(x), 0.6, substeps)
         w.run(3.0)
         moved = np.abs(w.position - x).max()
-        assert moved < 1e-4 if stays else moved > 0.2
+        assert moved < 1e-4 if stays else moved > 1.0
 
 
 @pytest.mark.slow
