@@ -122,6 +122,7 @@ def test_what_works_is_no_fault(world):
     link = tv.Distance([[0, 1]], compliance=1e-3)
     scenes = {
         "force": world(*pair(tv.Force(wind))),
+        "wind": world(*pair(tv.Wind((20.0, 0.0), 1.0))),
         "winch": world(*pair(gravity, tv.Winch([[0, 1]], speed=-1.0), pinned=[0])),
         "gravity": world(*pair(g := tv.Gravity(1.0))),
         "pin": world(*pair(pin, tv.Distance([[0, 1]]))),
@@ -143,17 +144,25 @@ def test_what_works_is_no_fault(world):
             report = w.step(1 / 60)
             assert FLAG not in report.flags, (name, k, before, report)
     gained = {name: w.last.energy for name, w in scenes.items()}
-    assert all(gained[name] > 0.1 for name in ("force", "winch", "pin", "wall", "rest", "edited", "thrown")), gained
+    assert all(gained[name] > 0.1 for name in ("force", "wind", "winch", "pin", "wall", "rest", "edited", "thrown")), gained
 
 
-def test_what_works_from_the_first_frame_on_is_no_fault(world):
+@pytest.mark.parametrize("place", ["alone", "one of many"])
+def test_what_works_from_the_first_frame_on_is_no_fault(world, place):
     # A wall is lifted, or turned, before the first step.
     for knob, value in (("position", (0.0, 0.3)), ("rotation", 0.3)):
         lift = tv.Polygon([[-2, -0.4], [2, -0.4], [2, -0.1], [-2, -0.1]])
         w = world(*pair(tv.Gravity(9.81), lift), substeps=8)
-        setattr(lift, knob, value)
+        many = tv.Worlds(w, 2) if place == "one of many" else None
+        if many:
+            many.set(lift, **{knob: [value, getattr(lift, knob)]})
+        else:
+            setattr(lift, knob, value)
         for _ in range(5):
-            assert FLAG not in w.step(1 / 60).flags
+            assert FLAG not in (many or w).step(1 / 60).flags
+        if many:
+            assert many.position[0, 1, 1] > many.position[1, 1, 1] + 0.1
+            many.close()
 
 
 @pytest.mark.slow
