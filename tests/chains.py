@@ -7,8 +7,6 @@ import tiverlet as tv
 from .conftest import case, pendulums, rms
 
 PLANAR = ["D05_chain10", "D06_chain100", "D08_massratio10", "D09_massratio_inverted"]
-
-
 PLANAR += [f"D07_massratio_1{'0' * k}" for k in (3, 4, 5, 6)]
 
 

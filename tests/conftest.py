@@ -41,10 +41,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # ignored in background j
 collect_ignore = [] if patched else ["test_compiling.py", "test_sharing.py"]  # these files test the patches
 # Files that take longest run first: otherwise one worker would still run one of them when the others are done.
 LONG = (
-    "body_impacts", "demos", "answers", "properties", "sleep", "softness", "reported_loads", "worlds", "placing", "rows",
-    "contact", "determinism", "guard", "statics", "edit_in_place", "wall_groups", "periodic", "polygons", "public_scenes",
-    "impacts", "velocity", "uneven_substeps", "walls", "direct", "solvers", "compiling", "fuzz", "shapes", "recordings", "flags",
-    "docs", "knobs", "conservation", "granular", "events", "regroup", "motors", "spin",
+    "touching_scenes", "scenes", "cases", "walls", "knobs", "edits", "worlds", "properties", "pictures", "answers", "statics",
+    "polygons", "impacts", "body_impacts", "rows", "recordings", "velocity", "guard", "reported_loads", "periodic",
+    "determinism", "direct", "sharing", "bodies", "placing", "pairs", "demos", "softness", "sleep", "solvers", "order", "docs",
 )  # fmt: skip
 ARCH = os.environ.get("TIVERLET_ARCH", "cpu")
 SOURCES = str(pathlib.Path(tv.__file__).parent)

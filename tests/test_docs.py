@@ -62,6 +62,10 @@ def test_files_that_pages_name_are_there():
     for page in PAGES:
         for name in re.findall(r"`([\w/]+\.(?:py|json))`", (ROOT / page).read_text()):
             assert (ROOT / name).exists() or any((ROOT / page).parent.rglob(name)), f"{page}: {name}"
+    # And so are the tests that code names.
+    sources = [*parsed(), *(ROOT / "tests").rglob("*.py")]
+    named = {(path.name, name) for path in sources for name in re.findall(r"\b(test_\w+\.py)", path.read_text())}
+    assert not [(of, name) for of, name in named if not (ROOT / "tests" / name).exists()]
 
 
 def test_the_first_page_is_short_and_leads_to_all_others():

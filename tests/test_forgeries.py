@@ -1,8 +1,10 @@
-"""Forged recordings: verify() names whatever the viewer would show differently, though all checksums are valid."""
+"""Forged and damaged recordings: replay() or verify() names what differs, and a file does nothing but show its scene."""
 
+import json
 import os
 import re
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -14,10 +16,12 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.__main__ import main
+from tiverlet.device import ti
+from tiverlet.device.language import NAME, NAMES
 from tiverlet.features import material
-from tiverlet.recording import reader, viewer
+from tiverlet.recording import journal, reader, viewer
 
-from .forging import FORGERIES, PLACES, Forgery, packed, record
+from .forging import FORGERIES, PARTICLES, Forgery, packed, pictures, record
 
 
 @pytest.fixture(scope="module")
@@ -30,13 +34,30 @@ def quick(read_here, built_once):
     """Read in this process and compile a scene once; these tests check neither."""
 
 
+@pytest.fixture
+def rewritten(original, tmp_path):
+    """Return a function that saves the recording with journal entries changed by change(entry)."""
+
+    def rewrite(change, seal=True):
+        def entry(e):
+            change(e)
+            return e
+
+        return Forgery(original).journal(entry, seal).save(tmp_path / "a.rrd")
+
+    return rewrite
+
+
 @pytest.mark.slow
-def test_forgeries_are_named(original, quick, tmp_path):
+def test_whatever_is_forged_is_named(original, quick, tmp_path):
+    def told(name):
+        FORGERIES[name](forged := Forgery(original))
+        return name, forged
+
     assert tv.replay(Forgery(original).save(tmp_path / "b.rrd")).verify()
-    passed = {}
-    for name in FORGERIES:
-        forged = Forgery(original)
-        FORGERIES[name](forged, PLACES)
+    passed, count = {}, 0
+    for name, forged in (*map(told, FORGERIES), *pictures(original)):
+        count += 1
         try:
             verdict = tv.replay(forged.save(tmp_path / "b.rrd")).verify()
         except ValueError as e:
@@ -44,13 +65,99 @@ def test_forgeries_are_named(original, quick, tmp_path):
             continue
         if verdict.kind != ("incomplete" if name == "no end" else "changed"):
             passed[name] = verdict
-    assert not passed
+    assert not passed and count > 100
+
+
+def test_the_place_of_a_change_is_named(original, rewritten, quick, tmp_path):
+    def turned(e, g=5.5):
+        if e["kind"] == "turned" and "0" in e["data"]["features"]:
+            e["data"]["features"]["0"]["g"] = g
+
+    with pytest.raises(ValueError, match="changed after it was recorded: entry [0-9]+, 'turned' of frame 4"):
+        tv.replay(rewritten(turned, seal=False))
+    verdict = tv.replay(path := rewritten(turned)).verify()
+    assert not verdict and (verdict.frame, verdict.particle) == (5, 1) and "first particle 1" in str(verdict)
+    assert main(["replay", str(path), "--verify"]) == 1
+    # One changed coordinate of the picture.
+    forged = Forgery(original)
+    k, row = forged.rows(PARTICLES, "Points2D:positions")[4]
+    x = forged.messages[k][2].column("Points2D:positions").to_pylist()
+    x[row][1][0] = np.nextafter(np.float32(x[row][1][0]), np.float32(9))
+    forged.set(k, Points2D__positions=x)
+    recording = tv.replay(forged.save(tmp_path / "a.rrd"))
+    with pytest.raises(ValueError, match="picture of frame 4"):
+        recording.position(4)
+    verdict = recording.verify()
+    assert (verdict.kind, verdict.frame, verdict.particle) == ("changed", 4, 1) and "picture" in str(verdict)
+
+
+def test_recordings_of_other_versions_are_named(rewritten, read_here):
+    def replaced(old, new, more=lambda e: None):
+        def change(e):
+            e.update(json.loads(json.dumps(e).replace(old, new)))
+            more(e)
+
+        return change
+
+    with pytest.raises(ValueError, match=f"is in format 99, of tiverlet .* reads format {journal.FORMAT}"):
+        tv.replay(rewritten(replaced(f'"format": {journal.FORMAT}', '"format": 99')))
+    other = next(name for name in NAMES.values() if name != NAME)
+    recording = tv.replay(rewritten(replaced(f'"compiler": "{NAME} ', f'"compiler": "{other} ')))
+    with pytest.raises(RuntimeError, match=f"recorded with {other}, and {NAME} runs here.*TIVERLET_COMPILER={other.lower()}"):
+        recording.verify()
+    assert f"{other} " in recording.text and len(recording.position(6)) == 6
+    minor = ".".join(map(str, ti.__version__[1:]))
+    with pytest.raises(RuntimeError, match=f"frame 5 .* not as it was: taichi 0.{minor} then, 1.{minor} now"):
+        change = replaced('"taichi": "1', '"taichi": "0', lambda e: e["kind"] == "turned" and e["data"]["features"].clear())
+        tv.replay(rewritten(change)).world(6)
 
 
 @pytest.mark.slow
-def test_what_is_damaged_is_never_intact(original, quick, tmp_path):
-    # One byte of the file is changed, or the file is cut short, at random places; and its end record is missing.
-    rng, whole, path = np.random.default_rng(0), original.read_bytes(), tmp_path / "b.rrd"
+@pytest.mark.slow
+def test_what_is_cut_short_says_where_it_ends(quick, tmp_path, monkeypatch):
+    monkeypatch.setattr("tiverlet.recording.recorder.SMALL", 0)  # many messages, as in a long recording
+    original = record(tmp_path / "a.rrd")
+    whole, path = original.read_bytes(), tmp_path / "b.rrd"
+    for data, kind, words in ((b"some text", ValueError, "not an .rrd file"), (whole[:200], ValueError, "before anything")):
+        path.write_bytes(data)
+        with pytest.raises(kind, match=words):
+            tv.replay(path)
+    with pytest.raises(FileNotFoundError):
+        tv.replay(tmp_path / "none.rrd")
+
+    # Cut in the middle of every message: everything before it is read, and the text says where that ends.
+    ends, at = [], reader.HEADER
+    while at < len(whole) and (kind := struct.unpack_from("<QQ", whole, at))[0]:
+        at += 16 + kind[1]
+        ends.append(at)
+    seen = set()
+    for end in ends:
+        path.write_bytes(whole[: end - 5])
+        try:
+            part = tv.replay(path)
+        except ValueError as e:
+            assert "cut short before anything" in str(e) and not seen
+            continue
+        seen.add(len(part.frames))
+        assert not part.complete and "not complete (the file is cut short" in part.text
+    assert len(seen) > 3 and max(seen) == 7
+    verdict = part.verify()
+    assert not verdict and (verdict.kind, verdict.frames) == ("incomplete", 7) and "the first 7 frames hold" in str(verdict)
+
+    # A missing entry of the journal; a wrong length; no end record.
+    forged = Forgery(original)
+    forged.only(forged.chunks(journal.JOURNAL)[3], [])
+    missing = tv.replay(forged.save(path)).verify()
+    assert missing.kind == "incomplete" and 0 < missing.frames < 7 and missing.of >= 6
+    assert f"the first {missing.frames} of {missing.of} frames hold" in str(missing)
+    at = ends[len(ends) // 2]
+    path.write_bytes(whole[:at] + struct.pack("<QQ", 2, 1 << 60) + whole[at + 16 :])
+    wrong = tv.replay(path)
+    assert not wrong.complete and "a length is wrong" in wrong.text and wrong.verify().kind == "incomplete"
+    verdict = tv.replay(Forgery(original).save(path, seal=False)).verify()
+    assert verdict.kind == "incomplete" and verdict.frames == verdict.of
+    # One byte is changed, or the file is cut short, at random places.
+    rng = np.random.default_rng(0)
     for k, at in enumerate(rng.integers(0, len(whole), 20)):
         changed = bytearray(whole)
         changed[at] ^= int(rng.integers(1, 256))
@@ -60,54 +167,44 @@ def test_what_is_damaged_is_never_intact(original, quick, tmp_path):
             assert not recording.complete or not recording.verify(), (k, at)
         except ValueError as e:
             assert "replay: " in str(e), (k, at)
-    open_ended = tv.replay(Forgery(original).save(tmp_path / "c.rrd", seal=False)).verify()
-    assert open_ended.kind == "incomplete" and open_ended.frames == open_ended.of
 
 
-def test_a_file_calls_nothing_in_a_script(original, tmp_path, monkeypatch, capsys):
+def test_a_file_calls_nothing_in_a_script_and_leaves_no_folder(original, rewritten, tmp_path, monkeypatch, capsys):
     victim = tmp_path / "victim"
     victim.write_text("precious")
     (tmp_path / "mine.py").write_text("from pathlib import Path\nfrom subprocess import run\n")
 
-    def chosen(name, arguments):
+    def chosen(name):
         def change(e):
             if e["kind"] == "scene":
                 e["data"]["needs"] = {name: ""}
-                e["data"]["features"][0].update({"class": {"given": name}, "arguments": arguments})
-            return e
+                e["data"]["features"][0].update({"class": {"given": name}, "arguments": {"args": ["rm", str(victim)]}})
 
-        return Forgery(original).journal(change).save(tmp_path / "a.rrd")
+        return rewritten(change)
 
     def argument(e):
         if e["kind"] == "scene":
             e["data"]["needs"] = {"run": ""}
             e["data"]["features"][0]["arguments"]["acceleration"] = {"given": "run"}
-        return e
 
     monkeypatch.chdir(tmp_path)
-    chosen("run", {"args": ["rm", str(victim)]})
-    assert (
-        main(["replay", "a.rrd", "--verify", "--given", "mine.py"]) == 2
-        and "only functions with @ti.func" in capsys.readouterr().err
-    )
+    chosen("run")
+    assert main(["replay", "a.rrd", "--verify", "--given", "mine.py"]) == 2
+    assert "only functions with @ti.func" in capsys.readouterr().err
     for function in (subprocess.run, os.remove):
-        path = chosen(function.__name__, {"args": ["rm", str(victim)]})
         with pytest.raises(ValueError, match="no feature of this version"):
-            tv.replay(path, [function]).world(0)
+            tv.replay(chosen(function.__name__), [function]).world(0)
     with pytest.raises(ValueError, match="takes no function"):
-        tv.replay(Forgery(original).journal(argument).save(tmp_path / "b.rrd"), [subprocess.run]).verify()
+        tv.replay(rewritten(argument), [subprocess.run]).verify()
     assert victim.read_text() == "precious"
+    forged = Forgery(original)
+    k, row = forged.rows("figures/energy", "Scalars:scalars")[0]
+    forged.copy(k, [row], entity="figures/../../../stray")
+    with pytest.raises(ValueError, match="a curve with the name '../../../stray'"):
+        tv.replay(forged.save(tmp_path / "b.rrd")).export(str(tmp_path / "a.npz"))
 
 
-@pytest.mark.slow
-def test_what_a_file_asks_for_is_bounded(original, tmp_path):
-    def told(change):
-        def entry(e):
-            change(e)
-            return e
-
-        return Forgery(original).journal(entry).save(tmp_path / "a.rrd")
-
+def test_what_a_file_asks_for_is_bounded(original, rewritten, quick):
     def shape(e):
         if e["arrays"]:
             e["arrays"][0][2] = [10**9, 10]
@@ -118,7 +215,7 @@ def test_what_a_file_asks_for_is_bounded(original, tmp_path):
 
     for change in (shape, count, lambda e: e.update(steps=[[1 / 60, "auto", 1, 1]]), lambda e: e.update(frame=[[[]]])):
         with pytest.raises(ValueError, match="^replay: |^The state|shape"):
-            tv.replay(told(change)).verify()
+            tv.replay(rewritten(change)).verify()
 
     # Rows that claim to unpack to 70 GB, and more data than is allowed.
     forged = Forgery(original)
@@ -134,8 +231,7 @@ def test_what_a_file_asks_for_is_bounded(original, tmp_path):
 
     # A table with an entry per pair of groups, with as many groups as particles.
     n = 20_000
-    table = material.Table("Contact", {(0, 1): 0.3}, 0.0, None).rows(np.arange(n))[1]
-    assert len(table) == 9
+    assert len(material.Table("Contact", {(0, 1): 0.3}, 0.0, None).rows(np.arange(n))[1]) == 9
     with pytest.raises(ValueError, match="groups of particles"):
         material.Table("Contact", {(k, k): 0.3 for k in range(n)}, 0.0, None).rows(np.arange(n))
 
@@ -174,15 +270,3 @@ def _command(number):
             return file.read()
     except OSError:
         return b""
-
-
-def test_names_of_a_file_do_not_leave_the_folder(original, quick, tmp_path):
-    forged = Forgery(original)
-    forged.copy(*_first(forged, "figures/energy"), entity="figures/../../../stray")
-    with pytest.raises(ValueError, match="a curve with the name '../../../stray'"):
-        tv.replay(forged.save(tmp_path / "a.rrd")).export(str(tmp_path / "a.npz"))
-
-
-def _first(forged, entity):
-    k, row = forged.rows(entity, "Scalars:scalars")[0]
-    return k, [row]

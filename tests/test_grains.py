@@ -8,7 +8,7 @@ from .laboratory.grains import SIZE, Silo
 
 
 def test_a_super_ball_under_gravity_obeys_its_law():
-    # Velocity and spin after three bounces, to rounding (test_spin.py has the other cases).
+    # R20: velocity and spin after three bounces on a floor that grips, to rounding.
     for velocity, _place in rolling.own_errors(rolling.super_ball(), "f64", (5, 20)):
         assert velocity <= 1e-12
 

@@ -80,10 +80,6 @@ ROWS3 = {
         {"lower": 0.2, "upper": 0.5} | SPRINGS
     ),
     "Dihedral": (lambda i, x, **k: tv.Dihedral([i], **k), WINGS, ANGLE | SPRING, {"rest": 0.7} | SPRINGS),
-    "Motor": (
-        lambda i, x, **k: tv.Motor([i], **k), PATH, {"speed": 1.0, "torque": 5.0} | SPRING,
-        {"speed": -2.0, "torque": 0.3} | SPRINGS,
-    ),
     "Motor, angle": (
         lambda i, x, **k: tv.Motor([i], **k), WINGS, {"speed": 3.0, "angle": 2.5, "torque": 90.0} | SPRING,
         {"speed": 1.0, "angle": -1.5, "torque": 0.3} | SPRINGS,
@@ -183,7 +179,7 @@ ELSEWHERE = {
     ("Winch", "shortest"),
 }  # settings without an effect on these particles
 
-GOES_ON = ("Path, speed", "Motor", "Motor, angle", "Winch")  # these continue from their current place, wherever particles are put
+GOES_ON = ("Path, speed", "Motor, angle", "Winch")  # these continue from their current place, wherever particles are put
 
 
 class Scene:
@@ -239,17 +235,16 @@ class Scene:
 
 GROUPED = {
     "forces": ["Gravity", "Drag", "Wind", "Attractor", "Hand"],
-    "links": ["Distance", "Bend", "AngleLimit"],
-    "drives": ["Motor", "Motor, angle", "Winch"],
+    "links": ["Distance", "AngleLimit"],
+    "drives": ["Motor, angle", "Winch"],
     "bodies": ["Area", "ShapeMatch"],
     "tethers": ["Pin", "Pin, driven", "Snap", "Path", "Path, at", "Path, speed"],
     "contact": ["Contact"],
-    "walls": ["Box", "HalfSpace", "Ball", "Capsule"],
-    "solid": ["Mesh"],
-}
+    "walls": ["Box", "HalfSpace", "Ball", "Capsule", "Mesh"],
+}  # fmt: skip
 LIKE = {  # settings that the same code writes and reads; compiling these kinds would only take long
-    "Rope": tv.Distance, "Spacer": tv.Distance, "Constraint": tv.Distance, "Dihedral": tv.Bend, "Volume": tv.Area, "Sdf": tv.Mesh,
-    "Polygon": tv.Mesh, "Polygons": tv.Contact,
+    "Rope": tv.Distance, "Spacer": tv.Distance, "Constraint": tv.Distance, "Bend": tv.Distance, "Dihedral": tv.Distance,
+    "Volume": tv.Area, "Sdf": tv.Mesh, "Polygon": tv.Mesh, "Polygons": tv.Contact,
 }  # fmt: skip
 
 
@@ -269,24 +264,6 @@ def test_the_rows_have_every_feature():
             {"groups", "events", "sensors"} if kind is tv.Polygons else set()
         ) and kind.upload is like.upload
     assert knobs_of(tv.Force) == ()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("friction", [{(0, 0): 0.3, (1, 2): 0.6, (2, 2): 0.1}, {(2, 1): 0.5}, 0.4], ids=repr)
-def test_friction_may_name_other_groups(world, friction):
-    # Fewer, more or other groups than before must act as in a world that had them from the start: tables then have other rows.
-    x = np.stack([0.9 * (np.arange(12) % 4), 0.5 + 0.9 * (np.arange(12) // 4)], axis=1)  # not touching, so compiled once
-    ends = []
-    for first in ({(0, 0): 0.5, (1, 1): 0.5}, friction):
-        start = tv.Particles(
-            x + 0.02 * np.cos(np.arange(24)).reshape(12, 2), radius=0.43, group=np.arange(12) % 3, velocity=(1, 0)
-        )
-        w = world(start, [tv.Gravity(), contact := tv.Contact(friction=first), tv.Box((-1, 0), (4, 9))], precision="f64")
-        w.step(1e-9)
-        contact.friction = friction
-        w.run(0.3)
-        ends.append(w.position)
-    assert np.abs(ends[0] - ends[1]).max() < 1e-6
 
 
 @pytest.mark.slow
@@ -370,66 +347,63 @@ def test_what_is_not_live_refuses_and_says_what_is(world):
         w.substep = 3
 
 
-def test_what_is_wrong_is_said_where_it_is_made(world):
-    for make in (lambda: tv.Rope([[0, 1]], length=-1), lambda: tv.Spacer([[0, 1]], -1), lambda: tv.Distance([[0, 1]], rest=[-1])):
-        with pytest.raises(ValueError, match=r"(length|rest)(\[0\])? = -1"):
-            make()
-    with pytest.raises(ValueError, match="rest has shape"):
-        tv.Bend([[0, 1, 2]], rest=[0.1, 0.2])
-    with pytest.raises(TypeError, match="Box: there is no one_way. Capsule, Polygon and Mesh take it"):
-        tv.Box((0, 0), (1, 1), one_way=(0, 1))  # type: ignore[call-arg]
-    with pytest.raises(TypeError, match=r"particles = Drag is a feature; write features=\[...\]"):
-        world(tv.Particles([[0.0, 1.0]])).add(tv.Drag(1.0))
-
-
 def test_rest_values_that_nobody_gave_are_read_only_too(world):
     # A world cannot notice a change of a part of them. The same holds in clones, and where particles were removed.
-    for rows in (ROWS3, ROWS2):
-        names = [name for name, (_, _, old, _) in rows.items() if "rest" in old]
-        some = {name: rows[name] for name in names}
-        for name in {*names} - {"Spacer"}:
-            make, points, old, new = rows[name]
-            some[name] = make, points, old | {"rest": None}, new
-        scene = Scene(world, some, False)
-        scene.world.remove([*scene.indices.values()][0])
-        with scene.world.clone() as other:
-            for k, feature in enumerate(other.features):
-                for one in (feature, scene.world.features[k]):
-                    for setting in knobs_of(type(one)):
-                        value = getattr(one, setting)
-                        with pytest.raises(ValueError, match=f"{type(one).__name__}.{setting} is read-only.* Assign the whole"):
-                            value[:1] = 2.0
-                assert k == 0 or feature.rest.shape == (1,)
-        assert len(names) == len(scene.world.features) == (9 if rows is ROWS3 else 1)
-
-
-def falling(world, features, **settings):
-    """Build a world of two linked discs that fall on a floor, and of two that collide."""
-    x = np.array([[0.0, 0.3], [0.9, 0.3], [4.0, 0.3], [4.9, 0.4]])
-    speed = [[2.0, -2], [0, -2], [3, -2], [0, -2]]
-    return world(tv.Particles(x, velocity=speed, radius=0.25), [tv.Gravity(), *features], precision="f64", **settings)
+    some = {name: (row[0], row[1], row[2] | {"rest": None}, row[3]) for name, row in ROWS3.items() if "rest" in row[2]}
+    some["Spacer"] = ROWS3["Spacer"]  # whose length is given
+    scene = Scene(world, some, False)
+    scene.world.remove([*scene.indices.values()][0])
+    with scene.world.clone() as other:
+        for one in (*other.features, *scene.world.features):
+            for setting in knobs_of(type(one)):
+                with pytest.raises(ValueError, match=f"{type(one).__name__}.{setting} is read-only.* Assign the whole"):
+                    getattr(one, setting)[:1] = 2.0
+        assert [len(f.rest) for f in other.features] == [0, *[1] * 8]
 
 
 @pytest.mark.slow
-def test_what_was_absent_is_compiled_when_it_is_first_asked_for(world):
-    # From smooth to rough: as in a world built rough. Then a clone, which continues bit for bit.
-    surfaces, rough = ([tv.HalfSpace((0, 1), **k), tv.Contact(**k)] for k in ({}, {"friction": 0.3, "restitution": 0.5}))
-    w, other = falling(world, surfaces), falling(world, rough)
-    start, handle = (w.position, w.velocity), w.handle([3])
-    w.run(0.1)
-    for surface in surfaces:
-        surface.friction, surface.restitution = 0.3, 0.5
-    twin = w.clone()
-    for one in (w, twin):
-        one.run(0.1)
-    assert twin.hash() == w.hash() and handle.indices.tolist() == [3]
-    twin.close()
+@pytest.mark.parametrize("kind", ["link", "surfaces"])
+def test_what_was_absent_is_compiled_when_it_is_first_asked_for(world, tmp_path, kind):
+    # From rigid to soft, or from smooth to rough, in a recording: later values compile nothing. Then as in a world built so; a
+    # clone continues bit for bit, and the values stay where the world is edited.
+    x = np.array([[0.0, 0.3], [0.9, 0.3], [4.0, 0.3], [4.9, 0.4]])
+    start = tv.Particles(x, velocity=[[2.0, -2], [0, -2], [3, -2], [0, -2]], radius=0.25)
+    first = {"compliance": 1e-3, "break_at": 1e8} if kind == "link" else {"friction": (0.4, 0.2), "restitution": 0.2}
+    later = {"compliance": 1e-2, "break_at": 1e9} if kind == "link" else {"friction": 0.3, "restitution": 0.5}
+
+    def built(**knobs):
+        some = [tv.Distance([[0, 1]], **knobs)] if kind == "link" else [tv.HalfSpace((0, 1), **knobs), tv.Contact(**knobs)]
+        return world(start, [tv.Gravity(), *some], precision="f64")
+
+    def turn(values):
+        for feature in w.features[1:]:
+            for name, value in values.items():
+                setattr(feature, name, value)
+
+    w, other = built(), built(**later)
+    handle = w.handle([3])
+    w.run(0.05)
+    with tv.Recorder(tmp_path / "a.rrd", w) as recorder:
+        turn(first)
+        w.run(0.05, recorder=recorder)
+        memory = w._runner.memory
+        turn(later)
+        w.run(0.05, recorder=recorder)
+        assert w._runner.memory is memory
+    replay = tv.replay(tmp_path / "a.rrd")
+    assert replay.verify() and replay.world(6).hash() == w.hash()
+    with w.clone() as twin:
+        for one in (w, twin):
+            one.run(0.05)
+        assert twin.hash() == w.hash() and handle.indices.tolist() == [3]
     for one in (w, other):
-        one.velocity, one.position = 0 * start[1], start[0] + [0, 3]
+        one.velocity, one.position = 0 * start.velocity, x + [0, 3]
         one.step(DT)  # a frame in which pairs forget their data
-        one.position, one.velocity = start
+        one.position, one.velocity = x, start.velocity
         one.run(0.2)
     np.testing.assert_allclose(w.position, other.position, atol=1e-9)
+    w.remove(w.add(tv.Particles([[9.0, 9.0]]), [tv.Drag(0.1)]))
+    assert all(np.all(getattr(f, name) == value) for f in w.features[1:-1] for name, value in later.items())
 
 
 def test_a_link_whose_rest_length_becomes_zero(world):
@@ -437,52 +411,13 @@ def test_a_link_whose_rest_length_becomes_zero(world):
     built = []
     for rest in (None, 0.0):
         link = tv.Distance([[0, 1]], rest)
-        w = falling(world, [link])
+        start = tv.Particles([[0.0, 0.3], [0.9, 0.3]], velocity=[[2.0, -2], [0, -2]])
+        built.append(world(start, [tv.Gravity(), link], precision="f64"))
         link.rest = 0.0
-        w.run(0.1)
-        built.append(w)
+        built[-1].run(0.1)
     assert built[0].position.tolist() == built[1].position.tolist()
     r, v = (a[0] - a[1] for a in (built[0].position, built[0].velocity))
     assert np.hypot(*r) < 1e-3 and np.hypot(*v) < 0.1  # both particles are one, and fall as one
-
-
-@pytest.mark.slow
-def test_what_was_turned_and_turned_back_leaves_no_trace(world):
-    # Links of length 0 are relaxed alone. With a length again, they are solved with the others, with the bits of a new world.
-    def hang(rest):
-        start = tv.Particles(np.array([[0.0, 0], [0.5, 0], [1, 0.2], [1.4, 0]]), pinned=[0])
-        links = tv.Distance([[0, 1], [1, 2], [2, 3]], rest=rest)
-        return world(start, [links, tv.Gravity(9.81)], substeps=7, solver=tv.Direct()), links
-
-    w, links = hang([0.5, 0.5, 0.4])
-    for rest in ([0.5, 0.0, 0.4], [0.6, 0.5, 0.4]):
-        links.rest = rest
-        w.step(DT)
-    fresh, _ = hang([0.6, 0.5, 0.4])
-    w.velocity, w.position = w.particles.velocity, w.particles.position
-    for _ in range(3):
-        w.step(DT)
-        fresh.step(DT)
-        assert w.position.tobytes() == fresh.position.tobytes()
-
-
-@pytest.mark.slow
-def test_what_is_turned_stays_in_edited_worlds_and_in_recordings(world, tmp_path):
-    link, floor = tv.Distance([[0, 1]]), tv.HalfSpace((0, 1), friction=0.5)
-    w = falling(world, [link, floor])
-    w.run(0.05)
-    with tv.Recorder(tmp_path / "a.rrd", w) as recorder:
-        link.compliance, link.break_at, floor.friction = 1e-2, 1e9, (0.4, 0.2)  # compiles
-        w.run(0.05, recorder=recorder)
-        memory = w._runner.memory
-        link.compliance, link.break_at, link.damping = 1e-3, None, 0.0
-        w.run(0.05, recorder=recorder)
-        assert w._runner.memory is memory and np.isfinite(link.residual).all() and link.load[0] != 0
-    replay = tv.replay(tmp_path / "a.rrd")
-    assert replay.verify() and replay.world(6).hash() == w.hash()
-    w.remove(w.add(tv.Particles([[9.0, 9.0]]), [tv.Drag(0.1)]))
-    assert link.compliance[0] == 1e-3 and floor.friction == (0.4, 0.2)
-    w.step(DT)
 
 
 def test_a_force_that_changes_starts_from_velocities(world):
@@ -510,19 +445,13 @@ def test_forces_that_change_disturb_nothing_that_they_do_not_reach(world):
     # lies still. With a start in each frame, in which contacts find half of their loads, it moved by 0.004 radii across.
     pile = np.array([[0.1 * (i + j / 2), 0.05 + j * 0.05 * 3**0.5] for j in range(6) for i in range(6 - j)])
     start = tv.Particles(np.vstack([pile, [[9.0, 0.0]], [[30.0, 50.0]]]), radius=0.05)
-
-    def lying():
-        """Return a world of the pile at rest, a disc that a hand holds, and one that falls; its gravity, and the hand."""
-        floor = tv.Polygon([(-1, -1), (2, -1), (2, 0), (-1, 0)], friction=0.4)
-        features = [tv.Gravity(9.81), tv.Contact(friction=0.4), tv.Hand((9.0, 0.0), 21), floor]
-        w = world(start, features, substeps=4, precision="f64")
-        w.run(3.0)
-        return w, w.features[0], w.features[2]
-
-    w, gravity, hand = lying()
+    floor = tv.Polygon([(-1, -1), (2, -1), (2, 0), (-1, 0)], friction=0.4)
+    features = [tv.Gravity(9.81), tv.Contact(friction=0.4), tv.Hand((9.0, 0.0), 21), floor]
+    w = world(start, features, substeps=4, precision="f64")
+    w.run(3.0)
+    v = w.clone()
     w.run(1.0)
-    rest = w.position
-    v, gravity, hand = lying()
+    rest, (gravity, _, hand, _) = w.position, v.features
     for frame in range(60):
         hand.target, hand.rate = (9.0, 0.3 * np.sin(0.2 * frame)), 20.0
         gravity.g = 9.81
@@ -537,3 +466,4 @@ def test_forces_that_change_disturb_nothing_that_they_do_not_reach(world):
     np.testing.assert_allclose(v.position[22], x, rtol=1e-12)
     np.testing.assert_allclose(v.velocity[22], u, rtol=1e-11)
     assert np.abs(v.position[:21, 0] - rest[:21, 0]).max() < 1e-3 * 0.05
+    v.close()

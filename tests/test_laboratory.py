@@ -9,7 +9,7 @@ import pytest
 from tiverlet.report.output import Table
 
 from .conftest import python
-from .laboratory import results
+from .laboratory import mutations, results
 from .laboratory.__main__ import EXPERIMENTS
 
 FOLDER = pathlib.Path(results.__file__).parent
@@ -31,6 +31,12 @@ def test_results_replace_those_of_the_same_experiment(tmp_path):
     assert re.findall(r"^## (\w+)$", text, re.M) == ["a", "b"] and text.startswith(results.HEAD)
     assert "| 2 | x |" in text and "| 3 | x |" in text and "| 1 | x |" not in text and text.count("- a note") == 2
     assert re.search(r"`python -m tests.laboratory b`: \d{4}-\d\d-\d\d, .* cores, .*, commit ([0-9a-f]{7,}\+?|unknown)\.", text)
+
+
+def test_faults_that_can_be_put_back_are_where_they_were():
+    for fault in mutations.FAULTS:
+        assert (mutations.ROOT / "tiverlet" / fault.file).read_text().count(fault.now) == 1, fault
+        assert all((mutations.ROOT / "tests" / f"test_{test}.py").exists() for test in fault.tests.split()), fault
 
 
 @pytest.mark.slow

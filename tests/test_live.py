@@ -147,18 +147,31 @@ def test_what_pages_ask_for_is_done_recorded_and_replayed(rope, server, tmp_path
     assert len(tv.replay(tmp_path / "play.rrd").frames) == 2
 
 
-def test_a_page_that_goes_lets_go_and_one_that_is_slow_is_not_waited_for(rope, server):
+def test_pages_let_go_when_they_go_and_only_of_what_they_hold_and_slow_ones_are_not_waited_for(rope, server, tmp_path):
     live = Session(rope, server)
-    with page(server) as there:
-        there.send(json.dumps({"do": "grab", "particle": 5, "target": [0, 0]}))
+
+    def ask(there, count, **message):
+        there.send(json.dumps(message))
+        hear(server, count)
+
+    with page(server) as one, page(server) as other:
         hear(server, 2)
-        for _ in range(20):  # the page never confirms a frame
+        ask(one, 3, do="grab", particle=4, target=[0, 0])
+        ask(other, 4, do="grab", particle=5, target=[0, 0])
+        ask(one, 5, do="drop")
+        for _ in range(20):  # the pages never confirm a frame
             live.advance()
         assert live.hand.particle == 5 and live.steps == 20
-        assert server.viewers[0].waiting == session.AHEAD
-    hear(server, 1)
+        assert [viewer.waiting for viewer in server.viewers] == 2 * [session.AHEAD]
+    hear(server, 2)
     live.advance()
     assert live.hand.particle == -1 and not server.viewers
+    live.close()
+    for name, words in (("notes.rrd", "is no recording, and is not replaced"), ("notes.txt", "ends in '.txt', but a recording")):
+        (tmp_path / name).write_text("mine")
+        with pytest.raises(ValueError, match=words):
+            Session(rope, server, record=tmp_path / name)
+        assert (tmp_path / name).read_text() == "mine" and not rope._watchers
 
 
 def received(there) -> tuple[list[dict], dict, np.ndarray]:
@@ -257,21 +270,6 @@ def test_a_scene_that_diverges_is_still_shown(world, server):
     live.close()
 
 
-def test_only_the_page_that_holds_a_particle_lets_it_go(rope, server):
-    live = Session(rope, server)
-    with page(server) as one, page(server) as other:
-        hear(server, 2)
-        one.send(json.dumps({"do": "grab", "particle": 4, "target": [0, 0]}))
-        hear(server, 3)
-        other.send(json.dumps({"do": "grab", "particle": 5, "target": [0, 0]}))
-        hear(server, 4)
-        one.send(json.dumps({"do": "drop"}))
-        hear(server, 5)
-        live.advance()
-        assert live.hand.particle == 5
-    live.close()
-
-
 def test_a_page_that_does_not_read_holds_up_nobody(server):
     with page(server, max_size=None, max_queue=1) as there:
         hear(server, 1)
@@ -280,15 +278,6 @@ def test_a_page_that_does_not_read_holds_up_nobody(server):
             server.viewers[0].send(bytes(8 << 20))  # more than sockets buffer
         assert time.monotonic() - begin < 1
         assert [len(there.recv(timeout=10)) for _ in range(3)] == 3 * [8 << 20]
-
-
-def test_play_replaces_recordings_only(rope, server, tmp_path):
-    for name, words in (("notes.rrd", "is no recording, and is not replaced"), ("notes.txt", "ends in '.txt', but a recording")):
-        notes = tmp_path / name
-        notes.write_text("mine")
-        with pytest.raises(ValueError, match=words):
-            Session(rope, server, record=notes)
-        assert notes.read_text() == "mine" and not rope._watchers
 
 
 def test_only_who_knows_the_address_gets_in(server):

@@ -1,4 +1,4 @@
-"""Periodic boxes and Lees-Edwards shear: against explicit images, shifted scenes, closed forms and conservation laws."""
+"""Periodic boxes and Lees-Edwards shear: against explicit images, closed forms and conservation laws."""
 
 from itertools import product
 
@@ -46,18 +46,8 @@ def by_images(a, b, length, axes, offset=0.0):
     return out
 
 
-def touching(x, radius, length, axes, offset, by=0.0):
-    """Return the pairs i < j that overlap by more than `by` [m], over all images."""
-    distance = by_images(x, x, length, axes, offset)
-    i, j = np.nonzero(np.triu(radius[:, None] + radius - distance > by, 1))
-    return set(zip(i.tolist(), j.tolist(), strict=True))
-
-
 MIXED = (0.3, 0.1, 0.04)
 BOXES = {  # lengths, axes, shear, radii; several sizes of cells wherever that makes other kernels
-    "2D, two cells and one": ((2.4, 1.3), (0, 1), 0.0, MIXED),
-    "2D, more cells than buckets": ((300.0, 160.0), (0, 1), 0.0, MIXED),
-    "2D, x alone": ((5.0, 4.0), (0,), 0.0, (0.3,)),
     "2D, sheared": ((8.0, 7.0), (0, 1), 1.5, MIXED),
     "2D, sheared, one cell": ((3.0, 1.35), (0, 1), -5.0, MIXED),
     "2D, sheared, more cells than buckets": ((300.0, 160.0), (0, 1), 0.3, MIXED),
@@ -67,7 +57,7 @@ BOXES = {  # lengths, axes, shear, radii; several sizes of cells wherever that m
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*BOXES])
-def test_no_pair_is_missed_whichever_image_is_near(world, name):
+def test_contacts_and_queries_find_the_nearest_image(world, name):
     length, axes, shear, radii = BOXES[name]
     length, rng = np.array(length), np.random.default_rng(0)
     dim, n = len(length), 60
@@ -77,75 +67,32 @@ def test_no_pair_is_missed_whichever_image_is_near(world, name):
     radius, v = rng.choice(radii, n), rng.normal(size=(n, dim))
     v[:, 0] += shear * x[:, 1]
     box = tv.Periodic(np.zeros(dim), length, axes, shear=shear)
-    w = world(tv.Particles(x, velocity=v, radius=radius), [tv.Contact(), box], substeps=4)
+    w = world(tv.Particles(x, velocity=v, radius=radius), [tv.Contact(0.4, 0.6), box], substeps=4, precision="f64")
     found = 0
-    for frame in range(8):
-        w.step(DT)
-        listed = set(map(tuple, w._runner.search.list.entries()[0].tolist()))  # the frame's list, however old
-        there = touching(w.position, radius, length, axes, box.offset, 1e-4)
-        assert there <= listed
+    for _ in range(8):
+        report = w.step(DT)
+        distance = by_images(w.position, w.position, length, axes, box.offset)
+        depth = np.triu(radius[:, None] + radius - distance, 1)
+        there = set(map(tuple, np.argwhere(depth > 1e-4).tolist()))
+        contacts = w.contacts  # of the frame's list, and of one built anew
+        assert {tuple(p) for p, d in zip(contacts.pairs.tolist(), contacts.overlap, strict=True) if d > 1e-4} == there
+        assert report.contacts >= len(there)
+        pairs, deep = measure.overlapping(w.position, radius, 0.0, box)
+        assert {tuple(p) for p, d in zip(pairs.tolist(), deep, strict=True) if d > 1e-4} == there
         found += len(there)
-        if frame in (0, 7):
-            contacts = w.contacts
-            some = contacts.overlap > 1e-4
-            assert set(map(tuple, contacts.pairs[some].tolist())) == there
-            pairs, depth = measure.overlapping(w.position, radius, 0.0, box)
-            assert set(map(tuple, pairs[depth > 1e-4].tolist())) == there
-            np.testing.assert_allclose(depth.sum(), contacts.overlap[contacts.overlap > 0].sum(), atol=1e-3)
     assert found > 10 and np.isclose(box.strain, shear * 8 * DT)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("contact", [True, False])
-def test_queries_find_the_nearest_image(world, contact):
-    rng, length = np.random.default_rng(1), np.array([4.0, 3.0])
-    x, points, radius = rng.uniform(-2, 3, (40, 2)) * length, rng.uniform(-3, 3, (15, 2)) * length, rng.uniform(0.1, 2.5, 15)
-    box = tv.Periodic((0, 0), length, shear=0.7)
-    w = world(tv.Particles(x, radius=0.1), [box, *([tv.Contact()] if contact else [])], precision="f64")
-    w.step(DT)
-    distance = by_images(points, w.position, length, (0, 1), box.offset)
-    np.testing.assert_array_equal(w.near(points, radius), np.argwhere(distance <= radius[:, None]))
+    points, reach = rng.uniform(-3, 3, (15, dim)) * length, rng.uniform(0.1, 0.45, 15) * length.min()
+    distance = by_images(points, w.position, length, axes, box.offset)
+    np.testing.assert_array_equal(w.near(points, reach), np.argwhere(distance <= reach[:, None]))
     index, near = w.nearest(points)
     np.testing.assert_array_equal(index, distance.argmin(axis=1))
-    np.testing.assert_allclose(near, distance.min(axis=1), atol=1e-12)
-    inside = box.wrap(w.position)
-    assert (inside >= -1e-12).all() and (inside < length + 1e-12).all()
-    np.testing.assert_allclose(w.position - inside, box.away(box.boxes(w.position)), atol=1e-12)
+    np.testing.assert_allclose(near, distance.min(axis=1), atol=1e-11 * length.max())
+    inside = box.wrap(w.position)[:, list(axes)]
+    assert (inside >= -1e-9).all() and (inside < length[list(axes)] + 1e-9).all()
+    np.testing.assert_allclose(w.position - box.wrap(w.position), box.away(box.boxes(w.position)), atol=1e-9)
     # Positions that are not finite have no image, and no warning is issued.
-    nowhere = np.array([[np.inf, 1.0], [1.0, -1e300], [np.nan, 0.0]])
-    np.testing.assert_array_equal(np.isfinite(box.difference(nowhere, points[:3])).all(axis=1), [False, True, False])
-
-
-def crowd(shift, moved, contact, shear=0.0, n=30, **settings):
-    """Return discs, springs and a contact or soft force in a box that begins at `shift`; `moved` adds whole boxes."""
-    rng, length = np.random.default_rng(2), np.array([4.0, 3.0])
-    x, v = rng.uniform(0, 1, (n, 2)) * length, rng.normal(size=(n, 2))
-    boxes = rng.integers(-2, 3, (n, 2)) if moved else np.zeros((n, 2))
-    v[:, 0] += shear * (x[:, 1] + boxes[:, 1] * length[1])
-    links = [[0, 1], [1, 2], [5, 6]]
-    features = [tv.Periodic(shift, shift + length, shear=shear), tv.Distance(links, 0.8, compliance=1e-3, damping=1.0)]
-    features += [contact] if contact else [tv.PairForce(soft, 0.5, potential=soft_energy)]
-    return tv.Particles(x + shift + boxes * length, velocity=v, radius=0.15), features, settings | {"precision": "f64"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["contact", "pair force"])
-def test_where_the_box_begins_and_which_image_is_followed_changes_nothing(world, kind):
-    def run(shift, moved):
-        contact = tv.Contact(friction=0.3, restitution=0.8) if kind == "contact" else None
-        particles, features, settings = crowd(np.array(shift), moved, contact)
-        w = world(particles, features, substeps=5, **settings)
-        w.run(0.1)
-        return w
-
-    # For a short time only: each collision amplifies rounding tenfold.
-    base, shifted, moved = run((0.0, 0.0), False), run((1.7, -2.3), False), run((0.0, 0.0), True)
-    d = base.position - base.particles.position
-    np.testing.assert_allclose(shifted.position - shifted.particles.position, d, atol=1e-9)
-    np.testing.assert_allclose(moved.position - moved.particles.position, d, atol=1e-9)
-    np.testing.assert_allclose(shifted.velocity, base.velocity, atol=1e-7)
-    np.testing.assert_allclose(moved.velocity, base.velocity, atol=1e-7)
-    assert np.abs(d).max() > 0.1
+    nowhere = np.array([[np.inf, 1.0, 0.0], [1.0, 1e300, 0.0], [np.nan, 0.0, 0.0]])[:, :dim]
+    assert not np.isfinite(box.difference(nowhere, points[:3])).all(axis=1)[[0, 2]].any()
 
 
 @pytest.mark.slow
@@ -155,8 +102,10 @@ def test_a_collision_across_the_boundary_is_that_with_the_image(world):
     # along the normal is m (1 + e) u_n, and across it friction stops the slip or is mu times that.
     length, shear, mu, e = np.array([5.0, 4.0]), 0.8, 0.4, 0.6
     x, v, m = np.array([[1.0, 3.7], [1.3 - 1.28 * shear, 0.4]]), np.array([[0.2, 0.5], [-0.1, -0.4]]), np.array([1.0, 2.0])
-    features = [tv.Periodic((0, 0), length, shear=shear), tv.Contact(mu, e)]
-    w = world(tv.Particles(x, velocity=v, radius=0.25, mass=m), features, precision="f64")
+    # Far from them particles of other sizes stay in the flow: one structure with the test above.
+    more, flow = np.array([[2.5, 1.0], [2.5, 2.0]]), np.array([[shear, 0.0], [2 * shear, 0.0]])
+    start = tv.Particles([*x, *more], velocity=[*v, *flow], radius=[0.25, 0.25, 0.1, 0.04], mass=[*m, 1, 1])
+    w = world(start, [tv.Contact(mu, e), tv.Periodic((0, 0), length, shear=shear)], precision="f64")
     w.run(1 / 3)
     image, faster = np.array([0.0, length[1]]), np.array([shear * length[1], 0.0])
     r, u = x[0] - x[1] - image, v[0] - v[1] - faster
@@ -167,8 +116,8 @@ def test_a_collision_across_the_boundary_is_that_with_the_image(world):
     drag = -slip * min(reduced, mu * push / np.linalg.norm(slip))
     after = v + np.array([[1.0], [-1.0]]) * (push * n + drag) / m[:, None]
     assert 0.2 < t < 0.3
-    np.testing.assert_allclose(w.velocity, after, atol=1e-11)
-    np.testing.assert_allclose(w.position, x + t * v + (w.time - t) * after, atol=1e-11)
+    np.testing.assert_allclose(w.velocity, [*after, *flow], atol=1e-11)
+    np.testing.assert_allclose(w.position[:2], x + t * v + (w.time - t) * after, atol=1e-11)
 
 
 def test_a_ring_around_the_box_swings_as_a_periodic_chain(world):
@@ -188,91 +137,43 @@ def test_a_ring_around_the_box_swings_as_a_periodic_chain(world):
     np.testing.assert_allclose(w.position[:, 1], 0.5, atol=1e-12)
 
 
-def test_a_closed_chain_with_bends_rests_as_it_was_put(world):
-    # A chain straight around the box: all lengths and angles are met, also across the boundary, so only its centre moves.
-    n = 16
-    links = np.stack([np.arange(n), (np.arange(n) + 1) % n], axis=1)
-    bends = np.stack([np.arange(n), (np.arange(n) + 1) % n, (np.arange(n) + 2) % n], axis=1)
-    x = np.stack([np.arange(n) * 0.25, np.full(n, 0.5)], axis=1)
-    chain = tv.Distance(links)
-    w = world(
-        tv.Particles(x, velocity=(1.3, 0.4)), [tv.Periodic((0, 0), (4, 1)), chain, tv.Bend(bends, compliance=1e-2)],
-        precision="f64",
-    )  # fmt: skip
-    np.testing.assert_allclose(chain.rest, 0.25, rtol=1e-14)
-    w.run(0.5)
-    np.testing.assert_allclose(w.position, x + np.array([1.3, 0.4]) * w.time, atol=1e-9)
-    assert w.last and w.last.clean and w.last.residual < 1e-9
+LOOP = [[0, 1, 2, 3]]
 
 
 @pytest.mark.slow
-def test_an_elastic_gas_keeps_energy_and_momentum(world):
-    n, length = 5, 6.0
-    x = (np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) * length / n
-    v = np.random.default_rng(3).normal(size=x.shape)
-    box = tv.Periodic([0] * 3, [length] * 3)
-    w = world(tv.Particles(x, velocity=v, radius=0.28), [tv.Contact(restitution=1.0), box], substeps=10, precision="f64")
-    energy, momentum = measure.kinetic_energy(w), measure.momentum(w)
-    w.run(1.0)
-    assert (np.abs(w.velocity - v).max(axis=1) > 0.1).mean() > 0.3  # particles have collided
-    assert (np.abs(box.boxes(w.position)) > 0).any()
-    np.testing.assert_allclose(measure.kinetic_energy(w), energy, rtol=1e-12)
-    np.testing.assert_allclose(measure.momentum(w), momentum, atol=1e-11)
+def test_soft_bodies_pass_the_boundary_as_if_there_were_none(world):
+    # Members of a body that is given whole are the nearest images of each other. In the larger box they never reach the boundary.
+    square, found = np.array([[0.0, 0], [0.6, 0], [0.6, 0.6], [0, 0.6]]), []
+    for size in (2, 200):
+        edges, bends = [[0, 1], [1, 2], [2, 3], [3, 0]], tv.Bend([[0, 1, 2], [2, 3, 0]], 1.7, compliance=1e-2)
+        features = [tv.Area(LOOP, pressure=1.2, compliance=1e-4), tv.Distance(edges, compliance=1e-4), bends]
+        box = tv.Periodic((0, 0), (size, size))
+        w = world(tv.Particles(square + 1.2, velocity=(2.0, 1.0)), [box, *features], precision="f64")
+        w.run(0.8)
+        found.append(w.position)
+    np.testing.assert_allclose(*found, atol=1e-10)
 
 
-def test_forces_between_images_keep_energy_and_are_those_of_brute_force(world):
-    particles, features, settings = crowd(np.zeros(2), True, None, n=60)
-    force = features[2]
-    w = world(particles, [features[0], force], substeps=50, **settings)
-    w.step(1e-9)
-    energy, momentum = w.last.energy, measure.momentum(w)
-    x, length = w.position, np.array([4.0, 3.0])
-    r = features[0].difference(x[:, None], x)
+def test_forces_between_images_are_those_of_brute_force_and_keep_energy(world):
+    rng, length, n = np.random.default_rng(2), np.array([4.0, 3.0]), 60
+    x, v = (rng.uniform(0, 1, (n, 2)) + rng.integers(-2, 3, (n, 2))) * length, rng.normal(size=(n, 2))
+    box, force = tv.Periodic((0, 0), length), tv.PairForce(soft, 0.5, potential=soft_energy)
+    w = world(tv.Particles(x, velocity=0 * v), [box, force], substeps=1, precision="f64")
+    h = 1e-3  # one substep from rest: x = x0 + h^2 a / 2
+    w.step(h)
+    r = box.difference(x[:, None], x)
     s = np.linalg.norm(r, axis=2)
     np.testing.assert_allclose(s, by_images(x, x, length, (0, 1)), atol=1e-12)
     near = (s < 0.5) & (s > 0)
-    want = (np.where(near, 40 * (1 - 2 * s) ** 2 / np.where(near, s, 1), 0)[..., None] * r).sum(axis=1)
-    np.testing.assert_allclose(w._runner.memory.read(force.dev.now)[: len(x)], want, atol=1e-4)  # a substep later
+    a = (np.where(near, 40 * (1 - 2 * s) ** 2 / np.where(near, s, 1), 0)[..., None] * r).sum(axis=1)
+    np.testing.assert_allclose(w.position - x, h * h / 2 * a, rtol=0, atol=1e-13)
+    w.velocity, w.position, w.substeps = v, x, 50
+    w.step(1e-9)
+    energy, momentum = w.last.energy, measure.momentum(w)
     w.run(1.0)
     # Order 2: h = 3e-4 s and omega is about 15 / s, so the error is (omega h)^2 = 2e-5 of the energy that oscillates.
     np.testing.assert_allclose(w.last.energy, energy, rtol=2e-4)
     np.testing.assert_allclose(measure.momentum(w), momentum, atol=1e-10)
-
-
-@pytest.mark.slow
-def test_a_shear_is_live_and_survives_whatever_happens_to_the_world(world, tmp_path):
-    particles, features, settings = crowd(np.zeros(2), False, tv.Contact(friction=0.2, restitution=0.1))
-    w = world(particles, features, **settings)
-    box = features[0]
-    w.step(DT)
-    assert box.strain == 0 and "Periodic.strain" not in w.fields
-    box.shear = 2.0
-    w.step(DT)
-    with tv.Recorder(tmp_path / "shear.rrd", w) as recorder:
-        for _ in range(2):
-            w.step(DT)
-            recorder.log()
-        box.shear = -1.0
-        x = w.position
-        w.add(tv.Particles([[9.0, 9.0]], radius=0.15), extend={features[1]: tv.Distance([[3, 4]], compliance=1e-3)})
-        w.step(DT)
-        recorder.log()
-    assert np.isclose(box.strain, 5 * DT) and np.isclose(box.offset, 5 * DT * 3.0)
-    assert abs(features[1].rest[-1] - by_images(x[[3]], x[[4]], (4, 3), (0, 1), 6 * DT * 3.0)[0, 0]) < 1e-12
-    twin, other = w.clone(), w.clone(precision="f32")
-    replay = tv.replay(tmp_path / "shear.rrd")
-    assert replay.verify().kind == "intact"
-    again = replay.world(3)
-    drawn = replay.position(3)
-    body = np.unique([[0, 1, 2], [5, 6, 3], [4, 4, 4]])
-    single = np.setdiff1d(np.arange(len(drawn)), body)
-    np.testing.assert_allclose(drawn[single], box.wrap(w.position)[single], atol=1e-5)
-    assert other.features[0].strain == box.strain
-    for copy in (w, twin, again):
-        copy.step(DT)
-    assert twin.hash() == w.hash() == again.hash()
-    for copy in (twin, other, again):
-        copy.close()
 
 
 def strain(w):
@@ -281,16 +182,18 @@ def strain(w):
 
 
 @pytest.mark.slow
-def test_many_worlds_have_boxes_of_their_own():
-    particles, features, settings = crowd(np.zeros(2), False, tv.Contact(), shear=0.5)
-    with tv.World(particles, [features[0], features[2]], **settings) as one, tv.Worlds(one, 3) as many:
+def test_a_shear_is_live_and_each_of_many_worlds_has_its_own(world):
+    box = tv.Periodic((0, 0), (4, 3))
+    w = world(tv.Particles([[0.5, 0.5]], radius=0.1), [box, tv.PairForce(soft, 0.5)], precision="f64")
+    w.step(DT)
+    assert box.strain == 0
+    box.shear = 2.0
+    w.step(DT)
+    assert np.isclose(box.strain, 2 * DT) and np.isclose(box.offset, 2 * DT * 3)
+    with tv.Worlds(w, 3) as many:
+        many.set(many.features[0], shear=[0.5, 1.0, -1.0])
         many.step(DT)
-        one.step(DT)
-        np.testing.assert_array_equal(many.position[1], one.position)
-        many.set(features[0], shear=[0.5, 1.0, -1.0])  # one shear for each world
-        many.step(DT)
-        many.step(DT)
-        np.testing.assert_allclose(many.each(strain), np.array([1.5, 2.5, -1.5]) * DT, rtol=1e-12)
+        np.testing.assert_allclose(many.each(strain), (2 + np.array([0.5, 1.0, -1.0])) * DT, rtol=1e-12)
 
 
 def test_obstacles_meet_images(world):
@@ -308,54 +211,29 @@ def test_obstacles_meet_images(world):
     np.testing.assert_allclose(w.velocity, np.tile([-2, 0], (6, 1)), atol=1e-9)
 
 
-def test_a_floor_under_a_periodic_box(world):
-    # Walls along other axes: a particle that slides out on the right comes in on the left, and stays on the floor.
-    x = np.stack([np.arange(8) * 0.5 + 0.25, 0.2 + 0.01 * np.arange(8)], axis=1)
-    walls = [tv.Box((-np.inf, 0), (np.inf, 5)), tv.HalfSpace((0, 1), 0.0)]
-    w = world(tv.Particles(x, velocity=(3.0, 0.0), radius=0.2), [tv.Gravity(), tv.Periodic((0, -9), (4, 9), (0,)), *walls])
-    w.run(2.0)
-    np.testing.assert_allclose(w.position[:, 1], 0.2, atol=1e-3)
-    np.testing.assert_allclose(w.position[:, 0] - x[:, 0], 3.0 * w.time, atol=2e-5)
-    assert (w.position[:, 0] > 4).any()
-
-
-LOOP = [[0, 1, 2, 3]]
-
-
-@pytest.mark.parametrize(("make", "words"), [
-    (lambda: tv.Periodic((0, 0), (1, 0)), "is no length"),
-    (lambda: tv.Periodic((0, 0), (1, np.nan)), "high"),
-    (lambda: tv.Periodic((0, 0), (1, np.inf)), "is no length"),
-    (lambda: tv.Periodic((0, 0), (1, 1, 1)), "two corners"),
-    (lambda: tv.Periodic((0, 0), (1, 1), ()), "leaves nothing periodic"),
-    (lambda: tv.Periodic((0, 0), (1, 1), (2,)), "axes"),
-    (lambda: tv.Periodic((0, 0), (1, 1), shear=np.nan), "shear"),
-])  # fmt: skip
-def test_boxes_that_are_none(make, words):
-    with pytest.raises(ValueError, match=words):
-        make()
-
-
-@pytest.mark.parametrize(("features", "words"), [
-    ([tv.Periodic((0, 0, 0), (1, 1, 1))], "2D"),
-    ([tv.Periodic((0, 0), (9, 0.7)), tv.Contact()], "two particles touch.*longer than 0.8"),
-    ([tv.Periodic((0, 0), (9, 9)), tv.Periodic((0, 0), (9, 9))], "more than one Periodic"),
-    ([tv.Periodic((0, 0), (9, 4)), tv.Distance([[0, 1]], 2.0)], "link 0"),
-    ([tv.Periodic((0, 0), (9, 4)), tv.Rope([[0, 1]], 2.5)], "link 0"),
-    ([tv.Periodic((0, 0), (9, 4)), tv.PairForce(soft)], "radius=2"),
-    ([tv.Periodic((0, 0), (9, 4)), tv.PairForce(soft, 2.1)], "pairs act"),
-    ([tv.Periodic((0, 0), (9, 4)), tv.Box((0, 0), (9, 4))], "along x, which is periodic"),
-    ([tv.Periodic((0, 0), (9, 4), (0,)), tv.HalfSpace((0.1, 1))], "gravity have the slope"),
-    ([tv.Periodic((0, 0), (9, 4), (0,), shear=1.0)], "x and y"),
-    ([tv.Periodic((0, 0), (9, 4), shear=1.0), tv.Ball((1, 1), 0.5)], "slide"),
-    ([tv.Periodic((0, 0), (9, 4)), tv.Polygons(LOOP)], "Polygons"),
-    ([tv.Periodic((0, 0), (1.5, 4)), tv.Area(LOOP)], "unwrapped"),
-    ([tv.Periodic((0, 0), (1.5, 4)), tv.ShapeMatch(LOOP)], "unwrapped"),
-])  # fmt: skip
-def test_what_does_not_fit_is_refused(features, words):
-    x = [[0.0, 0], [1, 0], [1, 1], [0, 1]]
-    with pytest.raises(ValueError, match=words):
-        tv.World(tv.Particles(x, radius=0.2), [f.copy() for f in features])
+@pytest.mark.slow
+def test_f32_with_low_words_is_as_good_a_hundred_boxes_away(world):
+    # Particles a hundred boxes from each other: f32 resolves their positions to 3e-5 m, with low words to 1e-9 m.
+    x = np.stack(np.meshgrid(np.arange(5), np.arange(5)), -1).reshape(-1, 2) * 0.8 + 0.4
+    rng = np.random.default_rng(4)
+    v, away, found = rng.normal(size=x.shape), 400.0 * rng.integers(-1, 2, x.shape), []
+    for start in (x, x + away):
+        features = [tv.Periodic((0, 0), (4, 4)), tv.Contact()]
+        w = world(tv.Particles(start, velocity=v, radius=0.15), features, substeps=4, precision="f32-compensated")
+        w.run(0.3)
+        found.append(w.position - (start - x))
+    assert np.abs(found[0] - x - v * 0.3).max() > 0.1  # particles have collided
+    np.testing.assert_allclose(found[1], found[0], atol=2e-6)
+    # Ten million radii from the origin one f32 has steps of a radius: cells must read both words, and points keep their digits.
+    corner, radius = 3e5, 0.03
+    box = tv.Periodic((corner, corner), (corner + 1, corner + 1))
+    w = world(tv.Particles(corner + rng.uniform(0, 1, (300, 2)), radius=radius), [box, tv.Contact()], precision="f32-compensated")
+    away = np.linalg.norm(box.difference(w.position[:, None], w.position), axis=-1)
+    np.testing.assert_array_equal(w.contacts.pairs, np.argwhere(np.triu(away < 2 * radius, 1)))
+    points = corner + np.random.default_rng(5).uniform(0, 1, (99, 2))
+    distance = np.linalg.norm(box.difference(points[:, None], w.position), axis=-1)
+    np.testing.assert_array_equal(w.near(points, radius), np.argwhere(distance <= radius))
+    np.testing.assert_array_equal(w.nearest(points)[0], distance.argmin(axis=1))
 
 
 def test_lengths_are_refused_while_it_runs(world):
@@ -372,32 +250,33 @@ def test_lengths_are_refused_while_it_runs(world):
     links.rest = 0.74
 
 
-@pytest.mark.slow
-def test_f32_with_low_words_is_as_good_a_hundred_boxes_away(world):
-    # Particles a hundred boxes from each other: f32 resolves their positions to 3e-5 m, with low words to 1e-9 m.
-    x = np.stack(np.meshgrid(np.arange(5), np.arange(5)), -1).reshape(-1, 2) * 0.8 + 0.4
-    rng = np.random.default_rng(4)
-    v, away = rng.normal(size=x.shape), 400.0 * rng.integers(-1, 2, x.shape)
-    found = []
-    for precision, start in (("f64", x), ("f32-compensated", x + away)):
-        w = world(
-            tv.Particles(start, velocity=v, radius=0.15), [tv.Periodic((0, 0), (4, 4)), tv.Contact()], substeps=4,
-            precision=precision,
-        )  # fmt: skip
-        w.run(0.3)
-        found.append(w.position - (start - x))
-    assert np.abs(found[0] - x - v * 0.3).max() > 0.1  # particles have collided
-    np.testing.assert_allclose(found[1], found[0], atol=2e-6)
+def box(width, height, *more, **options):
+    return tv.Periodic((0, 0), (width, height), *more, **options)
 
 
-def test_soft_bodies_pass_the_boundary_as_if_there_were_none(world):
-    # Members of a body that is given whole are the nearest images of each other. In the larger box they never reach the boundary.
-    square = np.array([[0.0, 0], [0.6, 0], [0.6, 0.6], [0, 0.6]])
-    found = []
-    for size in (2, 200):
-        features = [tv.Area(LOOP, pressure=1.2, compliance=1e-4), tv.Distance([[0, 1], [1, 2], [2, 3], [3, 0]], compliance=1e-4)]
-        box = tv.Periodic((0, 0), (size, size))
-        w = world(tv.Particles(square + 1.2, velocity=(2.0, 1.0)), [box, *features], precision="f64")
-        w.run(0.8)
-        found.append(w.position)
-    np.testing.assert_allclose(*found, atol=1e-10)
+@pytest.mark.parametrize(("make", "words"), [
+    (lambda: [box(1, 0)], "is no length"),
+    (lambda: [box(1, np.nan)], "high"),
+    (lambda: [box(1, np.inf)], "is no length"),
+    (lambda: [tv.Periodic((0, 0), (1, 1, 1))], "two corners"),
+    (lambda: [box(1, 1, ())], "leaves nothing periodic"),
+    (lambda: [box(1, 1, (2,))], "axes"),
+    (lambda: [box(1, 1, shear=np.nan)], "shear"),
+    (lambda: [tv.Periodic((0, 0, 0), (1, 1, 1))], "2D"),
+    (lambda: [box(9, 0.7), tv.Contact()], "two particles touch.*longer than 0.8"),
+    (lambda: [box(9, 9), box(9, 9)], "more than one Periodic"),
+    (lambda: [box(9, 4), tv.Distance([[0, 1]], 2.0)], "link 0"),
+    (lambda: [box(9, 4), tv.Rope([[0, 1]], 2.5)], "link 0"),
+    (lambda: [box(9, 4), tv.PairForce(soft)], "radius=2"),
+    (lambda: [box(9, 4), tv.PairForce(soft, 2.1)], "pairs act"),
+    (lambda: [box(9, 4), tv.Box((0, 0), (9, 4))], "along x, which is periodic"),
+    (lambda: [box(9, 4, (0,)), tv.HalfSpace((0.1, 1))], "gravity have the slope"),
+    (lambda: [box(9, 4, (0,), shear=1.0)], "x and y"),
+    (lambda: [box(9, 4, shear=1.0), tv.Ball((1, 1), 0.5)], "slide"),
+    (lambda: [box(9, 4), tv.Polygons(LOOP)], "Polygons"),
+    (lambda: [box(1.5, 4), tv.Area(LOOP)], "unwrapped"),
+    (lambda: [box(1.5, 4), tv.ShapeMatch(LOOP)], "unwrapped"),
+])  # fmt: skip
+def test_what_does_not_fit_is_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        tv.World(tv.Particles([[0.0, 0], [1, 0], [1, 1], [0, 1]], radius=0.2), make())

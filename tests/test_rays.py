@@ -1,4 +1,4 @@
-"""Rays and shapes against closed forms of distances, sampled densely along the rays."""
+"""Questions: rays and shapes against closed forms of distances, sampled densely along the rays."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,6 @@ import pytest
 import tiverlet as tv
 from tiverlet.device import ti
 from tiverlet.device.patches.compiler import CachedLaunch
-from tiverlet.geometry.bounding_tree import BoundingTree, ray_entry_bound
-from tiverlet.geometry.intervals import ball, entry, rounding
 
 NONE = -1
 U = np.array([(-1, -1), (1, -1), (1, 1), (0.5, 1), (0.5, -0.5), (-0.5, -0.5), (-0.5, 1), (-1, 1)]) * 0.8  # not convex
@@ -144,12 +142,14 @@ def bundle(dim, k, seed, wide=2.0):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_walls_are_met_where_their_distance_falls_to_zero(world, dim, monkeypatch):
+def test_walls_are_met_and_are_where_their_distance_falls_to_zero(world, dim, monkeypatch):
     # Before and after a frame in which the walls move; for rays of radius 0 and above; and for starts inside of the wall. The
     # host computes where walls are, so the frame runs without its kernel, which takes long to compile for all walls.
     monkeypatch.setattr(CachedLaunch, "__call__", lambda launch: None)
     made = [make() for make, _, _ in WALLS[dim]]
-    w = world(tv.Particles(np.full((1, dim), 0.05), radius=0.01, pinned=[0]), made, precision="f64", substeps=1)
+    rng = np.random.default_rng(9)
+    x, r = rng.uniform(-1.5, 1.5, (500, dim)), rng.uniform(0.001, 0.2, 500)
+    w = world(tv.Particles(x, radius=r, pinned=range(500)), made, precision="f64", substeps=1)
     o, d = bundle(dim, 120, 1)
     before = [w.ray(o, d, features=[wall], groups=()) for wall in made]
     for wall, (_, knobs, _) in zip(made, WALLS[dim], strict=True):
@@ -164,12 +164,16 @@ def test_walls_are_met_where_their_distance_falls_to_zero(world, dim, monkeypatc
             hits = w.ray(o, d, 8.0, radius=radius, features=[wall], groups=())
             met = prove(hits, o, d, gap, radius, fine)
             assert 0.02 < met.mean() and (hits.wall[met] == k).all() and (hits.wall[~met] == NONE).all()
-        # The same shape outside of any world, at its new place; and starts inside of it.
+        # The same shape outside of any world, at its new place; and which particles are inside of it.
         alone = make()
         for name, value in knobs.items():
             setattr(alone, name, value)
         np.testing.assert_allclose(alone.clearance(o), gap(o), atol=1e-12)
         np.testing.assert_allclose(wall.clearance(o), gap(o), atol=1e-12)
+        depth = gap(x) if alone.inside else -gap(x)
+        for part, least in (("center", 0 * r), ("whole", r), ("touching", -r)):
+            np.testing.assert_array_equal(w.inside(alone, part), np.flatnonzero(depth >= least))
+        assert 0 < len(w.inside(alone)) < 500
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -205,49 +209,6 @@ def test_particles_and_links_are_met_first_come_first(world, dim):
         assert (kinds == 1).all()
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_the_tree_and_brute_force_find_the_same(dim):
-    # Bit for bit; with one disc at 1e9 m, some discs in one place, some rays along axes, and a limited reach for some.
-    rng = np.random.default_rng(4)
-    n, k = 3000, 300
-    center, radius = rng.uniform(-1, 1, (n, dim)), 10.0 ** rng.uniform(-4, (-1.3, -0.9)[dim - 2], n)
-    center[0], center[1:40], radius[1:41] = 1e9, center[40], 0.05
-    o, d = rng.uniform(-1, 1, (k, dim)), rng.normal(size=(k, dim))
-    d[:50] = np.eye(dim)[rng.integers(0, dim, 50)]
-    o[:25] = np.round(o[:25], 1)
-    d /= np.linalg.norm(d, axis=1)[:, None]
-    o[50:60] = center[40] - 0.0501 * d[50:60]  # just before the place of forty discs
-    most = np.where(np.arange(k) % 3 == 0, 0.3, np.inf)
-
-    def value(q, i):
-        """Return where ray q meets disc i."""
-        return entry(ball(o[q], d[q], center[i], radius[i]), rounding(o[q], center[i]))
-
-    tree = BoundingTree(center - radius[:, None], center + radius[:, None])
-    distance, which = tree.find_least(k, most, ray_entry_bound(o, d, 0.0), value)
-    every = value(*np.indices((k, n)).reshape(2, -1)).reshape(k, n)
-    every[every > most[:, None]] = np.inf
-    np.testing.assert_array_equal(distance, every.min(axis=1))
-    np.testing.assert_array_equal(which, np.where(every.min(axis=1) < np.inf, every.argmin(axis=1), NONE))
-    assert (which[50:60] == 1).all() and 0.2 < (which >= 0).mean() < 1
-
-
-def test_nothing_slips_between_facets():
-    # From the inside of a closed mesh, a ray exactly through an edge or a corner is stopped, in 2D and 3D.
-    cube = tv.Mesh(CUBE, FACES, inside=True)
-    edges = CUBE[np.ravel(FACES)] / 2 + CUBE[np.roll(FACES, -1, axis=1).ravel()] / 2
-    target = np.concatenate([CUBE, edges])
-    for start in (np.zeros(3), np.array([0.1, 0.0, 0.07])):
-        length = np.linalg.norm(target - start, axis=1)
-        distance, _ = cube.cast(np.tile(start, (len(target), 1)), (target - start) / length[:, None], 0.0)
-        np.testing.assert_allclose(distance, length, atol=1e-14)
-    star, seen = tv.Polygon(U, inside=True), U[:2]
-    for start in ((0.05, -0.6), (0.0, -0.7)):
-        length = np.linalg.norm(seen - start, axis=1)
-        distance, _ = star.cast(np.tile(start, (2, 1)), (seen - start) / length[:, None], 0.0)
-        np.testing.assert_allclose(distance, length, atol=1e-14)
-
-
 def test_what_a_ray_starts_in_or_on(world):
     # A ray leaves a particle and a rod without meeting them, and meets the next thing. From a surface: inwards it meets at 0,
     # outwards and along never.
@@ -273,7 +234,7 @@ FLOORS = [tv.HalfSpace((0, 1), 0.5), tv.Box((-9, 0.5), (9, 30)), tv.Polygon([(-9
 
 
 @pytest.mark.parametrize("wall", FLOORS, ids=repr)
-def test_floors_met_at_their_surface_or_along_it(wall):
+def test_floors_are_met_at_their_surface_and_not_along_it(wall):
     # The height of the origin, the slope of the ray, and its way to the floor y = 0.5 before other sides of the wall.
     ways = (1.5, -1.0, 1.0), (0.5, -1.0, 0.0), (0.5, 1.0, np.inf), (0.5, 0.0, np.inf), (0.6, 0.0, np.inf), (1.5, -1e-9, np.inf)
     for y, down, far in ways:
@@ -281,9 +242,6 @@ def test_floors_met_at_their_surface_or_along_it(wall):
         distance, normal = wall.cast(np.array([[0.0, y]]), d / np.linalg.norm(d), 0.0)
         assert np.where(distance < 8, distance, np.inf)[0] == far, (y, down)
         assert far == np.inf or (normal == (0, 1)).all()
-    shallow = np.array([[1.0, -1e-6]])
-    distance, _ = wall.cast(np.array([[0.0, 0.5 + 2e-6]]), shallow / np.linalg.norm(shallow), 0.0)
-    np.testing.assert_allclose(distance, 2.0, rtol=1e-6)
 
 
 def test_a_sheet_has_two_sides():
@@ -358,7 +316,7 @@ def test_edges_of_polygons_are_links(world):
     assert hits.link.tolist() == [[0, 3], [0, 6], [0, 7], [0, 2]]
 
 
-def test_the_shapes_of_answers(world):
+def test_answers_have_the_shape_of_the_question(world):
     w = world(tv.Particles([(0, 0)], radius=1.0), precision="f64")
     one = w.ray((-3, 0), (1e-300, 0))
     assert one.distance == 2 and one.point.shape == (2,) and one.particle == 0 and one.link.shape == (2,) and bool(one.met)
@@ -367,65 +325,43 @@ def test_the_shapes_of_answers(world):
     assert fan.particle.tolist() == [0, NONE] and np.isnan(fan.point[1]).all()
     rain = w.ray([(0.0, 5), (0.6, 5), (3, 5)], (0, -1e300), reach=[4, 5, np.inf])
     np.testing.assert_allclose(rain.distance, (4, 4.2, np.inf))  # sqrt(1 - 0.6^2) = 0.8
-    np.testing.assert_allclose(rain.normal[1], (0.6, 0.8))
     assert len(w.ray(np.zeros((0, 2)), (0, 1))) == 0 and len(w.ray([(0, 0)], [(0, 1)]).distance) == 1
     empty = world(tv.Particles(np.zeros((0, 3))))
     assert not empty.ray((0, 0, 0), (0, 0, 1)).met and len(empty.inside(tv.Ball((0, 0, 0), 1.0))) == 0
 
 
-def test_rays_leave_the_world_as_it_is(world):
-    w = world(tv.Particles([(0, 0), (1, 0)], radius=0.1), [tv.Gravity(), tv.Box((-2, -2), (2, 2)), tv.Sdf(ring)], substeps=2)
-    w.step(0.01)
-    before, text = w.hash(), set(w.fields)
-    assert w.ray((-1.5, 0), (1, 0)).wall == 2 and w.ray((0.5, -1.2), (0, -1)).wall == 1
-    assert w.hash() == before and set(w.fields) == text
-    clone = w.clone(precision="f64")
-    assert clone.ray((-1.5, 0), (1, 0)).wall == 2
+OTHER, FAN = tv.HalfSpace((0, 1)), (np.zeros((3, 2)), np.ones((2, 2)))
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_inside_is_where_the_shape_is(world, dim):
-    rng = np.random.default_rng(9)
-    x, r = rng.uniform(-1.5, 1.5, (500, dim)), rng.uniform(0, 0.2, 500)
-    w = world(tv.Particles(x, radius=r), precision="f64")
-    for make, knobs, gap in WALLS[dim]:
-        shape = make()
-        for name, value in knobs.items():
-            setattr(shape, name, value)
-        depth = gap(x) if shape.inside else -gap(x)
-        for part, least in (("center", 0 * r), ("whole", r), ("touching", -r)):
-            np.testing.assert_array_equal(w.inside(shape, part), np.flatnonzero(depth >= least))
-        assert 0 < len(w.inside(shape)) < 500
-
-
-def test_what_makes_no_sense_is_named(world):
+@pytest.mark.parametrize("ask, pattern", [
+    (lambda w: w.ray((0, 0), (0, 0)), "direction = 0 has no direction"),
+    (lambda w: w.ray((0, 0), [(1, 0), (0, 0)]), r"direction\[1\] = 0 has no direction"),
+    (lambda w: w.ray((0, np.nan), (1, 0)), r"origin\[1\] = nan"),
+    (lambda w: w.ray([(0, 0), (np.inf, 0)], (1, 0)), r"origin\[1, 0\] = inf"),
+    (lambda w: w.ray((1e20, 0), (1, 0)), "out of range"),
+    (lambda w: w.ray((0, 0), (1, np.nan)), r"direction\[1\] = nan"),
+    (lambda w: w.ray((0, 0, 0), (1, 0)), r"origin has shape \(3,\), but 2 numbers"),
+    (lambda w: w.ray((0, 0), 1.0), r"direction has shape \(\)"),
+    (lambda w: w.ray(*FAN), "3 origins and 2 directions"),
+    (lambda w: w.ray((0, 0), (1, 0), -1.0), r"reach\[0\] = -1, but it must be at least 0"),
+    (lambda w: w.ray((0, 0), (1, 0), np.nan), r"reach\[0\] = nan"),
+    (lambda w: w.ray((0, 0), (1, 0), radius=-1.0), "radius = -1"),
+    (lambda w: w.ray((0, 0), (1, 0), skip=[2]), r"skip\[0\] = 2, but there are 2 particles"),
+    (lambda w: w.ray((0, 0), (1, 0), skip=[True]), r"skip has shape \(1,\), but a mask of shape \(2,\)"),
+    (lambda w: w.ray((0, 0), (1, 0), groups="red"), "groups = 'red'"),
+    (lambda w: w.ray((0, 0), (1, 0), features=[OTHER]), r"features\[0\] = HalfSpace does not act in this world"),
+    (lambda w: w.ray((0, 0), (1, 0), features=OTHER), "features = HalfSpace is a HalfSpace, but a list"),
+    (lambda w: w.inside((0, 1)), "shape = .* is a tuple, but a Box"),
+    (lambda w: w.inside(tv.Box((0, 0, 0), (1, 1, 1))), "Box has a lower of 3 numbers, but the particles are in 2D"),
+    (lambda w: w.inside(tv.Mesh(CUBE, FACES)), "Mesh is for 3D, but the particles are in 2D"),
+    (lambda w: w.inside(tv.Ball((0, 0), 1.0), "half"), "part = 'half', but it must be one of 'center', 'whole', 'touching'"),
+    (lambda w: w.near([(0, 0)], -1.0), r"radius\[0\] = -1"),
+    (lambda w: w.nearest(np.zeros((3, 3))), "points has shape"),
+])  # fmt: skip
+def test_questions_that_make_no_sense_are_refused(world, ask, pattern):
     w = world(tv.Particles([(0, 0), (1, 0)], radius=0.1), [tv.Gravity()])
-    other = tv.HalfSpace((0, 1))
-    for call, pattern in (
-        (lambda: w.ray((0, 0), (0, 0)), "direction = 0 has no direction"),
-        (lambda: w.ray((0, 0), [(1, 0), (0, 0)]), r"direction\[1\] = 0 has no direction"),
-        (lambda: w.ray((0, np.nan), (1, 0)), r"origin\[1\] = nan"),
-        (lambda: w.ray([(0, 0), (np.inf, 0)], (1, 0)), r"origin\[1, 0\] = inf"),
-        (lambda: w.ray((1e20, 0), (1, 0)), "out of range"),
-        (lambda: w.ray((0, 0), (1, np.nan)), r"direction\[1\] = nan"),
-        (lambda: w.ray((0, 0, 0), (1, 0)), r"origin has shape \(3,\), but 2 numbers"),
-        (lambda: w.ray((0, 0), 1.0), r"direction has shape \(\)"),
-        (lambda: w.ray(np.zeros((3, 2)), np.ones((2, 2))), "3 origins and 2 directions"),
-        (lambda: w.ray((0, 0), (1, 0), -1.0), r"reach\[0\] = -1, but it must be at least 0"),
-        (lambda: w.ray((0, 0), (1, 0), np.nan), r"reach\[0\] = nan"),
-        (lambda: w.ray((0, 0), (1, 0), radius=-1.0), "radius = -1"),
-        (lambda: w.ray((0, 0), (1, 0), skip=[2]), r"skip\[0\] = 2, but there are 2 particles"),
-        (lambda: w.ray((0, 0), (1, 0), skip=[True]), r"skip has shape \(1,\), but a mask of shape \(2,\)"),
-        (lambda: w.ray((0, 0), (1, 0), groups="red"), "groups = 'red'"),
-        (lambda: w.ray((0, 0), (1, 0), features=[other]), r"features\[0\] = HalfSpace does not act in this world"),
-        (lambda: w.ray((0, 0), (1, 0), features=other), "features = HalfSpace is a HalfSpace, but a list"),
-        (lambda: w.inside((0, 1)), "shape = .* is a tuple, but a Box"),
-        (lambda: w.inside(tv.Box((0, 0, 0), (1, 1, 1))), "Box has a lower of 3 numbers, but the particles are in 2D"),
-        (lambda: w.inside(tv.Mesh(CUBE, FACES)), "Mesh is for 3D, but the particles are in 2D"),
-        (lambda: w.inside(tv.Ball((0, 0), 1.0), "half"), "part = 'half', but it must be one of 'center', 'whole', 'touching'"),
-    ):
-        with pytest.raises((ValueError, TypeError), match=f"World.*{pattern}"):
-            call()
+    with pytest.raises((ValueError, TypeError), match=f"World.*{pattern}"):
+        ask(w)
     w.close()
     with pytest.raises(RuntimeError, match="closed"):
         w.ray((0, 0), (1, 0))

@@ -224,9 +224,3 @@ raise SystemExit(0 if good else 7)
 """
     done = python(code, check=False, PYTHONPATH=str(tmp_path))
     assert done.returncode == 7, done.stdout + done.stderr
-
-
-def test_f32_keeps_second_order_until_rounding_is_left():
-    # 40 substeps instead of 10: nearly a sixteenth of the error, down to a rounding of some 3e-7.
-    few, many = points.curve(points.Task("D01_double_pendulum", "Direct x 3", "f32", (10, 40), 1))
-    assert 14 < few.error / many.error < 17 and many.error < 3e-6

@@ -6,57 +6,41 @@ import pytest
 import tiverlet as tv
 from tiverlet.colliders.cos_sin import cos_sin
 from tiverlet.device import ti
-from tiverlet.geometry.ordered import distinct, median
 
 
-def test_mix_is_exact_at_both_ends():
+def test_mix_clamp_smoothstep_and_approach():
     a, b = 0.1, 1e17 + 0.3
     assert tv.mix(a, b, 0) == a and tv.mix(a, b, 1) == b
     np.testing.assert_array_equal(tv.mix(np.array([1.0, 2.0]), np.array([3.0, 6.0]), 0.5), [2.0, 4.0])
-
-
-def test_clamp_and_smoothstep():
     np.testing.assert_array_equal(tv.clamp(np.array([-2.0, 0.5, 7.0]), 0.0, 1.0), [0.0, 0.5, 1.0])
     # t^2 (3 - 2 t): 0, 1/2 and 1 at the ends and the middle, level at both ends.
     np.testing.assert_allclose(tv.smoothstep(1.0, 3.0, np.array([0.0, 1.0, 2.0, 3.0, 9.0])), [0, 0, 0.5, 1, 1])
     assert tv.smoothstep(0.0, 1.0, 1e-4) < 4e-8
-
-
-def test_approach_does_not_depend_on_how_time_is_cut():
-    # x' = rate (target - x): x(t) = target + (x0 - target) exp(-rate t)
-    exact = 5 + (1 - 5) * np.exp(-3 * 0.7)
-    x = 1.0
+    # x' = rate (target - x): x(t) = target + (x0 - target) exp(-rate t), however time is cut.
+    exact, x = 5 + (1 - 5) * np.exp(-3 * 0.7), 1.0
     for dt in (0.1, 0.25, 0.05, 0.3):
         x = tv.approach(x, 5.0, 3.0, dt)
     assert x == pytest.approx(exact, rel=1e-14) and tv.approach(1.0, 5.0, 3.0, 0.7) == pytest.approx(exact, rel=1e-15)
 
 
-@pytest.mark.parametrize("dim", [1, 2, 3])
-def test_golden_is_even_and_has_an_inverse(dim):
-    n = 4096
-    u = tv.golden(np.arange(n), dim=dim).reshape(n, dim)
-    assert ((u >= 0) & (u < 1)).all()
-    for k in range(dim):
-        # Each of n/16 equal cells of an axis holds 16 points, give or take the discrepancy; random points scatter by 4.
-        counts = np.histogram(u[:, k], bins=n // 16, range=(0, 1))[0]
-        assert counts.std() < 2 and np.abs(counts - 16).max() <= (3 if dim == 1 else 6)
-    many = np.array([0, 1, 2, 3, 1000, 2**31, 2**32 - 1])
-    np.testing.assert_array_equal(tv.golden_index(tv.golden(many, dim=dim), dim=dim), many)
+def test_golden_is_even_and_has_an_inverse():
+    n, many = 4096, np.array([0, 1, 2, 3, 1000, 2**31, 2**32 - 1])
+    for dim in (1, 2, 3):
+        u = tv.golden(np.arange(n), dim=dim).reshape(n, dim)
+        assert ((u >= 0) & (u < 1)).all()
+        for k in range(dim):
+            # Each of n/16 equal cells of an axis holds 16 points, give or take the discrepancy; random points scatter by 4.
+            counts = np.histogram(u[:, k], bins=n // 16, range=(0, 1))[0]
+            assert counts.std() < 2 and np.abs(counts - 16).max() <= (3 if dim == 1 else 6)
+        np.testing.assert_array_equal(tv.golden_index(tv.golden(many, dim=dim), dim=dim), many)
+    # d = 1: 1 / phi; d = 2: inverse powers of the plastic number, x^3 = x + 1 (Roberts 2018).
+    plastic = 1.32471795724474602596
+    assert tv.golden(1) == pytest.approx(2 / (1 + 5**0.5), abs=2**-31)
+    np.testing.assert_allclose(tv.golden(1, dim=2), [1 / plastic, 1 / plastic**2], atol=2**-31)
     with pytest.raises(ValueError, match="at least 0"):
         tv.golden(-1)
-
-
-def test_golden_steps_are_the_golden_ratio_and_its_kin():
-    # d = 1: 1 / phi; d = 2: inverse powers of the plastic number, x^3 = x + 1 (Roberts 2018).
-    phi, plastic = (1 + 5**0.5) / 2, 1.32471795724474602596
-    assert tv.golden(1) == pytest.approx(1 / phi, abs=2**-31)
-    np.testing.assert_allclose(tv.golden(1, dim=2), [1 / plastic, 1 / plastic**2], atol=2**-31)
-
-
-def test_colors_differ():
     colors = tv.golden_colors(12)
-    assert colors.shape == (12, 3) and colors.dtype == np.uint8
-    assert len(np.unique(colors, axis=0)) == 12
+    assert colors.shape == (12, 3) and colors.dtype == np.uint8 and len(np.unique(colors, axis=0)) == 12
     assert tv.golden_colors(0).shape == (0, 3)
 
 
@@ -104,13 +88,3 @@ def test_tools_work_inside_kernels():
     np.testing.assert_allclose(out.to_numpy(), want, rtol=1e-15)
     np.testing.assert_array_equal(out.to_numpy()[-2:], third)  # exact at both ends
     np.testing.assert_array_equal(back.to_numpy(), [some] * 3)
-
-
-def test_medians_and_distinct_rows_are_those_of_numpy():
-    rng = np.random.default_rng(0)
-    for values in (rng.normal(size=7), rng.normal(size=8), np.array([3.0])):
-        assert median(values) == np.median(values)
-    for rows in (rng.integers(0, 9, 50), rng.integers(0, 3, (40, 2)), np.zeros(0, int), np.zeros((0, 2), int)):
-        want = np.unique(rows, axis=0, return_inverse=True, return_counts=True)
-        for mine, numpys in zip(distinct(rows), want, strict=True):
-            np.testing.assert_array_equal(mine, numpys.reshape(mine.shape))

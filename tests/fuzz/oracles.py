@@ -100,6 +100,13 @@ def overlap(contact: Any, features: list[Any], particles: Any, free: np.ndarray,
     return len(deep), max(deep, default=0.0)
 
 
+def in_walls(features: list[Any], particles: Any, free: np.ndarray, x: np.ndarray) -> float:
+    """Return how deep particles are in walls at most, in their radii."""
+    some = (free > 0) & (particles.radius > 0)
+    gaps = [gap(f, x, particles.radius)[some] / particles.radius[some] for f in features if type(f).__name__ in WALLS]
+    return max(0.0, *(-each.min(initial=0.0) for each in gaps), 0.0)
+
+
 def shapeless(f: Any, x: np.ndarray) -> np.ndarray:
     """Return which constraints on angles have corners without an angle: nothing acts on these."""
     if not isinstance(getattr(f, "quantity", None), Angle):

@@ -368,9 +368,8 @@ class Impulses:
     @ti.func
     def start_passes(self):
         """Before the first pass: no extrapolation, and what rows may lack. One thread calls it."""
-        rows, force = self.total(ROWS), self.total(FORCE)
-        mean = force / ti.max(ti.cast(self.n, self.real), 1)
-        met, lands = ti.static(MET * MET) * mean * rows + self.total(LOAD), ti.static(LANDS * LANDS) * mean * rows
+        rows, force = self.total(ROWS), self.total(FORCE)  # the sum over rows of the squared displacement by forces
+        met, lands = ti.static(MET * MET) * force + self.total(LOAD), ti.static(LANDS * LANDS) * force
         self.numbers[None] = [0, ti.static(MOMENTUM), met, lands, 0]
         self.flags[None][GOING], self.flags[None][TURN] = ti.cast(rows > 0, ti.i32), 0
 

@@ -119,11 +119,12 @@ class RowPass:
                     self.rows.begin_empty(i, row)
                     if ti.static(self.edges) or self.bodies.moves(i):
                         row = self.rows.find(i, begin, end, row)
-                        count += ti.cast(row - self.rows.own[i], self.real)
-                        noise += self.noise(i) * ti.cast(row - self.rows.own[i], self.real)
-                        force += kick.dot(kick)
+                        own = ti.cast(row - self.rows.own[i], self.real)
+                        noise += self.noise(i) * own
                         if ti.static(bool(self.answers)):
-                            count += self.answers.links.sum_of(self.answers.links.open, i)
+                            own += self.answers.links.sum_of(self.answers.links.open, i)
+                        count += own
+                        force += own * kick.dot(kick)
                     if ti.static(self.rows.bounces):
                         if ti.static(self.in_turn):
                             hits += self.impacts.count(i)

@@ -148,7 +148,7 @@ def _passed(
     mixes = not (runner.step.walls or runner.step.contacts)  # which do not call back what a mix has put behind them
     frame = (dt / h) ** 2 / 2  # a pass that repeats in each substep moves particles by so many times its move in a frame
     new, left, mixing = x, bodies.far(x, 0.0, DONE + bodies.digit), Anderson(bodies)
-    digit = bodies.digit * np.abs(x).max()  # of coordinates: a move that says nothing
+    digit = bodies.digit * bodies.longest(x)  # of coordinates: a move that says nothing
     plain, many, still = x, True, ROUGHLY if (system := runner.scene.slots.system) and system.steps else STILL
     for look in range(min(most, looks)):
         state.put(memory, new)

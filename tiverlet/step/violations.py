@@ -56,7 +56,7 @@ class Bodies:
         return out
 
     def longest(self, way: np.ndarray) -> np.ndarray:
-        """Return the longest of the ways, (n, dim), of the particles of each body, (bodies,)."""
+        """Return the length of the longest vector, (n, dim), of the particles of each body, (bodies,)."""
         out = np.zeros(self.count)
         np.maximum.at(out, self.body, np.linalg.norm(way, axis=1))
         return out
