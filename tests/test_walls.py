@@ -774,3 +774,22 @@ def wrong(p):
 def test_bad_walls_are_named(make, error, words):
     with pytest.raises(error, match=words):
         make()
+
+
+@pytest.mark.slow
+def test_a_thin_slab_among_contacts_bears_discs_on_both_sides(world):
+    # Discs of 0.1 m on slabs of 0.04 and 0.08 m, which are behind both of their long sides at once: one lies still, one rises.
+    # What lies on them is a radius above. What comes from below is stopped there, and falls freely again.
+    halves, speeds = np.array([0.02, 0.04]), np.array([0.0, 0.3])
+    slabs = [tv.Polygon([(-1, -h), (1, -h), (1, h), (-1, h)], position=(3.0 * k, 0)) for k, h in enumerate(halves)]
+    x = np.concatenate([[(3.0 * k, h + 0.1), (3.0 * k - 0.5, -h - 0.3)] for k, h in enumerate(halves)])
+    start = tv.Particles(x, radius=0.1, velocity=[(0.0, 0.0), (0.0, 3.0)] * 2)
+    w = world(start, [tv.Gravity(9.81), tv.Contact(), *slabs], precision="f64")
+    highest = np.full(4, -9.0)
+    for k in range(60):
+        for slab, speed, at in zip(slabs, speeds, (0.0, 3.0), strict=True):
+            slab.position = (at, speed * (k + 1) / 60)
+        assert w.step(1 / 60).overlap < 0.01
+        highest = np.maximum(highest, w.position[:, 1])
+    np.testing.assert_allclose(w.position[::2, 1], halves + 0.1 + speeds, atol=1e-3)
+    assert (highest[1::2] < 0.3 - halves - 0.1 + 1e-3).all() and (w.position[1::2, 1] < -2.0).all()

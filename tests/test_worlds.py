@@ -305,8 +305,10 @@ def test_a_reset_starts_from_places_that_are_given():
 
 @pytest.mark.skipif(not patched, reason="every world has a tree and kernels of its own")
 def test_worlds_of_the_same_structure_compile_nothing_and_take_no_more_memory():
-    with tv.Worlds(pendulum(), 80) as many:
+    with tv.Worlds([pendulum() for _ in range(80)]) as many:
         many.run(0.1)
+        many.reset([0])
+        many.step(0.01)
     with compiled() as names, tv.Worlds([pendulum(2.0, 3.0) for _ in range(99)]) as many:
         many.run(0.1)
         many.reset(np.arange(99) % 2 == 0)

@@ -238,6 +238,20 @@ class FacetShape(Shape):
         return distance - contact_distance, n, bend
 
     @ti.func
+    def is_hidden(self, f, q):
+        """Whether q is behind facet f, and nearer to another one."""
+        out = False
+        if ti.static(self.closed):
+            distance, n, _at = self.nearest(f, q)
+            if n.dot(self.normal[f]) < 0:
+                begin, end = self.facets_near(q, distance)
+                for place in range(begin, end):
+                    another, _n, _at = self.nearest(self.list[place], q)
+                    if another < distance:
+                        out = True
+        return out
+
+    @ti.func
     def box(self):
         """Return the corners of the box around the facets."""
         return self.vector(self.low), self.vector(self.high)

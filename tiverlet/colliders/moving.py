@@ -11,7 +11,7 @@ from ..features.feature import Knob, Scene
 from ..particles import Particles
 from .collider import Collider
 from .pose import Pose, rotation_matrix
-from .shape import HostShape
+from .shape import FAR, HostShape
 from .surface import ANY_DEPTH
 
 TOUCHES = 8  # of one particle in one substep; after these it stays at the last place known to be free
@@ -167,6 +167,8 @@ class Moving(Collider):
         moved = self.dev.pose.place[2] + self.dev.pose.outward(2, q)
         e = self.dev.pose.inward(0, self.dev.state.d[i] - moved)
         gap, n, bend = self.dev.shape.facet_gap(face, q, e, ti.cast(self.radius, self.dev.real) + radius)
+        if self.dev.shape.is_hidden(face, q):
+            gap = ti.cast(FAR, self.dev.real)
         return gap, self.dev.pose.outward(0, n), bend, moved
 
     @ti.func

@@ -86,6 +86,11 @@ class Shape:
         return 0 * q[0], q, 0 * q[0]
 
     @ti.func
+    def is_hidden(self, f, q):
+        """Whether q is behind facet f, and nearer to another one: on the far side of the solid, or on another way out of it."""
+        return False
+
+    @ti.func
     def box(self):
         """Return the lower and the upper corner of a box around it."""
         return 0, 0
