@@ -43,6 +43,8 @@ SCHEDULES = {
     "auto": lambda k: ("auto", 1 / 60),
     "uneven": lambda k: (8, 4 ** (DRAWN[k] - 0.5) / 60),
     "a hitch": lambda k: (8, 0.1 if k == 30 else 1 / 60),
+    "a long hitch": lambda k: (8, 2.0 if k == 30 else 1 / 60),
+    "auto at last": lambda k: (1 if k < 30 else "auto", 1 / 60),
 }
 
 

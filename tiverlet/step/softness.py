@@ -70,14 +70,19 @@ def keep(runner: "Runner", h: float, dt: float, iterations: int, adapts: bool = 
     elif measured and growth >= NEAR**2 * clock.softness:
         clock.softened = clock.time
     elif s > 1 and (adapts or clock.time >= clock.softened + HOLD * (clock.softened > 0)):
-        s = stiffened(runner, s, dt, adapts)
+        s = stiffened(runner, s, dt, adapts, left)
+    if growth < 1 < s:
+        s *= too_stiff(runner, left)
     runner.set_softness(s if s > 1 + SETTLED else 1.0)
 
 
-def stiffened(runner: "Runner", s: float, dt: float, adapts: bool) -> float:
-    """Return the softness to which links may stiffen from s in a frame of dt [s]. adapts: whether the energy alone decides."""
+def stiffened(runner: "Runner", s: float, dt: float, adapts: bool, left: float) -> float:
+    """Return the softness to which links may stiffen from s in a frame of dt [s]. adapts: whether the energy alone decides.
+
+    left: as in keep(). With the softness s they store as much as they did before that.
+    """
     clock = runner.clock
-    store = stored(runner)
+    store = stored(runner) / left if left > 0 else 0.0
     if not store > 0:
         return 1.0
     most = s / (1 + (s - 1) * exp(-dt / SETTLE))
@@ -85,6 +90,18 @@ def stiffened(runner: "Runner", s: float, dt: float, adapts: bool) -> float:
         room = (clock.bound + SLIGHT * clock.kinetic - clock.energy) / store
         most = room if adapts else min(most, room)
     return s / max(1.0, min(s, most))
+
+
+def too_stiff(runner: "Runner", left: float) -> float:
+    """Return how many times as soft links must get, so that the scene has no more energy than ever with what they store.
+
+    It is 1 but after a long substep that threw bodies about: violations that it left bear no load.
+    """
+    clock = runner.clock
+    if clock.energy is None or clock.bound is None or clock.bound == CHANGED:
+        return 1.0
+    store, room = stored(runner) / max(left, TINY), max(clock.bound - clock.energy, 0.0) + SLIGHT * clock.kinetic
+    return max(1.0, store / room) if room > 0 else 1.0
 
 
 def needs_no_care(runner: "Runner", s: float) -> bool:
