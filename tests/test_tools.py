@@ -6,6 +6,7 @@ import pytest
 import tiverlet as tv
 from tiverlet.colliders.cos_sin import cos_sin
 from tiverlet.device import ti
+from tiverlet.features.material import limit_length
 
 
 def test_mix_clamp_smoothstep_and_approach():
@@ -88,3 +89,17 @@ def test_tools_work_inside_kernels():
     np.testing.assert_allclose(out.to_numpy(), want, rtol=1e-15)
     np.testing.assert_array_equal(out.to_numpy()[-2:], third)  # exact at both ends
     np.testing.assert_array_equal(back.to_numpy(), [some] * 3)
+
+
+def test_what_friction_takes_of_no_slip_is_finite(taichi):
+    # Up to `most` all of a slip v, beyond it the length given. A load that is taken back is negative, and a slip may be 0.
+    out = ti.Vector.field(2, ti.f32, 4)
+
+    @ti.kernel
+    def run(length: ti.f32):
+        for k in range(4):
+            v = ti.Vector([3.0, 4.0]) * (k % 2)
+            out[k] = limit_length(v, 6.0 - 7.0 * (k // 2), length)
+
+    run(1.0)
+    np.testing.assert_allclose(out.to_numpy(), [[0, 0], [3, 4], [0, 0], [0.6, 0.8]], rtol=1e-6)
