@@ -46,6 +46,7 @@ def test_polygons_keep_their_area_or_take_that_of_their_pressure(world):
     np.testing.assert_allclose(area.rest_of(w.position), area.pressure * want, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_soft_ring_breathes_and_its_pressure_holds_a_rim(world):
     # n masses m on a ring: E = (A - A0)^2 / (2 alpha), A = c R^2, c = n/2 sin(2 pi / n): n m R'' = -2 c R (c R^2 - A0) / alpha.
     # In balance, the pressure p = (pressure A0 - A) / alpha of the other ring holds a rim of springs: p R cos(pi / n) = T.

@@ -12,6 +12,7 @@ def sliding(world, x, v=(0.0, 0.0), *, g=0.0, pull=0.0, **some):
     return world(tv.Particles(x, velocity=v, **some), features, substeps=8, precision="f64")
 
 
+@pytest.mark.slow
 def test_discs_that_lie_on_each_other_do_not_turn_by_themselves(world):
     # Seven discs without friction, attracted to a point by central forces. Impulses p act along the line of centers at the start
     # of a substep, x_n x p = 0. So L = sum m x x v is kept, but for moves that part overlap along the lines of centers, by
@@ -70,6 +71,7 @@ def test_a_loop_without_friction_is_second_order(world):
     assert abs(late[2]) < 1e-4 * until and np.abs(gained).max() < 5e-3 * g * radius
 
 
+@pytest.mark.slow
 def test_motion_has_the_symmetries_of_its_equations(world):
     # A net of rigid and soft links falls: turned by 90 degrees it has the same bits up to sign, in f32 as well, since the dither
     # has the sign of the kick; turned by any angle, seen from a moving place, or with all masses, springs and dashpots 7 times

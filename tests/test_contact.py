@@ -60,6 +60,7 @@ def test_overlap_parts_at_push_out_without_velocity(world, dim):
         assert np.abs((w.position[some] - x[some]).mean(axis=0)).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_idle_columns_do_not_creep(world):
     # Row 43: 1e5 substeps at rest on the floor, in f32.
     w = smooth(world, tv.Particles([[0.5, 0.5], [0.5, 1.501]], radius=0.5), (1, 9), rate=1.0, substeps=20)

@@ -123,6 +123,7 @@ def loaded(world, mass, *more, **options):
     return world(start, [tv.Gravity(9.81), tv.Distance(links(30)), *more], **options)
 
 
+@pytest.mark.slow
 def test_what_gives_way_gains_no_energy_where_substeps_change(world):
     # The rope gives way at the tension with (omega h)^2 = 4 w T h^2 / l <= 1, and stores T times its excess length. If T grew
     # with 1 / h^2 where the substep gets shorter, so would this energy, to several times the kinetic energy.

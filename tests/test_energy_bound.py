@@ -50,6 +50,7 @@ def pair(*features, **settings):
     return tv.Particles([[0.0, 0.0], [1.0, 0.0]], radius=0.1, **settings), list(features)
 
 
+@pytest.mark.slow
 def test_what_no_figure_tells_is_told_by_energy(world):
     # A level rope of six links falls and cracks. Two substeps do not resolve the cracks, and every constraint is satisfied, so
     # no other figure reveals the error. The rope gains a fifth of the energy of its fall; gains are flagged from a tenth on.

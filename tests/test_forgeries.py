@@ -68,6 +68,7 @@ def test_whatever_is_forged_is_named(original, quick, tmp_path):
     assert not passed and count > 100
 
 
+@pytest.mark.slow
 def test_the_place_of_a_change_is_named(original, rewritten, quick, tmp_path):
     def turned(e, g=5.5):
         if e["kind"] == "turned" and "0" in e["data"]["features"]:

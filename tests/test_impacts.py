@@ -37,6 +37,7 @@ def discs(
     return w
 
 
+@pytest.mark.slow
 def test_reported_impulses_are_changes_of_momentum(world):
     # The impulses of all substeps add up to (1 + e) u / (w1 + w2), and each equals the change of the disc's momentum. The same
     # holds for a fixed disc, and for a disc that throws the next one onto a third in the same substep.

@@ -348,6 +348,7 @@ def test_a_recording_is_watched_while_it_is_made_and_goes_on_without_its_viewer(
         watch.address(True)
 
 
+@pytest.mark.slow
 def test_notebooks_show_worlds_reports_features_and_recordings(tmp_path):
     w = stack()
     report = w.run(0.1, recorder=tmp_path / "a.rrd")

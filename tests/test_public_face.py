@@ -104,6 +104,7 @@ def test_what_completion_adds_is_documented():
                 assert inspect.getattr_static(kind, what).__doc__, f"{name}.{what}"
 
 
+@pytest.mark.slow
 def test_events_contacts_and_hits_fit_a_screen():
     n = 400
     start = tv.Particles(tv.golden(np.arange(n), dim=2) * 3, radius=0.08)

@@ -113,6 +113,7 @@ def drive(world, log, frames):
             log()
 
 
+@pytest.mark.slow
 def test_all_that_a_user_changes_is_replayed_and_goes_on_from_any_frame(tmp_path, read_here, built_once):
     with driven(4) as world, tv.Recorder(tmp_path / "a.rrd", world) as recorder:
         drive(world, recorder.log, range(12))

@@ -91,6 +91,7 @@ def test_a_sweep_finds_second_order_and_first(report):
         assert report.advantage(case, CASES[case].methods[0], cost="visits")[1] >= 100
 
 
+@pytest.mark.slow
 def test_a_report_can_be_read_by_people_and_machines(report, tmp_path):
     data = json.loads(report.json())
     assert len(data["points"]) == len(report.points) and not data["failures"] and data["machine"]
@@ -101,6 +102,7 @@ def test_a_report_can_be_read_by_people_and_machines(report, tmp_path):
     assert [os.path.getsize(p) > 1000 for p in report.plot(tmp_path / "plots")] == [True, True]
 
 
+@pytest.mark.slow
 def test_what_is_wrong_is_said(report):
     # The same points, made worse: order 1 instead of 2, an error above the limit, one that has diverged, a loss in f32.
     case, method = "D01_double_pendulum", "Direct"

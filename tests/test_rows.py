@@ -32,6 +32,7 @@ def high(w):
     return w.position[:-5, 1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("e", [0.0, 0.5])
 def test_what_meets_at_the_end_of_a_substep_bounces(world, e):
     # 400 pairs that close at 1.5 to 4.8 m/s and meet after 1 to 40 substeps, to rounding: some of them a little later.
@@ -79,6 +80,7 @@ def test_what_does_not_touch_bounces_one_after_the_other(world):
     assert w.velocity[1, 1] + 0.02 * G == pytest.approx(u, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.0, 0.5])
 def test_what_falls_stays_where_it_lands(world, friction):
     # Inelastic impacts leave no velocity.
@@ -221,6 +223,7 @@ def test_a_pile_adds_no_energy_and_rests(world, e, substeps):
     assert w.last.overlap < 1.5 * SLOP * BEYOND and tv.measure.kinetic_energy(w) < 1e-5 * start
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [1, 600])
 def test_velocities_hold_no_half_of_an_impact(world, ratio):
     # The energy by the velocities that users read is that by displacements, up to what h g adds to them, while a pile lands.

@@ -26,6 +26,7 @@ pytestmark = pytest.mark.skipif(ARCH != "cpu", reason="every world has kernels o
 NUMBERS = [(0.01, 1e-3, 9.81, 0.3, 12), (0.5, 1e-5, 1.6, 0.6, 9), (2.0, 0.1, -3.0, 0.2, 17)]
 
 
+@pytest.mark.slow
 def test_worlds_with_other_numbers_and_counts_and_clones_compile_nothing(world):
     # Shared worlds have the bits that they have alone, where each world compiles its own kernels.
     def hung(mass, compliance, g, rest, points):

@@ -179,6 +179,7 @@ def test_what_is_changed_or_carried_wakes_and_nothing_else(world):
     assert w.last.asleep == asleep - 1 and (w.position[0] == rest).all() and w.position[6, 0] > pulled + 0.3
 
 
+@pytest.mark.slow
 def test_what_lies_on_a_roller_wakes_as_it_begins_to_turn(world):
     # A disc between two pinned rollers takes the speed of their surfaces, -omega R / r.
     w = rough(world, np.array([(3.4, 5.0), (4.6, 5.0), (4.0, 5.8), AWAY]), 0.2, substeps=40, speed=0.01, pinned=[0, 1])

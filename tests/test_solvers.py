@@ -88,6 +88,7 @@ def test_constraints_that_are_not_met_are_flagged_with_what_helps(world, solver,
         assert ("unconverged" in better.flags) == (better.residual > 0.05)
 
 
+@pytest.mark.slow
 def test_pins_and_clusters_hold_the_energy_of_what_they_exert(world):
     # A spring of 1e-9 m/N pulls a rod's end, and another one a square, 0.01 m away from where rigid links keep them. At rest,
     # with shared masses, they hold alpha F^2 / 2, with F the force that they exert (4 alpha F^2 / 2 for a corner with a quarter

@@ -574,6 +574,7 @@ def test_bounces_on_a_belt(world):
     assert momentum == pytest.approx([2 * mu * (1 + e) * fall, 2 * e * fall], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_wall_may_get_a_belt_and_a_switch_later_which_wake_sleepers(world):
     # The world is rebuilt for either, once. Nothing falls asleep on a belt, however slow. Without the floor a particle falls from
     # rest for t = 0.5 s, by g t^2 / 2.
