@@ -220,35 +220,35 @@ class FacetShape(Shape):
         return begin, end
 
     @ti.func
-    def facet_gap(self, f, q, e, contact_distance):
+    def facet_gap(self, f, q, e, contact_distance, at_start: ti.template()):  # type: ignore[valid-type]
         """Return the gap at q to facet f, the normal and the curvature. Beside the facet it is round about its corners."""
         distance, n, at = self.nearest(f, q)
-        bend = 0 * distance
+        bend, hidden = 0 * distance, False
+        if ti.static(self.closed and at_start):
+            if n.dot(self.normal[f]) < 0:  # q is behind it: on its way out, or on the other side of a thin solid
+                hidden = self.has_nearer(q, distance)
         if at < 0:
             if ti.static(self.closed):
                 if n.dot(self.normal[f]) < 0:
                     distance, n = -distance, -n
         else:
             bend = 1 / ti.max(distance, self.touch)
-            hidden = not self.is_nearest_feature(at, n)
+            hidden = hidden or not self.is_nearest_feature(at, n)
             if ti.static(self.closed):
                 hidden = hidden or n.dot(self.facing[at]) < 0
-            if hidden:
-                distance = ti.cast(FAR, self.real)
+        if hidden:
+            distance = ti.cast(FAR, self.real)
         return distance - contact_distance, n, bend
 
     @ti.func
-    def is_hidden(self, f, q):
-        """Whether q is behind facet f, and nearer to another one."""
+    def has_nearer(self, q, distance):
+        """Whether any facet is nearer to q than this distance."""
         out = False
-        if ti.static(self.closed):
-            distance, n, _at = self.nearest(f, q)
-            if n.dot(self.normal[f]) < 0:
-                begin, end = self.facets_near(q, distance)
-                for place in range(begin, end):
-                    another, _n, _at = self.nearest(self.list[place], q)
-                    if another < distance:
-                        out = True
+        begin, end = self.facets_near(q, distance)
+        for place in range(begin, end):
+            another, _n, _at = self.nearest(self.list[place], q)
+            if another < distance:
+                out = True
         return out
 
     @ti.func

@@ -11,7 +11,7 @@ from ..features.feature import Knob, Scene
 from ..particles import Particles
 from .collider import Collider
 from .pose import Pose, rotation_matrix
-from .shape import FAR, HostShape
+from .shape import HostShape
 from .surface import ANY_DEPTH
 
 TOUCHES = 8  # of one particle in one substep; after these it stays at the last place known to be free
@@ -166,9 +166,7 @@ class Moving(Collider):
         q = self.dev.pose.inward(0, x - self.dev.pose.place[0])
         moved = self.dev.pose.place[2] + self.dev.pose.outward(2, q)
         e = self.dev.pose.inward(0, self.dev.state.d[i] - moved)
-        gap, n, bend = self.dev.shape.facet_gap(face, q, e, ti.cast(self.radius, self.dev.real) + radius)
-        if self.dev.shape.is_hidden(face, q):
-            gap = ti.cast(FAR, self.dev.real)
+        gap, n, bend = self.dev.shape.facet_gap(face, q, e, ti.cast(self.radius, self.dev.real) + radius, True)
         return gap, self.dev.pose.outward(0, n), bend, moved
 
     @ti.func
@@ -176,7 +174,7 @@ class Moving(Collider):
         """Return the gap to a facet."""
         x = self.dev.state.inside(self.dev.state.place(i))
         q = self.dev.pose.inward(1, x - self.dev.pose.place[1])
-        gap, n, _bend = self.dev.shape.facet_gap(face, q, 0 * q, ti.cast(self.radius, self.dev.real) + radius)
+        gap, n, _bend = self.dev.shape.facet_gap(face, q, 0 * q, ti.cast(self.radius, self.dev.real) + radius, False)
         return gap, self.dev.pose.outward(1, n)
 
     @ti.func

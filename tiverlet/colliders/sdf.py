@@ -228,7 +228,7 @@ class FunctionShape(Shape):
         return out
 
     @ti.func
-    def facet_gap(self, f, q, e, contact_distance):
+    def facet_gap(self, f, q, e, contact_distance, at_start: ti.template()):  # type: ignore[valid-type]
         """Return the gap, the normal and the curvature: that of the function on the way e across the normal, or on a step of
         differences if that is longer, so that rounding does not matter."""
         n, size = self.normal(q, contact_distance)

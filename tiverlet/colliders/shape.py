@@ -79,16 +79,13 @@ class Shape:
         return 0, 0
 
     @ti.func
-    def facet_gap(self, f, q, e, contact_distance):
+    def facet_gap(self, f, q, e, contact_distance, at_start: ti.template()):  # type: ignore[valid-type]
         """Return the gap at q to facet f [m], the normal, and the curvature of the gap [1/m] along a displacement e.
 
-        A facet that another one hides is far away."""
+        A facet that another one hides is far away. at_start: of a substep; then one that q is behind is hidden by any nearer one.
+        At the end it is not, since what passed a thin solid is behind its far side.
+        """
         return 0 * q[0], q, 0 * q[0]
-
-    @ti.func
-    def is_hidden(self, f, q):
-        """Whether q is behind facet f, and nearer to another one: on the far side of the solid, or on another way out of it."""
-        return False
 
     @ti.func
     def box(self):

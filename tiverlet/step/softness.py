@@ -11,7 +11,7 @@ Then links are as soft as in the longest recent substep, and nothing has to move
 all before, which takes energy out. Otherwise it approaches 1, (s - 1)' = -(s - 1) / SETTLE, which lifts what sags. So a frame
 adds a share dt / SETTLE of the energy that violations store, but not while the scene would have more energy than ever. Where a
 loop measures dt, links wait until no frame has been about as long for HOLD. What "auto" and systems need not wait for is
-in settling.py.
+in settling.py. And s is larger where a substep that is longer than what follows has left violations that store more.
 """
 
 from math import exp
@@ -81,14 +81,12 @@ def stiffened(runner: "Runner", s: float, dt: float, adapts: bool, left: float) 
 
     left: as in keep(). With the softness s they store as much as they did before that.
     """
-    clock = runner.clock
-    store = stored(runner) / left if left > 0 else 0.0
+    store, room = _store_and_room(runner, left)
     if not store > 0:
         return 1.0
     most = s / (1 + (s - 1) * exp(-dt / SETTLE))
-    if clock.energy is not None and clock.bound is not None and clock.bound != CHANGED:
-        room = (clock.bound + SLIGHT * clock.kinetic - clock.energy) / store
-        most = room if adapts else min(most, room)
+    if room is not None:
+        most = room / store if adapts else min(most, room / store)
     return s / max(1.0, min(s, most))
 
 
@@ -97,11 +95,19 @@ def too_stiff(runner: "Runner", left: float) -> float:
 
     It is 1 but after a long substep that threw bodies about: violations that it left bear no load.
     """
-    clock = runner.clock
-    if clock.energy is None or clock.bound is None or clock.bound == CHANGED:
+    store, room = _store_and_room(runner, left)
+    if room is None or not (spare := max(room, SLIGHT * runner.clock.kinetic)) > 0:
         return 1.0
-    store, room = stored(runner) / max(left, TINY), max(clock.bound - clock.energy, 0.0) + SLIGHT * clock.kinetic
-    return max(1.0, store / room) if room > 0 else 1.0
+    return max(1.0, store / spare)
+
+
+def _store_and_room(runner: "Runner", left: float) -> tuple[float, float | None]:
+    """Return what links store with the softness that keep() gives them, and how much they may [J]; None where that is unknown."""
+    clock = runner.clock
+    store = stored(runner) / left if left > 0 else 0.0
+    if clock.energy is None or clock.bound is None or clock.bound == CHANGED:
+        return store, None
+    return store, clock.bound + SLIGHT * clock.kinetic - clock.energy
 
 
 def needs_no_care(runner: "Runner", s: float) -> bool:
