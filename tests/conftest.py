@@ -175,7 +175,7 @@ def world():
 
 @pytest.fixture
 def briefly(monkeypatch):
-    """Compile large worlds as small ones are compiled: a third of the time, with the same bits (see test_determinism.py)."""
+    """Compile large worlds as small ones are compiled: a third of the time, with the same bits (see test_compiling.py)."""
     monkeypatch.setattr(build, "_passes", lambda *_: BRIEF)
 
 

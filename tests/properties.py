@@ -21,7 +21,7 @@ from .scenes import SCENES
 
 __all__ = [
     "pytest_generate_tests",
-    "trials",
+    "trial",
     "test_under_no_schedule_of_substeps_a_scene_gains_energy",
     "test_a_scene_has_the_same_bits_however_it_is_run",
     "test_a_frame_that_is_undone_leaves_nothing_behind",
@@ -44,36 +44,26 @@ TOUCHING = {
 
 
 def pytest_generate_tests(metafunc) -> None:
-    """Give tests of `name` the scenes of their file."""
-    if "name" in metafunc.fixturenames:
-        some = [name for name in SCENES if (name in TOUCHING) == metafunc.module.TOUCH]
-        metafunc.parametrize("name", [name for name in some if fits(metafunc.function.__name__, name)])
+    """Give tests the scenes of their file: all as `name`, smooth ones as `smooth`, those with known units as `measured`."""
+    some = [name for name in SCENES if (name in TOUCHING) == metafunc.module.TOUCH]
+    smooth = [name for name in some if SCENES[name].smooth]
+    for argument, names in (("name", some), ("smooth", smooth), ("measured", [name for name in some if has_units(name)])):
+        if argument in metafunc.fixturenames:
+            metafunc.parametrize(argument, names)
 
 
-def fits(test: str, name: str) -> bool:
-    """Whether a scene is for a test."""
-    calls = (SCENES[name].structure.particles, *SCENES[name].structure.features)
-    if "second_order" in test:
-        return SCENES[name].smooth
-    return "units" not in test or all(call.name in UNITS for call in calls)
+def has_units(name: str) -> bool:
+    """Whether UNITS knows all that a scene is made of."""
+    structure = SCENES[name].structure
+    return all(call.name in UNITS for call in (structure.particles, *structure.features))
 
 
-@pytest.fixture(scope="module")
-def trials(taichi) -> Iterator:
-    """Return a function that builds a scene once."""
-    made: dict[str, Trial] = {}
-
-    def trial(name: str) -> Trial:
-        if name not in made:
-            for other in made.values():
-                other.close()
-            made.clear()
-            made[name] = Trial(SCENES[name].structure)
-        return made[name]
-
-    yield trial
-    for each in made.values():
-        each.close()
+@pytest.fixture
+def trial(request, taichi) -> Iterator[Trial]:
+    """Return the scene of a test, built anew; its kernels are those of the first time."""
+    (name,) = (request.getfixturevalue(argument) for argument in ("name", "smooth") if argument in request.fixturenames)
+    with contextlib.closing(Trial(SCENES[name].structure)) as built:
+        yield built
 
 
 def is_rigid(structure: Structure) -> bool:
@@ -103,11 +93,11 @@ def scheduled(name: str, schedule, frames: int = 60) -> Iterator[Event]:
 
 
 @pytest.mark.slow
-def test_under_no_schedule_of_substeps_a_scene_gains_energy(trials, name):
+def test_under_no_schedule_of_substeps_a_scene_gains_energy(trial, name):
     # Every frame is judged: residual, overlap and walls by brute force, momentum of what is closed. Beyond that, passive scenes
     # never have more than at the start, to a thousandth of the heights that they pass, m g L, and of their kinetic energy. By the
     # velocities that are read it is the same, to the work in a substep, v a h, also where loads cancel in braced bodies.
-    trial, off = trials(name), []
+    off = []
     for label, schedule in SCHEDULES.items():
         start, energies, flags = None, [], set()
         low = high = trial.structure.position
@@ -134,7 +124,7 @@ def test_under_no_schedule_of_substeps_a_scene_gains_energy(trials, name):
 
 
 @pytest.mark.slow
-def test_a_scene_has_the_same_bits_however_it_is_run(trials, name):
+def test_a_scene_has_the_same_bits_however_it_is_run(trial, name):
     # As a clone, from a recording, with a particle far away that comes and goes; as a copy among many, on a team of threads or
     # in many launches. What is asked of it on the way changes nothing and is right.
     number = list(SCENES).index(name)
@@ -145,13 +135,12 @@ def test_a_scene_has_the_same_bits_however_it_is_run(trials, name):
     for way in WAYS:
         if way not in left_out:
             with contextlib.suppress(Refused):  # by what says that it is for one world, as Sleep
-                way(trials(name), events)
+                way(trial, events)
 
 
 @pytest.mark.slow
-def test_a_frame_that_is_undone_leaves_nothing_behind(trials, name):
+def test_a_frame_that_is_undone_leaves_nothing_behind(trial, name):
     # Neither one that was right nor one in which all is NaN, which is flagged.
-    trial = trials(name)
     trial.replay([*SCENES[name].first, Step(1 / 60)])
     w, state = trial.world, trial.world._runner.scene.state
     kept, flags = checkpoint.keep(w), checkpoint.flags(w)
@@ -169,11 +158,11 @@ def test_a_frame_that_is_undone_leaves_nothing_behind(trials, name):
         assert w.hash() == after and np.isfinite([report.energy, report.residual, report.overlap]).all()
 
 
-def test_a_smooth_scene_is_second_order(trials, name):
+def test_a_smooth_scene_is_second_order(trial, smooth):
     ends = []
     for substeps in (10, 20, 40, 80):
-        trials(name).replay([*SCENES[name].first, Set(None, "substeps", substeps), *[Step(1 / 60)] * 20])
-        ends.append(trials(name).world.position)
+        trial.replay([*SCENES[smooth].first, Set(None, "substeps", substeps), *[Step(1 / 60)] * 20])
+        ends.append(trial.world.position)
     assert 1.85 <= order([rms(a, b) for a, b in zip(ends[1:], ends[:-1], strict=True)]) <= 2.15
 
 
@@ -204,10 +193,10 @@ def in_units(call: Call, length: float, mass: float) -> Call:
 
 
 @pytest.mark.slow
-def test_a_scene_moves_alike_in_other_units(trials, name):
+def test_a_scene_moves_alike_in_other_units(taichi, measured):
     # Lengths times 2^a, masses times 2^b and accelerations times 2^a give positions times 2^a: nothing has a size of its own.
-    scene, found = SCENES[name].structure, []
-    events = [*SCENES[name].first, *[Step(1 / 60)] * 8]
+    scene, found = SCENES[measured].structure, []
+    events = [*SCENES[measured].first, *[Step(1 / 60)] * 8]
     for length, mass in ((1.0, 1.0), (2.0**-7, 2.0**-10), (2.0**5, 2.0**12)):
         parts = [in_units(call, length, mass) for call in (scene.particles, *scene.features)]
         other = Trial(Structure(parts[0], tuple(parts[1:]), scene.settings))
@@ -215,6 +204,6 @@ def test_a_scene_moves_alike_in_other_units(trials, name):
             quiet()
             other.replay(events)
             found.append(other.world.position / length)
-    digit = 2.0**-23 * trials(name).world.particles.size
+            digit = 2.0**-23 * other.world.particles.size / length
     np.testing.assert_allclose(found[1], found[0], rtol=0, atol=digit)
     np.testing.assert_allclose(found[2], found[0], rtol=0, atol=digit)

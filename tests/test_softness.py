@@ -5,6 +5,9 @@ import pytest
 
 import tiverlet as tv
 
+from .properties import DRAWN
+from .properties import SCHEDULES as COMMON
+
 G, R, SUBSTEPS = 9.81, 0.5, 8
 
 
@@ -35,15 +38,10 @@ def weight(world):
     return linked(world, x, links, [0.05] * 24 + [10.0], [0]), 11.2 * G * 1.2
 
 
-DRAWN = np.random.default_rng(0).random(60)
-SCHEDULES = {
+SCHEDULES = COMMON | {
     "random": lambda k: (int(64 ** DRAWN[k]), 1 / 60),
     "in turns": lambda k: ([2, 32, 5, 17, 1, 64][k // 10 % 6], 1 / 60),
     "once": lambda k: (2 if k < 30 else 64, 1 / 60),
-    "auto": lambda k: ("auto", 1 / 60),
-    "uneven": lambda k: (8, 4 ** (DRAWN[k] - 0.5) / 60),
-    "a hitch": lambda k: (8, 0.1 if k == 30 else 1 / 60),
-    "a long hitch": lambda k: (8, 2.0 if k == 30 else 1 / 60),
     "auto at last": lambda k: (1 if k < 30 else "auto", 1 / 60),
 }
 

@@ -103,8 +103,8 @@ def overlap(contact: Any, features: list[Any], particles: Any, free: np.ndarray,
 def in_walls(features: list[Any], particles: Any, free: np.ndarray, x: np.ndarray) -> float:
     """Return how deep particles are in walls at most, in their radii."""
     some = (free > 0) & (particles.radius > 0)
-    gaps = [gap(f, x, particles.radius)[some] / particles.radius[some] for f in features if type(f).__name__ in WALLS]
-    return max(0.0, *(-each.min(initial=0.0) for each in gaps), 0.0)
+    walls = [f for f in features if type(f).__name__ in WALLS]
+    return max((-(gap(f, x, particles.radius)[some] / particles.radius[some]).min(initial=0.0) for f in walls), default=0.0)
 
 
 def shapeless(f: Any, x: np.ndarray) -> np.ndarray:
