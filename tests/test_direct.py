@@ -1,4 +1,4 @@
-"""Elimination: dense solutions, chains with known answers at any mass ratio, and where tensions are too large."""
+"""Elimination: dense solutions, and where tensions are too large. For chains with known answers see test_cases.py."""
 
 import re
 from itertools import product
@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
+from tiverlet.report import CASES
+from tiverlet.report.accuracy.cases.case import links
 
-from .chains import Scene, links
-from .conftest import case, pendulums, rerun, rms
+from .conftest import case, rerun, rms
 
 
 def dense(x, d, w, pairs, rest):
@@ -150,60 +151,10 @@ def test_what_gives_way_recovers_at_rest(world):
 
 
 @pytest.mark.slow
-def test_every_case_reaches_the_figures_of_the_prototypes(world):
-    scene = Scene()
-    features = [tv.Gravity(9.81), tv.Distance(scene.pairs)]
-    w, single = (world(scene.particles, [f.copy() for f in features], precision=p, solver=tv.Direct()) for p in ("f64", "f32"))
-    errors = {}
-    for substeps in (20, 80, 200):
-        for t in (0.3, 0.5, 1.0):
-            rerun(w, t, substeps=substeps)
-            for name in scene.begin:
-                if f"t{t}" in case(name)["values"] and "tip_xy" not in case(name)["values"][f"t{t}"]:
-                    errors[name, t, substeps] = scene.error(w, name, t)
-    compared = 0
-    for name in scene.begin:
-        for row in case(name).get("prototype_errors", []):
-            key = (name, row["t"], row["substeps_per_frame_60hz"])
-            figure = row["rms_error_m"].get("SHAKE-direct")
-            if key in errors and isinstance(figure, float) and figure < 1:
-                # The prototype uses the same method, so errors agree to the digits of its figure. The pivots for 1e6:1 have
-                # errors of 1e-10.
-                assert errors[key] <= (7e-7 if "1000000" in name else figure * 1.02 + 2e-8), key
-                compared += 1
-    assert compared >= 25
-    # Second order wherever substeps resolve the vibration of the light masses.
-    for name in ("D05_chain10", "D06_chain100", "D08_massratio10", "S02_chain5_3d"):
-        assert errors[name, 0.5, 80] / errors[name, 0.5, 200] == pytest.approx(6.25, rel=0.1)
-    assert errors["D06_chain100", 0.5, 80] <= 1.3e-5 and errors["D06_chain100", 0.5, 20] <= 1.2e-4
-    assert errors["D09_massratio_inverted", 0.5, 20] <= 1e-4
-    # f32 has the errors of the method at 20 substeps. Where substeps resolve the motion, it follows f64 up to f32's rounding.
-    rerun(single, 1.0, substeps=20)
-    for name, figure in (("D06_chain100", 2.4e-4), ("D07_massratio_10000", 3e-5), ("D08_massratio10", 3e-5)):
-        assert scene.error(single, name, 1.0) <= figure
-    far = np.linalg.norm(rerun(single, 0.5, substeps=200).position - rerun(w, 0.5, substeps=200).position, axis=1)
-    assert far.max() <= 5e-4
-
-
-@pytest.mark.slow
 def test_shorter_substeps_never_make_it_worse(world):
     # If the rounding errors of d, x and C were dropped, a double pendulum would be off by 6.5e-6 m at 20 substeps a frame and
     # by 2.5e-3 m at 5120. With them, the error is that of the method, of order h^2, plus about 2^-24 sqrt(frames).
-    x, mass, pairs = pendulums("D01_double_pendulum")
-    w = world(tv.Particles(x, mass=mass, pinned=[0]), [tv.Gravity(9.81), tv.Distance(pairs)], precision="f32-compensated")
-    want = case("D01_double_pendulum")["values"]["t2.0"]["xy"]
+    start, features = CASES["D01_double_pendulum"].build()
+    w, want = world(start, features, precision="f32-compensated"), case("D01_double_pendulum")["values"]["t2.0"]["xy"]
     for substeps in (20, 80, 320, 1280, 5120):
         assert rms(rerun(w, 2.0, substeps=substeps).position[1:], want) <= 1.1e-5 * (20 / substeps) ** 2 + 1e-6, substeps
-
-
-def test_static_elongation_with_one_pass(world):
-    # R11: the elongation is alpha m g N (N + 1) / 2 for any number of substeps, with a single pass.
-    c = case("R11_elastic_rope_N100_alpha1e-5")
-    p, n = c["params"], c["params"]["links"]
-    link = tv.Distance(links(n), p["rest"], compliance=p["alpha"])
-    start = tv.Particles(np.stack([np.zeros(n + 1), -p["rest"] * np.arange(n + 1)], axis=1), mass=p["m"], pinned=[0])
-    w = world(start, [tv.Gravity(p["g"]), link, tv.Drag(10.0)], precision="f64", solver=tv.Direct())
-    for substeps in (10, 20):
-        rerun(w, 10.0, substeps=substeps)
-        assert -w.position[-1, 1] - n * p["rest"] == pytest.approx(c["values"]["total_elongation"], rel=1e-6)
-        np.testing.assert_allclose(link.load, p["m"] * p["g"] * np.arange(n, 0, -1), rtol=1e-5)

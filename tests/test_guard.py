@@ -5,18 +5,18 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.device import ti
+from tiverlet.report import CASES
 from tiverlet.step.adaptive import StepController
 
-from .conftest import case, pendulums, rms
+from .conftest import case, rms
 
 G, DT = 9.81, 1 / 60
 
 
 def chain(world, name):
-    """Return a world with the chain of a D case under "auto", hung up at its anchor, from one substep on."""
-    x, mass, pairs = pendulums(name)
-    features = [tv.Gravity(case(name)["params"]["g"]), tv.Distance(pairs)]
-    w = world(tv.Particles(x, mass=mass, pinned=[0]), features, precision="f64", solver=tv.Direct(), substeps="auto")
+    """Return a world with the chain of a case under "auto", from one substep on."""
+    particles, features = CASES[name].build()
+    w = world(particles, features, precision="f64", solver=tv.Direct(), substeps="auto")
     w._controller.substeps = 1
     return w
 
@@ -116,17 +116,6 @@ def test_what_no_effort_improves_is_said_and_not_tried_each_time(world):
     assert w.position[1] == pytest.approx([1.5, 0.0], abs=2e-2)
 
 
-def test_a_scene_does_not_go_to_and_fro_between_two_substeps(world):
-    # 4 substeps are enough for one frame of a rotating body of springs, but not for the next: they are tried ever more rarely. It
-    # has dashpots: without them, 16 substeps would keep the energy of what vibrates.
-    body = tv.shapes.truss((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3), (2, 2, 2))
-    links = tv.Distance(np.concatenate([body.links, body.braces]), compliance=1e-3, damping=1e-3)
-    start = tv.Particles(body.position, velocity=np.cross([0.0, 3.0, 6.0], body.position), mass=1 / len(body.position))
-    w = world(start, [links], substeps="auto", precision="f64")
-    substeps = [w.step(DT).substeps for _ in range(300)]
-    assert set(substeps) == {4, 8} and np.count_nonzero(np.diff(substeps)) < 30  # 150 changes if every frame allowed were a try
-
-
 @pytest.mark.slow
 def test_springs_vibrate_on_under_auto_and_cost_nothing_where_they_are_quiet(world):
     # A mass drawn to a place: a^2 / (2 alpha) stays. Nothing else asks for substeps, and in one of 1/60 s with alpha = 1e-3 m/N,
@@ -144,12 +133,8 @@ def test_springs_vibrate_on_under_auto_and_cost_nothing_where_they_are_quiet(wor
     w = world(tv.Particles(x, mass=0.05, pinned=[0, 10]), [tv.Gravity(G), links], substeps="auto", precision="f64")
     assert max(w.step(DT).substeps for _ in range(120)) <= 64
     # Springs of more than 8 periods in a frame, omega dt = 74 here, are left unresolved, and a flag says what that loses.
-    w = world(
-        tv.Particles([(0, 0), (1.001, 0)], mass=0.05, pinned=[0]),
-        [tv.Gravity(0.0), tv.Distance([(0, 1)], 1.0, compliance=1e-6)],
-        substeps="auto",
-        precision="f64",
-    )
+    bridge = tv.Particles([(0, 0), (1.001, 0)], mass=0.05, pinned=[0])
+    w = world(bridge, [tv.Gravity(0.0), tv.Distance([(0, 1)], 1.0, compliance=1e-6)], substeps="auto", precision="f64")
     assert max(w.step(DT).substeps for _ in range(30)) <= 8 and w.last.flags == {"energy-loss"}
 
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-
-from .chains import links
+from tiverlet.report.accuracy.cases.case import links
 
 N, M, G = 20, 0.05, 9.81
 

@@ -7,9 +7,9 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.device import ti
+from tiverlet.report.accuracy.cases.case import links
 from tiverlet.solvers.solver import SemiIteration, Solver
 
-from .chains import links
 from .conftest import unprojected
 
 
