@@ -7,66 +7,11 @@ import numpy as np
 
 from .. import checks
 from ..checks import ArrayLike
-from ..device import ti
-from ..features.feature import Knob, Scene
+from ..features.feature import Knob
 from ..particles import Particles
-from .core.angle import (
-    TURN,
-    Angle,
-    angles_of_paths,
-    least_sine,
-    path_angle,
-    path_angles,
-    path_gradients,
-    shorter_link,
-    wrap_near,
-    wrap_to_pi,
-)
+from .core.angle import TURN, PathAngle, angles_of_paths, wrap_to_pi
+from .core.quantity import Quantity
 from .core.scalar import Scalar
-
-
-class AngleFromMiddle(Angle):
-    """The angle of a path relative to the middle of its range, on the device.
-
-    On the host values() returns the angle itself, since the middle depends on knobs.
-    """
-
-    arity, centred = 3, True
-    exchangeable = ((0, 2),)
-    middle: Any
-
-    def values(self, x: np.ndarray) -> np.ndarray:
-        """Return the angles of the paths, (m,)."""
-        return path_angles(x[:, 0], x[:, 1], x[:, 2])
-
-    def gradients(self, x: np.ndarray) -> np.ndarray:
-        """Return the gradients of the angles, (m, 3, dim)."""
-        return path_gradients(x[:, 0], x[:, 1], x[:, 2])
-
-    def bind(self, scene: Scene, batch: Any, equation: Any) -> "AngleFromMiddle":
-        """Return the quantity for kernels, with a field for the middle of each range."""
-        bound = super().bind(scene, batch, equation)
-        bound.middle = scene.memory.field("AngleLimit.middle", batch.count, values=batch.middle)
-        return bound
-
-    @ti.func
-    def trust_radius(self, q):
-        """Return the length of the shorter link."""
-        return shorter_link(q)
-
-    @ti.func
-    def unwrap(self, f, other):
-        """Return f unchanged: a distance from the middle has a single value."""
-        return f
-
-    @ti.func
-    def measure(self, c, q):
-        """Return |angle - middle| and its gradients: the gradients of the angle, with the sign of angle - middle."""
-        f, g = path_angle(q, 0 * q[0, :], False, least_sine(self.state, self.real))
-        middle = self.middle[c]
-        f = wrap_near(f, middle) - middle
-        side = ti.select(f < 0, ti.cast(-1, self.real), ti.cast(1, self.real))
-        return side * f, side * g
 
 
 class AngleLimit(Scalar):
@@ -85,7 +30,6 @@ class AngleLimit(Scalar):
     `load` is the moment at either stop [N m].
     """
 
-    measures = AngleFromMiddle
     code_size = 3.0
     uploads_all = False  # limits are checked against each other, for a single world
     index_name = "triples"
@@ -129,6 +73,10 @@ class AngleLimit(Scalar):
             high = np.where((self.upper == np.pi) & (self.lower > 0), TURN - self.lower, high)
         return low, high
 
+    def quantity_of(self, indices) -> Quantity:
+        """Return the distances of the angles of these paths from the middles of their ranges."""
+        return PathAngle(self.fixed(indices, 3), centred=True)
+
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the indices, and check the limits against the dimension."""
         checks.indices("AngleLimit", self.index_name, self.indices, particles.count, arity=3)
@@ -140,7 +88,7 @@ class AngleLimit(Scalar):
         return np.abs(wrap_to_pi(super().values(x) - self.middle))
 
     def gradients(self, position: np.ndarray) -> np.ndarray:
-        """Return the gradients of |angle - middle| by each corner, (m, 3, dim), as AngleFromMiddle.measure() does."""
+        """Return the gradients of |angle - middle| by each corner, (m, 3, dim), as PathAngle.measure() does."""
         side = np.where(wrap_to_pi(super().values(self.placed(position)) - self.middle) < 0, -1.0, 1.0)
         return side[:, None, None] * super().gradients(position)
 

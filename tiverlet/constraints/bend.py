@@ -7,8 +7,8 @@ import numpy as np
 from ..checks import ArrayLike
 from ..features.feature import Knob
 from ..geometry.intervals import cross
-from .core.angle import angles_of_paths
-from .core.bend_angle import BendAngle
+from .core.angle import PathAngle, angles_of_paths
+from .core.quantity import Quantity
 from .core.scalar import Scalar
 
 if TYPE_CHECKING:
@@ -34,12 +34,15 @@ class Bend(Scalar):
     joint a compliance of 30 h^2 / (m l^2), even where compliance is 0.
     """
 
-    measures = BendAngle
     index_name = "triples"
     rest = Knob(lambda f, v: angles_of_paths(f, "rest", v), "Rest angle [rad].")
 
     def __init__(self, triples, rest=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0, break_at=None):
         self.setup(triples, rest, compliance, damping, break_at)
+
+    def quantity_of(self, indices) -> Quantity:
+        """Return the angles of these paths, which in 3D remember their planes: a straight path does not define one."""
+        return PathAngle(self.fixed(indices, 3), remembers=True)
 
     def prepare(self, particles: "Particles", inv_mass: np.ndarray) -> None:
         """Check the indices and the rest angles. Initial angles are exactly 0 where a path in 3D is straight but for rounding."""
@@ -59,7 +62,7 @@ class Bend(Scalar):
 
     def _sides(self, position: np.ndarray) -> np.ndarray:
         """Return -1 for paths that bend the other way than about their remembered axis, else 1, (m,)."""
-        if not hasattr(vars(self.dev).get("quantity"), "axis"):
+        if "quantity" not in vars(self.dev) or not self.dev.quantity.has_axis:
             return np.ones(self.count)
         x, axis = self.placed(position), self.scene.memory.read(self.dev.quantity.axis)[: self.count]
         along = (cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 1]) * axis).sum(axis=1)

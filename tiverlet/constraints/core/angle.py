@@ -7,7 +7,7 @@ import numpy as np
 
 from ... import checks
 from ...device import called_with, inline, ti
-from ...features.feature import Knob
+from ...features.feature import Knob, Scene
 from ...geometry.intervals import cross
 from .quantity import Quantity, exact_rest
 
@@ -71,28 +71,125 @@ class Angle(Quantity):
 
 
 class PathAngle(Angle):
-    """The angle by which a path i - j - k turns at j, see path_angle()."""
+    """The angle by which a path i - j - k turns at j, see path_angle(), or how far it is from the middle of its range.
+
+    remembers: whether paths in 3D remember their last normal, the `axis`. With it the angle has a direction and a sign while a
+    rod swings through straight. centred: f is |angle - middle|; on the host values() returns the angle itself, since the middle
+    depends on knobs. in_state: its fields in the exact state, by name.
+    """
 
     arity = 3
     exchangeable = ((0, 2),)
+    has_axis = False
+    axis: Any  # on the device, as are the next two
+    middle: Any
+    in_state: dict[str, Any]
+
+    def __init__(self, members: Any, remembers: bool = False, centred: bool = False):
+        super().__init__(members)
+        self.remembers, self.centred = remembers, centred
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """Return the angles of the paths, (m,)."""
-        return path_angles(x[:, 0], x[:, 1], x[:, 2])
+        """Return what path_angle() measures, of corners (m, 3, dim) [m]: (m,) [rad]."""
+        a, b = x[:, 1] - x[:, 0], x[:, 2] - x[:, 1]
+        dot = (a * b).sum(axis=1)
+        if x.shape[2] == 2:
+            return np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], dot)
+        return np.arctan2(np.linalg.norm(cross(a, b), axis=1), dot)
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
-        """Return the gradients of the angles, (m, 3, dim)."""
-        return path_gradients(x[:, 0], x[:, 1], x[:, 2])
+        """Return the gradients of values() by each corner, (m, 3, dim), as path_angle() does; 0 where corners coincide.
+
+        Differences would be 0 for a straight path in 3D, whose angle grows in all directions alike: it gets those in one plane.
+        """
+        (u, a), (v, b) = directions(x[:, 1] - x[:, 0]), directions(x[:, 2] - x[:, 1])
+        if x.shape[2] == 2:
+            across = [np.stack([-r[:, 1], r[:, 0]], axis=1) for r in (u, v)]
+        else:
+            axis = np.where(np.abs(u[:, :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+            axis, _ = directions(axis - (axis * u).sum(axis=1)[:, None] * u)
+            e, size = directions(cross(u, v))
+            e = np.where(size > LEAST_SINE, e, axis)
+            across = [cross(e, r) for r in (u, v)]
+        some = (a > SHORT**0.5) & (b > SHORT**0.5)
+        g, h = (np.divide(r, size, out=np.zeros_like(r), where=some) for r, size in zip(across, (a, b), strict=True))
+        return np.stack([g, -(g + h), h], axis=1)
+
+    def bind(self, scene: Scene, batch: Any, equation: Any) -> "PathAngle":
+        """Return the quantity for kernels, with fields for the axes or the middles of ranges."""
+        bound = super().bind(scene, batch, equation)
+        if self.remembers and scene.state.dim == 3:
+            bound.has_axis, bound.axis = True, scene.memory.field(f"{batch!r}.axis", batch.count, width=3, state=True)
+            bound.in_state = {"axis": bound.axis}
+        if self.centred:
+            bound.middle = scene.memory.field("AngleLimit.middle", batch.count, values=batch.middle)
+        return bound
 
     @ti.func
     def trust_radius(self, q):
-        """Return the length of the shorter link."""
-        return shorter_link(q)
+        """Return the length of the shorter of the two links of a path."""
+        return ti.min((q[1, :] - q[0, :]).norm(), (q[2, :] - q[1, :]).norm())
+
+    @ti.func
+    def unwrap(self, f, other):
+        """Return f plus whole turns, within half a turn of `other`; unchanged where it is a distance from the middle."""
+        if ti.static(not self.centred):
+            f = wrap_near(f, other)
+        return f
 
     @ti.func
     def measure(self, c, q):
-        """Return path_angle(), without memory of the plane."""
-        return path_angle(q, 0 * q[0, :], False, least_sine(self.state, self.real))
+        """Return path_angle(), about the remembered axis if there is one; or its distance from the middle, and the gradients."""
+        axis = 0 * q[0, :]
+        if ti.static(self.has_axis):
+            axis = self.axis[c]
+        f, g = path_angle(q, axis, self.mirrored(c), least_sine(self.state, self.real))
+        if ti.static(self.centred):
+            middle = self.middle[c]
+            f = wrap_near(f, middle) - middle
+            side = ti.select(f < 0, ti.cast(-1, self.real), ti.cast(1, self.real))
+            f, g = side * f, side * g
+        return f, g
+
+    @ti.func
+    def mirrored(self, c):
+        """Whether the angle is measured about its axis: where paths have one, and the rest shape is straight."""
+        out = False
+        if ti.static(self.has_axis):
+            out = self.rest[c] == 0
+        return out
+
+    @ti.func
+    def is_radial(self, c):
+        """Whether the path turns in 3D and its rest shape is straight: it may bend in any plane."""
+        return self.mirrored(c)
+
+    @ti.func
+    def direction_reliable(self, f, f0):
+        """Whether the path is bent by more than 0.1 rad, where it has an axis: the plane of one less bent turns at once."""
+        out = True
+        if ti.static(self.has_axis):
+            out = ti.max(ti.abs(f), ti.abs(f0)) > 0.1
+        return out
+
+    @ti.func
+    def start_substep(self, c, now, start, fresh):
+        """Remember the normal, with the sign that suits the last one.
+
+        Where the path is straight at the start, the normal at the end is used.
+        """
+        if ti.static(self.has_axis):
+            if fresh != 0:
+                self.axis[c] = ti.Vector.zero(self.real, 3)
+            least = 10 * least_sine(self.state, self.real)
+            e = path_cross(start)
+            if e.norm() < least:
+                e = path_cross(now)
+            if e.norm() > least:
+                side = ti.cast(1, self.real)
+                if self.mirrored(c) and self.axis[c].dot(e) < 0:
+                    side = -side
+                self.axis[c] = side * e / e.norm()
 
 
 class DihedralAngle(Angle):
@@ -102,8 +199,11 @@ class DihedralAngle(Angle):
     exchangeable = ((0, 1), (2, 3))
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """Return the angles of the edges, (m,)."""
-        return dihedral_angles(x[:, 0], x[:, 1], x[:, 2], x[:, 3])
+        """Return what dihedral_angle() measures, of corners (m, 4, 3) [m]: (m,) [rad]."""
+        e, a, b = (x[:, k] - x[:, 0] for k in (1, 2, 3))
+        e = e / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), 1e-300)
+        p, q = (r - e * (r * e).sum(axis=1, keepdims=True) for r in (a, b))
+        return np.arctan2((e * cross(p, q)).sum(axis=1), -(p * q).sum(axis=1))
 
     @ti.func
     def trust_radius(self, q):
@@ -148,44 +248,10 @@ def wrap_near(f, other):
     return f - ti.static(TURN) * ti.round((f - other) * ti.static(1 / TURN))
 
 
-@ti.func
-def shorter_link(q):
-    """Return the length of the shorter of the two links of a path."""
-    return ti.min((q[1, :] - q[0, :]).norm(), (q[2, :] - q[1, :]).norm())
-
-
 @inline
 def least_sine(state, real):
     """Return |u x v| of unit vectors below which their normal is lost in rounding."""
     return ti.cast(LEAST_SINE if state.double else 1e-6, real)
-
-
-def path_angles(i: np.ndarray, j: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """Return what path_angle() measures, of corners (m, dim) [m]: (m,) [rad]."""
-    a, b = j - i, k - j
-    dot = (a * b).sum(axis=1)
-    if i.shape[1] == 2:
-        return np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], dot)
-    return np.arctan2(np.linalg.norm(cross(a, b), axis=1), dot)
-
-
-def path_gradients(i: np.ndarray, j: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """Return the gradients of path_angles() by each corner, (m, 3, dim), as path_angle() does; 0 where corners coincide.
-
-    Differences would be 0 for a straight path in 3D, whose angle grows in all directions alike: it gets those in one plane.
-    """
-    (u, a), (v, b) = directions(j - i), directions(k - j)
-    if i.shape[1] == 2:
-        across = [np.stack([-r[:, 1], r[:, 0]], axis=1) for r in (u, v)]
-    else:
-        axis = np.where(np.abs(u[:, :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
-        axis, _ = directions(axis - (axis * u).sum(axis=1)[:, None] * u)
-        e, size = directions(cross(u, v))
-        e = np.where(size > LEAST_SINE, e, axis)
-        across = [cross(e, r) for r in (u, v)]
-    some = (a > SHORT**0.5) & (b > SHORT**0.5)
-    g, h = (np.divide(r, size, out=np.zeros_like(r), where=some) for r, size in zip(across, (a, b), strict=True))
-    return np.stack([g, -(g + h), h], axis=1)
 
 
 def directions(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -236,12 +302,10 @@ def path_angle(q, axis, mirrored, faint):
     return f, ti.Matrix.rows([g, -(g + k), k])
 
 
-def dihedral_angles(i: np.ndarray, j: np.ndarray, k: np.ndarray, l: np.ndarray) -> np.ndarray:  # noqa: E741
-    """Return what dihedral_angle() measures, of corners (m, 3) [m]: (m,) [rad]."""
-    e, a, b = (end - i for end in (j, k, l))
-    e = e / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), 1e-300)
-    p, q = (r - e * (r * e).sum(axis=1, keepdims=True) for r in (a, b))
-    return np.arctan2((e * cross(p, q)).sum(axis=1), -(p * q).sum(axis=1))
+@ti.func
+def path_cross(q):
+    """Return u x v of a path in 3D."""
+    return (q[1, :] - q[0, :]).normalized(1e-30).cross((q[2, :] - q[1, :]).normalized(1e-30))
 
 
 @ti.func
