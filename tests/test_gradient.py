@@ -109,8 +109,8 @@ def test_what_is_refused():
         (thrown, {}, landing, None, ValueError, "must be a dict of numbers"),
         (thrown, {"speed": "fast"}, landing, None, TypeError, "parameters are numbers"),
         (thrown, {"speed": np.nan}, landing, None, ValueError, "speed = nan, but it must be finite"),
-        (lambda speed: speed, one, landing, None, TypeError, "returned 1.0, which is a float and not a World"),
-        (lambda speed: last, one, landing, None, ValueError, "the same World twice"),
+        (lambda speed: speed, one, landing, None, TypeError, "make returned 1.0, a float, but a tv.World is needed"),
+        (lambda speed: last, one, landing, None, ValueError, "the same World again"),
         (thrown, one, landing, {"pace": 1.0}, ValueError, "step has 'pace', but parameters are speed"),
         (thrown, one, landing, 0.0, ValueError, "lost in rounding"),
         (thrown, one, landing, -1.0, ValueError, "lost in rounding"),
@@ -124,5 +124,5 @@ def test_what_is_refused():
     ):
         with pytest.raises(error, match=says) as caught:
             tv.gradient(make, parameters, figure, step=step)  # type: ignore[arg-type]
-        note = {grows: "two for each number of speed", fails: "speed = 1.0"}.get(make)
+        note = {grows: "two for each number of speed", fails: "speed=1.0"}.get(make)
         assert note is None or note in caught.value.__notes__[0]

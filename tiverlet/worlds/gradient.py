@@ -7,6 +7,7 @@ import numpy as np
 
 from .. import checks
 from ..world import World
+from .part import make_world
 from .worlds import Worlds
 
 
@@ -64,15 +65,14 @@ def gradient(
     values = {name: _numbers(name, value) for name, value in parameters.items()}
     worlds: list[World] = []
     try:
-        worlds.append(_made(make, parameters, worlds))
-        steps = _steps(values, step, 2.0**-52 if worlds[0].settings["precision"] == "f64" else 2.0**-23)
+        first = make_world("gradient", make, 0, parameters, worlds)
+        steps = _steps(values, step, 2.0**-52 if first.settings["precision"] == "f64" else 2.0**-23)
         for name, value in values.items():
             for index in np.ndindex(value.shape):
                 for sign in (-1, 1):
                     varied = value.copy()
                     varied[index] += sign * steps[name][index]
-                    given = varied if varied.ndim else float(varied)
-                    worlds.append(_made(make, {**parameters, name: given}, worlds))
+                    make_world("gradient", make, len(worlds), {**parameters, name: _plain(varied)}, worlds)
         try:
             copies = Worlds(worlds)
         except ValueError as error:
@@ -102,21 +102,6 @@ def _numbers(name: str, value: Any) -> np.ndarray:
     if not np.isfinite(array).all():
         raise ValueError(f"gradient: {name} = {value!r}, but it must be finite.")
     return array
-
-
-def _made(make: Callable[..., World], parameters: Mapping[str, Any], before: list[World]) -> World:
-    """Call make for these parameters, and check that it returns a new World."""
-    said = ", ".join(f"{name} = {value!r}" for name, value in parameters.items())
-    try:
-        world = make(**parameters)
-    except Exception as error:
-        error.add_note(f"That is what make said to gradient for {said:.500}.")
-        raise
-    if not isinstance(world, World):
-        raise TypeError(f"gradient: make({said:.500}) returned {world!r}, which is a {type(world).__name__} and not a World.")
-    if any(world is other for other in before):
-        raise ValueError("gradient: make returned the same World twice; it must make a new one each time.")
-    return world
 
 
 def _steps(values: dict[str, np.ndarray], step: Any, eps: float) -> dict[str, np.ndarray]:

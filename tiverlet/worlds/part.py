@@ -37,13 +37,6 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Lost:
-    """The outcome of a part whose worker died. why: the known cause."""
-
-    why: str
-
-
-@dataclass(frozen=True)
 class Job:
     """The work for each part: functions and plain data, which can be sent to another process.
 
@@ -57,14 +50,27 @@ class Job:
     versions: str
 
 
-def format_call(row: dict[str, Any]) -> str:
+def format_call(row: Mapping[str, Any]) -> str:
     """Return the call of make() with these parameters, as one line."""
     return f"make({', '.join(f'{name}={_short(value)}' for name, value in row.items())})"
 
 
-def describe_parameters(number: int, row: dict[str, Any]) -> str:
+def describe_parameters(number: int, row: Mapping[str, Any]) -> str:
     """Return the number and the call of one set of parameters."""
     return f"parameters {number}, {format_call(row)}"
+
+
+def make_world(who: str, make: Callable[..., World], number: int, row: Mapping[str, Any], before: list[World]) -> World:
+    """Call make() with a set of parameters, and append the World to those before. Raises TypeError or ValueError if it is none,
+    or one of them."""
+    with _noted(f"{who}: raised by {describe_parameters(number, row)}"):
+        world = make(**row)
+        if not isinstance(world, World):
+            raise TypeError(f"{who}: make returned {world!r}, a {type(world).__name__}, but a tv.World is needed.")
+        if world in before:
+            raise ValueError(f"{who}: make returned the same World again. Make a new one for each call.")
+    before.append(world)
+    return world
 
 
 def compute(job: Job, part: Part, report_number: Callable[[int], None] = lambda number: None) -> Outcome:
@@ -114,20 +120,13 @@ def _figures(job: Job, part: Part, report_number: Callable[[int], None]) -> dict
     from .worlds import Worlds
 
     with contextlib.ExitStack() as stack:
-        made: dict[int, World] = {}
+        made: list[World] = []
         for number, row in zip(part.numbers, part.rows, strict=True):
             report_number(number)
-            with _noted(f"sweep: raised by {describe_parameters(number, row)}"):
-                world = job.make(**row)
-                if not isinstance(world, World):
-                    raise TypeError(f"sweep: make returned {world!r}, a {type(world).__name__}, but a tv.World is needed.")
-                if id(world) in made:
-                    raise ValueError("sweep: make returned the same World again. Make a new one for each call.")
-            made[id(world)] = stack.enter_context(world)
+            stack.enter_context(make_world("sweep", job.make, number, row, made))
         report_number(-1)
         with _noted(f"sweep: raised by the worlds of {part}"):
-            worlds = Worlds(list(made.values()))
-            stack.callback(worlds.close)
+            worlds = stack.enter_context(Worlds(made))
             return _checked(job.figures(worlds), len(part.rows))
 
 

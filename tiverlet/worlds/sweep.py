@@ -1,7 +1,7 @@
 """One scene with many parameters: make worlds, step them together and measure them, in processes or on a cluster."""
 
 import inspect
-from collections import Counter, deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -10,7 +10,7 @@ import numpy as np
 
 from .. import checks
 from ..world import World
-from .part import Job, Lost, Part, describe_parameters, describe_versions, settings
+from .part import Job, Part, describe_parameters, describe_versions, settings
 
 if TYPE_CHECKING:
     from .workers import Workers
@@ -101,27 +101,25 @@ def sweep(
 
 def _done(parts: list[Part], workers: "Workers") -> Iterable[tuple[Part, dict[str, np.ndarray], Repeated | None]]:
     """Yield each part with its figures, as it is finished."""
-    todo, deaths, why = deque(parts), Counter(), {}
+    todo, deaths = deque(parts), defaultdict[int, list[str]](list)  # why workers died, by the first number of their part
     while todo or workers.busy:
         while todo and workers.free:
             workers.begin(todo.popleft())
-        for part, outcome in workers.finished():
+        for part, outcome, why in workers.finished():
             if isinstance(outcome, Exception):
                 raise outcome
-            if not isinstance(outcome, Lost):
-                causes = why.get(part.first)
-                by = workers.name
-                yield part, outcome, Repeated(part.numbers, part.rows, tuple(causes), by) if causes else None
+            causes = deaths[part.first]
+            if outcome is not None:
+                yield part, outcome, Repeated(part.numbers, part.rows, tuple(causes), workers.name) if causes else None
                 continue
-            deaths[part.first] += 1
-            why.setdefault(part.first, []).append(outcome.why)
-            if deaths[part.first] == TRIES:
+            causes.append(why)
+            if len(causes) == TRIES:
                 raise RuntimeError(
-                    f"sweep: {part} could not be done, because its worker died {TRIES} times: {outcome.why}. Try these "
+                    f"sweep: {part} could not be done, because its worker died {TRIES} times: {why}. Try these "
                     "parameters with executor=1 and at_once=1 to see which of them it is; where memory is short, take a smaller "
                     "at_once or fewer workers."
                 )
-            checks.warn(f"sweep: {part} is done again: {outcome.why}.", RuntimeWarning)
+            checks.warn(f"sweep: {part} is done again: {why}.", RuntimeWarning)
             todo.appendleft(part)
 
 

@@ -1,289 +1,213 @@
-"""Workers of a sweep: this process, processes that the sweep starts, or a user's executor."""
+"""Workers of a sweep: this process, processes that the sweep starts, or a user's executor. All are executors with submit()."""
 
 import contextlib
 import multiprocessing
 import os
 import pickle
 import signal
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
-from multiprocessing import connection
-from typing import Any, Protocol
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from typing import Any
 
 from .. import checks
 from ..device import runtime
-from .part import Job, Lost, Outcome, Part, compute, compute_in_worker, format_call
-
-
-class Workers(Protocol):
-    """Computes parts, in any order. Only finished() waits."""
-
-    @property
-    def name(self) -> str:
-        """The name for messages."""
-        ...
-
-    @property
-    def free(self) -> bool:
-        """Whether it accepts a part now."""
-        ...
-
-    @property
-    def busy(self) -> bool:
-        """Whether a part is unfinished."""
-        ...
-
-    def begin(self, part: Part) -> None:
-        """Accept a part."""
-        ...
-
-    def finished(self) -> list[tuple[Part, Outcome | Lost]]:
-        """Wait for at least one part, and return the finished parts."""
-        ...
-
-    def close(self) -> None:
-        """Stop unfinished parts."""
-        ...
+from .part import Job, Outcome, Part, compute, compute_in_worker, format_call
 
 
 class ThisProcess:
     """Computes one part at a time, in this process."""
 
-    name = "this process"
+    name, most = "this process", 1
 
-    def __init__(self, job: Job):
-        self._job = job
-        self._part: Part | None = None
-
-    @property
-    def free(self) -> bool:
-        """Whether it accepts a part now."""
-        return self._part is None
-
-    @property
-    def busy(self) -> bool:
-        """Whether a part is unfinished."""
-        return self._part is not None
-
-    def begin(self, part: Part) -> None:
-        """Accept a part."""
-        self._part = part
-
-    def finished(self) -> list[tuple[Part, Outcome | Lost]]:
+    def submit(self, function: Any, job: Job, part: Part, attempt: int) -> "Future[Outcome]":
         """Compute the part."""
-        part, self._part = self._part, None
-        return [(part, compute(self._job, part))] if part else []
+        future: Future[Outcome] = Future()
+        future.set_result(compute(job, part))
+        return future
 
     def close(self) -> None:
         """Do nothing: no part runs between calls."""
 
 
+class Died(Exception):
+    """A process ended before its part was done."""
+
+
 class _Process:
     """A process that computes one part after the other, and sends over a pipe which world it makes."""
 
-    def __init__(self, context: Any, job: bytes, threads: int):
+    def __init__(self, context: Any, threads: int):
         self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs, job, threads), daemon=True)
+        self.process = context.Process(target=_serve, args=(theirs, threads), daemon=True)
         self.process.start()
         theirs.close()  # so that the pipe closes when the process ends
-        self.part: Part | None = None
-        self.at: int | None = None  # number of the world being made; -1 after the last
 
-    def begin(self, part: Part) -> None:
-        """Send a part to the process."""
-        self.part, self.at = part, None
-        with contextlib.suppress(OSError):  # if the process died, receive() finds the pipe closed
-            self.pipe.send(part)
-
-    def receive(self) -> Outcome | Lost | None:
-        """Return the outcome of its part; None while the part is unfinished."""
+    def compute(self, job: bytes, part: Part) -> Outcome:
+        """Return the outcome of a part. Raises Died."""
+        at = None  # number of the world being made; -1 after the last
+        with contextlib.suppress(OSError):  # if the process died, recv() finds the pipe closed
+            self.pipe.send((job, part))
         try:
-            message = self.pipe.recv()
+            while isinstance(message := self.pipe.recv(), int):
+                at = message
         except (EOFError, OSError):
             self.end()
-            return Lost(self._death())
-        if isinstance(message, int):
-            self.at = message
-            return None
-        self.part = None
+            raise Died(self._death(part, at)) from None
         return message
 
-    def end(self, kill: bool = False) -> None:
-        """Close the pipe, and wait for the process. kill: terminate it."""
+    def end(self) -> None:
+        """Close the pipe, and wait for the process."""
         self.pipe.close()
-        if kill:
-            self.process.terminate()
         self.process.join(5)
         if self.process.exitcode is None:
             self.process.kill()
             self.process.join()
 
-    def _death(self) -> str:
-        code, part = self.process.exitcode, self.part
+    def _death(self, part: Part, at: int | None) -> str:
+        code = self.process.exitcode
         how = f"ended with exit code {code}"
         if code is not None and code < 0:
             with contextlib.suppress(ValueError):
                 how = f"was ended by {signal.Signals(-code).name}"
             how += " (perhaps because memory is short)" if code == -9 else ""
         when = 'before it began; in a script, call tv.sweep below `if __name__ == "__main__":`'
-        if self.at is not None and part:
-            making = f"in {format_call(part.rows[self.at - part.first])}, number {self.at}"
-            when = making if self.at >= 0 else "after all worlds were made"
+        if at is not None:
+            making = f"in {format_call(part.rows[at - part.first])}, number {at}"
+            when = making if at >= 0 else "after all worlds were made"
         return f"worker process {self.process.pid} {how} {when}"
 
 
 class Processes:
-    """Processes that the sweep starts, each with a share of the cores; spawned, since Taichi does not survive a fork."""
+    """Processes that the sweep starts, each with a share of the cores; spawned, since Taichi does not survive a fork.
+
+    A process starts with the first part that finds no other one idle. A thread waits for each part that is being computed.
+    """
 
     name = "another process"
 
-    def __init__(self, count: int, job: bytes):
-        self._count, self._job = count, job
+    def __init__(self, count: int):
+        self.most = count
         self._context = multiprocessing.get_context("spawn")
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self._threads = max(1, cores // count)
-        self._all: list[_Process] = []
+        self._share = max(1, _cores() // count)
+        self._threads = ThreadPoolExecutor(count)
+        self._idle: list[_Process] = []
+        self._busy: list[_Process] = []
 
-    @property
-    def free(self) -> bool:
-        """Whether it accepts a part now."""
-        return len(self._all) < self._count or any(p.part is None for p in self._all)
+    def submit(self, function: Any, job: bytes, part: Part, attempt: int) -> "Future[Outcome]":
+        """Send the part to a process. Its future has the outcome, or raises Died."""
+        worker = self._idle.pop() if self._idle else _Process(self._context, self._share)
+        self._busy.append(worker)
+        return self._threads.submit(self._compute, worker, job, part)
 
-    @property
-    def busy(self) -> bool:
-        """Whether a part is unfinished."""
-        return any(p.part is not None for p in self._all)
-
-    def begin(self, part: Part) -> None:
-        """Accept a part."""
-        idle = next((p for p in self._all if p.part is None), None)
-        if idle is None:
-            idle = _Process(self._context, self._job, self._threads)
-            self._all.append(idle)
-        idle.begin(part)
-
-    def finished(self) -> list[tuple[Part, Outcome | Lost]]:
-        """Wait for at least one part, and return the finished parts."""
-        out = []
-        while not out:
-            working = {p.pipe: p for p in self._all if p.part is not None}
-            for pipe in connection.wait(list(working)):
-                worker = working[pipe]  # type: ignore[index]
-                part, outcome = worker.part, worker.receive()
-                if isinstance(outcome, Lost):
-                    self._all.remove(worker)
-                if outcome is not None:
-                    out.append((part, outcome))
-        return out
+    def _compute(self, worker: _Process, job: bytes, part: Part) -> Outcome:
+        try:
+            outcome = worker.compute(job, part)
+            self._idle.append(worker)
+            return outcome
+        finally:
+            self._busy.remove(worker)
 
     def close(self) -> None:
         """End the processes, at once if they are computing."""
-        for worker in self._all:
-            worker.end(kill=worker.part is not None)
-        self._all.clear()
+        for worker in [*self._busy]:
+            worker.process.terminate()
+        self._threads.shutdown()
+        for worker in self._idle:
+            worker.end()
 
 
-def _serve(pipe: Any, job: bytes, threads: int) -> None:
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _serve(pipe: Any, threads: int) -> None:
     """Run a worker process until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the one that started the sweep ends the others
     runtime.share = threads
     with contextlib.suppress(EOFError, OSError):
         while True:
-            pipe.send(compute_in_worker(job, pipe.recv(), 0, pipe.send))
+            pipe.send(compute_in_worker(*pipe.recv(), 0, pipe.send))
 
 
-class ExecutorWorkers:
-    """A user's executor with submit(). If it accepts no more parts after a loss, processes of the sweep do the rest.
+class Workers:
+    """Gives parts to an executor. If a user's one accepts no more parts after a loss, processes of the sweep do the rest.
 
     A part that ended a worker is not computed in this process, which it might end, too. The exception is a job that cannot be
     sent to processes of the sweep: then this process is the only place left.
     """
 
-    def __init__(self, executor: Any, job: Job):
-        self._executor, self._job = executor, job
-        self._pool = isinstance(executor, ProcessPoolExecutor)
-        # A pool of processes fails as a whole. It gets one part per process, so that few parts are lost with a worker.
-        self._most: int = getattr(executor, "_max_workers", 1) if self._pool else 2**31
+    def __init__(self, job: Job, executor: Any):
+        self._job = job
         self._waiting: dict[Any, Part] = {}
         self._submitted, self._lost = 0, False
-        self._fallback: Workers | None = None
+        self._use(executor)
 
-    @property
-    def name(self) -> str:
-        """The name for messages."""
-        return self._fallback.name if self._fallback else "the executor"
+    def _use(self, executor: Any) -> None:
+        """Give parts to this executor from now on."""
+        self._executor, pool = executor, isinstance(executor, ProcessPoolExecutor)
+        self._own = isinstance(executor, (ThisProcess, Processes))
+        self.name: str = executor.name if self._own else "the executor"
+        # A pool of processes fails as a whole. It gets one part per process, so that few parts are lost with a worker.
+        self._most: int = executor.most if self._own else getattr(executor, "_max_workers", 1) if pool else 2**31
+        self._sent = sent(self._job) if pool or isinstance(executor, Processes) else self._job
 
     @property
     def free(self) -> bool:
-        """Whether it accepts a part now."""
-        if self._fallback:
-            return not self._waiting and self._fallback.free
+        """Whether a part can begin now."""
         return len(self._waiting) < self._most
 
     @property
     def busy(self) -> bool:
         """Whether a part is unfinished."""
-        return bool(self._waiting) or (self._fallback is not None and self._fallback.busy)
+        return bool(self._waiting)
 
     def begin(self, part: Part) -> None:
-        """Accept a part."""
-        if self._fallback is None:
-            job = sent(self._job) if self._pool else self._job
-            self._submitted += 1
+        """Begin a part."""
+        try:
+            self._submit(part)
+        except Exception:
+            if self._own or not self._lost:  # the executor never worked
+                raise
             try:
-                self._waiting[self._executor.submit(compute_in_worker, job, part, self._submitted)] = part
-                return
-            except Exception:
-                if not self._lost:  # the executor never worked
-                    raise
-            self._fallback = self._make_fallback()
-        self._fallback.begin(part)
+                self._use(Processes(min(self._most, os.cpu_count() or 1)))
+            except TypeError:
+                self._use(ThisProcess())
+            self._submit(part)
 
-    def finished(self) -> list[tuple[Part, Outcome | Lost]]:
-        """Wait for at least one part, and return the finished parts."""
-        if not self._waiting and self._fallback:
-            return self._fallback.finished()
-        out: list[tuple[Part, Outcome | Lost]] = []
-        done = self._done()
-        while done:
-            future = done.pop()
+    def _submit(self, part: Part) -> None:
+        self._submitted += 1
+        self._waiting[self._executor.submit(compute_in_worker, self._sent, part, self._submitted)] = part
+
+    def finished(self) -> Iterator[tuple[Part, Outcome | None, str]]:
+        """Wait for at least one part, and return each finished part with its outcome; None, and why, if its worker died."""
+        futures = [future for future in self._waiting if isinstance(future, Future)]
+        # futures of other kinds are awaited one by one
+        for future in wait(futures, return_when=FIRST_COMPLETED).done if futures else [next(iter(self._waiting))]:
             part = self._waiting.pop(future)
             try:
-                out.append((part, future.result()))
+                yield part, future.result(), ""
+            except Died as error:
+                yield part, None, str(error)
             except Exception as error:
                 self._lost = True
-                out.append((part, Lost(f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(".: "))))
-                if isinstance(error, BrokenExecutor):
-                    done = list(self._waiting)  # all other parts fail with the pool
-        return out
+                yield part, None, f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(".: ")
 
     def close(self) -> None:
-        """Cancel parts that have not begun. The executor itself stays open for the user."""
+        """Cancel parts that have not begun, and end processes of the sweep. A user's executor stays open."""
         for future in self._waiting:
             with contextlib.suppress(Exception):
                 future.cancel()
-        if self._fallback:
-            self._fallback.close()
-
-    def _done(self) -> list[Any]:
-        first = next(iter(self._waiting))
-        if isinstance(first, Future):
-            return list(wait(self._waiting, return_when=FIRST_COMPLETED).done)
-        return [first]  # futures of other kinds are awaited one by one
-
-    def _make_fallback(self) -> Workers:
-        try:
-            return Processes(min(self._most, os.cpu_count() or 1), sent(self._job))
-        except TypeError:
-            return ThisProcess(self._job)
+        if self._own:
+            self._executor.close()
 
 
 def choose_workers(executor: Any, job: Job) -> tuple[Workers, int]:
     """Return the workers, and the least number of parts."""
     if executor is None:
-        return ThisProcess(job), 1
+        return Workers(job, ThisProcess()), 1
     if isinstance(executor, int):
         count = checks.integer("sweep", "executor", executor, least=1)
-        return Processes(count, sent(job)), count
+        return Workers(job, Processes(count)), count
     if isinstance(executor, type) or not callable(getattr(executor, "submit", None)):
         kind = "class, not an object" if isinstance(executor, type) else type(executor).__name__
         raise TypeError(
@@ -302,10 +226,8 @@ def choose_workers(executor: Any, job: Job) -> tuple[Workers, int]:
                 'sweep: executor forks its processes ("fork"), but Taichi hangs after a fork. Type executor=4 for four '
                 'processes, or ProcessPoolExecutor(4, mp_context=multiprocessing.get_context("spawn")).'
             )
-        sent(job)
     of_client = getattr(executor, "get_executor", None)  # of Dask; not pure: a failed call may be repeated
-    executor = of_client(pure=False) if callable(of_client) else executor
-    return ExecutorWorkers(executor, job), 1
+    return Workers(job, of_client(pure=False) if callable(of_client) else executor), 1
 
 
 def sent(job: Job) -> bytes:
