@@ -1,5 +1,6 @@
 """Starting Taichi, and queries about the running one."""
 
+import atexit
 import contextlib
 import ctypes
 import numbers
@@ -175,6 +176,14 @@ def _keep_taichi_in_child() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_keep_taichi_in_child)
+
+
+@atexit.register  # so it runs after what the user registers
+def _write_cache() -> None:
+    """End Taichi with the process, which writes its cache of kernels: without that, it depends on what outlives Taichi's modules."""
+    runtime = _started.get("runtime")
+    if runtime is not None and runtime is language.current() and runtime.prog and not forked():
+        ti.reset()
 
 
 def _register(wanted: dict | None = None) -> None:
