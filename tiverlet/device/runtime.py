@@ -180,7 +180,7 @@ if hasattr(os, "register_at_fork"):
 
 @atexit.register  # so it runs after what the user registers
 def _write_cache() -> None:
-    """End Taichi with the process, which writes its cache of kernels: without that, it depends on what outlives Taichi's modules."""
+    """End Taichi with the process, which writes its cache of kernels. Else it may outlive its modules, and the cache is lost."""
     runtime = _started.get("runtime")
     if runtime is not None and runtime is language.current() and runtime.prog and not forked():
         ti.reset()
