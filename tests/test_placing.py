@@ -74,29 +74,24 @@ def test_springs_that_become_rigid_bring_no_energy(world):
         assert np.abs(w.velocity).max() < 0.01 + G * h / 8
 
 
-@pytest.mark.parametrize("size, substeps", [((5, 3), 2), pytest.param((5, 3, 3), 200, marks=pytest.mark.slow)])
-def test_lattices_that_become_rigid_gain_no_energy(world, size, substeps):
+def test_a_lattice_that_becomes_rigid_gains_no_energy(world):
     # All clusters of a lattice together are one rigid body. Soft ones that hang from a corner and turn about it go to their rigid
     # shape with the velocities that they have: their energy is m g y there, and the kinetic energy before, at most. Passes would
-    # make up to 4e5 J of 87. Clusters keep the shape of their cube: its sides and diagonals.
-    g = np.stack(np.meshgrid(*map(np.arange, size), indexing="ij"), axis=-1).reshape(-1, len(size))
-    clusters = [np.flatnonzero(((g >= low) & (g <= low + 1)).all(axis=1)) for low in g[(g + 1 < size).all(axis=1)]]
-    x, shapes, corner = 0.2 * g, tv.ShapeMatch(clusters, compliance=2e-4, damping=0.2), len(g) - 1
-    w = world(tv.Particles(x, pinned=[corner]), [tv.Gravity(9.81), shapes], substeps=substeps)
+    # make up to 4e5 J of 87.
+    g = np.stack(np.divmod(np.arange(15), 3), axis=1)
+    clusters = [[3 * i + j + k for k in (0, 1, 3, 4)] for i in range(4) for j in range(2)]
+    x, shapes = 0.2 * g, tv.ShapeMatch(clusters, compliance=2e-4, damping=0.2)
+    w = world(tv.Particles(x, pinned=[14]), [tv.Gravity(G), shapes], substeps=2)
     w.run(15 / 60)
-    kinetic, arm, q = tv.measure.kinetic_energy(w), w.position - x[corner], x - x[corner]
+    kinetic, arm, q = tv.measure.kinetic_energy(w), w.position - x[14], x - x[14]
     shapes.compliance = 0.0
     reports = [w.step(1 / 60) for _ in range(8)]
     before = reports[0].energy - reports[0].energy_change
-    if len(size) == 2:  # the rotation that fits best about the corner
-        turn = np.angle(((arm[:, 0] + 1j * arm[:, 1]) * (q[:, 0] - 1j * q[:, 1])).sum())
-        height = x[corner, 1] + np.sin(turn) * q[:, 0] + np.cos(turn) * q[:, 1]
-        assert before == pytest.approx(kinetic + 9.81 * np.delete(height, corner).sum(), rel=0.01)
+    turn = np.angle(((arm[:, 0] + 1j * arm[:, 1]) * (q[:, 0] - 1j * q[:, 1])).sum())  # that fits best about the corner
+    height = x[14, 1] + np.sin(turn) * q[:14, 0] + np.cos(turn) * q[:14, 1]
+    assert before == pytest.approx(kinetic + G * height.sum(), rel=0.01)
     assert ["moved" in r.flags for r in reports] == [True] + [False] * 7
     assert max(r.energy for r in reports) < before + 0.01 * abs(before)
-    for c in clusters if substeps == 200 else ():  # passes leave little of the load
-        far = [np.linalg.norm(p[c][:, None] - p[c][None], axis=2) for p in (x, w.position)]
-        np.testing.assert_allclose(far[0], far[1], atol=2e-4)
 
 
 def test_what_is_placed_has_no_speed(world):
@@ -118,6 +113,13 @@ def test_what_is_placed_has_no_speed(world):
         w.place(floor, height=1.0)
     with pytest.raises(ValueError, match="no wall, Pin or Path"):
         w.place(w.features[0], g=1.0)
+    box = tv.Box((0.0, 0.0), (1.0, 1.0))  # both corners pass the place of the other one
+    w = world(tv.Particles([(0.5, 0.5)], radius=0.1), [box])
+    w.shift((5.0, 0.0))
+    w.place(box, lower=(1.0, 0.0), upper=(2.0, 1.0))
+    with pytest.raises(ValueError, match="goes from 3 to 2 m"):
+        w.place(box, lower=(3.0, 0.0), upper=(2.0, 1.0))
+    np.testing.assert_array_equal([box.lower, box.upper], [(1, 0), (2, 1)])
     w = world(tv.Particles([(0.5, 0.5)]), [tv.Periodic((0, 0), (1, 1))])
     with pytest.raises(ValueError, match="Periodic.* is fixed in space. Remove it"):
         w.shift((1.0, 0.0))

@@ -45,18 +45,24 @@ def shift(world: Any, by: np.ndarray) -> None:
     runner.clock.forget_bound()
 
 
+def _set(values: Values) -> None:
+    """Set knobs that differ. Those of one feature change together: none is checked against what another was, as corners are."""
+    other = {f: {n: v for n, v in some.items() if not np.array_equal(getattr(f, n, ()), v)} for f, some in values.items()}
+    for f, some in other.items():
+        for name in some:
+            vars(f).pop(name, None)
+        for name, value in some.items():
+            setattr(f, name, value)
+
+
 def _take(world: Any, values: Values, position: np.ndarray | None = None) -> None:
     """Set knobs, and positions, (n, dim), without a motion from the present ones."""
     world._rebuild_for_knobs()  # for what waits already
     before = {f: {name: getattr(f, name) for name in some} for f, some in values.items()}
     try:
-        for f, some in values.items():
-            for name, value in some.items():
-                setattr(f, name, value)
+        _set(values)
     except Exception:
-        for f, some in before.items():
-            for name, value in some.items():
-                setattr(f, name, value)
+        _set(before)
         raise
     if position is None:  # a shift changes no force
         world._rebuild_for_knobs()
