@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from ..jobs import done
 from ..output import Report, Table, error_line
-from .rows import ROWS, NotAvailable
+from .rows import ROWS
 
 if TYPE_CHECKING:
     from ...world import World
 
-PASSED, FAILED, ABSENT = "passed", "FAILED", "not available"
-STYLES = {FAILED: "red", ABSENT: "yellow"}
+PASSED, FAILED = "passed", "FAILED"
 
 
 @dataclass(frozen=True)
@@ -47,13 +46,13 @@ class Certificate(Report):
     @property
     def summary(self) -> str:
         """The counts of verdicts, as text."""
-        count = {v: sum(r.verdict == v for r in self.results) for v in (PASSED, FAILED, ABSENT)}
-        return f"{count[PASSED]} of {len(self.results)} passed, {count[FAILED]} failed, {count[ABSENT]} not available."
+        failed = sum(r.verdict == FAILED for r in self.results)
+        return f"{len(self.results) - failed} of {len(self.results)} passed, {failed} failed."
 
     def tables(self) -> Iterator[Table]:
         """Yield the table of all rows."""
         rows = [(str(r.number), r.what, r.criterion, r.figure, "; ".join([r.verdict, *r.failing])) for r in self.results]
-        heads, styles = ("#", "case", "criterion", "figure", "verdict"), [STYLES.get(r.verdict, "") for r in self.results]
+        heads, styles = ("#", "case", "criterion", "figure", "verdict"), ["red" * (r.verdict == FAILED) for r in self.results]
         yield Table("Stiff and extreme cases", heads, rows, [self.summary], heads, styles)
 
     def json(self) -> str:
@@ -70,8 +69,6 @@ def certify(number: int) -> Result:
             found = row.attempt()
         failing = tuple(name for name, holds in found.holds.items() if not holds)
         figure, how = found.figure, FAILED if failing or not found.holds else PASSED
-    except NotAvailable as why:
-        figure, how, failing = str(why), ABSENT, ()
     except Exception as error:
         figure, how, failing = "", FAILED, (error_line(error),)
     return Result(row.number, row.what, row.criterion, figure, how, failing, perf_counter() - clock)

@@ -24,7 +24,8 @@ class Suspect:
     unit: str
 
     def __str__(self) -> str:
-        return f"{self.name}, particles {self.members}, off by {self.amount:.3g} {self.unit}"
+        particles = f", particles {self.members}" if len(self.members) < 9 else ""
+        return f"{self.name}{particles}, off by {self.amount:.3g} {self.unit}"
 
 
 @dataclass(frozen=True)
@@ -151,6 +152,16 @@ def dissect(w: World, dt: float, seen: StepReport, frame: int, wrong, last: int)
 
 def suspects(w: World, particle: int | None) -> list[Suspect]:
     """Return constraints and contacts, the most violated first: all of one particle, or the worst of each feature for None."""
+    out, found = held(w, particle), w.contacts
+    for k in np.argsort(-found.overlap)[: None if particle is not None else 1]:
+        pair = tuple(int(i) for i in found.pairs[k])
+        if particle is None or particle in pair:
+            out.append(Suspect("Contact", pair, float(found.overlap[k]), "m of overlap"))
+    return sorted(out, key=lambda s: -s.amount)
+
+
+def held(w: World, particle: int | None) -> list[Suspect]:
+    """Return constraints alone, in the same order."""
     out = []
     for f in w.features:
         if isinstance(f, Batch) and f.count:
@@ -159,9 +170,4 @@ def suspects(w: World, particle: int | None) -> list[Suspect]:
                 members = tuple(int(i) for i in f.members_of(int(c)))
                 if particle is None or particle in members:
                     out.append(Suspect(f"{f!r} {int(c)}", members, float(left[c]), "of its size"))
-    found = w.contacts
-    for k in np.argsort(-found.overlap)[: None if particle is not None else 1]:
-        pair = tuple(int(i) for i in found.pairs[k])
-        if particle is None or particle in pair:
-            out.append(Suspect("Contact", pair, float(found.overlap[k]), "m of overlap"))
     return sorted(out, key=lambda s: -s.amount)

@@ -15,6 +15,6 @@ from . import (  # noqa: F401  (they register their rows)
     taut,
     touching,
 )
-from .row import ROWS, Finding, NotAvailable, Row
+from .row import ROWS, Finding, Row
 
-__all__ = ["ROWS", "Finding", "NotAvailable", "Row"]
+__all__ = ["ROWS", "Finding", "Row"]

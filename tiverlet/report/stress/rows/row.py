@@ -36,10 +36,6 @@ class Finding:
     holds: dict[str, bool] = field(default_factory=dict)
 
 
-class NotAvailable(Exception):
-    """Raised by a row whose subject this version of tiverlet does not have."""
-
-
 ROWS: dict[int, Row] = {}
 
 
