@@ -2,7 +2,7 @@
 
 import os
 import platform
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +26,11 @@ class Table:
     notes: Sequence[str] = ()
     left: Container[str] = ()
     styles: Sequence[str] = ()
+
+    @classmethod
+    def of(cls, title: str, columns: Mapping[str, Callable[[Any], str]], items: Iterable[Any]) -> "Table":
+        """Return a table with a row per item. columns: the head of each, and the function from an item to its text."""
+        return cls(title, list(columns), [[cell(item) for cell in columns.values()] for item in items])
 
     def shown(self) -> Iterator[RichTable | Text]:
         """Yield the table and its notes, for rich."""

@@ -21,7 +21,7 @@ from ...step.span import integer
 
 KINDS = (Gravity, Drag, Distance)  # supported features
 STIFFNESS = 0.5  # share of a violation that the article's scheme corrects per pass
-GIVE = Struct("5d").pack_into  # the substep, the factor of drag on velocities, substeps, iterations, whether it is a start
+GIVE = Struct("4d").pack_into  # the substep, the factor of drag on velocities, substeps, whether it is a start
 
 
 @ti.data_oriented
@@ -30,11 +30,11 @@ class Baseline:
 
     name = ""
     soft = False  # whether it supports compliance
-    advance: Any  # advances by a frame: (h, exp(-rate h), substeps, iterations, fresh)
+    advance: Any  # advances by a frame: (h, exp(-rate h), substeps, fresh)
 
     def __init__(self, particles: Particles, features: Sequence[Feature]):
         runtime.ensure_started()
-        self.particles, self.features, self.substeps, self.iterations = particles, features, 20, 1
+        self.particles, self.substeps = particles, 20
         links: Any = [f for f in features if type(f) is Distance]
         for link in links:
             link.prepare(particles, particles.inv_mass)
@@ -54,7 +54,7 @@ class Baseline:
         self.pull = add("g", None, width=self.dim, values=self.g)
         self.memory.place()
         self.pull[None] = self.g
-        given: Any = np.zeros(5)
+        given: Any = np.zeros(4)
         self.given, self.quick = given.data, CachedLaunch(self, "frame", self.memory.compiler, given)
         self.restart()
 
@@ -87,7 +87,7 @@ class Baseline:
         """Advance by a frame with the arguments packed by step()."""
         ti.loop_config(serialize=True)
         for _ in range(1):
-            self.advance(given[0], given[1], integer(given, 2), integer(given, 3), integer(given, 4))
+            self.advance(given[0], given[1], integer(given, 2), integer(given, 3))
 
     def restart(self) -> None:
         """Restore the start."""
@@ -100,7 +100,7 @@ class Baseline:
         """Advance by a frame of dt [s]."""
         mine = vars(self)  # skips Taichi's attribute checks, as in a World
         h = dt / mine["substeps"]
-        GIVE(mine["given"], 0, h, math.exp(-mine["rate"] * h), mine["substeps"], mine["iterations"], mine["fresh"])
+        GIVE(mine["given"], 0, h, math.exp(-mine["rate"] * h), mine["substeps"], mine["fresh"])
         mine["quick"]()
         mine["fresh"] = False
 
@@ -148,7 +148,7 @@ class Article(Baseline):
     name = "article"
 
     @ti.func
-    def advance(self, h, keep, substeps, iterations, fresh):
+    def advance(self, h, keep, substeps, fresh):
         """Compute all substeps. `before` is the position one substep earlier."""
         for s in range(substeps):
             for i in range(self.n):
@@ -158,9 +158,8 @@ class Article(Baseline):
                     d = (self.x[i] - self.before[i]) * keep + h * h * self.pull[None]
                     self.before[i] = self.x[i]
                     self.x[i] += d
-            for it in range(iterations):
-                for c in range(self.m):
-                    self.relax(c, STIFFNESS, 0.0)
+            for c in range(self.m):
+                self.relax(c, STIFFNESS, 0.0)
         for i in range(self.n):
             self.v[i] = (self.x[i] - self.before[i]) / h
 
@@ -172,17 +171,16 @@ class Xpbd(Baseline):
     name, soft = "XPBD", True
 
     @ti.func
-    def advance(self, h, keep, substeps, iterations, fresh):
-        """Compute all substeps. Multipliers start at 0 in every pass, so more than one pass suits rigid links only."""
+    def advance(self, h, keep, substeps, fresh):
+        """Compute all substeps, with one pass each, in which multipliers start at 0."""
         for s in range(substeps):
             for i in range(self.n):
                 self.before[i] = self.x[i]
                 if self.w[i] > 0:
                     self.v[i] = self.v[i] * keep + h * self.pull[None]
                     self.x[i] += h * self.v[i]
-            for it in range(iterations):
-                for c in range(self.m):
-                    self.relax(c, 1.0, self.give[c] / (h * h))
+            for c in range(self.m):
+                self.relax(c, 1.0, self.give[c] / (h * h))
             for i in range(self.n):
                 self.v[i] = (self.x[i] - self.before[i]) / h
 

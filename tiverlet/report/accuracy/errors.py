@@ -2,8 +2,8 @@
 
 import json
 import os
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -32,23 +32,17 @@ class Missing:
 
 @dataclass(frozen=True)
 class Summary:
-    """The result of one case: its first method in f64, at the substeps of its limit, with comparisons.
+    """The result of one case: its first measured method in f64, at the substeps of its limit, with comparisons.
 
-    in_time, in_work: the error of XPBD over this one, at the same run time and at the same number of constraint visits.
-    over_article: the error of the article's scheme over this one at the same run time; see ErrorReport.advantage. order: measured
-    with the solver shown_by. single: the error in f32. failures: reasons why the case fails.
+    order: measured with the solver shown_by. single: the error in f32. in_time, in_work: the error of XPBD over this one, at the
+    same run time and at the same number of constraint visits; over_article: that of the article's scheme at the same run time;
+    see ErrorReport.advantage. failures: reasons why the case fails.
     """
 
-    case: str
-    method: str
-    substeps: int
-    error: float
-    unit: str
+    case: Case
+    best: "Point"
     order: float | None
     shown_by: str
-    seconds: float
-    energy: float
-    momentum: float
     single: float | None
     in_time: tuple[float, float] | None
     in_work: tuple[float, float] | None
@@ -105,34 +99,24 @@ class ErrorReport(Report):
         method = next((m for m in case.methods if self.curve(name, m)), None)
         if method is None:
             return None
-        points = self.curve(name, method)
+        points, failures = self.curve(name, method), []
         best = next((p for p in points if p.substeps == case.at), points[-1])
         single = next((p.error for p in self.curve(name, method, "f32") if p.substeps == best.substeps), None)
-        shown = [(o, m) for m in case.methods if (o := self.order(name, m)) is not None] if case.order else []
-        slope, by = (shown or [(None, "")])[0]
-        return Summary(
-            name, method, best.substeps, best.error, case.unit, slope, by, best.seconds, best.energy, best.momentum, single,
-            self.advantage(name, method), self.advantage(name, method, cost="visits"), self.advantage(name, method, "article"),
-            tuple(self.faults(case, method, best)),
-        )  # fmt: skip
-
-    def faults(self, case: Case, method: str, best: "Point") -> list[str]:
-        """Return the reasons why a case fails; empty if it passes."""
-        out = []
+        shown = {m: o for m in case.methods if case.order and (o := self.order(name, m)) is not None}
         if best.diverged:
-            out.append(f"diverged at {best.substeps} substeps")
+            failures.append(f"diverged at {best.substeps} substeps")
         elif best.substeps == case.at and method == case.methods[0] and best.error > case.limit:
-            out.append(f"error {best.error:.2g} {case.unit} at {case.at} substeps, limit {case.limit:.2g}")
-        if case.order:
-            slopes = {m: self.order(case.name, m) for m in case.methods if len(self.curve(case.name, m)) >= 3}
-            shown = {m: o for m, o in slopes.items() if o is not None}
-            out += [f"{m}: order {o:.2f}, not {case.order:g}" for m, o in shown.items() if abs(o - case.order) > ORDER]
-            if slopes and not shown:
-                out.append("no order shows: the error does not fall with the step")
-        single = [p for p in self.curve(case.name, method, "f32") if p.substeps == best.substeps]
-        if single and single[0].error > max(10 * best.error, case.single):
-            out.append(f"f32: error {single[0].error:.2g} {case.unit} at {best.substeps} substeps, floor {case.single:.2g}")
-        return out
+            failures.append(f"error {best.error:.2g} {case.unit} at {case.at} substeps, limit {case.limit:.2g}")
+        failures += [f"{m}: order {o:.2f}, not {case.order:g}" for m, o in shown.items() if abs(o - (case.order or 0)) > ORDER]
+        if case.order and not shown and any(len(self.curve(name, m)) >= 3 for m in case.methods):
+            failures.append("no order shows: the error does not fall with the step")
+        if single is not None and single > max(10 * best.error, case.single):
+            failures.append(f"f32: error {single:.2g} {case.unit} at {best.substeps} substeps, floor {case.single:.2g}")
+        by = next(iter(shown), "")
+        return Summary(
+            case, best, shown.get(by), by, single, self.advantage(name, method), self.advantage(name, method, cost="visits"),
+            self.advantage(name, method, "article"), tuple(failures),
+        )  # fmt: skip
 
     @cached_property
     def summaries(self) -> list[Summary]:
@@ -142,30 +126,25 @@ class ErrorReport(Report):
     @property
     def failures(self) -> dict[str, tuple[str, ...]]:
         """Cases that fail and curves that could not be measured, with the reasons."""
-        out = {s.case: s.failures for s in self.summaries if s.failures}
+        out = {s.case.name: s.failures for s in self.summaries if s.failures}
         return out | {m.task: (f"missing: {m.why}",) for m in self.missing}
 
     def tables(self) -> Iterator[Table]:
         """Yield the table of the main columns, in 80 characters."""
-        rows = []
-        for s in self.summaries:
-            error = f"{s.error:.1e} {'rel.' if s.unit == 'relative' else s.unit[:4]:4}"
-            verdict, over = "FAIL" if s.failures else "ok", times(s.in_time and s.in_time[:1])
-            rows.append((s.case, str(s.substeps), error, ordered(s)[:4], f"{1e3 * s.seconds:.1f}", over, verdict))
         notes = [*(f"{case}: {'; '.join(why)}" for case, why in self.failures.items()), LEGEND]
         notes += [f"left out: {line}" for line in self.omissions]
-        styles = ["red" * bool(s.failures) for s in self.summaries]
-        yield Table(f"Error against run time ({self.machine})", SHORT, rows, notes, (), styles)
+        table = Table.of(f"Error against run time ({self.machine})", SHORT, self.summaries)
+        yield replace(table, notes=notes, styles=["red" * bool(s.failures) for s in self.summaries])
 
     def wide(self) -> Table:
         """Return the table of all columns."""
-        return Table("Error against run time", HEADS, [cells(s) for s in self.summaries])
+        return Table.of("Error against run time", WIDE, self.summaries)
 
     def markdown(self) -> str:
         """Return the table of all columns, one of all points for each case, and what was left out, as Markdown."""
         out = [self.wide()]
         for case in self.cases:
-            out.append(Table(f"{case}: {CASES[case].title}", COLUMNS, [entry(p) for some in self.curves(case) for p in some]))
+            out.append(Table.of(f"{case}: {CASES[case].title}", OF_POINTS, [p for some in self.curves(case) for p in some]))
         out[-1].notes = [*(f"missing: {m.task}: {m.why}" for m in self.missing), *(f"left out: {o}" for o in self.omissions)]
         return "\n".join(table.markdown() for table in out)
 
@@ -213,14 +192,6 @@ LEGEND = (
     "error with n substeps of a frame; its order in the substep; run time per simulated second; the error of XPBD at the same "
     "run time over ours. All columns, and all points: --markdown FILE"
 )
-SHORT = ("case", "n", "error", "order", "ms/s", "XPBD", "")  # on a screen
-HEADS = (
-    "case", "solver", "substeps", "error", "order", "ms per s", "XPBD / ours", "at equal work", "article / ours", "f32 error",
-    "energy drift", "momentum drift", "verdict",
-)  # fmt: skip
-COLUMNS = (
-    "solver", "precision", "substeps", "error", "s per s", "visits per s", "residual", "energy drift", "compile [s]", "flags",
-)  # fmt: skip
 
 
 def fitted(case: Case, points: "list[Point]") -> float | None:
@@ -247,29 +218,11 @@ def front(points: "list[Point]", cost: str) -> np.ndarray:
     return np.log(np.stack([t, np.minimum.accumulate([p.error for p in good])], axis=1))
 
 
-def cells(s: Summary) -> tuple[str, ...]:
-    """Return the table row of a result."""
-    return (
-        s.case, s.method, str(s.substeps), f"{s.error:.1e} {s.unit}", ordered(s),
-        f"{1e3 * s.seconds:.1f}", times(s.in_time), times(s.in_work), times(s.over_article),
-        "" if s.single is None else f"{s.single:.1e}", drift(s.energy), drift(s.momentum), "; ".join(s.failures) or "ok",
-    )  # fmt: skip
-
-
-def entry(p: "Point") -> tuple[str, ...]:
-    """Return the table row of a point."""
-    error = "diverged" if p.diverged else f"{p.error:.2e}"
-    return (
-        p.method, p.precision, f"{p.substeps} x {p.iterations}", error, f"{p.seconds:.2e}", f"{p.visits:.1e}",
-        f"{p.residual:.1e}", drift(p.energy), f"{p.compile:.1f}", " ".join(p.flags),
-    )  # fmt: skip
-
-
 def ordered(s: Summary) -> str:
     """Return the order as text, with the solver that shows it if that is not the first one."""
     if s.order is None:
         return ""
-    return f"{s.order:.2f}" if s.shown_by == s.method else f"{s.order:.2f} ({s.shown_by})"
+    return f"{s.order:.2f}" if s.shown_by == s.best.method else f"{s.order:.2f} ({s.shown_by})"
 
 
 def times(ratios: tuple[float, ...] | None) -> str:
@@ -282,3 +235,41 @@ def times(ratios: tuple[float, ...] | None) -> str:
 def drift(value: float) -> str:
     """Return a drift as text; empty if nothing is conserved."""
     return "" if not np.isfinite(value) else f"{value:.0e}"
+
+
+SHORT: dict[str, Callable[[Summary], str]] = {  # on a screen of 80 characters
+    "case": lambda s: s.case.name,
+    "n": lambda s: str(s.best.substeps),
+    "error": lambda s: f"{s.best.error:.1e} {'rel.' if s.case.unit == 'relative' else s.case.unit[:4]:4}",
+    "order": lambda s: ordered(s)[:4],
+    "ms/s": lambda s: f"{1e3 * s.best.seconds:.1f}",
+    "XPBD": lambda s: times(s.in_time and s.in_time[:1]),
+    "": lambda s: "FAIL" if s.failures else "ok",
+}
+WIDE: dict[str, Callable[[Summary], str]] = {
+    "case": lambda s: s.case.name,
+    "solver": lambda s: s.best.method,
+    "substeps": lambda s: str(s.best.substeps),
+    "error": lambda s: f"{s.best.error:.1e} {s.case.unit}",
+    "order": ordered,
+    "ms per s": lambda s: f"{1e3 * s.best.seconds:.1f}",
+    "XPBD / ours": lambda s: times(s.in_time),
+    "at equal work": lambda s: times(s.in_work),
+    "article / ours": lambda s: times(s.over_article),
+    "f32 error": lambda s: "" if s.single is None else f"{s.single:.1e}",
+    "energy drift": lambda s: drift(s.best.energy),
+    "momentum drift": lambda s: drift(s.best.momentum),
+    "verdict": lambda s: "; ".join(s.failures) or "ok",
+}
+OF_POINTS: "dict[str, Callable[[Point], str]]" = {
+    "solver": lambda p: p.method,
+    "precision": lambda p: p.precision,
+    "substeps": lambda p: f"{p.substeps} x {p.iterations}",
+    "error": lambda p: "diverged" if p.diverged else f"{p.error:.2e}",
+    "s per s": lambda p: f"{p.seconds:.2e}",
+    "visits per s": lambda p: f"{p.visits:.1e}",
+    "residual": lambda p: f"{p.residual:.1e}",
+    "energy drift": lambda p: drift(p.energy),
+    "compile [s]": lambda p: f"{p.compile:.1f}",
+    "flags": lambda p: " ".join(p.flags),
+}

@@ -84,14 +84,13 @@ def curve(task: Task) -> list[Point]:
             run, energy, momentum = observe(case, world)
             with np.errstate(all="ignore"):
                 error = float(case.error(run)) if np.isfinite(world.position).all() else np.inf
-            left = residual_of(world)
             times = timed(lambda: repeat(case, world), task.runs)
             flags: set[str] = set().union(*(r.flags for r in run.reports))
             visits = substeps * iterations * charge * count / case.frame
             point = Point(
                 case.name, task.method, task.precision, substeps, iterations, error,
                 float(np.median(times)), len(times), compiled, visits,
-                max((r.residual for r in run.reports), default=left), energy, momentum,
+                max(r.residual for r in run.reports) if run.reports else world.residual, energy, momentum,
                 tuple(sorted(flags)), not error <= case.size,
             )  # fmt: skip
             out.append(point)
@@ -105,11 +104,6 @@ def charge_of(solver) -> float:
     return float(solver.steps) if isinstance(solver, ConjugateGradient) else 1.0
 
 
-def residual_of(world) -> float:
-    """Return the current violation of a baseline, which makes no reports; 0 for a World, whose reports have it."""
-    return world.residual if isinstance(world, Baseline) else 0.0
-
-
 def restart(world) -> None:
     """Restore the start of a World or a baseline."""
     if isinstance(world, Baseline):
@@ -121,18 +115,16 @@ def restart(world) -> None:
 def observe(case: Case, world) -> tuple[Run, float, float]:
     """Run a case, recording every frame. Returns the run, the drift of energy and the drift of momentum."""
     restart(world)
-    run, before, energies, kinetic, momenta = Run(world), None, [], [1e-300], []
+    run, energies, kinetic, momenta = Run(world), [], [1e-300], []
     for k in range(case.frames):
         report = world.step(case.frame)
         run.times.append((k + 1) * case.frame)
-        if report is None:
-            energies.append(world.energy if case.conserves else 0.0)
+        if report is None:  # a baseline
+            energies.append(world.energy)
         else:
             run.reports.append(report)
-            energies.append(report.energy)
-            before = report.energy - report.energy_change if before is None else before
-        if case.conserves:
-            kinetic.append(kinetic_energy(world))
+            energies += [report.energy - report.energy_change, report.energy] if k == 0 else [report.energy]
+        kinetic.append(kinetic_energy(world))
         if case.watch:
             run.seen.append(case.watch(world))
         if case.momentum:
@@ -140,8 +132,8 @@ def observe(case: Case, world) -> tuple[Run, float, float]:
     energy = momentum = np.nan
     with np.errstate(all="ignore"):
         if case.conserves:
-            energy = float(np.abs(np.array(energies) - (energies[0] if before is None else before)).max() / max(kinetic))
-        if case.momentum:
+            energy = float(np.abs(np.array(energies) - energies[0]).max() / max(kinetic))
+        if momenta:
             p, size = np.array([m for m, _ in momenta]), max(s for _, s in momenta)
             momentum = float(np.abs(p - p[0]).max() / max(size, 1e-300))
     return run, energy, momentum

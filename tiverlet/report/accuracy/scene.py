@@ -1,7 +1,8 @@
 """Error against run time of the user's own scene: its reference, the cheapest settings, and the share of f32 in the error."""
 
+import functools
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -9,10 +10,10 @@ import numpy as np
 from rich.progress import Progress
 
 from ... import checks
-from ...constraints import ShapeMatch
 from ...constraints.core.scalar import Scalar
-from ...features.feature import Batch
 from ...solvers import Direct, Jacobi
+from ...step.checkpoint import keep, put_back
+from ...step.step_report import StepReport
 from ...world import World
 from ..output import Report, Table, plain
 from .cases.case import rms
@@ -102,21 +103,20 @@ class SceneReport(Report):
 
     def tables(self) -> Iterator[Table]:
         """Yield the table of all settings."""
-        styles = ["bold" if s is self.recommended else "" if s.best else "dim" for s in self.settings]
-        order = f"Observed order: {self.order:.2f}. Tolerance: {self.tolerance:.2g} m. In bold the cheapest setting within it."
         title = f"Error against run time; reference: {self.reference}, itself within {self.reference_error:.1e} m"
-        yield Table(title, HEADS, [self.cells(s) for s in self.settings], [order, self.paste], (), styles)
+        table = Table.of(title, COLUMNS | {"error [m]": self.error_of}, self.settings)
+        order = f"Observed order: {self.order:.2f}. Tolerance: {self.tolerance:.2g} m. In bold the cheapest setting within it."
+        styles = ["bold" if s is self.recommended else "" if s.best else "dim" for s in self.settings]
+        yield replace(table, notes=[order, self.paste], styles=styles)
 
-    def cells(self, s: Setting) -> tuple[str, ...]:
-        """Return the table row of a setting; an error near that of the reference is shown as a bound."""
-        near = s.error < MARGIN * self.reference_error
-        error = f"< {MARGIN * self.reference_error:.1e}" if near else f"{s.error:.1e}"
-        error = error if self.converges else f"({s.error:.1e})"
-        return (
-            s.solver, f"{s.substeps} x {s.iterations}", s.precision, error if np.isfinite(s.error) else "diverged",
-            f"{100 * s.share:.0f} %" if s.precision != "f64" else "", f"{1e3 * s.seconds:.2f}", f"{s.residual:.1e}",
-            f"{s.energy_change:+.1e}", "*" if s.best else "", " ".join(s.flags),
-        )  # fmt: skip
+    def error_of(self, s: Setting) -> str:
+        """Return the error of a setting as text; near the error of the reference as a bound."""
+        if not np.isfinite(s.error):
+            return "diverged"
+        if not self.converges:
+            return f"({s.error:.1e})"
+        bound = MARGIN * self.reference_error
+        return f"< {bound:.1e}" if s.error < bound else f"{s.error:.1e}"
 
     def json(self) -> str:
         """Return the report as JSON."""
@@ -125,7 +125,18 @@ class SceneReport(Report):
         return json.dumps({**about, "settings": [plain(asdict(s)) for s in self.settings]}, indent=1, allow_nan=False)
 
 
-HEADS = ("solver", "substeps", "precision", "error [m]", "f32's share", "ms per s", "residual", "energy [J]", "Pareto", "flags")
+COLUMNS: dict[str, Callable[[Setting], str]] = {
+    "solver": lambda s: s.solver,
+    "substeps": lambda s: f"{s.substeps} x {s.iterations}",
+    "precision": lambda s: s.precision,
+    "error [m]": lambda s: f"{s.error:.1e}",
+    "f32's share": lambda s: f"{100 * s.share:.0f} %" if s.precision != "f64" else "",
+    "ms per s": lambda s: f"{1e3 * s.seconds:.2f}",
+    "residual": lambda s: f"{s.residual:.1e}",
+    "energy [J]": lambda s: f"{s.energy_change:+.1e}",
+    "Pareto": lambda s: "*" if s.best else "",
+    "flags": lambda s: " ".join(s.flags),
+}
 
 
 def scene_report(
@@ -143,7 +154,6 @@ def scene_report(
     if not len(world.particles):
         raise ValueError("World.report: there are no particles.")
     frames = max(1, round(seconds / dt))
-    runner = Runner(world, frames, dt)
     # The reference has twice the substeps of the finest setting, so that it is finer than all of them.
     finer = [*efforts, 2 * efforts[-1]]
     rows: dict[tuple[str, str], list[Result]] = {}
@@ -153,9 +163,10 @@ def scene_report(
         for solver in solvers:
             for precision in precisions:
                 some = finer if precision == "f64" else efforts
-                rows[repr(solver), precision] = runner.run(solver, precision, some, lambda: bar.advance(shown))
+                with world.clone(solver=solver, precision=precision) as clone:
+                    rows[repr(solver), precision] = run(clone, some, frames, dt, lambda: bar.advance(shown))
     best, truth, error, order = reference(rows)
-    motion = rms(truth, runner.start[0]) if np.isfinite(truth).all() else np.inf
+    motion = distance(truth, world.position)
     settings = []
     for (solver, precision), results in rows.items():
         exact = {r.substeps: r.position for r in rows[solver, "f64"]}
@@ -164,8 +175,8 @@ def scene_report(
             rounding = distance(r.position, exact[r.substeps]) if precision != "f64" else 0.0
             share = min(1.0, rounding / wrong) if wrong > 0 and np.isfinite(wrong) and np.isfinite(rounding) else 0.0
             settings.append(Setting(
-                solver, r.substeps, world.iterations, precision, wrong, rounding, share, r.seconds / seconds, False, r.residual,
-                r.energy, r.flags, world.order,
+                solver, r.substeps, world.iterations, precision, wrong, rounding, share, r.seconds / seconds, False,
+                r.report.residual, r.report.energy_change, tuple(sorted(r.report.flags)), world.order,
             ))  # fmt: skip
     settings.sort(key=lambda s: s.seconds)
     beaten = [any(o.seconds <= s.seconds and o.error < s.error for o in settings) for s in settings]
@@ -176,58 +187,28 @@ def scene_report(
 
 @dataclass
 class Result:
-    """The result of one run."""
+    """The results of a number of substeps: final positions [m], run time [s], and the worst report of all frames."""
 
     substeps: int
     position: np.ndarray
     seconds: float
-    residual: float
-    energy: float
-    flags: tuple[str, ...]
+    report: StepReport
 
 
-class Runner:
-    """Runs clones of a world from its current state."""
-
-    def __init__(self, world: World, frames: int, dt: float):
-        self.world, self.frames, self.dt = world, frames, dt
-        self.start = world.position.copy(), world.velocity.copy()
-        # If constraints break or shapes creep, positions and velocities do not restore the start: every run needs its own clone.
-        self.fresh = any(isinstance(f, Batch) and f.breaks or isinstance(f, ShapeMatch) and f.creep.any() for f in world.features)
-
-    def run(self, solver, precision: str, efforts: Sequence[int], done) -> list[Result]:
-        """Run all substeps `efforts` with one solver in one precision. done: called after each."""
-        clone, out = self.world.clone(solver=solver, precision=precision, substeps=1), []
-        try:
-            self.run_once(clone, 1)  # compiles
-            for n in efforts:
-                times, report = [], None
-                for _ in range(RUNS):
-                    if self.fresh:
-                        clone.close()
-                        clone = self.world.clone(solver=solver, precision=precision, substeps=n)
-                    report, energy, t = self.run_once(clone, n)
-                    times.append(t)
-                assert report
-                flags = tuple(sorted(report.flags))
-                out.append(Result(n, clone.position, float(np.median(times)), report.residual, energy, flags))
-                done()
-        finally:
-            clone.close()
-        return out
-
-    def run_once(self, clone: World, substeps: int) -> tuple[Any, float, float]:
-        """Run once: return the worst report, the change of energy [J], and the seconds by the median frame."""
-        if not self.fresh:
-            clone.position, clone.velocity = self.start
-        clone.substeps = substeps
-        worst, change, times = None, 0.0, []
-        for _ in range(self.frames):
-            report = clone.step(self.dt)
-            times.append(report.seconds)
-            change += report.energy_change
-            worst = report if worst is None else worst.worse(report)
-        return worst, change, float(np.median(times)) * self.frames
+def run(clone: World, efforts: Sequence[int], frames: int, dt: float, done: Callable[[], object]) -> list[Result]:
+    """Run a clone with each number of substeps from its present state. done: called after each."""
+    start, out = keep(clone), []
+    clone.step(dt)  # compiles
+    for n in efforts:
+        times = []
+        for _ in range(RUNS):
+            put_back(clone, start)
+            clone.substeps = n
+            reports = [clone.step(dt) for _ in range(frames)]
+            times.append(float(np.median([r.seconds for r in reports])) * frames)
+        out.append(Result(n, clone.position, float(np.median(times)), functools.reduce(StepReport.worse, reports)))
+        done()
+    return out
 
 
 def solvers_of(world: World) -> list[Any]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
 from typing import Any
 
 from ..jobs import done
@@ -16,19 +15,14 @@ FARTHER = (4, 16)  # baselines also get these multiples of the most substeps, si
 QUICK = 3  # efforts of a quick sweep
 
 
-@dataclass(frozen=True)
-class Plan:
-    """The curves that a sweep measures, and those that it leaves out, with reasons."""
-
-    tasks: list[Task]
-    omissions: list[str]
-
-
 def plan(
     cases: Sequence[Case], methods: Iterable[str] | None, precisions: Sequence[str], efforts: Sequence[int] | None,
     baselines: bool, runs: int, quick: bool,
-) -> Plan:  # fmt: skip
-    """Plan a sweep: every method of a case in the first precision, its first method in the others, and the baselines."""
+) -> tuple[list[Task], list[str]]:  # fmt: skip
+    """Return the curves of a sweep, and those that it leaves out, with reasons.
+
+    These are every method of a case in the first precision, its first method in the others, and the baselines.
+    """
     tasks, refused = [], {}
     for case in cases:
         steps = tuple(efforts or case.efforts)
@@ -44,7 +38,7 @@ def plan(
     omissions = [f"{name} on {', '.join(names)}: {why}" for (name, why), names in refused.items()]
     if not baselines:
         omissions.append("the baselines: not asked for")
-    return Plan(tasks, omissions)
+    return tasks, omissions
 
 
 def few(case: Case, steps: tuple[int, ...]) -> tuple[int, ...]:
@@ -75,12 +69,12 @@ def error_vs_time(
         if name not in METHODS:
             raise ValueError(f"error_vs_time: methods has {name!r}, but there are {', '.join(METHODS)}.")
     some = chosen(cases)
-    todo = plan(some, methods, precisions, efforts, baselines, 1 if quick else runs, quick)
+    tasks, omissions = plan(some, methods, precisions, efforts, baselines, 1 if quick else runs, quick)
     points, missing = [], []
-    for task, made, why in done("error against run time", curve, todo.tasks, executor, progress):
+    for task, made, why in done("error against run time", curve, tasks, executor, progress):
         points += made or []
         missing += [Missing(str(task), why)] if why else []
     order = {name: k for k, name in enumerate(CASES)}
     points.sort(key=lambda p: (order[p.case], p.method in BASELINES))
     left = [f"{name}: {why}" for name, why in LEFT_OUT.items()] if cases is None else []
-    return ErrorReport([c.name for c in some], points, missing, todo.omissions + left, machine())
+    return ErrorReport([c.name for c in some], points, missing, omissions + left, machine())
