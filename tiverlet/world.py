@@ -28,7 +28,7 @@ from .step import checkpoint, edit_scene, energy_bound, impulse, placing, violat
 from .step.adaptive import StepController
 from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver, usual_substeps
 from .step.build_again import Rebuild
-from .step.clock import CHANGED, Clock
+from .step.clock import CHANGED, Clock, exceeds, falls_short
 from .step.diagnostics import KINETIC
 from .step.edit_scene import Handle
 from .step.explain import compiling, explain
@@ -172,9 +172,9 @@ class World:
                 self._handle_failed_step()
                 raise
             self._runner.end_ramps()
-            if self._clock.exceeds(report.energy, self._runner.sheet.item(KINETIC), report.overlap):
+            if exceeds(self._clock, report.energy, self._runner.sheet.item(KINETIC), report.overlap):
                 report = energy_bound.checked(self, report)
-            elif self._clock.falls_short(report.energy):
+            elif falls_short(self._clock, report.energy):
                 report = energy_bound.checked_for_loss(self, report)
             report.__dict__["seconds"] = perf_counter() - clock  # the report is frozen; this field is not compared
             self._last, self._clock.energy, self._undo, self._events = report, report.energy, None, None

@@ -19,6 +19,7 @@ CHANGED = -np.inf  # the bound while work is done on the scene in the coming fra
 SQUEEZED = 0.1  # overlap [radii] from which particles that were pressed together may push themselves apart
 MET = 1e-6  # relative violation that counts as rounding
 PARTED = 0.01  # overlap [radii] down to which particles placed into each other push themselves apart
+NO, YES, UNKNOWN = range(3)  # whether a scene conserves energy
 
 
 def energy_limit(bound: Any, kinetic: Any, energy: Any) -> Any:
@@ -29,6 +30,39 @@ def energy_limit(bound: Any, kinetic: Any, energy: Any) -> Any:
 def energy_floor(bound: Any, kinetic: Any, energy: Any) -> Any:
     """The least energy of a scene that conserves energy [J], see energy_bound.py. Numbers or arrays."""
     return bound - SHARE * kinetic - DIGITS * abs(energy)
+
+
+def exceeds(clock: Any, energy: Any, kinetic: Any, overlap: Any) -> Any:
+    """Record total and kinetic energy [J] and overlap [radii] after a frame. Returns whether the energy exceeds its bound.
+
+    clock: a Clock and numbers, or Clocks and arrays.
+    """
+    bound = clock.bound
+    several = isinstance(bound, np.ndarray)
+    if several or clock.parting or bound is None or bound == CHANGED:
+        choose, largest = (np.where, np.fmax) if several else (_choose, max)
+        unknown, changed = np.isnan(bound) if several else bound is None, bound == CHANGED
+        before = energy if clock.energy is None else clock.energy
+        bound = choose(unknown, largest(before, energy), choose(changed, energy, bound))
+        clock.kinetic = choose(unknown | changed, 0.0, clock.kinetic)
+        clock.conserves = choose(unknown | changed, UNKNOWN, clock.conserves)
+        parting = clock.parting | (changed & (overlap > SQUEEZED))
+        clock.bound, clock.parting = choose(parting, largest(bound, energy), bound), parting & (overlap > PARTED)
+    clock.kinetic, clock.overlap = (np.fmax if several else max)(clock.kinetic, kinetic), overlap
+    return energy > energy_limit(clock.bound, clock.kinetic, energy)
+
+
+def falls_short(clock: Any, energy: Any) -> Any:
+    """Return whether the energy [J] is below that of a scene that conserves it, as this one does as far as is known.
+
+    clock: a Clock and a number, or Clocks and an array. Call it after exceeds().
+    """
+    short = energy < energy_floor(clock.bound, clock.kinetic, energy)
+    return short & (clock.parting == 0) & (clock.conserves != NO)
+
+
+def _choose(some: Any, yes: Any, no: Any) -> Any:
+    return yes if some else no
 
 
 def initial_margin(inv_mass: np.ndarray, extent: np.ndarray, h: Any) -> Any:
@@ -53,9 +87,9 @@ class Clock:
     moved, (n,); None: all may have.
     energy: at the end of the last frame [J]; None if unknown. bound, kinetic, parting: the energy that must not be exceeded [J],
     None if unknown; the largest kinetic energy since then [J]; whether particles that were placed into each other still part;
-    see energy_bound.py. overlap: of the worst contact at the end of the last frame [radii]. conserves: whether the scene
-    conserves energy, see energy_bound.conserves(); None if unknown. It follows from the features, and is not recorded; nor is
-    moved_mask, which is None after a frame.
+    see energy_bound.py. overlap: of the worst contact at the end of the last frame [radii]. conserves: NO, YES or
+    UNKNOWN, see energy_bound.conserves(). It follows from the features, and is not recorded; nor is moved_mask, which is None
+    after a frame.
     """
 
     time: float = 0.0
@@ -79,7 +113,7 @@ class Clock:
     kinetic: float = 0.0
     overlap: float = 0.0
     parting: bool = False
-    conserves: bool | None = None
+    conserves: int = UNKNOWN
 
     def copy(self) -> "Clock":
         """A clock with the same values."""
@@ -109,25 +143,7 @@ class Clock:
     def begin_with(self, energy: float, more: float) -> None:
         """Set the bound to the initial energy plus `more` [J], unless work is done on the scene in the coming frame."""
         if self.bound != CHANGED:
-            self.bound, self.kinetic, self.conserves = float(energy + more), 0.0, None
-
-    def exceeds(self, energy: float, kinetic: float, overlap: float) -> bool:
-        """Record total and kinetic energy [J] and overlap [radii] after a frame. Returns whether the energy exceeds its bound."""
-        if self.bound is None:
-            self.bound, self.kinetic = energy if self.energy is None else max(self.energy, energy), 0.0
-            self.conserves = None
-        elif self.bound == CHANGED:
-            self.bound, self.kinetic, self.parting = energy, 0.0, self.parting or overlap > SQUEEZED
-            self.conserves = None
-        self.kinetic, self.overlap = max(self.kinetic, kinetic), overlap
-        if self.parting:
-            self.bound, self.parting = max(self.bound, energy), overlap > PARTED
-        return energy > energy_limit(self.bound, self.kinetic, energy)
-
-    def falls_short(self, energy: float) -> bool:
-        """Whether the energy [J] is below that of a scene that conserves it, as this one does as far as is known. Call it after
-        exceeds()."""
-        return self.conserves is not False and not self.parting and energy < energy_floor(self.bound, self.kinetic, energy)
+            self.bound, self.kinetic, self.conserves = float(energy + more), 0.0, UNKNOWN
 
     def next_frame(self, dt: float) -> tuple[float, float, int]:
         """When frames of this length began, their length, and their number with the coming one. Counting frames of equal length,

@@ -7,7 +7,7 @@ A passive scene, of gravity, springs, dashpots, contacts and fixed walls, loses 
 whatever vibrates in it. E(0), the bound, is the energy at the beginning, or when the scene was last changed from outside:
 particles placed, features edited, a knob changed, a pin or a wall moved. The check allows a gain of a tenth of the largest
 kinetic energy since then, plus the error of forces that are hardly resolved, (omega h)^2 / 4 of that energy. A larger gain means
-that substeps are too long for some motion that no other figure of the report measures. Clock.exceeds() checks this after each
+that substeps are too long for some motion that no other figure of the report measures. exceeds() checks this after each
 frame; this file has the further checks for frames where it returns true.
 
 A scene of springs, uniform gravity, and walls and contacts without friction that return what strikes them also has a lower bound,
@@ -16,7 +16,7 @@ A scene of springs, uniform gravity, and walls and contacts without friction tha
 
 since nothing in it is known to take energy out. But springs that the substep does not resolve are damped by it: a vibration loses
 2 pi s^5 of its energy in each period, s = omega h, see adaptive.damping(). A loss of more than a tenth of the largest kinetic
-energy is flagged. Clock.falls_short() finds the frames for checked_for_loss(), see conserves() for the scenes.
+energy is flagged. falls_short() finds the frames for checked_for_loss(), see conserves() for the scenes.
 """
 
 from dataclasses import replace
@@ -31,7 +31,7 @@ from ..constraints.core.scalar import Scalar
 from ..features.feature import Acceleration, Batch
 from ..forces.gravity import Gravity
 from ..neighbours.periodic import Periodic
-from .clock import CHANGED, DIGITS, PARTED, energy_floor, energy_limit, initial_margin
+from .clock import CHANGED, DIGITS, NO, PARTED, UNKNOWN, YES, energy_floor, energy_limit, initial_margin
 from .diagnostics import ENERGY, EXTENT, KINETIC, REACH, STIFFNESS
 from .step_report import StepReport
 
@@ -44,40 +44,45 @@ BOUNCED = 0.003  # the same where bodies bounce and nothing takes energy out: im
 SKIN = 1e-5  # share of the largest coordinate: apparent depth of particles that lie on a wall, at most
 ROUNDED = 64  # rounding error of positions, in units in the last place of the largest coordinate
 SMALL_LOSS = 0.05  # of its energy, that a spring may lose: half of what is flagged. In a radian it loses (omega h)^5 of it
-FLAG, LOST = "energy-gain", "energy-loss"
+GAIN, LOST = "energy-gain", "energy-loss"
 
 
 def checked(world: "World", report: StepReport) -> StepReport:
-    """Return the report of a frame after which Clock.exceeds() is true, with the flag "energy-gain" if the gain is spurious."""
-    clock, sheet = world._clock, world._runner.sheet
-    if works(world):
-        clock.bound = None
-        return report
+    """Return the report of a frame after which exceeds() is true, with the flag "energy-gain" if the gain is spurious."""
+    clock = world._clock
     bound: Any = clock.bound
     gain = report.energy - energy_limit(bound, clock.kinetic, report.energy)
-    err = blur(world, sheet[EXTENT : EXTENT + world.particles.dim], sheet[REACH]) + sheet[STIFFNESS] / 4 * clock.kinetic
-    if not gain > err:
-        return report
-    if inside(world, sheet[REACH]):
-        clock.bound = report.energy
-        return report
-    if not gain > err + let_out(world):
+    if not spurious_gain(world, np.array([gain]), world._runner.sheet[None])[0]:
         return report
     note = (
         f"Nothing works on the scene, but it has {report.energy - bound:.3g} J more than it had; its kinetic energy was "
         f"{clock.kinetic:.3g} J at most. Use more substeps, at first {2 * report.substeps}, or soften what is stiff and heavy."
     )
-    return replace(report, flags=report.flags | {FLAG}, notes=(*report.notes, note))
+    return replace(report, flags=report.flags | {GAIN}, notes=(*report.notes, note))
+
+
+def spurious_gain(world: "World", gain: np.ndarray, figures: np.ndarray) -> np.ndarray:
+    """Return in which frames the energy beyond energy_limit() is spurious, (frames,).
+
+    gain: by how much it is beyond that, (frames,) [J]. figures: of the report, (frames, any). If they tell of work that is done,
+    the bound is changed.
+    """
+    clock = world._clock
+    if works(world):
+        clock.bound = None
+        return np.zeros(len(gain), dtype=bool)
+    reach = figures[:, REACH]
+    err = blur(world, figures[:, EXTENT : EXTENT + world.particles.dim], reach) + figures[:, STIFFNESS] / 4 * clock.kinetic
+    if (gain > err).any() and inside(world, reach.max()):
+        clock.bound, err = float(figures[:, ENERGY].max()), np.inf
+    return gain > err + let_out(world)
 
 
 def checked_for_loss(world: "World", report: StepReport) -> StepReport:
-    """Return the report of a frame after which Clock.falls_short() is true, with "energy-loss" if the loss is spurious."""
-    clock, sheet = world._clock, world._runner.sheet
-    if clock.conserves is None:
-        clock.conserves = conserves(world) and not works(world)
+    """Return the report of a frame after which falls_short() is true, with "energy-loss" if the loss is spurious."""
+    clock = world._clock
     bound: Any = clock.bound
-    loss = energy_floor(bound, clock.kinetic, report.energy) - report.energy
-    if not (clock.conserves and loss > loss_error(world, sheet[EXTENT : EXTENT + world.particles.dim], sheet[REACH])):
+    if not spurious_loss(world, energy_floor(bound, clock.kinetic, report.energy) - report.energy, world._runner.sheet):
         return report
     omega = fastest_spring(world)
     need = np.ceil(report.substeps * omega * clock.h * (omega * clock.time / SMALL_LOSS) ** 0.2)
@@ -88,6 +93,15 @@ def checked_for_loss(world: "World", report: StepReport) -> StepReport:
         "Otherwise say that energy is lost: give springs damping, or make rigid what is too stiff (compliance 0)."
     )
     return replace(report, flags=report.flags | {LOST}, notes=(*report.notes, note))
+
+
+def spurious_loss(world: "World", loss: float, figures: np.ndarray) -> bool:
+    """Return whether the energy that lacks to energy_floor(), `loss` [J], is lost by nothing. figures: of the report."""
+    clock = world._clock
+    if clock.conserves == UNKNOWN:
+        clock.conserves = YES if conserves(world) and not works(world) else NO
+    extent, reach = figures[EXTENT : EXTENT + world.particles.dim], figures[REACH]
+    return clock.conserves == YES and bool(loss > loss_error(world, extent, reach))
 
 
 def before(world: "World") -> float | None:

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -46,12 +46,11 @@ DATES = 4  # per copy: when frames of the present length began [s], their length
 WRAP = 2.0**31  # substeps are counted modulo this
 
 
-def sheets(h, start, end, tick, since, fresh, owed, origin, substeps: int, passes: int) -> np.ndarray:
-    """Return the sheets of frames, one row per copy, see Span. Arguments: arrays with a value per copy; substeps and passes are
-    the same for all."""
-    out = np.zeros((len(h), SHEET))
-    dates = (H, h), (START, start), (END, end), (TICK, tick), (SINCE, since)
-    for k, values in (*dates, (FRESH, fresh), (OWED, owed), (ORIGIN, origin)):
+def sheets(clocks: Any, end: np.ndarray, origin: np.ndarray, substeps: int, passes: int) -> np.ndarray:
+    """Return the sheets of frames, one row per copy, see Span. clocks: Clocks. end, origin: with a value per copy."""
+    out = np.zeros((len(end), SHEET))
+    dates = (H, clocks.h), (START, clocks.time), (END, end), (TICK, clocks.tick), (SINCE, clocks.since)
+    for k, values in (*dates, (FRESH, clocks.d_is_velocity), (OWED, clocks.owed), (ORIGIN, origin)):
         out[:, k] = values
     out[:, STAGES], out[:, ITERATIONS] = substeps, passes
     out[:, UNTIL], out[:, PART] = substeps + 1, passes

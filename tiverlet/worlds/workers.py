@@ -126,7 +126,8 @@ def _serve(pipe: Any, threads: int) -> None:
     runtime.share = threads
     with contextlib.suppress(EOFError, OSError):
         while True:
-            pipe.send(compute_in_worker(*pipe.recv(), 0, pipe.send))
+            job, part = pipe.recv()
+            pipe.send(compute_in_worker(job, part, 0, pipe.send))
 
 
 class Workers:

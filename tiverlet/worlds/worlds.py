@@ -20,11 +20,11 @@ from ..features.unknown_names import answer_names, suggest
 from ..particles import in_range
 from ..step import checkpoint, energy_bound, impulse
 from ..step import frames as kernel
-from ..step.clock import CHANGED, PARTED, SQUEEZED, energy_floor, energy_limit, initial_margin
-from ..step.diagnostics import ENERGY, EXTENT, KINETIC, OVERLAP, REACH, STARTED, STEPPED, STIFFNESS, TURNS, UNSTEPPED, risks
+from ..step.clock import CHANGED, energy_floor, energy_limit, exceeds, falls_short, initial_margin
+from ..step.diagnostics import ENERGY, EXTENT, KINETIC, OVERLAP, STARTED, STEPPED, TURNS, UNSTEPPED, risks
 from ..step.integrator import shares_of
 from ..world import World
-from .clocks import NO, NONE, UNKNOWN, YES, Clocks
+from .clocks import NONE, Clocks
 from .knobs import Knobs
 from .report import WorldsReport
 from .structure import check_structure, with_equal_kernels
@@ -226,37 +226,15 @@ class Worlds:
                     moved[k], released[k], jumped[k] = runner.moved, runner.released, runner.jumped
         unknown = np.flatnonzero(~clocks.known)
         if len(unknown):
-            figures = self._measure_worlds(unknown)
-            energy, overlap = figures[:, ENERGY], figures[:, OVERLAP]
-            clocks.energy[unknown], clocks.known[unknown] = energy, True
-            placed = clocks.first_moved[unknown] != NONE
-            first = placed & (clocks.tick[unknown] == 0)
-            more = initial_margin(runner.scene.inv_mass, figures[:, EXTENT : EXTENT + world.particles.dim], h)
-            works = clocks.bound[unknown] == CHANGED  # something does work in the coming frame
-            clocks.bound[unknown] = np.where(works, CHANGED, np.where(first, energy + more, np.nan))
-            clocks.kinetic[unknown] = np.where(first, 0.0, clocks.kinetic[unknown])
-            clocks.conserves[unknown] = UNKNOWN
-            clocks.parting[unknown] = np.where(placed, overlap > 0, clocks.parting[unknown])
-            clocks.overlap[unknown] = overlap
+            origin = np.where(clocks.d_is_velocity, UNSTEPPED, np.where(clocks.started, STARTED, STEPPED))
+            figures = self._launch_worlds(unknown, clocks.time, origin, 0, 1)[unknown, 0]
+            margin = initial_margin(runner.scene.inv_mass, figures[:, EXTENT : EXTENT + world.particles.dim], h)
+            clocks.begin(unknown, figures[:, ENERGY], figures[:, OVERLAP], margin)
         for contact in runner.step.contacts:
             runner.memory.write_some(contact.dev.fast, 1, np.flatnonzero(jumped))
         clocks.first_moved[some], clocks.needs_drag[some] = NONE, False
         self._start = self._start or _Start(self)
         return moved, released
-
-    def _measure_worlds(self, some: np.ndarray) -> np.ndarray:
-        """Return the figures of the worlds `some` in their present state, (k, FIGURES)."""
-        clocks = self._clocks
-        origin = np.where(clocks.d_is_velocity, UNSTEPPED, np.where(clocks.started, STARTED, STEPPED))
-        sheets = kernel.sheets(
-            clocks.h, clocks.time, clocks.time, clocks.tick, clocks.since, clocks.d_is_velocity, clocks.owed, origin, substeps=0,
-            passes=1,
-        )  # fmt: skip
-        plan = np.zeros(kernel.PLAN, dtype=np.int32)
-        plan[kernel.FRAMES] = plan[kernel.KEEPS] = 1
-        figures = np.zeros((len(self), 1, kernel.FIGURES))
-        self._launch_worlds(plan, some, sheets, np.zeros((len(self), kernel.DATES)), figures, np.zeros(1))
-        return figures[some, 0]
 
     def _upload(self) -> None:
         """Write knobs to the device: those assigned for all worlds, and those set for some."""
@@ -293,44 +271,46 @@ class Worlds:
             for semi_iteration in runner.semi_iterations:
                 semi_iteration.prepare(iterations)
         begun = perf_counter()
-        clocks.count_frame(dt, np.ones(len(self), dtype=bool))
+        clocks.count_frame(dt)
         started = clocks.d_is_velocity & (substeps * stages == 1)
-        dates = np.zeros((len(self), kernel.DATES))
-        dates[:, :3] = clocks.frame
-        sheets = kernel.sheets(
-            clocks.h, clocks.time, dates[:, 0] + dates[:, 1] * (dates[:, 2] + 1), clocks.tick, clocks.since, clocks.d_is_velocity,
-            clocks.owed, np.where(started, STARTED, STEPPED), stages * substeps if runner.n else 0,
-            runner.integrator.passes(iterations),
+        since, length, count = clocks.frame.T
+        figures = self._launch_worlds(
+            np.arange(len(self)), since + length * (count + 1), np.where(started, STARTED, STEPPED),
+            substeps if runner.n else 0, iterations, frames, every, track, before,
         )  # fmt: skip
-        plan = np.zeros(kernel.PLAN, dtype=np.int32)
-        plan[kernel.FRAMES], plan[kernel.SUBSTEPS] = frames, substeps if runner.n else 0
-        plan[kernel.EVERY], plan[kernel.BEFORE], plan[kernel.KEEPS] = every, before, 1
-        plan[kernel.ROWS] = track.shape[1] if track is not None else 0
-        figures = np.zeros((len(self), frames, kernel.FIGURES))
-        flat = np.zeros(1) if track is None else track.reshape(-1)
-        self._launch_worlds(plan, np.arange(len(self)), sheets, dates, figures, flat)
-        energy = np.where(clocks.known, clocks.energy, np.nan)
         runner.end_ramps()
         clocks.advance(substeps, iterations, frames, started)
         with np.errstate(all="ignore"):  # energies may be infinite, which flags report
-            self._last = self._report(figures, energy, moved, released, perf_counter() - begun)
+            self._last = self._report(figures, moved, released, perf_counter() - begun)
         return self._last
 
     def _launch_worlds(
-        self, plan: np.ndarray, some: np.ndarray, sheets: np.ndarray, dates: np.ndarray, figures: np.ndarray, track: np.ndarray
-    ) -> None:
-        """Launch frames of the worlds `some`, and relaunch those that stopped for a longer list."""
-        runner, memory = self._runner, self._runner.memory
-        which = some.astype(np.int32)
+        self, some: np.ndarray, end: np.ndarray, origin: np.ndarray, substeps: int, iterations: int, frames: int = 1,
+        every: int = 0, track: np.ndarray | None = None, before: int = 0,
+    ) -> np.ndarray:  # fmt: skip
+        """Launch frames of the worlds `some`, and relaunch those that stopped for a longer list.
+
+        end, origin: of the first frame of each world, see Span. every, track, before: of the track, see rollout(). Returns the
+        figures, (worlds, frames, FIGURES).
+        """
+        runner, memory, integrator = self._runner, self._runner.memory, self._runner.integrator
+        sheets = kernel.sheets(self._clocks, end, origin, integrator.stages * substeps, integrator.passes(iterations))
+        dates = np.zeros((len(self), kernel.DATES))
+        dates[:, :3] = self._clocks.frame
         memory.write(self._kernels.sheet, sheets)
         memory.write(self._kernels.dates, dates)
+        plan = np.zeros(kernel.PLAN, dtype=np.int32)
+        plan[kernel.FRAMES], plan[kernel.SUBSTEPS], plan[kernel.KEEPS] = frames, substeps, 1
+        plan[kernel.EVERY], plan[kernel.BEFORE], plan[kernel.ROWS] = every, before, 0 if track is None else track.shape[1]
+        figures = np.zeros((len(self), frames, kernel.FIGURES))
+        flat, which = np.zeros(1) if track is None else track.reshape(-1), some.astype(np.int32)
         while len(some):
             plan[kernel.COUNT], plan[kernel.GRAIN] = len(some), self._kernels.grain(len(some))
             which[: len(some)] = some
             with self._knobs.shown(0):  # kernels depend on whether there is friction, which is the same in all worlds
-                CachedLaunch(self._kernels, "run", memory.compiler, plan, which, figures.reshape(-1), track)()
+                CachedLaunch(self._kernels, "run", memory.compiler, plan, which, figures.reshape(-1), flat)()
             if not runner.step.searches:
-                return
+                break
             sheets = memory.read(self._kernels.sheet)
             some = some[kernel.waits(sheets[some])]
             for k in some:
@@ -340,88 +320,51 @@ class Worlds:
                     runner.grow()
                     runner.invalidate()
             memory.write(self._kernels.sheet, sheets)
+        return figures
 
-    def _report(
-        self, figures: np.ndarray, before: np.ndarray, moved: np.ndarray, released: np.ndarray, seconds: float
-    ) -> WorldsReport:
-        """Make the report from the figures of all frames, (worlds, frames, FIGURES). before: energies before them [J]."""
+    def _report(self, figures: np.ndarray, moved: np.ndarray, released: np.ndarray, seconds: float) -> WorldsReport:
+        """Make the report from the figures of all frames, (worlds, frames, FIGURES)."""
         world, runner, clocks = self._world, self._runner, self._clocks
-        reporter, dim, n = runner.diagnostics.report, world.particles.dim, runner.n
+        before, n = clocks.energy, runner.n
         energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned = np.moveaxis(
             figures[..., :KINETIC], 2, 0
         )
         stiff = np.maximum(stiff, (self._fastest * clocks.h**2)[:, None])
         first = np.arange(figures.shape[1]) == 0
         pressed = np.column_stack([clocks.overlap, overlap[:, :-1]])
-        every = risks(
-            n, reporter.farthest, bad, reach, fast, overlap, pressed, turned, np.where(first, moved[:, None], 0.0), tension,
-            stiff, np.where(first, released[:, None], 0.0), residual,
-        )  # fmt: skip
-        every[energy_bound.FLAG] = self._gains(before, figures)
-        every[energy_bound.LOST] = self._losses(figures[:, -1])[:, None]
+        every: dict[str, Any] = risks(
+            n, runner.diagnostics.report.farthest, bad, reach, fast, overlap, pressed, turned,
+            np.where(first, moved[:, None], 0.0), tension, stiff, np.where(first, released[:, None], 0.0), residual,
+        ) | self._flag_energies(figures)  # fmt: skip
         wrong = bad < n
-        report = WorldsReport(
-            clocks.time.copy(), residual.max(1), overlap.max(1), contacts.max(1).astype(int), energy[:, -1].copy(),
-            energy[:, -1] - before,
-            np.where(wrong.any(1), bad[np.arange(len(self)), wrong.argmax(1)], -1).astype(int), broken.sum(1).astype(int),
-            np.array(TURNS)[turned.max(1).astype(int)], tension.max(1),
+        clocks.energy, clocks.known[:] = energy[:, -1].copy(), True
+        for search in runner.step.searches:
+            search.fit(figures[:, -1, EXTENT : EXTENT + world.particles.dim].max(0))
+        return WorldsReport(
+            clocks.time.copy(), residual.max(1), overlap.max(1), contacts.max(1).astype(int), clocks.energy.copy(),
+            clocks.energy - before, np.where(wrong.any(1), bad[np.arange(len(self)), wrong.argmax(1)], -1).astype(int),
+            broken.sum(1).astype(int), np.array(TURNS)[turned.max(1).astype(int)], tension.max(1),
             {name: there.any(1) for name, there in every.items() if there.any()}, world.substeps, world.iterations,
             seconds,
         )  # fmt: skip
-        clocks.energy, clocks.known = energy[:, -1].copy(), np.ones(len(self), dtype=bool)
-        clocks.first_moved = np.full(len(self), NONE)
-        if runner.search:
-            extent = figures[:, -1, EXTENT : EXTENT + dim]
-            runner.search.fit(extent.max(0))
-        return report
 
-    def _gains(self, before: np.ndarray, figures: np.ndarray) -> np.ndarray:
-        """Return which worlds gained energy without work, and in which frames, (worlds, frames).
-
-        Does what Clock.exceeds() and energy_bound.checked() do, for all worlds. before: energies [J]. figures: (worlds, frames,
-        FIGURES).
-        """
-        energy, overlap, stiff, reach, kinetic = (figures[..., k] for k in (ENERGY, OVERLAP, STIFFNESS, REACH, KINETIC))
-        extent = figures[..., EXTENT : EXTENT + self._world.particles.dim]
-        clocks, gain = self._clocks, np.empty_like(energy)
+    def _flag_energies(self, figures: np.ndarray) -> dict[str, np.ndarray]:
+        """Return which worlds gained energy without work, and in which frames, (worlds, frames), and which have lost some by the
+        last frame that nothing took, (worlds, 1), see energy_bound.py."""
+        clocks, energy = self._clocks, figures[..., ENERGY]
+        gain, lost = np.empty_like(energy), np.zeros((len(self), 1), dtype=bool)
         for k in range(energy.shape[1]):
-            unknown, changed = np.isnan(clocks.bound), clocks.bound == CHANGED
-            clocks.bound = np.where(unknown, np.fmax(before, energy[:, k]), np.where(changed, energy[:, k], clocks.bound))
-            clocks.parting |= changed & (overlap[:, k] > SQUEEZED)
-            clocks.kinetic = np.maximum(np.where(unknown | changed, 0.0, clocks.kinetic), kinetic[:, k])
-            clocks.conserves[unknown | changed] = UNKNOWN
-            clocks.bound = np.where(clocks.parting, np.maximum(clocks.bound, energy[:, k]), clocks.bound)
-            clocks.parting = clocks.parting & (overlap[:, k] > PARTED)
-            clocks.overlap = overlap[:, k].copy()
+            exceeds(clocks, energy[:, k], figures[:, k, KINETIC], figures[:, k, OVERLAP].copy())
             gain[:, k] = energy[:, k] - energy_limit(clocks.bound, clocks.kinetic, energy[:, k])
         out = gain > 0
         for k in np.flatnonzero(out.any(1)):
             with self._as_world(k) as world:
-                if energy_bound.works(world):
-                    world._clock.bound, out[k] = None, False
-                else:
-                    err = energy_bound.blur(world, extent[k], reach[k]) + stiff[k] / 4 * world._clock.kinetic
-                    if (gain[k] > err).any() and energy_bound.inside(world, reach[k].max()):
-                        world._clock.bound, err = energy[k].max(), np.inf
-                    out[k] = gain[k] > err + energy_bound.let_out(world)
-        return out
-
-    def _losses(self, figures: np.ndarray) -> np.ndarray:
-        """Return which worlds have lost energy by the last frame that nothing took, (worlds,). Call it after _gains().
-
-        Does what Clock.falls_short() and energy_bound.checked_for_loss() do. figures: of the last frame, (worlds, FIGURES).
-        """
-        clocks, out = self._clocks, np.zeros(len(self), dtype=bool)
-        floor = energy_floor(clocks.bound, clocks.kinetic, figures[:, ENERGY])
-        short = (figures[:, ENERGY] < floor) & ~clocks.parting & (clocks.conserves != NO)
-        for k in np.flatnonzero(short):
+                out[k] = energy_bound.spurious_gain(world, gain[k], figures[k])
+        loss = energy_floor(clocks.bound, clocks.kinetic, energy[:, -1]) - energy[:, -1]
+        for k in np.flatnonzero(falls_short(clocks, energy[:, -1])):
             with self._as_world(k) as world:
-                if clocks.conserves[k] == UNKNOWN:
-                    clocks.conserves[k] = YES if energy_bound.conserves(world) and not energy_bound.works(world) else NO
-                if clocks.conserves[k] == YES:
-                    extent = figures[k, EXTENT : EXTENT + world.particles.dim]
-                    out[k] = floor[k] - figures[k, ENERGY] > energy_bound.loss_error(world, extent, figures[k, REACH])
-        return out
+                lost[k] = energy_bound.spurious_loss(world, loss[k], figures[k, -1])
+        return {energy_bound.GAIN: out, energy_bound.LOST: lost}
 
     # Knobs and states of chosen worlds.
 
@@ -583,10 +526,9 @@ class Worlds:
         out = runner.memory.read(runner.scene.state.d)[:, : runner.n].astype(np.float64)
         saved = runner.memory.read(runner.search.list.old_saved)[:, 0] if runner.search else np.zeros(len(self))
         alone = ~clocks.d_is_velocity & ((saved != 0) | bool(runner.probe))
-        for k, known in clocks.velocity_override.items():
-            out[k] = known
-        there = clocks.d_is_velocity.copy()
-        there[list(clocks.velocity_override)] = True
+        for k in np.flatnonzero(clocks.overridden):
+            out[k] = clocks.velocity_override[k]
+        there = clocks.d_is_velocity | clocks.overridden
         alone &= ~there
         some = np.flatnonzero(~there & ~alone).astype(np.int32)
         if len(some):
@@ -630,8 +572,7 @@ class Worlds:
         steered = moved & ~clocks.d_is_velocity[chosen] & (not runner.probe) & (drag[:, 0] >= impulse.WEAK)
         if steered.any():
             some, memory, n = chosen[steered], runner.memory, runner.n
-            for k in some:
-                clocks.velocity_override.pop(int(k), None)
+            clocks.velocity_override[some] = None
             want, seen, change, drag = velocity[steered], seen[steered], change[steered], drag[steered]
             inv_mass = [self._sources[k].inv_mass for k in some] if self._sources else runner.scene.inv_mass
             moves = change.any(axis=2) & (np.asarray(inv_mass) > 0)
@@ -651,7 +592,8 @@ class Worlds:
                     impulse.restore_turn(runner, 0, parts)
             steered[steered] = found
             clocks.known[some] = False
-            clocks.velocity_override.update((int(k), want[i]) for i, k in enumerate(some) if found[i])
+            for i in np.flatnonzero(found):
+                clocks.velocity_override[some[i]] = want[i]
         fresh = moved & ~steered
         self._start_from(velocity[fresh], chosen[fresh])
 
@@ -665,8 +607,7 @@ class Worlds:
         if state.carries:
             memory.write_some(state.d_low, 0.0, chosen)
         clocks.d_is_velocity[chosen], clocks.known[chosen], clocks.owed[chosen] = True, False, 0.0
-        for k in chosen:
-            clocks.velocity_override.pop(int(k), None)
+        clocks.velocity_override[chosen] = None
 
     @property
     def substeps(self) -> int:
