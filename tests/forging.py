@@ -2,16 +2,15 @@
 
 import hashlib
 import json
-import struct
 
 import pyarrow as pa
 
 import tiverlet as tv
-from tiverlet.recording import journal, reader
+from tiverlet.recording import journal, messages, reader
 
 PARTICLES = "world/scene/particles"
 NOT_SHOWN = ("rerun.controls.RowId", "blueprint", "RecordingInfo:start_time")
-NEVER = "7fffffffffffffffffffffffffffffff"  # an id higher than all others
+LAST_ID = 0x7FFFFFFFFFFFFFFFFFFFFFFFFFFFFF00  # an id higher than all others
 
 
 def record(path, frames=6):
@@ -29,80 +28,46 @@ def record(path, frames=6):
     return path
 
 
-def varint(n):
-    """Encode a number as protobuf does."""
-    out = bytearray()
-    while n > 127:
-        out.append(n & 127 | 128)
-        n >>= 7
-    return bytes([*out, n])
-
-
-def packed(fields):
-    """Encode a protobuf record."""
-    out = b""
-    for number, value in sorted(fields.items()):
-        if isinstance(value, int):
-            out += varint(number << 3) + varint(value)
-        else:
-            out += varint(number << 3 | 2) + varint(len(value)) + value
-    return out
+def entity_of(rows):
+    """Return the path of the entity that rows are of."""
+    return rows.schema.metadata[b"rerun:entity_path"].decode().lstrip("/")
 
 
 class Forgery:
-    """A recording as a list of messages: (kind, bytes), or (2, fields, batch) where there are rows."""
+    """A recording as a list of messages, each with its kind, and with the rows of an entity or None."""
 
     def __init__(self, path):
         data = path.read_bytes()
-        self.head, self.messages, at = data[: reader.HEADER], [], reader.HEADER
-        while at < len(data):
-            kind, length = struct.unpack_from("<QQ", data, at)
-            body, at = data[at + 16 : at + 16 + length], at + 16 + length
-            if kind == 2:
-                fields = reader.record(body, "1 2 3 4 5 6 7")
-                raw = fields[5] if fields[2] == 1 else pa.Codec("lz4_raw").decompress(fields[5], decompressed_size=fields[3])
-                self.messages.append((2, fields, pa.ipc.open_stream(raw).read_next_batch()))
-            elif kind:
-                self.messages.append((kind, body))
+        self.head, parts = data[: messages.HEADER], messages.split(data)
+        self.messages = [(kind, m, messages.Chunk(m).rows() if kind == messages.CHUNK else None) for kind, m in parts if kind]
 
     def save(self, to, seal=True):
         """Write the recording to `to` and return the path. seal: append a valid end record."""
         out = self.head
-        for kind, body, *batch in self.messages:
-            if batch:
-                sink = pa.BufferOutputStream()
-                with pa.ipc.new_stream(sink, batch[0].schema) as stream:
-                    stream.write_batch(batch[0])
-                raw = sink.getvalue().to_pybytes()
-                body = packed({**body, 2: 2, 3: len(raw), 5: pa.Codec("lz4_raw").compress(raw).to_pybytes()})
-            out += struct.pack("<QQ", kind, len(body)) + body
+        for kind, message, rows in self.messages:
+            body = message if rows is None else messages.Chunk(message).holding(rows)
+            out += messages.HEAD.pack(kind, len(body)) + body
         if seal:
-            out += struct.pack("<QQ", 0, 34) + reader.SEAL + hashlib.sha256(out).digest()
+            out += messages.HEAD.pack(messages.END, 34) + reader.SEAL + hashlib.sha256(out).digest()
         to.write_bytes(out)
         return to
 
-    def chunks(self, entity="", static=None):
+    def chunks(self, entity):
         """Return the numbers of messages that hold rows of entities whose paths begin with `entity`."""
-        out = []
-        for k, message in enumerate(self.messages):
-            if message[0] == 2:
-                path = message[2].schema.metadata[b"rerun:entity_path"].decode().lstrip("/")
-                if path.startswith(entity) and static in (None, bool(message[1].get(7))):
-                    out.append(k)
-        return out
+        return [k for k, (_, _, rows) in enumerate(self.messages) if rows is not None and entity_of(rows).startswith(entity)]
 
     def rows(self, entity, column):
-        """Return where rows of the entity with this column are: (number of the message, row)."""
+        """Return where rows of the entity with this column are, except those for all frames: (number of the message, row)."""
         out = []
-        for k in self.chunks(entity, static=False):
+        for k in self.chunks(entity):
             batch = self.messages[k][2]
-            if column in batch.schema.names:
+            if {column, "frame"} <= {*batch.schema.names}:
                 out += [(k, row) for row in range(batch.num_rows) if batch.column(column)[row].is_valid]
         return out
 
     def set(self, k, **columns):
         """Replace columns given by name, with __ for :. None drops a column."""
-        _, fields, batch = self.messages[k]
+        kind, message, batch = self.messages[k]
         for name, values in columns.items():
             at = batch.schema.get_field_index(name.replace("__", ":"))
             if values is None:
@@ -112,31 +77,29 @@ class Forgery:
                 if not isinstance(values, pa.Array):
                     values = pa.array(values, type=field.type)
                 batch = batch.set_column(at, field, values)
-        self.messages[k] = (2, fields, batch)
+        self.messages[k] = (kind, message, batch)
 
     def only(self, k, rows):
         """Keep these rows of a message; without rows, drop the message."""
-        _, fields, batch = self.messages[k]
+        kind, message, batch = self.messages[k]
         if len(rows):
-            self.messages[k] = (2, fields, batch.take(pa.array(rows)))
+            self.messages[k] = (kind, message, batch.take(pa.array(rows)))
         else:
             del self.messages[k]
 
-    def copy(self, k, rows, before=0, entity=None, static=False, ident=NEVER):
-        """Insert copies of rows, with other ids, before message `before`. Returns the number of the new message."""
-        _, fields, batch = self.messages[k]
+    def copy(self, k, rows, entity=None, static=False):
+        """Insert copies of rows, with ids above all others, before all rows."""
+        kind, message, batch = self.messages[k]
         batch = batch.take(pa.array(rows))
         at = batch.schema.get_field_index("rerun.controls.RowId")
-        ids = [(int(ident, 16) + n).to_bytes(16, "big") for n in range(len(rows))]
+        ids = [(LAST_ID + n).to_bytes(16, "big") for n in range(len(rows))]
         batch = batch.set_column(at, batch.schema.field(at), pa.array(ids, type=batch.schema.field(at).type))
         if entity:
             batch = batch.replace_schema_metadata({**batch.schema.metadata, b"rerun:entity_path": f"/{entity}".encode()})
         if static:
             batch = batch.drop_columns([name for name in ("frame", "time") if name in batch.schema.names])
-            fields = {**fields, 7: 1}
-        place = max(before, 1 + max(n for n, m in enumerate(self.messages) if m[0] == 1))
-        self.messages.insert(place, (2, fields, batch))
-        return place
+            message += bytes([7 << 3, 1])
+        self.messages.insert(1 + max(n for n, m in enumerate(self.messages) if m[0] == 1), (kind, message, batch))
 
     def journal(self, change, seal=True):
         """Replace every journal entry by change(entry), or drop it where that is None. seal: write valid checksums again."""
@@ -181,13 +144,13 @@ def changed(value):
 def pictures(original):
     """Yield names and recordings in which each column of the picture, and each sixth of its layout, has one cell changed.
 
-    In chunks of the scene, rows are also dropped, and others stand before them with later ids, for all frames, or elsewhere.
+    In chunks of the scene, rows are also dropped, or others stand before them with later ids, for all frames, or elsewhere: in
+    each chunk in two of these ways, in turn.
     """
-    for k, (kind, *rest) in enumerate(Forgery(original).messages):
-        entity = kind == 2 and rest[1].schema.metadata[b"rerun:entity_path"].decode().lstrip("/")
-        if not entity or entity == journal.JOURNAL:
+    for k, (_, _, batch) in enumerate(Forgery(original).messages):
+        entity = entity_of(batch) if batch is not None else journal.JOURNAL
+        if entity == journal.JOURNAL:
             continue
-        batch = rest[1]
         for name in [n for n in batch.schema.names if n not in NOT_SHOWN]:
             column = batch.column(name).cast(pa.int64()) if name == "time" else batch.column(name)
             values = column.to_pylist()
@@ -199,14 +162,15 @@ def pictures(original):
             yield f"{entity} {name}", forged
         if "frame" in batch.schema.names and entity.startswith("world/"):
             last, column = batch.num_rows - 1, next(n for n in batch.schema.names if ":" in n).replace(":", "__")
-            for name, method, args, more in (
+            ways = (
                 ("a row less", "only", [range(last)], {}),
                 ("no rows", "only", [[]], {}),
                 ("a column less", "set", [], {column: None}),
                 ("a later row", "copy", [[0]], {}),
                 ("a row for all frames", "copy", [[last]], {"static": True}),
                 ("a row elsewhere", "copy", [[last]], {"entity": f"{entity}/more"}),
-            ):
+            )
+            for name, method, args, more in ways[k % 3 :: 3]:
                 forged = Forgery(original)
                 getattr(forged, method)(k, *args, **more)
                 yield f"{entity} {name}", forged
@@ -232,11 +196,11 @@ def _gone(kind):
 
 def _metadata(f):
     k, _ = f.rows(PARTICLES, "Points2D:positions")[0]
-    _, fields, batch = f.messages[k]
+    kind, message, batch = f.messages[k]
     at = batch.schema.get_field_index("Points2D:positions")
     field = batch.schema.field(at)
     field = field.with_metadata({**field.metadata, b"rerun:component_type": b"rerun.components.Color"})
-    f.messages[k] = (2, fields, batch.set_column(at, field, batch.column(at)))
+    f.messages[k] = (kind, message, batch.set_column(at, field, batch.column(at)))
 
 
 def _reordered(f):
@@ -245,10 +209,8 @@ def _reordered(f):
     f.set(k, **{"rerun.controls.RowId": [ids[0], ids[-1], *ids[2:-1], ids[1]]})
 
 
-def _renamed(part):
-    if isinstance(part, bytes):
-        return part.replace(b"tiverlet_", b"tiverless")
-    return {**part, 1: part[1].replace(b"tiverlet_", b"tiverless")} if isinstance(part, dict) else part
+def _renamed(f):
+    f.messages = [(kind, message.replace(b"tiverlet_", b"tiverless"), rows) for kind, message, rows in f.messages]
 
 
 FORGERIES = {
@@ -257,9 +219,7 @@ FORGERIES = {
     "rows twice": lambda f: f.messages.append(f.messages[f.rows(PARTICLES, "Points2D:positions")[3][0]]),
     "no layout": lambda f: f.messages.__setitem__(slice(None), [m for m in f.messages if m[0] != 3]),
     "a view less": lambda f: f.only(f.chunks("view/")[1], []),
-    "another application": lambda f: f.messages.__setitem__(
-        slice(None), [(m[0], *(_renamed(part) for part in m[1:])) for m in f.messages]
-    ),
+    "another application": _renamed,
     "the environment": _told("scene", lambda d: d["environment"].update(taichi="1.7.5")),
     "the number of threads": _told("scene", lambda d: d["environment"].update(threads=64)),
     "the number of frames": _told("end", lambda d: d.update(frames=d["frames"] + 1)),

@@ -4,7 +4,6 @@ import json
 import os
 import re
 import signal
-import struct
 import subprocess
 import sys
 import time
@@ -19,9 +18,9 @@ from tiverlet.__main__ import main
 from tiverlet.device import ti
 from tiverlet.device.language import NAME, NAMES
 from tiverlet.features import material
-from tiverlet.recording import journal, reader, viewer
+from tiverlet.recording import journal, messages, reader, viewer
 
-from .forging import FORGERIES, PARTICLES, Forgery, packed, pictures, record
+from .forging import FORGERIES, PARTICLES, Forgery, pictures, record
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +64,7 @@ def test_whatever_is_forged_is_named(original, quick, tmp_path):
             continue
         if verdict.kind != ("incomplete" if name == "no end" else "changed"):
             passed[name] = verdict
-    assert not passed and count > 100
+    assert not passed and count > 90
 
 
 @pytest.mark.slow
@@ -114,7 +113,6 @@ def test_recordings_of_other_versions_are_named(rewritten, read_here):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_what_is_cut_short_says_where_it_ends(quick, tmp_path, monkeypatch):
     monkeypatch.setattr("tiverlet.recording.recorder.SMALL", 0)  # many messages, as in a long recording
     original = record(tmp_path / "a.rrd")
@@ -127,11 +125,8 @@ def test_what_is_cut_short_says_where_it_ends(quick, tmp_path, monkeypatch):
         tv.replay(tmp_path / "none.rrd")
 
     # Cut in the middle of every message: everything before it is read, and the text says where that ends.
-    ends, at = [], reader.HEADER
-    while at < len(whole) and (kind := struct.unpack_from("<QQ", whole, at))[0]:
-        at += 16 + kind[1]
-        ends.append(at)
-    seen = set()
+    sizes = [messages.HEAD.size + len(message) for kind, message in messages.split(whole) if kind]
+    ends, seen = (messages.HEADER + np.cumsum(sizes)).tolist(), set()
     for end in ends:
         path.write_bytes(whole[: end - 5])
         try:
@@ -152,7 +147,7 @@ def test_what_is_cut_short_says_where_it_ends(quick, tmp_path, monkeypatch):
     assert missing.kind == "incomplete" and 0 < missing.frames < 7 and missing.of >= 6
     assert f"the first {missing.frames} of {missing.of} frames hold" in str(missing)
     at = ends[len(ends) // 2]
-    path.write_bytes(whole[:at] + struct.pack("<QQ", 2, 1 << 60) + whole[at + 16 :])
+    path.write_bytes(whole[:at] + messages.HEAD.pack(2, 1 << 60) + whole[at + 16 :])
     wrong = tv.replay(path)
     assert not wrong.complete and "a length is wrong" in wrong.text and wrong.verify().kind == "incomplete"
     verdict = tv.replay(Forgery(original).save(path, seal=False)).verify()
@@ -170,7 +165,7 @@ def test_what_is_cut_short_says_where_it_ends(quick, tmp_path, monkeypatch):
             assert "replay: " in str(e), (k, at)
 
 
-def test_a_file_calls_nothing_in_a_script_and_leaves_no_folder(original, rewritten, tmp_path, monkeypatch, capsys):
+def test_a_file_calls_nothing_in_a_script_and_leaves_no_folder(original, rewritten, quick, tmp_path, monkeypatch, capsys):
     victim = tmp_path / "victim"
     victim.write_text("precious")
     (tmp_path / "mine.py").write_text("from pathlib import Path\nfrom subprocess import run\n")
@@ -220,12 +215,13 @@ def test_what_a_file_asks_for_is_bounded(original, rewritten, quick):
 
     # Rows that claim to unpack to 70 GB, and more data than is allowed.
     forged = Forgery(original)
-    _, fields, _ = forged.messages[forged.chunks("world/scene/particles")[0]]
+    message = forged.messages[forged.chunks("world/scene/particles")[0]][1]
+    start, _, end, _ = messages.Chunk(message)._fields[messages.SIZE]
     out = reader.ResultFile(os.open(os.devnull, os.O_WRONLY), 1000)
     taker = reader.Reader(out, False)
-    taker.stores.append(reader.store_of(fields[1]))
+    taker.stores.append(reader.store_of(reader.record(message, "1 2 3 4 5 6 7")[1]))
     with pytest.raises(reader.Damaged, match="unpack to"):
-        taker.chunk(packed({**fields, 2: 2, 3: 1 << 36, 5: b"x" * 5000}))
+        taker.chunk(message[:start] + bytes([messages.SIZE << 3]) + messages._as_varint(1 << 36) + message[end:])
     with pytest.raises(reader.Damaged, match="MB"):
         out.put(b"x" * 1001)
     out.close()

@@ -70,17 +70,26 @@ def page(server, **options):
     return connect(server.url.replace("http", "ws") + "socket", **options)
 
 
-def figures(message: bytes) -> tuple[dict, np.ndarray]:
-    length = int.from_bytes(message[:4], "little")
-    return json.loads(message[4 : 4 + length]), np.frombuffer(message[4 + length :], "<f4")
-
-
 def hear(server, count: int) -> None:
     """Wait until `count` messages have arrived."""
     end = time.monotonic() + 10
     while server.received.qsize() < count and time.monotonic() < end:
         time.sleep(0.005)
     assert server.received.qsize() >= count
+
+
+def refuse(name):
+    raise AssertionError(f"{name} is no JSON")
+
+
+def received(there) -> tuple[list[dict], dict, np.ndarray]:
+    """Return the messages of a page up to the next frame, the figures of this frame, and its numbers. The page shows it."""
+    said = []
+    while isinstance(text := there.recv(timeout=10), str):
+        said.append(json.loads(text, parse_constant=refuse))
+    there.send('{"do": "shown"}')
+    end = 4 + int.from_bytes(text[:4], "little")
+    return said, json.loads(text[4:end], parse_constant=refuse), np.frombuffer(text[end:], "<f4")
 
 
 @pytest.mark.slow
@@ -95,10 +104,9 @@ def test_what_pages_ask_for_is_done_recorded_and_replayed(rope, server, tmp_path
             hear(server, len(messages) + (not came))
             came.append(True)
             live.advance()
-            there.send('{"do": "shown"}')
-            while isinstance(text := there.recv(timeout=10), str):
-                said.append(json.loads(text))
-            return figures(text)
+            new, told, x = received(there)
+            said.extend(new)
+            return told, x
 
         came, said = [], []
         told, x = turn()
@@ -172,15 +180,6 @@ def test_pages_let_go_when_they_go_and_only_of_what_they_hold_and_slow_ones_are_
         with pytest.raises(ValueError, match=words):
             Session(rope, server, record=tmp_path / name)
         assert (tmp_path / name).read_text() == "mine" and not rope._watchers
-
-
-def received(there) -> tuple[list[dict], dict, np.ndarray]:
-    """Return the messages of a page up to the next frame, the figures of this frame, and its numbers. The page shows it."""
-    said = []
-    while isinstance(text := there.recv(timeout=10), str):
-        said.append(json.loads(text))
-    there.send('{"do": "shown"}')
-    return said, *figures(text)
 
 
 def weight(world, g):
@@ -259,13 +258,7 @@ def test_a_scene_that_diverges_is_still_shown(world, server):
     with page(server) as there:
         hear(server, 1)
         live.advance()
-
-        def refuse(name):
-            raise AssertionError(f"{name} is no JSON")
-
-        while isinstance(text := there.recv(timeout=10), str):
-            json.loads(text, parse_constant=refuse)
-        told = json.loads(text[4 : 4 + int.from_bytes(text[:4], "little")], parse_constant=refuse)
+        _, told, _ = received(there)
         assert told["energy"] is None
     live.close()
 
@@ -321,14 +314,18 @@ def test_bodies_and_their_surfaces_are_found(world):
     body = bodies(w)[corners[:, 0]]
     assert areas[body == 0].sum() == pytest.approx(w.features[0].rest[0]) and areas[body == 10].sum() == pytest.approx(1)
     assert set(body.tolist()) == {0, 10} and len(corners) == 8 + 2
-    # A cube of six tetrahedra has twelve faces; a cloth has two triangles per cell.
+    # A cube of six tetrahedra has twelve faces. A cloth with threads, diagonals, and braces over two threads has two triangles
+    # per cell, none missing or doubled. A tetrahedron of links has four.
     cube = np.array([[a, b, c] for a in (0, 1) for b in (0, 1) for c in (0, 1)], dtype=float)
     tets = [[0, a, a + b, 7] for a, b in ((1, 2), (1, 4), (2, 1), (2, 4), (4, 1), (4, 2))]
-    assert len(surfaces.skin(np.array(tets))) == 12
-    sheet = tv.shapes.cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (4, 5))
-    solid = world(tv.Particles(np.concatenate([cube, sheet.position + 5])), [tv.Volume(tets), tv.Distance(sheet.links + 8)])
-    corners = surfaces.triangles(solid)
-    assert (corners < 8).all(axis=1).sum() == 12
+    sheet = tv.shapes.cloth((5, 0, 0), (1, 0, 0), (0, 0, 1), (6, 5))
+    edges = np.concatenate([8 + sheet.links, 8 + sheet.braces, 38 + np.stack(np.triu_indices(4, 1), axis=1)])
+    x = np.concatenate([cube, sheet.position, np.eye(4, 3) + 9])
+    corners = surfaces.triangles(world(tv.Particles(x), [tv.Volume(tets), tv.Distance(edges)]))
+    areas = np.linalg.norm(np.cross(x[corners[:, 1]] - x[corners[:, 0]], x[corners[:, 2]] - x[corners[:, 0]]), axis=1) / 2
+    assert (corners < 8).all(axis=1).sum() == len(surfaces.skin(np.array(tets))) == 12
+    flat = (corners >= 8).all(axis=1) & (corners < 38).all(axis=1)
+    assert flat.sum() == 2 * 5 * 4 and areas[flat].sum() == pytest.approx(1.0) and (corners >= 38).all(axis=1).sum() == 4
 
 
 def test_walls_have_surfaces_that_lie_on_them(world):

@@ -29,33 +29,16 @@ def scene():
 
 
 @pytest.mark.parametrize(
-    "name, words",
-    [
-        ("Space", r"write tv.World\(particles, features\)"),
-        ("Circle", r"write tv.Particles\(position, radius="),
-        ("DampedSpring", r"write tv.Distance\(pairs, rest, compliance=1 / stiffness"),
-        ("Mesh_", "did you mean 'Mesh'"),
-        ("LennardJones", r"write tv.PairForce\(function, radius\)"),
-        ("backend", r"write tv.init\(arch="),
-        ("SoftBody", r"write tv.ShapeMatch\(clusters, compliance="),
-        ("Distnace", "did you mean 'Distance'"),
-    ],
-)
-def test_a_name_of_the_package_is_answered(name, words):
-    with pytest.raises(AttributeError, match=words):
-        getattr(tv, name)
-
-
-@pytest.mark.parametrize(
     "read, words",
     [
+        (lambda w: tv.Space, r"write tv.World\(particles, features\)"),
+        (lambda w: tv.DampedSpring, r"write tv.Distance\(pairs, rest, compliance=1 / stiffness"),
+        (lambda w: tv.backend, r"write tv.init\(arch="),
+        (lambda w: tv.Distnace, "did you mean 'Distance'"),
         (lambda w: w.mass, "write world.particles.mass"),
         (lambda w: w.GetPosition, "did you mean 'position'"),
         (lambda w: w.dt, r"write world.step\(dt\)"),
-        (lambda w: w.apply_force, r"write tv.Force\(function\)"),
-        (lambda w: w.stpe, "did you mean 'step'"),
         (lambda w: w.particles.masses, "did you mean 'mass'"),
-        (lambda w: w.particles.restitution, r"write tv.Contact\(friction=..., restitution="),
         (lambda w: w.features[1].stiffness, "write compliance = 1 / stiffness"),
         (lambda w: w.features[2].forces, "write world.contacts"),
         (lambda w: w.features[3].elasticity, "write restitution"),
@@ -70,7 +53,7 @@ def test_a_name_of_the_package_is_answered(name, words):
         (lambda w: setattr(w.features[1], "stiffness", 5.0), "write compliance = 1 / stiffness. Live are"),
     ],
 )
-def test_an_attribute_is_answered(scene, read, words):
+def test_an_attribute_of_another_name_is_answered(scene, read, words):
     with pytest.raises(AttributeError, match=words):
         read(scene)
 
@@ -78,31 +61,24 @@ def test_an_attribute_is_answered(scene, read, words):
 @pytest.mark.parametrize(
     "call, words",
     [
-        (lambda w: tv.Distance(LINK, stiffness=100.0), "write compliance = 1 / stiffness. It takes pairs, rest, compliance"),
         (lambda w: tv.Distance(LINK, frequencyHz=4.0), "write compliance = 1 / "),
-        (lambda w: tv.Distance(body_a=0, body_b=1), "its first argument has the indices"),
-        (lambda w: tv.Box(*CORNERS, mass=1.0), "walls have no mass"),
+        (lambda w: tv.Distance(body_a=0, body_b=1), "its first argument has the indices .* It takes pairs, rest, compliance"),
         (lambda w: tv.Box(*CORNERS, one_way=(0, 1)), "Capsule, Polygon and Mesh take it"),
         (lambda w: tv.Box(width=2.0, height=1.0), r"write its corners: tv.Box\(lower, upper\)"),
-        (lambda w: tv.Contact(stiffness=1e5), "contacts are rigid"),
         (lambda w: tv.Contact(0.3, 0.5, 0.1), "3 arguments, but 2 without a name; write skin=, groups="),
         (lambda w: tv.Gravity(y=-9.81), r"write tv.Gravity\(\(0, -9.81\)\)"),
         (lambda w: tv.Particles(X, velocities=0.0), "write velocity|did you mean 'velocity'"),
-        (lambda w: tv.Particles(X, density=1000.0), r"write mass=density \* volume"),
-        (lambda w: tv.Particles(X, 0.0), "2 arguments, but 1 without a name; write velocity=, mass="),
         (lambda w: tv.Particles(), "missing a required argument: 'position'"),
         (lambda w: tv.World(w.particles, gravity=(0, -9.81)), "it is a feature"),
-        (lambda w: tv.World(w.particles, device="cuda"), r"write tv.init\(arch="),
         (lambda w: tv.World(w.particles, sub_steps=4), "did you mean 'substeps'"),
         (lambda w: w.step(1 / 60, iterations=4), "write world.substeps = 20 or world.iterations = 4"),
-        (lambda w: w.run(), "missing a required argument: 'seconds'"),
         (lambda w: w.hash(1), "1 arguments, but 0 without a name"),
         (lambda w: tv.init(num_threads=4), "write threads="),
         (lambda w: tv.shapes.rope((0, 0), (1, 0), segments=10), "write points. It takes start, end, points"),
         (lambda w: tv.Jacobi(omega=1.5), "It takes relaxation, loads"),
     ],
 )
-def test_an_argument_is_answered(scene, call, words):
+def test_an_argument_of_another_name_is_answered(scene, call, words):
     with pytest.raises(TypeError, match=words):
         call(scene)
 
