@@ -13,29 +13,39 @@ from ..features.unknown_names import owners_of, suggest
 if TYPE_CHECKING:
     from ..world import World
 
+FLAGS = "changed", "moving", "new_force"  # see Feature
+CHANGED, MOVING, FORCED = range(len(FLAGS))
+
 
 class Knobs:
     """The knobs of the features of one World that stands for `count` worlds.
 
-    Holds the knobs that differ from world to world, the value of each world, and which knobs wait to be uploaded for the next
-    frame. worlds: the worlds from which they were made.
+    Holds the knobs that differ from world to world, with the value of each world, and the FLAGS of each world. Features have
+    those of a world while it is shown; between that, flags say what was assigned for all worlds. worlds: those from which they
+    were made, as many or one.
     """
 
     def __init__(self, features: tuple[Feature, ...], worlds: "list[World]", count: int):
         self.features, self.count = features, count
         self._given = _other_knobs(worlds)  # (feature, knob) -> the value of each world
-        self._waiting = [[_flags(f) for f in world.features] for world in worlds]  # flags per world, for frame 1
-        self._set: dict[int, np.ndarray] = {}  # feature -> mask of the worlds in which set() changed its knobs
-        self._forced: set[Feature] = set()  # those of these features whose force changed
-        for f, *each in zip(features, *self._waiting, strict=True):
-            changed, moving, new_force = (any(flags) for flags in zip(*each, strict=True))
-            _set_flags(f, (changed, moving, new_force))
+        self._flags = np.repeat([_flags(world.features) for world in worlds], count // len(worlds), axis=0)
+        self._several = len(worlds) > 1  # and their flags are those of other worlds, with other data
+        self._hide_flags()
 
-    def forget_assigned(self) -> None:
-        """Drop values per world of knobs that were assigned for all worlds since."""
+    def take_assigned(self) -> None:
+        """Take over knobs that were assigned for all worlds since, in place of values per world."""
         for i, name in [*self._given]:
             if vars(self.features[i])[name] is not self._given[i, name]:
                 del self._given[i, name]
+        self._flags |= _flags(self.features)
+        self._hide_flags()
+
+    def _hide_flags(self) -> None:
+        self._set_flags(np.zeros((len(self.features), len(FLAGS)), dtype=bool))
+
+    def _set_flags(self, flags: np.ndarray) -> None:
+        for f, each in zip(self.features, flags.tolist(), strict=True):
+            f.changed, f.moving, f.new_force = each
 
     def show(self, k: int | None) -> None:
         """Give features the knobs of world k; None: those of all worlds, as the user sees them."""
@@ -44,17 +54,20 @@ class Knobs:
 
     @contextlib.contextmanager
     def shown(self, k: int) -> Iterator[None]:
-        """Give features the knobs of world k while the context lasts."""
+        """Give features the knobs and flags of world k while the context lasts, and note the flags at its end."""
         self.show(k)
+        self._set_flags(self._flags[k])
         try:
             yield
         finally:
+            self._flags[k] = _flags(self.features)
+            self._hide_flags()
             self.show(None)
 
     def set(self, i: int, chosen: np.ndarray, knobs: dict[str, Any]) -> None:
         """Set knobs of feature i in the chosen worlds, see Worlds.set()."""
         f = self.features[i]
-        self.forget_assigned()
+        self.take_assigned()
         for name, values in knobs.items():
             if name not in knobs_of(type(f)):
                 live = ", ".join(knobs_of(type(f))) or "nothing"
@@ -82,10 +95,8 @@ class Knobs:
                     error.add_note(f"That is what Worlds.set was given for world {k}.")
                 raise
             vars(f)[name] = self._given[i, name] = together
-            mask = self._set.setdefault(i, np.zeros(self.count, dtype=bool))
-            mask[chosen] = True
-            if knob.force:
-                self._forced.add(f)
+            self._flags[chosen, i, CHANGED] = True
+            self._flags[chosen, i, FORCED] |= knob.force
 
     def check_kernels(self) -> None:
         """Raise ValueError if a knob that was assigned for all worlds needs other kernels; for the world that is shown."""
@@ -93,70 +104,39 @@ class Knobs:
             if f.changed and f.needs_other_kernels:
                 _refuse_other_kernels(f)
 
-    def has_nothing_to_upload(self) -> bool:
-        """Whether no knob waits to be uploaded."""
-        if self._set or any(f.changed or f.moving for f in self.features):
-            return False
-        self._waiting = []  # no flag of the original worlds waits either
-        return True
+    @property
+    def waiting(self) -> Any:
+        """Which worlds have a knob that waits to be uploaded, or a target that has moved in the last frame, (worlds,)."""
+        return self._flags[..., :FORCED].any(axis=(1, 2))
+
+    def has_changed(self, feature: Feature) -> np.ndarray:
+        """Return in which worlds a knob of a feature waits, (worlds,)."""
+        return self._flags[:, self.features.index(feature), CHANGED]
+
+    @property
+    def any_moves(self) -> bool:
+        """Whether a target moves in the coming frame, in any world."""
+        return bool(self._flags[..., MOVING].any())
 
     def upload_to_all(self) -> bool:
         """Upload the knobs of all worlds at once if features can. Returns False if each world has to be uploaded by itself."""
-        changed = [f for i, f in enumerate(self.features) if f.changed or i in self._set]
-        able = all(f.uploads_all and not f.new_force and f not in self._forced for f in changed)
-        able = able and all(f.uploads_all for f in self.features if f.moving) and len(self._waiting) <= 1
-        stacked = [values for (i, _), values in self._given.items() if self.features[i] in changed]
-        if not able or any(not isinstance(values, np.ndarray) or values.dtype == object for values in stacked):
+        several, self._several = self._several, False
+        changed, moving, forced = np.any(self._flags, axis=0).T  # (features,)
+        values = [values for (i, _), values in self._given.items() if changed[i]]
+        stacked = all(isinstance(v, np.ndarray) and v.dtype != object for v in values)
+        if several or not stacked or forced.any() or not all(f.uploads_all for f in self._some(changed | moving)):
             return False
-        self._set, self._waiting = {}, []
-        for f in self.features:
-            if f.moving:
-                f.moving = False
-                f.end_motion()
-        for f in changed:
-            f.changed = False
+        for f in self._some(moving):
+            f.end_motion()
+        for f in self._some(changed):
             f.upload()
+        self._flags[..., MOVING] = self._flags[..., CHANGED] & [f.moving for f in self.features]
+        self._flags[..., CHANGED] = False
+        self._hide_flags()
         return True
 
-    @property
-    def changed_worlds(self) -> np.ndarray:
-        """The worlds in which a knob has another value than in the last frame, a mask."""
-        if len(self._waiting) > 1 or any(f.changed for f in self.features):
-            return np.ones(self.count, dtype=bool)
-        return np.any([np.zeros(self.count, dtype=bool), *self._set.values()], axis=0)
-
-    def waiting_mask(self, feature: Feature) -> np.ndarray:
-        """Return the mask of the worlds in which a knob of a feature waits."""
-        of = self._set.get(self.features.index(feature), np.zeros(self.count, dtype=bool))
-        return of | feature.changed
-
-    @property
-    def waiting_worlds(self) -> np.ndarray:
-        """The numbers of the worlds in which a knob waits or a target moves."""
-        if len(self._waiting) > 1 or any(f.changed or f.moving for f in self.features):
-            return np.arange(self.count)
-        return np.flatnonzero(np.any([*self._set.values()], axis=0))
-
-    def note_uploaded(self, moving: list[bool]) -> None:
-        """Note that each world was uploaded by itself. moving: for each feature, whether a target moves in any world."""
-        self._set, self._waiting = {}, []
-        self._forced.clear()
-        for f, still in zip(self.features, moving, strict=True):
-            _set_flags(f, (False, still, False))
-
-    @contextlib.contextmanager
-    def flagged(self, k: Any) -> Iterator[None]:
-        """Set the flags of features to those of world k while the context lasts."""
-        common = [_flags(f) for f in self.features]
-        own = self._waiting[k] if len(self._waiting) > 1 else common
-        for i, (f, (changed, moving, new_force)) in enumerate(zip(self.features, own, strict=True)):
-            changed = changed or (i in self._set and bool(self._set[i][k]))
-            _set_flags(f, (changed, moving, new_force or (changed and f in self._forced)))
-        try:
-            yield
-        finally:
-            for f, flags in zip(self.features, common, strict=True):
-                _set_flags(f, flags)
+    def _some(self, chosen: Any) -> list[Feature]:
+        return [f for f, some in zip(self.features, chosen, strict=True) if some]
 
 
 def _check_fits(feature: Feature, name: str, value: Any) -> None:
@@ -176,13 +156,9 @@ def _refuse_other_kernels(feature: Feature) -> None:
     )
 
 
-def _flags(feature: Feature) -> tuple[bool, bool, bool]:
-    """Return the flags of a feature: what waits in it to be uploaded."""
-    return feature.changed, feature.moving, feature.new_force
-
-
-def _set_flags(feature: Feature, flags: tuple[bool, bool, bool]) -> None:
-    feature.changed, feature.moving, feature.new_force = flags
+def _flags(features: tuple[Feature, ...]) -> np.ndarray:
+    """Return the flags of features, (features, FLAGS)."""
+    return np.array([(f.changed, f.moving, f.new_force) for f in features], dtype=bool).reshape(-1, len(FLAGS))
 
 
 def _other_knobs(worlds: "list[World]") -> dict[tuple[int, str], Any]:

@@ -89,10 +89,10 @@ class Worlds:
                     memory.copy_to_all()
                 self._clocks = Clocks([self._clocks.of(0)] * count)
             self._knobs = Knobs(self._world.features, sources, count)
-            self._deselect()
+            self._runner.memory.choose(None)
+            self._knobs.show(None)
         self._copies.closed = True
         self._last: WorldsReport | None = None
-        self._turned = np.zeros(len(self), dtype=bool)  # worlds whose knobs changed before the last frame
         self._start: _Start | None = None  # the state for reset(); set by the first step
 
     def _take(self, k: int, world: World) -> None:
@@ -113,7 +113,7 @@ class Worlds:
         """Make fields those of all worlds, and delay signals, while the context lasts."""
         with deferred_signals, self._copies.all():
             self._runner.memory.check()
-            self._knobs.forget_assigned()
+            self._knobs.take_assigned()
             yield
 
     @property
@@ -121,11 +121,6 @@ class Worlds:
         """The kernels for many worlds; other objects after a list has grown."""
         assert self._runner.frames
         return self._runner.frames
-
-    def _deselect(self) -> None:
-        """Choose no world."""
-        self._runner.memory.choose(None)
-        self._knobs.show(None)
 
     @contextlib.contextmanager
     def _as_world(self, k: Any) -> Iterator[World]:
@@ -136,12 +131,12 @@ class Worlds:
         runner.set_multipliers_per_newton()
         if self._sources:
             self._sources[k].put_on(world)
-        self._knobs.show(k)
-        try:
-            yield world
-        finally:
-            self._clocks.put(k, world._clock)
-            self._deselect()
+        with self._knobs.shown(k):
+            try:
+                yield world
+            finally:
+                self._clocks.put(k, world._clock)
+                runner.memory.choose(None)
 
     # The step.
 
@@ -195,7 +190,7 @@ class Worlds:
                     moved, released = self._begin(dt)
                     # A target moves during one frame, then the host ends the motion: launch that frame alone. The host stiffens
                     # soft links between frames, too.
-                    alone = self._runner.ramping or any(f.moving for f in world.features) or (self._clocks.softness > 1).any()
+                    alone = self._runner.ramping or self._knobs.any_moves or (self._clocks.softness > 1).any()
                     some = 1 if alone else min(at_once, frames - done)
                     report = self._launch(dt, some, moved, released, every, track, done)
                 worst, done = report if worst is None else worst.worse(report), done + some
@@ -211,7 +206,7 @@ class Worlds:
         """
         world, runner, clocks = self._world, self._runner, self._clocks
         for drag in runner.drags:
-            clocks.needs_drag |= self._knobs.waiting_mask(drag)
+            clocks.needs_drag |= self._knobs.has_changed(drag)
         self._upload()
         h = dt / world.substeps * runner.integrator.first
         ready = (clocks.first_moved == NONE) & (clocks.h == h) & ~clocks.needs_drag
@@ -238,26 +233,19 @@ class Worlds:
 
     def _upload(self) -> None:
         """Write knobs to the device: those assigned for all worlds, and those set for some."""
-        world, features, knobs = self._world, self._world.features, self._knobs
-        if knobs.has_nothing_to_upload():
+        waiting = self._knobs.waiting
+        if not waiting.any():
             return
-        turned = knobs.changed_worlds
-        # Targets move only in worlds whose knobs changed before the last frame.
-        works = np.where(turned | (self._turned & any(f.moving for f in features)), CHANGED, self._clocks.bound)
-        self._turned = turned
         with self._as_world(0):
-            knobs.check_kernels()
-        if knobs.upload_to_all():
+            self._knobs.check_kernels()
+        if self._knobs.upload_to_all():
+            self._clocks.bound[waiting] = CHANGED
             self._runner.find_ramps()
-        else:
-            still = np.zeros(len(features), dtype=bool)
-            for k in knobs.waiting_worlds:
-                with self._as_world(k), knobs.flagged(k):
-                    world._find_stiffened()
-                    world._upload_parameters()
-                    still |= [f.moving for f in features]
-            knobs.note_uploaded(still.tolist())
-        self._clocks.bound = works
+            return
+        for k in np.flatnonzero(waiting):
+            with self._as_world(k) as world:
+                world._find_stiffened()
+                world._upload_parameters()
 
     def _launch(
         self, dt: float, frames: int, moved: np.ndarray, released: np.ndarray, every: int = 0, track: np.ndarray | None = None,
@@ -436,7 +424,7 @@ class Worlds:
         if not -len(self) <= k < len(self):
             raise IndexError(f"Worlds: world {k}, but there are {len(self)} (0 ... {len(self) - 1}).")
         k = range(len(self))[k]
-        with self._open(), self._as_world(k) as world, self._knobs.flagged(k):
+        with self._open(), self._as_world(k) as world:
             self._knobs.check_kernels()
             return world.clone(path="auto")
 
