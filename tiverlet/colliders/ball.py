@@ -1,19 +1,20 @@
 """A ball with particles outside, or inside."""
 
+from types import MappingProxyType
+
 import numpy as np
 
 from .. import checks
 from ..checks import ArrayLike
 from ..device import inline, ti
 from ..features.arguments import shifted
-from ..features.feature import Knob, Scene
+from ..features.feature import Knob
 from ..geometry.intervals import ball, entry, exit_of, rounding
 from ..geometry.nearest import surface_normal
 from ..particles import Particles
 from .collider import Collider
 from .round_mesh import rounded
 from .surface import ALONG, FRICTIONLESS, NEAR, TOUCH
-from .track import Track
 
 
 class Ball(Collider):
@@ -37,6 +38,7 @@ class Ball(Collider):
     )
 
     shares_code = True
+    tracks = MappingProxyType({"center": None})
     radius = Knob(lambda f, v: f._size(v), "Of the ball [m].", device="size")
     widest = 0.0  # radius of a particle [m]
 
@@ -73,24 +75,6 @@ class Ball(Collider):
         """
         return self.inside and (self.dev.surface.has_friction or self.dev.surface.has_restitution)
 
-    def bind(self, scene: Scene) -> None:
-        """Declare the center at the start and the end of a frame, and the radius."""
-        Collider.bind(self, scene)
-        self.dev.center = Track(scene.memory, "Ball.center", self.center)
-        self.dev.size = scene.memory.field("Ball.radius", None, values=self.radius)
-        self.changed = False
-
-    def upload(self) -> None:
-        """Move to the new center in the next frame."""
-        Collider.upload(self)
-        self.scene.memory.write(self.dev.size, self.radius)
-        self.dev.center.set_target(self.center)
-        self.moving = True
-
-    def end_motion(self) -> None:
-        """Stay at the last center."""
-        self.dev.center.end_motion()
-
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """Return a circle in 2D, three circles in 3D."""
         turn = np.linspace(0, 2 * np.pi, 65)
@@ -111,22 +95,17 @@ class Ball(Collider):
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """Return |x - center| - R outside, the opposite inside."""
-        gap = np.linalg.norm(points - self._middle, axis=1) - self.radius
+        gap = np.linalg.norm(points - self.place_of("center"), axis=1) - self.radius
         return -gap if self.inside else gap
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the distances into the ball, or out of it, and the normals there."""
-        center = self._middle
+        center = self.place_of("center")
         way = ball(origin, direction, center, self.radius + (-radius if self.inside else radius))
         close = rounding(origin, center[None])
         distance = exit_of(way, close) if self.inside else entry(way, close)
         r = origin + np.where(distance < np.inf, distance, np.nan)[:, None] * direction - center
         return distance, surface_normal(-r if self.inside else r, np.zeros_like(r), direction, np.zeros_like(r), close)
-
-    @property
-    def _middle(self) -> np.ndarray:
-        """The present center [m]."""
-        return self.center if self.scene is None else self.dev.center.now
 
     @property
     def has_bounds(self) -> bool:
@@ -141,7 +120,7 @@ class Ball(Collider):
     @ti.func
     def bounds(self):
         """Return the corners of the box around the ball at the start and the end of the frame."""
-        a, b, r = self.dev.center.ends[0], self.dev.center.ends[1], ti.cast(self.radius, self.dev.real)
+        a, b, r = self.dev.center.ends[0], self.dev.center.ends[1], self.own()
         return ti.min(a, b) - r, ti.max(a, b) + r
 
     sides = 1  # type: ignore[assignment]
@@ -150,7 +129,7 @@ class Ball(Collider):
     @ti.func
     def least_gap(self, face, i, radius):
         """Return the gap at the last center, less how far it moves."""
-        depth, _n = self.nearest(self.dev.state.nearest(self.dev.state.place(i) - self.dev.center.ends[1]), self.own(), radius)
+        depth, _n = self.nearest(self.dev.state.nearest(self.dev.state.place(i) - self.dev.center.ends[1]), radius)
         return -depth - (self.dev.center.ends[1] - self.dev.center.ends[0]).norm()
 
     @inline
@@ -159,19 +138,14 @@ class Ball(Collider):
         return ti.cast(self.radius, self.dev.real)
 
     @ti.func
-    def start_gap(self, face, i, radius, frame_fraction):
+    def gap(self, face, i, radius, frame_fraction, at_start: ti.template()):  # type: ignore[valid-type]
         """Return the gap to the ball."""
-        r = self.dev.state.nearest(self.dev.state.place(i) - self.dev.center.at(frame_fraction[0])) - self.dev.state.d[i]
-        depth, n = self.nearest(r, self.own(), radius)
+        r = self.dev.state.nearest(self.dev.state.place(i) - self.dev.center.at(frame_fraction[ti.static(0 if at_start else 1)]))
+        if ti.static(at_start):
+            r -= self.dev.state.d[i]
+        depth, n = self.nearest(r, radius)
         bend = ti.static(-1 if self.inside else 1) / ti.max(r.norm(), self.own() * TOUCH)
         return -depth, n, bend, self.dev.center.step(frame_fraction)
-
-    @ti.func
-    def end_gap(self, face, i, radius, frame_fraction):
-        """Return the gap to the ball."""
-        r = self.dev.state.nearest(self.dev.state.place(i) - self.dev.center.at(frame_fraction[1]))
-        depth, n = self.nearest(r, self.own(), radius)
-        return -depth, n
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, mode):
@@ -181,12 +155,12 @@ class Ball(Collider):
         """
         center, moved = self.dev.center.at(frame_fraction[1]), self.dev.center.step(frame_fraction)
         r = self.dev.state.nearest(self.dev.state.place(i) - center)
-        own = ti.cast(self.radius, self.dev.real)
-        depth, n = self.nearest(r, own, radius)
+        own = self.own()
+        depth, n = self.nearest(r, radius)
         d = self.dev.surface.path(i, moved)
         start = r - d
         slides = False
-        start_depth, first = self.nearest(start, own, radius)
+        start_depth, first = self.nearest(start, radius)
         if ti.static(not self.inside):
             contact_distance = own + radius
             c, b, a = start.dot(start) - contact_distance * contact_distance, start.dot(d), d.dot(d)
@@ -211,13 +185,13 @@ class Ball(Collider):
         self.dev.surface.push(i, depth, start_depth, n, moved, h, mode, slides)
 
     @ti.func
-    def nearest(self, r, own, radius):
+    def nearest(self, r, radius):
         """Return depth in the surface and its normal at r from the center; a particle at the center moves along +x."""
         length, n = r.norm(), 0 * r
         n[0] = 1
         if length > 0:
             n = r / length
-        depth = own + radius - length
+        depth = self.own() + radius - length
         if ti.static(self.inside):
-            depth, n = length + radius - own, -n
+            depth, n = length + radius - self.own(), -n
         return depth, n

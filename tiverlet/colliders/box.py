@@ -87,19 +87,17 @@ class Box(Collider):
 
     def bind(self, scene: Scene) -> None:
         """Declare the corners at the start and the end of a frame."""
-        Collider.bind(self, scene)
+        super().bind(scene)
         sides = np.concatenate([self.lower, self.upper])
         self.dev.sides = scene.memory.field("Box.sides", len(sides), width=2, values=np.stack([sides, sides], 1), state=True)
         self.dev.now = scene.memory.field("Box.sides_now", len(sides), width=2)  # the plane, and its motion in the substep
-        self.changed = False
 
     def upload(self) -> None:
         """Move from the last corners to the new ones in the next frame."""
-        Collider.upload(self)
+        super().upload()
         old, new = self.scene.memory.read(self.dev.sides)[:, 1], np.concatenate([self.lower, self.upper])
         jump = np.isinf(old) | np.isinf(new)
         self.scene.memory.write(self.dev.sides, np.stack([np.where(jump, new, old), new], axis=1))
-        self.moving = True
 
     def end_motion(self) -> None:
         """Stay at the last corners."""
@@ -197,22 +195,18 @@ class Box(Collider):
         return ti.min(self.height(axis, sign, x, a), self.height(axis, sign, x, b)) - radius
 
     @ti.func
-    def start_gap(self, face, i, radius, frame_fraction):
+    def gap(self, face, i, radius, frame_fraction, at_start: ti.template()):  # type: ignore[valid-type]
         """Return the gap to a side."""
         axis, sign = self.side(face)
         n, now = self.normal(axis, sign), self.dev.now[face]
-        gap = self.height(axis, sign, self.dev.state.place(i), now[0]) - n.dot(self.dev.state.d[i]) + sign * now[1] - radius
-        return gap, n, 0 * gap, now[1] * sign * n
-
-    @ti.func
-    def end_gap(self, face, i, radius, frame_fraction):
-        """Return the gap to a side."""
-        axis, sign = self.side(face)
-        return self.height(axis, sign, self.dev.state.place(i), self.dev.now[face][0]) - radius, self.normal(axis, sign)
+        gap = self.height(axis, sign, self.dev.state.place(i), now[0])
+        if ti.static(at_start):
+            gap = gap - n.dot(self.dev.state.d[i]) + sign * now[1]
+        return gap - radius, n, 0 * gap, now[1] * sign * n
 
     @ti.func
     def may_touch(self, i, radius):
-        """Return 1 if push_without_slide() may have something to do, else 0."""
+        """Return 1 if push() may have something to do, else 0."""
         out, x, close = 0, self.dev.state.place(i), self.dev.state.digits(i)
         for k in ti.static(range(self.dim)):
             out |= ti.cast(self.dev.now[k][0] + radius - x[k] > -close, ti.i32)
@@ -224,11 +218,11 @@ class Box(Collider):
         """Press the particle at two planes per axis, lower ones first."""
         if self.may_touch(i, radius) != 0:
             for side in range(ti.static(2 * self.dim)):
-                wall, shift, x = self.dev.now[side][0], self.dev.now[side][1], self.dev.state.place(i)
-                n, moved, depth = ti.zero(x), ti.zero(x), ti.zero(wall)
+                axis, sign = self.side(side)
+                wall, x = self.dev.now[side][0], self.dev.state.place(i)
+                n, depth = self.normal(axis, sign), ti.zero(wall)
+                moved = self.dev.now[side][1] * abs(n)
                 for k in ti.static(range(self.dim)):
-                    if side == k:
-                        n[k], moved[k], depth = 1, shift, wall + radius - x[k]
-                    elif side == k + self.dim:
-                        n[k], moved[k], depth = -1, shift, x[k] + radius - wall
-                self.dev.surface.push_without_slide(i, depth, depth + self.dev.surface.path(i, moved).dot(n), n, moved, h, mode)
+                    if k == axis:
+                        depth = ti.select(sign > 0, wall + radius - x[k], x[k] + radius - wall)
+                self.dev.surface.push(i, depth, depth + self.dev.surface.path(i, moved).dot(n), n, moved, h, mode, False)

@@ -1,19 +1,20 @@
 """A rod with round ends."""
 
+from types import MappingProxyType
+
 import numpy as np
 
 from .. import checks
 from ..checks import ArrayLike
 from ..device import inline, ti
 from ..features.arguments import shifted
-from ..features.feature import Knob, Scene
+from ..features.feature import Knob
 from ..geometry.intervals import capsule, entry, rounding
 from ..geometry.nearest import closest_segment_point, surface_normal
 from ..particles import Particles
 from .collider import Collider
 from .round_mesh import rounded
 from .surface import TOUCH
-from .track import Track
 
 SHORT = 1e-30  # square of the length of an axis that has no direction, as where both ends have moved to one place [m^2]
 STEPS = 64  # most steps along a path; each at least halves what is left of one that grazes the rod
@@ -40,6 +41,7 @@ class Capsule(Collider):
 
     code_size = 0.6
     shares_code = has_bounds = True
+    tracks = MappingProxyType({"a": None, "b": None})
     a, b = _end("a"), _end("b")
     radius = Knob(lambda f, v: checks.number("Capsule", "radius", v, above=0.0), "Of the rod [m].", device="size")
 
@@ -56,26 +58,6 @@ class Capsule(Collider):
         self._keep(dim=particles.dim)
         self.a, self.b = self.a, self.b
 
-    def bind(self, scene: Scene) -> None:
-        """Declare the ends at the start and the end of a frame, and the radius."""
-        Collider.bind(self, scene)
-        self.dev.size = scene.memory.field("Capsule.radius", None, values=self.radius)
-        self.dev.a, self.dev.b = Track(scene.memory, "Capsule.a", self.a), Track(scene.memory, "Capsule.b", self.b)
-        self.changed = False
-
-    def upload(self) -> None:
-        """Move to the new ends in the next frame."""
-        Collider.upload(self)
-        self.scene.memory.write(self.dev.size, self.radius)
-        self.dev.a.set_target(self.a)
-        self.dev.b.set_target(self.b)
-        self.moving = True
-
-    def end_motion(self) -> None:
-        """Stay at the last ends."""
-        self.dev.a.end_motion()
-        self.dev.b.end_motion()
-
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the axis, as thick as the rod."""
         return np.array([[self.a, self.b]]), self.radius
@@ -86,21 +68,16 @@ class Capsule(Collider):
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """Return the distance to the axis, less the radius."""
-        a, b = self._ends
+        a, b = self.place_of("a"), self.place_of("b")
         return np.linalg.norm(points - closest_segment_point(points, a[None], b[None])[0], axis=1) - self.radius
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the distances into the rod, and the normals there."""
-        a, b = (np.broadcast_to(end, origin.shape) for end in self._ends)
+        a, b = (np.broadcast_to(end, origin.shape) for end in (self.place_of("a"), self.place_of("b")))
         close = rounding(origin, a, b)
         distance = entry(capsule(origin, direction, a, b, self.radius + radius), close)
         x = origin + np.where(distance < np.inf, distance, np.nan)[:, None] * direction
         return distance, surface_normal(x, closest_segment_point(x, a, b)[0], direction, b - a, close)
-
-    @property
-    def _ends(self) -> tuple[np.ndarray, np.ndarray]:
-        """The present ends a and b [m]."""
-        return (self.a, self.b) if self.scene is None else (self.dev.a.now, self.dev.b.now)
 
     @ti.func
     def nearest(self, x, a, b):
@@ -159,34 +136,26 @@ class Capsule(Collider):
         return ti.cast(self.radius, self.dev.real) + radius
 
     @ti.func
-    def start_gap(self, face, i, radius, frame_fraction):
+    def gap(self, face, i, radius, frame_fraction, at_start: ti.template()):  # type: ignore[valid-type]
         """Return the gap to the rod. Beside the axis it is flat, but for the corners of the cap that end in the substep."""
-        a, b = self.dev.a.at(frame_fraction[0]), self.dev.b.at(frame_fraction[0])
-        x = self.dev.state.around(self.dev.state.place(i), (a + b) / 2) - self.dev.state.d[i]
+        when = frame_fraction[ti.static(0 if at_start else 1)]
+        a, b = self.dev.a.at(when), self.dev.b.at(when)
+        x = self.dev.state.around(self.dev.state.place(i), (a + b) / 2)
+        if ti.static(at_start):
+            x -= self.dev.state.d[i]
         t, length, n = self.nearest(x, a, b)
         bend = 1 / ti.max(length, self.reach(radius) * TOUCH)
         if ti.static(self.dim == 2):
             bend = ti.select(0 < t < 1, 0 * length, bend)
-        return (
-            length - self.reach(radius),
-            n,
-            bend,
-            self.dev.a.step(frame_fraction) * (1 - t) + self.dev.b.step(frame_fraction) * t,
-        )
-
-    @ti.func
-    def end_gap(self, face, i, radius, frame_fraction):
-        """Return the gap to the rod."""
-        a, b = self.dev.a.at(frame_fraction[1]), self.dev.b.at(frame_fraction[1])
-        _t, length, n = self.nearest(self.dev.state.around(self.dev.state.place(i), (a + b) / 2), a, b)
-        return length - self.reach(radius), n
+        moved = self.dev.a.step(frame_fraction) * (1 - t) + self.dev.b.step(frame_fraction) * t
+        return length - self.reach(radius), n, bend, moved
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, mode):
         """Press the particle at the surface where it was met, or where it is nearest."""
         a, b = self.dev.a.at(frame_fraction[1]), self.dev.b.at(frame_fraction[1])
         a_moved, b_moved = self.dev.a.step(frame_fraction), self.dev.b.step(frame_fraction)
-        middle, contact_distance = (a + b) / 2, ti.cast(self.radius, self.dev.real) + radius
+        middle, contact_distance = (a + b) / 2, self.reach(radius)
         x = self.dev.state.around(self.dev.state.place(i), middle)
         t, length, n = self.nearest(x, a, b)
         depth = contact_distance - length
@@ -222,4 +191,4 @@ class Capsule(Collider):
                             n, depth = m, (s - 1) * d.dot(m)
                     s = further
             if not self.dev.surface.lets_through(i, n, start_depth, contact_distance):
-                self.dev.surface.push_without_slide(i, depth, start_depth, n, moved, h, mode)
+                self.dev.surface.push(i, depth, start_depth, n, moved, h, mode, False)

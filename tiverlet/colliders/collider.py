@@ -1,26 +1,33 @@
 """The contract of all colliders: walls that particles stay outside of, or inside."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from .. import checks
 from ..device import ti
+from ..features.arguments import knobs_of
 from ..features.feature import Feature, Knob, Scene
-from ..features.material import Bounce, as_given, friction_of, is_elastic, restitution_of
+from ..features.material import Bounce, Coefficients, as_given, friction_of, is_elastic, restitution_of
 from ..features.regrouping import Regrouping
 from .surface import Surface
+from .track import Track
 from .wall_log import WallLog
 
 
 class Collider(Feature):
     """Keeps each particle on one side of a wall, as the last correction in every iteration.
 
-    Subclasses implement confine(), which finds how deep a particle is and calls dev.surface.push_without_slide() of the Surface
-    that each holds; and for host queries, clearance() and cast(). One-sided: depth that was gained in this substep is removed
-    completely, at any speed, whether it came from motion, constraints, contacts, friction or a bounce off another wall. Earlier
-    depth (a bad start) is removed at `push_out` [m/s], and gives no more velocity than that. None, the default: 1 m/s, and among
-    contacts a quarter of the radius in a substep, without velocity.
+    Subclasses implement confine(), which finds how deep a particle is and calls dev.surface.push() of the Surface that each
+    holds; gap() and least_gap(), by which contacts meet its faces; and for host queries, clearance() and cast(). One-sided: depth
+    that was gained in this substep is removed completely, at any speed, whether it came from motion, constraints, contacts,
+    friction or a bounce off another wall. Earlier depth (a bad start) is removed at `push_out` [m/s], and gives no more velocity
+    than that. None, the default: 1 m/s, and among contacts a quarter of the radius in a substep, without velocity.
+
+    tracks: its knobs that are places, and the types of their numbers, None for that of the world. Each is a Track on the device,
+    by its name: an assigned place is reached in the next frame.
 
     Where one correction may push a particle into a wall again, corrections are repeated until none changes anything. The first
     rounds include friction and bounces; later rounds are projections of the displacement, which add no energy. A particle that is
@@ -39,6 +46,7 @@ class Collider(Feature):
     compiled_for = ("has_friction", "has_restitution", "has_switch", "has_surface_velocity", "turns")
     host_only = ("widest",)
     for_users = ("clearance",)
+    tracks: Mapping[str, Any] = MappingProxyType({})
     one_way: Any = None  # unit vector along which particles pass
     _switch = False  # whether `active` was given
     needs_start_position = False  # needs the exact position at the start of the substep
@@ -58,15 +66,10 @@ class Collider(Feature):
         self.friction, self.restitution, self.push_out, self.events = friction, restitution, push_out, events
         self.surface_velocity = surface_velocity
         if one_way is not None:
-            self.one_way = self._direction(one_way, dim)
+            self.one_way = checks.direction(checks.vector(repr(self), "one_way", one_way, dim))
+            if not self.one_way.any():
+                raise ValueError(f"{self!r}: one_way = 0 has no direction; {(0, 1, 0)[:dim]} lets particles pass upwards.")
         self._switch, self.active = active is not None, True if active is None else active
-
-    def _direction(self, one_way: Any, dim: int) -> np.ndarray:
-        """Return one_way, checked, as a unit vector."""
-        way = checks.direction(checks.vector(repr(self), "one_way", one_way, dim))
-        if not way.any():
-            raise ValueError(f"{self!r}: one_way = 0 has no direction; {(0, 1, 0)[:dim]} lets particles pass upwards.")
-        return way
 
     @property
     def conserves(self) -> bool:
@@ -76,20 +79,18 @@ class Collider(Feature):
     @property
     def has_friction(self) -> bool:
         """Whether there is friction, or was when kernels were compiled."""
-        return (
-            self.turns or friction_of(repr(self), "friction", self.friction).static > 0 or "has_friction" in self.compiled_so_far
-        )
+        return self.turns or self.coefficients.static > 0 or "has_friction" in self.compiled_so_far
 
     @property
     def has_restitution(self) -> bool:
         """Whether there is restitution, or was when kernels were compiled."""
-        return self._bounce.normal > 0 or "has_restitution" in self.compiled_so_far
+        return self.bounce.normal > 0 or "has_restitution" in self.compiled_so_far
 
     @property
     def turns(self) -> bool:
         """Whether it resists rolling, or bounces across the normal, or did when kernels were compiled."""
-        rub = friction_of(repr(self), "friction", self.friction)
-        return max(rub.rolling, rub.twisting, self._bounce.tangential) > 0 or "turns" in self.compiled_so_far
+        rub = self.coefficients
+        return max(rub.rolling, rub.twisting, self.bounce.tangential) > 0 or "turns" in self.compiled_so_far
 
     @property
     def has_surface_velocity(self) -> bool:
@@ -102,7 +103,13 @@ class Collider(Feature):
         return self.surface_velocity is not None and bool(self.surface_velocity.any())
 
     @property
-    def _bounce(self) -> Bounce:
+    def coefficients(self) -> Coefficients:
+        """The coefficients of friction."""
+        return friction_of(repr(self), "friction", self.friction)
+
+    @property
+    def bounce(self) -> Bounce:
+        """The coefficients of restitution."""
         return restitution_of(repr(self), "restitution", self.restitution)
 
     @property
@@ -137,31 +144,46 @@ class Collider(Feature):
         raise NotImplementedError
 
     def bind(self, scene: Scene) -> None:
-        """Store the state, and make the surface."""
+        """Store the state, make the surface, and declare tracks and the knobs that kernels read."""
         self.scene = scene
         self.dev.state = scene.state
         self.dev.real = scene.real
-        both = friction_of(repr(self), "friction", self.friction) if self.has_friction else None
-        restitution, active = self._bounce if self.has_restitution else None, self.active if self.has_switch else None
         self.dev.log = WallLog(scene, repr(self)) if self.events else None
-        velocity = self._velocity(scene.particles.dim) if self.has_surface_velocity else None
-        if velocity is not None and both is None:
-            raise ValueError(f"{self!r}: surface_velocity moves nothing without friction. Give friction above 0 too.")
-        self.dev.surface = Surface(
-            scene, repr(self), both, restitution, self.push_out, active, self.turns, self.dev.log, self.one_way, velocity
-        )
+        self.dev.surface = Surface(scene, self, self.dev.log)
+        for name, kind in self.tracks.items():
+            value = np.atleast_1d(getattr(self, name))
+            vars(self.dev)[name] = Track(scene.memory, f"{self!r}.{name}", value, kind)
+        for name, field in self._settings().items():
+            vars(self.dev)[field] = scene.memory.field(f"{self!r}.{name}", None, values=getattr(self, name))
+        self.changed = False
 
-    def _velocity(self, dim: int) -> np.ndarray:
-        """Return the velocity of the surface, (dim,) [m/s]."""
+    def velocity_of_surface(self, dim: int) -> np.ndarray:
+        """Return the velocity of the surface relative to the wall, (dim,) [m/s]."""
         given = self.surface_velocity
         return np.zeros(dim) if given is None else checks.vector(repr(self), "surface_velocity", given, dim)
 
+    def _settings(self) -> dict[str, str]:
+        """Return its knobs that kernels read, and the names of their fields."""
+        knobs = {name: getattr(type(self), name) for name in knobs_of(type(self))}
+        return {name: knob.device for name, knob in knobs.items() if knob.device}
+
     def upload(self) -> None:
-        """Write friction, restitution, `active` and the velocity of the surface to the device."""
-        self.dev.surface.upload(
-            friction_of(repr(self), "friction", self.friction), self._bounce, self.active,
-            self._velocity(self.scene.particles.dim), self.push_out,
-        )  # fmt: skip
+        """Write the settings to the device, and move to the present places in the next frame."""
+        self.dev.surface.upload(self)
+        for name, field in self._settings().items():
+            self.scene.memory.write(vars(self.dev)[field], getattr(self, name))
+        for name in self.tracks:
+            vars(self.dev)[name].set_target(np.atleast_1d(getattr(self, name)))
+        self.moving = True
+
+    def end_motion(self) -> None:
+        """Stay at the last places."""
+        for name in self.tracks:
+            vars(self.dev)[name].end_motion()
+
+    def place_of(self, name: str) -> np.ndarray:
+        """Return where a track is now; outside of a world, its knob."""
+        return np.asarray(getattr(self, name)) if self.scene is None else vars(self.dev)[name].now
 
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether the widest particle, for which the wall was checked and built, is as wide as before."""
@@ -209,8 +231,6 @@ class Collider(Feature):
         """Return the corners of a box in which it stays during the frame [m]."""
         return ti.zero(self.dev.state.d[0]), ti.zero(self.dev.state.d[0])
 
-    has_facets = False  # its number of sides is no part of the code
-
     @ti.func
     def near_sides(self, i, reach):
         """Return from where to where side_at() has the sides that may be within `reach` of particle i during the frame."""
@@ -227,15 +247,12 @@ class Collider(Feature):
         return 0 * radius
 
     @ti.func
-    def start_gap(self, face, i, radius, frame_fraction):
-        """Return the gap of particle i at a face at the start of the substep, the normal, the curvature of the gap [1/m], and
-        how far the wall moves there in the substep [m]."""
-        return 0 * radius, ti.zero(self.dev.state.d[i]), 0 * radius, ti.zero(self.dev.state.d[i])
+    def gap(self, face, i, radius, frame_fraction, at_start: ti.template()):  # type: ignore[valid-type]
+        """Return the gap of particle i at a face, at the start or at the end of the substep [m], and the normal.
 
-    @ti.func
-    def end_gap(self, face, i, radius, frame_fraction):
-        """Return the gap of particle i at a face at the end of the substep [m], and the normal."""
-        return 0 * radius, ti.zero(self.dev.state.d[i])
+        Behind these: the curvature of the gap [1/m], and how far the wall moves there in the substep [m]; at the start only.
+        """
+        return 0 * radius, ti.zero(self.dev.state.d[i]), 0 * radius, ti.zero(self.dev.state.d[i])
 
     @ti.func
     def in_frame_of_one_way(self, n):
@@ -249,7 +266,7 @@ class Collider(Feature):
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, mode):
-        """Move particle i out of the wall, with self.dev.surface.push_without_slide().
+        """Move particle i out of the wall, with self.dev.surface.push().
 
         mode: ANY_DEPTH, BEYOND_ROUNDING, or FRICTIONLESS.
         """

@@ -57,13 +57,8 @@ class FacetGrid:
         facets, cells = [], []
         groups = np.split(np.arange(len(corners)), np.flatnonzero(np.diff(np.cumsum(number) // CHUNK)) + 1)
         for group in groups:
-            facet = np.repeat(group, number[group])
-            rest = np.arange(len(facet)) - np.repeat(np.cumsum(number[group]) - number[group], number[group])
-            size = last[facet] - first[facet] + 1
-            at = np.empty_like(size)
-            for k in range(corners.shape[2]):
-                at[:, k] = first[facet, k] + rest % size[:, k]
-                rest = rest // size[:, k]
+            row, at = _between(first[group], last[group])
+            facet = group[row]
             middle = self.origin + (at + 0.5) * self.cell
             off = np.abs(((middle - corners[facet, 0]) * normal[facet]).sum(axis=1))
             half = self.cell / 2 * np.abs(normal).sum(axis=1)[facet]
@@ -94,20 +89,13 @@ class FacetGrid:
 
     def _winding(self, corners: np.ndarray) -> np.ndarray:
         """Return the winding number of the facets around the middle of each cell: signed crossings of a ray towards -x."""
-        m, arity, dim = corners.shape
+        _, arity, dim = corners.shape
         # Middles are shifted slightly off the cell pattern, so that no ray meets a corner or an edge.
         shift = self.cell * np.array([0.0, 0.0137, 0.0091][:dim])
         local = (corners - self.origin - shift) / self.cell - 0.5  # in cells, from the middle of cell 0
         first = np.maximum(np.ceil(local[..., 1:].min(axis=1)).astype(int), 0)
         last = np.minimum(np.floor(local[..., 1:].max(axis=1)).astype(int), self.shape[1:] - 1)
-        number = np.maximum(last - first + 1, 0).prod(axis=1)
-        facet = np.repeat(np.arange(m), number)
-        rest = np.arange(len(facet)) - np.repeat(np.cumsum(number) - number, number)
-        ray = np.empty((len(facet), dim - 1), dtype=int)
-        for k in range(dim - 1):
-            size = (last - first + 1)[facet, k]
-            ray[:, k] = first[facet, k] + rest % size
-            rest = rest // size
+        facet, ray = _between(first, last)
         c = local[facet]
         if dim == 2:
             weight = (ray[:, 0] - c[:, 0, 1]) / (c[:, 1, 1] - c[:, 0, 1])
@@ -123,3 +111,16 @@ class FacetGrid:
         at = np.clip(np.floor(x).astype(int) + 1, 0, self.shape[0])
         np.add.at(change, (*(ray[:, k] for k in range(dim - 2, -1, -1)), at), sign.astype(int))
         return np.cumsum(change[..., :-1], axis=-1).ravel()
+
+
+def _between(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return all integer places from first to last, (m, k) each, axis 0 fastest: the rows that they belong to, and the places."""
+    size = np.maximum(last - first + 1, 0)
+    number = size.prod(axis=1)
+    row = np.repeat(np.arange(len(first)), number)
+    rest = np.arange(len(row)) - np.repeat(np.cumsum(number) - number, number)
+    place = np.empty((len(row), first.shape[1]), dtype=int)
+    for k in range(first.shape[1]):
+        place[:, k] = first[row, k] + rest % size[row, k]
+        rest = rest // size[row, k]
+    return row, place

@@ -1,5 +1,7 @@
 """A plane with particles on one side."""
 
+from types import MappingProxyType
+
 import numpy as np
 
 from .. import checks
@@ -9,7 +11,6 @@ from ..features.feature import Knob, Scene
 from ..geometry.intervals import entry, rounding, slab
 from ..particles import Particles
 from .collider import Collider
-from .track import Track
 
 
 class HalfSpace(Collider):
@@ -25,6 +26,7 @@ class HalfSpace(Collider):
     """
 
     shares_code = True
+    tracks = MappingProxyType({"offset": None})
     offset = Knob(
         lambda f, v: checks.number("HalfSpace", "offset", v), "Of the plane along its normal [m].",
         place=lambda f, offset, by: offset + float(np.dot(f.normal, by)),
@@ -48,21 +50,9 @@ class HalfSpace(Collider):
         checks.vector("HalfSpace", "normal", self.normal, particles.dim)
 
     def bind(self, scene: Scene) -> None:
-        """Declare the normal, and the offsets at the start and the end of a frame."""
-        Collider.bind(self, scene)
+        """Declare the normal."""
+        super().bind(scene)
         self.dev.normal = scene.memory.field("HalfSpace.normal", None, width=len(self.normal), values=self.normal)
-        self.dev.offset = Track(scene.memory, "HalfSpace.offset", np.atleast_1d(self.offset))
-        self.changed = False
-
-    def upload(self) -> None:
-        """Move from the last offset to the new one in the next frame."""
-        Collider.upload(self)
-        self.dev.offset.set_target(np.atleast_1d(self.offset))
-        self.moving = True
-
-    def end_motion(self) -> None:
-        """Stay at the last offset."""
-        self.dev.offset.end_motion()
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """Return lines across the scene: one in 2D, two at right angles in 3D."""
@@ -81,19 +71,14 @@ class HalfSpace(Collider):
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """Return n . x - offset."""
-        return points @ self.normal - self._plane
+        return points @ self.normal - self.place_of("offset")
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the distances down to the plane, and its normal."""
-        end = self._plane + radius
+        end = self.place_of("offset").item() + radius
         close = rounding(origin, np.array([[end]]))
         way = slab(origin @ self.normal, direction @ self.normal, -np.inf, end, close)
         return entry(way, close), np.tile(self.normal, (len(origin), 1))
-
-    @property
-    def _plane(self) -> float:
-        """The present offset of the plane [m]."""
-        return float(self.offset if self.scene is None else self.dev.offset.now[0])  # type: ignore[arg-type]
 
     sides = 1  # type: ignore[assignment]
 
@@ -109,21 +94,19 @@ class HalfSpace(Collider):
         return self.dev.offset.at(frame_fraction)[0]
 
     @ti.func
-    def start_gap(self, face, i, radius, frame_fraction):
+    def gap(self, face, i, radius, frame_fraction, at_start: ti.template()):  # type: ignore[valid-type]
         """Return the gap to the plane."""
         n, before, now = self.dev.normal[None], self.offset_at(frame_fraction[0]), self.offset_at(frame_fraction[1])
-        gap = n.dot(self.dev.state.place(i)) - n.dot(self.dev.state.d[i]) - before - radius
+        gap = n.dot(self.dev.state.place(i))
+        if ti.static(at_start):
+            gap = gap - n.dot(self.dev.state.d[i]) - before - radius
+        else:
+            gap = gap - now - radius
         return gap, n, 0 * gap, (now - before) * n
-
-    @ti.func
-    def end_gap(self, face, i, radius, frame_fraction):
-        """Return the gap to the plane."""
-        n = self.dev.normal[None]
-        return n.dot(self.dev.state.place(i)) - self.offset_at(frame_fraction[1]) - radius, n
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, mode):
         """Press the particle if it is below the plane."""
         n, before, now = self.dev.normal[None], self.offset_at(frame_fraction[0]), self.offset_at(frame_fraction[1])
         depth, moved = now + radius - n.dot(self.dev.state.place(i)), (now - before) * n
-        self.dev.surface.push_without_slide(i, depth, depth + self.dev.surface.path(i, moved).dot(n), n, moved, h, mode)
+        self.dev.surface.push(i, depth, depth + self.dev.surface.path(i, moved).dot(n), n, moved, h, mode, False)

@@ -4,10 +4,10 @@ import numpy as np
 
 from .. import checks
 from ..checks import ArrayLike
+from ..geometry.common_sense import common_sense, edges_of
 from .collider import Collider
 from .facets import Facets, facet_normals
 from .moving import Moving
-from .shape import HostShape
 
 FLAT = 0.999  # cosine between faces whose common edge is not drawn
 
@@ -38,10 +38,8 @@ class Mesh(Moving):
     ):  # fmt: skip
         vertices = checks.points("Mesh", "vertices", vertices, dim=3)
         faces = checks.indices("Mesh", "faces", faces, len(vertices), arity=3).astype(int)
-        self.closed, self.inside = bool(closed), bool(inside)
+        self.set_sides(closed, inside, "a sheet")
         self.radius = radius
-        if self.inside and not self.closed:
-            raise ValueError("Mesh: inside = True needs an inside; a sheet (closed = False) has none.")
         if not len(faces):
             raise ValueError("Mesh: faces is empty; a wall needs at least one.")
         corners = vertices[faces]
@@ -56,27 +54,26 @@ class Mesh(Moving):
         self.vertices, self.faces = vertices, faces
         for array in (vertices, faces):
             array.flags.writeable = False
-        self.place(position, rotation)
+        self.position, self.rotation = position, rotation
         self.set_surface(friction, restitution, push_out, active, events, one_way, 3, surface_velocity=surface_velocity)
         self.facets = self._joined()
 
     def _outward(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         """Return the faces with their corners in the order that makes normals point away from the solid."""
-        halves = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-        owner = np.repeat(np.arange(len(faces)), 3)
-        edges, which, number = np.unique(np.sort(halves, axis=1), axis=0, return_inverse=True, return_counts=True)
+        edges, which, number = edges_of(faces)
         if (number != 2).any():
             e = int(np.argmax(number != 2))
-            k = int(owner[np.argmax(which.ravel() == e)])
+            k = int(np.argmax((which == e).any(axis=1)))
             what = "one face only" if number[e] == 1 else f"{number[e]} faces"
             raise ValueError(
                 f"Mesh: the edge {tuple(edges[e].tolist())} of faces[{k}] belongs to {what}, but each edge of a closed mesh has "
                 "two. Merge vertices that are in the same place, close the hole, or use closed = False for a thin sheet."
             )
-        order = np.argsort(which.ravel(), kind="stable").reshape(-1, 2)
-        first, second = owner[order].T
-        same = (halves[order[:, 0]] == halves[order[:, 1]]).all(axis=1)  # both run along it the same way: one is turned
-        turned, part = _turned(len(faces), first, second, same)
+        turned, part, wrong = common_sense(faces)
+        if wrong >= 0:
+            raise ValueError(
+                f"Mesh: the faces around faces[{wrong}] have no outside; a Moebius strip or a Klein bottle has none."
+            )
         faces = np.where(turned[:, None], faces[:, ::-1], faces)
         return np.where((_inwards(vertices[faces], part) != self.inside)[:, None], faces[:, ::-1], faces)
 
@@ -85,9 +82,7 @@ class Mesh(Moving):
         faces, m = self.faces, len(self.vertices)
         c = self.vertices[faces]
         normal = facet_normals(c)
-        pairs = faces[:, [[0, 1], [1, 2], [2, 0]]]
-        self.edges, which = np.unique(np.sort(pairs.reshape(-1, 2), axis=1), axis=0, return_inverse=True)
-        edge = which.reshape(-1, 3)
+        self.edges, edge, _ = edges_of(faces)
         features = np.concatenate([faces, m + edge], axis=1)
         along = self.vertices[self.edges[:, 1]] - self.vertices[self.edges[:, 0]]
         along /= np.linalg.norm(along, axis=1)[:, None]
@@ -113,15 +108,6 @@ class Mesh(Moving):
         facing /= np.maximum(np.linalg.norm(facing, axis=1), 1e-9)[:, None]
         return Facets(c, features, wings, facing, self.closed, self.inside)
 
-    def host_shape(self, dim: int) -> HostShape:
-        """Return the facets."""
-        return self.facets
-
-    @property
-    def normals(self) -> np.ndarray:
-        """Outward unit normals of the faces, (m, 3)."""
-        return self.facets.normals
-
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the edges where the mesh bends."""
         return self.placed(self.vertices[self.edges[self.creases]]), self.radius
@@ -129,36 +115,6 @@ class Mesh(Moving):
     def solid(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the faces, unless the scene is inside of the mesh."""
         return Collider.solid(self, low, high) if self.inside else (self.placed(self.vertices), np.asarray(self.faces))
-
-
-def _turned(count: int, first: np.ndarray, second: np.ndarray, same: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which faces to reverse so that all neighbours agree, and the number of the connected part that each belongs to.
-
-    first, second: pairs of neighbours. same: whether exactly one of each pair has to be reversed.
-    """
-    a, b, differ = np.concatenate([first, second]), np.concatenate([second, first]), np.concatenate([same, same])
-    order = np.argsort(a, kind="stable")
-    b, differ = b[order], differ[order]
-    begin = np.searchsorted(a[order], np.arange(count + 1))
-    turned, part, parts = np.full(count, -1), np.zeros(count, dtype=int), 0
-    for seed in range(count):
-        if turned[seed] >= 0:
-            continue
-        turned[seed], queue = 0, [seed]
-        parts += 1
-        while queue:
-            f = queue.pop()
-            part[f] = parts - 1
-            for k in range(begin[f], begin[f + 1]):
-                want = turned[f] ^ int(differ[k])
-                if turned[b[k]] < 0:
-                    turned[b[k]] = want
-                    queue.append(int(b[k]))
-                elif turned[b[k]] != want:
-                    raise ValueError(
-                        f"Mesh: the faces around faces[{f}] have no outside; a Moebius strip or a Klein bottle has none."
-                    )
-    return turned == 1, part
 
 
 def _inwards(corners: np.ndarray, part: np.ndarray) -> np.ndarray:

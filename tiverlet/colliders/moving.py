@@ -1,5 +1,6 @@
 """Colliders of any shape that are moved and turned as a whole."""
 
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,8 @@ from ..features.arguments import shifted
 from ..features.feature import Knob, Scene
 from ..particles import Particles
 from .collider import Collider
+from .facets import Facets
 from .pose import Pose, rotation_matrix
-from .shape import HostShape
 from .surface import ANY_DEPTH
 
 TOUCHES = 8  # of one particle in one substep; after these it stays at the last place known to be free
@@ -39,14 +40,16 @@ class Moving(Collider):
     a fixed axis that is a constant angular velocity, for any number of turns. Friction and restitution use the velocity of the
     wall at the contact point.
 
-    It holds a Pose and a Shape. A particle is followed in the wall's frame, along the straight line from where it was at the
-    start of the substep. shape.find_first_touch() finds the first touch, surface.push() corrects it, and then the rest of the way
-    is followed. So nothing passes, at any speed of either, and corners need no special case. Where a particle still moves in
-    after TOUCHES touches (in a wedge), it stays at the last one.
+    It is made of `facets`, or a subclass gives it another shape in its own frame (host_shape). A particle is followed in the
+    wall's frame, along the straight line from where it was at the start of the substep. shape.find_first_touch() finds the first
+    touch, surface.push() corrects it, and then the rest of the way is followed. So nothing passes, at any speed of either, and
+    corners need no special case. Where a particle still moves in after TOUCHES touches (in a wedge), it stays at the last one.
     """
 
     code_size = 1.5
-    needs_start_position = poses = bends = has_facets = True
+    facets: Facets
+    needs_start_position = poses = bends = True
+    tracks = MappingProxyType({"position": None, "rotation": ti.f64})
     radius: Any = Knob(
         lambda f, v: checks.number(repr(f), "radius", v, least=0.0),
         "Rounded by so much [m].",
@@ -56,37 +59,32 @@ class Moving(Collider):
     position = Knob(_position, "Where the origin of the wall's frame is [m].", place=shifted)
     rotation = Knob(_rotation, "Angle (2D) or rotation vector (3D) [rad].")
 
-    def place(self, position: Any, rotation: Any) -> None:
-        """Check and store the initial pose of the wall."""
-        self.position, self.rotation = position, rotation
+    def set_sides(self, closed: bool, inside: bool, open_shape: str) -> None:
+        """Check and store on which sides of facets particles are. open_shape: what the wall is called where it is not closed."""
+        self.closed, self.inside = bool(closed), bool(inside)
+        if self.inside and not self.closed:
+            raise ValueError(f"{self!r}: inside = True needs an inside; {open_shape} (closed = False) has none.")
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check the dimension, and the particles."""
+        """Check the dimension, and refuse points at an open wall without thickness: a point on it would have no side."""
         if self.dim and self.dim != particles.dim:
             raise ValueError(f"{self!r}: it is a wall for {self.dim}D, but the particles are in {particles.dim}D.")
         self._keep(dim=particles.dim)
         self.position, self.rotation = self.position, self.rotation
-        self.host_shape(self.dim).check(repr(self), particles, self.radius)
+        points = particles.radius + self.radius == 0
+        if not self.closed and points.any():
+            raise ValueError(
+                f"{self!r}: particle {int(np.argmax(points))} has radius 0, and so has the open wall, so nothing tells on which "
+                "side of it the particle is. Give one of them a radius."
+            )
 
     def bind(self, scene: Scene) -> None:
-        """Declare the pose at the ends of a frame and of the current substep, and the shape."""
-        Collider.bind(self, scene)
-        self.dev.pose = Pose(scene, repr(self), self.position, self.rotation, self.dev.surface.turns)
+        """Declare the pose in the current substep, and the shape."""
+        super().bind(scene)
+        self.dev.pose = Pose(scene, repr(self), self.dev.position, self.dev.rotation, self.dev.surface.turns)
         self.dev.surface.poses = [self.dev.pose]
-        self.dev.thickness = scene.memory.field(f"{self!r}.radius", None, values=self.radius)
         self.dev.shape = self.host_shape(self.dim).on_device(scene, repr(self), self.radius)
         self.dev.shape.can_slide = type(self.dev.shape).can_slide and not self.dev.surface.has_restitution
-        self.changed = False
-
-    def upload(self) -> None:
-        """Move and turn to the new pose in the next frame."""
-        Collider.upload(self)
-        self.dev.pose.set_target(self.position, self.rotation)
-        self.moving = True
-
-    def end_motion(self) -> None:
-        """Stay at the last pose."""
-        self.dev.pose.end_motion()
 
     def placed(self, points: np.ndarray) -> np.ndarray:
         """Return points (..., dim) of the wall's frame in the world, for pictures."""
@@ -94,14 +92,21 @@ class Moving(Collider):
 
     def current_pose(self, dim: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the present position (dim,) [m] and rotation matrix; outside of a world, for `dim` dimensions."""
-        position, rotation = np.asarray(self.position), self.rotation
-        if self.scene is not None:
-            position, rotation = self.dev.pose.position.now, self.dev.pose.rotation.now
-        return position, rotation_matrix(rotation) if np.any(rotation) else np.eye(dim)
+        rotation = self.place_of("rotation")
+        return self.place_of("position"), rotation_matrix(rotation) if rotation.any() else np.eye(dim)
 
-    def host_shape(self, dim: int) -> HostShape:
-        """Return the shape in its own frame; outside of a world, for `dim` dimensions."""
-        raise NotImplementedError
+    def host_shape(self, dim: int) -> Any:
+        """Return the shape in its own frame, outside of a world for `dim` dimensions: the facets, or what a subclass has.
+
+        It has clearance() and cast() as a Collider has, and on_device(scene, who, radius), the Shape for kernels. who: the name
+        of the wall. radius: by what the shape is thickened [m].
+        """
+        return self.facets
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Outward unit normals of the facets, (m, dim)."""
+        return self.facets.normals
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """Return the clearance of the shape, less `radius`."""
@@ -117,13 +122,13 @@ class Moving(Collider):
 
     @property
     def has_bounds(self) -> bool:
-        """Whether its shape is of a limited size."""
-        return self.host_shape(self.dim).limited
+        """Whether the solid is not all around."""
+        return not (self.closed and self.inside)
 
     @property
     def middle(self) -> np.ndarray:
-        """Where the middle of the shape is."""
-        return self.placed(self.host_shape(self.dim).middle)
+        """Where the middle of the box around the facets is."""
+        return self.placed((self.facets.corners.min(axis=(0, 1)) + self.facets.corners.max(axis=(0, 1))) / 2)
 
     @ti.func
     def bounds(self):
@@ -133,7 +138,7 @@ class Moving(Collider):
     @property
     def sides(self) -> int:
         """The number of facets."""
-        return self.host_shape(self.dim).sides if self.dim else 0
+        return len(self.facets.corners)
 
     @ti.func
     def near_sides(self, i, reach):
@@ -160,22 +165,17 @@ class Moving(Collider):
         return distance - ti.cast(self.radius, self.dev.real) - radius - self.motion()
 
     @ti.func
-    def start_gap(self, face, i, radius, frame_fraction):
+    def gap(self, face, i, radius, frame_fraction, at_start: ti.template()):  # type: ignore[valid-type]
         """Return the gap to a facet."""
-        x = self.dev.state.inside(self.dev.state.place(i) - self.dev.state.d[i])
-        q = self.dev.pose.inward(0, x - self.dev.pose.place[0])
-        moved = self.dev.pose.place[2] + self.dev.pose.outward(2, q)
-        e = self.dev.pose.inward(0, self.dev.state.d[i] - moved)
-        gap, n, bend = self.dev.shape.facet_gap(face, q, e, ti.cast(self.radius, self.dev.real) + radius, True)
-        return gap, self.dev.pose.outward(0, n), bend, moved
-
-    @ti.func
-    def end_gap(self, face, i, radius, frame_fraction):
-        """Return the gap to a facet."""
-        x = self.dev.state.inside(self.dev.state.place(i))
-        q = self.dev.pose.inward(1, x - self.dev.pose.place[1])
-        gap, n, _bend = self.dev.shape.facet_gap(face, q, 0 * q, ti.cast(self.radius, self.dev.real) + radius, False)
-        return gap, self.dev.pose.outward(1, n)
+        x, when = self.dev.state.place(i), ti.static(0 if at_start else 1)
+        if ti.static(at_start):
+            x -= self.dev.state.d[i]
+        q = self.dev.pose.inward(when, self.dev.state.inside(x) - self.dev.pose.place[when])
+        moved, e = self.dev.pose.place[2] + self.dev.pose.outward(2, q), 0 * q
+        if ti.static(at_start):
+            e = self.dev.pose.inward(0, self.dev.state.d[i] - moved)
+        gap, n, bend = self.dev.shape.facet_gap(face, q, e, ti.cast(self.radius, self.dev.real) + radius, at_start)
+        return gap, self.dev.pose.outward(when, n), bend, moved
 
     @ti.func
     def in_frame_of_one_way(self, n):

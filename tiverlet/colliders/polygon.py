@@ -6,7 +6,6 @@ from .. import checks
 from ..checks import ArrayLike
 from .facets import Facets, facet_normals
 from .moving import Moving
-from .shape import HostShape
 
 BLOCK = 1 << 20  # pairs of edges that are compared together
 
@@ -34,10 +33,8 @@ class Polygon(Moving):
         None = None, events: bool = False, surface_velocity=None, one_way=None,
     ):  # fmt: skip
         vertices = checks.points("Polygon", "vertices", vertices, dim=2)
-        self.closed, self.inside = bool(closed), bool(inside)
+        self.set_sides(closed, inside, "an open line")
         self.radius = radius
-        if self.inside and not self.closed:
-            raise ValueError("Polygon: inside = True needs an inside; an open line (closed = False) has none.")
         if self.closed and len(vertices) > 1 and (vertices[0] == vertices[-1]).all():
             vertices = vertices[:-1]  # a loop whose last vertex repeats the first
         if len(vertices) < (3 if self.closed else 2):
@@ -59,7 +56,7 @@ class Polygon(Moving):
                 i, j = j, i
         self.vertices = vertices
         self.vertices.flags.writeable = False
-        self.place(position, rotation)
+        self.position, self.rotation = position, rotation
         self.set_surface(friction, restitution, push_out, active, events, one_way, 2, surface_velocity=surface_velocity)
         along = vertices[j] - vertices[i]
         along /= np.linalg.norm(along, axis=1)[:, None]
@@ -72,15 +69,6 @@ class Polygon(Moving):
         facing[i] = np.where(np.linalg.norm(facing[i], axis=1)[:, None] > 1e-9, facing[i], normal)
         facing /= np.maximum(np.linalg.norm(facing, axis=1)[:, None], 1e-9)
         self.facets = Facets(vertices[features], features, wings, facing, self.closed, self.inside)
-
-    def host_shape(self, dim: int) -> HostShape:
-        """Return the facets."""
-        return self.facets
-
-    @property
-    def normals(self) -> np.ndarray:
-        """Outward unit normals of the edges, (m, 2)."""
-        return self.facets.normals
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the polygon."""

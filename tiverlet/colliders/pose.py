@@ -11,32 +11,18 @@ from .track import Track
 class Pose:
     """The pose of a frame: a point p of it is at position + R p in the world. R is computed once for each substep.
 
-    position: (dim,) [m]; rotation: an angle (2D) or a rotation vector (3D) [rad], at the start of the first frame. turns: whether
-    `spin` is needed, the angle or rotation vector of a substep [rad]; it is first order where the axis changes. in_state: its
-    fields in the exact state, by name.
+    position: the Track of a place (dim,) [m]; rotation: that of an angle (2D) or a rotation vector (3D) [rad], in f64. turns:
+    whether `spin` is needed, the angle or rotation vector of a substep [rad]; it is first order where the axis changes.
     """
 
-    def __init__(self, scene: Scene, name: str, position: np.ndarray, rotation, turns: bool):
-        self.dim, self.real = len(position), scene.real
-        self.position = Track(scene.memory, f"{name}.position", position)
-        self.rotation = Track(scene.memory, f"{name}.rotation", np.atleast_1d(rotation), kind=ti.f64)
+    def __init__(self, scene: Scene, name: str, position: Track, rotation: Track, turns: bool):
+        self.dim, self.real = scene.particles.dim, scene.real
+        self.position, self.rotation, self.turns = position, rotation, turns
         # Rows of R at the start and the end of the substep, and of their difference; and the position likewise.
         self.turn = scene.memory.field(f"{name}.turn", 3 * self.dim, width=self.dim)
         self.place = scene.memory.field(f"{name}.place", 3, width=self.dim)
-        self.turns = turns
         if turns:
-            self.spin = scene.memory.field(f"{name}.spin", None, width=len(np.atleast_1d(rotation)))
-        self.in_state = {"position": self.position.ends, "rotation": self.rotation.ends}
-
-    def set_target(self, position: np.ndarray, rotation) -> None:
-        """Move to this pose during the next frame."""
-        self.position.set_target(position)
-        self.rotation.set_target(np.atleast_1d(rotation))
-
-    def end_motion(self) -> None:
-        """Stay where the last frame ended."""
-        self.position.end_motion()
-        self.rotation.end_motion()
+            self.spin = scene.memory.field(f"{name}.spin", None, width=2 * self.dim - 3)
 
     @ti.func
     def update(self, frame_fraction):

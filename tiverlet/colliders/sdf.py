@@ -14,7 +14,7 @@ from ..particles import Particles
 from ..tools import golden
 from .moving import Moving
 from .pose import rotation_matrix
-from .shape import HostShape, Shape
+from .shape import Shape
 from .surface import ALONG, NEAR
 
 FINE = NEAR  # of a displacement: closer than that, the tangent plane replaces the surface
@@ -64,7 +64,7 @@ class Sdf(Moving):
         self.function: Any = function
         self.gradient: Any = gradient
         self.radius = radius
-        self.place(position, rotation)
+        self.position, self.rotation = position, rotation
         self.set_surface(friction, restitution, push_out, active, events, surface_velocity=surface_velocity)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
@@ -80,16 +80,16 @@ class Sdf(Moving):
 
     def _check_around(self, particles: Particles) -> None:
         """Evaluate and check the function at the particles and around them."""
-        x = particles.position
+        x, probe = particles.position, self.host_shape(self.dim)
         if not len(x):
-            for probe in (self.dev.probe.clearance, self.dev.probe.gradient)[: 2 if self.gradient else 1]:
-                probe(np.zeros((1, self.dim)))  # checks only what kind of thing is returned
+            for read in (probe.clearance, probe.gradient)[: 2 if self.gradient else 1]:
+                read(np.zeros((1, self.dim)))  # checks only what kind of thing is returned
             return
         low, high = x.min(axis=0), x.max(axis=0)
         reach = float((high - low).max()) or float(particles.radius.max()) or 1.0
         around = low - reach / 2 + golden(np.arange(SAMPLES), dim=self.dim) * (high - low + reach)
         points = (np.concatenate([x[:SAMPLES], around]) - self.position) @ rotation_matrix(self.rotation)
-        value, slope = self.dev.probe.clearance(points), self.dev.probe.slope(points, 1e-6 * reach)
+        value, slope = probe.clearance(points), probe.slope(points, 1e-6 * reach)
         size = np.linalg.norm(slope, axis=1)
         bad = ~np.isfinite(value) | ~np.isfinite(size)
         if bad.any():
@@ -109,7 +109,7 @@ class Sdf(Moving):
                 "there. Divide the function by the size of its gradient at the surface, or particles would stay too far away."
             )
         if self.gradient:
-            off = np.linalg.norm(self.dev.probe.gradient(points) - slope, axis=1)
+            off = np.linalg.norm(probe.gradient(points) - slope, axis=1)
             if not (np.median(off) < 1 - FLAT):
                 k = int(np.argmax(off))
                 raise ValueError(
@@ -127,17 +127,11 @@ class Sdf(Moving):
                 grid[..., a] += line[:, None]
                 grid[..., b] += line[None, :]
                 local = (grid.reshape(-1, self.dim) - self.position) @ rotation_matrix(self.rotation)
-                out.append(contour(grid, self.dev.probe.clearance(local).reshape(129, 129) - self.radius))
+                out.append(contour(grid, self.host_shape(self.dim).clearance(local).reshape(129, 129) - self.radius))
         return np.concatenate(out), 0.0
 
-    def host_shape(self, dim: int) -> HostShape:
-        """Return the function as a shape in `dim` dimensions; it also works outside of a world."""
-        if "probe" not in vars(self.dev) or self.dev.probe.dim != dim:
-            runtime.ensure_started()
-            self.dev.probe = _Probe(self, dim)
-        return self.dev.probe  # type: ignore[reportReturnType]  # it has no middle, since it is not limited
-
-    has_facets = False
+    sides = 1  # type: ignore[assignment]
+    has_bounds = False  # type: ignore[assignment]
 
     @ti.func
     def near_sides(self, i, reach):
@@ -148,6 +142,13 @@ class Sdf(Moving):
     def side_at(self, place):
         """Return its only side."""
         return place
+
+    def host_shape(self, dim: int) -> "_Probe":
+        """Return the function as a shape in `dim` dimensions; it also works outside of a world."""
+        if "probe" not in vars(self.dev) or self.dev.probe.dim != dim:
+            runtime.ensure_started()
+            self.dev.probe = _Probe(self, dim)
+        return self.dev.probe
 
     @ti.func
     def least_gap(self, face, i, radius):
@@ -310,16 +311,10 @@ class FunctionShape(Shape):
 class _Probe:
     """The function at many points, evaluated from Python in f64."""
 
-    limited = False
-    sides = 1
-
     def __init__(self, wall: Sdf, dim: int):
         self.compiler = Compiler(ti.f64)
         self.wall: Any = wall
         self.dim = dim
-
-    def check(self, who: str, particles: Particles, radius: float) -> None:
-        """Accept all particles; Sdf.prepare() checks the function around them."""
 
     def on_device(self, scene: Scene, who: str, radius: float) -> FunctionShape:
         """Return the function for kernels."""

@@ -1,55 +1,6 @@
-"""The contracts of the shapes that moving colliders hold."""
-
-from typing import TYPE_CHECKING, Any, Protocol
-
-import numpy as np
+"""The contract of the shapes of moving colliders on the device."""
 
 from ..device import ti
-
-if TYPE_CHECKING:
-    from ..features.feature import Scene
-    from ..particles import Particles
-
-FAR = 1e15  # [m] the distance of a facet that another one hides
-
-
-class HostShape(Protocol):
-    """A shape in a frame of its own, for host queries.
-
-    who: the collider that holds it. radius: by what the shape is thickened [m]. limited: whether it ends anywhere, so that it has
-    a middle.
-    """
-
-    @property
-    def limited(self) -> bool:
-        """Whether it ends anywhere."""
-        ...
-
-    @property
-    def sides(self) -> int:
-        """The number of its facets; 0 if it has none."""
-        ...
-
-    @property
-    def middle(self) -> np.ndarray:
-        """A point in the middle of it, (dim,) [m]."""
-        ...
-
-    def check(self, who: str, particles: "Particles", radius: float) -> None:
-        """Raise ValueError for particles that the shape cannot be a wall for."""
-        ...
-
-    def on_device(self, scene: "Scene", who: str, radius: float) -> Any:
-        """Return the shape on the device, in a world."""
-        ...
-
-    def clearance(self, points: np.ndarray) -> np.ndarray:
-        """Return the distance of points (k, dim) from the shape [m], negative inside of it, (k,)."""
-        ...
-
-    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return lengths and normals as Collider.cast(), in the shape's frame."""
-        ...
 
 
 class Shape:
@@ -74,11 +25,6 @@ class Shape:
         return 0 * contact_distance + 2, 0 * contact_distance, 0 * e
 
     @ti.func
-    def facets_near(self, q, reach):
-        """Return begin and end in `list` of the facets that may be within `reach` of q."""
-        return 0, 0
-
-    @ti.func
     def facet_gap(self, f, q, e, contact_distance, at_start: ti.template()):  # type: ignore[valid-type]
         """Return the gap at q to facet f [m], the normal, and the curvature of the gap [1/m] along a displacement e.
 
@@ -86,11 +32,6 @@ class Shape:
         At the end it is not, since what passed a thin solid is behind its far side.
         """
         return 0 * q[0], q, 0 * q[0]
-
-    @ti.func
-    def box(self):
-        """Return the lower and the upper corner of a box around it."""
-        return 0, 0
 
     @ti.func
     def rounding(self, q):

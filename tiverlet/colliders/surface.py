@@ -2,12 +2,14 @@
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ..device import at, inline, ti
 from ..features.material import limit_length, refuse_turning
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
-    from ..features.material import Bounce, Coefficients
+    from .collider import Collider
     from .wall_log import WallLog
 
 # How a collider confines. ANY_DEPTH: at any depth. BEYOND_ROUNDING: only deeper than rounding. FRICTIONLESS: as
@@ -29,62 +31,65 @@ def speed_of_parting(push_out: float | None) -> float:
 class Surface:
     """The response of the surface of one collider on the device: friction, restitution, push_out; Collider defines them.
 
-    friction: coefficients, or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s], or None. active: whether
-    the wall is present, or None for a wall without a switch. turns: whether it resists rolling, or bounces across the normal.
-    poses: the Pose of a wall that may turn; else none. log: of events, or None. one_way: unit vector along which the wall lets
-    particles pass, or None. velocity: of the surface relative to the wall [m/s], or None.
+    fields: the values of the wall that kernels read, by name. poses: the Pose of a wall that may turn; else none. log: of events,
+    or None.
     """
 
-    def __init__(
-        self, scene: "Scene", name: str, friction: "Coefficients | None", restitution: "Bounce | None", push_out: float | None,
-        active: bool | None, turns: bool, log: "WallLog | None", one_way: Any, velocity: Any,
-    ):  # fmt: skip
+    host_only = ("fields",)
+    push_out: Any
+    friction: Any
+    restitution: Any
+    rolling: Any
+    one_way: Any
+    velocity: Any
+    active: Any
+
+    def __init__(self, scene: "Scene", wall: "Collider", log: "WallLog | None"):
         self.log: Any = log
         self.has_log = log is not None
         self._memory, self.state, self.real = scene.memory, scene.state, scene.real
-        self.push_out = scene.memory.field(f"{name}.push_out", None, values=-1.0 if push_out is None else push_out)
-        self.has_friction, self.has_restitution = friction is not None, restitution is not None
+        self.has_friction, self.has_restitution, self.turns = wall.has_friction, wall.has_restitution, wall.turns
+        self.has_switch, self.is_one_way, self.has_velocity = wall.has_switch, wall.one_way is not None, wall.has_surface_velocity
         self.impacts: Any = scene.impacts
         # A particle with spin and friction bounces alone, since the extra passes do not change its spin.
-        self.has_impacts = bool(scene.impacts) and not (scene.state.spins and friction)
+        self.has_impacts = bool(scene.impacts) and not (scene.state.spins and self.has_friction)
         self.has_impacts = self.has_impacts and (self.has_restitution or scene.impacts.stops)
         self.log_number = self.impacts.add_log(log) if self.has_impacts else -1
         self.poses: list[Any] = []
-        self.spins, self.turns, self.radius = scene.state.spins and self.has_friction, turns, scene.radius
+        self.spins, self.radius = scene.state.spins and self.has_friction, scene.radius
         self.spin: Any = scene.state.spin if scene.state.spins else None
-        if turns and not scene.state.spins:
-            refuse_turning(name)
-        if friction:
-            self.friction = scene.memory.field(f"{name}.friction", None, width=2, values=friction[:2])
-        if restitution:
-            self.restitution = scene.memory.field(f"{name}.restitution", None, values=restitution.normal)
-        if turns and friction:
-            values = friction.rolling, friction.twisting, restitution.tangential if restitution else 0.0
-            self.rolling = scene.memory.field(f"{name}.rolling", None, width=3, values=values)
-        self.has_switch, self.is_one_way = active is not None, one_way is not None
-        if self.is_one_way:
-            self.one_way = scene.memory.field(f"{name}.one_way", None, width=len(one_way), values=one_way)
-        self.has_velocity = velocity is not None
-        if self.has_velocity:
-            self.velocity = scene.memory.field(f"{name}.surface_velocity", None, width=len(velocity), values=velocity)
-        if self.has_switch:
-            self.active = scene.memory.field(f"{name}.active", None, kind=ti.i32, values=float(active or 0))
+        if self.turns and not scene.state.spins:
+            refuse_turning(repr(wall))
+        if self.has_velocity and not self.has_friction:
+            raise ValueError(f"{wall!r}: surface_velocity moves nothing without friction. Give friction above 0 too.")
+        self.fields: dict[str, Any] = {}
+        for name, value in self._values(wall).items():
+            kind, width = ti.i32 if name == "active" else None, np.size(value) if np.ndim(value) else 0
+            self.fields[name] = scene.memory.field(f"{wall!r}.{name}", None, width=width, kind=kind, values=value)
+        vars(self).update(self.fields)
 
-    def upload(
-        self, friction: "Coefficients", restitution: "Bounce", active: bool, velocity: Any, push_out: float | None
-    ) -> None:
-        """Write these values to the device, as far as kernels read them."""
-        self._memory.write(self.push_out, -1.0 if push_out is None else push_out)
+    def _values(self, wall: "Collider") -> dict[str, Any]:
+        """Return the values of the wall that kernels read, by name."""
+        rub, bounce = wall.coefficients, wall.bounce
+        out: dict[str, Any] = {"push_out": -1.0 if wall.push_out is None else wall.push_out}
         if self.has_friction:
-            self._memory.write(self.friction, friction[:2])
+            out["friction"] = rub[:2]
         if self.has_restitution:
-            self._memory.write(self.restitution, restitution.normal)
+            out["restitution"] = bounce.normal
         if self.turns:
-            self._memory.write(self.rolling, (friction.rolling, friction.twisting, restitution.tangential))
-        if self.has_switch:
-            self._memory.write(self.active, float(active))
+            out["rolling"] = rub.rolling, rub.twisting, bounce.tangential
+        if self.is_one_way:
+            out["one_way"] = wall.one_way
         if self.has_velocity:
-            self._memory.write(self.velocity, velocity)
+            out["velocity"] = wall.velocity_of_surface(self.state.dim)
+        if self.has_switch:
+            out["active"] = float(wall.active)
+        return out
+
+    def upload(self, wall: "Collider") -> None:
+        """Write the present values of the wall to the device, as far as kernels read them."""
+        for name, value in self._values(wall).items():
+            self._memory.write(self.fields[name], value)
 
     @property
     def was_active(self) -> bool:
@@ -147,11 +152,6 @@ class Surface:
             on = 4 * self.state.digits(i) + ti.static(ON) * contact_distance
             out = n.dot(self.one_way[None]) <= 0 or start_depth > on
         return out
-
-    @ti.func
-    def push_without_slide(self, i, depth, start_depth, n, moved, h, mode):
-        """Push particle i out as push() does, where it does not slide along a curved surface."""
-        return self.push(i, depth, start_depth, n, moved, h, mode, False)
 
     @ti.func
     def push(self, i, depth, start_depth, n, moved, h, mode, slides):

@@ -1,10 +1,14 @@
 """A point that moves to a given place during a frame."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..device import ti
-from ..device.memory import Memory
 from ..geometry.interpolation import interpolate
+
+if TYPE_CHECKING:
+    from ..device.memory import Memory
 
 
 class Track:
@@ -13,7 +17,7 @@ class Track:
     in_state: its fields in the exact state, by name.
     """
 
-    def __init__(self, memory: Memory, name: str, value: np.ndarray, kind=None):
+    def __init__(self, memory: "Memory", name: str, value: np.ndarray, kind=None):
         self._memory = memory
         self.ends = memory.field(name, 2, width=len(value), kind=kind, values=[value, value], state=True)
         self.in_state = {"ends": self.ends}

@@ -31,9 +31,8 @@ class WallGroup:
         self.walls = list(walls)
         self.wall: Any = walls[0]
         self.single = len(walls) == 1
-        self.sides = 0 if self.wall.has_facets else self.wall.sides  # of each; 0 where these differ
         self.total: Any = None  # of all
-        self.owner: Any = None  # of each face, where they differ: its wall
+        self.owner: Any = None  # of each face: its wall
         self.first_side: Any = None  # of each wall
         self.members: Any = None
         self.tree: Any = None
@@ -91,7 +90,7 @@ class WallGroup:
         sides = np.array([wall.sides for wall in self.walls])
         self.faces = np.split(first + np.arange(sides.sum()), np.cumsum(sides)[:-1])
         self.first_face, self.total = scene.memory.number(first), scene.memory.number(int(sides.sum()))
-        if not (self.single or self.sides):
+        if not self.single:
             add, name = scene.memory.field, repr(self.wall)
             self.owner = add(f"{name}.owner", int(sides.sum()), kind=ti.i32, values=np.repeat(np.arange(len(sides)), sides))
             self.first_side = add(f"{name}.first_side", len(sides), kind=ti.i32, values=np.cumsum(sides) - sides)
@@ -101,10 +100,8 @@ class WallGroup:
     def face(self, k, side):
         """Return the number of a side of member k, among the faces of all walls."""
         out = self.first_face.now + side
-        if ti.static(bool(self.owner)):
+        if ti.static(not self.single):
             out += self.first_side[k]
-        elif ti.static(not self.single):
-            out += k * self.sides
         return out
 
     @inline
@@ -114,24 +111,20 @@ class WallGroup:
 
     @ti.func
     def wall_of(self, face):
-        """Return the member to which a face belongs; -1 or less, or `count` or more, for faces of other groups."""
+        """Return the member to which a face belongs. For faces of other groups it is 0 if there is one member, else -1."""
         out = 0
-        if ti.static(bool(self.owner)):
+        if ti.static(not self.single):
             out = -1
             if self.has_face(face):
                 out = self.owner[face - self.first_face.now]
-        elif ti.static(not self.single):
-            out = (face - self.first_face.now) // self.sides
         return out
 
     @ti.func
     def side_of(self, face):
         """Return the side of its wall that a face is."""
         out = face - self.first_face.now
-        if ti.static(bool(self.owner)):
+        if ti.static(not self.single):
             out -= self.first_side[self.owner[out]]
-        elif ti.static(not self.single):
-            out %= self.sides
         return out
 
     @ti.func

@@ -14,7 +14,7 @@ ASIDE = 1e-6  # of an impulse: if it is longer by more than that than its part a
 
 
 class WallLog:
-    """A row for each particle, written where the wall presses it, see Surface.push_without_slide().
+    """A row for each particle, written where the wall presses it, see Surface.push().
 
     touching: whether it was pressed in the last substep of the last frame; only this is kept between frames. when: the substeps
     of the frame, from 1 on, in which it was first pressed and last pressed, or BEFORE or NEVER. impulse: the sum of the changes

@@ -616,7 +616,7 @@ class Rows:
         for group, w in ti.static([(g, g.wall) for g in self.walls]):
             if group.has_face(face):
                 group.enter(group.wall_of(face))
-                gap, n, bend, moved = w.start_gap(group.side_of(face), i, self.radius.of(i), self.frame_fraction())
+                gap, n, bend, moved = w.gap(group.side_of(face), i, self.radius.of(i), self.frame_fraction(), True)
                 u = self.state.d[i] - moved
                 un = u.dot(n)
                 ahead = gap + un
@@ -749,6 +749,6 @@ class Rows:
         for group, w in ti.static([(g, g.wall) for g in self.walls]):
             if group.has_face(face):
                 group.enter(group.wall_of(face))
-                gap, n = w.end_gap(group.side_of(face), i, self.radius.of(i), self.frame_fraction())
+                gap, n, _bend, _moved = w.gap(group.side_of(face), i, self.radius.of(i), self.frame_fraction(), False)
                 push_out = w.dev.surface.push_out[None]
         return gap, n, push_out
