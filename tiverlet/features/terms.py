@@ -41,7 +41,6 @@ ROWS: dict[str, dict[str, str]] = {
         "PBC PeriodicBox PeriodicBoundary": "write tv.Periodic(low, high)",
         "Vec2 Vec2d Vec3 Vector": "a point is a tuple, or a row of an array",
         "Writer Recording Film Video dump record": "write tv.Recorder(path, world)",
-        "save": "write world.save(path)",
         "open read": "write tv.load(path) for worlds, tv.replay(path) for recordings, tv.shapes.load(path) for OBJ and PLY files",
         "show render view viewer draw gui": "write tv.play(world)",
         "XPBD PBD GaussSeidel": "write tv.World(particles, features, solver=tv.Jacobi())",
