@@ -10,13 +10,16 @@ from tiverlet.report import CASES
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_a_case_reaches_its_known_answer(name):
-    exact = name.startswith("S07")  # the first method solves all, so that no order shows; the second shows it in short substeps
-    methods = CASES[name].methods[: 2 if exact else 1]
-    found = tv.report.error_vs_time([name], methods=methods, precisions=("f64",), baselines=False, runs=1, quick=not exact)
+    # Where the first method solves all, no order shows; then the second shows it, in short substeps.
+    some = {"precisions": ("f64",), "baselines": False, "runs": 1}
+    case = CASES[name]
+    found = tv.report.error_vs_time([name], methods=case.methods[:1], quick=True, **some)
+    if found.failures and case.order and found.order(name, case.methods[0]) is None:
+        found = tv.report.error_vs_time([name], methods=case.methods, **some)
     assert not found.failures and not found.missing and len(found.points) > 0
 
 
-@pytest.mark.parametrize("name", ["D01_double_pendulum", "S04_spring_pendulum", "R16_bounce_e0.5"])
+@pytest.mark.parametrize("name", ["D06_chain100", "D08_massratio10", "S04_spring_pendulum", "R16_bounce_e0.5"])
 def test_f32_keeps_the_error_of_a_case(name):
     found = tv.report.error_vs_time([name], methods=CASES[name].methods[:1], efforts=[CASES[name].at], baselines=False, runs=1)
     assert not found.failures and {p.precision for p in found.points} == {"f32", "f64"}

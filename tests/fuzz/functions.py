@@ -32,6 +32,27 @@ def waves(x, v, t, i):
     return ti.sin(3.0 * x + t + 0.1 * ti.cast(i, ti.f32)) - 0.1 * v
 
 
+TABLE = np.array([0.0, 2.0])  # kernels compare it when they are compiled
+
+
+@ti.func
+def compared(x):
+    """A force by comparisons and choices of all kinds. NaN is not less than any number."""
+    s, v, n = x[0], ti.Vector([x[0], 2 * x[0]]), ti.cast(4 * x[0], ti.i32)
+    u, none, f = ti.cast(ti.abs(n), ti.u32), (s - s) / (s - s), 0.0 * x
+    for k in ti.static(range(2)):
+        if ti.static(TABLE[k] > 1.5):
+            f[0] += 1
+    if ti.static(np.int64(2) == 2) and TABLE[1] > 1.5:
+        f[1] += 1
+    larger, same, chosen = v > 0.5, v == v, ti.select(v > 0.5, v, 0 * v)
+    f[0] += larger[0] + 2 * larger.any() + 4 * same.all() + chosen[0] - chosen[1]
+    f[1] += (s != s) + 2 * (0 < s < 0.5) + 4 * (s >= 0.1) + 8 * (not s < 0.1) + (none < 1) + 2 * (none >= 1) + 4 * (none != none)
+    f[0] += (s > 0.3) + (s > 0.2) - 3.0 * (s > 0) + (u > -1) + ((n > 1) << 2)
+    f[1] += ti.select(s > 0.1, 1.0, 2.0) - ti.select(not s > 0.1, 1.0, 2.0) + ti.select(n, 3.0, 4.0)
+    return f + ((s > 0.1) != (s > 0.2)) - ((s > 0.1) == (s > 0.3))
+
+
 def perimeter(a, b, c):
     """Return the perimeter of a triangle."""
     return (a - b).norm() + (b - c).norm() + (c - a).norm()
