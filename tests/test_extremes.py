@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.device import thread_team
 from tiverlet.report.stress.certificate import certify
-from tiverlet.report.stress.rows.motion import check_nan_flag
 
 from .conftest import ARCH
 
@@ -22,12 +20,6 @@ def test_rows_pass(number, briefly):
     whip = "Jacobi(relaxation=1): turned, unconverged; Direct(): softened, unconverged"
     said = {18: whip, 62: ("5 substeps advised", "6 substeps advised")}
     assert result.figure.startswith(said.get(number, ""))
-
-
-def test_nan_is_flagged_in_launches():
-    with thread_team.launching():
-        found = check_nan_flag(tv.Box((-9, -9), (99, 99)), path="parallel")
-    assert all(found.values()), found
 
 
 def test_thousands_in_one_cell_are_warned_of_and_all_pairs_are_there(world):

@@ -148,18 +148,6 @@ def test_high_orders_of_springs(world):
         w.step(dt)
         errors.append(abs(w.position[1, 0] - (1.3 - 3.0 * np.sin(20 * dt) / 20)))
     assert order(errors) > 3.7 and errors[-1] < 1e-5, errors
-    # Springs of 1e6 N/m between all of seven particles, stretched to twice their length: the particles fly through each other at
-    # some 1000 m/s, which no substep of 0.8 ms resolves, and gain energy. A spring that turns by 0.01 of a turn sets no flag, nor
-    # does a spring of length 0, whose force is linear, when it passes through its other end.
-    crowd, two = 0.7 * tv.golden(range(7), dim=2), [(0, 0), (1, 0)]
-    every = np.stack(np.triu_indices(7, 1), axis=1)
-    wild, swing, through = (
-        world(tv.Particles(x, pinned=[0]), [tv.Gravity(0.0), tv.Distance(pairs, rest, compliance=soft)], precision="f64", order=4)
-        for x, pairs, rest, soft in ((crowd, every, 0.3, 1e-6), (two, [(0, 1)], 0.5, 1e-3), (two, [(0, 1)], 0.0, 1e-3))
-    )
-    assert "turned" in wild.step(1 / 60).flags
-    for w in (swing, through):
-        assert not any("turned" in w.step(1 / 60).flags for _ in range(20))
 
 
 def test_order_4_is_reversible_keeps_its_energy_and_its_order_where_substeps_change(world):
@@ -207,6 +195,7 @@ def test_what_has_no_high_order_is_refused():
         (tv.Distance([(0, 1)], break_at=1.0), "can break"),
         (tv.ShapeMatch([[0, 1, 2]]), "not one number"),
         (tv.Area([[0, 1, 2, 3]]), "any number of corners"),
+        (tv.Motor([[0, 1, 2]], 1.0), "moves on its own"),
     ):
         with pytest.raises(ValueError, match=re.escape(f"order = 4, but {feature!r} ") + f".*{why}"):
             tv.World(four, [feature], precision="f64", order=4)

@@ -65,10 +65,8 @@ def test_conjugate_gradients_reach_the_direct_solution(world):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "solver, advised", [(tv.Jacobi(), tv.ConjugateGradient()), (tv.ConjugateGradient(3), tv.ConjugateGradient(6))]
-)
-def test_constraints_that_are_not_met_are_flagged_with_what_helps(world, solver, advised):
+@pytest.mark.parametrize("solver", [tv.Jacobi(), tv.ConjugateGradient(3)])
+def test_constraints_that_are_not_met_are_flagged_with_what_helps(world, solver):
     # The residual of a cloth that falls into its two pins falls with h or faster: both the note's substeps and its solver help.
     x, pairs = cloth(12)
     start = tv.Particles(x, mass=1e-3, pinned=[0, 11])
@@ -80,34 +78,10 @@ def test_constraints_that_are_not_met_are_flagged_with_what_helps(world, solver,
     found = worst(solver, 8)
     assert found.residual > 0.1 and "unconverged" in found.flags
     (note,) = (n for n in found.notes if n.startswith("Constraints are not met:"))
-    assert f"off by {100 * found.residual:.3g} %" in note
-    need = int(re.findall(r"Use about (\d+) substeps", note)[0])
-    assert 8 < need < 60 and note.split(", or solver=tv.")[1].startswith(repr(advised).partition("(")[0])
-    for better in (worst(solver, need), worst(advised, 8)):
-        assert better.residual < 0.11, better
-        assert ("unconverged" in better.flags) == (better.residual > 0.05)
-
-
-@pytest.mark.slow
-def test_pins_and_clusters_hold_the_energy_of_what_they_exert(world):
-    # A spring of 1e-9 m/N pulls a rod's end, and another one a square, 0.01 m away from where rigid links keep them. At rest,
-    # with shared masses, they hold alpha F^2 / 2, with F the force that they exert (4 alpha F^2 / 2 for a corner with a quarter
-    # of the square's mass). C^2 / (2 alpha) would be 5e4 J each, m C^2 / h^2 of a pass 1e3 J, and F C / 2, which is no spring's
-    # energy, 20 J. The share of F C / 2 that is not stiff, (alpha / h^2)^2, is included.
-    corner = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
-    x = np.concatenate([[[-3.0, 0], [-2, 0]], corner])
-    ring = np.stack([2 + np.arange(4), 2 + (np.arange(4) + 1) % 4], axis=1)
-    pin = tv.Pin([1], (-1.99, 0.0), compliance=1e-9)
-    body = tv.ShapeMatch([2 + np.arange(4)], compliance=1e-9)
-    rods = tv.Distance(np.concatenate([[[0, 1]], ring]), np.r_[1.0, np.full(4, 1.01)])
-    w = world(tv.Particles(x, pinned=[0]), [pin, body, rods, tv.Drag(30.0)], precision="f64", solver=tv.Jacobi(), substeps=20)
-    w.run(1.0)
-    off = np.linalg.norm(w.position[1] - pin.target[0])
-    far = np.linalg.norm(w.position[2:] - w.position[2:].mean(axis=0), axis=1) - np.sqrt(0.5)
-    held = 1e-9 * np.linalg.norm(pin.load[0]) ** 2 / 2 + 4 * 4e-9 * body.load[0] ** 2 / 2
-    soft = (4e-9 * 1200**2) ** 2 * 4 * body.load[0] * np.abs(far).max() / 2
-    assert np.abs(w.velocity).max() < 1e-3 and off > 1e-3 and np.abs(far).min() > 1e-3
-    assert w.step(1 / 60).energy == pytest.approx(held + soft, rel=1e-2)
+    said = re.search(r"off by (\S+) %.* Use about (\d+) substeps.*, or solver=tv.(ConjugateGradient)", note)
+    assert said and said[1] == f"{100 * found.residual:.3g}" and 8 < int(said[2]) < 60
+    for better in (worst(solver, int(said[2])), worst(tv.ConjugateGradient(6), 8)):
+        assert better.residual < 0.11 and ("unconverged" in better.flags) == (better.residual > 0.05), better
 
 
 def test_a_contradictory_rope_softens_no_other_links(world):
@@ -151,22 +125,17 @@ class HeavyBall(Solver):
     """Jacobi with momentum (Polyak 1964): d_j = a z_j + b d_(j-1), for eigenvalues from 1 / kappa to 1."""
 
     converges = True
-
-    def __init__(self, kappa=16.0):
-        root = kappa**-0.5
-        self.a, self.b = 4 / (1 + root) ** 2, ((1 - root) / (1 + root)) ** 2
+    b = ((1 - 1 / 4) / (1 + 1 / 4)) ** 2  # kappa = 16
+    a = 4 / (1 + 1 / 4) ** 2
 
     def semi_iteration(self, scene):
-        return Ball(self.a, self.b)
+        return Ball()
 
 
 class Ball(SemiIteration):
-    def __init__(self, a, b):
-        self.a, self.b = a, b
-
     @ti.func
     def step(self, last, correction):
-        return self.a * correction + self.b * last
+        return HeavyBall.a * correction + HeavyBall.b * last
 
 
 def recursive(solver, eigenvalue, k):
