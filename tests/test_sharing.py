@@ -1,15 +1,19 @@
 """Worlds of the same structure share compiled kernels, and no state."""
 
+import inspect
 import resource
+import sys
 
 import numpy as np
 import pytest
 import taichi as ti
+from taichi.lang.kernel_impl import Kernel
 
 import tiverlet as tv
 from tiverlet.device import layout, runtime
 from tiverlet.device.patches import sharing
 from tiverlet.device.patches.compiler import CachedLaunch
+from tiverlet.features.arguments import knobs_of
 from tiverlet.step.step import Step
 
 from .conftest import ARCH, compiled
@@ -60,27 +64,28 @@ def compliant(row, corners):
 
 ALL = {name: (row.points, lambda c, row=row: compliant(row, c)) for name, row in ROWS.items()}
 ALL |= {name: (points, make) for name, (points, make, _) in OTHERS.items()}
-# Walls with other corners, and with other numbers of facets.
-ALL["Polygon"] = 9 + SQUARE[:1], lambda c: tv.Polygon([*(len(c) * SQUARE), *[(-len(c), 0.0)] * (len(c) > 2)])
-ALL["Mesh"] = (
-    9 + CUBE[:1],
-    lambda c: tv.Mesh(
-        np.concatenate([len(c) * CUBE + 99.0 * k for k in range(len(c) // 2)]),
-        np.concatenate([np.array(CUBE_FACES) + 8 * k for k in range(len(c) // 2)]),
+WALLS = {  # with other corners, and with other numbers of facets
+    "Polygon": (9 + SQUARE[:1], lambda c: tv.Polygon([*(len(c) * SQUARE), *[(-len(c), 0.0)] * (len(c) > 2)])),
+    "Mesh": (
+        9 + CUBE[:1],
+        lambda c: tv.Mesh(
+            np.concatenate([len(c) * CUBE + 99.0 * k for k in range(len(c) // 2)]),
+            np.concatenate([np.array(CUBE_FACES) + 8 * k for k in range(len(c) // 2)]),
+        ),
     ),
-)
+}
 
 
 @pytest.mark.filterwarnings("ignore:Path")  # which warns of points off the curve
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", ALL | WALLS)
 def test_kernels_depend_on_no_number_of_anything(world, name, monkeypatch):
     # The text of a world, which decides what is compiled, is the same for two constraints and for four, with more or fewer free
     # particles, for other sizes of the scene, and before and after steps of several lengths. Steps run without their kernels,
-    # which cannot write to Python objects and compile long. That all of a scene is in the text shows in test_knobs.py.
+    # which cannot write to Python objects and compile long.
     monkeypatch.setattr(CachedLaunch, "__call__", lambda launch: None)
     for kernel in ("to_velocity", "velocities"):
         monkeypatch.setattr(Step, kernel, lambda *arguments: None)
-    points, make = ALL[name]
+    points, make = (ALL | WALLS)[name]
     m, dim = points.shape
 
     def built(count, free, far):
@@ -103,6 +108,64 @@ def test_kernels_depend_on_no_number_of_anything(world, name, monkeypatch):
         assert written(w) == first
         w.remove([len(w.particles) - 1])
         assert written(w) == first
+
+
+class Untold(np.ndarray):
+    """An array whose content must not be read."""
+
+    def refuse(self, *args, **kwargs):
+        raise AssertionError("a kernel reads what an array holds")
+
+    shape = size = property(refuse)
+    __len__ = __getitem__ = __array_ufunc__ = __array_function__ = __float__ = __int__ = __bool__ = __iter__ = tolist = refuse
+
+
+class Translated(Exception):
+    """What ends a launch once its kernel is translated."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dim", [2, 3])
+def test_what_is_left_out_of_the_text_is_not_read(world, monkeypatch, dim):
+    # Compiled code is a function of what is read. So while kernels are translated, nothing that sharing.KernelInputs leaves out
+    # may be read: attributes for the host, and the content of arrays.
+    translating, materialize = [False], Kernel.materialize
+    modules = [m for name, m in sys.modules.items() if name.startswith("tiverlet.") and "patches" not in name]
+    for kind in {o for m in modules for o in vars(m).values() if inspect.isclass(o) and o.__module__.startswith("tiverlet.")}:
+        whole = kind.__bases__ == (object,) or "__getattribute__" in vars(kind)
+        if "patches" in kind.__module__ or issubclass(kind, (BaseException, np.ndarray)) or not whole:
+            continue
+
+        def read(self, name, plain=kind.__getattribute__):
+            value = plain(self, name)
+            if translating[0] and name in object.__getattribute__(self, "__dict__"):
+                knob = name in knobs_of(type(self)) and not getattr(type(self), name).built  # see Feature.compiled()
+                told = sharing.may_read(type(self), name) or knob or name.startswith("__")
+                assert told, f"a kernel reads {name} of a {type(self).__name__}"
+                return value.view(Untold) if isinstance(value, np.ndarray) else value
+            return value
+
+        monkeypatch.setattr(kind, "__getattribute__", read)
+
+    def translate(self, key=None, args=None, arg_features=None):
+        translating[0] = True
+        try:
+            materialize(self, key=key, args=args, arg_features=arg_features)
+        finally:
+            translating[0] = False
+        raise Translated
+
+    points, features = [np.random.default_rng(0).normal(size=(9, dim))], []
+    for corners, make in (some for some in ALL.values() if some[0].shape[1] == dim):
+        features.append(make(sum(map(len, points)) + np.arange(len(corners))[None]))
+        points.append(corners)
+    walls = [tv.Box([-9.0] * dim, [9.0] * dim), tv.HalfSpace(np.eye(dim)[1], -8.0), tv.Ball([0.0] * dim, 9.0, inside=True)]
+    push = [tv.Gravity(9.81), tv.Drag(0.1), tv.Contact(friction=0.5, restitution=0.5), *walls]
+    r = world(tv.Particles(np.concatenate(points), radius=0.01), [*features, *push])._runner
+    monkeypatch.setattr(Kernel, "materialize", translate)
+    for name, given in (("fused", r.sheet), ("to_velocity", np.zeros(2))):
+        with pytest.raises(Translated), r.memory.compiler():
+            getattr(r.step, name)(given)
 
 
 def test_what_functions_of_the_user_know_is_part_of_the_structure(world):
