@@ -2,14 +2,19 @@
 
 import ast
 import functools
+import inspect
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import tiverlet as tv
+from tiverlet.constraints.core.corner_passes import CornerPasses
 from tiverlet.device.patches import patched
+from tiverlet.features.feature import Batch
+from tiverlet.neighbours.neighbour_list import NeighbourList
 
 from .conftest import ARCH, parsed
 
@@ -37,23 +42,18 @@ def modules() -> dict[str, ast.Module]:
     return out
 
 
-def named(module: str, node: ast.AST) -> dict[str, tuple[str, str]]:
-    """Return what an import of the package defines in a module: name -> (module, name in it), where "" is the module itself."""
-    if not isinstance(node, ast.ImportFrom) or not node.level:
-        return {}
-    package = module if (ROOT.parent / module.replace(".", "/")).is_dir() else module.rpartition(".")[0]
-    base = ".".join([*package.split(".")[: len(package.split(".")) + 1 - node.level], *filter(None, [node.module])])
-    return {a.asname or a.name: (m, "") if (m := f"{base}.{a.name}") in modules() else (base, a.name) for a in node.names}
-
-
 def imported(name: str) -> list[str]:
-    """Return the modules of the package that a module imports when it is imported."""
+    """Return the modules of the package that a module imports when it is imported: not in functions or under TYPE_CHECKING."""
+    package = name if (ROOT.parent / name.replace(".", "/")).is_dir() else name.rpartition(".")[0]
     out: list[str] = []
 
     def look(body: list[ast.stmt]) -> None:
-        """Collect the imports of statements, except in functions and under TYPE_CHECKING."""
+        """Collect the imports of statements."""
         for node in body:
-            out.extend(module for module, _ in named(name, node).values())
+            if isinstance(node, ast.ImportFrom) and node.level:
+                parts = package.split(".")
+                base = ".".join([*parts[: len(parts) + 1 - node.level], *filter(None, [node.module])])
+                out.extend(m if (m := f"{base}.{a.name}") in modules() else base for a in node.names)
             if isinstance(node, ast.If) and "TYPE_CHECKING" not in ast.unparse(node.test):
                 look(node.body + node.orelse)
 
@@ -61,30 +61,15 @@ def imported(name: str) -> list[str]:
     return [m for m in dict.fromkeys(out) if m != name]
 
 
-@pytest.mark.slow
-def test_imports_go_in_no_circle():
-    done: set[str] = set()
-
-    def visit(name: str, path: tuple[str, ...]) -> None:
-        """Check the imports of a module, and recursively theirs."""
-        assert name not in path, " -> ".join((*path[path.index(name) :], name))
-        if name not in done:
-            for below in imported(name):
-                visit(below, (*path, name))
-            done.add(name)
-
-    for name in modules():
-        visit(name, ())
-
-
-def test_imports_are_shallow():
+def test_imports_are_shallow_and_go_in_no_circle():
     # The longest chain of imports is bounded, so that few modules must be read to understand one.
     chains: dict[str, tuple[str, ...]] = {}
 
-    def chain(name: str) -> tuple[str, ...]:
-        """Return the longest chain that begins at a module."""
+    def chain(name: str, path: tuple[str, ...] = ()) -> tuple[str, ...]:
+        """Return the longest chain that begins at a module, to which `path` leads."""
+        assert name not in path, " -> ".join((*path, name))
         if name not in chains:
-            chains[name] = (name, *max(map(chain, imported(name)), key=len, default=()))
+            chains[name] = (name, *max((chain(below, (*path, name)) for below in imported(name)), key=len, default=()))
         return chains[name]
 
     longest = max(map(chain, modules()), key=len)
@@ -93,56 +78,40 @@ def test_imports_are_shallow():
 
 
 @functools.cache
-def kinds() -> dict[tuple[str, str], ast.ClassDef]:
-    """Return all classes of the package by module and name."""
-    return {(m, node.name): node for m, tree in modules().items() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+def kinds() -> set[type]:
+    """Return all classes of the package."""
+    every = (kind for name in modules() for kind in vars(import_module(name)).values())
+    return {kind for kind in every if inspect.isclass(kind) and kind.__module__ in modules()}
 
 
-@functools.cache
-def origins() -> dict[str, dict[str, tuple[str, str]]]:
-    """Return for each module the names that its imports define."""
-    return {m: {k: v for node in ast.walk(tree) for k, v in named(m, node).items()} for m, tree in modules().items()}
+def bases(kind: type) -> list[type]:
+    """Return the direct base classes of a class in the package."""
+    return [b for b in kind.__bases__ if b in kinds()]
 
 
-def kind_of(module: str, said: ast.expr) -> tuple[str, str] | None:
-    """Return the class of the package, by module and name, to which an expression refers in a module."""
-    if isinstance(said, ast.Attribute) and isinstance(said.value, ast.Name):
-        module, name = origins()[module].get(said.value.id, ("", ""))[0], said.attr
-    else:
-        name = said.id if isinstance(said, ast.Name) else ""
-    while module and (module, name) not in kinds():
-        module, name = origins()[module].get(name, ("", ""))
-    return (module, name) if module else None
-
-
-@functools.cache
-def bases() -> dict[tuple[str, str], list[tuple[str, str]]]:
-    """Return for each class its direct base classes in the package."""
-    return {kind: [b for said in node.bases if (b := kind_of(kind[0], said))] for kind, node in kinds().items()}
-
-
-def depth(kind: tuple[str, str], ground: tuple[str, ...] = CONTRACTS) -> int:
+def depth(kind: type, ground: tuple[str, ...] = CONTRACTS) -> int:
     """Return how many base classes of the package are below a class, down to those of `ground`, which do not count."""
-    return 0 if kind[1] in ground else max((1 + depth(b, ground) for b in bases()[kind]), default=0)
+    return 0 if kind.__name__ in ground else max((1 + depth(b, ground) for b in bases(kind)), default=0)
 
 
-@pytest.mark.slow
 def test_classes_are_at_most_two_below_a_contract():
     # No chain of classes is longer than CHAIN, contracts included.
-    by = {kind[1]: kind for kind in kinds()}
-    assert {kind: d for kind in kinds() if (d := depth(kind)) > 2} == {}
-    assert {kind: d for kind in kinds() if (d := depth(kind, ()) + 1) > CHAIN} == {}
-    assert depth(by["Distance"]) == depth(by["Mesh"]) == 2 and depth(by["Gravity"]) == depth(by["Direct"]) == 1
-    assert depth(by["Distance"], ()) + 1 == CHAIN and depth(by["Direct"], ()) + 1 == 2
+    assert [kind for kind in kinds() if depth(kind) > 2 or depth(kind, ()) >= CHAIN] == []
+    assert depth(tv.Distance) == depth(tv.Mesh) == 2 and depth(tv.Gravity) == depth(tv.Direct) == 1
+    assert depth(tv.Distance, ()) + 1 == CHAIN and depth(tv.Direct, ()) + 1 == 2
 
 
 def test_classes_are_abstract_or_final():
     # Base classes are never instantiated: code is shared by holding an object.
-    abstract = {b for below in bases().values() for b in below}
-    calls = {m: [node for node in ast.walk(tree) if isinstance(node, ast.Call)] for m, tree in modules().items()}
-    made = {kind for m, some in calls.items() for node in some if (kind := kind_of(m, node.func))}
-    assert abstract & made == set()
-    assert ("tiverlet.features.feature", "Batch") in abstract and ("tiverlet.neighbours.neighbour_list", "NeighbourList") in made
+    abstract, made = {b for kind in kinds() for b in bases(kind)}, set()
+    for name, tree in modules().items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name | ast.Attribute):
+                *owner, last = ast.unparse(node.func).rsplit(".", 1)
+                given = vars(import_module(name))
+                made.add(str(getattr(given.get(owner[0]), last, None) if owner else given.get(last)))
+    assert {*map(str, abstract)} & made == set()
+    assert Batch in abstract and str(NeighbourList) in made
 
 
 def lines(function: ast.FunctionDef) -> int:
@@ -151,26 +120,21 @@ def lines(function: ast.FunctionDef) -> int:
     return (body[-1].end_lineno or 0) - body[0].lineno + 1 if body else 0
 
 
-def functions(kind: tuple[str, str], in_kernels: bool | None = None) -> list[ast.FunctionDef]:
-    """Return the functions of a class: all, those for kernels, or those for the host."""
-    some = [node for node in kinds()[kind].body if isinstance(node, ast.FunctionDef)]
-    marks = {id(f): bool({ast.unparse(d) for d in f.decorator_list} & {"ti.func", "ti.kernel", "inline"}) for f in some}
-    return [f for f in some if in_kernels is None or marks[id(f)] == in_kernels]
-
-
-def above(kind: tuple[str, str]) -> list[tuple[str, str]]:
-    """Return all base classes of a class in the package."""
-    return [a for b in bases()[kind] for a in (b, *above(b))]
+def functions(kind: type, in_kernels: bool = False) -> list[ast.FunctionDef]:
+    """Return the functions of a class; or those for kernels alone."""
+    (node,) = (n for n in ast.walk(modules()[kind.__module__]) if isinstance(n, ast.ClassDef) and n.name == kind.__name__)
+    some = [f for f in node.body if isinstance(f, ast.FunctionDef)]
+    marks = ({ast.unparse(d) for d in f.decorator_list} & {"ti.func", "ti.kernel", "inline"} for f in some)
+    return [f for f, marked in zip(some, marks, strict=True) if marked or not in_kernels]
 
 
 def test_kernels_inherit_nothing_that_does_something():
     # Kernel functions that contracts define have one line, the default. A constraint inherits few lines for the host.
-    by = {kind[1]: kind for kind in kinds()}
-    abstract = {b for below in bases().values() for b in below}
-    long = {kind[1] for kind in abstract if any(lines(f) > 1 for f in functions(kind, in_kernels=True))}
+    abstract = {b for kind in kinds() for b in bases(kind)}
+    long = {kind.__name__ for kind in abstract if any(lines(f) > 1 for f in functions(kind, in_kernels=True))}
     assert long == set(SHARED)
-    assert lines(functions(by["CornerPasses"], in_kernels=True)[0]) > 10  # shows that functions are found
-    inherited = sum(lines(f) for kind in above(by["Rope"]) for f in functions(kind))
+    assert lines(functions(CornerPasses, in_kernels=True)[0]) > 10  # shows that functions are found
+    inherited = sum(lines(f) for kind in tv.Rope.__mro__[1:] if kind in kinds() for f in functions(kind))
     assert 100 < inherited <= INHERITED
 
 

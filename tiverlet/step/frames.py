@@ -11,28 +11,7 @@ from ..device.memory import Memory
 from ..device.patches.compiler import CachedLaunch
 from ..device.thread_team import LEAST
 from .diagnostics import STEPPED
-from .span import (
-    BEGIN,
-    END,
-    FIGURES,
-    FIRST,
-    FRESH,
-    HALF,
-    HALT,
-    ITERATIONS,
-    ORIGIN,
-    OWED,
-    PART,
-    RESUMED,
-    SHEET,
-    SINCE,
-    START,
-    TICK,
-    UNTIL,
-    H,
-    integer,
-)  # fmt: skip
-from .span import SUBSTEPS as STAGES
+from .span import BEGIN, END, FIGURES, FIRST, FRESH, HALF, HALT, ORIGIN, RESUMED, SHEET, SINCE, START, TICK, H, integer
 
 if TYPE_CHECKING:
     from .step import Step
@@ -48,23 +27,12 @@ WRAP = 2.0**31  # substeps are counted modulo this
 
 def sheets(clocks: Any, end: np.ndarray, origin: np.ndarray, substeps: int, passes: int) -> np.ndarray:
     """Return the sheets of frames, one row per copy, see Span. clocks: Clocks. end, origin: with a value per copy."""
-    out = np.zeros((len(end), SHEET))
-    dates = (H, clocks.h), (START, clocks.time), (END, end), (TICK, clocks.tick), (SINCE, clocks.since)
-    for k, values in (*dates, (FRESH, clocks.d_is_velocity), (OWED, clocks.owed), (ORIGIN, origin)):
-        out[:, k] = values
-    out[:, STAGES], out[:, ITERATIONS] = substeps, passes
-    out[:, UNTIL], out[:, PART] = substeps + 1, passes
+    out, c = np.zeros((len(end), SHEET)), clocks
+    given = (
+        c.h, c.time, end, c.tick, c.since, c.d_is_velocity, c.owed, substeps, passes, 0, 0, 0, 0, origin, substeps + 1, passes
+    )  # fmt: skip
+    out[:, H:] = np.column_stack([np.broadcast_to(values, len(end)) for values in given])
     return out
-
-
-def waits(some: np.ndarray) -> np.ndarray:
-    """Return the mask of the rows whose frames stopped for a list to be grown or built."""
-    return some[:, HALT] != 0
-
-
-def resume(row: np.ndarray, resumed: int, begin: int, half: int) -> None:
-    """Set a sheet so that its frame resumes in the substep, and before the half of a pass, in which it stopped."""
-    row[RESUMED], row[BEGIN], row[HALF] = resumed, begin, half
 
 
 @ti.data_oriented

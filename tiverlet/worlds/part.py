@@ -7,6 +7,7 @@ import pickle
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,50 +74,11 @@ def make_world(who: str, make: Callable[..., World], number: int, row: Mapping[s
     return world
 
 
-def compute(job: Job, part: Part, report_number: Callable[[int], None] = lambda number: None) -> Outcome:
-    """Return the figures of a part, or the exception of the user's functions, with a note that names the parameters.
+def compute(job: Job, part: Part, report_number: Callable[[int], Any] = lambda number: None) -> dict[str, np.ndarray]:
+    """Return the figures of a part by name. Exceptions of the user's functions get a note that names the parameters.
 
-    Exceptions are returned, so that one that is raised in a worker means a failure of the worker itself. report_number: called
-    with the number of each world before it is made, and with -1 after the last.
+    report_number: called with the number of each world before it is made, and with -1 after the last.
     """
-    try:
-        return _figures(job, part, report_number)
-    except Exception as error:
-        return error
-
-
-def compute_in_worker(
-    job: Job | bytes, part: Part, attempt: int, report_number: Callable[[int], None] = lambda number: None
-) -> Outcome:
-    """Run compute() in a process of an executor. attempt: makes repeated calls differ, for executors that cache by arguments.
-
-    Taichi belongs to the thread that started it. Workers of some executors have several threads, so one dedicated thread does all
-    parts there.
-    """
-    if threading.current_thread() is threading.main_thread():
-        return _prepared(job, part, report_number)
-    return _thread().submit(_prepared, job, part, report_number).result()
-
-
-def _prepared(job: Job | bytes, part: Part, report_number: Callable[[int], None]) -> Outcome:
-    try:
-        job = _loaded(job) if isinstance(job, bytes) else job
-        if job.versions != describe_versions():
-            raise RuntimeError(
-                f"sweep: a worker has {describe_versions()}, but the sweep was started with {job.versions}, so the bits could "
-                "differ. Install the same versions on all machines."
-            )
-        if ti.cfg is None:
-            runtime.share = runtime.share or _cores_of_worker()
-            if job.settings:
-                runtime.init(**job.settings)
-    except Exception as error:
-        return _sendable(error)
-    outcome = compute(job, part, report_number)
-    return _sendable(outcome) if isinstance(outcome, Exception) else outcome
-
-
-def _figures(job: Job, part: Part, report_number: Callable[[int], None]) -> dict[str, np.ndarray]:
     from .worlds import Worlds
 
     with contextlib.ExitStack() as stack:
@@ -128,6 +90,36 @@ def _figures(job: Job, part: Part, report_number: Callable[[int], None]) -> dict
         with _noted(f"sweep: raised by the worlds of {part}"):
             worlds = stack.enter_context(Worlds(made))
             return _checked(job.figures(worlds), len(part.rows))
+
+
+def compute_in_worker(
+    job: Job | bytes, part: Part, attempt: int, report_number: Callable[[int], Any] = lambda number: None
+) -> Outcome:
+    """Run compute() in a process of an executor. attempt: makes repeated calls differ, for executors that cache by arguments.
+
+    Exceptions are returned, so that one that is raised means a failure of the worker itself. Taichi belongs to the thread that
+    started it. Workers of some executors have several threads, so one dedicated thread does all parts there.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return _thread().submit(_outcome, job, part, report_number).result()
+    return _outcome(job, part, report_number)
+
+
+def _outcome(job: Job | bytes, part: Part, report_number: Callable[[int], Any]) -> Outcome:
+    try:
+        job = _loaded(job) if isinstance(job, bytes) else job
+        if job.versions != describe_versions():
+            raise RuntimeError(
+                f"sweep: a worker has {describe_versions()}, but the sweep was started with {job.versions}, so the bits could "
+                "differ. Install the same versions on all machines."
+            )
+        if ti.cfg is None:
+            runtime.share = runtime.share or _cores_of_worker()
+            if job.settings:
+                runtime.init(**job.settings)
+        return compute(job, part, report_number)
+    except Exception as error:
+        return _sendable(error)
 
 
 def _checked(found: Any, count: int) -> dict[str, np.ndarray]:
@@ -213,7 +205,5 @@ def _loaded(job: bytes) -> Job:
 
 
 @functools.cache
-def _thread() -> Any:
-    from concurrent.futures import ThreadPoolExecutor  # noqa: PLC0415
-
+def _thread() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1, "sweep")

@@ -169,7 +169,7 @@ def _rows(make: Any, parameters: Any, figures: Any) -> list[dict[str, Any]]:
 
 def _columns(parameters: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the rows of a dict of columns."""
-    columns = {name: _column(name, values) for name, values in _names(parameters, "parameters").items()}
+    columns = {name: _column(name, values) for name, values in parameters.items()}
     lengths = {name: len(values) for name, values in columns.items()}
     if len(set(lengths.values())) > 1:
         told = ", ".join(f"{name} has {length}" for name, length in lengths.items())
@@ -199,15 +199,7 @@ def _dicts(parameters: Any) -> list[dict[str, Any]]:
                 f'sweep: parameters[{k}] = {row!r} is a {kind}, but a dict such as {{"length": 1.0}} is needed, or a dict of '
                 "arrays for all."
             )
-    return [{name: _plain(v) for name, v in _names(row, f"parameters[{k}]").items()} for k, row in enumerate(rows)]
-
-
-def _names(row: Mapping[Any, Any], where: str) -> Mapping[str, Any]:
-    for name in row:
-        if not isinstance(name, str):
-            kind = type(name).__name__
-            raise TypeError(f"sweep: {where} has the key {name!r}, a {kind}, but names of make's arguments are needed.")
-    return row
+    return [{name: _plain(v) for name, v in row.items()} for row in rows]
 
 
 def _plain(value: Any) -> Any:

@@ -142,16 +142,14 @@ class Worlds:
 
     def step(self, dt: float) -> WorldsReport:
         """Advance all worlds by dt [s], see World.step()."""
-        dt = checks.number("Worlds.step", "dt", dt, above=0.0)
-        with self._open():
-            return self._launch(dt, 1, *self._begin(dt))
+        return self._frames(1, checks.number("Worlds.step", "dt", dt, above=0.0))
 
     def run(self, seconds: float, dt: float = 1 / 60, progress: bool = False) -> WorldsReport:
         """Step all worlds for `seconds` [s], rounded to whole frames of dt [s], with many frames per launch.
 
         Returns the worst figures of all frames. progress: show a bar.
         """
-        return self._frames("Worlds.run", seconds, dt, 0, None, progress)
+        return self._frames(_frame_count("Worlds.run", seconds, dt), dt, progress=progress)
 
     def rollout(self, seconds: float, dt: float = 1 / 60, every: int = 1, progress: bool = False) -> Rollout:
         """Run as run() does, and record the positions of all particles after each `every`-th frame, in f64."""
@@ -165,14 +163,15 @@ class Worlds:
                 "`every`, or make several rollouts."
             )
         position = np.zeros((len(self), frames // every, n, dim))
-        report = self._frames("Worlds.rollout", seconds, dt, every, position, progress)
+        report = self._frames(frames, dt, every, position, progress)
         since, length, count = self._clocks.frame.T[:, :, None]
         time = since + length * (count - frames + every * np.arange(1, frames // every + 1))
         return Rollout(time, position, report)
 
-    def _frames(self, who: str, seconds: float, dt: float, every: int, track: np.ndarray | None, progress: bool) -> WorldsReport:
-        """Step frames, several per launch."""
-        frames = _frame_count(who, seconds, dt)
+    def _frames(
+        self, frames: int, dt: float, every: int = 0, track: np.ndarray | None = None, progress: bool = False
+    ) -> WorldsReport:  # fmt: skip
+        """Step frames, several per launch. track: where the positions after each `every`-th frame go, see rollout()."""
         world = self._world
         work = len(self) * world.substeps * world.iterations * self._runner.integrator.stages
         work *= 1 + len(world.particles) + sum(b.count for b in self._runner.batches)
@@ -300,11 +299,11 @@ class Worlds:
             if not runner.step.searches:
                 break
             sheets = memory.read(self._kernels.sheet)
-            some = some[kernel.waits(sheets[some])]
+            some = some[sheets[some, kernel.HALT] != 0]
             for k in some:
                 with self._as_world(k):
                     runner.sheet[:] = sheets[k]
-                    kernel.resume(sheets[k], *runner.take_halt()[:3])
+                    sheets[k, [kernel.RESUMED, kernel.BEGIN, kernel.HALF]] = runner.take_halt()[:3]
                     runner.grow()
                     runner.invalidate()
             memory.write(self._kernels.sheet, sheets)
