@@ -18,7 +18,7 @@ from tiverlet.report import CASES
 from tiverlet.report.accuracy import baselines, errors, points
 from tiverlet.report.accuracy.cases import LEFT_OUT, chosen, entries
 from tiverlet.report.stress.certificate import certify
-from tiverlet.report.stress.rows import ROWS, Finding, Row
+from tiverlet.report.stress.rows import ROWS, Row
 
 from .conftest import figures, python
 
@@ -161,9 +161,9 @@ def test_the_certificate_tells_what_holds_and_what_does_not(monkeypatch, tmp_pat
     def wrong():
         raise RuntimeError("no such luck")
 
-    monkeypatch.setitem(ROWS, 71, Row(71, "a row", "holds", lambda: Finding("1 m", {"short": False, "long": True})))
+    monkeypatch.setitem(ROWS, 71, Row(71, "a row", "holds", lambda: [("short", False), ("long", True)]))
     monkeypatch.setitem(ROWS, 72, Row(72, "another", "works", wrong))
-    monkeypatch.setitem(ROWS, 73, Row(73, "an empty one", "says something", lambda: Finding("nothing")))
+    monkeypatch.setitem(ROWS, 73, Row(73, "an empty one", "says something", lambda: []))
     assert [certify(n).verdict for n in (71, 72, 73)] == ["FAILED"] * 3
     assert certify(71).failing == ("short",) and "no such luck" in certify(72).failing[0]
     path = str(tmp_path / "certificate.json")

@@ -15,6 +15,6 @@ from . import (  # noqa: F401  (they register their rows)
     taut,
     touching,
 )
-from .row import ROWS, Finding, Row
+from .row import ROWS, Row
 
-__all__ = ["ROWS", "Finding", "Row"]
+__all__ = ["ROWS", "Row"]

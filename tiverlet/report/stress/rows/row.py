@@ -2,13 +2,14 @@
 
 import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from ....contact import Contact
 from ....features.feature import Feature
 from ....measure import overlapping
 from ....particles import Particles
@@ -16,34 +17,28 @@ from ....step.step_report import StepReport
 from ....world import World
 
 NAN, INF = float("nan"), float("inf")
+Findings = Iterator[tuple[str, Any]]  # statements of what was seen, each with whether it is as it should be
+Attempt = tuple[Callable[[], object], str]  # a call that must be refused, and a pattern in the text of the error
 
 
 @dataclass(frozen=True)
 class Row:
-    """A row: its number, the extreme case, the criterion, and the function that runs it: () -> Finding."""
+    """A row: its number, the extreme case, the criterion, and the function that runs it and yields its findings."""
 
     number: int
     what: str
     criterion: str
-    attempt: Callable[[], "Finding"]
-
-
-@dataclass
-class Finding:
-    """The result of a row: a figure in words, and whether each part of its criterion holds."""
-
-    figure: str
-    holds: dict[str, bool] = field(default_factory=dict)
+    attempt: Callable[[], Iterable[tuple[str, Any]]]
 
 
 ROWS: dict[int, Row] = {}
 
 
 def row(number: int, what: str, criterion: str) -> Callable:
-    """Return a decorator that registers a function as the row of this number."""
+    """Return a decorator that registers a function as the row of this number. Raises ValueError if the number is taken."""
 
-    def register(attempt: Callable[[], Finding]) -> Callable[[], Finding]:
-        """Register the function. Raises ValueError if the number is taken."""
+    def register(attempt: Callable[[], Findings]) -> Callable[[], Findings]:
+        """Register the function."""
         if number in ROWS:
             raise ValueError(f"row {number} is there twice.")
         ROWS[number] = Row(number, what, criterion, attempt)
@@ -52,16 +47,18 @@ def row(number: int, what: str, criterion: str) -> Callable:
     return register
 
 
+def refusals(number: int, what: str, criterion: str, *attempts: Attempt) -> None:
+    """Register a row of calls that must be refused."""
+    row(number, what, criterion)(lambda: refused(*attempts))
+
+
 @contextmanager
 def world(particles: Particles, features: Sequence[Feature] = (), **settings) -> Iterator[Any]:
     """Provide a world in f64 that is closed at the end; warnings about its structure are suppressed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        made = World(particles, features, **{"precision": "f64", **settings})
-        try:
+        with World(particles, features, **{"precision": "f64", **settings}) as made:
             yield made
-        finally:
-            made.close()
 
 
 def rerun(w: World, seconds: float, dt: float = 1 / 60, **settings) -> StepReport:
@@ -72,20 +69,26 @@ def rerun(w: World, seconds: float, dt: float = 1 / 60, **settings) -> StepRepor
     return w.run(seconds, dt=dt)
 
 
-def refused(*attempts: tuple[Callable[[], object], str]) -> Finding:
+def summary(figure: str, parts: Mapping[str, Any]) -> Findings:
+    """Yield a figure for many parts of a criterion, and the names of those that do not hold."""
+    yield figure, len(parts) > 0
+    yield from ((name, False) for name, holds in parts.items() if not holds)
+
+
+def refused(*attempts: Attempt) -> Findings:
     """Check that each attempt raises a ValueError or TypeError whose text matches its pattern."""
-    holds = {}
+    wrong = []
     for attempt, pattern in attempts:
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                made = attempt()
+            made = attempt()
             if isinstance(made, World):
                 made.close()
-            holds[f"{pattern!r} was not refused"] = False
+            wrong.append(f"{pattern!r} was not refused")
         except (ValueError, TypeError) as error:
-            holds[f"{pattern!r} was refused with: {error}"] = re.search(pattern, str(error)) is not None
-    return Finding(f"{sum(holds.values())} of {len(holds)} refused by name", holds)
+            if not re.search(pattern, str(error)):
+                wrong.append(f"{pattern!r} was refused with: {error}")
+    yield f"{len(attempts) - len(wrong)} of {len(attempts)} refused by name", not wrong
+    yield from ((why, False) for why in wrong)
 
 
 def warned(attempt: Callable[[], object], pattern: str) -> bool:
@@ -105,19 +108,13 @@ def finite(w: World) -> bool:
 
 def contacts_of(position: np.ndarray, radius, **settings) -> np.ndarray:
     """Return all pairs that overlap in a world, sorted by their indices."""
-    from ....contact import Contact
-
     with world(Particles(position, radius=radius), [Contact(**settings)]) as w:
-        found = w.contacts.pairs
-    found = np.sort(found, axis=1)
+        found = np.sort(w.contacts.pairs, axis=1)
     return found[np.lexsort((found[:, 1], found[:, 0]))]
 
 
-def same_pairs(position: np.ndarray, radius, **settings) -> Finding:
+def same_pairs(what: str, position: np.ndarray, radius) -> Findings:
     """Compare the contacts of a cloud of particles with brute force."""
-    found, want = contacts_of(position, radius, **settings), overlapping(position, radius)[0]
+    found, want = contacts_of(position, radius), overlapping(position, radius)[0]
     missed = len(set(map(tuple, want)) - set(map(tuple, found)))
-    return Finding(
-        f"{len(found)} contacts, {missed} missed",
-        {"as many as by brute force": len(found) == len(want), "the same": np.array_equal(found, want), "some": len(want) > 0},
-    )
+    yield f"{what}{len(found)} contacts, {missed} missed", np.array_equal(found, want) and len(want) > 0

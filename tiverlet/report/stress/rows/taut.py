@@ -1,6 +1,6 @@
 """Rows about scenes with more constraints than degrees of freedom, or with a load that no constraint bears to first order."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from ....particles import Particles
 from ....solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
 from ....step.adaptive import StepController
 from ...accuracy.cases.case import links
-from .row import Finding, row, world
+from .row import Findings, row, summary, world
 
 G, MASS = 9.81, 0.01
 STEPS = (2, 20, 200, "auto")
@@ -22,29 +22,36 @@ RULE = "energy never above what it was plus 1e-3 of m g times the size, no speed
 SECONDS = 10
 WHIP = 2.0  # bound of speed over that of free fall: the end of a swinging chain is faster than free fall
 
+Scenes = Iterator[tuple[str, Particles, Sequence[Feature], dict[str, Any]]]  # name, particles, features, options of watched()
 
-class Watch:
-    """Runs passive scenes with every number of substeps, and keeps the worst figures."""
 
-    def __init__(self):
-        self.gain, self.speed, self.holds, self.flags = -np.inf, 0.0, {}, set()
+def passive(number: int, what: str, criterion: str = RULE, softened: bool = False) -> Callable:
+    """Return a decorator that registers the scenes that a function yields as a row. softened: whether that flag must come."""
 
-    def run(
-        self, name: str, particles: Particles, features: Sequence[Feature], most: float = 1e-2, room: float = 1e-3, steps=STEPS,
-        **settings,
-    ) -> None:  # fmt: skip
-        """Run a scene with each number of substeps in `steps`.
+    def register(scenes: Callable[[], Scenes]) -> Callable[[], Scenes]:
+        """Register the function."""
+        row(number, what, criterion)(lambda: watched(scenes(), softened))
+        return scenes
 
-        most: the residual above which a frame under "auto" must have a flag. room: the allowed gain of energy, as a share of m g
-        L, if a frame is flagged "unconverged"; else 1e-3.
-        """
-        free = np.flatnonzero(~particles.pinned)
+    return register
+
+
+def watched(scenes: Scenes, softened: bool) -> Findings:
+    """Run passive scenes with every number of substeps in STEPS, and yield the worst figures.
+
+    Options of a scene: settings of its world (f32 by default), and
+    most: the residual above which a frame under "auto" must have a flag.
+    room: the allowed gain of energy, as a share of m g L, if a frame is flagged "unconverged"; else 1e-3.
+    """
+    most_gain, most_speed, holds, seen = -np.inf, 0.0, {}, set()
+    for name, particles, features, options in scenes:
+        settings = {"precision": "f32", **options}
+        most, room = settings.pop("most", 1e-2), settings.pop("room", 1e-3)
         x = particles.position
         size = float(np.ptp(x, axis=0).max())
-        supply = MASS * G * len(free) * size
-        settings = {"precision": "f32", **settings}
+        supply = MASS * G * np.count_nonzero(~particles.pinned) * size
         with world(particles, features, **settings) as w:
-            for n in steps:
+            for n in STEPS:
                 w.position, w.velocity, w._controller = x, particles.velocity, StepController()
                 w.substeps = n
                 start, gain, fastest, lowest, silent, flags = None, -np.inf, 0.0, x[:, 1].min(), False, set()
@@ -56,18 +63,14 @@ class Watch:
                     lowest = min(lowest, w.position[:, 1].min())
                     silent |= n == "auto" and report.residual > most and report.clean
                     flags |= report.flags
-                self.flags |= flags
                 fastest /= np.sqrt(2 * G * max(size, x[:, 1].max() - lowest))
                 where = f"{name}, {settings['precision']}, {w._solver!r}, {n}"
-                self.holds[f"{where}: energy {gain:+.1e}"] = bool(gain <= (room if "unconverged" in flags else 1e-3))
-                self.holds[f"{where}: speed {fastest:.2g} of free fall"] = bool(fastest <= WHIP)
-                self.holds[f"{where}: nothing silent"] = not silent
-                self.gain, self.speed = max(self.gain, gain), max(self.speed, fastest)
-
-    def finding(self, **more: bool) -> Finding:
-        """Return the worst figures of all runs. more: further parts of the criterion."""
-        told = ", ".join(sorted(self.flags)) or "no flag"
-        return Finding(f"energy {self.gain:+.0e}, {self.speed:.2f} of free fall; {told}", {**self.holds, **more})
+                holds[f"{where}: energy {gain:+.1e}"] = gain <= (room if "unconverged" in flags else 1e-3)
+                holds[f"{where}: speed {fastest:.2g} of free fall"] = fastest <= WHIP
+                holds[f"{where}: nothing silent"] = not silent
+                most_gain, most_speed, seen = max(most_gain, gain), max(most_speed, fastest), seen | flags
+    yield from summary(f"energy {most_gain:+.0e}, {most_speed:.2f} of free fall", holds)
+    yield ", ".join(sorted(seen)) or "no flag", "softened" in seen or not softened
 
 
 def ropes(counts: Iterable[int], ends: Iterable[Sequence[float]], rest: float = 1.0) -> tuple[Particles, np.ndarray, np.ndarray]:
@@ -98,37 +101,32 @@ def complete(n: int) -> np.ndarray:
 LEVEL = [(1.0, 0.0)]
 
 
-@row(71, "straight ropes of 2 to 400 points between two pins", f"{RULE}; 2e-2 where 400 points are flagged unconverged")
-def _taut() -> Finding:
-    watch = Watch()
+@passive(71, "straight ropes of 2 to 400 points between two pins", f"{RULE}; 2e-2 for 400 points, flagged unconverged", True)
+def _taut() -> Scenes:
     for precision in ("f32", "f64"):
         for counts, room in (((2, 5, 40), 1e-3), ((400,), 2e-2)):  # the longest sags by 0.9 of its length
             particles, pairs, _ = ropes(counts, LEVEL * len(counts))
-            watch.run("Distance", particles, [Gravity(G), Distance(pairs)], precision=precision, room=room)
+            yield "Distance", particles, [Gravity(G), Distance(pairs)], {"precision": precision, "room": room}
     particles, pairs, _ = ropes((5, 40), LEVEL * 2)
     for solver, passes in ((Jacobi(), 1), (Chebyshev(), 4), (ConjugateGradient(8), 1)):
-        watch.run("Distance", particles, [Gravity(G), Distance(pairs)], solver=solver, iterations=passes)
-    return watch.finding(flagged="softened" in watch.flags)
+        yield "Distance", particles, [Gravity(G), Distance(pairs)], {"solver": solver, "iterations": passes}
 
 
-@row(72, "the same of Rope, upright, leaning, and 0.1 and 10 % too short", RULE)
-def _short() -> Finding:
-    watch = Watch()
+@passive(72, "the same of Rope, upright, leaning, and 0.1 and 10 % too short", RULE, True)
+def _short() -> Scenes:
     for rest in (1.0, 0.999, 0.9):
         particles, pairs, length = ropes((40, 20, 20), [(1.0, 0.0), (0.0, 1.0), (0.7, 0.7)], rest)
-        watch.run(f"Rope {rest:g}", particles, [Gravity(G), Rope(pairs, length)], solver=Direct(), most=0.2)
-    return watch.finding(flagged="softened" in watch.flags)
+        yield f"Rope {rest:g}", particles, [Gravity(G), Rope(pairs, length)], {"solver": Direct(), "most": 0.2}
 
 
-@row(74, "cantilever and plate with both diagonals, or of triangles that keep their areas", RULE)
-def _braced() -> Finding:
-    watch = Watch()
+@passive(74, "cantilever and plate with both diagonals, or of triangles that keep their areas")
+def _braced() -> Scenes:
     for (nx, ny), solver, iterations in (
         ((10, 2), Jacobi(), 1), ((10, 2), Direct(), 1), ((10, 2), Chebyshev(), 4), ((6, 6), Jacobi(), 1)
     ):  # fmt: skip
         x, pairs = grid(nx, ny)
         particles = Particles(x, mass=MASS, pinned=np.arange(ny))
-        watch.run(f"{nx} x {ny}", particles, [Gravity(G), Distance(pairs)], solver=solver, iterations=iterations)
+        yield f"{nx} x {ny}", particles, [Gravity(G), Distance(pairs)], {"solver": solver, "iterations": iterations}
     x, pairs = grid(8, 3, braced=False)
     k = np.arange(24).reshape(8, 3)
     below, above = (k[:-1, :-1], k[1:, :-1], k[:-1, 1:]), (k[1:, :-1], k[1:, 1:], k[:-1, 1:])
@@ -136,14 +134,13 @@ def _braced() -> Finding:
     particles = Particles(x, mass=MASS, pinned=np.arange(3))
     loops = np.stack([c.ravel() for c in (k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:])], axis=1)
     for name, areas, compliance in (("areas", triangles, 1e-3), ("loops", list(loops), 0.0)):
-        links_ = Distance(pairs, compliance=compliance)
-        watch.run(name, particles, [Gravity(G), links_, Area(areas)], solver=Jacobi())
-    return watch.finding()
+        edges = Distance(pairs, compliance=compliance)
+        yield name, particles, [Gravity(G), edges, Area(areas)], {"solver": Jacobi()}
 
 
-@row(75, "wheel with spokes, rigid loop, complete graph of 12 in 3D, truss between pins", RULE)
-def _rigid() -> Finding:
-    watch, rng = Watch(), np.random.default_rng(0)
+@passive(75, "wheel with spokes, rigid loop, complete graph of 12 in 3D, truss between pins")
+def _rigid() -> Scenes:
+    rng = np.random.default_rng(0)
     a = 2 * np.pi * np.arange(16) / 16
     wheel = np.vstack([[0, 2], np.stack([0.5 * np.cos(a), 2 + 0.5 * np.sin(a)], axis=1)])
     round_ = np.stack([np.arange(16), (np.arange(16) + 1) % 16], axis=1) + 1
@@ -158,55 +155,44 @@ def _rigid() -> Finding:
         ("truss", beam, braces, [0, 1, 18, 19], Jacobi()),
         ("truss", beam, braces, [0, 1, 18, 19], Direct()),
     ):
-        watch.run(name, Particles(x, mass=MASS, pinned=pinned), [Gravity(G), Distance(pairs)], solver=solver)
-    return watch.finding()
+        yield name, Particles(x, mass=MASS, pinned=pinned), [Gravity(G), Distance(pairs)], {"solver": solver}
 
 
-@row(76, "links twice, with two lengths, and of length 0", RULE)
-def _twice() -> Finding:
-    watch, n = Watch(), 10
+@passive(76, "links twice, with two lengths, and of length 0")
+def _twice() -> Scenes:
+    n = 10
     x = np.stack([0.1 * np.arange(n), np.full(n, 2.0)], axis=1)
-    once = links(n - 1)
+    once, held = links(n - 1), Particles(x, mass=MASS, pinned=[0, n - 1])
+    lengths = np.r_[np.full(n - 1, 0.0995), np.full(n - 1, 0.1005)]
     for solver in (Direct(), Jacobi()):
-        watch.run(
-            "twice", Particles(x, mass=MASS, pinned=[0, n - 1]), [Gravity(G), Distance(np.vstack([once, once]))], solver=solver
-        )
-        rest = np.r_[np.full(n - 1, 0.0995), np.full(n - 1, 0.1005)]
-        watch.run(
-            "two lengths",
-            Particles(x, mass=MASS, pinned=[0, n - 1]),
-            [Gravity(G), Distance(np.vstack([once, once]), rest)],
-            solver=solver,
-        )
+        for name, rest in (("twice", None), ("two lengths", lengths)):
+            yield name, held, [Gravity(G), Distance(np.vstack([once, once]), rest)], {"solver": solver}
     at = np.vstack([x, x[:1], x[-1:]])
     hung = Particles(at, mass=MASS, pinned=[n, n + 1])
     for solver, passes in ((Direct(), 1), (Jacobi(), 1), (Chebyshev(), 4), (ConjugateGradient(8), 1)):
         zero = Distance(np.vstack([once, [[n, 0], [n - 1, n + 1]]]))
-        watch.run("length 0", hung, [Gravity(G), zero], precision="f64", solver=solver, iterations=passes)
-    return watch.finding()
+        yield "length 0", hung, [Gravity(G), zero], {"precision": "f64", "solver": solver, "iterations": passes}
 
 
-@row(77, "rigid clusters that share three points, and one with links inside", RULE)
-def _clusters() -> Finding:
-    watch = Watch()
+@passive(77, "rigid clusters that share three points, and one with links inside")
+def _clusters() -> Scenes:
     x, pairs = grid(3, 5)
     k = np.arange(15).reshape(3, 5).T
     shared = ShapeMatch([k[:3].ravel(), k[2:].ravel()])
-    watch.run("shared", Particles(x, mass=MASS, pinned=[0]), [Gravity(G), shared])
-    row_, _ = grid(8, 2)
-    watch.run("in a row", Particles(row_, mass=MASS, pinned=[0, 1]), [Gravity(G), ShapeMatch(np.arange(4) + 2 * k[:7, :1])])
-    watch.run("links inside", Particles(x, mass=MASS, pinned=[0]), [Gravity(G), ShapeMatch([np.arange(15)]), Distance(pairs)])
-    return watch.finding()
+    yield "shared", Particles(x, mass=MASS, pinned=[0]), [Gravity(G), shared], {}
+    beam, _ = grid(8, 2)
+    yield "in a row", Particles(beam, mass=MASS, pinned=[0, 1]), [Gravity(G), ShapeMatch(np.arange(4) + 2 * k[:7, :1])], {}
+    inside = [Gravity(G), ShapeMatch([np.arange(15)]), Distance(pairs)]
+    yield "links inside", Particles(x, mass=MASS, pinned=[0]), inside, {}
 
 
-@row(78, "a bridge of ropes under 500 discs", "energy as above; nothing flies, every disc stays in the box")
-def _bridge() -> Finding:
-    watch, rng = Watch(), np.random.default_rng(3)
+@passive(78, "a bridge of ropes under 500 discs", "energy as above; nothing flies, every disc stays in the box")
+def _bridge() -> Scenes:
+    rng = np.random.default_rng(3)
     particles, pairs, _ = ropes((30, 30), LEVEL * 2)
     bridge = particles.position[:, :2] + np.repeat([[0.0, 0.0], [0.0, 0.3]], 30, axis=0)
     k = np.arange(500)
     discs = np.stack([0.08 + 0.085 * (k % 10), 2.45 + 0.085 * (k // 10)], axis=1) + rng.uniform(-0.01, 0.01, (500, 2))
     x, radius = np.vstack([bridge, discs]), np.r_[np.full(60, 0.012), np.full(500, 0.03)]
     scene: list[Any] = [Gravity(G), Distance(pairs), Contact(), Box((-0.5, 0.0), (1.5, 8.0))]
-    watch.run("bridge", Particles(x, mass=MASS, radius=radius, pinned=[0, 29, 30, 59]), scene, most=0.1)
-    return watch.finding()
+    yield "bridge", Particles(x, mass=MASS, radius=radius, pinned=[0, 29, 30, 59]), scene, {"most": 0.1}
