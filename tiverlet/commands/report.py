@@ -2,8 +2,7 @@
 
 import argparse
 
-from .output import output
-from .pool import add_workers, workers
+from .measuring import add_workers, measured, output, write
 
 ABOUT = "error against run time on scenes with known answers"
 
@@ -21,22 +20,15 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Measure, print and write the report; return 1 if a case fails its criterion."""
-    from rich.console import Console
-
     from ..report import CASES, error_vs_time
 
-    console = Console()
     if args.list:
         for name, case in CASES.items():
-            console.print(f"{name:36} {case.title}", highlight=False)
+            print(f"{name:36} {case.title}")
         return 0
-    with workers(args.workers) as executor:
-        report = error_vs_time(args.cases or None, quick=args.quick, executor=executor, progress=console.is_terminal)
-    console.print(report)
-    for path, text in ((args.json, report.json), (args.markdown, report.markdown)):
-        if path:
-            with open(path, "w", encoding="utf-8") as file:
-                file.write(text())
+    report = measured(args.workers, error_vs_time, args.cases or None, quick=args.quick)
+    write(args.json, report.json)
+    write(args.markdown, report.markdown)
     if args.plot:
         report.plot(args.plot)
     return 1 if report.failures else 0

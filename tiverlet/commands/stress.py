@@ -2,8 +2,7 @@
 
 import argparse
 
-from .output import output
-from .pool import add_workers, workers
+from .measuring import add_workers, measured, output, write
 
 ABOUT = "stiff and extreme cases, with a verdict on each"
 
@@ -17,15 +16,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run, print and write the certificate; return 1 if a row fails."""
-    from rich.console import Console
-
     from ..report import stress
 
-    console = Console()
-    with workers(args.workers) as executor:
-        certificate = stress(rows=args.rows or None, executor=executor, progress=console.is_terminal)
-    console.print(certificate)
-    if args.json:
-        with open(args.json, "w", encoding="utf-8") as file:
-            file.write(certificate.json())
+    certificate = measured(args.workers, stress, rows=args.rows or None)
+    write(args.json, certificate.json)
     return 0 if certificate.passed else 1
