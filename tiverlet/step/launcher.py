@@ -1,5 +1,7 @@
 """A frame that is launched phase by phase: takes the place of a Step in frame() if no kernel runs a whole frame."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from ..contact.limits import BOUNCES, GOING, IMPULSES, MOVES, PLACES, ROUNDS
@@ -27,16 +29,26 @@ class Launcher:
     def __init__(self, runner: "Runner"):
         self.runner, step = runner, runner.step
         self.halves, self.newton_steps, self.finishes = step.halves, step.newton_steps, step.finishes
-        self.drives, self.constrains, self.acts = map(bool, (step.drivers, step.batches, step.particles.acts))
         self.has_pair_forces, self.lists_pairs = step.has_pair_forces, bool(step.listed_forces)
         self.systems, self.steps = bool(step.constraints.systems), step.constraints.steps
         self.rows, self.impacts = step.contact_pass.rows, step.impacts
-        self.looks, self.applies_first = step.looks, step.particles.applies_first
+        self.has_impacts, self.looks = step.has_impacts, step.looks
         self.few = {ROUNDS: FEW, IMPULSES: FEW * self.rows.impulses.least if self.rows else 0, PLACES: FEW}
         self.taken = dict(MANY)
         self.needs_more = True  # whether extra passes of this substep may be needed, see BodyImpacts
         self.waiting: list[str] = []
-        self.now: Any = None  # the half of a pass of the waiting phases
+        self.now: Any = None  # the moment of the waiting phases
+        # Phases that are one launch, or part of one, where the scene needs them.
+        self.integrate = self.phase("integrate")
+        self.drive = self.phase("drive", bool(step.drivers))
+        self.solve_constraints = self.phase("solve_constraints", bool(step.batches))
+        self.update_multipliers = self.phase("update_multipliers", self.systems)
+        self.apply_constraints = self.phase("apply_constraints", step.particles.applies_first)
+        self.apply_corrections = self.phase("apply_corrections", step.particles.acts)
+
+    def phase(self, name: str, needed: bool = True) -> Callable[[Moment], None]:
+        """Return a function that adds a phase to the waiting ones."""
+        return partial(self.put, name=name) if needed else lambda now: None
 
     def flush(self) -> None:
         """Launch the waiting phases."""
@@ -45,27 +57,19 @@ class Launcher:
             self.waiting = []
             self.runner.step.phases(
                 names, span.h64, span.start, span.tick, span.since, span.fresh, span.owed, now.s, span.substeps,
-                span.iterations, now.half,
+                span.iterations, now.half, now.newton,
             )  # fmt: skip
 
-    def put(self, now: Moment, name: str, there: bool = True) -> None:
-        """Add a phase to those that wait for the next launch, unless `there` is false.
-
-        If waiting phases belong to another half of a pass, launch them first. In the second Newton step, the name ends with '.
-        """
-        if there:
-            if self.waiting and (self.now.s, self.now.half) != (now.s, now.half):
-                self.flush()
-            self.waiting.append(name + "'" * now.newton)
-            self.now = now
-
-    def resumes(self, now: Moment) -> bool:
-        """Whether the substep resumes in the middle."""
-        return bool(now.span.resumed) and now.s == now.span.begin
+    def put(self, now: Moment, name: str) -> None:
+        """Add a phase to those that wait for the next launch. If these belong to another moment, launch them first."""
+        if self.waiting and (self.now.s, self.now.half, self.now.newton) != (now.s, now.half, now.newton):
+            self.flush()
+        self.waiting.append(name)
+        self.now = now
 
     def moment(self, span: Span, s: int) -> Moment:
         """Return the Moment of substep s, with the values that the host needs."""
-        return Moment(span, s)
+        return Moment(span, s, resumed=span.resumed if s == span.begin else 0)
 
     def pass_of(self, now: Moment, half: int) -> Moment:
         """Return the Moment of one half of a pass."""
@@ -76,39 +80,13 @@ class Launcher:
         self.runner.raise_signals()
         return True
 
-    def begins_substep(self, now: Moment) -> bool:
-        """Whether the substep begins here."""
-        return now.s < now.span.substeps and not self.resumes(now)
+    def halted(self) -> int:
+        """Return 0: where the frame has stopped, launches do nothing."""
+        return 0
 
-    def has_pass(self, now: Moment) -> bool:
-        """Whether this is a substep, not the round after all substeps."""
-        return now.s < now.span.substeps
-
-    def ends_substep(self, now: Moment) -> bool:
-        """Whether all passes of the substep are done."""
-        return now.s < now.span.substeps and now.span.part == now.span.iterations
-
-    def ends_frame(self, now: Moment) -> bool:
-        """Whether all substeps are done."""
-        return now.s >= now.span.substeps
-
-    def first_half(self, now: Moment) -> int:
-        """Return the half of a pass in which the substep begins or resumes."""
-        return now.span.half if self.resumes(now) else 0
-
-    def last_half(self, now: Moment) -> int:
-        """Return the half of a pass before which the substep ends. The round after all substeps has one half, for the list."""
-        extra = self.impacts.passes if self.impacts and now.span.part == now.span.iterations else 0
-        passes = now.span.part + extra
-        return passes * self.halves if now.s < now.span.substeps else 1
-
-    def is_regular(self, now: Moment, half: int) -> bool:
-        """Whether every substep has this half of a pass; bodies that struck walls add further ones."""
-        return half // self.halves < now.span.iterations or now.s >= now.span.substeps
-
-    def runs_half(self, now: Moment, half: int) -> bool:
+    def runs_half(self, now: Moment, half: int, regular: bool) -> bool:
         """Whether this half of a pass is run. If bodies may bounce off walls, the host has to wait for the answer."""
-        if self.is_regular(now, half):
+        if regular:
             return True
         it = half // self.halves - now.span.iterations
         if it == 0 and half % self.halves == 0:
@@ -118,52 +96,32 @@ class Launcher:
             self.needs_more = bool(self.runner.memory.read(self.impacts.open)[it])
         return self.needs_more
 
-    def begins_round(self, now: Moment) -> bool:
-        """Whether this round (a substep, or the one after all substeps) begins here instead of resuming."""
-        return not self.resumes(now)
-
     def evaluate_pair_forces(self, now: Moment) -> None:
         """Add the first phases of a substep. The frame may stop here until lists are rebuilt."""
-        self.put(now, "ask_for_pairs", self.lists_pairs)
+        if self.lists_pairs:
+            self.put(now, "ask_for_pairs")
         self.put(now, "sum_pair_forces")
-
-    def integrate(self, now: Moment) -> None:
-        """Add the phase integrate."""
-        self.put(now, "integrate")
-
-    def drive(self, now: Moment) -> None:
-        """Add the phase drive, if there are driven particles."""
-        self.put(now, "drive", self.drives)
 
     def update_neighbours(self, now: Moment, half: int) -> None:
         """Add the check of the neighbour list. The frame may stop here until the list is rebuilt, or islands are woken."""
         if half and not half % self.halves:
             self.runner.raise_signals()
-        self.put(self.pass_of(now, half), "ask_for_list", bool(self.runner.search))
-        if self.looks and self.has_pass(now):
+        if self.runner.search:
+            self.put(self.pass_of(now, half), "ask_for_list")
+        if self.looks and now.s < now.span.substeps:
             self.put(self.pass_of(now, half), "look_for_sleepers")
             self.put(self.pass_of(now, half), "ask_to_wake")
 
-    def solve_constraints(self, now: Moment) -> None:
-        """Add the phase solve_constraints, if there are constraints."""
-        self.put(now, "solve_constraints", self.constrains)
-
     def solve_systems(self, now: Moment) -> None:
         """Add the phases that solve systems. Each iteration of an iterative system is a launch of its own."""
-        self.put(now, "start_systems" if self.steps else "solve_systems", self.systems)
+        if not self.systems:
+            return
+        self.put(now, "start_systems" if self.steps else "solve_systems")
         for _ in range(self.steps):
             self.flush()
             self.put(now, "iterate_systems")
         if self.steps:
             self.flush()
-
-    def update_multipliers(self, now: Moment) -> None:
-        """Add the phase update_multipliers, if there are systems."""
-        self.put(now, "update_multipliers", self.systems)
-
-    def apply_constraints(self, now: Moment) -> None:
-        """Add the phase apply_constraints, unless particles move only once, at the end of the pass."""
-        self.put(now, "apply_constraints", self.applies_first)
 
     def needs_newton_step(self, now: Moment) -> bool:
         """Whether there is only one pass. The host reads no result; if all systems are met, a second Newton step does nothing."""
@@ -176,7 +134,7 @@ class Launcher:
         """
         if not (self.rows and now.it == 0):
             return
-        what = now.span.what if self.resumes(now) and now.half == now.span.half else LISTS
+        what = now.span.what if now.resumed and now.half == now.span.half else LISTS
         if what == LISTS:
             self.put(now, "start_events")
             self.put(now, "find_rows")
@@ -227,10 +185,6 @@ class Launcher:
         """After a frame: take from its sheet how many passes a substep took."""
         for what in self.taken:
             self.taken[what] = int(data[MOST + what])
-
-    def apply_corrections(self, now: Moment) -> None:
-        """Add the last phase of a pass, if particles have corrections to apply."""
-        self.put(now, "apply_corrections", self.acts)
 
     def finish_substep(self, now: Moment) -> None:
         """Add the phase finish_substep, after the last pass."""

@@ -35,18 +35,18 @@ class Moment:
     """The substep, and the pass over the constraints, in which a phase runs.
 
     s, h, last, time: number of the substep, its length, the length of the one before, its beginning [s]. frame_fraction: where it
-    begins and ends in the frame, and its share of the frame. fresh: whether it is a start. final: whether it is the last one. it:
-    number of the pass. first: whether multipliers begin in this pass. checks_list: whether the
-    pass ends with a check for a stale list (every substep begins with one, too). half: number of the half, counted through all
-    passes. newton: the Newton step within the pass, 0 or 1.
+    begins and ends in the frame, and its share of the frame. fresh: whether it is a start. final: whether it is the last one.
+    resumed: 1 if the frame had stopped in it, and goes on there. it: number of the pass. first: whether multipliers begin in this
+    pass. checks_list: whether the pass ends with a check for a stale list (every substep begins with one, too). half: number of
+    the half, counted through all passes. newton: the Newton step within the pass, 0 or 1.
     """
 
     def __init__(
-        self, span, s, h=0.0, last=0.0, time=0.0, tick=0, frame_fraction=None, fresh=0, final=0, it=0, first=0,
-        checks_list=0, half=0, newton=0,
+        self, span, s, h=0.0, last=0.0, time=0.0, tick=0, frame_fraction=None, fresh=0, final=0, resumed=0, it=0,
+        first=0, checks_list=0, half=0, newton=0,
     ):  # fmt: skip
         self.span, self.thread, self.s, self.h, self.last, self.time, self.tick = span, span.thread, s, h, last, time, tick
-        self.frame_fraction, self.fresh, self.final = frame_fraction, fresh, final
+        self.frame_fraction, self.fresh, self.final, self.resumed = frame_fraction, fresh, final, resumed
         self.it, self.first, self.checks_list, self.half, self.newton = it, first, checks_list, half, newton
 
     @inline
@@ -54,7 +54,7 @@ class Moment:
         """The same substep, in this pass."""
         return Moment(
             self.span, self.s, self.h, self.last, self.time, self.tick, self.frame_fraction, self.fresh, self.final,
-            it, first, checks_list, half, newton,
+            self.resumed, it, first, checks_list, half, newton,
         )  # fmt: skip
 
     @inline

@@ -31,27 +31,28 @@ def frame(do, span):
         now = do.moment(span, s)
         if do.takes_part(now):
             substep(do, now)
-            if do.ends_frame(now):
+            if s >= span.substeps and do.halted() == 0:
                 do.diagnose(now)
 
 
 @ti.pyfunc
 def substep(do, now):
-    """One substep.
+    """One substep, or its rest where the frame had stopped in it.
 
     In scenes with constraints and contacts a pass has two halves, constraints and then contacts. Each half begins with a valid
     neighbour list. Constraints may take a second Newton step in the first half.
     """
     if ti.static(do.has_pair_forces):
-        if do.begins_round(now):
+        if now.resumed == 0:
             do.evaluate_pair_forces(now)
-    if do.begins_substep(now):
+    if now.s < now.span.substeps and now.resumed == 0 and do.halted() == 0:
         do.integrate(now)
         do.drive(now)
-    for half in range(do.first_half(now), do.last_half(now)):
-        if do.is_regular(now, half):
+    for half in range(now.resumed * now.span.half, last_half(do, now)):
+        regular = is_regular(do, now, half)
+        if regular:
             do.update_neighbours(now, half)
-        if do.has_pass(now) and do.runs_half(now, half):
+        if now.s < now.span.substeps and do.halted() == 0 and do.runs_half(now, half, regular):
             this_pass = do.pass_of(now, half)
             if half % do.halves == 0:
                 for k in range(do.newton_steps):
@@ -61,12 +62,33 @@ def substep(do, now):
                         do.update_multipliers(this_pass.newton_step(k))
                         do.apply_constraints(this_pass.newton_step(k))
             if half % do.halves == do.halves - 1:
-                if do.is_regular(now, half):
+                if regular:
                     do.solve_contacts(this_pass)
                 do.apply_corrections(this_pass)
     if ti.static(do.finishes):
-        if do.ends_substep(now):
+        if now.s < now.span.substeps and now.span.part == now.span.iterations and do.halted() == 0:
             do.finish_substep(now)
+
+
+@ti.pyfunc
+def last_half(do, now):
+    """The half of a pass before which the substep ends. The round after all substeps has one half, for the list."""
+    halves = now.span.part * do.halves
+    if ti.static(do.has_impacts):
+        if now.span.part == now.span.iterations:
+            halves += do.impacts.passes * do.halves
+    if now.s >= now.span.substeps:
+        halves = 1
+    return halves
+
+
+@ti.pyfunc
+def is_regular(do, now, half):
+    """Whether every substep has this half of a pass; bodies that struck walls add further ones."""
+    out = True
+    if ti.static(do.has_impacts):
+        out = half // do.halves < now.span.iterations or now.s >= now.span.substeps
+    return out
 
 
 @ti.data_oriented
@@ -147,23 +169,23 @@ class Step:
     @ti.kernel
     def phases(
         self, names: ti.template(), h64: ti.f64, start: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32,  # type: ignore[valid-type]
-        owed: ti.f64, s: ti.i32, substeps: ti.i32, iterations: ti.i32, half: ti.i32,
+        owed: ti.f64, s: ti.i32, substeps: ti.i32, iterations: ti.i32, half: ti.i32, newton: ti.i32,
     ):  # fmt: skip
         """Run some phases of a substep, by name. It returns nothing, because the host would have to wait for a result."""
         now = self.pass_of(self.moment(Span(h64, start, start, tick, since, fresh, owed, 0, substeps, iterations), s), half)
-        for phase, k in ti.static(self.named(names)):
-            phase(now.newton_step(k))
+        for phase in ti.static(self.named(names)):
+            phase(now.newton_step(newton))
 
-    def named(self, names: str) -> list[tuple[Any, int]]:
-        """The phases with these names, in order, each with the number of its Newton step (1 for names that end in ')."""
-        return [(getattr(self, name.rstrip("'")), int(name.endswith("'"))) for name in names.split()]
+    def named(self, names: str) -> list[Any]:
+        """The phases with these names, in order."""
+        return [getattr(self, name) for name in names.split()]
 
     @ti.func
     def moment(self, span, s):
         """The Moment of substep s of a frame; s = span.substeps is the round after the last substep."""
         h, last, time, frame_fraction = self.integrator.times(span, s)
         tick, fresh, final = span.tick + s, ti.select(s == 0, span.fresh, 0), ti.cast(s == span.substeps - 1, ti.i32)
-        return Moment(span, s, h, last, time, tick, frame_fraction, fresh, final)
+        return Moment(span, s, h, last, time, tick, frame_fraction, fresh, final, ti.select(s == span.begin, span.resumed, 0))
 
     @ti.func
     def pass_of(self, now, half):
@@ -180,67 +202,13 @@ class Step:
         return self.team.takes_part(now.thread) and self.halted() == 0
 
     @ti.func
-    def resumes(self, now):
-        """1 if the substep resumes in the middle, after the frame stopped there."""
-        return ti.select(now.s == now.span.begin, now.span.resumed, 0)
-
-    @ti.func
-    def begins_substep(self, now):
-        """Whether the substep begins here, with valid lists."""
-        out = now.s < now.span.substeps and self.resumes(now) == 0
-        if ti.static(len(self.listed_forces) > 0):
-            out = out and self.halted() == 0
-        return out
-
-    @ti.func
-    def begins_round(self, now):
-        """Whether this round (a substep, or the one after all substeps) begins here instead of resuming."""
-        return self.resumes(now) == 0
-
-    @ti.func
-    def first_half(self, now):
-        """The half of a pass in which the substep begins or resumes."""
-        return ti.select(self.resumes(now) != 0, now.span.half, 0)
-
-    @ti.func
-    def last_half(self, now):
-        """The half of a pass before which the substep ends. The round after all substeps has one half, for the list."""
-        passes = now.span.part
-        if ti.static(self.has_impacts):
-            passes += ti.select(now.span.part == now.span.iterations, self.impacts.passes, 0)
-        return ti.select(now.s < now.span.substeps, passes * self.halves, 1)
-
-    @ti.func
-    def is_regular(self, now, half):
-        """Whether every substep has this half of a pass; bodies that struck walls add further ones."""
-        out = True
-        if ti.static(self.has_impacts):
-            out = half // self.halves < now.span.iterations or now.s >= now.span.substeps
-        return out
-
-    @ti.func
-    def runs_half(self, now, half):
+    def runs_half(self, now, half, regular):
         """Whether this half of a pass is run: always if it is regular, else only if bodies struck walls."""
         out = True
         if ti.static(self.has_impacts):
-            if not self.is_regular(now, half):
+            if not regular:
                 out = self.impacts.needs_pass(self.pass_of(now, half))
         return out
-
-    @ti.func
-    def has_pass(self, now):
-        """Whether there is a pass to run, with a valid list."""
-        return now.s < now.span.substeps and self.halted() == 0
-
-    @ti.func
-    def ends_substep(self, now):
-        """Whether all passes of the substep are done."""
-        return now.s < now.span.substeps and now.span.part == now.span.iterations and self.halted() == 0
-
-    @ti.func
-    def ends_frame(self, now):
-        """Whether all substeps are done."""
-        return now.s >= now.span.substeps and self.halted() == 0
 
     @ti.func
     def evaluate_pair_forces(self, now):
@@ -340,7 +308,7 @@ class Step:
         if ti.static(self.hashes):
             self.rebuild_stale(now, half)
         if ti.static(self.looks):
-            if self.has_pass(now) and self.sleepers.count[None] > 0:
+            if now.s < now.span.substeps and self.halted() == 0 and self.sleepers.count[None] > 0:
                 self.look_for_sleepers(self.pass_of(now, half))
                 if self.sleepers.calls[None] != 0:
                     self.halt[None] = [1, now.s, half, LISTS]
