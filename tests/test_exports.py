@@ -470,7 +470,6 @@ def test_films_have_the_size_the_theme_and_the_camera_that_are_asked_for(tmp_pat
         ("a.gif", {"theme": "blue"}, ValueError, "theme = 'blue', but it must be one of 'dark', 'light'"),
         ("a.gif", {"camera": (0, 3)}, ValueError, r"camera\[1\] = 3, but it must be at most 1.57"),
         ("a.csv", {"size": 640}, ValueError, "a.csv takes no size; .gif, .mp4, .webp do"),
-        ("a.glb", "pygltflib", ImportError, r"a.glb needs pygltflib, .* pip install 'tiverlet\[export\]'"),
         ("a.mp4", "imageio_ffmpeg", ImportError, r"a.mp4 needs imageio_ffmpeg, .* pip install 'tiverlet\[export\]'"),
         ("a.usd", "pxr.Usd", ImportError, r"a.usd needs pxr.Usd, .* pip install 'tiverlet\[usd\]'"),
     ],

@@ -114,7 +114,7 @@ def test_recordings_of_other_versions_are_named(rewritten, read_here):
 
 @pytest.mark.slow
 def test_what_is_cut_short_says_where_it_ends(quick, tmp_path, monkeypatch):
-    monkeypatch.setattr("tiverlet.recording.recorder.SMALL", 0)  # many messages, as in a long recording
+    monkeypatch.setattr("tiverlet.recording.sink.SMALL", 0)  # many messages, as in a long recording
     original = record(tmp_path / "a.rrd")
     whole, path = original.read_bytes(), tmp_path / "b.rrd"
     for data, kind, words in ((b"some text", ValueError, "not an .rrd file"), (whole[:200], ValueError, "before anything")):

@@ -468,7 +468,7 @@ def test_positions_take_most_of_a_file(world, tmp_path, read_here):
     features = [tv.Gravity(1.0), tv.Distance(sheet.links), tv.Distance(sheet.braces, compliance=1e-2)]
     world(cloth, features, substeps=2, solver=tv.Jacobi()).run(2.0, recorder=tmp_path / "a.rrd")
     of = [message for kind, message in messages.split((tmp_path / "a.rrd").read_bytes()) if kind == messages.CHUNK]
-    of = [m for m in of if messages.Chunk(m).rows().schema.metadata[b"rerun:entity_path"] == b"/world/scene/particles"]
+    of = [m for m in of if messages.rows_of(m).schema.metadata[b"rerun:entity_path"] == b"/world/scene/particles"]
     raw = 121 * 256 * 3 * 4
     assert raw < sum(map(len, of)) < 1.4 * raw + 1500 * len(of) + 100 * 121
     # A rope of 40 points: 320 bytes in a frame. Everything else (layout, curves, hashes) takes at most 1.5 times as much.

@@ -8,16 +8,15 @@ import numpy as np
 
 from .. import checks
 from ..colliders import Box, HalfSpace
-from ..colliders.collider import Collider
-from ..constraints import Path
 from ..constraints.core.length import is_link
 from ..features.feature import Batch
 from ..forces import Hand
+from ..recording.bodies import rims
 from ..recording.drawing import links, upwards, view_up
 from ..recording.hues import BY_BODY, Coloring
 from ..recording.images import box_of
-from ..recording.rims import rims
 from ..recording.surfaces import covered, triangles
+from ..recording.walls import outline
 
 if TYPE_CHECKING:
     from ..world import World
@@ -61,12 +60,11 @@ def walls(world: "World", extent: tuple[np.ndarray, np.ndarray]) -> str:
     """Return outlines of walls, paths and a periodic box at their present places, as JSON. extent: see scene()."""
     out = []
     for f in world.features:
-        if isinstance(f, (Collider, Path)) and getattr(f, "active", True):
-            strips, radius = f.outline(*extent)
-            vertices, faces = f.solid(*extent) if isinstance(f, Collider) else (np.zeros((0, 3)), np.zeros((0, 3)))
-            out.append(_wall([] if len(faces) else strips, radius, vertices, faces))
-    if box := box_of(world):
-        out.append(_wall(box.outline(*extent), 0.0, np.zeros((0, 3)), np.zeros((0, 3))))
+        if (shape := outline(f, *extent)) and shape.active:
+            out.append({
+                "strips": [_short(strip) for strip in shape.strips], "radius": float(shape.radius),
+                "vertices": _short(shape.vertices.ravel()), "faces": shape.faces.tolist(),
+            })  # fmt: skip
     return json.dumps({"kind": "walls", "walls": out, "floor": floor(world, extent)})
 
 
@@ -79,11 +77,6 @@ def floor(world: "World", extent: tuple[np.ndarray, np.ndarray]) -> float | None
         elif isinstance(f, Box) and f.active:
             heights.append(float((f.outline(*extent)[0] @ up).min()))
     return max(heights, default=None)
-
-
-def _wall(strips: Any, radius: float, vertices: np.ndarray, faces: np.ndarray) -> dict[str, Any]:
-    lines = [_short(strip) for strip in strips]
-    return {"strips": lines, "radius": float(radius), "vertices": _short(vertices.ravel()), "faces": faces.tolist()}
 
 
 def broken(world: "World") -> str:

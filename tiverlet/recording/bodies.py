@@ -1,4 +1,4 @@
-"""Bodies: particles that constraints and loops join."""
+"""Bodies: particles that constraints and loops join, and their rounded edges."""
 
 from typing import TYPE_CHECKING
 
@@ -28,3 +28,12 @@ def bodies(world: "World | Parts") -> np.ndarray:
             what.append(count + owner)
             count += len(f.loops)
     return components(len(world.particles), np.concatenate(who), np.concatenate(what))
+
+
+def rims(world: "World | Parts") -> tuple[np.ndarray, np.ndarray]:
+    """Return the edges of Polygons with a radius, (k, 2), and their radii, (k,) [m]: the means of their two ends."""
+    loops = [np.asarray(loop) for f in world.features if isinstance(f, Polygons) for loop in f.loops]
+    pairs = [np.stack([loop, np.roll(loop, -1)], axis=1) for loop in loops]
+    edges = np.concatenate([np.zeros((0, 2), dtype=np.int64), *pairs])
+    radius = world.particles.radius[edges].mean(axis=1)
+    return edges[radius > 0], radius[radius > 0]

@@ -5,14 +5,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..colliders import Ball, Box, Capsule, HalfSpace, Mesh, Polygon
-from ..colliders.collider import Collider
-from ..constraints import Path
+from ..colliders import Box, HalfSpace
 from ..constraints.core.length import is_link
-from ..features.feature import Batch, Feature
+from ..features.feature import Batch
 from ..forces import Gravity
-from ..neighbours import Periodic
-from .bodies import bodies
+from .bodies import bodies, rims
 from .fill import Fill, outlines, within
 from .hues import BY_BODY
 from .images import InBox, box_of, crosses_box
@@ -20,9 +17,9 @@ from .journal import PARTICLES
 from .layout import LEGEND, SCENE, WIDE
 from .lines import Lines
 from .overlays import AHEAD, ARROW, LOAD, Overlays, loads
-from .rims import rims
-from .strain import LEVELS, SCALE, levels, packed
-from .surfaces import Surface, covered, triangles
+from .strain import LEVELS, SCALE, levels, packed, tinted
+from .surfaces import covered, lit, triangles
+from .walls import EDGE, OPEN, WALL, outline, walled
 
 if TYPE_CHECKING:
     from ..world import World
@@ -30,9 +27,6 @@ if TYPE_CHECKING:
 
 POINT = -2.5  # radius of the dot for a particle without radius (negative: pixels)
 MANY = 5000  # most links drawn as lines; of more, an even selection
-WALL = np.array([[92, 97, 112]], dtype=np.uint8)  # colour of surfaces of walls
-EDGE = (120, 125, 140)  # colour of walls that are lines
-OPEN = (60, 63, 70)  # colour of an inactive wall
 EDGES = (150, 120, 70)  # colour of a periodic box
 HELD, PINS = (225, 228, 235), 200  # colour of the marks of fixed particles; no marks if there are more of them
 MARK, SPOT = (24, 26, 32), 0.5  # marks that show rotation: their colour, and the radius of a spot on a sphere, in radii
@@ -60,6 +54,7 @@ class Drawing:
         self._strip = pyarrow.list_(pyarrow.field("item", point, nullable=False))  # the type of rerun's line strips
         self.bytes = 0
         self.extent, self._overlays = extent, overlays
+        self.low, self.high = np.full((2, world.particles.dim), [[np.inf], [-np.inf]])  # corners of everything drawn
         self.logged: dict[str, np.ndarray] = {}  # the user's quantities of particles, as logged last
         self.scenes = 0  # the number of the scene that is drawn, from 1 on
         self._in_box = InBox()
@@ -79,7 +74,8 @@ class Drawing:
         Then all of it is logged again, under another name. scenes: the number of scenes so far, of which some may have ended
         before a frame of them was drawn.
         """
-        world, p, hues = self.world, self.world.particles, self._paint()
+        world, p = self.world, self.world.particles
+        self._paint()
         self._root = f"{SCENE}/scene{scenes - 1}" if scenes > 1 else SCENE
         if self.scenes:
             self._log(SCENE, self._rr.Clear(recursive=True))
@@ -87,13 +83,13 @@ class Drawing:
         self._contacts = len(p) <= FEW and bool(world._runner.step.contacts)
         self._broken = {k: f.broken for k, f in enumerate(world.features) if isinstance(f, Batch) and f.breaks}
         self._broke = {k: np.flatnonzero(gone).tolist() for k, gone in self._broken.items() if gone.any()}
-        self._join(hues)
+        self._join()
         radii = np.where(p.radius > 0, p.radius, POINT)
-        if self._surface:
-            radii[covered(world, self._surface.triangles) & (p.inv_mass > 0)] = 0.0  # hidden by the surface
-        fixed = {} if self._overlays.color.name else {"colors": hues}  # static colours would override those of each frame
+        if len(self._corners):
+            radii[covered(world, self._corners) & (p.inv_mass > 0)] = 0.0  # hidden by the surface
+        fixed = {} if self._overlays.color.name else {"colors": self._hues}  # static colours would override those of each frame
         what = [self._points.from_fields(radii=radii, **fixed)]
-        what += [self._rr.Mesh3D.from_fields(triangle_indices=self._surface.triangles.astype(np.uint32))] if self._surface else []
+        what += [self._rr.Mesh3D.from_fields(triangle_indices=self._corners.astype(np.uint32))] if len(self._corners) else []
         what += [self._strips.from_fields(radii=[-1.2])] if self._lines else []
         self.static(f"{self._root}/{PARTICLES}", *what)
         held = np.flatnonzero(p.inv_mass == 0)
@@ -101,9 +97,6 @@ class Drawing:
             at = self.drawn_positions(world.position)[held].astype(np.float32)
             marks = self._points.from_fields(positions=at, radii=[-3.5], colors=[HELD], **self._above)
             self._log(f"{self._root}/held", marks)  # not static, since static data cannot be cleared when the scene ends
-        if box := box_of(world):
-            edges = box.outline(*self.extent).astype(np.float32)
-            self.static(f"{self._root}/box", self._strips(edges, colors=[EDGES], radii=[-0.8]))
         scale = self._overlays.scale(bool(len(self._pairs)))
         if scale:
             hues, labels = scale
@@ -114,12 +107,11 @@ class Drawing:
                 f"{LEGEND}/labels", self._rr.Points2D(at + [0, 0.1], colors=[LABEL], labels=labels, radii=[0], show_labels=True)
             )
 
-    def _paint(self) -> np.ndarray:
-        """Return the present colours of particles, (n, 3)."""
+    def _paint(self) -> None:
+        """Take the present colours of particles, (n, 3)."""
         self._hues = self._overlays.color.colors(self.world, self.logged)
-        return self._hues
 
-    def _join(self, hues: np.ndarray) -> None:
+    def _join(self) -> None:
         """Collect all links: those that are part of a surface colour it, and the others are drawn as lines."""
         world = self.world
         found = links(world)
@@ -130,9 +122,9 @@ class Drawing:
         number, row = (np.concatenate([[], *each]).astype(np.int64) for each in (
             [np.full(f.count, k) for k, f in found], [np.arange(f.count) for _, f in found]
         ))  # fmt: skip  # of the feature, and of the link in it
-        self._surface, inside = None, np.zeros(0, dtype=np.int64)
-        corners = np.zeros((0, 3), dtype=np.int64) if self._flat else triangles(world)
-        under = np.isin(self._pairs, corners).all(axis=1)  # links of surfaces, which are not drawn as lines
+        inside = np.zeros(0, dtype=np.int64)
+        self._corners = np.zeros((0, 3), dtype=np.int64) if self._flat else triangles(world)
+        under = np.isin(self._pairs, self._corners).all(axis=1)  # links of surfaces, which are not drawn as lines
         loops = outlines(world) if self._flat else []
         if loops:
             inside, breaks = within(world, loops), np.isin(number, list(self._broken))
@@ -145,11 +137,9 @@ class Drawing:
             self._pairs, self._rest, number, row = (each[some] for each in (self._pairs, self._rest, number, row))
             some, under = np.arange(len(some)), np.zeros(len(some), dtype=bool)
         under &= ~np.isin(number, [k for k, f in found if np.any(getattr(f, "compliance", 0))])  # compliant links show no strain
-        if len(corners):
-            self._surface = Surface(corners, hues, self._pairs[under], upwards(world))
         self._fill = None
         if loops:
-            self._fill = Fill(loops, world.position, hues, inside[self._pairs[under, 0]], rims(world))
+            self._fill = Fill(loops, world.position, inside[self._pairs[under, 0]], rims(world))
             self.static(f"{self._root}/fill", self._strips.from_fields(radii=self._fill.radii, draw_order=BELOW))
         self._line_links, self._surface_links = some, under
         self._breakable_links = [(k, np.flatnonzero(number == k), row[number == k]) for k, _ in found if k in self._broken]
@@ -164,17 +154,19 @@ class Drawing:
         x, x32: positions, (n, dim) [m], in full and in f32. changed_features: numbers of features with other knobs than in the
         last frame. broke: whether something broke since then.
         """
+        radius, some = self.world.particles.radius[:, None], np.isfinite(x).all(axis=1)
+        if some.any():
+            self.low = np.minimum(self.low, (x - radius)[some].min(axis=0))
+            self.high = np.maximum(self.high, (x + radius)[some].max(axis=0))
         # Log everything in one row, so that LZ4 matches the points of lines and sheets with those of the particles.
         colored = {}
         if self._overlays.color.name:
-            hues = self._paint()
-            colored = {"colors": hues}
-            self.bytes += hues.nbytes
-            for body in filter(None, (self._surface, self._fill)):
-                body.paint(hues)
+            self._paint()
+            colored = {"colors": self._hues}
+            self.bytes += self._hues.nbytes
         row = [self._points.from_fields(positions=x32, **colored)]
         self.bytes += x32.nbytes
-        if len(self._pairs) or self._surface or self._fill:
+        if len(self._pairs) or len(self._corners) or self._fill:
             row += self._link(x, x32)
         self._log(f"{self._root}/{PARTICLES}", *row)
         for k in changed_features:
@@ -218,8 +210,9 @@ class Drawing:
         for k, mine, rows in self._breakable_links:
             level[mine[self._broken[k][rows]]] = -1
         row = []
-        if self._surface:
-            shades = self._surface.colors(x, level[self._surface_links])
+        if len(self._corners):
+            ends, under = self._pairs[self._surface_links].ravel(), np.repeat(level[self._surface_links], 2)
+            shades = packed(lit(tinted(self._hues, ends, under), self._corners, x, upwards(self.world)))
             row.append(self._rr.Mesh3D.from_fields(vertex_positions=x32, vertex_colors=shades))
             self.bytes += shades.nbytes + x32.nbytes
         if self._lines:
@@ -228,7 +221,7 @@ class Drawing:
             self.bytes += shades.nbytes
         if self._fill:
             points, ends = self._fill.strips(x)
-            shades = self._fill.colors(level[self._surface_links])
+            shades = self._fill.colors(self._hues, level[self._surface_links])
             self._log(f"{self._root}/fill", self._strips.from_fields(strips=self._packed(points, ends), colors=shades))
             self.bytes += shades.nbytes
         return row
@@ -247,30 +240,21 @@ class Drawing:
         return pa.ListArray.from_arrays(pa.array(ends.astype(np.int32)), listed, type=self._strip)
 
     def _wall(self, k: int) -> None:
-        """Draw a wall or a path at its present place."""
-        wall = self.world.features[k]
-        if isinstance(wall, (Collider, Path)):
-            if self._solid(k, wall):
-                return
-            strips, thickness = wall.outline(*self.extent)
-            radius = thickness if thickness else -1.5  # half the width [m], or pixels (negative)
-            hue = OPEN if isinstance(wall, Collider) and not wall.active else EDGE
-            self._log(f"{self._root}/walls/{k}", self._strips(strips, colors=[hue], radii=[radius]))
-            self.bytes += strips.nbytes
-
-    def _solid(self, k: int, wall: Any) -> bool:
-        """Draw a wall of a 3D scene as a surface lit from above. Returns whether it has a surface."""
-        if self._flat or not isinstance(wall, Collider):
-            return False
-        vertices, faces = wall.solid(*self.extent)
-        if len(faces):
-            corners = vertices.astype(np.float32)
-            hues = np.repeat(WALL if wall.active else WALL // 2, len(vertices), axis=0)
-            shades = Surface(faces, hues, np.zeros((0, 2), dtype=np.int64), upwards(self.world)).colors(vertices, np.zeros(0))
-            mesh = self._rr.Mesh3D(vertex_positions=corners, triangle_indices=faces.astype(np.uint32), vertex_colors=shades)
-            self._log(f"{self._root}/walls/{k}", mesh)
-            self.bytes += corners.nbytes + shades.nbytes + 4 * faces.size
-        return bool(len(faces))
+        """Draw a wall, a wire or a periodic box at its present place; a surface is lit from above."""
+        shape = outline(self.world.features[k], *self.extent)
+        if shape is None:
+            return
+        if len(shape.faces):
+            hues = np.repeat(WALL if shape.active else WALL // 2, len(shape.vertices), axis=0)
+            shades = packed(lit(hues, shape.faces, shape.vertices, upwards(self.world)))
+            corners, faces = shape.vertices.astype(np.float32), shape.faces.astype(np.uint32)
+            what = self._rr.Mesh3D(vertex_positions=corners, triangle_indices=faces, vertex_colors=shades)
+            self.bytes += corners.nbytes + shades.nbytes + faces.nbytes
+        else:
+            hue, thin = (EDGES, -0.8) if self.world.features[k] is box_of(self.world) else (EDGE if shape.active else OPEN, -1.5)
+            what = self._strips(shape.strips, colors=[hue], radii=[shape.radius or thin])  # negative: pixels
+            self.bytes += shape.strips.nbytes
+        self._log(f"{self._root}/walls/{k}", what)
 
     def _contact(self) -> None:
         """Draw the points of contact."""
@@ -361,23 +345,6 @@ def view_up(world: "World | Parts", y_down: bool = False) -> np.ndarray:
 def links(world: "World | Parts") -> list[tuple[int, Batch]]:
     """Return the features drawn as lines between two particles, with their numbers."""
     return [(k, f) for k, f in enumerate(world.features) if isinstance(f, Batch) and f.arity == 2 and f.count]
-
-
-def walled(features: Iterable[Feature], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Extend the box between two corners [m] by the walls and paths of finite size."""
-    for f in features:
-        if isinstance(f, (Ball, Capsule, Mesh, Path, Polygon)):
-            strips, thickness = f.outline(low, high)
-            if strips.size:
-                low = np.minimum(low, strips.min(axis=(0, 1)) - thickness)
-                high = np.maximum(high, strips.max(axis=(0, 1)) + thickness)
-        if isinstance(f, Periodic):
-            ends = f.outline(low, high)
-            low, high = np.minimum(low, ends.min(axis=(0, 1))), np.maximum(high, ends.max(axis=(0, 1)))
-        if isinstance(f, Box):
-            low = np.where(np.isfinite(f.lower), np.minimum(low, f.lower), low)
-            high = np.where(np.isfinite(f.upper), np.maximum(high, f.upper), high)
-    return low, high
 
 
 def bounds(world: "World") -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ import numpy as np
 from ..constraints import Area
 from ..contact import Polygons
 from .bodies import bodies
-from .strain import LEVELS, LONGER, SHORTER, packed
+from .strain import packed, tinted
 
 if TYPE_CHECKING:
     from ..world import World
@@ -49,14 +49,11 @@ def within(world: "World", loops: list[np.ndarray]) -> np.ndarray:
 class Fill:
     """Lines that fill bodies: their outlines, moved inwards step by step, and their rounded edges.
 
-    loops: particles around each body, counterclockwise. x: their positions at first, which set the widths of lines. hues: colours
-    of particles, (n, 3). body: for each link inside a body the number of the body, (m,); the link's strain shows in the colour,
-    from 1 % on. rims: see rims().
+    loops: particles around each body, counterclockwise. x: their first positions, which set the widths of lines. body: for each
+    link inside a body its number, (m,); the body shows their strain. rims: see rims().
     """
 
-    def __init__(
-        self, loops: list[np.ndarray], x: np.ndarray, hues: np.ndarray, body: np.ndarray, rims: tuple[np.ndarray, np.ndarray]
-    ):
+    def __init__(self, loops: list[np.ndarray], x: np.ndarray, body: np.ndarray, rims: tuple[np.ndarray, np.ndarray]):
         size = np.array([len(loop) for loop in loops])
         self._corner = np.concatenate(loops)
         first = np.cumsum(size) - size
@@ -79,13 +76,6 @@ class Fill:
         self._shown = np.concatenate([filling, owner[self._edges[:, 0]]])  # the body of each line
         self.radii = np.concatenate([(self._depth * HALF[:, None]).ravel(), rims[1][some]]).astype(np.float32)
         self._body = body
-        self.paint(hues)
-
-    def paint(self, hues: np.ndarray) -> None:
-        """Set other colours of the particles, (n, 3); each body has the mean of its corners."""
-        count = np.bincount(self._owner)
-        totals = [np.bincount(self._owner, column) for column in hues[self._corner].T]
-        self._hues = SHADE * np.stack(totals, axis=1) / count[:, None]
 
     def _inwards(self, p: np.ndarray) -> np.ndarray:
         """Return the inward normal of the side that begins at each corner."""
@@ -105,15 +95,14 @@ class Fill:
         begin = len(INSETS) * self._ends[-1]
         return points.astype(np.float32), np.concatenate([*turns, np.arange(begin, len(points) + 1, 2)])
 
-    def colors(self, level: np.ndarray) -> np.ndarray:
-        """Return RGBA of all lines as u32. level: the level of the strain of each link, (m,); each body shows its worst."""
-        hues, off = self._hues, level - LEVELS
-        if len(off):
-            most = np.zeros(len(hues), dtype=np.int64)
-            np.maximum.at(most, self._body, 2 * np.abs(off) + (off > 0))
-            share = np.maximum(0, 3 * (most >> 1) / LEVELS - 2)[:, None]
-            hues = hues + share * (np.where((most & 1)[:, None], LONGER, SHORTER) - hues)
-        return packed(hues)[self._shown]
+    def colors(self, hues: np.ndarray, level: np.ndarray) -> np.ndarray:
+        """Return RGBA of all lines as u32; each body has the mean of its corners.
+
+        hues: colours of the particles, (n, 3). level: the level of the strain of each link, (m,); each body shows its worst.
+        """
+        totals = [np.bincount(self._owner, column) for column in hues[self._corner].T]
+        mean = SHADE * np.stack(totals, axis=1) / np.bincount(self._owner)[:, None]
+        return packed(tinted(mean, self._body, level))[self._shown]
 
 
 def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:

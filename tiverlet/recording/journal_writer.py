@@ -50,6 +50,7 @@ class Journal:
         if now != self._last:
             data["now"], self._last = now, now
         text, blob = Entry(kind, self.frame, data, arrays or {}, self._steps).pack(self._serial)
+        blob = blob or bytes(not self._serial)  # rerun knows the type of a column only from the first value that is not empty
         self._sum = checksum(self._sum, text, blob)
         self._write(text, np.frombuffer(blob, dtype=np.uint8), self._sum)
         self._serial, self._steps = self._serial + 1, []

@@ -12,6 +12,7 @@ LEGEND = "legend/strain"
 WIDE = 5.0  # distance of the steps of the legend, relative to its height
 
 HALF, ASPECT = 0.52, 1.5  # tangent of half the viewer's vertical angle of 55 degrees; width over height
+CAMERA = float(np.radians(30)), float(np.radians(20))  # angles of the eye, see eye_axes()
 MARGIN = 1.06  # factor on the distance of the eye
 SEEN = 1e-2, 1e4  # least and most size of scenes [m] that the viewer shows unscaled
 
@@ -39,18 +40,19 @@ def upright(up: np.ndarray) -> rr.components.ViewCoordinates:
     return getattr(rr.ViewCoordinates, f"RIGHT_HAND_{axis}_{'UP' if up.max() > -up.min() else 'DOWN'}")
 
 
-def eye_axes(up: np.ndarray) -> np.ndarray:
+def eye_axes(up: np.ndarray, camera: tuple[float, float] = CAMERA) -> np.ndarray:
     """Return the axes of an eye in 3D: unit vectors to the right, up and out of the scene, (3, 3).
 
-    It looks from the front, the side and above.
+    camera: how far it stands to the right of the front, from where x points to the right, and above the horizon [rad].
     """
-    k = int(np.argmax(np.abs(up)))  # the axes are permuted cyclically, which keeps their handedness
-    aside, front = np.roll(np.eye(3)[0], k - 1), np.roll(np.eye(3)[2], k - 1)
-    back = 0.45 * aside + 0.35 * up + 0.82 * front
-    back /= np.linalg.norm(back)
-    right = np.cross(up, back)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(back, right), back])
+    aside, above = camera
+    front = np.array([0.0, -1, 0] if abs(up[2]) > 0.5 else [0.0, 0, 1])
+    front -= front @ up * up
+    front /= np.linalg.norm(front)
+    eye = np.cos(aside) * front + np.sin(aside) * np.cross(up, front)
+    right = np.cross(up, eye)
+    eye = np.cos(above) * eye + np.sin(above) * up
+    return np.array([right, np.cross(eye, right), eye])
 
 
 def distance(size: np.ndarray, axes: np.ndarray) -> float:

@@ -3,19 +3,19 @@
 The HTML loads nothing and runs no script, so it also shows in a notebook that is only read.
 """
 
+import base64
+import io
 from collections.abc import Mapping
 from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..colliders.collider import Collider
-from ..constraints import Path
-from .drawing import bounds, links, upwards
-from .hues import by_body
+from .drawing import bounds, view_up
+from .exports.geometry import geometry
+from .exports.sketch import Look, Sketch, View
 from .images import InBox
-from .layout import eye_axes
-from .rims import rims
+from .scene import Parts
 
 if TYPE_CHECKING:
     from ..features.feature import Feature
@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from ..world import World
     from .replay import Replay
 
-MANY = 800  # most particles drawn; of more, an even selection
-SIZE = 280  # pixels of the longer side of a picture
-GREY = "#8a8f9c"  # visible on black and on white
+SIZE = 320  # width of a picture [pixels]
 
 
 def table(rows: Mapping[str, Any], title: str = "") -> str:
@@ -67,7 +65,7 @@ def of_world(world: "World") -> str:
     """Return the HTML of a world: its picture, and the text of explain(), folded."""
     try:
         more = f"<details><summary>explain()</summary><pre>{escape(world.explain())}</pre></details>"
-        image = picture(world, InBox().drawn_positions(world, world.position))
+        image = picture(world)
     except RuntimeError:  # the world was closed
         return f"<code>{escape(repr(world))}</code>"
     return f"<div><code>{escape(repr(world))}, {world.time:.4g} s</code><br>{image}{more}</div>"
@@ -80,43 +78,12 @@ def of_replay(replay: "Replay") -> str:
     return table(rows, replay.path) + f"<p>{escape(replay.text)}</p>"
 
 
-def picture(world: "World", x: np.ndarray) -> str:
-    """Return particles at x (n, dim), links, walls and paths as SVG; a 3D scene is seen from the front and a little above."""
-    low, high = bounds(world)
-    view = np.eye(2) if len(low) == 2 else eye_axes(upwards(world))
-    some = np.arange(0, len(x), -(-len(x) // MANY) or 1)
-    corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, len(low)) @ view.T
-    left, top = corners.min(axis=0)[:2]
-    wide, tall = np.maximum(corners.max(axis=0)[:2] - corners.min(axis=0)[:2], 1e-12)
-    scale = SIZE / max(wide, tall)
-
-    def place(points: np.ndarray) -> np.ndarray:
-        """Return pixels."""
-        flat = (points @ view.T)[..., :2]
-        return np.stack([(flat[..., 0] - left) * scale, (tall - flat[..., 1] + top) * scale], axis=-1) + 2
-
-    parts = []
-    for f in world.features:
-        if isinstance(f, (Collider, Path)):
-            strips, radius = f.outline(low, high)
-            parts += [_line(strip, GREY, max(1.0, 2 * radius * scale)) for strip in place(strips)] if strips.size else []
-    ends = np.concatenate([np.zeros((0, 2), dtype=np.int64), *(f.indices for _, f in links(world))])
-    parts += [_line(pair, GREY, 1.0) for pair in place(x[ends[:: -(-len(ends) // MANY) or 1]])]
-    hues, (edges, thick) = by_body(world), rims(world)
-    parts += [_line(pair, _hex(hues[i]), 2 * r * scale) for pair, i, r in zip(place(x[edges]), edges[:, 0], thick, strict=True)]
-    depth = (x @ view.T)[:, 2] if x.shape[1] == 3 else np.zeros(len(x))
-    radii = np.maximum(world.particles.radius * scale, 1.2)
-    for i in some[np.argsort(depth[some], kind="stable")]:
-        a, b = place(x[i])
-        parts.append(f"<circle cx='{a:.1f}' cy='{b:.1f}' r='{radii[i]:.1f}' fill='{_hex(hues[i])}'/>")
-    size = f"width='{wide * scale + 4:.0f}' height='{tall * scale + 4:.0f}'"
-    return f"<svg xmlns='http://www.w3.org/2000/svg' {size}>{''.join(parts)}</svg>"
-
-
-def _hex(hue: np.ndarray) -> str:
-    return "#" + bytes(hue.tolist()).hex()
-
-
-def _line(points: np.ndarray, color: str, width: float) -> str:
-    at = " ".join(f"{a:.1f},{b:.1f}" for a, b in points)
-    return f"<polyline points='{at}' fill='none' stroke='{color}' stroke-width='{width:.1f}'/>"
+def picture(world: "World") -> str:
+    """Return the present picture of a world as an image that needs no other file; "" where positions are not finite."""
+    parts, corners = Parts(world.particles, world.features, tuple(range(len(world.features)))), bounds(world)
+    if not np.isfinite(corners).all():
+        return ""
+    shape, out = geometry(parts), io.BytesIO()
+    sketch = Sketch(parts, shape, View(*corners, view_up(world), Look((SIZE, None))), corners)
+    sketch.frame(InBox().drawn_positions(world, world.position), shape).save(out, "PNG")
+    return f"<img src='data:image/png;base64,{base64.b64encode(out.getvalue()).decode()}'>"

@@ -14,6 +14,7 @@ HEAD = struct.Struct("<QQ")  # head of a message: its kind, and how many bytes f
 END, STORE, CHUNK, SHOWN = range(4)  # kinds: the last message, a store, rows of an entity, which layout is shown
 LAYOUT = 2  # the kind of a store with a layout
 COMPRESSION, SIZE, PAYLOAD = 2, 3, 5  # fields of a chunk: the compression, the uncompressed size, the bytes
+FIELDS = "1 2 3 4 5 6 7"  # all fields of a chunk
 LZ4 = 2
 BATCH = 120_000  # bytes sent together: LZ4 finds matches within 64 kB
 LEVEL = 9  # LZ4 level that matches the points of lines with those of particles, at 60 MB/s
@@ -23,71 +24,40 @@ WRITTEN = "log_time"  # column of the layout's rows with the time of writing, wh
 PARTS = ("particles", "fill", "contacts", "velocities", "breaks")  # of the scene: drawn in each frame, or again in the next
 
 
-class Chunk:
-    """A message with rows of an entity."""
+def rows_of(message: bytes) -> Any:
+    """Return the rows of a message as a pyarrow.RecordBatch."""
+    return reader.rows_of(reader.record(message, FIELDS))
 
-    def __init__(self, message: bytes):
-        self._message, self._fields, at = message, {}, 0
-        while at < len(message):
-            start = at
-            key, at = _varint(message, at)
-            number, at = _varint(message, at)
-            if key & 7 not in (0, 2):
-                raise ValueError("a message of rerun is not as expected")
-            begin, at = at, at + (number if key & 7 == 2 else 0)
-            self._fields[key >> 3] = (start, begin, at, number)
 
-    def __len__(self) -> int:
-        return len(self._message)
+def holding(message: bytes, rows: Any) -> bytes:
+    """Return the message with other rows, well compressed. pyarrow pads them less than rerun does."""
+    import pyarrow as pa
 
-    def noise(self) -> bool:
-        """Whether better compression would gain too little."""
-        packed, plain = self._number(PAYLOAD), self._number(SIZE)
-        return self._number(COMPRESSION) != LZ4 or packed > NOISE * plain
-
-    def _number(self, field: int) -> int:
-        return self._fields[field][3] if field in self._fields else 0
-
-    def rows(self) -> Any:
-        """Return the rows as a pyarrow.RecordBatch."""
-        import pyarrow as pa
-
-        _, begin, end, _ = self._fields[PAYLOAD]
-        data = self._message[begin:end]
-        if self._number(COMPRESSION) == LZ4:
-            data = pa.decompress(data, self._number(SIZE), codec="lz4_raw")
-        return pa.ipc.open_stream(data).read_next_batch()
-
-    def holding(self, rows: Any) -> bytes:
-        """Return the message with other rows, well compressed. pyarrow pads them less than rerun does."""
-        import pyarrow as pa
-
-        ids = rows.schema.field(0)  # rerun recognises ids by their kind, and needs no name of their type in addition
-        told = {key: value for key, value in (ids.metadata or {}).items() if not key.startswith(b"ARROW:extension")}
-        rows = rows.set_column(0, ids.with_metadata(told), rows.column(0))
-        out = pa.BufferOutputStream()
-        with pa.ipc.new_stream(out, rows.schema) as stream:
-            stream.write_batch(rows)
-        plain = out.getvalue()
-        packed = pa.Codec("lz4_raw", compression_level=LEVEL).compress(plain).to_pybytes()
-        parts = []
-        for field, (start, _, end, _) in self._fields.items():
-            new = {
-                COMPRESSION: bytes([COMPRESSION << 3, LZ4]),
-                SIZE: bytes([SIZE << 3]) + _as_varint(len(plain)),
-                PAYLOAD: bytes([PAYLOAD << 3 | 2]) + _as_varint(len(packed)) + packed,
-            }
-            parts.append(new.get(field, self._message[start:end]))
-        return b"".join(parts)
+    ids = rows.schema.field(0)  # rerun recognises ids by their kind, and needs no name of their type in addition
+    told = {key: value for key, value in (ids.metadata or {}).items() if not key.startswith(b"ARROW:extension")}
+    rows = rows.set_column(0, ids.with_metadata(told), rows.column(0))
+    buffer = pa.BufferOutputStream()
+    with pa.ipc.new_stream(buffer, rows.schema) as stream:
+        stream.write_batch(rows)
+    plain = buffer.getvalue()
+    packed = pa.Codec("lz4_raw", compression_level=LEVEL).compress(plain).to_pybytes()
+    fields = reader.record(message, FIELDS) | {COMPRESSION: LZ4, SIZE: len(plain), PAYLOAD: packed}
+    out = b""
+    for field, value in fields.items():
+        if isinstance(value, int):
+            out += bytes([field << 3]) + _varint(value)
+        else:
+            out += bytes([field << 3 | 2]) + _varint(len(value)) + value
+    return out
 
 
 def smaller(message: bytes) -> bytes:
     """Return a message with its rows compressed better than rerun does; unchanged where nothing is gained."""
-    chunk = Chunk(message)
-    if chunk.noise():
+    fields = reader.record(message, FIELDS)
+    if fields.get(COMPRESSION) != LZ4 or len(fields[PAYLOAD]) > NOISE * fields[SIZE]:
         return message
-    rows = chunk.rows()
-    new = chunk.holding(rows.drop_columns([name for name in rows.schema.names if name == WRITTEN]))
+    rows = reader.rows_of(fields)
+    new = holding(message, rows.drop_columns([name for name in rows.schema.names if name == WRITTEN]))
     return new if len(new) < len(message) else message
 
 
@@ -118,7 +88,7 @@ def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[in
     for kind, message in messages:
         entity = ""
         if kind == CHUNK:
-            rows = Chunk(message).rows()
+            rows = rows_of(message)
             name = rows.schema.metadata[b"rerun:entity_path"].decode()
             if "frame" in rows.schema.names and (thins(name) or stride == 1):
                 entity = name
@@ -134,10 +104,9 @@ def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[in
         if not entity:
             yield kind, message
             continue
-        chunk = Chunk(message)
-        rows = chunk.rows()
+        rows = rows_of(message)
         if entity == f"/{journal.JOURNAL}":
-            entries.append((chunk, rows))
+            entries.append((message, rows))
             continue
         rows = rows.take(np.flatnonzero(~np.isin(rows.column("frame").to_numpy(), gone[entity])))
         together = waiting[entity, tuple(zip(rows.schema.names, rows.schema.types, strict=True))]
@@ -145,7 +114,7 @@ def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[in
             pictures.append(_joined(together))
             together.clear()
         if rows.num_rows:
-            together.append((chunk, rows))
+            together.append((message, rows))
     yield from ((CHUNK, message) for message in _packed(entries))
     pictures += [_joined(together) for together in waiting.values() if together]
     yield from ((CHUNK, message) for message in pictures)
@@ -163,45 +132,21 @@ def _store(kind: int, message: bytes) -> tuple | None:
     if kind == STORE:
         message = reader.record(reader.record(message, "1 2").get(2, b""), "2 5 6")[2]
         return tuple(reader.store_of(message))
-    return tuple(reader.store_of(reader.record(message, "1 2 3 4 5 6 7").get(1, b""))) if kind in (CHUNK, SHOWN) else None
+    return tuple(reader.store_of(reader.record(message, FIELDS).get(1, b""))) if kind in (CHUNK, SHOWN) else None
 
 
-def _packed(entries: list[tuple[Chunk, Any]]) -> Iterator[bytes]:
+def _packed(entries: list[tuple[bytes, Any]]) -> Iterator[bytes]:
     """Yield messages with rows of a journal: the first row by itself, so that it is written early, the others together."""
     pieces, size, mark = [], BATCH, ""
-    whole = max((rows.schema for _, rows in entries), key=len, default=None)  # entries without bytes lack that column
-    entries = _in_order([(chunk, _with_all(rows, whole)) for chunk, rows in entries])
-    for chunk, rows in entries:
+    for message, rows in entries:
         size += rows.nbytes
         if len(pieces) < 2 or size > BATCH:
             pieces.append([])
             size = rows.nbytes
-        pieces[-1].append((chunk, rows))
+        pieces[-1].append((message, rows))
     for piece in pieces:
         rows, mark = _in_runs(_together(piece), mark)
-        yield piece[0][0].holding(rows)
-
-
-def _in_order(entries: list[tuple[Chunk, Any]]) -> list[tuple[Chunk, Any]]:
-    """Sort rows by their ids. Rows with and without bytes come in separate messages, which may overtake each other."""
-    ids = [rows.column(0).to_pylist() for _, rows in entries]
-    together = [one for part in ids for one in part]
-    if together == sorted(together):
-        return entries
-    single = []
-    for part, (chunk, rows) in zip(ids, entries, strict=True):
-        single += [(one, chunk, rows.slice(k, 1)) for k, one in enumerate(part)]
-    return [(chunk, row) for _, chunk, row in sorted(single, key=lambda one: one[0])]
-
-
-def _with_all(rows: Any, whole: Any) -> Any:
-    """Return rows with all columns of a schema; missing ones are empty."""
-    import pyarrow as pa
-
-    if rows.schema.equals(whole):
-        return rows
-    columns = [rows.column(f.name) if f.name in rows.schema.names else pa.nulls(len(rows), f.type) for f in whole]
-    return pa.RecordBatch.from_arrays(columns, schema=whole.with_metadata(rows.schema.metadata))
+        yield holding(piece[0][0], rows)
 
 
 def _in_runs(rows: Any, mark: str) -> tuple[Any, str]:
@@ -211,8 +156,7 @@ def _in_runs(rows: Any, mark: str) -> tuple[Any, str]:
     """
     import pyarrow as pa
 
-    texts = [text for (text,) in rows.column("text").to_pylist()]
-    blobs = [bytes(blob or ()) for blob in rows.column("blob").to_pylist()] if "blob" in rows.schema.names else [b""] * len(texts)
+    texts, blobs = [text for (text,) in rows.column("text").to_pylist()], [bytes(b) for b in rows.column("blob").to_pylist()]
     firsts, together, marks = [], [], [mark]
     for k, text in enumerate(texts):
         alike = k and all(not blobs[j] and journal.is_frame(texts[j]) for j in (k - 1, k))
@@ -231,7 +175,7 @@ def _in_runs(rows: Any, mark: str) -> tuple[Any, str]:
     return rows, marks[-1]
 
 
-def _together(parts: list[tuple[Chunk, Any]]) -> Any:
+def _together(parts: list[tuple[bytes, Any]]) -> Any:
     """Join the rows of several messages, with the schema of the first."""
     import pyarrow as pa
 
@@ -240,8 +184,8 @@ def _together(parts: list[tuple[Chunk, Any]]) -> Any:
     return table.combine_chunks().to_batches()[0]
 
 
-def _joined(parts: list[tuple[Chunk, Any]]) -> bytes:
-    return parts[0][0].holding(_together(parts))
+def _joined(parts: list[tuple[bytes, Any]]) -> bytes:
+    return holding(parts[0][0], _together(parts))
 
 
 def split(data: bytes) -> list[tuple[int, bytes]]:
@@ -254,17 +198,8 @@ def split(data: bytes) -> list[tuple[int, bytes]]:
     return out
 
 
-def _varint(data: bytes, at: int) -> tuple[int, int]:
-    """Decode a number of seven bits per byte; return it and the index behind it."""
-    number = shift = 0
-    while True:
-        byte = data[at]
-        number, shift, at = number | (byte & 127) << shift, shift + 7, at + 1
-        if byte < 128:
-            return number, at
-
-
-def _as_varint(number: int) -> bytes:
+def _varint(number: int) -> bytes:
+    """Encode a number with seven bits per byte."""
     out = bytearray()
     while number > 127:
         out.append(number & 127 | 128)

@@ -32,6 +32,11 @@ class Overlays:
     def __post_init__(self) -> None:
         object.__setattr__(self, "strain", self.strain and self.color is BY_BODY)
 
+    @staticmethod
+    def checked(who: str, color: Coloring, **flags: Any) -> "Overlays":
+        """Return overlays from the arguments of a recorder, or raise TypeError."""
+        return Overlays(color=color, **{name: checks.flag(who, name, value) for name, value in flags.items()})
+
     def title(self, links: bool) -> str | None:
         """Return the title of the colour scale, or None without a scale. links: whether the scene has any."""
         return self.color.title or ("Strain of links" if links and self.strain else None)

@@ -35,7 +35,6 @@ class Picture:
         self.world, self._stream, self._explained, self._environment = world, stream, explained, environment
         self._overlays = overlays
         self.drawing = Drawing(world, stream, bounds(world), overlays)
-        self._low, self._high = np.full((2, world.particles.dim), [[np.inf], [-np.inf]])  # corners of everything drawn
         self._unit, dim = unit(*self.drawing.extent), world.particles.dim
         about = [transform(view_up(world, overlays.y_down), self._unit)] if dim == 2 or self._unit != 1 else []
         self.drawing.static(SCENE, *about, *([upright(upwards(world))] if dim == 3 else []))
@@ -70,7 +69,6 @@ class Picture:
         if scenes > self.drawing.scenes:
             self.curves.read_masses(self.world)
             self.drawing.begin(scenes)
-        self._frame_all(x)
         self.drawing.frame(x, x32, changed_features, bool(report and report.broken))
         if report:
             self.curves.add(number, report, now)
@@ -83,17 +81,9 @@ class Picture:
         self.curves.log(number, self.world.time, {name: value for name, value in values.items() if np.ndim(value) == 0})
         self.drawing.logged |= {name: value for name, value in values.items() if np.ndim(value)}
 
-    def _frame_all(self, x: np.ndarray) -> None:
-        """Extend the region of all particles so far, for layout()."""
-        radius = self.world.particles.radius[:, None]
-        some = np.isfinite(x).all(axis=1)
-        if some.any():
-            self._low = np.minimum(self._low, (x - radius)[some].min(axis=0))
-            self._high = np.maximum(self._high, (x + radius)[some].max(axis=0))
-
     def layout(self) -> Any:
         """Return the layout in which the finished recording opens: the view frames the whole run."""
-        extent = framed(self.drawing.extent, self._low, self._high)
+        extent = framed(self.drawing.extent, self.drawing.low, self.drawing.high)
         return layout(self.world, self._overlays, (extent, self._unit), self.curves.own)
 
     def end(self, worst: StepReport | None, frames: int, note: str) -> None:

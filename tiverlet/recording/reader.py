@@ -72,6 +72,18 @@ def store_of(data: bytes) -> tuple[int, str, str]:
     return parts.get(1, 0), record(parts.get(3, b""), "1").get(1, b"").decode(), parts.get(2, b"").decode()
 
 
+def rows_of(parts: dict):
+    """Return the rows of a message of kind 2 as a pyarrow.RecordBatch. parts: the decoded message."""
+    import pyarrow as pa
+
+    packed, size = parts.get(5, b""), parts.get(3, 0)
+    if parts.get(2) == 2:
+        if size > LZ4 * len(packed) + 64:
+            raise Damaged(f"{len(packed)} bytes say that they unpack to {size}")
+        packed = pa.Codec("lz4_raw").decompress(packed, decompressed_size=size)
+    return pa.ipc.open_stream(packed).read_next_batch()
+
+
 class ResultFile:
     """The output for the parent process: arrays one behind the other in the file, and their places."""
 
@@ -158,15 +170,10 @@ class Reader:
         """Read a message with rows."""
         np, pa = self.np, self.pa
         parts = record(data, "1 2 3 4 5 6 7")
-        store, packed, size = store_of(parts.get(1, b"")), parts.get(5, b""), parts.get(3, 0)
+        store = store_of(parts.get(1, b""))
         if store not in self.stores:
             raise Damaged("rows of a store that is not announced")
-        if parts.get(2) == 2:
-            if size > LZ4 * len(packed) + 64:
-                raise Damaged(f"{len(packed)} bytes say that they unpack to {size}")
-            packed = pa.Codec("lz4_raw").decompress(packed, decompressed_size=size)
-        stream = pa.ipc.open_stream(packed)
-        batch = stream.read_next_batch()
+        batch = rows_of(parts)
         batch.validate(full=True)
         about = {k.decode(): v.decode() for k, v in (batch.schema.metadata or {}).items()}
         entity = about.get("rerun:entity_path", "").lstrip("/")

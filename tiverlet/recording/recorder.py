@@ -23,7 +23,7 @@ from .overlays import Overlays, checked_y_down
 from .picture import Picture, layout
 from .quantities import QUANTITIES, checked_quantities
 from .scene import environment
-from .sink import BACKLOG, CHECK_INTERVAL, SMALL, Sink, file_error
+from .sink import Sink, checked_place, file_error
 
 SEND = 1.0  # [s] between two transfers of curve points to rerun
 SHARE = 20  # an exact state is written once the pictures since the last one take so many times its bytes, uncompressed
@@ -75,27 +75,23 @@ class Recorder:
         self.world = world
         self.every = checks.integer("Recorder", "every", every, least=1)
         self.budget = None if budget is None else checks.integer("Recorder", "budget", budget, least=1)
-        flags = {"strain": strain, "forces": forces, "velocities": velocities}
-        given = {name: checks.flag("Recorder", name, value) for name, value in flags.items()}
-        given["y_down"] = checked_y_down("Recorder", world, y_down)
+        down = checked_y_down("Recorder", world, y_down)
         coloring = Coloring.checked("Recorder", color, len(world.particles), None)
-        self._overlays = Overlays(color=coloring.following(world), **given)
+        following = coloring.following(world)
+        self._overlays = Overlays.checked("Recorder", following, strain=strain, forces=forces, velocities=velocities, y_down=down)
         self._own: dict[str, Any] = {}  # the user's quantities, for the next frame that is drawn
         if path is None and not live:
             raise ValueError("Recorder: path = None is for live recordings; give a file, or live=True.")
         if live == "notebook" and path is not None:
             raise ValueError('Recorder: live="notebook" shows without a file; give path=None, or one of live=True and "web".')
-        self.path = os.devnull if path is None else os.fspath(path)
+        self.path, title = (os.devnull, "live") if path is None else checked_place("Recorder", path)
         self._live = live
-        folder = os.path.dirname(os.path.abspath(self.path))
-        if not os.path.isdir(folder):
-            raise ValueError(f"Recorder: the folder {folder} does not exist. Make it first: os.makedirs({folder!r}).")
         self.frames = self._calls = 0
         self._stride = self.every  # one of so many frames is drawn
         self._frame_bytes = 0  # about the bytes of a frame
         self._note = ""  # which frames the budget has left out
         self._full = self._closed = False  # whether the budget has ended the recording; whether close() was called
-        self._open(overwrite)
+        self._open(title, overwrite)
 
     def __enter__(self) -> "Recorder":
         return self
@@ -104,9 +100,8 @@ class Recorder:
         self.close()
 
     @interrupts.uninterrupted
-    def _open(self, overwrite: bool) -> None:
+    def _open(self, title: str, overwrite: bool) -> None:
         world = self.world
-        title = "live" if self.path == os.devnull else os.path.splitext(os.path.basename(self.path))[0]
         viewer = None
         if self._live:
             from . import watch  # imported late, since it imports a server
@@ -137,14 +132,13 @@ class Recorder:
         world._rebuild_for_knobs()  # rebuild for the present knobs first, so that the state belongs to their kernels
         explained = explain(world)
         self._picture = Picture(world, self._stream, explained, environment(), self._overlays)
-        self._sent, self._flushed = perf_counter(), 0
+        self._sent = perf_counter()
         self._picture.stamp(0)
         picture_settings = {"title": title, "explained": explained, "overlays": self._overlays.stored()}
         self._journal = Journal(world, self._write, picture_settings)
         self._note_state(self._journal.size)
         self._frame(0)
         self.flush()  # so that a process that ends early leaves a readable file
-        self._checked_at = perf_counter()
         if error := self._sink.error:
             raise file_error(error, f"Recorder: nothing could be written to {self.path}")
         least = self._sink.bytes + RESERVE
@@ -164,7 +158,7 @@ class Recorder:
     @property
     def bytes(self) -> int:
         """About how many bytes the file will have when it is closed."""
-        return self._sink.bytes + self._logged - self._flushed
+        return self._sink.bytes + self._logged - self._sink.flushed
 
     @interrupts.uninterrupted
     def log(self, **quantities) -> None:
@@ -196,11 +190,7 @@ class Recorder:
         if now - self._sent > SEND:
             self._picture.curves.send()
             self._sent = now
-        if self._logged - self._flushed > BACKLOG:
-            self.flush()
-        if now - self._checked_at > CHECK_INTERVAL:
-            self._sink.check()
-            self._checked_at = now
+        self._sink.keep_up(self._logged)
         if self._sink.error:
             self._fail()
 
@@ -211,8 +201,7 @@ class Recorder:
             return
         self._check()
         self._picture.curves.send()
-        self._sink.flush()
-        self._flushed = self._logged
+        self._sink.flush(self._logged)
 
     def _check(self) -> None:
         """Raise RuntimeError if nothing can be written."""
@@ -330,12 +319,7 @@ class Recorder:
         if "hash" in end:
             self._picture.end(journal.worst, self.frames, self._note)
         journal.put("end", {**end, "note": self._note, **flags_to_record(journal.worst)})
-        if "hash" in end:
-            self._sink.show(self._picture.layout())
-        self._sink.flush()
-        self._sink.check()
-        if self._sink.bytes < SMALL:
-            self._sink.thin(1)
+        self._sink.finish(self._picture.layout() if "hash" in end else None)
         self._closing()
         if self._sink.error:
             self._fail()

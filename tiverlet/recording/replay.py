@@ -418,8 +418,8 @@ class Replay:
         the front and above the horizon in 3D; theme, "dark" or "light".
 
         Raises ValueError for what a format does not take, such as added or removed particles, and for a shape of other particles;
-        RuntimeError if motion does not come out as recorded; FileNotFoundError if the folder is missing; ImportError for .glb and
-        .mp4 without tiverlet[export], and for .usd without tiverlet[usd].
+        RuntimeError if motion does not come out as recorded; FileNotFoundError if the folder is missing; ImportError for .mp4
+        without ffmpeg and tiverlet[export], and for .usd without tiverlet[usd].
         """
         from . import exports  # imported late, since it imports rerun
 

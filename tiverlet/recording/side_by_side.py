@@ -1,9 +1,7 @@
 """WorldsRecorder: records some of many worlds in one file, each in a view of its own."""
 
-import os
 import weakref
 from collections.abc import Iterable
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -16,7 +14,7 @@ from ..worlds.worlds import Worlds
 from . import scene
 from .hues import Coloring
 from .overlays import Overlays
-from .sink import BACKLOG, CHECK_INTERVAL, SMALL, Sink, file_error
+from .sink import Sink, checked_place, file_error
 
 MOST = 64  # most views in a recording
 FEW = 9  # views by default
@@ -51,26 +49,21 @@ class WorldsRecorder:
         if not isinstance(worlds, Worlds):
             hint = "; one World is for tv.Recorder(path, world)" if isinstance(worlds, World) else ""
             raise TypeError(f"WorldsRecorder: worlds = {worlds!r} is a {type(worlds).__name__}, not a tv.Worlds{hint}.")
-        self.worlds, self.path = worlds, os.fspath(path)
+        self.worlds, (self.path, title) = worlds, checked_place("WorldsRecorder", path)
         numbers = range(min(FEW, len(worlds))) if chosen is None else chosen
         self.chosen = checks.indices("WorldsRecorder", "chosen", np.asarray([*numbers]), len(worlds), things="worlds").tolist()
         if not 0 < len(self.chosen) <= MOST or len({*self.chosen}) < len(self.chosen):
             raise ValueError(f"WorldsRecorder: chosen = {self.chosen}, but it must be 1 to {MOST} numbers, each once.")
         self.every = checks.integer("WorldsRecorder", "every", every, least=1)
-        flags = {"strain": strain, "forces": forces, "velocities": velocities}
-        given = {name: checks.flag("WorldsRecorder", name, value) for name, value in flags.items()}
         (count,) = worlds.each(lambda world: len(world.particles), self.chosen[:1])
-        overlays = Overlays(color=Coloring.checked("WorldsRecorder", color, count), **given)
-        folder = os.path.dirname(os.path.abspath(self.path))
-        if not os.path.isdir(folder):
-            raise ValueError(f"WorldsRecorder: the folder {folder} does not exist. Make it first: os.makedirs({folder!r}).")
-        self.frames = self._calls = self._flushed = 0
+        color = Coloring.checked("WorldsRecorder", color, count)
+        overlays = Overlays.checked("WorldsRecorder", color, strain=strain, forces=forces, velocities=velocities)
+        self.frames = self._calls = 0
         self._before = self._last = 0.0  # [s] the total time before the last reset; the time of the last frame
-        self._checked_at = perf_counter()
         with interrupts.deferred_signals:
-            self._open(overlays, overwrite)
+            self._open(title, overlays, overwrite)
 
-    def _open(self, overlays: Overlays, overwrite: bool) -> None:
+    def _open(self, title: str, overlays: Overlays, overwrite: bool) -> None:
         from .drawing import bounds, links, view_up
 
         def known(world: World) -> tuple:
@@ -81,7 +74,6 @@ class WorldsRecorder:
         self._title, corners = titles[0], np.array(each)  # (worlds, 2, dim)
         self._extent = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
         dim = corners.shape[2]
-        title = os.path.splitext(os.path.basename(self.path))[0]
         opens = self._layout(*self._extent)
         self._sink = Sink(self.path, f"tiverlet_worlds_{dim}d", opens, title, overwrite)
         self._closing = weakref.finalize(self, self._sink.close)  # runs also when the process ends
@@ -112,13 +104,7 @@ class WorldsRecorder:
         self._calls += 1
         if self._calls % self.every == 0:
             self._draw()
-        bytes_drawn = sum(view.drawing.bytes for view in self._views)
-        if bytes_drawn - self._flushed > BACKLOG:
-            self._sink.flush()
-            self._flushed = bytes_drawn
-        if perf_counter() - self._checked_at > CHECK_INTERVAL:
-            self._sink.check()
-            self._checked_at = perf_counter()
+        self._sink.keep_up(sum(view.drawing.bytes for view in self._views))
         self._fail()
 
     def _draw(self) -> None:
@@ -154,13 +140,9 @@ class WorldsRecorder:
             return
         from .picture import framed
 
-        low = np.min([view.low for view in self._views], axis=0)
-        high = np.max([view.high for view in self._views], axis=0)
-        self._sink.show(self._layout(*framed(self._extent, low, high)))
-        self._sink.flush()
-        self._sink.check()
-        if self._sink.bytes < SMALL:
-            self._sink.thin(1)
+        low = np.min([view.drawing.low for view in self._views], axis=0)
+        high = np.max([view.drawing.high for view in self._views], axis=0)
+        self._sink.finish(self._layout(*framed(self._extent, low, high)))
         self._closing()
         self._fail()
 
@@ -174,8 +156,7 @@ class _View:
 
         dim = world.particles.dim
         self.drawing = Drawing(world, stream, extent, overlays)
-        self.low, self.high = np.full(dim, np.inf), np.full(dim, -np.inf)  # corners of everything drawn
-        self._known: list[dict[str, Any]] = [{} for _ in world.features]
+        self._known: list[Any] = [None for _ in world.features]
         self._broken = 0
         turn = [upright(upwards(world))] if dim == 3 else []
         self.drawing.static(SCENE, transform(view_up(world), unit(*extent)), *turn)
@@ -185,14 +166,10 @@ class _View:
         """Draw the world's present state."""
         self.drawing.world = world
         now = [scene.knobs(f) for f in world.features]
-        changed = [i for i, (new, old) in enumerate(zip(now, self._known, strict=True)) if not old or not _equal(new, old)]
+        changed = [i for i, (new, old) in enumerate(zip(now, self._known, strict=True)) if old is None or not _equal(new, old)]
         self._known = now
         broken = sum(int(f.broken.sum()) for f in world.features if getattr(f, "breaks", False))  # type: ignore[attr-defined]
-        x, radius = self.drawing.drawn_positions(world.position), world.particles.radius[:, None]
-        some = np.isfinite(x).all(axis=1)
-        if some.any():
-            self.low = np.minimum(self.low, (x - radius)[some].min(axis=0))
-            self.high = np.maximum(self.high, (x + radius)[some].max(axis=0))
+        x = self.drawing.drawn_positions(world.position)
         self.drawing.frame(x, x.astype(np.float32), changed, broken != self._broken)
         self._broken = broken
 

@@ -64,6 +64,7 @@ class Sink:
         import rerun as rr
 
         self.path, self.bytes, self._watched = path, 0, viewer is not None
+        self.flushed, self._checked_at = 0, monotonic()  # bytes logged before the last flush; when check() was called last
         self.error: Exception | None = None
         batches = rr.ChunkBatcherConfig(flush_tick=TICK, flush_num_bytes=BATCH)
         self.stream: Any = rr.RecordingStream(application, recording_id=uuid.uuid4(), batcher_config=batches)
@@ -151,6 +152,7 @@ class Sink:
 
     def check(self) -> None:
         """Set `error` if the file was removed or replaced by another one."""
+        self._checked_at = monotonic()
         if self._regular and self.error is None and not self._is_own_file(self._new or self.path):
             self.error = FileNotFoundError(errno.ENOENT, "the file was removed or replaced")
 
@@ -248,8 +250,25 @@ class Sink:
         """Whether this is a child of the recording process, where rerun and the copying thread do not work."""
         return self._pid != os.getpid()
 
-    def flush(self) -> None:
-        """Wait until everything logged is in the file."""
+    def keep_up(self, logged: int) -> None:
+        """Wait if too much is not written yet, and look from time to time whether the file is there. logged: bytes in all."""
+        if logged - self.flushed > BACKLOG:
+            self.flush(logged)
+        if monotonic() - self._checked_at > CHECK_INTERVAL:
+            self.check()
+
+    def finish(self, blueprint: Any) -> None:
+        """Wait until everything is in the file, which opens with this layout, if one is given. A small file is rewritten."""
+        if blueprint:
+            self.show(blueprint)
+        self.flush()
+        self.check()
+        if self.bytes < SMALL:
+            self.thin(1)
+
+    def flush(self, logged: int = 0) -> None:
+        """Wait until everything logged is in the file. logged: bytes in all."""
+        self.flushed = logged
         if self.error is None:
             try:
                 self.stream.flush(timeout_sec=WAIT)
@@ -284,6 +303,14 @@ class Sink:
             self._file.close()
             self.stream = None
             rerun.flush_and_cleanup_orphaned_recordings()  # ends the threads of what Python no longer refers to
+
+
+def checked_place(who: str, path: str | os.PathLike) -> tuple[str, str]:
+    """Return the path of a new recording and its title; raise ValueError if the folder is missing."""
+    folder, (title, _) = os.path.dirname(os.path.abspath(path)), os.path.splitext(os.path.basename(path))
+    if not os.path.isdir(folder):
+        raise ValueError(f"{who}: the folder {folder} does not exist. Make it first: os.makedirs({folder!r}).")
+    return os.fspath(path), title
 
 
 def is_recording(path: str) -> bool:

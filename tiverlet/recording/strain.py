@@ -31,6 +31,17 @@ def levels(strain: np.ndarray) -> np.ndarray:
     return LEVELS + np.rint(np.copysign(LEVELS * share, strain)).astype(np.int32)
 
 
+def tinted(hues: np.ndarray, at: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Return colours (n, 3) that turn red or blue with strain, from 1 % on.
+
+    at: the row of `hues` that shows each link, (m,); each row shows its worst. level: that of each link, (m,); -1: not drawn.
+    """
+    off, most = np.where(level < 0, 0, level - LEVELS), np.zeros(len(hues), dtype=np.int64)
+    np.maximum.at(most, at, 2 * np.abs(off) + (off > 0))
+    share = np.maximum(0, 3 * (most >> 1) / LEVELS - 2)[:, None]  # 0 up to 1 % of strain, 1 at 10 %
+    return hues + share * (np.where((most & 1)[:, None], LONGER, SHORTER) - hues)
+
+
 def legend() -> tuple[np.ndarray, list[str]]:
     """Return colours and labels of the scale, from the most compressed to the most stretched."""
     decades = np.array([1e-1, 1e-2, 1e-3])

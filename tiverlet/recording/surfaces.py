@@ -9,7 +9,6 @@ from ..constraints import Area, Dihedral, ShapeMatch, Volume
 from ..contact import Polygons
 from ..features.feature import Batch
 from .lines import cells
-from .strain import LEVELS, LONGER, SHORTER, packed
 
 if TYPE_CHECKING:
     from ..world import World
@@ -79,49 +78,22 @@ def doubled(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(uu * vv - uv * uv, 0))
 
 
-class Surface:
-    """Bodies as one mesh, in the colours of their particles, lit from the eye's side and above.
+def normals(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return normals at particles, (n, 3), each as long as twice the area of its triangles."""
+    a, b, c = (x[k] for k in triangles.T)
+    across, corner = np.cross(b - a, c - a), triangles.ravel()
+    return np.stack([np.bincount(corner, np.repeat(column, 3), len(x)) for column in across.T], axis=1)
 
-    triangles: (t, 3). hues: colours of particles, (n, 3). pairs: links whose strain shows in the colours of their ends, from 1 %
-    on, (m, 2). up: the direction against gravity.
+
+def lit(hues: np.ndarray, triangles: np.ndarray, x: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Return colours (n, 3) of particles at x on a surface that is lit from the eye's side and above.
+
+    triangles: (t, 3). up: the direction against gravity.
     """
-
-    def __init__(self, triangles: np.ndarray, hues: np.ndarray, pairs: np.ndarray, up: np.ndarray):
-        self.triangles, self._hues = triangles, hues.astype(np.float64)
-        self._light = LIGHT + up
-        self._light /= np.linalg.norm(self._light)
-        corner = triangles.ravel()
-        order = np.argsort(corner, kind="stable")
-        self._at, self._begin = np.unique(corner[order], return_index=True)
-        self._face = (order // 3).astype(np.int64)
-        ends = pairs.T.ravel()
-        order = np.argsort(ends, kind="stable")
-        self._end, self._first = np.unique(ends[order], return_index=True)
-        self._link = (order % max(1, len(pairs))).astype(np.int64)
-
-    def paint(self, hues: np.ndarray) -> None:
-        """Set other colours of the particles, (n, 3)."""
-        self._hues = hues.astype(np.float64)
-
-    def colors(self, x: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """Return RGBA of all particles at x as u32, (n,).
-
-        level: the level of the strain of each link, (m,); each particle shows its worst.
-        """
-        a, b, c = (x[k] for k in self.triangles.T)
-        normal = np.add.reduceat(np.cross(b - a, c - a)[self._face], self._begin, axis=0)
-        size = np.sqrt(np.einsum("ij,ij->i", normal, normal))
-        light = np.abs(normal @ self._light) / np.where(size > 0, size, 1)
-        shade = np.ones(len(x))
-        shade[self._at] = DARKEST + (1 - DARKEST) * np.rint(SHADES * light) / SHADES  # few shades compress well
-        hues = self._hues
-        if len(self._end):
-            off = level[self._link] - LEVELS
-            most = np.maximum.reduceat(2 * np.abs(off) + (off > 0), self._first)
-            share = np.maximum(0, 3 * (most >> 1) / LEVELS - 2)[:, None]  # 0 up to 1 % of strain, 1 at 10 %
-            hues = hues.copy()
-            hues[self._end] += share * (np.where((most & 1)[:, None], LONGER, SHORTER) - hues[self._end])
-        return packed(hues * shade[:, None])
+    normal, light = normals(x, triangles), LIGHT + up
+    size = np.sqrt(np.einsum("ij,ij->i", normal, normal))
+    bright = np.abs(normal @ (light / np.linalg.norm(light))) / np.where(size > 0, size, 1)
+    return hues * (DARKEST + (1 - DARKEST) * np.rint(SHADES * bright) / SHADES)[:, None]  # few shades compress well
 
 
 def cliques(pairs: np.ndarray) -> np.ndarray:

@@ -35,12 +35,11 @@ def write(
 ) -> list[str]:
     """Write a film in the scene's own time, RATE pictures a second; each picture shows the nearest frame."""
     look = Look.checked(size, camera, theme, recording.scenes[0].entry.arrays["position"].shape[1])
-    image, draw = needed("PIL.Image", path), needed("PIL.ImageDraw", path)
     kind = os.path.splitext(path)[1].lower()
     video = _ffmpeg(path) if kind == ".mp4" else ""
     if not len(recording.frames):
         raise ValueError(f"replay: {recording.path} has no frame, so there is nothing for {path}.")
-    pictures = _pictures(recording, stretches(recording, color=color), shape, image, draw, look)
+    pictures = _pictures(recording, stretches(recording, color=color), shape, look)
     first = next(pictures)
     if not video:
         first.save(path, save_all=True, append_images=pictures, duration=1000 // RATE, loop=0)
@@ -65,7 +64,7 @@ def _ffmpeg(path: str) -> str:
     return shutil.which("ffmpeg") or needed("imageio_ffmpeg", path).get_ffmpeg_exe()
 
 
-def _pictures(recording: "Replay", found: list[Stretch], shape: Shape | None, image: Any, draw: Any, look: Look) -> Iterator[Any]:
+def _pictures(recording: "Replay", found: list[Stretch], shape: Shape | None, look: Look) -> Iterator[Any]:
     """Yield one picture after the other, all from the same point of view."""
     times = recording.times
     moments = np.arange(times[0], times[-1] + 0.5 / RATE, 1 / RATE)
@@ -80,15 +79,13 @@ def _pictures(recording: "Replay", found: list[Stretch], shape: Shape | None, im
     view = View(low, high, view_up(found[0].parts, recording.overlays.y_down), look)
     for stretch in found:
         here = set(stretch.frames.tolist())
-        yield from _stretch(stretch, shape, [k for k in wanted if k in here], image, draw, view, (low, high))
+        yield from _stretch(stretch, shape, [k for k in wanted if k in here], view, (low, high))
 
 
-def _stretch(
-    stretch: Stretch, shape: Shape | None, wanted: list[int], image: Any, draw: Any, view: View, ends: tuple
-) -> Iterator[Any]:
+def _stretch(stretch: Stretch, shape: Shape | None, wanted: list[int], view: View, ends: tuple) -> Iterator[Any]:
     """Yield the pictures of one stretch, with walls at their places in each frame."""
     geometries = dict(zip(stretch.frames.tolist(), stretch.geometries(shape), strict=True))
-    sketch = Sketch(image, draw, stretch.parts, next(iter(geometries.values())), view, ends)
+    sketch = Sketch(stretch.parts, next(iter(geometries.values())), view, ends)
     turn = stretch.knobs_at()
     for frame in wanted:
         turn(frame)

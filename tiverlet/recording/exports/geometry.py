@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ...geometry.common_sense import common_sense, edges_of
 from ...shapes import Shape
 from ..drawing import links, upwards
 from ..hues import BY_BODY, Coloring
@@ -113,26 +114,10 @@ def _pieces(faces: np.ndarray) -> Iterable[tuple[np.ndarray, np.ndarray, bool]]:
     For each piece: its triangles, which of them have the other sense than the first, and whether the piece is closed (has no
     other edges).
     """
-    halves = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    _, edge, count = np.unique(np.sort(halves, axis=1), axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(edge.ravel(), kind="stable")
-    pairs = order[count[edge.ravel()[order]] == 2].reshape(-1, 2)
-    alike = (halves[pairs[:, 0]] == halves[pairs[:, 1]]).all(axis=1)
-    near: list[list[tuple[int, bool]]] = [[] for _ in faces]
-    for (p, q), same in zip((pairs // 3).tolist(), alike.tolist(), strict=True):
-        near[p].append((q, same))
-        near[q].append((p, same))
-    turned = np.full(len(faces), -1)
-    for seed in range(len(faces)):
-        if turned[seed] >= 0:
-            continue
-        turned[seed], piece = 0, [seed]
-        for face in piece:  # the list grows during the loop
-            for other, same in near[face]:
-                if turned[other] < 0:
-                    turned[other] = turned[face] ^ same
-                    piece.append(other)
-        yield np.array(piece), turned[piece] == 1, all(len(near[face]) == 3 for face in piece)
+    _, which, number = edges_of(faces)
+    turned, pieces, _ = common_sense(faces)
+    for piece in np.split(np.argsort(pieces, kind="stable"), np.cumsum(np.bincount(pieces))[:-1]) if len(faces) else []:
+        yield piece, turned[piece], bool((number[which[piece]] == 2).all())
 
 
 def turn(up: np.ndarray) -> list[float]:

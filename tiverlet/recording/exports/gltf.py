@@ -4,8 +4,10 @@ Each frame but the first is a morph target, the displacement from the first fram
 frames. Positions are stored as recorded; a node above them rotates the scene so that up is y.
 """
 
+import json
 import os
 import re
+import struct
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -14,7 +16,7 @@ import numpy as np
 
 from ...colliders.round_mesh import rounded
 from ...shapes import Shape
-from .extras import needed
+from ..surfaces import normals
 from .geometry import Geometry, linear, turn
 from .sketch import extent
 from .stretch import Stretch, in_space, only
@@ -36,7 +38,6 @@ def write(recording: "Replay", path: str, *, shape: Shape | None = None, motion:
     Particles that no surface hides are spheres of their radii, or points. motion: spheres turn as their orientations do. A vertex
     has one colour in a file: that of a quantity is of the last frame.
     """
-    lib: Any = needed("pygltflib", path)
     stretch = only(recording, path, "mesh", ".csv, .obj, .pvd, .usd or .xyz", motion, color)
     geometries = [*stretch.geometries(shape)]
     geometry = replace(geometries[0], hues=geometries[-1].hues)
@@ -51,8 +52,7 @@ def write(recording: "Replay", path: str, *, shape: Shape | None = None, motion:
     walls = [wall.at(later) for wall in drawn_walls(stretch, *ends)]
     hues = np.concatenate([geometry.hues, *(np.repeat(wall.hue, wall.corners.shape[1], axis=0) for wall in walls)])
     turned = [moved["orientation"] for _, moved in both if "orientation" in moved]
-    scene = _Scene(lib, np.concatenate([x[later], *(wall.corners for wall in walls)], axis=1), times[later])
-    root = scene.node(name="scene", rotation=turn(geometry.up))
+    scene = _Scene(np.concatenate([x[later], *(wall.corners for wall in walls)], axis=1), times[later])
     single = geometry.bare if len(geometry.bare) <= SPHERES else geometry.bare[:0]
     unbroken = [g.links for g, kept in zip(geometries, later.tolist(), strict=True) if kept]
     nodes = _meshes(scene, geometry, unbroken, np.setdiff1d(geometry.loose, single))
@@ -61,8 +61,7 @@ def write(recording: "Replay", path: str, *, shape: Shape | None = None, motion:
     for wall in walls:
         nodes.append(_wall(scene, wall, begin, hues))
         begin += wall.corners.shape[1]
-    scene.children(root, nodes)
-    return scene.save(path)
+    return scene.save(path, turn(geometry.up), nodes)
 
 
 def _meshes(scene: "_Scene", geometry: Geometry, unbroken: list[np.ndarray], points: np.ndarray) -> list[int]:
@@ -119,9 +118,7 @@ def _normals(x: np.ndarray, at: np.ndarray, triangles: np.ndarray) -> np.ndarray
 
     at: the particle of each vertex.
     """
-    a, b, c = (x[at[k]] for k in triangles.T)
-    across, corner = np.cross(b - a, c - a), at[triangles].ravel()
-    normal = np.stack([np.bincount(corner, np.repeat(across[:, k], 3), len(x)) for k in range(3)], axis=1)[at]
+    normal = normals(x, at[triangles])[at]
     size = np.linalg.norm(normal, axis=1, keepdims=True)
     return np.where(size > 0, normal / np.where(size > 0, size, 1), [0.0, 1.0, 0.0])
 
@@ -154,13 +151,12 @@ def _spheres(scene: "_Scene", stretch: Stretch, geometry: Geometry, single: np.n
     for i in single.tolist():
         hue = tuple(linear(geometry.hues[i]).tolist())
         if hue not in meshes:
-            part = scene.lib.Primitive(
-                mode=TRIANGLES, indices=corners, material=scene.material(hue),
-                attributes=scene.lib.Attributes(POSITION=position, NORMAL=normal),
-            )  # fmt: skip
+            attributes = {"POSITION": position, "NORMAL": normal}
+            part = {"mode": TRIANGLES, "attributes": attributes, "indices": corners, "material": scene.material(hue)}
             meshes[hue] = scene.mesh("particle", part)
         place = scene.x[:, i]
-        node = scene.node(name=f"particle {i}", mesh=meshes[hue], translation=place[0].tolist(), scale=[float(radius[i])] * 3)
+        at, size = place[0].tolist(), [float(radius[i])] * 3
+        node = scene.put("nodes", name=f"particle {i}", mesh=meshes[hue], translation=at, scale=size)
         if (place != place[0]).any():
             scene.animate(node, "translation", scene.sampler(place, "VEC3"))
         if turned is not None and len(turned) > 1:
@@ -172,41 +168,44 @@ def _spheres(scene: "_Scene", stretch: Stretch, geometry: Geometry, single: np.n
 class _Scene:
     """A glTF file under construction. x: (frames, n, 3) [m]. times: (frames,) [s]."""
 
-    def __init__(self, lib: Any, x: np.ndarray, times: np.ndarray):
-        self.lib, self.x = lib, x
-        self._file = lib.GLTF2(asset=lib.Asset(version="2.0", generator="tiverlet"), scene=0)
+    def __init__(self, x: np.ndarray, times: np.ndarray):
+        self.x = x
+        lists = ("scenes", "nodes", "meshes", "materials", "accessors", "bufferViews")
+        self._file: dict[str, Any] = {"asset": {"version": "2.0", "generator": "tiverlet"}, "scene": 0, **{n: [] for n in lists}}
         self._blocks: list[bytes] = []
         self._size = 0
         self._plain = self.material((1.0, 1.0, 1.0))
-        self._channels: list[Any] = []
-        self._samplers: list[Any] = []
+        self._channels: list[dict[str, Any]] = []
+        self._samplers: list[dict[str, Any]] = []
         self._weights: int | None = None  # the sampler of morph weights, for all meshes
         self._times = self.add(times, "SCALAR", ends=True) if len(x) > 1 else None
+
+    def put(self, kind: str, **what: Any) -> int:
+        """Add an object to the list of its kind; return its number. What is None is left out."""
+        self._file[kind].append({name: value for name, value in what.items() if value is not None})
+        return len(self._file[kind]) - 1
 
     def add(self, array: np.ndarray, kind: str, use: int | None = None, *, ends: bool = False) -> int:
         """Add an array; return the number of its accessor.
 
         use: VERTICES or INDICES. ends: also store the least and largest values. Bytes count as shares of 255.
         """
-        lib, data = self.lib, np.ascontiguousarray(array).tobytes()
+        data = np.ascontiguousarray(array).tobytes()
         number = {"f4": FLOAT, "u4": UINT, "u1": BYTE}[array.dtype.str[1:]]
         rows = array.reshape(-1, 1) if kind == "SCALAR" else array.reshape(len(array), -1)
         limits = {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()} if ends else {}
-        view, accessors = len(self._file.bufferViews), self._file.accessors
-        self._file.bufferViews.append(lib.BufferView(buffer=0, byteOffset=self._size, byteLength=len(data), target=use))
-        what = {"componentType": number, "normalized": number == BYTE, "count": len(rows), "type": kind}
-        accessors.append(lib.Accessor(bufferView=view, **what, **limits))
+        view = self.put("bufferViews", buffer=0, byteOffset=self._size, byteLength=len(data), target=use)
         self._blocks.append(data)
         self._size += len(data)  # a multiple of 4 for all arrays here
-        return len(accessors) - 1
+        what = {"componentType": number, "normalized": number == BYTE, "count": len(rows), "type": kind}
+        return self.put("accessors", bufferView=view, **what, **limits)
 
     def material(self, hue: tuple) -> int:
         """Add a matte two-sided material; return its number."""
-        look = self.lib.PbrMetallicRoughness(baseColorFactor=[*hue, 1.0], metallicFactor=0.0, roughnessFactor=0.8)
-        self._file.materials.append(self.lib.Material(pbrMetallicRoughness=look, doubleSided=True, alphaCutoff=None))
-        return len(self._file.materials) - 1
+        look = {"baseColorFactor": [*hue, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.8}
+        return self.put("materials", pbrMetallicRoughness=look, doubleSided=True)
 
-    def primitive(self, mode: int, at: np.ndarray, hues: np.ndarray, indices=None, normals=None, uv=()) -> Any:
+    def primitive(self, mode: int, at: np.ndarray, hues: np.ndarray, indices=None, normals=None, uv=()) -> dict[str, Any]:
         """Return a primitive whose vertices move with the particles `at`, (vertices,) or in each frame (frames, vertices).
 
         normals: (frames, vertices, 3).
@@ -225,28 +224,18 @@ class _Scene:
             if normals is not None:
                 targets[-1]["NORMAL"] = self.add(normals[k] - normals[0], "VEC3", VERTICES)
         corners = None if indices is None else self.add(indices.astype(np.uint32).ravel(), "SCALAR", INDICES)
-        attributes = self.lib.Attributes(**first)
-        return self.lib.Primitive(mode=mode, attributes=attributes, indices=corners, targets=targets, material=self._plain)
+        part = {"mode": mode, "attributes": first, "indices": corners, "targets": targets, "material": self._plain}
+        return {name: value for name, value in part.items() if value is not None and value != []}
 
-    def mesh(self, name: str, part: Any) -> int:
+    def mesh(self, name: str, part: dict[str, Any]) -> int:
         """Add a mesh; return its number."""
-        self._file.meshes.append(self.lib.Mesh(name=name, primitives=[part], weights=[0.0] * len(part.targets or ())))
-        return len(self._file.meshes) - 1
+        weights = [0.0] * len(part.get("targets", ()))
+        return self.put("meshes", name=name, primitives=[part], weights=weights or None)
 
-    def node(self, **what: Any) -> int:
-        """Add a node; return its number."""
-        self._file.nodes.append(self.lib.Node(**what))
-        return len(self._file.nodes) - 1
-
-    def children(self, node: int, others: list[int]) -> None:
-        """Put nodes below another one, which becomes the root of the scene."""
-        self._file.nodes[node].children = others
-        self._file.scenes.append(self.lib.Scene(nodes=[node]))
-
-    def moving(self, name: str, part: Any) -> int:
+    def moving(self, name: str, part: dict[str, Any]) -> int:
         """Add a node with a mesh that follows the frames; return its number."""
-        node = self.node(name=name, mesh=self.mesh(name, part))
-        if part.targets:
+        node = self.put("nodes", name=name, mesh=self.mesh(name, part))
+        if "targets" in part:
             if self._weights is None:
                 self._weights = self.sampler(np.eye(len(self.x), dtype=np.float32)[:, 1:].ravel(), "SCALAR")
             self.animate(node, "weights", self._weights)
@@ -254,32 +243,38 @@ class _Scene:
 
     def sampler(self, values: np.ndarray, kind: str) -> int:
         """Add values at the times of all frames, linear in between; return the number of the sampler."""
-        self._samplers.append(self.lib.AnimationSampler(input=self._times, output=self.add(values, kind), interpolation="LINEAR"))
+        self._samplers.append({"input": self._times, "output": self.add(values, kind), "interpolation": "LINEAR"})
         return len(self._samplers) - 1
 
     def animate(self, node: int, what: str, sampler: int) -> None:
         """Animate a property of a node by a sampler."""
-        target = self.lib.AnimationChannelTarget(node=node, path=what)
-        self._channels.append(self.lib.AnimationChannel(sampler=sampler, target=target))
+        self._channels.append({"sampler": sampler, "target": {"node": node, "path": what}})
 
-    def save(self, path: str) -> list[str]:
-        """Write the file, or two files for .gltf; return their names."""
-        lib, file = self.lib, self._file
+    def save(self, path: str, rotation: list[float], nodes: list[int]) -> list[str]:
+        """Put nodes below a root with this rotation, and write the file, or two files for .gltf; return their names."""
+        self.put("scenes", nodes=[self.put("nodes", name="scene", rotation=rotation, children=nodes or None)])
+        file = self._file
         if self._channels:
-            file.animations.append(lib.Animation(name="recording", channels=self._channels, samplers=self._samplers))
-        file.buffers.append(lib.Buffer(byteLength=self._size))
+            file["animations"] = [{"name": "recording", "channels": self._channels, "samplers": self._samplers}]
+        file["buffers"] = [{"byteLength": self._size}]
+        file = {name: value for name, value in file.items() if value != []}  # glTF has no empty lists
         if path.lower().endswith(".glb"):
-            if self._size + 1024 * len(file.accessors) > MOST:
+            text = json.dumps(file, separators=(",", ":")).encode()
+            text += b" " * (-len(text) % 4)
+            size = 28 + len(text) + self._size
+            if size > MOST:
                 raise ValueError(f"replay: {path} would have more than 4 GiB, the most of a .glb file; export to .gltf or .obj.")
-            file.set_binary_blob(b"".join(self._blocks))
-            file.save_binary(path)
+            with open(path, "wb") as out:
+                out.write(struct.pack("<4sIII4s", b"glTF", 2, size, len(text), b"JSON"))
+                out.write(text)
+                out.write(struct.pack("<I4s", self._size, b"BIN\0"))
+                out.writelines(self._blocks)
             return [path]
         beside = f"{os.path.splitext(path)[0]}.bin"
         with open(beside, "wb") as out:
             out.writelines(self._blocks)
-        file.buffers[0].uri = re.sub(
-            "[%#?]", lambda found: quote(found[0]), os.path.basename(beside)
-        )  # which end a path in a URI
+        name = os.path.basename(beside)
+        file["buffers"][0]["uri"] = re.sub("[%#?]", lambda found: quote(found[0]), name)  # these end a path in a URI
         with open(path, "w", encoding="utf-8") as out:
-            out.write(file.to_json())
+            json.dump(file, out)
         return [path, beside]

@@ -9,16 +9,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from PIL import Image, ImageDraw
 
 from ... import checks
-from ...colliders.collider import Collider
-from ...constraints import Path
-from ...neighbours import Periodic
-from ..drawing import EDGE, OPEN, WALL, upwards, walled
+from ..bodies import rims
 from ..images import box_of, crosses_box
-from ..rims import rims
+from ..layout import CAMERA, eye_axes
 from ..scene import Parts
-from ..surfaces import Surface
+from ..surfaces import lit
+from ..walls import EDGE, OPEN, WALL, outline, walled
 from .geometry import Geometry
 
 WIDE, MARGIN = 640, 0.04  # width [pixels]; share of it left free on each side
@@ -31,7 +30,6 @@ THEMES = {
     "dark": ((13, 16, 17), OPEN, WALL),
     "light": ((250, 250, 250), (200, 203, 210), np.array([[190, 194, 205]], dtype=np.uint8)),
 }
-CAMERA = float(np.radians(30)), float(np.radians(20))  # default angles of the eye in 3D
 
 
 @dataclass(frozen=True)
@@ -71,17 +69,11 @@ class View:
     """Maps points of a scene between two corners [m] to pixels, in parallel projection."""
 
     def __init__(self, low: np.ndarray, high: np.ndarray, up: np.ndarray, look: Look):
-        self.look, (aside, above) = look, look.camera
+        self.look = look
         if len(low) == 2:
             self._axes = np.array([[1.0, 0], [0, up[1]], [0, 0]])
         else:
-            front = np.array([0.0, -1, 0] if abs(up[2]) > 0.5 else [0.0, 0, 1])  # so that x points to the right
-            front -= front @ up * up
-            front /= np.linalg.norm(front)
-            eye = np.cos(aside) * front + np.sin(aside) * np.cross(up, front)
-            right = np.cross(up, eye)
-            eye = np.cos(above) * eye + np.sin(above) * up
-            self._axes = np.array([right, np.cross(eye, right), eye])
+            self._axes = eye_axes(up, look.camera)
         corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(len(low), -1)
         at = (self._axes @ corners)[:2]
         self._low, size = at.min(axis=1), np.maximum(np.ptp(at, axis=1), 1e-9 * np.abs(at).max() + 1e-30)
@@ -112,21 +104,17 @@ def extent(parts: Parts, frames: Sequence[np.ndarray] | np.ndarray) -> tuple[np.
 class Sketch:
     """Draws frames of a scene. view: the view of all frames. extent: two corners [m] between which walls are drawn."""
 
-    def __init__(
-        self, image: Any, draw: Any, parts: Parts, geometry: Geometry, view: View, extent: tuple[np.ndarray, np.ndarray]
-    ):
-        self._image, self._draw, self._parts, self._view, self._extent = image, draw, parts, view, extent
-        self._triangles = geometry.around[geometry.corners]
+    def __init__(self, parts: Parts, geometry: Geometry, view: View, extent: tuple[np.ndarray, np.ndarray]):
+        self._parts, self._view, self._extent = parts, view, extent
+        self._triangles, self._up = geometry.around[geometry.corners], geometry.up
         self._flat = parts.particles.dim == 2
-        none = np.zeros((0, 2), dtype=np.int64)
-        lit = len(self._triangles) and not self._flat
-        self._surface = Surface(self._triangles, geometry.hues, none, geometry.up) if lit else None
 
     def frame(self, x: np.ndarray, geometry: Geometry) -> Any:
         """Return the picture of a frame. x: positions [m]. geometry: links and colours of the frame, see Stretch.geometries."""
         view, self._hues = self._view, geometry.hues
-        canvas = self._image.new("RGB", tuple(FINE * s for s in view.size), THEMES[view.look.theme][0])
-        draw = self._draw.Draw(canvas)
+        wide, tall = view.size
+        canvas = Image.new("RGB", (FINE * wide, FINE * tall), THEMES[view.look.theme][0])
+        draw = ImageDraw.Draw(canvas)
         x = x.astype(np.float64)
         things = [*self._walls(), *self._faces(x), *self._rims(x), *self._links(x, geometry.links)]
         things += self._discs(x, np.union1d(geometry.bare, geometry.loose))
@@ -147,12 +135,7 @@ class Sketch:
         return [(d, "face", p, hue, 0) for d, p, hue in zip(nearness, places, shades, strict=True)]
 
     def _faces(self, x: np.ndarray) -> list[tuple]:
-        if not len(self._triangles):
-            return []
-        hues = self._hues
-        if self._surface:
-            self._surface.paint(hues)
-            hues = _bytes(self._surface.colors(x, np.zeros(0)))
+        hues = self._hues if self._flat else np.rint(lit(self._hues, self._triangles, x, self._up))
         return self._mesh(x, self._triangles, np.mean, hues)
 
     def _rims(self, x: np.ndarray) -> list[tuple]:
@@ -185,30 +168,13 @@ class Sketch:
 
     def _walls(self) -> list[tuple]:
         out, (_, off, solid) = [], THEMES[self._view.look.theme]
-        for wall in self._parts.features:
-            if isinstance(wall, Periodic):
-                for edge in wall.outline(*self._extent):
-                    at, near = self._view.place(edge)
-                    out.append((float(near.min()), "line", at.ravel().tolist(), EDGE, round(self._view.line * LINE)))
-            if not isinstance(wall, (Collider, Path)):
-                continue
-            closed = not isinstance(wall, Collider) or wall.active
-            if isinstance(wall, Collider) and not self._flat:
-                vertices, faces = wall.solid(*self._extent)
-                if len(faces):
-                    hues = np.repeat(solid if closed else solid // 2, len(vertices), axis=0)
-                    light = Surface(faces, hues, np.zeros((0, 2), dtype=np.int64), upwards(self._parts))
-                    shades = _bytes(light.colors(vertices, np.zeros(0)))
-                    out += self._mesh(vertices, faces, np.min, shades)  # np.min puts bodies on the wall in front of it
-                    continue
-            strips, thickness = wall.outline(*self._extent)
-            width = max(round(2 * self._view.scale * thickness), round(self._view.line * LINE))
-            for strip in strips:
+        for shape in filter(None, (outline(f, *self._extent) for f in self._parts.features)):
+            if len(shape.faces):
+                hues = np.repeat(solid if shape.active else solid // 2, len(shape.vertices), axis=0)
+                shades = np.rint(lit(hues, shape.faces, shape.vertices, self._up))
+                out += self._mesh(shape.vertices, shape.faces, np.min, shades)  # np.min puts bodies on the wall in front of it
+            width = max(round(2 * self._view.scale * shape.radius), round(self._view.line * LINE))
+            for strip in shape.strips:
                 at, near = self._view.place(np.asarray(strip))
-                out.append((float(near.min()), "line", at.ravel().tolist(), EDGE if closed else off, width))
+                out.append((float(near.min()), "line", at.ravel().tolist(), EDGE if shape.active else off, width))
         return out
-
-
-def _bytes(rgba: np.ndarray) -> np.ndarray:
-    """Return red, green and blue of colours given as u32, (n, 3)."""
-    return np.stack([rgba >> 24, rgba >> 16 & 255, rgba >> 8 & 255], axis=1)

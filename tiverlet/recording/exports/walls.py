@@ -7,7 +7,8 @@ import numpy as np
 
 from ...colliders.collider import Collider
 from ...constraints import Path
-from ..drawing import EDGE, WALL
+from ...features.feature import Feature
+from ..walls import EDGE, WALL, outline
 
 if TYPE_CHECKING:
     from .stretch import Stretch
@@ -56,15 +57,16 @@ def drawn_walls(stretch: "Stretch", low: np.ndarray, high: np.ndarray) -> list[W
     return out
 
 
-def _shape(wall: Collider | Path, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _shape(wall: Feature, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return corners (v, dim) [m], and those of each triangle or line."""
-    vertices, faces = wall.solid(low, high) if isinstance(wall, Collider) else (low[None], np.zeros((0, 3), dtype=np.int64))
-    if len(faces):
-        corners, parts = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
+    shape = outline(wall, low, high)
+    assert shape
+    if len(shape.faces):
+        corners, parts = shape.vertices[shape.faces].reshape(-1, 3), np.arange(shape.faces.size).reshape(-1, 3)
     else:
-        strips = np.asarray(wall.outline(low, high)[0])
+        strips = np.asarray(shape.strips)
         number = np.arange(strips.shape[0] * strips.shape[1]).reshape(strips.shape[:2])
         corners, parts = strips.reshape(-1, len(low)), np.stack([number[:, :-1], number[:, 1:]], axis=-1).reshape(-1, 2)
-    if isinstance(wall, Collider) and not wall.active:
+    if not shape.active:
         corners = np.broadcast_to(corners[:1], corners.shape)
     return corners, parts
