@@ -1,11 +1,11 @@
-"""Links from soft to rigid: against the NumPy prototype, in physical units, and at the extremes of compliance."""
+"""Links from soft to rigid: against the NumPy prototype, at the extremes of compliance, twice and in contradiction."""
 
 import numpy as np
 import pytest
 
 import tiverlet as tv
 
-from .conftest import case, order, rerun, unprojected
+from .conftest import unprojected
 from .prototype import Prototype
 
 
@@ -45,24 +45,7 @@ def test_kernels_agree_with_the_prototype(world, dim, iterations):
     np.testing.assert_array_equal(made.position[:2], x[:2])
 
 
-def test_springs_swing_as_their_equation_says(world):
-    # R05, x'' = -(k x + c x') / m: x = x0 e^(-z w t) (cos + z w / wd sin), second order. R04b, without a dashpot: backward Euler
-    # (XPBD) would keep 0.7 % of the amplitude in these 1000 steps.
-    p, want = case("R05_damped_oscillator")["params"], case("R05_damped_oscillator")["values"]
-    link = tv.Distance([[0, 1]], rest=5.0, compliance=1 / p["k"], damping=p["c"])
-    start = tv.Particles([[0.0, 0], [5 + p["x0"], 0]], mass=[1, p["m"]], pinned=[0])
-    w = linked(world, start, link, iterations=3)
-    errors = [abs(rerun(w, p["T"], substeps=n).position[1, 0] - 5 - want["x_T"]) for n in (10, 20, 40)]
-    assert 1.9 <= order(errors) <= 2.1 and errors[1] <= 1e-4
-    link = tv.Distance([[0, 1], [2, 3]], rest=2.0, compliance=0.01, damping=[0.0, 1.0])
-    x = [[0.0, 0], [2.5, 0], [0.0, 9], [2.0, 9]]
-    w = linked(world, tv.Particles(x, pinned=[0, 2]), link, substeps=10, iterations=3)
-    w.run(9.0, dt=0.1)
-    largest = max(float(w.step(0.1) and abs(w.position[1, 0] - 2)) for _ in range(10))
-    assert w.last.energy == pytest.approx(0.5 * 100 * 0.5**2, rel=5e-3) and largest <= 0.5 * (1 + 1e-2)
-
-
-def test_compliance_from_1e_minus_12_to_1e12(world):
+def test_springs_stretch_by_their_compliance_from_1e_minus_12_to_1e12(world):
     # Rows 8 and 9: a link under a load of F = 9.81 N stretches by s = alpha F. Released at its rest length it gets there by
     # s'' = g - s / alpha - c s', and the softest links fall freely. One pendulum per compliance.
     alpha = np.array([0.0, *10.0 ** np.arange(-12, 13)])
@@ -122,29 +105,25 @@ def test_ropes_pull_and_spacers_push(world):
     assert v[9, 1] ** 2 / 2 + g * y[9, 1] + stretch**2 / 0.02 == pytest.approx(-g, rel=1e-3)
 
 
-def test_redundant_links(world):
+def test_each_of_two_equal_links_bears_half_of_the_load(world):
     # Row 22: a rope of ten links, and one that has each link twice, both relaxed. They move alike, since mass splitting counts
-    # both copies. At rest both are the catenary R10b, and each copy bears half of the tension.
-    n, v = 10, case("R10b_discrete_catenary_N10")["values"]
-    t, k = np.linspace(0, 1, n + 1), np.arange(n)
-    rope = np.stack([6 * t, -4 * (1 - np.abs(2 * t - 1))], axis=1)
-    pairs = np.stack([k, k + 1], axis=1)
+    # both copies.
+    n = 10
+    x = np.stack([np.linspace(0, 6, n + 1), np.zeros(n + 1)], axis=1)
+    pairs = np.stack([np.arange(n), np.arange(n) + 1], axis=1)
     with pytest.warns(UserWarning, match="duplicates") as said:
-        links = tv.Distance(np.concatenate([pairs, pairs + n + 1, pairs + n + 1]), 10 / n)
+        links = tv.Distance(np.concatenate([pairs, pairs + n + 1, pairs + n + 1]), 1.0)
     assert said[0].filename == __file__  # the warning names the caller's line
-    start = tv.Particles(np.concatenate([rope, rope]), mass=0.1, pinned=[0, n, n + 1, 2 * n + 1])
+    start = tv.Particles(np.concatenate([x, x]), mass=0.1, pinned=[0, n, n + 1, 2 * n + 1])
     w = linked(world, start, links, 9.81, 4.0, iterations=16)
-    for seconds in (0.5, 7.5):
-        w.run(seconds)
-        np.testing.assert_allclose(w.position[: n + 1], w.position[n + 1 :], atol=1e-10)
-        single, first, second = links.load.reshape(3, n)
-        np.testing.assert_allclose(first, single / 2, rtol=1e-6)
-        np.testing.assert_array_equal(first, second)
-    assert -w.position[:, 1].min() == pytest.approx(v["sag"], rel=1e-5)
-    assert single[0] == pytest.approx(v["end_link_tension_over_mg"] * 0.1 * 9.81, rel=1e-5)
+    w.run(0.5)
+    np.testing.assert_allclose(w.position[: n + 1], w.position[n + 1 :], atol=1e-10)
+    single, first, second = links.load.reshape(3, n)
+    np.testing.assert_allclose(first, single / 2, rtol=1e-6)
+    np.testing.assert_array_equal(first, second)
 
 
-def test_contradictory_links(world):
+def test_contradictory_links_meet_in_a_compromise(world):
     # Row 21: a triangle 1, 1, 3 cannot close. Relaxed, it settles on the compromise, and its oscillation decays.
     links = tv.Distance([[0, 1], [1, 2], [0, 2]], [1.0, 1.0, 3.0])
     w = unprojected(linked(world, tv.Particles([[0.0, 0], [1, 0.1], [2.2, 0]]), links, substeps=50))
@@ -160,7 +139,7 @@ def test_contradictory_links(world):
     assert tv.measure.strain(w, links.indices, [1, 1, 3]) == pytest.approx([1 / 3, 1 / 3, -1 / 9], abs=1e-4)
 
 
-def test_ends_that_are_in_one_place_but_for_rounding(world):
+def test_residuals_of_links_without_length_do_not_depend_on_rounding(world):
     # 0.1 + 0.2 and 0.3: the violation of a link of length 0 is relative to the size of the scene, not to 5e-17 m.
     told = []
     for at in (0.3, 0.1 + 0.2):

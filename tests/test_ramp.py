@@ -37,11 +37,10 @@ def test_a_link_is_drawn_in_at_the_speed_of_the_frame(world):
 def test_a_rope_that_was_drawn_in_is_slack(world):
     # As above, but a rope does not stop a particle that comes in: the next frame takes it as far.
     rope = tv.Rope([[0, 1]])
-    w = pendulum(world, rope, substeps=50)
+    w = pendulum(world, rope, substeps=50, precision="f64")
     w.step(DT)
     rope.rest = 0.9 * L
-    report = w.step(DT)
-    assert report.energy == pytest.approx(M * (0.1 * L / DT) ** 2 / 2, rel=1e-4)
+    assert w.step(DT).energy == pytest.approx(M * (0.1 * L / DT) ** 2 / 2, rel=1e-4)
     w.step(DT)
     assert w.position[1, 0] == pytest.approx(0.8 * L, rel=1e-5)
 
@@ -71,62 +70,27 @@ def test_springs_follow_a_moving_rest_value_to_second_order(world):
     spring = tv.Distance([[0, 1], [1, 2]], 1.0, compliance=1e-3, damping=100.0)
     start = tv.Particles([[0.0, 0], [0, -1.0], [0, -2.0]], pinned=[0])
     w, ways = world(start, [tv.Gravity(9.81), spring], precision="f64"), []
-
-    def way():
-        before, spring.rest = w.position, 1.5
-        w.step(DT)
-        return w.position[2, 1] - before[2, 1]
-
     for w.substeps in (1024, 8):
         w.position, w.velocity, spring.rest = start.position, 0 * start.position, 1.0
         w.run(0.2)
-        ways.append(way())
+        before, spring.rest = w.position, 1.5
+        w.step(DT)
+        ways.append(w.position[2, 1] - before[2, 1])
     assert ways[0] < -0.3 and ways[1] == pytest.approx(ways[0], rel=5e-3)
     with w.clone() as twin:
         np.testing.assert_array_equal(twin.velocity, w.velocity)
-    # They go down, too, where the substep gets shorter in that frame: links are as soft as before, and dashpots so much slower.
-    w.position, w.velocity, spring.rest, w.substeps = start.position, 0 * start.position, 1.0, 2
-    w.run(2.0)
-    w.substeps = 8
-    assert -0.35 < way() < -0.05
 
 
 @pytest.mark.slow
-def test_an_angle_goes_the_shorter_way(world):
-    # From 3 to -3 rad it is 2 pi - 6 = 0.283 rad, at L 0.283 / dt; the other way, through 0, would be 21 times as fast.
-    x = np.array([[0.0, 0], [L, 0], [L * (1 + np.cos(3.0)), L * np.sin(3.0)]])
-    bend = tv.Bend([[0, 1, 2]])
-    w = world(tv.Particles(x, pinned=[0, 1]), [bend, tv.Distance([[1, 2]])], substeps=50, precision="f64", solver=tv.Jacobi())
-    w.step(DT)
-    bend.rest = -3.0
-    assert w.step(DT).energy == pytest.approx((L * (2 * np.pi - 6) / DT) ** 2 / 2, rel=1e-2)
-    assert bend.rest_of(w.position) == pytest.approx(-3.0, abs=1e-3)
-
-
-@pytest.mark.slow
-def test_copies_edits_and_recordings_know_where_a_ramp_begins(world, tmp_path):
+def test_what_comes_while_a_rest_value_changes_begins_at_its_own(world):
+    # And what was there goes on as in a clone without the new links.
     links, x = tv.Distance([[0, 1], [1, 2]]), np.array([(0.0, 0), (0.5, 0), (1, 0)])
     w = world(tv.Particles(x, mass=M), [links], solver=tv.Jacobi())
     w.step(DT)
-    links.rest = 0.475
-    twin, many = w.clone(), tv.Worlds(w, 2)
-    for one in (w, twin, many):
-        one.step(DT)
-    assert w.hash() == twin.hash() == many.hash(1)
-    # What comes while a ramp waits begins at rest values of its own.
     links.rest = 0.45
-    twin.close()
-    many.close()
-    twin = w.clone()
-    w.add(tv.Particles(x + [0, 20.0], mass=M), extend={links: tv.Distance([[3, 4], [4, 5]], 0.5)})
-    w.step(DT)
-    twin.step(DT)
-    np.testing.assert_allclose(w.position[:3], twin.position, rtol=0, atol=1e-6)
+    with w.clone() as twin:
+        w.add(tv.Particles(x + [0, 20.0], mass=M), extend={links: tv.Distance([[3, 4], [4, 5]], 0.5)})
+        w.step(DT)
+        twin.step(DT)
+        np.testing.assert_allclose(w.position[:3], twin.position, rtol=0, atol=1e-6)
     np.testing.assert_allclose(w.position[3:], x + [0, 20.0], rtol=0, atol=1e-5)
-    twin.close()
-    with tv.Recorder(tmp_path / "a.rrd", w) as recorder:
-        for k in range(3):
-            links.rest = 0.45 + 0.02 * k
-            w.step(DT)
-            recorder.log()
-    assert tv.replay(tmp_path / "a.rrd").verify().kind == "intact"
