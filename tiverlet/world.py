@@ -28,7 +28,7 @@ from .step import checkpoint, edit_scene, energy_bound, impulse, placing, violat
 from .step.adaptive import StepController
 from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver, usual_substeps
 from .step.build_again import Rebuild
-from .step.clock import CHANGED, Clock, exceeds, falls_short
+from .step.clock import CHANGED, NO, Clock, exceeds, falls_short
 from .step.diagnostics import KINETIC
 from .step.edit_scene import Handle
 from .step.explain import compiling, explain
@@ -174,7 +174,7 @@ class World:
             self._runner.end_ramps()
             if exceeds(self._clock, report.energy, self._runner.sheet.item(KINETIC), report.overlap):
                 report = energy_bound.checked(self, report)
-            elif falls_short(self._clock, report.energy):
+            elif self._clock.conserves != NO and falls_short(self._clock, report.energy):
                 report = energy_bound.checked_for_loss(self, report)
             report.__dict__["seconds"] = perf_counter() - clock  # the report is frozen; this field is not compared
             self._last, self._clock.energy, self._undo, self._events = report, report.energy, None, None
