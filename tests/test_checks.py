@@ -154,7 +154,7 @@ def test_features_of_a_world_are_pickled_and_copied_without_it(world):
         assert again.hash() == w.hash() and all(a is not b for a, b in zip(features, others, strict=True))
 
 
-def test_what_does_nothing_is_said(world):
+def test_features_without_effect_are_warned_of(world):
     start = tv.Particles([[0.0, 0], [1, 0], [3.5, 0]])
     with pytest.warns(UserWarning, match="all radii are 0, so nothing touches"):
         world(start, [tv.Contact()])
@@ -222,7 +222,7 @@ LINK = [[0, 1]]
         (lambda: tv.Force(misordered), "takes .'x', 't'.*: its t would get v"),
     ],
 )
-def test_what_functions_of_users_take_and_return(make, words):
+def test_functions_of_users_with_wrong_arguments_or_results_are_named(make, words):
     # A vector in place of the value of an Sdf ended the process; a matrix or a vector elsewhere gave an error inside of Taichi.
     with pytest.raises(TypeError, match=words):
         w = tv.World(tv.Particles([[1.0, 1.0], [2.0, 1.0]]), [make()])
@@ -239,7 +239,7 @@ def test_errors_in_functions_of_users_name_their_line(world):
     assert "integrator.py" not in said and "A Taichi function returns once, at its end" in said
 
 
-def test_what_taichi_says_of_a_start_is_said_in_our_words():
+def test_errors_before_a_start_name_tv_init():
     typed = (
         f"import {COMPILER} as ti\nimport tiverlet as tv\n"
         "for make in (lambda: ti.field(ti.f32, 4), lambda: ti.Vector.field(2, ti.f32, 4)):\n"
@@ -255,7 +255,7 @@ def test_what_taichi_says_of_a_start_is_said_in_our_words():
     assert "overridden" not in done.stdout + done.stderr
 
 
-def test_what_holds_or_drives_leaves_nothing_and_bears_no_load(world):
+def test_held_and_driven_constraints_have_no_residual_and_no_load(world):
     x = np.arange(10.0).reshape(5, 2)
     held, pin = tv.Distance([[0, 1]], rest=2**1.5, break_at=1.0), tv.Pin([2])
     snap, path = tv.Snap([1], 1.0, compliance=1.0), tv.Path([3], [(6, 7), (9, 7)], speed=1.0)

@@ -168,7 +168,7 @@ def test_a_corner_presses_from_both_sides(world):
         np.testing.assert_allclose(np.linalg.norm(touches.normal, axis=1), 1, rtol=1e-12)
 
 
-def test_what_cannot_be_told_is_refused(world):
+def test_wrong_arguments_of_events_are_refused(world):
     w = world(tv.Particles([(0.0, 0.0)], radius=0.1), [tv.Contact()])
     for make, error, says in (
         (lambda: tv.Contact(groups=[(1, 0)], sensors=[(0, 1)]), ValueError, r"groups has \(0, 1\).* sensors"),

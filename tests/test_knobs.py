@@ -280,7 +280,7 @@ def test_every_setting_is_live(world, group):
     assert all(f.broken.all() for name, f in scene.features.items() if "break_at" in rows[name][2])
 
 
-def test_what_is_not_live_refuses_and_says_what_is(world):
+def test_all_else_refuses_and_names_what_is_live(world):
     # Every argument and every other public attribute refuses, a misspelt name gets a suggestion, and arrays are read-only.
     made = {name: Scene(lambda *a, **k: None, {name: row}, False).features[name] for name, row in (ROWS3 | ROWS2).items()}
     for name, feature in made.items():
@@ -339,7 +339,7 @@ def test_rest_values_that_nobody_gave_are_read_only_too(world):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["link", "surfaces"])
-def test_what_was_absent_is_compiled_when_it_is_first_asked_for(world, tmp_path, kind):
+def test_settings_that_need_other_kernels_compile_once_and_are_recorded(world, tmp_path, kind):
     # From rigid to soft, or from smooth to rough, in a recording: later values compile nothing. Then as in a world built so; a
     # clone continues bit for bit, and the values stay where the world is edited.
     x = np.array([[0.0, 0.3], [0.9, 0.3], [4.0, 0.3], [4.9, 0.4]])

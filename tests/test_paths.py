@@ -58,7 +58,7 @@ def test_beads_off_their_curve_are_moved_there(world):
     assert w.step(1 / 60).clean and not w.velocity.any()
 
 
-def test_driven_along_a_path(world):
+def test_driven_beads_follow_their_path(world):
     # At a constant speed around a square with corners, whatever load hangs on the bead; and to given arc lengths, evenly.
     square = [[0, 0], [1, 0], [1, 1], [0, 1]]
     belt = tv.Path([0, 1], square, closed=True, smooth=False, speed=[1.0, -2.0])
@@ -128,6 +128,6 @@ LINE = [[0, 0], [1, 0]]
         (lambda: tv.World(tv.Particles(np.zeros((1, 3))), [tv.Path([0], LINE)]), r"points has shape \(2, 2\)"),
     ],
 )
-def test_paths_that_are_refused(make, message):
+def test_wrong_paths_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
