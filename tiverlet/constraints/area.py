@@ -10,8 +10,8 @@ from ..device import ti
 from ..features.feature import Knob, Scene
 from ..geometry.intervals import cross
 from ..particles import Particles
-from .core.members import FixedSize, VariableSize, rows
-from .core.outline_passes import PRESSURE
+from .core.members import Members, rows
+from .core.outline_passes import GOAL, PRESSURE
 from .core.quantity import Quantity
 from .core.scalar import Scalar
 
@@ -38,8 +38,7 @@ class Area(Scalar):
 
     index_name = "loops"
     each = (*Scalar.each, "pressure")
-    pressure = PRESSURE
-    quantity: "Triangles | Loops"
+    pressure, goal = PRESSURE, GOAL
     rest = Knob(lambda f, v: checks.per_item("Area", "rest", v, f.count, least=0.0), "Area at pressure 1 [m^2].")
 
     def __init__(
@@ -49,28 +48,17 @@ class Area(Scalar):
         self.setup(loops, rest, compliance, damping, break_at)
         self.pressure = pressure
 
-    @property
-    def goal(self) -> np.ndarray:
-        """The target areas, pressure * rest [m^2], (m,)."""
-        return self.pressure * self.rest
-
     def quantity_of(self, indices) -> Quantity:
         """Return Triangles where all loops have 3 corners, else Loops. Triangles have simpler kernels of their own."""
         loops = checks.rows("Area", "loops", indices, "a sequence of index sequences")
         if all(np.ndim(loop) == 1 and len(loop) == 3 for loop in loops):
             return Triangles(self.fixed(indices, 3))
-        return Loops(VariableSize("Area", rows("Area", "loops", indices, 3)))
+        return Loops(Members.joined("Area", rows("Area", "loops", indices, 3)))
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Order the corners of each area so that it is positive at the start."""
+        """Refuse loops in 3D; order the corners of each area so that it is positive at the start."""
         if not self.arity and particles.dim != 2:
             raise ValueError("Area: loops of more than 3 particles enclose no definite area in 3D; use triangles, or Volume.")
-        self.check_indices(particles)
-        if particles.dim == 2:
-            for _ in range(2):  # twice: a flat area can be negative in both senses; it keeps its order, so a clone does, too
-                self.hold(self.quantity.reversed(self.rest_of(particles.position) < 0))
-        if "rest" not in self.__dict__ and self._rest_given is None:  # the area of a straight loop may be negative by rounding
-            self.rest = np.maximum(self.rest_of(particles.position), 0.0)
         super().prepare(particles, inv_mass)
 
 
@@ -83,7 +71,7 @@ class Triangles(Quantity):
     def reversed(self, which: np.ndarray) -> "Triangles":
         """Return these triangles, with two corners swapped where `which` (m,) is True."""
         indices = self.members.indices
-        return Triangles(FixedSize("Area", np.where(which[:, None], indices[:, ::-1], indices)))
+        return Triangles(Members("Area", np.where(which[:, None], indices[:, ::-1], indices)))
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return the areas of the triangles, (m,) [m^2]; signed in 2D."""
@@ -92,11 +80,6 @@ class Triangles(Quantity):
             (ux, uy), (vx, vy) = (b - a).T, (c - a).T
             return (ux * vy - uy * vx) / 2
         return np.linalg.norm(cross(b - a, c - a), axis=1) / 2
-
-    @ti.func
-    def trust_radius(self, q):
-        """Return the size of a triangle [m]."""
-        return q.norm()
 
     @ti.func
     def measure(self, c, q):
@@ -126,7 +109,7 @@ class Loops(Quantity):
 
     def reversed(self, which: np.ndarray) -> "Loops":
         """Return these loops, with the order of corners reversed where `which` (m,) is True."""
-        return Loops(VariableSize("Area", [self.members.row(k)[:: -1 if w else 1] for k, w in enumerate(which)]))
+        return Loops(Members.joined("Area", [self.members.row(k)[:: -1 if w else 1] for k, w in enumerate(which)]))
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return the areas, (m,) [m^2], by the shoelace formula."""

@@ -24,8 +24,8 @@ GRADIENT_TOLERANCE = 1e-4
 class Function(Quantity):
     """The user's function f, in the given unit.
 
-    derivative: f and its gradients. origin: what corners are relative to, as two f32 words, so that f32 does not round it; None
-    for the first corner. size: of the scene part that f acts on [m]. All but the unit are known only once there are particles.
+    derivative: f and its gradients. size: of the scene part that f acts on [m]. All but the unit are known only once there are
+    particles.
     """
 
     foreign = True
@@ -42,10 +42,6 @@ class Function(Quantity):
         bound.size = scene.memory.number(self._size, ti.f64)
         return bound
 
-    def relative_corners(self, corners: Any) -> "RelativeCorners":
-        """Return corners relative to the origin, or to the first corner."""
-        return RelativeCorners(corners, self.origin)
-
     @ti.func
     def measure(self, c, q):
         """Return the function and its gradient; both are 0 where either is not finite."""
@@ -58,37 +54,6 @@ class Function(Quantity):
         for k, a in ti.static(ti.ndrange(self.corners.arity, self.state.dim)):
             n[k, a] = ti.select(good, ti.cast(g[k, a], self.real), 0)
         return ti.select(good, ti.cast(f, self.real), 0), n
-
-
-class RelativeCorners:
-    """The corners of constraints relative to an origin, given in two words, or to the first corner where origin is None."""
-
-    def __init__(self, corners: Any, origin: Any):
-        self.corners, self.state, self.real, self.arity, self.origin = corners, corners.state, corners.real, corners.arity, origin
-
-    @ti.func
-    def relative_positions(self, c, back):
-        """Return the corners of constraint c at x - back d."""
-        q = ti.Matrix.zero(self.real, self.arity, self.state.dim)
-        for k in ti.static(range(self.arity)):
-            i = self.corners.member(c, k)
-            r = -back * self.state.d[i]
-            if ti.static(bool(self.origin)):
-                for a in ti.static(range(self.state.dim)):
-                    r[a] += (self.state.x[i][a] - ti.static(self.origin[0][a])) - ti.static(self.origin[1][a])
-                if ti.static(self.state.compensated):
-                    r += self.state.low[i]
-            else:
-                j = self.corners.member(c, 0)
-                r += self.state.separation(i, j) + back * self.state.d[j]
-            for a in ti.static(range(self.state.dim)):
-                q[k, a] = r[a]
-        return q
-
-    @ti.func
-    def now_and_start(self, c):
-        """Return the corners of constraint c now and at the start of the substep."""
-        return self.relative_positions(c, 0), self.relative_positions(c, 1)
 
 
 class Constraint(Scalar):
@@ -121,7 +86,7 @@ class Constraint(Scalar):
     index_name = "indices"
     can_extend = False  # the function may read the number of a constraint
     _size = 0.0  # of the part of the scene that it acts on [m]
-    _cached_gradients: tuple[Any, Any, Any] = (None, None, None)  # positions, and values and gradients there
+    _measured: tuple[Any, Any] = (None, None)  # positions, and values and gradients there
     rest = Knob(lambda f, v: checks.per_item(repr(f), "rest", v, f.count), "What function should be.")
 
     @property
@@ -171,7 +136,7 @@ class Constraint(Scalar):
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the indices and the gradient, and set the rest values."""
-        checks.indices(repr(self), self.index_name, self.indices, particles.count, arity=self.arity)
+        self.check_indices(particles)
         words = None
         if self.origin is not None or self.arity == 1:
             origin = np.zeros(particles.dim) if self.origin is None else self.origin
@@ -182,14 +147,12 @@ class Constraint(Scalar):
         mine = self.indices.ravel()  # only its own particles, so that no other particle changes a bit of the result
         extent = float(np.ptp(particles.position[mine], axis=0).max()) if len(mine) else 0.0
         self._keep(_size=extent or float(particles.radius[mine].max(initial=0.0)) or 1.0)
-        self._keep(_cached_gradients=(None, None, None))
+        self._keep(_measured=(None, None))
         self._derivative = NumericGradient(self.function, self.gradient, self.arity, particles.dim, int(self.origin is None))
         self.hold(Function(self.members, self._unit, self._derivative, words, self._size))
         Scalar.prepare(self, particles, inv_mass)
-        values, slopes = np.zeros(0), np.zeros((0, self.arity, particles.dim))
-        if self.count:
-            values, slopes, _ = self._derivative(self._corners(particles.position), self._size)
-        self._keep(_cached_gradients=(particles.position, values, slopes))
+        values, gradients = self.measured(particles.position)
+        self._keep(_measured=(particles.position, (values, gradients)))
         if not np.isfinite(values).all():
             i = int(np.argmin(np.isfinite(values)))
             raise ValueError(f"{self!r}: the function is {values[i]} for {self.index_name}[{i}] at its initial position.")
@@ -250,18 +213,15 @@ class Constraint(Scalar):
         size = np.maximum(size, np.abs(self.goal))
         return np.divide(1, size, out=np.zeros(self.count), where=size > 0)
 
+    def measured(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the values of function, (m,), and its gradients, (m, arity, dim)."""
+        known, found = self._measured  # Taichi cannot launch kernels while the world's fields are being declared
+        return found if position is known else self._derivative(self._corners(position), self._size)[:2]
+
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """Return the values of function, (m,)."""
-        known, values, _ = self._cached_gradients
-        if position is known:  # Taichi cannot launch kernels while the world's fields are being declared
-            return values
-        return self._derivative(self._corners(position), self._size)[0] if self.count else np.zeros(0)
+        return self.measured(position)[0]
 
     def gradients(self, position: np.ndarray) -> np.ndarray:
         """Return the gradients of function, (m, arity, dim)."""
-        known, _, slopes = self._cached_gradients
-        if position is known:
-            return slopes
-        if not self.count:
-            return np.zeros((0, self.arity, position.shape[1]))
-        return self._derivative(self._corners(position), self._size)[1]
+        return self.measured(position)[1]

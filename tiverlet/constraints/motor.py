@@ -9,7 +9,7 @@ from ..checks import ArrayLike
 from ..features.feature import Feature, Knob, Scene
 from ..particles import Particles
 from .core.angle import TURN, DihedralAngle, PathAngle
-from .core.drive import Drive, largest_load
+from .core.drive import Drive, driven_rest, largest_load
 from .core.scalar import Scalar
 
 TIME_CONSTANT = 0.1  # [s] time constant with which a servo approaches its angle
@@ -46,6 +46,7 @@ class Motor(Scalar):
     uploads_all = False  # goals are computed for a single world
     speed = Knob(lambda f, v: checks.per_item("Motor", "speed", v, f.count), "Angular velocity [rad/s].")
     angle = Knob(lambda f, v: f._angle(v), "Where to turn to [rad].")
+    rest = driven_rest("_begin", "The current rest angles [rad], (m,).")
     torque = Knob(lambda f, v: largest_load(f, "torque", v), "The largest torque [N m].")
 
     def __init__(
@@ -73,20 +74,6 @@ class Motor(Scalar):
             )
         return checks.per_item("Motor", "angle", value, self.count, least=-TURN, most=TURN)
 
-    @property
-    def largest(self) -> Any:
-        """The largest torques [N m], (m,)."""
-        return self.torque
-
-    @property
-    def rest(self) -> np.ndarray:
-        """The current rest angles [rad], (m,)."""
-        if "drive" in vars(self.dev):
-            return self.dev.drive.values()[: self.count]
-        if "_begin" not in self.__dict__:
-            raise AttributeError("Motor has no rest before it is in a world.")
-        return self._begin
-
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the indices and angles against the dimension, and take the initial angles as rest angles."""
         self.check_indices(particles)
@@ -98,14 +85,13 @@ class Motor(Scalar):
 
     def drive_of(self, scene: Scene) -> Drive:
         """Make the drive, which goes to the angle, or on without end."""
-        largest, ends = self.torque if self.capped else None, scene.state.dim == 3 and self.arity == 3  # it ends at 0 and pi
+        ends = scene.state.dim == 3 and self.arity == 3  # at 0 and pi
         endless, period = not (self.serves or ends), 0.0 if ends else TURN
-        return Drive(scene, "Motor", self._begin, *self.course(), largest, endless, period, TIME_CONSTANT * self.serves)
+        return Drive(scene, self, self._begin, endless, period, TIME_CONSTANT * self.serves)
 
-    def course(self) -> tuple[Any, Any]:
-        """Return the goals of the rest angles [rad] and the speeds [rad/s]."""
-        end = np.where(self.speed > 0, np.pi, 0.0)
-        return self.angle if self.serves else end, self.speed
+    def course(self) -> tuple[Any, Any, Any]:
+        """Return the goals of the rest angles [rad], the speeds [rad/s] and the largest torques [N m]."""
+        return self.angle if self.serves else np.where(self.speed > 0, np.pi, 0.0), self.speed, self.torque
 
     def start_at(self, position: np.ndarray, first: int) -> None:
         """Move the rest angles of hinges with placed particles to where the hinges are now."""

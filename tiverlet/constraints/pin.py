@@ -35,8 +35,8 @@ def _indices(pin: "Pin", indices) -> np.ndarray:
     now, before = members.rows, pin.members.rows
     if len(now) != len(before):
         raise ValueError(f"Pin: indices has {len(now)} particles, but this Pin holds {len(before)}. Make another one.")
-    if pin.scene is not None and not pin._grabs:
-        own.update(_held=before, _grabs=now.tobytes() != before.tobytes())
+    if pin.scene is not None and not pin.needs_new_state:
+        own.update(held=before, needs_new_state=now.tobytes() != before.tobytes())
     own["members"] = members
     return now
 
@@ -78,11 +78,6 @@ class Target(Place):
         i = self.corners.member(c, 0)
         return self.state.place(i) - back * self.state.d[i] - self.target[c]
 
-    @ti.func
-    def offset_change(self, c):
-        """Return the displacement of the particle in this substep."""
-        return self.state.d[self.corners.member(c, 0)]
-
 
 class Pin(Anchored):
     """Particles held at targets that may move: an anchor, a hand, a mouse.
@@ -108,8 +103,7 @@ class Pin(Anchored):
     dim = 0
     exclusive = True
     indices: Any = Knob(_indices, "The particles that are held, (m, 1).")
-    _grabs = False  # whether other particles were assigned since the last frame; the previous ones are in _held
-    _held = np.zeros((0, 1), dtype=np.int32)
+    held = np.zeros((0, 1), dtype=np.int32)  # the particles before others were assigned, if it needs_new_state for these
     target = Knob(_targets, "Where the particles are held, (m, dim) [m].", place=shifted)
 
     def __init__(self, indices, target=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0):
@@ -139,28 +133,19 @@ class Pin(Anchored):
     @property
     def needs_other_kernels(self) -> bool:
         """Whether the world has to be rebuilt: also when other particles are held, since their masses and slots differ."""
-        return self._grabs or super().needs_other_kernels
-
-    @property
-    def needs_new_state(self) -> bool:
-        """Whether the Pin starts anew when the world is rebuilt: when other particles were assigned."""
-        return self._grabs
-
-    @property
-    def held(self) -> np.ndarray:
-        """The particles that the Pin held before others were assigned, (m, 1)."""
-        return self._held
+        return self.needs_new_state or super().needs_other_kernels
 
     def grab(self, scene: Scene) -> None:
         """Hold the assigned particles as a new Pin would. A Pin that drives them takes only their positions from the state."""
         memory, dev, own, kinematic, rows = scene.memory, self.dev, vars(self), self.is_kinematic, self.members.rows
         self.note_arguments()
-        own.update(_grabs=False, changed=kinematic, moving=False, new_force=False)
+        own.update(needs_new_state=False, changed=kinematic, moving=False, new_force=False)
         here = scene.state.get_some(memory, rows_of(rows)) if kinematic else own["target"]
         if not kinematic:
             self.start = scene.particles
             memory.write(dev.lam, np.zeros_like(here))
-            dev.spring.begin(self.compliance, self.damping)
+            dev.spring.upload(self.compliance, self.damping)
+            memory.write(dev.spring.last, np.zeros(1))  # not stretched
             dev.size.set(self.start.size)
         memory.write_rows(ALL, (dev.corners.members, rows), (dev.place.source, here), (dev.place.target, here))
 
@@ -172,7 +157,7 @@ class Pin(Anchored):
     def release(self) -> None:
         """Forget the world, and which particles were held there."""
         super().release()
-        self._grabs = False
+        self.__dict__.pop("needs_new_state", None)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check indices and targets, and set the inverse mass of driven particles to 0."""
@@ -188,18 +173,8 @@ class Pin(Anchored):
         return position[self.indices[:, 0]] - self.scene.memory.read(self.dev.place.source)[: self.count]
 
     def place_of(self, scene: Scene, passes: AnchorPasses) -> "Target":
-        """Make the targets at the start and the end of a frame."""
-        return Target(scene, passes, self._anchors)
-
-    def bind(self, scene: Scene) -> None:
-        """Declare fields. Driven particles have to go from where they are to the target, so the target is uploaded first."""
-        super().bind(scene)
-        self.changed = self.is_kinematic
-
-    @property
-    def _anchors(self) -> np.ndarray:
-        """Where targets start, (m, dim): at the particles where they are driven, at the given target for springs."""
-        return self.start.position[self.indices[:, 0]] if self.is_kinematic else self.target
+        """Make the targets at the start and the end of a frame: at first where driven particles are, or where springs draw to."""
+        return Target(scene, passes, self.start.position[self.indices[:, 0]] if self.is_kinematic else self.target)
 
     def upload(self) -> None:
         """Write the new target, which the next frame moves to."""

@@ -11,8 +11,9 @@ from ..features.feature import Batch, Knob, Scene
 from ..geometry.ordered import distinct
 from ..particles import Particles
 from .core.cluster_passes import ClusterPasses
-from .core.members import VariableSize, rows
-from .core.spring import SOFTEST, per_newton
+from .core.flag import BREAKS, SOFT, Flag
+from .core.members import Members, rows
+from .core.spring import SOFTEST, bears_nothing, per_newton
 from .core.strength import strength_of
 
 
@@ -53,12 +54,14 @@ class ShapeMatch(Batch):
     yield_strain: Any = Knob(lambda f, v: f._setting("yield_strain", v), "Strain without flow, (m,).")
     break_at: Any = Knob(strength_of, "Load beyond which a constraint breaks, (m,); None for never.")
     compiled_for = ("soft", "transcends", "breaks")
+    soft, breaks = SOFT, BREAKS
+    transcends = Flag(lambda f: (f.creep > 0).any(), "Whether any cluster flows, at an exponential rate.")
 
     def __init__(
         self, clusters, rest=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0, creep: ArrayLike = 0.0, yield_strain:
         ArrayLike = 0.0, break_at=None,
     ):  # fmt: skip
-        self.members = VariableSize("ShapeMatch", rows("ShapeMatch", "clusters", clusters, 1))
+        self.members = Members.joined("ShapeMatch", rows("ShapeMatch", "clusters", clusters, 1))
         self._rest = None if rest is None else checks.points("ShapeMatch", "rest", rest)
         self.compliance, self.damping, self.creep, self.yield_strain = compliance, damping, creep, yield_strain
         self.break_at = break_at
@@ -98,21 +101,6 @@ class ShapeMatch(Batch):
             pull[: len(self.owner)][stiffened[self.owner]] = 0.0
             self.scene.memory.write(self.dev.pull, pull)
 
-    @property
-    def soft(self) -> bool:
-        """Whether any cluster has compliance, or had when kernels were compiled."""
-        return bool((self.compliance > 0).any()) or "soft" in self.compiled_so_far
-
-    @property
-    def breaks(self) -> bool:
-        """Whether a load can break clusters, or could when kernels were compiled."""
-        return self.break_at is not None or "breaks" in self.compiled_so_far
-
-    @property
-    def transcends(self) -> bool:
-        """Whether any cluster flows, at an exponential rate, or did when kernels were compiled."""
-        return bool((self.creep > 0).any()) or "transcends" in self.compiled_so_far
-
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Compute the rest shapes, each about its center of mass."""
         self.members.check(repr(self), "clusters", particles.count)
@@ -134,7 +122,7 @@ class ShapeMatch(Batch):
 
     def set_listing(self, listing: Any) -> None:
         """Replace the clusters by these."""
-        self._keep(members=VariableSize("ShapeMatch", listing))
+        self._keep(members=Members.joined("ShapeMatch", listing))
 
     def shape_of(self, c: int) -> np.ndarray:
         """Return the rest shape of cluster c about its center, (k, dim)."""
@@ -170,11 +158,7 @@ class ShapeMatch(Batch):
     @in_turn
     def load(self) -> np.ndarray:
         """The largest force on a particle of each cluster during the last substep [N], (m,)."""
-        if not self.count:
-            return np.zeros(0)
-        if self.scene is None:
-            raise RuntimeError("ShapeMatch.load: there is none before a world has been stepped with it.")
-        if not self.acts:
+        if bears_nothing(self):
             return np.zeros(self.count)
         w = self.scene.inv_mass[self.indices]
         mass = self.scene.memory.read(self.dev.mass)

@@ -63,11 +63,6 @@ class Nodes(Place):
         x = self.state.place(i) - back * self.state.d[i]
         return x - self.nearest(x)
 
-    @ti.func
-    def offset_change(self, c):
-        """Return the displacement of the particle in this substep."""
-        return self.state.d[self.corners.member(c, 0)]
-
 
 class Snap(Anchored):
     """Particles drawn to the nearest node of a grid by springs.
@@ -133,8 +128,3 @@ class Snap(Anchored):
         free = np.isinf(self._spacing)
         x = self.start.position[self.indices[:, 0]]
         return Nodes(scene, passes, [self._origin, np.where(free, 0.0, self._spacing)], self.node(x))
-
-    def bind(self, scene: Scene) -> None:
-        """Declare fields. No knob has to be uploaded before the first frame."""
-        super().bind(scene)
-        self.changed = False

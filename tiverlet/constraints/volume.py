@@ -10,8 +10,8 @@ from ..device import ti
 from ..features.feature import Knob, Scene
 from ..geometry.intervals import cross
 from ..particles import Particles
-from .core.members import FixedSize, VariableSize
-from .core.outline_passes import PRESSURE
+from .core.members import Members
+from .core.outline_passes import GOAL, PRESSURE
 from .core.quantity import Quantity
 from .core.scalar import Scalar
 
@@ -40,8 +40,7 @@ class Volume(Scalar):
     index_name = "cells"
     for_users = ("faces",)
     each = (*Scalar.each, "pressure")
-    pressure = PRESSURE
-    quantity: "Tetrahedra | Surfaces"
+    pressure, goal = PRESSURE, GOAL
     rest = Knob(lambda f, v: checks.per_item("Volume", "rest", v, f.count, least=0.0), "Volume at pressure 1 [m^3].")
 
     def __init__(
@@ -50,11 +49,6 @@ class Volume(Scalar):
     ):  # fmt: skip
         self.setup(cells, rest, compliance, damping, break_at)
         self.pressure = pressure
-
-    @property
-    def goal(self) -> np.ndarray:
-        """The target volumes, pressure * rest [m^3], (m,)."""
-        return self.pressure * self.rest
 
     def quantity_of(self, indices) -> Quantity:
         """Return Surfaces for faces (k, 3), else Tetrahedra, which have simpler kernels of their own."""
@@ -70,15 +64,10 @@ class Volume(Scalar):
         return self.listing
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Order the corners so that volumes are positive at the start."""
+        """Refuse 2D worlds; order the corners so that volumes are positive at the start."""
         if particles.dim != 3:
             raise ValueError("Volume: there are no volumes in a 2D world; use Area.")
-        self.check_indices(particles)
-        for _ in range(2):  # twice: a flat body, negative in both senses by rounding, keeps its order, so a clone finds the same
-            self.hold(self.quantity.reversed(self.rest_of(particles.position) < 0))
         super().prepare(particles, inv_mass)
-        if (self.rest < 0).any():  # a flat body, by rounding in both senses
-            self.start_from(np.maximum(self.rest, 0.0))
 
     def bind(self, scene: Scene) -> None:
         """Bind, after raising ValueError for volumes that f32 cannot represent."""
@@ -97,17 +86,12 @@ class Tetrahedra(Quantity):
     def reversed(self, which: np.ndarray) -> "Tetrahedra":
         """Return these tetrahedra, with two corners swapped where `which` (m,) is True."""
         indices = self.members.indices
-        return Tetrahedra(FixedSize("Volume", np.where(which[:, None], indices[:, [0, 1, 3, 2]], indices)))
+        return Tetrahedra(Members("Volume", np.where(which[:, None], indices[:, [0, 1, 3, 2]], indices)))
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return the signed volumes, (m,) [m^3]."""
         a, b, c, d = (x[:, k] for k in range(4))
         return np.einsum("ij,ij->i", b - a, cross(c - a, d - a)) / 6
-
-    @ti.func
-    def trust_radius(self, q):
-        """Return the size of a tetrahedron [m]."""
-        return q.norm()
 
     @ti.func
     def measure(self, c, q):
@@ -132,7 +116,7 @@ class Surfaces(Quantity):
     def __init__(self, faces: np.ndarray, surface: np.ndarray):
         self.faces, self.surface = faces, surface
         bodies = [np.unique(faces[surface == k]) for k in range(int(surface.max(initial=-1)) + 1)]
-        super().__init__(VariableSize("Volume", bodies))
+        super().__init__(Members.joined("Volume", bodies))
 
     @property
     def listing(self) -> np.ndarray:

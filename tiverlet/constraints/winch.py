@@ -8,7 +8,7 @@ from .. import checks
 from ..checks import ArrayLike
 from ..features.feature import Knob, Scene
 from ..particles import Particles
-from .core.drive import Drive, largest_load
+from .core.drive import Drive, driven_rest, largest_load
 from .core.length import Length
 from .core.scalar import Scalar
 
@@ -35,11 +35,13 @@ class Winch(Scalar):
     measures = Length
     side = 1
     driven = True
+    cusp = False  # no length of a winch is 0
     each = ("speed", "length", "shortest", "longest", "force", "compliance", "damping", "break_at")
     uploads_all = False  # goals are computed for a single world
     speed = Knob(lambda f, v: checks.per_item("Winch", "speed", v, f.count), "Change of length [m/s].")
     shortest = Knob(lambda f, v: checks.per_item("Winch", "shortest", v, f.count, above=0.0), "Least length [m].")
     longest = Knob(lambda f, v: checks.per_item("Winch", "longest", v, f.count, above=0.0, infinite=True), "Largest length [m].")
+    rest = driven_rest("length", "The current lengths [m], (m,).")
     force = Knob(lambda f, v: largest_load(f, "force", v), "The largest pull [N].")
 
     def __init__(
@@ -52,25 +54,6 @@ class Winch(Scalar):
         if shortest is not None:
             self.shortest = shortest
         self.speed, self.longest, self.force = speed, longest, force
-
-    @property
-    def cusp(self) -> bool:
-        """False: no length of a winch is 0."""
-        return False
-
-    @property
-    def largest(self) -> Any:
-        """The largest pulls [N], (m,)."""
-        return self.force
-
-    @property
-    def rest(self) -> np.ndarray:
-        """The current lengths [m], (m,)."""
-        if "drive" in vars(self.dev):
-            return self.dev.drive.values()[: self.count]
-        if "length" not in self.__dict__:
-            raise AttributeError("Winch has no length before it is in a world, unless it is given.")
-        return self.length
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the indices, and take the initial distances as lengths where none were given."""
@@ -86,11 +69,11 @@ class Winch(Scalar):
 
     def drive_of(self, scene: Scene) -> Drive:
         """Make the drive, which goes to the shortest or the longest length."""
-        return Drive(scene, "Winch", self.length, *self.course(), self.force if self.capped else None, False, 0.0, 0.0)
+        return Drive(scene, self, self.length)
 
-    def course(self) -> tuple[Any, Any]:
-        """Return the goals of the lengths [m] and the speeds [m/s]."""
-        return np.where(self.speed > 0, self.longest, self.shortest), np.abs(self.speed)
+    def course(self) -> tuple[Any, Any, Any]:
+        """Return the goals of the lengths [m], the speeds [m/s] and the largest pulls [N]."""
+        return np.where(self.speed > 0, self.longest, self.shortest), np.abs(self.speed), self.force
 
     def start_at(self, position: np.ndarray, first: int) -> None:
         """Lengthen ropes with a limited force whose ends were placed further apart, to the new distance."""

@@ -97,13 +97,10 @@ class CGSystem(System):
         super().__init__(scene, batches, slots, scalars, rows)
         self.steps, self.n, self.begin, self.w = steps, scene.count, slots.begin, scene.state.w
         self.stride = 1  # iterations of a loop for each block; Taichi gives each CPU thread at least 512, see Step
-        row = np.concatenate([np.repeat(self.row(b), b.arity) for b in scalars])
-        slot, who = (np.concatenate([a.ravel() for a in arrays]) for arrays in (places, [b.indices for b in scalars]))
-        free = (slot >= 0) & (row >= 0)
-        order = np.argsort(row[free], kind="stable")
-        ends = np.concatenate([[0], np.cumsum(np.bincount(row[free], minlength=self.rows))])
+        row, slot, who = self.corners(scalars, slots)
+        ends = np.searchsorted(row, np.arange(self.rows + 1))
         self.corner_begin = self.ints("corner_begin", ends)
-        self.corner = self.ints("corner", np.stack([slot[free], who[free]], axis=1)[order], 2)
+        self.corner = self.ints("corner", np.stack([slot, who], axis=1), 2)
         self.direction, self.residual = self.vector("direction"), self.vector("residual")
         self.matrix_times_direction = self.vector("applied")
         self.inverse_diagonal, self.shift = self.vector("preconditioner"), self.vector("shift")
@@ -118,10 +115,10 @@ class CGSystem(System):
         self.rounding = self.epsilon ** (2 if scene.state.compensated else 1)  # of positions
         self._least = 1.2 * largest_eigenvalue(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
         self.least = self.memory.number(self._least, scene.real)
-        _, part, _ = distinct(components(len(rows), row[free], who[free]))
+        _, part, _ = distinct(components(len(rows), row, who))
         self._part_of = np.zeros(scene.particles.count, dtype=np.int32)  # the part of each particle, counted from 1; 0: none
-        self._part_of[who[free]] = part[row[free]] + 1
-        self.part, self.representative = self.ints("part", part + 1), self.ints("lead", self.representatives(scalars, slots))
+        self._part_of[who] = part[row] + 1
+        self.part, self.representative = self.ints("part", part + 1), self.ints("lead", who[ends[1:] - 1])
         self.part_of = scene.memory.field("system.part_of", scene.count, kind=ti.i32, values=self._part_of)
         count = int(part.max(initial=0)) + 2
         self.part_count = self.memory.number(count)

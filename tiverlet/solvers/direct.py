@@ -95,7 +95,7 @@ class Direct(Solver):
         found = plan(len(alone), owner[free], item[free], self.width)
         if not found.parts:
             return None
-        return Elimination(scene, batches, slots, scalars, found, slot[free], item[free], implied)
+        return Elimination(scene, batches, slots, scalars, found, slot[free], implied)
 
     def explain(self, batches: list[Batch], slots: Slots) -> str:
         """Return how many constraints are solved by elimination, and how many relaxed alone."""
@@ -127,11 +127,11 @@ class Elimination(System):
 
     def __init__(
         self, scene: Scene, batches: list[Batch], slots: Slots, scalars: "list[Scalar]", found: Plan, slot: np.ndarray,
-        item: np.ndarray, implied: np.ndarray,
+        implied: np.ndarray,
     ):  # fmt: skip
         rows, self._part = _with_implied(found, scalars, scene, implied)
         super().__init__(scene, batches, slots, scalars, rows)
-        self._scalars = scalars
+        row, corner, particle = self.corners(scalars, slots)
         self.plan, self.parts, self.entries = found, self.memory.number(found.parts), self.memory.number(len(found.column))
         self.solved, self.has_implied = self.memory.number(len(found.rows)), len(rows) > len(found.rows)
         # Of each part that gave way in the last substep: (h' / h)^2 for the substep h' that it is softened for, the sum of its
@@ -156,11 +156,10 @@ class Elimination(System):
             self.added, self.turned_to = (
                 scene.memory.field(f"system.{k}", found.parts, kind=ti.f64) for k in ("added", "turned_to")
             )
-            inside = self.row_slots(scalars, slots)
-            self.corner_begin = ints("corner_begin", np.searchsorted(inside[:, 0], np.arange(len(rows) + 1)))
-            self.corner = ints("corner", inside[:, 1])
+            self.corner_begin = ints("corner_begin", np.searchsorted(row, np.arange(len(rows) + 1)))
+            self.corner = ints("corner", corner)
         who = np.zeros(slots.total, dtype=np.int64)
-        who[slot] = item
+        who[corner] = particle
         self.particle_of, self.w, self.inverse_size = ints("who", who), scene.state.w, reals("close")
         self.refines = scene.order == 2 and not self.limits_steps and not self.has_shared_particles
         if self.refines:
@@ -173,7 +172,7 @@ class Elimination(System):
             self.any_unmet = scene.memory.field("system.any_unmet", None, kind=ti.i32)
         self.sleeps = bool(scene.state.sleepers)
         if self.sleeps:  # all particles of a system sleep, or none
-            self.representative = ints("lead", self.representatives(scalars, slots)[found.part_begin[:-1]])
+            self.representative = ints("lead", particle[np.searchsorted(row, found.part_begin[:-1], side="right") - 1])
         parts = [scene.inv_mass[b.indices] * (b.gradients(b.start.position) ** 2).sum(axis=2) for b in scalars]
         least = np.concatenate([np.where(p > 0, p, np.inf).min(axis=1, initial=np.inf) for p in parts])[rows]
         small = np.where(np.isfinite(least), SMALL_PIVOT * least, 0.0)
@@ -331,18 +330,18 @@ class Elimination(System):
                         at = self.update[u]
                         self.value[at] = self.value[at] - part * self.value[rows + k]
                         u += 1
-        for k in range(end - begin):
-            r = end - 1 - k
-            rest = self.step[r]
-            for e in range(self.entry_begin[r], self.entry_begin[r + 1]):
-                rest -= self.value[rows + e] * self.step[self.column[e]]
-            self.step[r] = rest / self.value[r]
+        self.substitute_back(self.step, begin, end)
         return hard
 
     @ti.func
-    def corner_particle(self, q):
-        """Return the particle at corner q, in the order of rows."""
-        return self.particle_of[self.corner[q]]
+    def substitute_back(self, x: ti.template(), begin, end):  # type: ignore[valid-type]
+        """Find x from the eliminated rows from `begin` up to `end`; 0 for rows that others imply."""
+        for k in range(end - begin):
+            r = end - 1 - k
+            rest = x[r]
+            for e in range(self.entry_begin[r], self.entry_begin[r + 1]):
+                rest -= self.value[self.solved + e] * x[self.column[e]]
+            x[r] = ti.select(self.diagonal[r] != 0, rest / self.value[r], 0 * rest)
 
     @ti.func
     def row_that_begins(self, s):
@@ -368,7 +367,7 @@ class Elimination(System):
         """Turn the directions of part b to those at the time of its impact."""
         when, before = ti.cast(0, self.real), ti.cast(self.turned_to[b], self.real)
         for q in range(self.corner_begin[self.part_begin[b]], self.corner_begin[self.part_begin[b + 1]]):
-            when = ti.max(when, rows.when_of(self.corner_particle(q)))
+            when = ti.max(when, rows.when_of(self.particle_of[self.corner[q]]))
         if when != before:
             turn = (when - before) / ti.max(1 - before, ti.static(2.0**-10))  # what is at the end already stays there
             self.turned_to[b] = when
@@ -416,12 +415,7 @@ class Elimination(System):
                 for e in range(self.entry_begin[r], self.entry_begin[r + 1]):
                     later = self.column[e]
                     self.change[later] = self.change[later] - self.value[rows + entries + e] * part
-            for k in range(end - begin):
-                r = end - 1 - k
-                rest = self.change[r]
-                for e in range(self.entry_begin[r], self.entry_begin[r + 1]):
-                    rest -= self.value[rows + e] * self.change[self.column[e]]
-                self.change[r] = ti.select(self.diagonal[r] != 0, rest / self.value[r], 0 * rest)
+            self.substitute_back(self.change, begin, end)
             for r in range(begin, end):
                 self.answer[r] = self.answer[r] + self.change[r]
                 for q in range(self.corner_begin[r], self.corner_begin[r + 1]):
@@ -555,12 +549,6 @@ class Elimination(System):
             if self.scale[r] != 0:
                 out = ti.max(out, softness * ti.abs(self.lam[r] + self.step[r]) * self.inverse_size[r] / self.scale[r])
         return out
-
-    @ti.func
-    def clear_steps(self, begin, end):
-        """Set all steps to 0."""
-        for r in range(begin, end):
-            self.step[r] = 0
 
     @ti.func
     def refine_violations(self, begin, end):
@@ -706,7 +694,8 @@ class Elimination(System):
                     self.softened[b][3] = ti.select(bound, tension_at_start, tension) / longer
                     self.end_newton(b)
                     if longer * self.earlier_tension(begin, end) > SOFTENED_TO:
-                        self.clear_steps(begin, end)
+                        for r in range(begin, end):
+                            self.step[r] = 0
                         ti.atomic_max(self.tension[None], reported)
                         stage = DONE
             else:

@@ -83,7 +83,7 @@ class Slots:
         alone = not self.system or self.system.steps > 0 or self.system.count_relaxed_alone(batches) > 0
         self.can_soften = alone and (not answers or any(b.clusters or b.arity == 1 for b in batches))
         if self.loads or any(b.breaks for b in batches):
-            self._bodies, self._rounding_masses = self._connected_bodies(batches, inv_mass)
+            self._connect_bodies(batches, inv_mass)
         if self.loads:
             self.bodies = memory.number(1 + max(int(b.max(initial=0)) for b in self._bodies.values()))
             self.body_load = memory.field("slots.bears", self.bodies)
@@ -93,19 +93,17 @@ class Slots:
         factor = solver.relaxed_by(scene, batches, blocks * inv_mass)
         self.relaxation = checks.number(type(solver).__name__, "relaxed_by()", factor, above=0.0)
 
-    @staticmethod
-    def _connected_bodies(batches: list[Batch], inv_mass: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray]:
-        """Return the body of each constraint, by the id of its batch, and the mass of rounding_mass() of each body [kg].
+    def _connect_bodies(self, batches: list[Batch], inv_mass: np.ndarray) -> None:
+        """Find the body of each constraint, by the id of its batch, and the root of the sum of squared masses of each body [kg].
 
-        Constraints that share movable particles, directly or through other constraints, are of one body. That mass is the root
-        of the sum of the squared masses.
+        Constraints that share movable particles, directly or through other constraints, are of one body.
         """
         ends = np.cumsum([b.count for b in batches])
         label, body = bodies_of(int(ends[-1]), *corners_of(batches), inv_mass)
         parts = np.split(label, ends[:-1])
         squares = np.divide(1, inv_mass, out=np.zeros(len(inv_mass)), where=inv_mass > 0) ** 2
-        masses = np.sqrt(np.bincount(body, weights=squares, minlength=int(ends[-1]) + 1))
-        return {id(b): part for b, part in zip(batches, parts, strict=True)}, masses
+        self._rounding_masses = np.sqrt(np.bincount(body, weights=squares, minlength=int(ends[-1]) + 1))
+        self._bodies = {id(b): part for b, part in zip(batches, parts, strict=True)}
 
     def body(self, batch: Batch) -> np.ndarray:
         """Return the body of each constraint of a batch, (m,), where constraints learn loads or break."""
@@ -227,7 +225,7 @@ class Slots:
 
         Where the limit acts, the value without the limit is stored for the report.
         """
-        most = TENSEST / geometric_stiffness
+        most = self.most_tense(geometric_stiffness)
         if ti.abs(wanted) >= most:
             ti.atomic_max(self.tension[None], ti.cast(TENSEST * ti.abs(wanted) / most, ti.f64))
         return ti.max(-most, ti.min(most, wanted))
@@ -260,16 +258,6 @@ class Slots:
         return total
 
     @ti.func
-    def correction_of(self, i):
-        """Return the correction of particle i: the sum of its moves [m]. With a system it is in f64, as large moves cancel."""
-        total = 0 * self.state.x[i]
-        if ti.static(self.has_system):
-            total = self.system.total_of(i, self.begin[i], self.begin[i + 1])
-        else:
-            total = self.total_of(i)
-        return total
-
-    @ti.func
     def gather(self, i, now):
         """Move particle i by the sum of its slots. In later Newton steps, only particles of systems that take the step move."""
         begin, end = self.begin[i], self.begin[i + 1]
@@ -279,7 +267,11 @@ class Slots:
                 if r < 0 or not self.system.is_unmet(r):
                     end = begin
         if end > begin:
-            correction = self.correction_of(i)
+            correction = 0 * self.state.x[i]
+            if ti.static(self.has_system):  # in f64, as large moves cancel
+                correction = self.system.total_of(i, begin, end)
+            else:
+                correction = self.total_of(i)
             self.shift(i, correction, now)
             if ti.static(self.refines):
                 self.system.record_move(i, begin, end, correction)

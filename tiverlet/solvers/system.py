@@ -53,10 +53,9 @@ class System:
         row[rows] = np.arange(len(rows))
         self._rows = dict(zip(map(id, scalars), np.split(row, np.cumsum(counts)[:-1]), strict=True))
         self.blocks, self.has_shared_particles = self._blocks(batches, scene)
+        row, slot, _ = self.corners(scalars, slots)
         of_slot = np.full(sum(b.indices.size for b in batches), -1)
-        for b in scalars:
-            slot = slots.places(b)
-            of_slot[slot[slot >= 0]] = np.broadcast_to(self.row(b)[:, None], slot.shape)[slot >= 0]
+        of_slot[slot] = row
         self.row_of = self.ints("row_of_slot", of_slot)
         self.step, self.violation, self.scale = self.reals("step"), self.reals("violation"), self.reals("scale")
         self.alpha, self.lam = self.reals("alpha"), self.reals("multiplier")
@@ -99,25 +98,13 @@ class System:
         """Return the row of each constraint of a batch, (m,), -1 for constraints that are relaxed alone."""
         return self._rows.get(id(batch), np.full(batch.count, -1))
 
-    def representatives(self, scalars: "list[Scalar]", slots: "Slots") -> np.ndarray:
-        """Return a movable particle of each row, (rows,)."""
-        out = np.zeros(self.rows, dtype=np.int64)
-        for b in scalars:
-            row = np.broadcast_to(self.row(b)[:, None], b.indices.shape)
-            free = (slots.places(b) >= 0) & (row >= 0)
-            out[row[free]] = b.indices[free]
-        return out
-
-    def row_slots(self, scalars: "list[Scalar]", slots: "Slots") -> np.ndarray:
-        """Return the row and the slot of each corner that can move, in the order of rows, (k, 2)."""
-        each = []
-        for b in scalars:
-            slot = slots.places(b)
-            row = np.broadcast_to(self.row(b)[:, None], slot.shape)
-            some = (slot >= 0) & (row >= 0)
-            each.append(np.stack([row[some], slot[some]], axis=1))
-        out = np.concatenate(each)
-        return out[np.argsort(out[:, 0], kind="stable")]
+    def corners(self, scalars: "list[Scalar]", slots: "Slots") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the row, the slot and the particle of each corner that can move, in the order of rows, (k,) each."""
+        row = np.concatenate([np.repeat(self.row(b), b.arity) for b in scalars])
+        slot = np.concatenate([slots.places(b).ravel() for b in scalars])
+        some = np.flatnonzero((slot >= 0) & (row >= 0))
+        some = some[np.argsort(row[some], kind="stable")]
+        return row[some], slot[some], np.concatenate([b.indices.ravel() for b in scalars])[some]
 
     def count_relaxed_alone(self, batches: "list[Batch]") -> int:
         """Return how many constraints with a movable particle are relaxed by themselves."""

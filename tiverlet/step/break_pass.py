@@ -35,7 +35,7 @@ class BreakPass:
                     if overload > 0:
                         first = f.dev.corners.compare(loop, c, overload, number)
                         if ti.static(loop == DECIDE):
-                            f.dev.forget_excess(c)
+                            f.dev.strength.forget_excess(c)
                             if first != 0:
                                 f.dev.strength.mark_broken(c, now.tick)
             self.team.wait()

@@ -37,7 +37,7 @@ class ConstraintPass:
         some: True for all of them, False for those whose residual needs the sums. Systems contain no such constraints, so later
         Newton steps have nothing to sum.
         """
-        for f in ti.static([f for f in self.ragged if f.needs_reduce_block or some]):
+        for f in ti.static([f for f in self.ragged if f.dev.needs_reduce_block or some]):
             n = f.dev.corners.block_count * (1 - newton)
             for b in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                 if ti.static(bool(self.slots.state.sleepers) and some):

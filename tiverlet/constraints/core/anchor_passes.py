@@ -15,11 +15,13 @@ if TYPE_CHECKING:
 class Place:
     """The contract of the places that particles are drawn to, on the device: C = x - place.
 
-    name: distinguishes it from other features. in_state: its fields in the exact state, by name.
+    name: distinguishes it from other features. corners: the particles. in_state: its fields in the exact state, by name.
     """
 
     has_own_compile_time = True
     name: str
+    state: Any
+    corners: Any
     in_state: dict[str, Any]
 
     def __repr__(self) -> str:
@@ -38,7 +40,7 @@ class Place:
     @ti.func
     def offset_change(self, c):
         """Return how far C changed in the last substep by the motion of the particle."""
-        return 0.0
+        return self.state.d[self.corners.member(c, 0)]
 
     @ti.func
     def drive(self, c, h, frame_fraction):

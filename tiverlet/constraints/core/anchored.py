@@ -10,20 +10,20 @@ from ...device.interrupts import in_turn
 from ...features.feature import Batch, Feature, Knob, Scene
 from ...features.regrouping import Regrouping
 from .anchor_passes import AnchorPasses, Place
-from .members import FixedSize
-from .spring import SOFTEST, per_newton
+from .members import Members
+from .spring import SOFTEST, bears_nothing, per_newton
 
 if TYPE_CHECKING:
     from ...particles import Particles
 
 
-def one_each(who: str, indices, count: int = checks.ANY) -> FixedSize:
+def one_each(who: str, indices, count: int = checks.ANY) -> Members:
     """Check particles below `count`, each of which has one place, and return them as members."""
     rows = checks.indices(who, "indices", indices, count)
     if len(rows) > 1 and len(np.unique(rows)) < len(rows):
         values, counts = np.unique(rows, return_counts=True)
         raise ValueError(f"{who}: particle {values[counts > 1][0]} is named twice, and can have only one place.")
-    return FixedSize(who, rows[:, None])
+    return Members(who, rows[:, None])
 
 
 class Anchored(Batch):
@@ -101,6 +101,11 @@ class Anchored(Batch):
         """Make the places of the particles, on the device."""
         raise NotImplementedError
 
+    def bind(self, scene: Scene) -> None:
+        """Declare fields. Driven particles have to go from where they are to their places, so these are uploaded first."""
+        super().bind(scene)
+        self.changed = self.is_kinematic
+
     def passes(self, scene: Scene) -> AnchorPasses:
         """Make the passes that draw particles to their places."""
         return AnchorPasses(scene, self, self.start_offset(self.start.position))
@@ -109,14 +114,11 @@ class Anchored(Batch):
     @in_turn
     def load(self) -> np.ndarray:
         """The force on each particle during the last substep [N], (m, dim)."""
-        if not self.count:
-            return np.zeros((0, 0 if self.start is None else self.start.dim))
-        if self.scene is None:
-            raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")
-        if self.is_kinematic:
+        nothing = bears_nothing(self)
+        if self.is_kinematic and self.count:
             raise RuntimeError(f"{self!r}.load: driven particles are taken along whatever it takes; give compliance to measure.")
-        if not self.acts:
-            return np.zeros((self.count, self.scene.particles.dim))
+        if nothing:
+            return np.zeros((self.count, 0 if self.start is None else self.start.dim))
         scale = per_newton(self.scene.multipliers_per_newton, self.compliance, lambda: self.weights(self.start.position))
         return scale[:, None] * self.scene.memory.read(self.dev.lam)[: self.count].astype(np.float64)
 

@@ -42,7 +42,7 @@ class ClusterPasses(Passes):
         self.shape = add(f"{name}.shape", total, width=dim, values=shape, state=self.plastic)
         turn = rotation.identity(dim)
         self.pull: Any = add(f"{name}.multiplier", total, width=dim, state=True)
-        self.strength = Strength(scene, name, batch, total, dim)
+        self.strength = Strength(scene, name, batch, self.corners)
         self.turn = add(f"{name}.turn", m, width=len(turn), kind=ti.f64, values=[turn] * m, state=True)
         for_reports = bool(scene.state.sleepers)  # the report reads it for clusters that sleep, in a clone too
         self.pose = add(f"{name}.pose", m, width=dim * dim, kind=ti.f64, state=for_reports)
@@ -117,12 +117,7 @@ class ClusterPasses(Passes):
         return mu
 
     @ti.func
-    def mass_in_fit(self, e, c):
-        """Return the mass of corner e in a fit."""
-        return self.mass_of(e, c, HEAVY)
-
-    @ti.func
-    def mass_of(self, e, c, heavy):
+    def mass_of(self, e, c, heavy=HEAVY):
         """Return the mass of corner e, `heavy` times that of its cluster c for a particle that cannot move."""
         w, mu = self.w[self.corners.members[e]], ti.cast(heavy * self.mass[c], ti.f64)
         if w > 0:
@@ -150,7 +145,7 @@ class ClusterPasses(Passes):
                 self.relative_position(e, i0, 1),
             )
             if first < 0:
-                mu, s = self.mass_in_fit(e, c), p
+                mu, s = self.mass_of(e, c), p
             total += mu
             p1 += mu * p
             q1 += mu * q
@@ -181,8 +176,8 @@ class ClusterPasses(Passes):
             p += self.p[b]
             q += self.q[b]
             s += self.s[b]
-            K += self.read_matrix(self.K, b)
-            X += self.read_matrix(self.X, b)
+            K += rotation.from_rows(self.K[b])
+            X += rotation.from_rows(self.X[b])
         p, q, s = p / total, q / total, s / total
         return total, p, q, s, K - total * q.outer_product(s), X - total * p.outer_product(s)
 
@@ -192,11 +187,6 @@ class ClusterPasses(Passes):
         for j in ti.static(range(self.state.dim)):
             for k in ti.static(range(self.state.dim)):
                 field[c][self.state.dim * j + k] = R[j, k]
-
-    @ti.func
-    def read_matrix(self, field: ti.template(), c):
-        """Read a matrix."""
-        return rotation.from_rows(field[c])
 
     @ti.func
     def is_firm(self, c, h):
@@ -220,25 +210,19 @@ class ClusterPasses(Passes):
     @ti.func
     def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
         """Compute the position and rotation of the cluster; in an extra pass, let it leave walls that it struck."""
+        extra = False
         if ti.static(bool(self.impacts)):
-            if self.impacts.is_extra_pass():
+            extra = self.impacts.is_extra_pass()
+            if extra:
                 self.impact.strike(c)
-            else:
-                self.find_place(c, h, h2_effective, first, fresh)
-        else:
-            self.find_place(c, h, h2_effective, first, fresh)
-
-    @ti.func
-    def find_place(self, c, h, h2_effective, first, fresh):
-        """Compute the position and rotation of the cluster."""
-        if self.mass[c] > 0:
+        if not extra and self.mass[c] > 0:
             total, p, q, s, K, X = self.moments(c)
             rigid, soft, now, last, alpha_prime = self.law(c, h, h2_effective, fresh)
             mean, U = 0 * p, 0 * K
             if ti.static(self.spring.soft):
                 for b in range(self.corners.blocks[c], self.corners.blocks[c + 1]):
                     mean += self.v[b] / total
-                    U += self.read_matrix(self.U, b)
+                    U += rotation.from_rows(self.U[b])
                 U -= total * mean.outer_product(s)
             start, end, cosine = rotation.step_rotation(K, X, U, first > 0, rigid, soft, self.turn[c], LEAST, self.spring.soft)
             pose = rotation.matrix(end)
@@ -321,7 +305,7 @@ class ClusterPasses(Passes):
         begin, end = self.corners.starts[c], self.corners.starts[c + 1]
         if self.mass[c] > 0 and self.strength.is_intact(c):
             mean, some = self.zero_vector(), False
-            S, A, alpha = self.read_matrix(self.inertia, c), self.answering[c][0], self.answering[c][1]
+            S, A, alpha = rotation.from_rows(self.inertia[c]), self.answering[c][0], self.answering[c][1]
             X = 0 * S
             for e in range(begin, end):
                 step = moved[self.corners.members[e]] - d[self.corners.members[e]]
@@ -392,7 +376,7 @@ class ClusterPasses(Passes):
         for e in range(begin, end):
             held = held or self.w[self.corners.members[e]] == 0
             m, r, move = (
-                self.mass_in_fit(e, c),
+                self.mass_of(e, c),
                 self.relative_position(e, i0, 0),
                 self.reaction(e, c, middle, center, R, h, firm, soft),
             )
@@ -444,7 +428,7 @@ class ClusterPasses(Passes):
         if ti.static(self.spring.soft):
             total, K, i0 = ti.cast(0, ti.f64), R, self.corners.reference_particle(c)
             for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
-                mu = self.mass_in_fit(e, c)
+                mu = self.mass_of(e, c)
                 x = self.relative_position(e, i0, back)
                 total += mu
                 middle += mu * x
@@ -460,16 +444,16 @@ class ClusterPasses(Passes):
         return (
             self.relative_position(e, self.corners.reference_particle(c), 0)
             - self.place[c]
-            - self.read_matrix(self.pose, c) @ self.shape[e]
+            - rotation.from_rows(self.pose[c]) @ self.shape[e]
         )
 
     @ti.func
     def scatter_corner(self, e, h, h2_effective, first, fresh):
         """Move corner e towards its place; in an extra pass, relax() has written its move."""
+        extra = False
         if ti.static(bool(self.impacts)):
-            if first < 0 or not self.impacts.is_extra_pass():
-                self.move_to_place(e, h, h2_effective, first, fresh)
-        else:
+            extra = first >= 0 and self.impacts.is_extra_pass()
+        if not extra:
             self.move_to_place(e, h, h2_effective, first, fresh)
 
     @ti.func
@@ -502,13 +486,13 @@ class ClusterPasses(Passes):
     @ti.func
     def soft_violation(self, e, c, C, rigid, soft, alpha_prime):
         """Return C* + alpha' lam of a soft cluster, with the soft part of C_(n+1) = C in the frame at the start."""
-        back = self.read_matrix(self.fit, c) @ (self.read_matrix(self.pose, c).transpose() @ C)
+        back = rotation.from_rows(self.fit[c]) @ (rotation.from_rows(self.pose[c]).transpose() @ C)
         return rigid * C + soft * back + self.spring.history[e] + alpha_prime * self.pull[e] - self.mean[c]
 
     @ti.func
     def store_history(self, e, c, h, now, last, fresh):
         """Store the terms of C_n and C_(n-1) in the violation; and let a plastic shape flow."""
-        R = self.read_matrix(self.fit, c)
+        R = rotation.from_rows(self.fit[c])
         C = self.relative_position(e, self.corners.reference_particle(c), 1) - self.middle[c] - R @ self.shape[e]
         self.spring.history[e] = now * C + last * (R @ self.spring.last_value(e, ti.cast(self.zero_vector(), self.real), fresh))
         body = R.transpose() @ C
@@ -526,7 +510,7 @@ class ClusterPasses(Passes):
         alpha, mass = self.spring.alpha[c], self.mass[c]
         out = 0 * C
         if alpha > 0:
-            rate = (C - self.read_matrix(self.pose, c) @ self.spring.last[e]) / h
+            rate = (C - rotation.from_rows(self.pose[c]) @ self.spring.last[e]) / h
             out = -h * h * (1 - self.spring.stiff(c, h, 1 / mass)) * (C / alpha + self.spring.damping[c] * rate) / mass
         return out
 
@@ -548,18 +532,13 @@ class ClusterPasses(Passes):
         return out
 
     @ti.func
-    def forget_excess(self, c):
-        """Forget that cluster c bore too much."""
-        self.strength.forget_excess(self.corners.starts[c], self.corners.starts[c + 1])
-
-    @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
         """Return the largest violation that is left, relative to the radius, with the rotation of the last pass."""
         worst, total, mean, holds = ti.cast(0, ti.f64), ti.cast(0, ti.f64), self.zero_vector(), self.strength.is_intact(c)
         rigid, soft, now, last, alpha_prime = self.law(c, h, h2_effective, fresh)
         for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
-            total += self.mass_in_fit(e, c)
-            mean += self.mass_in_fit(e, c) * self.offset_of(e, c)
+            total += self.mass_of(e, c)
+            mean += self.mass_of(e, c) * self.offset_of(e, c)
         for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
             if self.w[self.corners.members[e]] > 0 and holds:
                 C = self.offset_of(e, c) - mean / total  # positions are relative to a particle that has moved since

@@ -33,11 +33,10 @@ class CornerPasses(Passes):
         self.name = name = repr(batch)
         m, add = batch.count, scene.memory.field
         self.state, self.slots, self.w, self.real, self.arity = scene.state, scene.slots, scene.state.w, scene.real, batch.arity
-        self.corners = batch.members.bind(scene, batch)
+        self.corners = batch.members.bind(scene, batch, batch.quantity.origin)
         self.equation = Equation(scene, batch, self.corners, start)
         self.spring, self.strength, self.limit = self.equation.spring, self.equation.strength, self.equation.limit
         self.quantity, self.drive, self.side = self.equation.quantity, self.equation.drive, batch.side
-        self.relative_corners = self.quantity.relative_corners(self.corners)
         rows = scene.slots.rows(batch)
         self.in_system, self.has_outside = bool((rows >= 0).any()), bool((rows < 0).any())
         if self.in_system:
@@ -90,7 +89,7 @@ class CornerPasses(Passes):
         Returns the violation A C + B + alpha' lam, A, alpha', lam, the mass-split weight W (0: no corner can move), directions n
         and gradients g, both (arity, dim), how far it turned, see Slots.record_turn (n is g where too far), and C_(n+1) - C_n.
         """
-        now, start = self.relative_corners.now_and_start(c)
+        now, start = self.corners.now_and_start(c)
         if first != 0:
             self.quantity.start_substep(c, now, start, fresh)
         f, g = self.quantity.measure(c, now)
@@ -182,10 +181,8 @@ class CornerPasses(Passes):
         far = False
         if self.spring.is_rigid(c):
             u, W, longest, fastest = self.motion(c, n, together)
-            trust_radius, size = (
-                self.quantity.trust_radius(self.relative_corners.relative_positions(c, 0)),
-                self.equation.residual_scale(c),
-            )
+            size = self.equation.residual_scale(c)
+            trust_radius = self.quantity.trust_radius(self.corners.relative_positions(c, 0))
             new, far = self.limit.limit(c, lam, new, u, W, longest, fastest, trust_radius, size, share)
         return new, far
 
@@ -209,7 +206,7 @@ class CornerPasses(Passes):
             if split > 0 and self.spring.is_rigid(c):
                 spare = 2 * (violation - moved) ** 2 / split
                 if ti.static(self.limit.acts):
-                    most = TRUST * self.quantity.trust_radius(self.relative_corners.relative_positions(c, 0)) / longest
+                    most = TRUST * self.quantity.trust_radius(self.corners.relative_positions(c, 0)) / longest
             self.slots.system.limit_row(row, u, spare, most, lam - new)
         for k in ti.static(range(self.arity)):
             self.slots.system.set_gradient(self.corners.places[c][k], self.corners.member(c, k), g[k, :])
@@ -229,7 +226,7 @@ class CornerPasses(Passes):
                 w = self.w[self.corners.member(c, k)]
                 move += w * w * n[k, :].dot(n[k, :])
             new = self.limit.limit_collapse(
-                lam, new, self.equation.rest[c], self.relative_corners.relative_positions(c, 0).norm_sqr(), move
+                lam, new, self.equation.rest[c], self.corners.relative_positions(c, 0).norm_sqr(), move
             )
         step = new - lam
         if ti.static(self.semi_iterates):
@@ -260,9 +257,8 @@ class CornerPasses(Passes):
         out = self.spring.is_rigid(c)
         if ti.static(self.spring.soft):
             if not out:
-                g, w = self.quantity.measure(c, self.relative_corners.now_and_start(c)[1])[1], ti.cast(0, self.real)
-                for k in ti.static(range(self.arity)):
-                    w += self.w[self.corners.member(c, k)] * g[k, :].dot(g[k, :])
+                _, g = self.quantity.measure(c, self.corners.now_and_start(c)[1])
+                w, _ = self.weights(c, g)
                 out = w > 0 and stiff(self.spring.alpha[c], h, w) > FIRM
         return out
 
@@ -325,7 +321,7 @@ class CornerPasses(Passes):
     @ti.func
     def weigh_load(self, c):
         """At the end of a window: call KnownLoad.record_body_load()."""
-        _, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
+        _, g = self.measured(c, 0)
         _, _, most, _ = self.motion(c, g, 0)
         own = ti.cast(0, self.real)
         for k in ti.static(range(self.arity)):
@@ -335,7 +331,7 @@ class CornerPasses(Passes):
     @ti.func
     def learn_load(self, c, h):
         """After weigh_load(): call KnownLoad.learn()."""
-        _, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
+        _, g = self.measured(c, 0)
         _, W, _, fastest = self.motion(c, g, 0)
         self.known.learn(c, h * h * W, self.equation.residual_scale(c), ti.sqrt(fastest))
 
@@ -381,15 +377,12 @@ class CornerPasses(Passes):
 
         Rigid links get their force in the next substep, except for the load that they know.
         """
-        f, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
+        f, g = self.measured(c, 0)
         f = self.quantity.unwrap(f, self.equation.rest[c])
-        f0, w, W = f, ti.cast(0, self.real), ti.cast(0, self.real)
+        w, W = self.weights(c, g)
+        f0 = f
         if ti.static(self.spring.damped):
-            f0, _ = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 1))
-        for k in ti.static(range(self.arity)):
-            i, gg = self.corners.member(c, k), g[k, :].dot(g[k, :])
-            w += self.w[i] * gg
-            W += self.slots.split[i] * gg
+            f0, _ = self.measured(c, 1)
         if alone == 0 or not self.is_outside_systems(c):
             W = w
         force = self.equation.spring_force(c, f, self.quantity.unwrap(f0, f), w, W, h, soft)
@@ -406,22 +399,19 @@ class CornerPasses(Passes):
         if ti.static(self.equation.cusp):
             passes = passes or self.equation.rest[c] == 0
         if not (self.spring.is_rigid(c) or passes):
-            f, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
-            f0, n = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 1))
+            f, g = self.measured(c, 0)
+            f0, n = self.measured(c, 1)
             if self.quantity.direction_reliable(f, f0):
                 self.slots.record_turn(self.slots.classify_turn((g * n).sum(), g.norm() * n.norm()))
 
     @ti.func
     def push_reaction(self, c, h, firm, soft):
         """Push h^2 w_j F grad_j C, with F of Equation.reaction(); nothing if the multiplier contains an impact, which is over."""
-        f, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
+        f, g = self.measured(c, 0)
         w, W = ti.cast(0, self.real), ti.cast(0, self.real)
         if ti.static(self.spring.soft):
             f = self.quantity.unwrap(f, self.equation.rest[c])
-            for k in ti.static(range(self.arity)):
-                i, gg = self.corners.member(c, k), g[k, :].dot(g[k, :])
-                w += self.w[i] * gg
-                W += self.slots.split[i] * gg
+            w, W = self.weights(c, g)
         pull = self.equation.reaction(c, f, w, W, h, firm, soft)
         if ti.static(bool(self.impacts)):
             if self.spring.is_rigid(c):
@@ -442,7 +432,7 @@ class CornerPasses(Passes):
         lam, w, out = self.equation.lam[c], ti.cast(0, self.real), ti.cast(0, self.real)
         if ti.static(self.spring.soft):
             if h2_rigid > h2_effective:
-                w = self.weight(c)
+                w, _ = self.weights(c, self.measured(c, 0)[1])
         per_newton = self.spring.multiplier_per_newton(c, w, h2_rigid, h2_effective)
         if ti.static(self.known.learns):
             lam += (per_newton / h2_effective - 1) * self.known.given[c]
@@ -450,7 +440,7 @@ class CornerPasses(Passes):
             past, unsure = self.strength.add_excess(c, c, lam, per_newton), 0 * lam
             if past > 0:
                 if ti.static(not (self.quantity.precise and self.state.carries)):
-                    _, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
+                    _, g = self.measured(c, 0)
                     for k in ti.static(range(self.arity)):
                         if g[k, :].norm() > 0:
                             rounding = self.strength.rounding(c, self.corners.member(c, k), self.corners.member(c, 0))
@@ -460,28 +450,19 @@ class CornerPasses(Passes):
         return out
 
     @ti.func
-    def forget_excess(self, c):
-        """Forget that constraint c bore too much."""
-        self.strength.forget_excess(c, c + 1)
-
-    @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
         """Return the violation that is left, relative to the rest value (to the batch's mean f where that is 0).
 
         W is computed from the current gradients alone: it cancels, unless the multiplier is bounded. Without gradients no pass
         reduces the violation, so all of it is left; a spring correctly exerts no force there.
         """
-        f, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
+        f, g = self.measured(c, 0)
         f = self.quantity.unwrap(f, self.equation.rest[c])
-        w, W, free = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
+        w, W = self.weights(c, g)
+        free = ti.cast(0, self.real)
         for k in ti.static(range(self.arity)):
-            i, gg = self.corners.member(c, k), g[k, :].dot(g[k, :])
-            w += self.w[i] * gg
-            W += self.slots.split[i] * gg
-            free += self.w[i]
-        violation, A, alpha, lam, W = self.equation.terms(c, f, f, w, W, h, h2_effective, 0, fresh)
-        violation = self.equation.all_violation(c, violation, A)
-        left = self.equation.removable_violation(c, violation, A, alpha, lam, W)
+            free += self.w[self.corners.member(c, k)]
+        left = self.equation.left_violation(c, f, w, W, h, h2_effective, fresh)
         if g.norm_sqr() == 0 and free > 0 and self.strength.is_intact(c):
             if ti.static(self.quantity.collapses > 0) or self.spring.is_rigid(c):
                 left = ti.abs(self.equation.clip_to_side(f - self.equation.rest[c]))
@@ -493,15 +474,22 @@ class CornerPasses(Passes):
         out = ti.cast(0, ti.f64)
         if ti.static(self.spring.soft):
             if self.equation.stores_energy(c):
-                f, _ = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, back))
-                out = self.equation.energy(c, f, self.weight(c), h2_effective, residual)
+                f, _ = self.measured(c, back)
+                w, _ = self.weights(c, self.measured(c, 0)[1])
+                out = self.equation.energy(c, f, w, h2_effective, residual)
         return out
 
     @ti.func
-    def weight(self, c):
-        """Return sum_j w_j |grad_j f|^2 at the present positions."""
-        _, g = self.quantity.remeasure(c, self.relative_corners.relative_positions(c, 0))
-        w = ti.cast(0, self.real)
+    def measured(self, c, back):
+        """Return f of constraint c and its gradients at x - back d."""
+        return self.quantity.remeasure(c, self.corners.relative_positions(c, back))
+
+    @ti.func
+    def weights(self, c, g):
+        """Return sum_j w_j |g_j|^2 of constraint c with gradients g, and the same with split masses."""
+        w, W = ti.cast(0, self.real), ti.cast(0, self.real)
         for k in ti.static(range(self.arity)):
-            w += self.w[self.corners.member(c, k)] * g[k, :].dot(g[k, :])
-        return w
+            i, gg = self.corners.member(c, k), g[k, :].dot(g[k, :])
+            w += self.w[i] * gg
+            W += self.slots.split[i] * gg
+        return w, W

@@ -14,12 +14,16 @@ BLOCK = 32  # corners that one thread sums up: it fixes the order of all sums, w
 
 
 class FixedCorners:
-    """Corners of constraints on `arity` particles each. count: of constraints. places: their slots, None where they have none."""
+    """Corners of constraints on `arity` particles each.
+
+    count: of constraints. places: their slots, None where they have none. origin: see Quantity.
+    """
 
     count: Any = OnDevice()
 
-    def __init__(self, scene: "Scene", name: str, members: np.ndarray, places: np.ndarray | None):
+    def __init__(self, scene: "Scene", name: str, members: np.ndarray, places: np.ndarray | None, origin: Any):
         add, (m, arity) = scene.memory.field, members.shape
+        self.origin, self.first = origin, 0 if origin else 1  # first: the first corner that is not at 0
         self.state, self.slots, self.real, self.arity = scene.state, scene.slots, scene.real, arity
         self.count = scene.memory.number(m)
         self.members = add(f"{name}.members", m, width=arity, kind=ti.i32, values=members)
@@ -65,27 +69,38 @@ class FixedCorners:
 
     @ti.func
     def relative_positions(self, c, back):
-        """Return the corners of constraint c relative to the first, at x - back d: near the origin, where f32 loses no digits."""
+        """Return the corners of constraint c at x - back d, relative to the first (so f32 loses no digits) or the origin."""
         i = self.member(c, 0)
         q = ti.Matrix.zero(self.real, self.arity, self.state.dim)
-        for k in ti.static(range(1, self.arity)):
+        for k in ti.static(range(self.first, self.arity)):
             j = self.member(c, k)
-            r = self.state.separation(j, i) - back * self.state.relative_displacement(self.state.d[j] - self.state.d[i], j, i)
+            r = -back * self.state.d[j]
+            if ti.static(bool(self.origin)):
+                for a in ti.static(range(self.state.dim)):
+                    r[a] += (self.state.x[j][a] - ti.static(self.origin[0][a])) - ti.static(self.origin[1][a])
+                if ti.static(self.state.compensated):
+                    r += self.state.low[j]
+            else:
+                moved = self.state.relative_displacement(self.state.d[j] - self.state.d[i], j, i)
+                r = self.state.separation(j, i) - back * moved
             for a in ti.static(range(self.state.dim)):
                 q[k, a] = r[a]
         return q
 
     @ti.func
     def now_and_start(self, c):
-        """Return the corners of constraint c relative to the first, now and at the start of the substep."""
+        """Return relative_positions() of constraint c now and at the start of the substep."""
         i = self.member(c, 0)
         now = ti.Matrix.zero(self.real, self.arity, self.state.dim)
         start = now
-        for k in ti.static(range(1, self.arity)):
-            j = self.member(c, k)
-            r, moved = self.state.separation(j, i), self.state.relative_displacement(self.state.d[j] - self.state.d[i], j, i)
-            for a in ti.static(range(self.state.dim)):
-                now[k, a], start[k, a] = r[a] - 0 * moved[a], r[a] - moved[a]
+        if ti.static(bool(self.origin)):
+            now, start = self.relative_positions(c, 0), self.relative_positions(c, 1)
+        else:
+            for k in ti.static(range(1, self.arity)):
+                j = self.member(c, k)
+                r, moved = self.state.separation(j, i), self.state.relative_displacement(self.state.d[j] - self.state.d[i], j, i)
+                for a in ti.static(range(self.state.dim)):
+                    now[k, a], start[k, a] = r[a] - 0 * moved[a], r[a] - moved[a]
         return now, start
 
 
@@ -98,7 +113,7 @@ class VariableCorners:
         relax(c)   adds up its blocks, blocks[c] to blocks[c + 1], in order, and solves
         scatter_corner(e)  gives corner e its move, with write_move(e, move)
 
-    The same loops run before push_spring_force(), and reduce_block() before residual_of() where the batch `needs_reduce_block`.
+    The same loops run before push_spring_force(), and reduce_block() before residual_of() where passes say `needs_reduce_block`.
     count, total, block_count: of constraints, corners, blocks. members, owner: the particle and the constraint of each corner.
     starts: the first corner of each constraint.
     """

@@ -20,6 +20,19 @@ def largest_load(batch: "Batch", name: str, value: Any) -> np.ndarray:
     return checks.per_item(repr(batch), name, value, batch.count, least=0.0, infinite=True)
 
 
+def driven_rest(begin: str, text: str) -> property:
+    """Return the property `rest` of a driven batch, which has its initial rest values in the attribute `begin`."""
+
+    def rest(batch: Any) -> np.ndarray:
+        if "drive" in vars(batch.dev):
+            return batch.dev.drive.values()[: batch.count]
+        if begin not in vars(batch):
+            raise AttributeError(f"{batch!r} has no rest before it is in a world, unless it is given.")
+        return vars(batch)[begin]
+
+    return property(rest, doc=text)
+
+
 class Drive:
     """The moving rest values of a batch on the device, and the largest loads against which they move.
 
@@ -36,24 +49,21 @@ class Drive:
     For a rigid constraint, h^2 stands for the multiplier of a load of 1 N in this substep: h h / 2 in a start from given
     velocities, and h (h + h_old) / 2 where these velocities lack half of the last kick, see Integrator.h2_rigid().
 
-    The rest value is kept in f64, where slow motion is not lost in rounding. start: the initial rest values, (m,). largest: (m,),
-    or None where all are infinite, which costs nothing. period: of equivalent values, 0 for none. time_constant: [s]. in_state:
-    its fields in the exact state, by name.
+    The rest value is kept in f64, where slow motion is not lost in rounding. batch: its course() gives goals, speeds and largest
+    loads; if all of these are infinite, they cost nothing. start: the initial rest values, (m,). period: of equivalent values, 0
+    for none. time_constant: [s]. in_state: its fields in the exact state, by name.
     """
 
-    def __init__(
-        self, scene: "Scene", name: str, start: np.ndarray, goal: np.ndarray, speed: np.ndarray, largest: Any,
-        endless: bool, period: float, time_constant: float,
-    ):  # fmt: skip
-        add, m = scene.memory.field, len(start)
+    def __init__(self, scene: "Scene", batch: Any, start: np.ndarray, endless=False, period=0.0, time_constant=0.0):
+        add, m, name, (goal, speed, largest) = scene.memory.field, len(start), repr(batch), batch.course()
         self._memory, self.real = scene.memory, scene.real
-        self.endless, self.period, self.time_constant, self.capped = endless, period, time_constant, largest is not None
+        self.endless, self.period, self.time_constant, self.capped = endless, period, time_constant, batch.capped
         self.target = add(f"{name}.target", m, kind=ti.f64, values=start, state=True)
         self.goal = add(f"{name}.goal", m, kind=ti.f64, values=np.clip(goal, -LARGEST, LARGEST))
         self.speed = add(f"{name}.pace", m, kind=ti.f64, values=speed)
         self.step = add(f"{name}.step_of_rest", m)
         self.in_state = {"target": self.target}
-        if largest is not None:
+        if self.capped:
             self.largest = add(f"{name}.largest", m, values=np.minimum(largest, LARGEST))
             self.most = add(f"{name}.largest_multiplier", m, state=True)
             self.h2_rigid = add(f"{name}.h2_rigid", None)

@@ -129,13 +129,6 @@ class Equation:
         return A * C + B + alpha * lam, A, alpha, lam, W
 
     @ti.func
-    def all_violation(self, c, violation, A):
-        """Return what terms() returns, with what contacts left: no reason for an impulse, but part of the residual."""
-        if ti.static(self.answers):
-            violation += A * self.left[c]
-        return violation
-
-    @ti.func
     def earlier_violation(self, c, f, ago: ti.template()):  # type: ignore[valid-type]
         """Return f - rest with the rest value of `ago` substeps ago."""
         C = f - self.rest[c]
@@ -184,8 +177,11 @@ class Equation:
         return new
 
     @ti.func
-    def removable_violation(self, c, violation, A, alpha, lam, W):
-        """Return the size of the violation that a Jacobi pass would remove."""
+    def left_violation(self, c, f, w, W, h, h2_effective, fresh):
+        """Return the size of the violation that a Jacobi pass would remove. f, w, W, ...: as in terms()."""
+        violation, A, alpha, lam, W = self.terms(c, f, f, w, W, h, h2_effective, 0, fresh)
+        if ti.static(self.answers):  # what contacts left: no reason for an impulse, but part of the residual
+            violation += A * self.left[c]
         size = ti.cast(0, self.real)
         if W > 0:
             new = self.multiplier_of(c, violation, A, alpha, lam, W)

@@ -36,8 +36,9 @@ class NumericGradient:
         runtime.ensure_started()
         m = len(q)
         f, g, d = np.zeros(m), np.zeros((m, self.arity, self.dim)), np.zeros((m, self.arity, self.dim))
-        with self.compiler():
-            self.evaluate(np.ascontiguousarray(q), f, g, d, size)
+        if m:
+            with self.compiler():
+                self.evaluate(np.ascontiguousarray(q), f, g, d, size)
         return f, g if self.analytic else d, d
 
     @ti.kernel

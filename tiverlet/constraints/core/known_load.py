@@ -32,7 +32,8 @@ class KnownLoad:
     """
 
     def __init__(self, scene: "Scene", name: str, batch: Any):
-        self.learns, self.in_state = scene.slots.loads and batch.learns_loads, {}
+        not_flat = batch.driven or batch.quantity.curved or batch.quantity.collapses
+        self.learns, self.in_state = scene.slots.loads and not not_flat, {}
         if self.learns:
             self._memory, self.weights, self.body_load = scene.memory, scene.own_weight, scene.slots.body_load
             self.load = scene.memory.field(f"{name}.load", batch.count, state=True)  # [N]

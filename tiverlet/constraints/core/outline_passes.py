@@ -8,8 +8,10 @@ from ... import checks
 from ...device import ti
 from ...features.feature import FAR, Knob, Scene
 from .equation import Equation
+from .known_load import KnownLoad
 from .passes import Passes
 
+GOAL = property(lambda f: f.pressure * f.rest, doc="The target values of f, pressure * rest, (m,).")
 PRESSURE = Knob(lambda f, v: checks.per_item(repr(f), "pressure", v, f.count, least=0.0), "Factor on the rest value.")
 
 
@@ -20,6 +22,8 @@ class OutlinePasses(Passes):
     (Euler), and outlines need only their gradients, which are slope(e, back) of their Quantity.
     """
 
+    needs_reduce_block = True
+
     def __init__(self, scene: Scene, batch: Any, start: np.ndarray):
         self.name = name = repr(batch)
         m, add = batch.count, scene.memory.field
@@ -27,7 +31,7 @@ class OutlinePasses(Passes):
         self.corners = batch.members.bind(scene, batch)
         self.equation = Equation(scene, batch, self.corners, start)
         self.spring, self.strength, self.limit = self.equation.spring, self.equation.strength, self.equation.limit
-        self.quantity, self.drive = self.equation.quantity, self.equation.drive
+        self.quantity, self.drive, self.known = self.equation.quantity, self.equation.drive, KnownLoad(scene, name, batch)
         self.sums = add(f"{name}.sums", self.corners.block_count, width=8)
         self.start = add(f"{name}.gradient", self.corners.total, width=self.dim)
         self.change = add(f"{name}.change", m)
@@ -151,17 +155,10 @@ class OutlinePasses(Passes):
         return out
 
     @ti.func
-    def forget_excess(self, c):
-        """Forget that constraint c bore too much."""
-        self.strength.forget_excess(c, c + 1)
-
-    @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
         """Return the violation that is left, as in CornerPasses."""
         f, f0, w, W, turn, extent, move = self.sum_blocks(c)
-        violation, A, alpha, lam, W = self.equation.terms(c, f, f0, w, W, h, h2_effective, 0, fresh)
-        violation = self.equation.all_violation(c, violation, A)
-        left = self.equation.removable_violation(c, violation, A, alpha, lam, W)
+        left = self.equation.left_violation(c, f, w, W, h, h2_effective, fresh)
         if w == 0:  # collapsed, or static
             for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
                 if self.w[self.corners.members[e]] > 0 and self.strength.is_intact(c):

@@ -14,6 +14,7 @@ class Passes:
     """
 
     has_own_compile_time = True
+    needs_reduce_block = False  # residual_of() needs reduce_block()
     corners: Any
     name: str
 
@@ -79,10 +80,6 @@ class Passes:
 
         h2_rigid, h2_effective: its multiplier for 1 N, for rigid and for soft constraints.
         """
-
-    @ti.func
-    def forget_excess(self, c):
-        """Forget that constraint c bore too much."""
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):

@@ -22,7 +22,7 @@ class Quantity:
     object that bind() returns. For outlines (arity 0), f is a polynomial of degree dim in the corners, and slope() replaces
     measure(), see OutlinePasses.
 
-    members: FixedSize or VariableSize, the particles of each constraint.
+    members: Members, the particles of each constraint.
     """
 
     arity = 0  # corners of each constraint; 0: a variable number
@@ -35,6 +35,7 @@ class Quantity:
     collapses = 0  # the power of a length that f is, where gradients vanish with the size of the body; else 0
     transcends = False  # needs angles, cube roots or exponentials, which SPIR-V has for f32 only
     foreign = False  # whether f is the user's own, of which nothing is known
+    origin: Any = None  # what corners are relative to, as two f32 words, so that f32 does not round it; None: the first corner
     centred = False  # whether f is measured from a value that moves with the rest value
     state: Any  # set by bind() for the device, as are the next three
     real: Any
@@ -61,6 +62,10 @@ class Quantity:
         new.members = self.members.remapped(some, number)
         return new
 
+    def reversed(self, which: np.ndarray) -> "Quantity":
+        """Where it `collapses`: return the quantity with f of the other sign for constraints in the mask `which`, (m,)."""
+        return self
+
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return f, (m,), of corners x (m, arity, dim) [m]; for outlines, of all positions (n, dim)."""
         raise NotImplementedError(f"{type(self).__name__}.values() is missing.")
@@ -80,13 +85,9 @@ class Quantity:
         bound.corners, bound.rest, bound.drive, bound.ramp = equation.corners, equation.rest, equation.drive, equation.ramp
         return bound
 
-    def relative_corners(self, corners: Any) -> Any:
-        """Return the object that gives measure() its corners: by default relative to the first corner of each constraint."""
-        return corners
-
     @ti.func
     def measure(self, c, q):
-        """Return f of constraint c and its (arity, dim) gradients at corners q (arity, dim), which are relative to corner 0."""
+        """Return f of constraint c, and its gradients, at corners q, (arity, dim) both, relative to corner 0 or `origin`."""
         return 0.0, q
 
     @ti.func
@@ -120,7 +121,7 @@ class Quantity:
 
         q: the corners. The result is about the size of the body.
         """
-        return ti.cast(1, self.real)
+        return q.norm()
 
     @ti.func
     def start_substep(self, c, now, start, fresh):
@@ -144,7 +145,7 @@ def checked(batch: Any, quantity: Quantity) -> Quantity:
     """Return the quantity of a constraint. Raise TypeError if the class of either lacks a part without a default."""
     if not hasattr(type(batch), "rest"):
         raise TypeError(f"{batch!r}: the class has no knob `rest`. Write rest = Knob(check, text) in it, as in core/length.py.")
-    kind, wanted = type(quantity), "measure" if getattr(quantity.members, "arity", 0) else "slope"
+    kind, wanted = type(quantity), "measure" if quantity.members.arity else "slope"
     if getattr(kind, wanted) is getattr(Quantity, wanted):
         raise TypeError(f"{batch!r}: {kind.__name__}.{wanted}() is missing, see Quantity in constraints/core/quantity.py.")
     return quantity

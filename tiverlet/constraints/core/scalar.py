@@ -14,11 +14,12 @@ from ...geometry.ordered import distinct
 from .corner_passes import CornerPasses
 from .drive import Drive
 from .equation import SMALLEST
-from .members import FixedSize
+from .flag import BREAKS, SOFT, Flag
+from .members import Members
 from .outline_passes import OutlinePasses
 from .quantity import Quantity, checked
 from .ramp import Ramp
-from .spring import SOFTEST, per_newton
+from .spring import SOFTEST, bears_nothing, per_newton
 from .strength import strength_of
 
 if TYPE_CHECKING:
@@ -46,6 +47,15 @@ class Scalar(Batch):
     damping = Knob(lambda f, v: checks.per_item(repr(f), "damping", v, f.count, least=0.0), "Of the dashpot.", force=True)
     break_at = Knob(strength_of, "Load beyond which a constraint breaks, (m,); None for never.")
     compiled_for = ("soft", "rigid", "damped", "breaks", "limited", "cusp", "capped")
+    soft, breaks = SOFT, BREAKS
+    rigid = Flag(lambda f: (f.compliance == 0).any(), "Whether any constraint has no compliance.")
+    damped = Flag(lambda f: f.soft and (f.damping > 0).any(), "Whether any constraint has a dashpot.")
+    limited = Flag(lambda f: f.quantity.curved and (f.compliance == 0).any(), "Whether steps have to be limited, see StepLimit.")
+    cusp = Flag(
+        lambda f: f.quantity.has_cusp_at_zero and (f.goal == 0).any(),
+        "Whether any rest value is an f where the gradient is discontinuous: no direction is defined at f = 0.",
+    )
+    capped = Flag(lambda f: f.driven and np.isfinite(f.course()[2]).any(), "Whether any load of a drive is limited.")
 
     each = ("rest", "compliance", "damping", "break_at")
     uploads_all = True
@@ -65,13 +75,13 @@ class Scalar(Batch):
         """Return f of these particles, given as the user gives them."""
         return self.measures(self.fixed(indices, self.measures.arity))
 
-    def fixed(self, indices, arity: int) -> FixedSize:
+    def fixed(self, indices, arity: int) -> Members:
         """Check the indices of constraints on `arity` particles each, and return them as members."""
-        return FixedSize(type(self).__name__, checks.indices(repr(self), self.index_name, indices, checks.ANY, arity=arity))
+        return Members(type(self).__name__, checks.indices(repr(self), self.index_name, indices, checks.ANY, arity=arity))
 
     def hold(self, quantity: Quantity) -> None:
         """Use this f, and act on its particles."""
-        self._keep(quantity=checked(self, quantity), members=quantity.members, arity=getattr(quantity.members, "arity", 0))
+        self._keep(quantity=checked(self, quantity), members=quantity.members, arity=quantity.members.arity)
 
     def check_indices(self, particles: "Particles") -> None:
         """Raise ValueError where a constraint names a particle that does not exist."""
@@ -96,19 +106,6 @@ class Scalar(Batch):
     def transcends(self) -> bool:
         """Whether f needs angles, cube roots or exponentials."""
         return self.quantity.transcends
-
-    @property
-    def cusp(self) -> bool:
-        """Whether any rest value is an f where the gradient is discontinuous (f = 0), or was when kernels were compiled.
-
-        The constraint direction is not defined there.
-        """
-        return self.quantity.has_cusp_at_zero and bool((self.goal == 0).any()) or "cusp" in self.compiled_so_far
-
-    @property
-    def needs_reduce_block(self) -> bool:
-        """Whether residual_of() needs reduce_block(), as for outlines."""
-        return self.arity == 0
 
     @property
     def listing(self) -> Any:
@@ -167,14 +164,10 @@ class Scalar(Batch):
         """The ramp of rest values, while the batch is bound."""
         return self.dev.equation.ramp if "equation" in vars(self.dev) else None
 
-    @property
-    def rest_now(self) -> np.ndarray:
-        """The rest values of the state, (m,): before a ramp, those at which it begins."""
-        return self.ramp.now()[0] if self.ramp and self.ramp.under_way else self.goal
-
     def violation(self, position: np.ndarray) -> np.ndarray:
-        """Return C at the given positions, (m,), with the rest values of the state."""
-        return self.quantity.difference(self.rest_of(position), self.rest_now)
+        """Return C at the given positions, (m,), with the rest values of the state: before a ramp, those at which it begins."""
+        rest = self.ramp.now()[0] if self.ramp and self.ramp.under_way else self.goal
+        return self.quantity.difference(self.rest_of(position), rest)
 
     def gradients(self, position: np.ndarray) -> np.ndarray:
         """Return grad_k f of every constraint at the given positions, (m, arity, dim); for outlines (total, dim)."""
@@ -208,11 +201,15 @@ class Scalar(Batch):
         return np.divide(1, size, out=np.zeros(self.count), where=size > 0)
 
     def prepare(self, particles: "Particles", inv_mass: np.ndarray) -> None:
-        """Check indices against the number of particles, and set the rest values."""
+        """Check indices against the number of particles, and set the rest values. Areas and volumes are positive at the start."""
         self.check_indices(particles)
+        if self.quantity.collapses:
+            for _ in range(2):  # twice: what is flat can be negative in both senses; it keeps its order, so a clone does, too
+                self.hold(self.quantity.reversed(self.rest_of(particles.position) < 0))
         if "rest" not in self.__dict__:
             if self._rest_given is None:
-                self.start_from(self.rest_of(particles.position))
+                rest = self.rest_of(particles.position)
+                self.start_from(np.maximum(rest, 0.0) if self.quantity.collapses else rest)  # may be below 0 by rounding
             else:
                 self.rest = self._rest_given
 
@@ -236,36 +233,10 @@ class Scalar(Batch):
                     f"({int(wrong.sum())} such in all). They are skipped."
                 )
 
-    @property
-    def soft(self) -> bool:
-        """Whether any constraint of the batch has compliance, or had when kernels were compiled."""
-        return bool((self.compliance > 0).any()) or "soft" in self.compiled_so_far
-
-    @property
-    def rigid(self) -> bool:
-        """Whether any constraint of the batch has no compliance, or had none when kernels were compiled."""
-        return bool((self.compliance == 0).any()) or "rigid" in self.compiled_so_far
-
-    @property
-    def damped(self) -> bool:
-        """Whether any constraint has a dashpot, or had when kernels were compiled."""
-        return self.soft and bool((self.damping > 0).any()) or "damped" in self.compiled_so_far
-
-    @property
-    def breaks(self) -> bool:
-        """Whether a load can break constraints of the batch, or could when kernels were compiled."""
-        return self.break_at is not None or "breaks" in self.compiled_so_far
-
-    @property
-    def _strictly(self) -> bytes | None:
-        """The compliances in a world of order above 2, which is built for their values though its kernels are not; else None."""
-        return self.compliance.tobytes() if self.scene and self.scene.order > 2 else None
-
-    @property
-    def _implying(self) -> bytes | None:
-        """The lengths and compliances for which links imply others; None where none does."""
-        system = self.scene.slots.system if self.scene and self.solvable_together and not self.driven else None
-        return self.compliance.tobytes() + self.goal.tobytes() if system and system.has_implied else None
+    def _values(self, scene: Scene) -> bytes:
+        """Return the knobs that only the plan of a world depends on: compliances, and goals of links that imply others."""
+        implies = self.solvable_together and not self.driven and scene.slots.system and scene.slots.system.has_implied
+        return (self.compliance.tobytes() if implies or scene.order > 2 else b"") + (self.goal.tobytes() if implies else b"")
 
     def acts_as_force(self, scene: Scene) -> np.ndarray:
         """Return which constraints act as forces, (m,): soft ones in substeps of an order above 2. See high_order.py."""
@@ -277,63 +248,35 @@ class Scalar(Batch):
         These are constraints that act as forces, rigid ones at a cusp, and drives with a limited load.
         """
         if self.driven:
-            return self.acts_as_force(scene) | np.isfinite(self.largest)
+            return self.acts_as_force(scene) | np.isfinite(self.course()[2])
         return self.acts_as_force(scene) | (self.cusp & (self.goal == 0) & (self.compliance == 0))
 
     @property
     def needs_other_kernels(self) -> bool:
-        """Whether the world has to be rebuilt.
+        """Whether the world has to be rebuilt: also where other constraints than before are relaxed alone, and see _values().
 
-        It has to be where other constraints than before must be relaxed alone, where compliances differ in a world of order above
-        2, and where links imply others, with other lengths and compliances. The result depends on the current values of knobs,
-        not on earlier ones.
+        The result depends on the current values of knobs, not on earlier ones.
         """
         if not (self.scene and self.acts):
             return super().needs_other_kernels
         others = self.solvable_together and bool((self._alone != self.relaxed_alone(self.scene)).any())
-        return super().needs_other_kernels or others or self._made_for != (self._strictly, self._implying)
+        return super().needs_other_kernels or others or self._made_for != self._values(self.scene)
 
     def drive_of(self, scene: Scene) -> Drive:
         """Make the Drive that moves the rest values of a driven batch."""
         raise NotImplementedError
 
-    def course(self) -> tuple[Any, Any]:
-        """Return the goals and the speeds of the rest values of a driven batch, (m,) each."""
+    def course(self) -> tuple[Any, Any, Any]:
+        """Return the goals and the speeds of the rest values of a driven batch, and its largest loads, (m,) each."""
         raise NotImplementedError
-
-    @property
-    def largest(self) -> Any:
-        """The largest loads of a driven batch, (m,)."""
-        raise NotImplementedError
-
-    @property
-    def capped(self) -> bool:
-        """Whether any load of a drive is limited, or was when kernels were compiled."""
-        return self.driven and (bool(np.isfinite(self.largest).any()) or "capped" in self.compiled_so_far)
 
     def start_at(self, position: np.ndarray, first: int) -> None:
         """Adapt a driven batch after particles from number `first` on were placed at `position`, (n, dim)."""
 
     @property
-    def limited(self) -> bool:
-        """Whether steps have to be limited, see StepLimit, or had to be when kernels were compiled.
-
-        They are limited where f is curved and any constraint is rigid.
-        """
-        return self.quantity.curved and bool((self.compliance == 0).any()) or "limited" in self.compiled_so_far
-
-    @property
     def solvable_together(self) -> bool:
         """Whether constraints of the batch can be solved together with others: few corners, and a direction everywhere."""
         return self.arity > 0 and not self.quantity.collapses
-
-    @property
-    def learns_loads(self) -> bool:
-        """Whether rigid constraints of the batch can know their loads.
-
-        They need few corners, no drive, and an f that is not curved and does not collapse.
-        """
-        return self.arity > 0 and not (self.driven or self.quantity.curved or self.quantity.collapses)
 
     def passes(self, scene: Scene) -> Any:
         """Make the passes over a few corners, or over outlines."""
@@ -343,7 +286,7 @@ class Scalar(Batch):
     def bind(self, scene: Scene) -> None:
         """Declare the fields, and note for which values the world is built."""
         super().bind(scene)
-        self._alone, self._made_for = self.relaxed_alone(scene), (self._strictly, self._implying)
+        self._alone, self._made_for = self.relaxed_alone(scene), self._values(scene)
         self._scene_sized = self.dev.limit.scene_sized or self.dev.equation.scene_sized
         self.changed = False
 
@@ -351,7 +294,7 @@ class Scalar(Batch):
         """Write new stiffnesses and strengths to the device. New rest values are reached during the coming frame."""
         if self.acts:
             if self.driven:
-                self.dev.drive.upload(*self.course(), self.largest)
+                self.dev.drive.upload(*self.course())
             else:
                 self.dev.equation.ramp.check_goals()
             self.dev.spring.upload(self.compliance, self.damping)
@@ -366,11 +309,7 @@ class Scalar(Batch):
         positions adds about m ulp(x) / h^2, 1 N for 1 kg some 10 m from the origin at 1200 substeps/s; use f64 where that
         matters. break_at is not affected by it, see Strength.
         """
-        if not self.count:
-            return np.zeros(0)
-        if self.scene is None:
-            raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")
-        if not self.acts:
+        if bears_nothing(self):
             return np.zeros(self.count)
         memory, missing, factors = self.scene.memory, self.sagging, self.scene.multipliers_per_newton
         known = memory.read(self.dev.equation.lam)[: self.count] - missing  # velocities contain it, as a spring force
@@ -378,17 +317,12 @@ class Scalar(Batch):
         return -scale * missing - np.divide(known, factors[1], out=np.zeros(self.count), where=known != 0)
 
     @property
-    def _learns(self) -> bool:
-        """Whether the compiled kernels learn loads of the batch."""
-        return "known" in vars(self.dev) and self.dev.known.learns
-
-    @property
     def sagging(self) -> np.ndarray:
         """The multipliers of the last substep without known loads, (m,): the load that violations bear."""
         lam = self.scene.memory.read(self.dev.equation.lam)[: self.count].astype(np.float64)
-        return lam - self.scene.memory.read(self.dev.known.given)[: self.count] if self._learns else lam
+        return lam - self.scene.memory.read(self.dev.known.given)[: self.count] if self.dev.known.learns else lam
 
     def forget_loads(self, some: np.ndarray) -> None:
         """Forget the known loads of constraints in the mask `some`, (m,), whose particles were placed elsewhere."""
-        if self._learns:
+        if self.dev.known.learns:
             self.dev.known.forget(some)

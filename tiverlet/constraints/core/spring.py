@@ -8,7 +8,7 @@ import numpy as np
 from ...device import ti
 
 if TYPE_CHECKING:
-    from ...features.feature import Scene
+    from ...features.feature import Batch, Scene
 
 RESTARTED = 2  # `fresh` at a start from velocities that displacements were turned into, see Equation.spring_force()
 FIRM = 0.99  # theta from which on a spring is rigid in an impact
@@ -40,15 +40,11 @@ def late_share(alpha, w, h2_effective, late):
     return stiff_at(ratio / 2 * (h2_effective / late) ** 2) * theta / (theta + ratio)
 
 
-@ti.func
-def law(alpha, damping, h, w, fresh):
-    """Return the coefficients of C_(n+1), C_n and C_(n-1) in C* + alpha c dC/dt: central where resolved, backward where stiff."""
-    rigid, gamma = stiff(alpha, h, w), damping * alpha / h
-    A = (1 + 3 * rigid) / 4 + gamma * (1 + rigid) / 2
-    now, last = (1 - rigid) / 2 - gamma * rigid, (1 - rigid) / 4 - gamma * (1 - rigid) / 2
-    if fresh != 0:
-        A, now, last = rigid + gamma, 1 - rigid - gamma, 0 * rigid
-    return A, now, last
+def bears_nothing(batch: "Batch") -> bool:
+    """Whether a batch has no load, because no world moves its particles. Raise RuntimeError before a world has it."""
+    if batch.count and batch.scene is None:
+        raise RuntimeError(f"{batch!r}.load: there is none before a world has been stepped with it.")
+    return not (batch.count and batch.acts)
 
 
 def per_newton(multipliers: tuple[float, float], compliance: np.ndarray, weights: Callable[[], np.ndarray]) -> np.ndarray:
@@ -101,11 +97,6 @@ class Spring:
         if self.damped:
             self._memory.write(self.damping, damping)
 
-    def begin(self, compliance: np.ndarray, damping: np.ndarray) -> None:
-        """Set new values, and start with springs that are not stretched."""
-        self.upload(compliance, damping)
-        self._memory.write(self.last, np.zeros(1))
-
     @ti.func
     def is_rigid(self, c):
         """Whether constraint c has no compliance."""
@@ -125,14 +116,6 @@ class Spring:
                 if late > 0 and w > 0:
                     share = late_share(self.alpha[c], w, h2_effective, late)
         return h2_effective + share * late
-
-    @ti.func
-    def dashpot(self, c):
-        """Return the damping of constraint c."""
-        out = ti.cast(0, self.real)
-        if ti.static(self.damped):
-            out = self.damping[c]
-        return out
 
     @ti.func
     def bearing_share(self, borne, h2_effective, left):
@@ -178,10 +161,20 @@ class Spring:
 
     @ti.func
     def law(self, c, h, w, fresh):
-        """Return law() of constraint c."""
-        return law(self.alpha[c], self.dashpot(c), h, self.slots.softened(w), fresh)
+        """Return the coefficients of C_(n+1), C_n, C_(n-1) in C* + alpha c dC/dt: central where resolved, backward where stiff.
+
+        w: see stiff(). fresh: not 0 at a start.
+        """
+        rigid, gamma = self.stiff(c, h, w), ti.cast(0, self.real)
+        if ti.static(self.damped):
+            gamma = self.damping[c] * self.alpha[c] / h
+        A = (1 + 3 * rigid) / 4 + gamma * (1 + rigid) / 2
+        now, last = (1 - rigid) / 2 - gamma * rigid, (1 - rigid) / 4 - gamma * (1 - rigid) / 2
+        if fresh != 0:
+            A, now, last = rigid + gamma, 1 - rigid - gamma, 0 * rigid
+        return A, now, last
 
     @ti.func
     def stiff(self, c, h, w):
-        """Return stiff() of constraint c."""
+        """Return stiff() of constraint c, with the stiffness that it has, see softness.py."""
         return stiff(self.alpha[c], h, self.slots.softened(w))

@@ -39,19 +39,19 @@ class Strength:
     rounding. m: the root of the sum of the squares of the masses of the body, since roundings of particles are independent.
 
     A batch that never `breaks` costs nothing. overload: the load as a multiple of break_at, 0 up to 1. in_state: its fields in
-    the exact state, by name. entries, width: number and components of its loads, if they are not one number for each
+    the exact state, by name. corners: those of the batch, if its loads are a vector for each corner, not a number for each
     constraint.
     """
 
-    def __init__(self, scene: "Scene", name: str, batch: Any, entries: int | None = None, width: int = 0):
-        self._memory, self.breaks, self.in_state = scene.memory, batch.breaks, {}
+    def __init__(self, scene: "Scene", name: str, batch: Any, corners: Any = None):
+        self._memory, self.breaks, self.corners, self.in_state = scene.memory, batch.breaks, corners, {}
         if self.breaks:
             limit = np.full(batch.count, np.inf) if batch.break_at is None else batch.break_at
-            self.counter, self.state, self.width = scene.slots.broken, scene.state, width
+            self.counter, self.state = scene.slots.broken, scene.state
             self.limit = scene.memory.field(f"{name}.break_at", batch.count, values=limit)
             self.stamp = scene.memory.field(f"{name}.broken", batch.count, kind=ti.i32, state=True)
             self.overload = scene.memory.field(f"{name}.overload", batch.count)
-            total = batch.count if entries is None else entries
+            total, width = (corners.total, scene.state.dim) if corners else (batch.count, 0)
             self.excess = scene.memory.field(f"{name}.over", total, width=width, state=True)
             epsilon = np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps
             least = MARGIN * epsilon * scene.slots.rounding_mass(batch)
@@ -83,10 +83,10 @@ class Strength:
         """
         total = self.excess[e] + load
         size = 0 * per_newton
-        if ti.static(self.width == 0):
-            size = ti.abs(total)
-        else:
+        if ti.static(bool(self.corners)):
             size = total.norm()
+        else:
+            size = ti.abs(total)
         past, share = size - self.limit[c] * per_newton, 0 * size
         if past > 0:
             share = past / size
@@ -96,10 +96,13 @@ class Strength:
         return past
 
     @ti.func
-    def forget_excess(self, begin, end):
-        """Forget the excess of some entries: what breaks beside them unloads them."""
-        for e in range(begin, end):
-            self.excess[e] *= 0
+    def forget_excess(self, c):
+        """Forget the excess of constraint c: what breaks beside it unloads it."""
+        if ti.static(bool(self.corners)):
+            for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+                self.excess[e] *= 0
+        else:
+            self.excess[c] *= 0
 
     @ti.func
     def overload_by(self, c, past, per_newton):
