@@ -26,27 +26,6 @@ def loops(world, x, area, rims, compliance, damping, **settings):
 
 
 @pytest.mark.slow
-def test_polygons_keep_their_area_or_take_that_of_their_pressure(world):
-    # R25: the area is n/2 sin(2 pi / n), and passes keep it while the rims swing; every second loop is given clockwise.
-    sizes = (3, 6, 12, 64)
-    first = np.cumsum([0, *sizes])
-    rims = [np.arange(a, b) for a, b in zip(first, first[1:], strict=False)]
-    x = np.concatenate([ring(n) + [3 * k, 0] for k, n in enumerate(sizes)])
-    want = np.array([case("R25_polygon_area")["values"][f"n{n}"]["area"] for n in sizes])
-    v = 0.5 * np.random.default_rng(0).normal(size=x.shape)
-    # Some compliance, so that this is the structure of the tests below.
-    area = tv.Area([rim[:: 1 - 2 * (k % 2)] for k, rim in enumerate(rims)], compliance=[0.0, 0.0, 0.0, 1e-12])
-    w, _ = loops(world, x, area, rims, 1e-2, 2.0, velocity=v, pinned=first[:4])
-    np.testing.assert_allclose(area.rest, want, rtol=1e-14)
-    for iterations, target in ((1, 1e-3), (40, 1e-6)):
-        rerun(w, 1.0, iterations=iterations)
-        assert np.abs(area.rest_of(w.position) / want - 1).max() <= target
-    area.pressure = [1.2, 1.0, 0.8, 1.1]
-    rerun(w, 1.0)
-    np.testing.assert_allclose(area.rest_of(w.position), area.pressure * want, rtol=1e-5)
-
-
-@pytest.mark.slow
 def test_a_soft_ring_breathes_and_its_pressure_holds_a_rim(world):
     # n masses m on a ring: E = (A - A0)^2 / (2 alpha), A = c R^2, c = n/2 sin(2 pi / n): n m R'' = -2 c R (c R^2 - A0) / alpha.
     # In balance, the pressure p = (pressure A0 - A) / alpha of the other ring holds a rim of springs: p R cos(pi / n) = T.
@@ -144,29 +123,21 @@ def angular(w, m, steps):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("precision", ["f32", "f64"])
-def test_tennis_racket(world, precision):
-    # S05: a rigid cluster that spins about its middle axis turns over after half a period, again and again: from +1 to -1, then
-    # back, goes the cosine of that axis against L.
-    c = case("S05_tennis_racket")
-    p, values = c["params"], c["values"]
+def test_a_cluster_that_tumbles_in_f32_keeps_its_angular_momentum_and_period(world):
+    # S05, see test_cases.py: a cluster that spins about its middle axis turns over after half a period, again and again: from +1
+    # to -1, then back, goes the cosine of that axis against L. In f32 L drifts by 2^-25 of itself in each of 12 000 substeps, see
+    # ShapeMatch: 3.3e-6; by sqrt(2) times that, since the dither of moves is as large as the rounding.
+    p, values = case("S05_tennis_racket")["params"], case("S05_tennis_racket")["values"]
     x = np.repeat(np.diag(p["half_axes"]), 2, axis=0) * np.array([1, -1] * 3)[:, None]
-    start = tv.Particles(x, velocity=np.cross(p["omega0_body"], x))
-    w = world(start, [tv.ShapeMatch([np.arange(6)]), tv.Gravity(0.0)], precision=precision)
-    want = [values["t2.0"]["particle1_xyz"], values["t2.0"]["particle3_xyz"]]
-    errors = [rms(rerun(w, 2.0, substeps=n).position[[0, 2]], want) for n in (10, 20, 40)]
-    assert errors[1] <= 3e-5 and (precision == "f32" or 1.9 <= order(errors) <= 2.1)
-    rerun(w, 1 / 60, substeps=20)
+    w = world(tv.Particles(x, velocity=np.cross(p["omega0_body"], x)), [tv.ShapeMatch([np.arange(6)]), tv.Gravity(0.0)])
+    w.step(1 / 60)
     spin, tilt = angular(w, 1.0, 1200), [np.nan]
     for _ in range(599):
         w.step(1 / 60)
         axis, spun = w.position[2] / np.linalg.norm(w.position[2]), angular(w, 1.0, 1200)
         tilt.append(axis @ spun / np.linalg.norm(spun))
-    # In f32 the angular momentum drifts by 2^-25 of itself in each of 12 000 substeps, see ShapeMatch: 3.3e-6; by sqrt(2)
-    # times that, since the dither of moves is as large as the rounding. (omega h)^2 / 6 of the discrete start is 3e-6.
-    most = 2 * 4.6e-6 if precision == "f32" else 1e-9
-    assert np.linalg.norm(spun - spin) <= most * np.linalg.norm(spin)
-    assert abs(np.linalg.norm(spun) / values["L_norm"] - 1) <= 3e-6 + most
+    assert np.linalg.norm(spun - spin) <= 2 * 4.6e-6 * np.linalg.norm(spin)
+    assert abs(np.linalg.norm(spun) / values["L_norm"] - 1) <= 3e-6 + 2 * 4.6e-6  # (omega h)^2 / 6 of the discrete start
     turns = np.flatnonzero(np.diff(np.sign(tilt[1:])))
     assert 2 * (turns[1] - turns[0]) / 60 == pytest.approx(values["omega_period_closed_form"], rel=0.02)
     far = np.linalg.norm(w.position[:, None] - w.position[None], axis=2) - np.linalg.norm(x[:, None] - x[None], axis=2)
@@ -190,33 +161,6 @@ def test_spins_beyond_the_step(world):
         # sin(angle) = omega h of the start; the displacement is a chord, so d / h overstates v where both are large.
         assert w.last.energy <= kinetic * (1.1 if spin == 600 else 1.0) and ("turned" in report.flags) == (spin > 600)
         assert np.linalg.norm(w.position[0] - w.position[1]) == pytest.approx(2.0, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    "dim, precision, limit", [(2, "f64", 1e-12), pytest.param(3, "f32", 5e-6, marks=pytest.mark.slow)], ids=["2D", "3D"]
-)
-def test_shapes_without_extent(world, dim, precision, limit):
-    # Rows 23, 57: general, flat, on a line, in one place, tiny, mirrored; and one of a single particle. All start with random
-    # velocities.
-    rng = np.random.default_rng(0)
-    full, flat = rng.normal(size=(6, dim)), rng.normal(size=(6, dim))
-    flat[:, -1] = 0
-    line, tiny = np.outer(rng.normal(size=6), rng.normal(size=dim)), np.outer(np.arange(6), np.eye(dim)[-1] * 1e-9)
-    parts = [full, flat, line, np.full((6, dim), 0.5), tiny, full, full[:1]]
-    q = np.concatenate([a + 3 * k for k, a in enumerate(parts)])
-    x, m = q.copy(), rng.uniform(0.5, 2, len(q))
-    x[30:36, 0] = 30 - x[30:36, 0]
-    clusters = [np.arange(6 * k, min(6 * k + 6, len(q))) for k in range(7)]
-    start = tv.Particles(x, mass=m, velocity=rng.normal(size=x.shape))
-    w = world(start, [tv.ShapeMatch(clusters, rest=q), tv.Gravity(0.0)], precision=precision)
-    w.run(1.0)
-    y = w.position
-    np.testing.assert_allclose(tv.measure.momentum(w), m @ start.velocity, atol=1e-3 if precision == "f32" else 1e-7)
-    for c in clusters:
-        now, rest = (np.linalg.norm(a[c][:, None] - a[c][None], axis=2) for a in (y, q))
-        assert np.abs(now - rest).max() <= limit
-    if dim == 3:  # turned, not reflected
-        assert np.linalg.det((y[30:36] - y[30]).T @ (q[30:36] - q[30])) > 0
 
 
 @pytest.mark.slow

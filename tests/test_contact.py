@@ -60,23 +60,6 @@ def test_overlap_parts_at_push_out_without_velocity(world, dim):
         assert np.abs((w.position[some] - x[some]).mean(axis=0)).max() < 1e-9
 
 
-@pytest.mark.slow
-def test_idle_columns_do_not_creep(world):
-    # Row 43: 1e5 substeps at rest on the floor, in f32.
-    w = smooth(world, tv.Particles([[0.5, 0.5], [0.5, 1.501]], radius=0.5), (1, 9), rate=1.0, substeps=20)
-    w.run(20.0)
-    before = w.position
-    w.substeps = 200
-    w.run(5.0)
-    w.substeps = 1000
-    w.run(20 / 1.2, dt=1 / 1.2)  # h = 1 / 1200, as before
-    rest = w.position
-    w.run(100 / 1.2, dt=1 / 1.2)
-    assert np.abs(w.position - rest).max() <= 0.5e-6
-    assert np.abs(w.position - before).max() <= 1e-4
-    assert tv.measure.kinetic_energy(w) <= 1e-6 * 9.81 * 0.5
-
-
 def test_a_column_of_60_stands(world):
     x = np.stack([np.full(60, 0.1), 0.1 + 0.2001 * np.arange(60)], axis=1)
     w = smooth(world, tv.Particles(x, radius=0.1), (0.2, 20), substeps=2)
@@ -87,7 +70,8 @@ def test_a_column_of_60_stands(world):
 
 
 def test_outrunning_the_contacts_is_flagged(world):
-    # Row 47: at v h / r = 0.5 the pair is caught; above 1 it may pass through, which is flagged.
+    # At v h / r = 0.5 the pair is caught; above 1 it may pass through, which is flagged. Those that come from 0.22 m to behind
+    # each other in a substep, and are further apart at its end than what rows look ahead, are met on the way.
     r, h = 0.1, 1 / 600
     start = tv.Particles([[-0.55, 0.0], [0.55, 0.0]], radius=r)
     w = smooth(world, start, g=0.0, low=(-99.0, -99.0), push_out=0.25, substeps=10)
@@ -98,6 +82,11 @@ def test_outrunning_the_contacts_is_flagged(world):
         assert ("tunnelling-risk" in report.flags) == flagged
         if not flagged:
             assert w.position[0, 0] < w.position[1, 0]
+    w.substeps = 4
+    for speed in (53.0, 55.0, 57.0):
+        w.position, w.velocity = [(0, 0), (0.22, 0.01)], [(speed, 0), (-speed, 0)]
+        assert "tunnelling-risk" in w.step(1 / 60).flags
+        assert w.position[0, 0] < w.position[1, 0] and np.abs(w.velocity[:, 0]).max() < 1.0
 
 
 @pytest.mark.parametrize(("part", "flags"), [(0.045, set()), (0.055, {"compressed"})])

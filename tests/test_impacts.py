@@ -5,7 +5,7 @@ import pytest
 
 import tiverlet as tv
 
-from .conftest import case, rerun
+from .conftest import case
 
 
 def discs(
@@ -136,13 +136,6 @@ def test_newtons_cradle_lets_go_as_many_as_came(world):
             np.testing.assert_allclose(got, right, atol=1e-9)
 
 
-def test_impacts_in_turn_do_not_depend_on_the_substep(world):
-    # A ball breaks a triangle of 15 with gaps: each impact has its own time, place and normal, whatever the substep.
-    rack = [(0.21 * np.sqrt(0.75) * i, 0.21 * (j - i / 2)) for i in range(5) for j in range(i + 1)]
-    w = discs(world, np.array([(-1.0, 0.03), *rack]), np.r_[8.0, np.zeros(15)][:, None] * (1, 0), 1.0, [1.0], radius=0.1)
-    np.testing.assert_allclose(*(rerun(w, 0.2, substeps=substeps).velocity for substeps in (6, 50)), atol=1e-9)
-
-
 @pytest.mark.parametrize(
     "dim, precision, g, limit", [(2, "f64", 10.0, 1e-12), pytest.param(3, "f32", 0.0, 1e-5, marks=pytest.mark.slow)]
 )
@@ -201,18 +194,6 @@ def test_what_is_struck_by_two_in_one_substep_goes_from_impact_to_impact(world):
     ends = [by_events(*three, 1 / 240) for three in zip(x, v, mass, strict=True)]
     np.testing.assert_allclose(w.position[:-5], np.concatenate([x for x, _ in ends]), atol=1e-12)
     np.testing.assert_allclose(w.velocity[:-5], np.concatenate([v for _, v in ends]), atol=1e-10)
-
-
-def test_what_stands_slips_above_the_static_coefficient(world):
-    # Sticks below the static coefficient and slides with the dynamic one: to 0.1 degrees.
-    mu_s, mu_d = 0.5, 0.3
-    for degrees, slides in ((np.degrees(np.arctan(mu_s)) - 0.1, False), (np.degrees(np.arctan(mu_s)) + 0.1, True)):
-        a = np.radians(degrees)
-        slope = tv.HalfSpace((np.sin(a), np.cos(a)), friction=(mu_s, mu_d))
-        w = world(tv.Particles([[0.0, 0.1 / np.cos(a)]], radius=0.1), [tv.Gravity(9.81), slope], precision="f64")
-        w.run(1.0)
-        way = 9.81 * (np.sin(a) - mu_d * np.cos(a)) / 2 if slides else 0.0
-        assert np.hypot(*(w.position[0] - [0, 0.1 / np.cos(a)])) == pytest.approx(way, rel=1e-9, abs=1e-12)
 
 
 def test_a_disc_on_a_fixed_disc_slips_above_its_coefficient(world):

@@ -99,21 +99,6 @@ def test_energy_stays_and_lists_grow(world):
     check_accelerations(w, 1e-5, 1e-13)
 
 
-def test_added_particles_are_pulled_from_where_they_are(world):
-    # Frames are undone and repeated with more substeps.
-    w = crowd(world, 60, precision="f64", substeps="auto")
-    w.run(0.1)
-    velocity = w.velocity
-    more = w.add(tv.Particles([[0.5, 0.5], [0.55, 0.5]], velocity=[[0.0, 1.0], [0.0, -1.0]]))
-    assert np.abs(w.velocity[:-2] - velocity).max() < 1e-12
-    assert np.abs(w.velocity[more.indices] - [[0, 1], [0, -1]]).max() < 1e-12
-    momentum = w.particles.mass @ w.velocity
-    w.run(0.05)
-    assert np.abs(w.particles.mass @ w.velocity - momentum).max() < 1e-12
-    w.remove(more)
-    assert len(w.particles) == 60 and not w.step(1 / 60).flags
-
-
 def test_what_is_too_stiff_for_the_substep_is_named(world):
     # Two particles of 1 kg on a spring of k = 4e4 N/m: omega = sqrt(2 k) = 283 / s, so h = 1 / 120 s is too long.
     @ti.func

@@ -128,33 +128,15 @@ def test_chains_of_links_are_found_as_by_brute_force():
 
 
 @pytest.mark.slow
-def test_a_ball_on_a_rope_swings_as_without_contacts(world):
-    # The ball covers the end of the rope, and beads of radius above 1/7 m overlap the next but one. No contact could part them.
+def test_what_links_hold_inside_has_no_contact_unless_they_can_give_way(world):
+    # The ball covers the end of its rope, and beads of radius above 1/7 m overlap the next but one. No contact could part them.
     rope = tv.shapes.rope((0, 3), (2, 3), points=15)
     start = tv.Particles(rope.position, radius=[0.15] * 14 + [0.3], mass=[0.2] * 14 + [200.0], pinned=[0])
-    there, without = (world(start, [tv.Gravity(9.81), tv.Distance(rope.links), *more]) for more in ([tv.Contact()], []))
-    for _ in range(90):
-        report = there.step(1 / 60)
-        without.step(1 / 60)
-        assert not report.flags and not report.contacts
-    np.testing.assert_array_equal(there.position, without.position)
-
-
-def test_what_can_give_way_holds_nothing_inside(world):
+    assert len(tv.measure.overlapping(start.position, start.radius)[0]) > 20
+    assert len(world(start, [tv.Distance(rope.links), tv.Contact()]).contacts) == 0
     # Two links of 1 m join three particles of radius 1.5 m. The ends overlap for good, so they have no contact. They have one
     # if the links are springs or may break.
     x = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
     for more in ({}, {"compliance": 1e-3}, {"break_at": 5.0}):
         w = world(tv.Particles(x, radius=1.5), [tv.Distance([[0, 1], [1, 2]], **more), tv.Contact()])
         assert ([0, 2] in w._runner.search._excluded_pairs.tolist()) is (not more)  # these are not listed
-
-
-@pytest.mark.slow
-def test_discs_that_would_pass_each_other_in_a_substep_collide(world):
-    # At 106 m/s and more they come from 0.22 m to behind each other in a substep, and are further apart at its end than what rows
-    # look ahead. The list has the pair then, so it is met on the way: discs without restitution stay on their sides.
-    for speed in (53.0, 55.0, 57.0):
-        start = tv.Particles([(0, 0), (0.22, 0.01)], radius=0.1, velocity=[(speed, 0), (-speed, 0)])
-        w = world(start, [tv.Contact()], substeps=4, precision="f64")
-        assert "tunnelling-risk" in w.step(1 / 60).flags
-        assert w.position[0, 0] < w.position[1, 0] and np.abs(w.velocity[:, 0]).max() < 1.0

@@ -261,7 +261,6 @@ def box(width, height, *more, **options):
     (lambda: [tv.Periodic((0, 0), (1, 1, 1))], "two corners"),
     (lambda: [box(1, 1, ())], "leaves nothing periodic"),
     (lambda: [box(1, 1, (2,))], "axes"),
-    (lambda: [box(1, 1, shear=np.nan)], "shear"),
     (lambda: [tv.Periodic((0, 0, 0), (1, 1, 1))], "2D"),
     (lambda: [box(9, 0.7), tv.Contact()], "two particles touch.*longer than 0.8"),
     (lambda: [box(9, 9), box(9, 9)], "more than one Periodic"),

@@ -230,20 +230,6 @@ def test_what_a_ray_starts_in_or_on(world):
     assert len(point) > 100 and (again.particle != 2).all()
 
 
-FLOORS = [tv.HalfSpace((0, 1), 0.5), tv.Box((-9, 0.5), (9, 30)), tv.Polygon([(-9, 0), (9, 0), (9, 0.5), (-9, 0.5)])]
-
-
-@pytest.mark.parametrize("wall", FLOORS, ids=repr)
-def test_floors_are_met_at_their_surface_and_not_along_it(wall):
-    # The height of the origin, the slope of the ray, and its way to the floor y = 0.5 before other sides of the wall.
-    ways = (1.5, -1.0, 1.0), (0.5, -1.0, 0.0), (0.5, 1.0, np.inf), (0.5, 0.0, np.inf), (0.6, 0.0, np.inf), (1.5, -1e-9, np.inf)
-    for y, down, far in ways:
-        d = np.array([[1.0 if abs(down) < 1 else 0.0, down]])
-        distance, normal = wall.cast(np.array([[0.0, y]]), d / np.linalg.norm(d), 0.0)
-        assert np.where(distance < 8, distance, np.inf)[0] == far, (y, down)
-        assert far == np.inf or (normal == (0, 1)).all()
-
-
 def test_a_sheet_has_two_sides():
     # A sheet without thickness; a ray that starts on it does not meet it, in any direction.
     for sheet in (
@@ -334,17 +320,10 @@ OTHER, FAN = tv.HalfSpace((0, 1)), (np.zeros((3, 2)), np.ones((2, 2)))
 
 
 @pytest.mark.parametrize("ask, pattern", [
-    (lambda w: w.ray((0, 0), (0, 0)), "direction = 0 has no direction"),
-    (lambda w: w.ray((0, 0), [(1, 0), (0, 0)]), r"direction\[1\] = 0 has no direction"),
-    (lambda w: w.ray((0, np.nan), (1, 0)), r"origin\[1\] = nan"),
     (lambda w: w.ray([(0, 0), (np.inf, 0)], (1, 0)), r"origin\[1, 0\] = inf"),
     (lambda w: w.ray((1e20, 0), (1, 0)), "out of range"),
-    (lambda w: w.ray((0, 0), (1, np.nan)), r"direction\[1\] = nan"),
-    (lambda w: w.ray((0, 0, 0), (1, 0)), r"origin has shape \(3,\), but 2 numbers"),
     (lambda w: w.ray((0, 0), 1.0), r"direction has shape \(\)"),
     (lambda w: w.ray(*FAN), "3 origins and 2 directions"),
-    (lambda w: w.ray((0, 0), (1, 0), -1.0), r"reach\[0\] = -1, but it must be at least 0"),
-    (lambda w: w.ray((0, 0), (1, 0), np.nan), r"reach\[0\] = nan"),
     (lambda w: w.ray((0, 0), (1, 0), radius=-1.0), "radius = -1"),
     (lambda w: w.ray((0, 0), (1, 0), skip=[2]), r"skip\[0\] = 2, but there are 2 particles"),
     (lambda w: w.ray((0, 0), (1, 0), skip=[True]), r"skip has shape \(1,\), but a mask of shape \(2,\)"),

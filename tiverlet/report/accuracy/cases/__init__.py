@@ -15,9 +15,9 @@ LEFT_OUT = {
     "R04_oscillator_k100_dt0.1": "the same scene as R04_oscillator_k100_dt0.01, at another step",
     "R10_catenary": "a continuum; R10b are the ropes of links that it is the limit of",
     "R20_rolling": "spheres that roll: tests/test_grains.py",
-    "R22_packing": "statistics of many contacts: tests/test_granular.py",
-    "R23_hard_gas_pressure": "statistics of many contacts: tests/test_granular.py",
-    "R24_maxwell": "statistics of many contacts: tests/test_granular.py",
+    "R22_packing": "statistics of many contacts: tests/test_grains.py",
+    "R23_hard_gas_pressure": "statistics of many contacts: tests/test_grains.py",
+    "R24_maxwell": "statistics of many contacts: tests/test_grains.py",
     "R25b_volume": "volumes are held at rest, which tests/test_bodies.py measures",
 }
 
