@@ -39,13 +39,13 @@ class Forgery:
     def __init__(self, path):
         data = path.read_bytes()
         self.head, parts = data[: messages.HEADER], messages.split(data)
-        self.messages = [(kind, m, messages.Chunk(m).rows() if kind == messages.CHUNK else None) for kind, m in parts if kind]
+        self.messages = [(kind, m, messages.rows_of(m) if kind == messages.CHUNK else None) for kind, m in parts if kind]
 
     def save(self, to, seal=True):
         """Write the recording to `to` and return the path. seal: append a valid end record."""
         out = self.head
         for kind, message, rows in self.messages:
-            body = message if rows is None else messages.Chunk(message).holding(rows)
+            body = message if rows is None else messages.holding(message, rows)
             out += messages.HEAD.pack(kind, len(body)) + body
         if seal:
             out += messages.HEAD.pack(messages.END, 34) + reader.SEAL + hashlib.sha256(out).digest()
@@ -98,7 +98,7 @@ class Forgery:
             batch = batch.replace_schema_metadata({**batch.schema.metadata, b"rerun:entity_path": f"/{entity}".encode()})
         if static:
             batch = batch.drop_columns([name for name in ("frame", "time") if name in batch.schema.names])
-            message += bytes([7 << 3, 1])
+            message = message[:-1] + b"\x01"  # its last field
         self.messages.insert(1 + max(n for n, m in enumerate(self.messages) if m[0] == 1), (kind, message, batch))
 
     def journal(self, change, seal=True):
@@ -142,7 +142,7 @@ def changed(value):
 
 
 def pictures(original):
-    """Yield names and recordings in which each column of the picture, and each sixth of its layout, has one cell changed.
+    """Yield names and recordings in which each column of the picture, and each twelfth of its layout, has one cell changed.
 
     In chunks of the scene, rows are also dropped, or others stand before them with later ids, for all frames, or elsewhere: in
     each chunk in two of these ways, in turn.
@@ -155,7 +155,7 @@ def pictures(original):
             column = batch.column(name).cast(pa.int64()) if name == "time" else batch.column(name)
             values = column.to_pylist()
             row = max((r for r, value in enumerate(values) if value not in (None, [])), default=None)
-            if row is None or ("blueprint" in batch.schema.names and k % 6):
+            if row is None or ("blueprint" in batch.schema.names and k % 12):
                 continue
             forged = Forgery(original)
             forged.set(k, **{name.replace(":", "__"): [*values[:row], changed(values[row]), *values[row + 1 :]]})

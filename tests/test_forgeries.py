@@ -48,7 +48,7 @@ def rewritten(original, tmp_path):
 
 
 @pytest.mark.slow
-def test_whatever_is_forged_is_named(original, quick, tmp_path):
+def test_every_forged_recording_is_found(original, quick, tmp_path):
     def told(name):
         FORGERIES[name](forged := Forgery(original))
         return name, forged
@@ -200,7 +200,7 @@ def test_a_file_calls_nothing_in_a_script_and_leaves_no_folder(original, rewritt
         tv.replay(forged.save(tmp_path / "b.rrd")).export(str(tmp_path / "a.npz"))
 
 
-def test_what_a_file_asks_for_is_bounded(original, rewritten, quick):
+def test_the_memory_that_a_file_asks_for_is_bounded(original, rewritten, quick):
     def shape(e):
         if e["arrays"]:
             e["arrays"][0][2] = [10**9, 10]
@@ -216,12 +216,12 @@ def test_what_a_file_asks_for_is_bounded(original, rewritten, quick):
     # Rows that claim to unpack to 70 GB, and more data than is allowed.
     forged = Forgery(original)
     message = forged.messages[forged.chunks("world/scene/particles")[0]][1]
-    start, _, end, _ = messages.Chunk(message)._fields[messages.SIZE]
+    fields, key = reader.record(message, messages.FIELDS), bytes([messages.SIZE << 3])
     out = reader.ResultFile(os.open(os.devnull, os.O_WRONLY), 1000)
     taker = reader.Reader(out, False)
-    taker.stores.append(reader.store_of(reader.record(message, "1 2 3 4 5 6 7")[1]))
+    taker.stores.append(reader.store_of(fields[1]))
     with pytest.raises(reader.Damaged, match="unpack to"):
-        taker.chunk(message[:start] + bytes([messages.SIZE << 3]) + messages._as_varint(1 << 36) + message[end:])
+        taker.chunk(message.replace(key + messages._varint(fields[messages.SIZE]), key + messages._varint(1 << 36), 1))
     with pytest.raises(reader.Damaged, match="MB"):
         out.put(b"x" * 1001)
     out.close()
