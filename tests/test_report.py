@@ -1,12 +1,12 @@
 """The reports: what they measure, what they say of it, and that they find a defect in the engine."""
 
 import json
-import multiprocessing
 import os
 import pathlib
+import pickle
 import re
-import shutil
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 
 import numpy as np
@@ -20,9 +20,7 @@ from tiverlet.report.accuracy.cases import LEFT_OUT, chosen, entries
 from tiverlet.report.stress.certificate import certify
 from tiverlet.report.stress.rows import ROWS, Row
 
-from .conftest import figures, python
-
-ROOT = pathlib.Path(tv.__file__).parent
+from .conftest import figures
 
 
 def test_every_known_answer_is_a_case_or_said_to_be_left_out():
@@ -103,7 +101,7 @@ def test_a_report_can_be_read_by_people_and_machines(report, tmp_path):
 
 
 @pytest.mark.slow
-def test_what_is_wrong_is_said(report):
+def test_wrong_orders_large_errors_and_divergence_are_named(report):
     # The same points, made worse: order 1 instead of 2, an error above the limit, one that has diverged, a loss in f32.
     case, method = "D01_double_pendulum", "Direct"
 
@@ -127,31 +125,22 @@ def test_what_is_wrong_is_said(report):
     assert found == pytest.approx((100, 100))
 
 
-def die(task):
-    """End the process like a worker that is killed."""
-    os._exit(3)
-
-
 class Deadly:
-    """An executor whose worker dies in one task, after all earlier tasks are done."""
+    """An executor like one of processes, of which one dies in a task."""
 
-    def __init__(self, pool):
-        self.pool, self.sent = pool, []
+    def submit(self, function, task) -> Future:
+        out: Future = Future()
+        if task.method == "XPBD":
+            out.set_exception(BrokenProcessPool("it was killed"))
+        else:
+            function, task = pickle.loads(pickle.dumps((function, task)))
+            out.set_result(pickle.loads(pickle.dumps(function(task))))
+        return out
 
-    def submit(self, function, task):
-        deadly = task.method == "XPBD"
-        for future in self.sent if deadly else ():
-            future.result()
-        self.sent.append(self.pool.submit(die if deadly else function, task))
-        return self.sent[-1]
 
-
-def test_sweeps_run_in_processes_and_survive_one_that_dies():
-    # As on any executor; for the parts that Dask takes see test_sweep.py.
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        found = tv.report.error_vs_time(
-            "D01", methods=["Direct"], precisions=("f64",), efforts=(20, 40), runs=1, executor=Deadly(pool)
-        )
+def test_sweeps_run_on_any_executor_and_survive_a_worker_that_dies():
+    # For the parts that processes and Dask take see test_sweep.py.
+    found = tv.report.error_vs_time("D01", methods=["Direct"], precisions=("f64",), efforts=(20, 40), runs=1, executor=Deadly())
     assert [p.substeps for p in found.curve("D01_double_pendulum", "Direct")] == [20, 40]
     assert any(m.task == "D01_double_pendulum, XPBD, f64" for m in found.missing) and "missing" in str(found)
     assert any("BrokenProcessPool" in why for why in found.failures["D01_double_pendulum, XPBD, f64"])
@@ -167,7 +156,7 @@ def test_the_certificate_tells_what_holds_and_what_does_not(monkeypatch, tmp_pat
     assert [certify(n).verdict for n in (71, 72, 73)] == ["FAILED"] * 3
     assert certify(71).failing == ("short",) and "no such luck" in certify(72).failing[0]
     path = str(tmp_path / "certificate.json")
-    assert main(["stress", "3", "5", "49", "64", "--workers", "1", "--json", path]) == 0
+    assert main(["stress", "3", "5", "--workers", "1", "--json", path]) == 0
     assert json.loads(pathlib.Path(path).read_text())["passed"] is True
     assert main(["stress", "71", "3", "--workers", "1"]) == 1
     assert "1 of 2 passed, 1 failed" in capsys.readouterr().out
@@ -185,44 +174,3 @@ def test_commands(tmp_path, capsys):
             with pytest.raises(SystemExit):
                 main([command, "--json", name])
             assert words in capsys.readouterr().err
-
-
-PLANTS = {
-    "the gradient at the predicted position": (
-        "error_vs_time('D01', methods=['Jacobi'], precisions=('f64',), efforts=(20, 40, 80), baselines=False, runs=1)",
-        [("constraints/core/corner_passes.py", "n = self.quantity.measure(c, start)", "n = self.quantity.measure(c, now)")],
-    ),
-    "gravity lost in f32": (
-        "stress(rows=[11])",
-        [
-            (
-                "step/integrator.py",
-                "self.state.x[i] = x + step",
-                "self.state.x[i] = x + d; self.state.d[i] = self.state.x[i] - x",
-            )
-        ],
-    ),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("defect", PLANTS)
-def test_a_planted_defect_is_caught(defect, tmp_path):
-    # A copy of the package with the defect. Without it the same reports pass, see above and `python -m tiverlet stress`.
-    call, edits = PLANTS[defect]
-    shutil.copytree(ROOT, tmp_path / "tiverlet")  # with the bytecode of unchanged files, which keep their dates
-    for file, sound, broken in edits:
-        path = tmp_path / "tiverlet" / file
-        text = path.read_text()
-        assert sound in text, f"{file} has changed; plant the defect anew"
-        path.write_text(text.replace(sound, broken))
-    code = f"""
-import tiverlet as tv
-assert tv.__file__.startswith({str(tmp_path)!r})
-found = tv.report.{call}
-print(found)
-good = found.passed if hasattr(found, "passed") else not found.failures
-raise SystemExit(0 if good else 7)
-"""
-    done = python(code, check=False, PYTHONPATH=str(tmp_path))
-    assert done.returncode == 7, done.stdout + done.stderr
