@@ -14,7 +14,7 @@ import pytest
 import tiverlet as tv
 from tiverlet.__main__ import main
 from tiverlet.device import ti
-from tiverlet.recording import messages, recorder, rrd, viewer
+from tiverlet.recording import messages, rrd, sink, viewer
 from tiverlet.step import checkpoint
 
 from .conftest import python
@@ -272,7 +272,7 @@ def test_nothing_is_overwritten_unasked(falling, one, tmp_path, read_here):
 
 
 def test_a_file_that_is_removed_or_replaced_is_noticed(one, tmp_path, monkeypatch):
-    monkeypatch.setattr(recorder, "CHECK_INTERVAL", 0.0)
+    monkeypatch.setattr(sink, "CHECK_INTERVAL", 0.0)
     recording = tv.Recorder(tmp_path / "a.rrd", one)
     recording.log()
     (tmp_path / "a.rrd").unlink()

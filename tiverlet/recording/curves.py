@@ -16,8 +16,9 @@ from ..step.step_report import StepReport
 if TYPE_CHECKING:
     from ..world import World
 
+TURNING = "angular_momentum"  # path of the rows of angular momentum
 # Views of curves, by title: the last part of the path of their rows, and name, label and colour of each number in a row. Curves
-# of one view share rows, since a row takes 14 bytes in addition to its numbers.
+# of one view share rows, since a row takes 14 bytes in addition to its numbers. See curves_of() for those that a world has.
 CURVES = {
     "Worst violation": ("violation", {
         "residual": ("of constraints", [230, 120, 60]), "overlap": ("overlap [radii]", [90, 160, 230]),
@@ -28,10 +29,7 @@ CURVES = {
     }),
     "Substeps": ("substeps", {"substeps": ("substeps", [150, 160, 175])}),
     "Time per frame [ms]": ("milliseconds", {"milliseconds": ("ms", [190, 140, 220])}),
-}  # fmt: skip
-# Added if particles spin; in 2D only the first axis.
-SPIN = {
-    "Angular momentum [kg m^2/s]": ("angular_momentum", {
+    "Angular momentum [kg m^2/s]": (TURNING, {
         "angular momentum/z": ("z", [110, 150, 240]), "angular momentum/x": ("x", [235, 110, 100]),
         "angular momentum/y": ("y", [130, 200, 110]),
     }),
@@ -55,11 +53,10 @@ def own_name(path: str) -> str | None:
 
 
 def curves_of(world: "World") -> dict[str, tuple[str, dict[str, Any]]]:
-    """Return CURVES; if particles spin, also their angular momentum about the origin."""
-    if not world.particles.spins:
-        return CURVES
-    ((title, (end, curves)),) = SPIN.items()
-    return CURVES | {title: (end, {name: curves[name] for name in list(curves)[: world.particles.axes]})}
+    """Return the views of CURVES that a world has: angular momentum about the origin only if particles spin."""
+    axes = world.particles.axes if world.particles.spins else 0
+    some = {title: (end, dict(list(c.items())[:axes]) if end == TURNING else c) for title, (end, c) in CURVES.items()}
+    return {title: (end, curves) for title, (end, curves) in some.items() if curves}
 
 
 def informative_views(world: "World") -> dict[str, tuple[str, list[bool]]]:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .curves import CURVES, SPIN
+from .curves import CURVES
 
 if TYPE_CHECKING:
     from ..world import World
@@ -44,7 +44,7 @@ def is_name(name: str) -> bool:
 
 def checked_quantities(given: dict[str, Any], count: int) -> dict[str, Any]:
     """Check the user's quantities; return them as floats and arrays (count,) in f64."""
-    taken = {name for _, curves in (CURVES | SPIN).values() for name in curves}
+    taken = {name for _, curves in CURVES.values() for name in curves}
     out: dict[str, Any] = {}
     for name, value in given.items():
         array = np.asarray(value)

@@ -1,5 +1,6 @@
 """Reads a recording: its picture, a world that continues from any frame, and a check of both."""
 
+import contextlib
 import functools
 import inspect
 import numbers
@@ -19,7 +20,7 @@ from ..shapes import Shape
 from ..step import checkpoint
 from ..step.clock import Clock
 from . import journal, rrd, scene
-from .curves import CURVES, SPIN, own_name
+from .curves import CURVES, own_name
 from .journal import Entry
 from .overlays import Overlays
 from .redraw import Redraw, compare
@@ -67,18 +68,25 @@ class SceneFrames:
     broken: list[tuple[int, int, np.ndarray]]
 
 
+@contextlib.contextmanager
+def _clear_errors(path: Any) -> Iterator[None]:
+    """Within this context, the errors that a damaged file causes in Python become one ValueError that names the file."""
+    try:
+        yield
+    except (KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError, AssertionError) as e:
+        raise ValueError(f"replay: {path} is damaged, or was not written by a Recorder: {e!r}.") from e
+
+
 def _with_clear_errors(function):
-    """Turn the errors that a damaged file causes in Python into one clear ValueError."""
+    """Turn the errors that a damaged file causes in a method into one clear ValueError."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)
     def guarded(self, *args, **kwargs):
         """Call the method; errors caused by a damaged file become a ValueError that names the file."""
         signature.bind(self, *args, **kwargs)  # a call with wrong arguments raises its own TypeError
-        try:
+        with _clear_errors(self.path):
             return function(self, *args, **kwargs)
-        except (KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError, AssertionError) as e:
-            raise ValueError(f"replay: {self.path} is damaged, or was not written by a Recorder: {e!r}.") from e
 
     return guarded
 
@@ -452,10 +460,8 @@ def replay(path, given: Iterable[Any] | Mapping[str, Any] = ()) -> Replay:
     was written; the message names the place.
     """
     names = given if isinstance(given, Mapping) else {thing.__name__: thing for thing in given}
-    try:
+    with _clear_errors(path):
         return Replay(os.fspath(path), dict(names))
-    except (KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError) as e:
-        raise ValueError(f"replay: {path} is damaged, or was not written by a Recorder: {e!r}.") from e
 
 
 def load(path, given: Iterable[Any] | Mapping[str, Any] = ()) -> "World":
@@ -513,7 +519,7 @@ def _curves(contents: rrd.Contents) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         name = contents.entities[entity]
         if name.startswith("figures/"):
             found.setdefault(name[len("figures/") :], {})[frame] = k
-    out, known = {}, {end: list(curves) for end, curves in (CURVES | SPIN).values()}
+    out, known = {}, {end: list(curves) for end, curves in CURVES.values()}
     for end, rows in found.items():
         frames, own = sorted(rows), own_name(end)
         values = np.array([contents.values(rows[frame]) for frame in frames])

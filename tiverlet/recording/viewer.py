@@ -189,6 +189,12 @@ def named(path: str, frame: int) -> str:
     return NUMBER.sub(lambda found: found.group() % frame, path)
 
 
+def numbered(path: str, frame: int) -> str:
+    """Return the name of a frame's file: its number replaces a %d, or precedes the ending with at least four digits."""
+    base, kind = os.path.splitext(path)
+    return named(path if NUMBER.search(path) else f"{base}_%04d{kind}", frame)
+
+
 def _save_when_steady(process: subprocess.Popen, port: int, frame: int, name: str, view: str | None) -> None:
     """Save a picture once two successive ones are equal: by then everything is loaded and drawn."""
     from rerun.experimental import ViewerClient

@@ -41,6 +41,14 @@ class Geometry:
         return np.array(fans, dtype=np.int64).reshape(-1, 3)
 
     @property
+    def texture(self) -> np.ndarray:
+        """The texture coordinates of the corners of all faces, (corners, 2), 0 where a face has none; (0, 2) if no face has."""
+        if not any(len(uv) for uv in self.uv):
+            return np.zeros((0, 2))
+        pairs = zip(self.faces, self.uv, strict=True)
+        return np.concatenate([uv if len(uv) else np.zeros((len(face), 2)) for face, uv in pairs])
+
+    @property
     def around(self) -> np.ndarray:
         """The particles of all faces, one face after the other."""
         return np.concatenate([np.zeros(0, dtype=np.int64), *self.faces])

@@ -103,12 +103,10 @@ def _vertices(geometry: Geometry) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     A particle with several texture coordinates becomes as many vertices.
     """
-    around = geometry.around
-    if not any(len(uv) for uv in geometry.uv):
+    around, uv = geometry.around, geometry.texture
+    if not len(uv):
         at, vertex = np.unique(around, return_inverse=True)
-        return at, np.zeros((0, 2)), vertex.ravel()[geometry.corners]
-    pairs = zip(geometry.faces, geometry.uv, strict=True)
-    uv = np.concatenate([uv if len(uv) else np.zeros((len(face), 2)) for face, uv in pairs])
+        return at, uv, vertex.ravel()[geometry.corners]
     rows, vertex = np.unique(np.column_stack([around, uv]), axis=0, return_inverse=True)
     return rows[:, 0].astype(np.int64), rows[:, 1:], vertex.ravel()[geometry.corners]
 

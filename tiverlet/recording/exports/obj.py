@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 from ...shapes import Shape
 from ...shapes.files import obj_faces
-from .names import numbered
+from ..viewer import numbered
 from .stretch import stretches
 
 if TYPE_CHECKING:

@@ -76,9 +76,8 @@ class _Part:
             at = np.unique(of.around)
             mesh = self._mesh("surfaces", [len(face) for face in of.faces], np.searchsorted(at, of.around))
             self._paint(mesh, at, [code for code, _, _ in rows])
-            if any(len(uv) for uv in of.uv):
-                uv = [uv if len(uv) else np.zeros((len(face), 2)) for face, uv in zip(of.faces, of.uv, strict=True)]
-                self._primvar(mesh, "st", "TexCoord2fArray", np.concatenate(uv), "faceVarying")
+            if len(of.texture):
+                self._primvar(mesh, "st", "TexCoord2fArray", of.texture, "faceVarying")
             self._move(mesh, [(code, x[at]) for code, x, _ in rows])
         if len(of.links):
             self._links(rows, size)

@@ -12,8 +12,8 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from ...shapes import Shape
+from ..viewer import numbered
 from .geometry import Geometry
-from .names import numbered
 from .stretch import Stretch, in_space, stretches
 
 if TYPE_CHECKING:
