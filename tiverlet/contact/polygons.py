@@ -9,8 +9,7 @@ from .. import checks
 from ..checks import ArrayLike
 from ..device import ti
 from ..device.thread_team import Team
-from ..features.extending import extended
-from ..features.feature import Batch, Feature, Knob, Scene
+from ..features.feature import Batch, Feature, Knob, Scene, extended
 from ..features.regrouping import Regrouping
 from ..geometry.ordered import median
 from ..neighbours.neighbour_search import NeighbourSearch

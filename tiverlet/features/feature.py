@@ -249,6 +249,7 @@ class Acceleration(Feature):
     rate = 0.0
     pairwise = False
     neighbours_per_particle = 0  # initial room for listed neighbours, per particle
+    dim = 0  # of the world; 0 before it is in one
 
     @property
     def does_work(self) -> bool:
@@ -259,6 +260,12 @@ class Acceleration(Feature):
     def conserves(self) -> bool:
         """Whether it does not brake particles."""
         return not (self.decays or self.uses_velocity)
+
+    def prepare(self, particles: "Particles", inv_mass: np.ndarray) -> None:
+        """Check its knobs again, with the dimension known."""
+        self._keep(dim=particles.dim)
+        for name in knobs_of(type(self)):
+            setattr(self, name, getattr(self, name))
 
     def kernel_values(self) -> dict[str, Any]:
         """Return the numbers and vectors that kernels read as `dev.name[None]`, computed from its knobs."""
@@ -453,3 +460,21 @@ class Batch(Feature):
         """Put it on the device."""
         self.scene = scene
         self._keep(dev=self.passes(scene))
+
+
+def extended(feature: Any, more: Any, start: "Particles", now: "Particles", box: Any) -> "Particles":
+    """Append to an unbound feature the constraints or bodies of another, which start now.
+
+    Returns the particles by which the extended feature starts. Those of its own constraints are where they were when the feature
+    was added; all others are where they are now.
+    """
+    more.periodic, more.start = box, now
+    inv_mass = now.inv_mass.copy()
+    more.prepare(now, inv_mass)
+    if isinstance(more, Batch):  # bodies are reviewed with all constraints, see check_added()
+        more.review(now, inv_mass)
+    position = np.array(now.position)
+    mine = feature.indices.ravel()
+    position[mine] = start.position[mine]
+    feature.extend(more)
+    return start.placed(position)

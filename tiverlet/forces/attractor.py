@@ -8,7 +8,6 @@ from .. import checks
 from ..device import ti
 from ..features.arguments import shifted
 from ..features.feature import Acceleration, Knob
-from ..particles import Particles
 
 
 class Attractor(Acceleration):
@@ -27,17 +26,11 @@ class Attractor(Acceleration):
     center = Knob(lambda f, v: checks.vector("Attractor", "center", v, f.dim or len(np.atleast_1d(v))), "[m].", place=shifted)
     strength = Knob(lambda f, v: checks.number("Attractor", "strength", v), "G M [m^3/s^2].")
     softening = Knob(lambda f, v: checks.number("Attractor", "softening", v, least=0.0), "[m].")
-    dim = 0
 
     def __init__(self, center, strength, *, softening=0.0):
         self.center = center
         self.strength = strength
         self.softening = softening
-
-    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check the length of `center`."""
-        self._keep(dim=particles.dim)
-        self.center = self.center
 
     def kernel_values(self) -> dict[str, Any]:
         """Return center, strength and softening, for kernels."""

@@ -1,12 +1,9 @@
 """The user's own force."""
 
-import numpy as np
-
 from ..device import inline, ti
 from ..device.language import undecorated
 from ..features.feature import Acceleration, Scene
 from ..features.user_function import check_function, check_vector
-from ..particles import Particles
 
 
 class Force(Acceleration):
@@ -37,18 +34,15 @@ class Force(Acceleration):
         self.function = function
         self.uses_velocity = self.arity >= 2
 
-    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Do nothing: the function is checked when it is compiled."""
-
     def bind(self, scene: Scene) -> None:
         """Store the scene. The force has no field of its own."""
         self.scene = scene
-        self.dev.w, self.dev.dim = scene.state.w, scene.particles.dim
+        self.dev.w = scene.state.w
 
     @inline
     def force(self, value):
         """Return the value of the function if it is a vector, else refuse it."""
-        return check_vector("Force", undecorated(self.function).__name__, value, self.dev.dim)
+        return check_vector("Force", undecorated(self.function).__name__, value, self.dim)
 
     @ti.func
     def acceleration(self, i, x, v, t):

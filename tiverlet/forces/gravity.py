@@ -8,7 +8,6 @@ from .. import checks
 from ..checks import ArrayLike
 from ..device import ti
 from ..features.feature import Acceleration, Knob
-from ..particles import Particles
 
 
 def _vector(feature: "Gravity", g):
@@ -34,16 +33,10 @@ class Gravity(Acceleration):
     conservative = True
     uniform = common = steady = True
     is_fixed_in_space = False
-    dim = 0
     g = Knob(_vector, "Acceleration [m/s^2]: a number of at least 0 along -y, or a vector.")
 
     def __init__(self, g: ArrayLike = 9.81):
         self.g = g
-
-    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check the length of g, if it is a vector."""
-        self._keep(dim=particles.dim)
-        self.g = self.g
 
     def kernel_values(self) -> dict[str, Any]:
         """Return g as a vector, for kernels."""

@@ -45,15 +45,15 @@ class Hand(Acceleration):
     particle = Knob(_particle, "The particle that is drawn; -1: none.")
     target = Knob(_target, "Where it is drawn to [m].", place=shifted)
     rate = Knob(lambda f, v: checks.number("Hand", "rate", v, least=0.0), "How fast it gets there [1/s].")
-    dim = _count = 0
+    _count = 0
 
     def __init__(self, target: ArrayLike, particle: int = -1, *, rate: float = 20.0):
         self.target, self.particle, self.rate = target, particle, rate
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check the length of the target, and the particle."""
-        self._keep(dim=particles.dim, _count=len(particles))
-        self.target, self.particle = self.target, self.particle
+        """Check the knobs, with the number of particles known."""
+        self._keep(_count=len(particles))
+        super().prepare(particles, inv_mass)
 
     def remap_indices(self, number: np.ndarray, count: int) -> None:
         """Take new particle indices. A removed particle (-1) is let go."""

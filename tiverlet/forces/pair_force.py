@@ -12,7 +12,6 @@ from ..features.feature import Acceleration, Scene
 from ..features.regrouping import Regrouping
 from ..features.user_function import check_function, check_number, check_vector
 from ..neighbours.neighbour_search import NeighbourSearch
-from ..particles import Particles
 
 ROOM = (8, 40)  # initial room for listed neighbours per particle, in 2D and 3D; lists grow
 SKIN = 0.15  # skin of the neighbour list, relative to the radius
@@ -78,16 +77,12 @@ class PairForce(Acceleration):
         """Whether the force may change the energy in reports, because no potential is given."""
         return not self.potential_arity
 
-    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Do nothing: the functions are checked when they are compiled."""
-
     def bind(self, scene: Scene) -> None:
         """Declare two fields of accelerations, now and in the substep before. make_search() declares the list."""
         self.scene, dev = scene, self.dev
-        dim = scene.particles.dim
-        dev.state, dev.w, dev.real, dev.dim, dev.n = scene.state, scene.state.w, scene.real, dim, scene.count
-        dev.now = scene.memory.field("PairForce.acceleration", scene.count, width=dim, state=True)
-        dev.last = scene.memory.field("PairForce.acceleration_before", scene.count, width=dim)
+        dev.state, dev.w, dev.real, dev.n = scene.state, scene.state.w, scene.real, scene.count
+        dev.now = scene.memory.field("PairForce.acceleration", scene.count, width=self.dim, state=True)
+        dev.last = scene.memory.field("PairForce.acceleration_before", scene.count, width=self.dim)
 
     def make_search(self, scene: Scene, team: Any) -> NeighbourSearch | None:
         """Declare the neighbour search and return it; None without a radius."""
@@ -121,12 +116,12 @@ class PairForce(Acceleration):
     @property
     def neighbours_per_particle(self) -> int:
         """Initial room for listed neighbours per particle."""
-        return ROOM[self.dev.dim - 2]
+        return ROOM[self.dim - 2]
 
     @inline
     def checked(self, value):
         """Return the value of the function if it is a vector, else refuse it."""
-        return check_vector("PairForce", undecorated(self.function).__name__, value, self.dev.dim)
+        return check_vector("PairForce", undecorated(self.function).__name__, value, self.dim)
 
     @inline
     def checked_energy(self, value):
@@ -171,7 +166,7 @@ class PairForce(Acceleration):
         whether a far particle is listed.
         """
         self.dev.last[i] = self.dev.now[i]
-        total, w = ti.Vector.zero(self.dev.real, self.dev.dim), self.dev.w[i]
+        total, w = ti.Vector.zero(self.dev.real, self.dim), self.dev.w[i]
         if w > 0:
             if ti.static(self.listed):
                 for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):

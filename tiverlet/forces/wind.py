@@ -7,7 +7,6 @@ import numpy as np
 from .. import checks
 from ..device import ti
 from ..features.feature import Acceleration, Knob
-from ..particles import Particles
 
 
 class Wind(Acceleration):
@@ -22,16 +21,10 @@ class Wind(Acceleration):
     decays = True
     uniform = steady = True
     is_fixed_in_space = False
-    dim = 0
 
     def __init__(self, velocity, rate):
         self.velocity = velocity
         self.rate = rate
-
-    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check the length of `velocity`."""
-        self._keep(dim=particles.dim)
-        self.velocity = self.velocity
 
     def kernel_values(self) -> dict[str, Any]:
         """Return rate * velocity, the part of the acceleration beside the drag -rate v, for kernels."""

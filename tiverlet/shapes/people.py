@@ -13,9 +13,9 @@ _POINTS = {
 }  # fmt: skip
 # From the side, in 2D: how far left parts are behind the middle and right ones before it, so that nothing overlaps.
 _APART = {"shoulder": 0.03, "elbow": 0.07, "hand": 0.11, "joint": 0.03, "knee": 0.03, "foot": 0.03}
-_NAMES = ["head", "neck", "chest", "hip"] + [
+NAMES = ("head", "neck", "chest", "hip") + tuple(
     f"{side} {part}" for side in ("left", "right") for part in ("shoulder", "elbow", "hand", "joint", "knee", "foot")
-]
+)
 # Joints: lower and upper limit of the signed turn at the second of three points [rad]; in 3D from 0 to the larger of both.
 _TURNS = [
     ("head", "neck", "chest", -0.6, 0.6), ("neck", "chest", "hip", -0.5, 0.5),
@@ -67,6 +67,3 @@ def ragdoll(feet, height: float = 1.8) -> Shape:
         base + x, np.array(links), np.array(braces), limits=np.array(limits), lower=np.array(lower), upper=np.array(upper),
         radius=radius,
     )  # fmt: skip
-
-
-NAMES = tuple(_NAMES)

@@ -15,8 +15,7 @@ import numpy as np
 from ..constraints.core.anchored import refuse_held_twice
 from ..contact.exclusions import excluded_pairs
 from ..device.redeclaration import DeclarationsDiffer, Redeclaration
-from ..features.extending import extended
-from ..features.feature import Batch, Feature
+from ..features.feature import Batch, Feature, extended
 from ..features.regrouping import Regrouping
 from ..particles import Particles
 

@@ -8,8 +8,7 @@ import numpy as np
 from ..colliders.collider import Collider
 from ..contact.pair_contact import PairContact
 from ..device.memory import ALL, Memory
-from ..features.extending import extended
-from ..features.feature import Acceleration, Batch, Feature
+from ..features.feature import Acceleration, Batch, Feature, extended
 from ..neighbours.neighbour_list import WALL
 from ..neighbours.periodic import Periodic
 from ..particles import Particles
