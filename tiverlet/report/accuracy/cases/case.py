@@ -5,10 +5,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ....constraints import Distance
 from ....features.feature import Feature
 from ....measure import angular_momentum
 from ....particles import Particles
@@ -77,7 +78,7 @@ class Case:
 
     name: str
     title: str
-    build: Callable[[], tuple[Particles, Sequence[Feature]]]
+    build: "Callable[[], Scene]"
     seconds: float
     error: Callable[[Run], float]
     limit: float
@@ -99,6 +100,9 @@ class Case:
     def frames(self) -> int:
         """The number of frames of a run."""
         return round(self.seconds / self.frame)
+
+
+Scene = tuple[Particles, Sequence[Feature]]
 
 
 def rms(position, reference) -> float:
@@ -132,6 +136,18 @@ def sideways(world: "World") -> tuple[np.ndarray, float]:
     """Return the horizontal momentum, which gravity conserves, and sum m |v|."""
     m = world.particles.mass
     return m @ np.delete(world.velocity, 1, axis=1), float(m @ np.linalg.norm(world.velocity, axis=1))
+
+
+def single(position, velocity: Any = 0.0, *features: Feature) -> Scene:
+    """Build a scene of one particle."""
+    return Particles([position], velocity=velocity), list(features)
+
+
+def pendulum(position, velocity: Any = 0.0, *forces: Feature, mass: float = 1.0, rest=None, **link) -> Scene:
+    """Build a scene of one particle on a link from the origin."""
+    x, v = np.zeros((2, len(position))), np.zeros((2, len(position)))
+    x[1], v[1] = position, velocity
+    return Particles(x, velocity=v, mass=mass, pinned=[0]), [*forces, Distance([[0, 1]], rest, **link)]
 
 
 def links(n: int, first: int = 0) -> np.ndarray:

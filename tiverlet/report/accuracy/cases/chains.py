@@ -3,10 +3,9 @@
 import numpy as np
 
 from ....constraints import Distance
-from ....features.feature import Feature
 from ....forces import Gravity
 from ....particles import Particles
-from .case import Case, Run, ends_at, known, links, spin, upright
+from .case import Case, Run, Scene, ends_at, known, links, pendulum, rms, spin, upright
 
 CHAIN = ("Direct", "Jacobi")
 
@@ -43,29 +42,15 @@ def swings(name: str, t: float, limit: float, **more) -> Case:
     return Case(name, known(name)["title"], lambda: hung(name), t, error, limit, size, **{"methods": CHAIN, **more})
 
 
-def sphere() -> tuple[Particles, list[Feature]]:
-    """Build S01: a pendulum in 3D."""
-    p = known("S01_spherical_pendulum")["params"]
-    start = Particles([[0, 0, 0], p["x0"]], velocity=[[0, 0, 0], p["v0"]], pinned=[0])
-    return start, [Gravity(p["g"]), Distance([[0, 1]])]
-
-
-def skew() -> tuple[Particles, list[Feature]]:
+def skew() -> Scene:
     """Build S02: a chain of five links in 3D."""
-    p = known("S02_chain5_3d")["params"]
+    p = S02["params"]
     return Particles(p["x0"], mass=np.r_[1.0, p["masses"]], pinned=[0]), [Gravity(p["g"]), Distance(links(5))]
 
 
-def elastic() -> tuple[Particles, list[Feature]]:
-    """Build S04: an elastic pendulum."""
-    p = known("S04_spring_pendulum")["params"]
-    return Particles([[0, 0], p["x0"]], pinned=[0]), [Gravity(p["g"]), Distance([[0, 1]], p["L"], compliance=p["alpha"])]
-
-
-def single_pendulum(angle: float) -> tuple[Particles, list[Feature]]:
+def released(angle: float) -> Scene:
     """Build a pendulum of 1 m, released at `angle` [rad] from the vertical."""
-    start = Particles([[0, 0], [np.sin(angle), -np.cos(angle)]], pinned=[0])
-    return start, [Gravity(9.81), Distance([[0, 1]])]
+    return pendulum((np.sin(angle), -np.cos(angle)), 0.0, Gravity(9.81))
 
 
 def period_error(run: Run) -> float:
@@ -74,14 +59,7 @@ def period_error(run: Run) -> float:
     return abs(float(np.arctan2(x[0], -x[1]) / (v[0] * run.times[-1])))
 
 
-def conical() -> tuple[Particles, list[Feature]]:
-    """Build R07: a conical pendulum."""
-    p, v = known("R07_conical_pendulum")["params"], known("R07_conical_pendulum")["values"]
-    start = Particles([[0, 0, 0], [v["radius"], -v["depth"], 0]], velocity=[[0, 0, 0], [0, 0, v["speed"]]], pinned=[0])
-    return start, [Gravity(p["g"]), Distance([[0, 1]])]
-
-
-def rod(omega: float, masses: tuple[float, float], dim: int = 2) -> tuple[Particles, list[Feature]]:
+def rod(omega: float, masses: tuple[float, float], dim: int = 2) -> Scene:
     """Build R08 or S09: two masses on a rod of 1 m that spins about their centre of mass."""
     a, b = masses[1] / sum(masses), -masses[0] / sum(masses)
     x, v = np.zeros((2, dim)), np.zeros((2, dim))
@@ -104,7 +82,7 @@ def period(degrees: int, seconds: float, limit: float) -> Case:
     angle, frame = np.radians(degrees), seconds / 160
     title = f"Pendulum, period of {degrees} degrees"
     return Case(
-        f"R06_pendulum_period:{degrees}", title, lambda: single_pendulum(angle), seconds / 4, period_error, limit, 0.1,
+        f"R06_pendulum_period:{degrees}", title, lambda: released(angle), seconds / 4, period_error, limit, 0.1,
         "relative", frame, methods=("Jacobi",),
     )  # fmt: skip
 
@@ -114,14 +92,11 @@ def state(degrees: int, t: int, limit: float) -> Case:
     v, angle = known("R06b_pendulum_state")["values"][f"{degrees}deg_t{t}"], np.radians(degrees)
     title = f"Pendulum of {degrees} degrees after {t} s"
     error = ends_at([1], [[v["x"], v["y"]]])
-    return Case(f"R06b_pendulum_state:{degrees}", title, lambda: single_pendulum(angle), t, error, limit, 0.5)
-
-
-def _entry(name: str, t: str, key: str):
-    return known(name)["values"][t][key]
+    return Case(f"R06b_pendulum_state:{degrees}", title, lambda: released(angle), t, error, limit, 0.5)
 
 
 PERIODS = known("R06_pendulum_period")["values"]["period"]
+S01, S02, S04, R07 = map(known, ("S01_spherical_pendulum", "S02_chain5_3d", "S04_spring_pendulum", "R07_conical_pendulum"))
 HEAVY = {"efforts": (20, 80, 320, 640, 1280, 2560, 5120), "at": 320, "fit": (1280, 2560, 5120)}
 
 CASES = [
@@ -140,17 +115,20 @@ CASES = [
     swings("D08_massratio10", 0.5, 2e-5),
     swings("D09_massratio_inverted", 0.5, 1e-4),
     Case(
-        "S01_spherical_pendulum", "Spherical pendulum", sphere, 10.0,
-        ends_at([1], [_entry("S01_spherical_pendulum", "t10.0", "xyz")]), 1.8e-5, methods=CHAIN, momentum=upright,
+        "S01_spherical_pendulum", "Spherical pendulum",
+        lambda: pendulum(S01["params"]["x0"], S01["params"]["v0"], Gravity(S01["params"]["g"])), 10.0,
+        ends_at([1], [S01["values"]["t10.0"]["xyz"]]), 1.8e-5, methods=CHAIN, momentum=upright,
     ),
     Case(
         "S02_chain5_3d", "Skew chain of 5 links in space", skew, 1.0,
-        ends_at(slice(1, None), _entry("S02_chain5_3d", "t1.0", "xyz")), 1.3e-4, methods=CHAIN, momentum=upright,
+        ends_at(slice(1, None), S02["values"]["t1.0"]["xyz"]), 1.3e-4, methods=CHAIN, momentum=upright,
     ),
     swings("S03_folded_chain", 0.3, 1e-3),
     Case(
-        "S04_spring_pendulum", "Elastic pendulum", elastic, 5.0,
-        ends_at([1], [_entry("S04_spring_pendulum", "t5.0", "xy")]), 1.2e-6,
+        "S04_spring_pendulum", "Elastic pendulum",
+        lambda: pendulum(
+            S04["params"]["x0"], 0.0, Gravity(S04["params"]["g"]), rest=S04["params"]["L"], compliance=S04["params"]["alpha"]
+        ), 5.0, ends_at([1], [S04["values"]["t5.0"]["xy"]]), 1.2e-6,
     ),
     spun("S09_spinning_rod_decay", 10.0, (1.0, 1.0), 10.0, 1e-2),
     spun("R08_spinning_dumbbell", 50.0, (1.0, 3.0), 1.0, 2e-2),
@@ -159,12 +137,10 @@ CASES = [
     period(170, PERIODS["170deg"], 1e-5),
     state(90, 10, 5e-5),
     Case(
-        "R07_conical_pendulum", "Conical pendulum", conical, 10.0,
-        lambda run: float(np.linalg.norm(run.world.position[1, [0, 2]] - _circled())), 1e-3, momentum=upright,
+        "R07_conical_pendulum", "Conical pendulum",
+        lambda: pendulum(
+            (R07["values"]["radius"], -R07["values"]["depth"], 0), (0, 0, R07["values"]["speed"]), Gravity(R07["params"]["g"])
+        ), 10.0,
+        lambda run: rms(run.world.position[1, [0, 2]], [R07["values"][k] for k in ("x_t10", "z_t10")]), 1e-3, momentum=upright,
     ),
 ]  # fmt: skip
-
-
-def _circled() -> np.ndarray:
-    v = known("R07_conical_pendulum")["values"]
-    return np.array([v["x_t10"], v["z_t10"]])

@@ -6,10 +6,10 @@ import numpy as np
 
 from ....constraints import Area, Distance, ShapeMatch
 from ....device import ti
-from ....features.feature import Feature
 from ....forces import Attractor, Drag, Force, Gravity
 from ....particles import Particles
-from .case import Case, ends_at, known, links, sideways, spin
+from ....shapes import net, polygon
+from .case import Case, Scene, ends_at, known, links, pendulum, sideways, single, spin
 
 
 def fall(name: str) -> Case:
@@ -19,23 +19,23 @@ def fall(name: str) -> Case:
     y = p["y0"] + p["v0"] * t - p["g"] * t * t / 2
     return Case(
         name, f"Free fall in frames of {p['dt']:g} s",
-        lambda: (Particles([[0.0, p["y0"]]], velocity=(0, p["v0"])), [Gravity(p["g"])]), t, ends_at([0], [[0, y]]), 1e-10, 1.0,
+        lambda: single((0.0, p["y0"]), (0, p["v0"]), Gravity(p["g"])), t, ends_at([0], [[0, y]]), 1e-10, 1.0,
         frame=p["dt"], efforts=(1, 2, 4, 8), order=None, at=1,
     )  # fmt: skip
 
 
-def thrown() -> tuple[Particles, list[Feature]]:
+def thrown() -> Scene:
     """Build R02: a projectile in 3D."""
     p = known("R02_projectile")["params"]
     e, a = np.radians(p["elevation_deg"]), np.radians(p["azimuth_deg"])
     v = p["speed"] * np.array([np.cos(e) * np.cos(a), np.sin(e), np.cos(e) * np.sin(a)])
-    return Particles([[0, p["y0"], 0]], velocity=v), [Gravity(p["g"])]
+    return single((0, p["y0"], 0), v, Gravity(p["g"]))
 
 
-def dragged() -> tuple[Particles, list[Feature]]:
+def dragged() -> Scene:
     """Build R03: a projectile with linear drag."""
     p = known("R03_linear_drag")["params"]
-    return Particles([[0.0, 0.0]], velocity=(p["vx0"], p["vy0"])), [Gravity(p["g"]), Drag(p["k"])]
+    return single((0.0, 0.0), (p["vx0"], p["vy0"]), Gravity(p["g"]), Drag(p["k"]))
 
 
 @ti.func
@@ -55,7 +55,7 @@ def rings(name: str, spring, seconds: float, limit: float, **more) -> Case:
     p = known(name)["params"]
     want = p["x0"] * np.cos(np.sqrt(p["k"] / p["m"]) * seconds)
     return Case(
-        name, f"Oscillator by a force of the user's, {p['k']:g} N/m", lambda: (Particles([[p["x0"], 0.0]]), [Force(spring)]),
+        name, f"Oscillator by a force of the user's, {p['k']:g} N/m", lambda: single((p["x0"], 0.0), 0.0, Force(spring)),
         seconds, ends_at([0], [[want, 0.0]]), limit, p["x0"], conserves=False, **more,
     )  # fmt: skip
 
@@ -64,33 +64,27 @@ def sprung(name: str, seconds: float, limit: float) -> Case:
     """Return a case of R04b: a compliant link between an anchor and a mass; with XPBD the amplitude decays to nothing."""
     p = known(name)["params"]
     want = 1.0 + 0.1 * np.cos(np.sqrt(p["k"] / p["m"]) * seconds)
-
-    def build() -> tuple[Particles, list[Feature]]:
-        """Build a mass on a spring."""
-        return Particles([[0.0, 0], [1.1, 0]], mass=p["m"], pinned=[0]), [Distance([[0, 1]], 1.0, compliance=p["alpha"])]
-
-    return Case(name, f"Oscillator by a compliant link, {p['k']:g} N/m", build, seconds, ends_at([1], [[want, 0]]), limit, 0.2)
+    return Case(
+        name, f"Oscillator by a compliant link, {p['k']:g} N/m",
+        lambda: pendulum((1.1, 0), mass=p["m"], rest=1.0, compliance=p["alpha"]), seconds, ends_at([1], [[want, 0]]), limit, 0.2,
+    )  # fmt: skip
 
 
-def dashpot() -> tuple[Particles, list[Feature]]:
+def dashpot() -> Scene:
     """Build R05: a spring with a dashpot."""
     p = known("R05_damped_oscillator")["params"]
-    link = Distance([[0, 1]], 1.0, compliance=1 / p["k"], damping=p["c"])
-    return Particles([[0, 0], [1 + p["x0"], 0]], mass=p["m"], pinned=[0]), [link]
+    return pendulum((1 + p["x0"], 0), mass=p["m"], rest=1.0, compliance=1 / p["k"], damping=p["c"])
 
 
 def orbit(e: str, limit: float, **more) -> Case:
     """Return a case of R09: Kepler's orbit after 10 s. e: the key of its eccentricity, such as "e0.5"."""
     states = known("R09_kepler")["values"]["states"]
     s, want = states[f"{e}_start"], states[f"{e}_t10"]
-
-    def build() -> tuple[Particles, list[Feature]]:
-        """Build a planet in the field of an attractor."""
-        return Particles([[s["x"], s["y"]]], velocity=(s["vx"], s["vy"])), [Attractor((0, 0), 1.0)]
-
-    title = f"Kepler's orbit of eccentricity {e[1:]}"
-    error = ends_at([0], [[want["x"], want["y"]]])
-    return Case(f"R09_kepler:{e}", title, build, 10.0, error, limit, 1.0, momentum=spin, **more)
+    return Case(
+        f"R09_kepler:{e}", f"Kepler's orbit of eccentricity {e[1:]}",
+        lambda: single((s["x"], s["y"]), (s["vx"], s["vy"]), Attractor((0, 0), 1.0)), 10.0,
+        ends_at([0], [[want["x"], want["y"]]]), limit, 1.0, momentum=spin, **more,
+    )  # fmt: skip
 
 
 def mode(j: int, limit: float) -> Case:
@@ -102,7 +96,7 @@ def mode(j: int, limit: float) -> Case:
     u[-1] = 0
     want = x + np.cos(values[f"mode{j}"]["omega"] * seconds) * u
 
-    def build() -> tuple[Particles, list[Feature]]:
+    def build() -> Scene:
         """Build a chain, displaced along its mode."""
         link = Distance(links(n + 1), p["rest"], compliance=p["alpha"])
         return Particles(x + u, mass=p["m"], pinned=[0, n + 1]), [link]
@@ -122,7 +116,7 @@ def sway(n: int, limit: float) -> Case:
     x[1:, 1] = -np.cumsum(np.sqrt(1 / n**2 - np.diff(x[:, 0]) ** 2))
     want = np.cos(omega * seconds)
 
-    def build() -> tuple[Particles, list[Feature]]:
+    def build() -> Scene:
         """Build a hanging chain, displaced along its slowest mode."""
         return Particles(x, pinned=[0]), [Gravity(9.81), Distance(links(n), 1 / n)]
 
@@ -133,21 +127,20 @@ def sway(n: int, limit: float) -> Case:
     )  # fmt: skip
 
 
-def racket() -> tuple[Particles, list[Feature]]:
+def racket() -> Scene:
     """Build S05: a rigid cluster that tumbles about its intermediate axis."""
     p = known("S05_tennis_racket")["params"]
     x = np.repeat(np.diag(p["half_axes"]), 2, axis=0) * np.array([1, -1] * 3)[:, None]
     return Particles(x, velocity=np.cross(p["omega0_body"], x)), [ShapeMatch([np.arange(6)])]
 
 
-def ring() -> tuple[Particles, list[Feature]]:
+def ring() -> Scene:
     """Build R25: a soft ring of 12 links around a rigid area, released out of shape."""
     n = 12
-    k = np.arange(n)
-    a = 2 * np.pi * k / n
-    x = np.stack([1.2 * np.cos(a), np.sin(a) / 1.2], axis=1)
-    rim = Distance(np.stack([k, (k + 1) % n], axis=1), 2 * np.sin(np.pi / n), compliance=1e-2)
-    return Particles(x), [Area([k], known("R25_polygon_area")["values"]["n12"]["area"]), rim, Drag(2.0)]
+    rim = polygon((0.0, 0.0), 1.0, n)
+    edges = Distance(rim.links, 2 * np.sin(np.pi / n), compliance=1e-2)
+    area = Area(rim.loops, known("R25_polygon_area")["values"]["n12"]["area"])
+    return Particles(rim.position * [1.2, 1 / 1.2]), [area, edges, Drag(2.0)]
 
 
 def swollen(run) -> float:
@@ -156,16 +149,13 @@ def swollen(run) -> float:
     return abs(float(area.rest_of(run.world.position)[0] / area.rest[0]) - 1)
 
 
-def thrown_net() -> tuple[Particles, list[Feature]]:
+def thrown_net() -> Scene:
     """Build a net of unequal masses, soft in places, that flies and tumbles."""
-    rng = np.random.default_rng(4)
-    k = np.arange(36).reshape(6, 6)
-    pairs = [np.stack([k[:-1].ravel(), k[1:].ravel()], axis=1), np.stack([k[:, :-1].ravel(), k[:, 1:].ravel()], axis=1)]
-    x = np.stack(np.divmod(np.arange(36.0), 6), axis=1) + rng.uniform(-0.1, 0.1, (36, 2))
+    rng, flat = np.random.default_rng(4), net((0, 0), (5, 0), (0, 5), (6, 6))
+    x = flat.position + rng.uniform(-0.1, 0.1, (36, 2))
     v, mass = rng.normal(size=(36, 2)) + [2.0, 5.0], np.exp(rng.uniform(0, np.log(100), 36))
     alpha: Any = np.where(np.arange(60) % 3 == 0, 1e-3, 0.0)
-    net = Distance(np.concatenate(pairs), 1.0, compliance=alpha)
-    return Particles(x, velocity=v, mass=mass), [Gravity(9.81), net]
+    return Particles(x, velocity=v, mass=mass), [Gravity(9.81), Distance(flat.links, 1.0, compliance=alpha)]
 
 
 def parabola_error(run) -> float:

@@ -4,13 +4,12 @@ import numpy as np
 
 from ....colliders import Box, HalfSpace
 from ....contact import Contact
-from ....features.feature import Feature
 from ....forces import Drag, Gravity
 from ....particles import Particles
-from .case import Case, Run, known, rms, sideways
+from .case import Case, Run, Scene, known, rms, sideways
 
 
-def bumped(masses: tuple[float, float], speeds: tuple[float, float], e: float) -> tuple[Particles, list[Feature]]:
+def bumped(masses: tuple[float, float], speeds: tuple[float, float], e: float) -> Scene:
     """Build R14: two balls that collide head on."""
     start = Particles([[-0.3, 0], [0.3, 0]], velocity=[[speeds[0], 0], [speeds[1], 0]], mass=masses, radius=0.1)
     return start, [Contact(restitution=e)]
@@ -28,7 +27,7 @@ def head_on(m1: float, m2: float, u1: float, u2: float, e: float) -> Case:
     )  # fmt: skip
 
 
-def glanced() -> tuple[Particles, list[Feature]]:
+def glanced() -> Scene:
     """Build R15: a disc that hits another off center."""
     p = known("R15_oblique_discs")["params"]
     start = Particles([[-0.4, p["b"]], [0, 0]], velocity=[[p["u"], 0], [0, 0]], radius=p["r"])
@@ -42,7 +41,7 @@ def turned(run: Run) -> float:
     return float(np.abs(np.arctan2(v[:, 1], v[:, 0]) - np.arctan2(want[:, 1], want[:, 0])).max())
 
 
-def dropped(e: float) -> tuple[Particles, list[Feature]]:
+def dropped(e: float) -> Scene:
     """Build R16: a ball dropped on a floor."""
     return Particles([[0.0, 1.1]], radius=0.1), [Gravity(9.81), HalfSpace((0, 1), restitution=e)]
 
@@ -68,7 +67,7 @@ def bounces(e: float, limit: float) -> Case:
     )  # fmt: skip
 
 
-def cradle() -> tuple[Particles, list[Feature]]:
+def cradle() -> Scene:
     """Build R17: five balls in a row, the first of them moving."""
     p = known("R17_newton_cradle")["params"]
     x = np.zeros((p["n"], 2))
@@ -77,7 +76,7 @@ def cradle() -> tuple[Particles, list[Feature]]:
     return Particles(x, velocity=[[1.0, 0]] + [[0, 0]] * 4, radius=p["r"]), [Contact(restitution=1.0)]
 
 
-def slope(degrees: float, mu: float, speed: float) -> tuple[Particles, list[Feature]]:
+def slope(degrees: float, mu: float, speed: float) -> Scene:
     """Build R18: a disc that slides down an incline at `speed` [m/s]."""
     a = np.radians(degrees)
     n, t = np.array([np.sin(a), np.cos(a)]), np.array([np.cos(a), -np.sin(a)])
@@ -103,7 +102,7 @@ def slides(degrees: int, mu: float, speed: int, limit: float) -> Case:
     )  # fmt: skip
 
 
-def round_hill() -> tuple[Particles, list[Feature]]:
+def round_hill() -> Scene:
     """Build R19: a disc that slides off a smooth one, from 0.05 rad."""
     start = Particles([[0, 0], [np.sin(0.05), np.cos(0.05)]], radius=[0.9, 0.1], pinned=[0])
     return start, [Gravity(9.81), Contact()]
@@ -118,7 +117,7 @@ def leaves(run: Run) -> float:
     return abs(float(np.degrees(angle - np.arccos(2 / 3 * np.cos(0.05)))))
 
 
-def column() -> tuple[Particles, list[Feature]]:
+def column() -> Scene:
     """Build R21: ten discs on top of each other."""
     x = np.stack([np.full(10, 0.5), 0.5 + np.arange(10.0)], axis=1)
     return Particles(x, radius=0.5), [Gravity(9.81), Drag(8.0), Contact(), Box((0, 0), (1, np.inf))]

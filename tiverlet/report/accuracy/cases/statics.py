@@ -6,17 +6,17 @@ import numpy as np
 
 from ....constraints import Bend, Distance
 from ....device import ti
-from ....features.feature import Feature
 from ....forces import Drag, Force, Gravity
 from ....particles import Particles
-from .case import Case, Run, ends_at, known, links
+from ....shapes import net
+from .case import Case, Run, Scene, ends_at, known, links
 
 RATE = 4.0  # [1/s] of the drag that brings scenes to rest; after 10 s exp(-20) of a swing is left
 FINER: dict[str, Any] = {"efforts": (10, 20, 40, 80, 160)}  # for scenes that need more substeps for the order of Jacobi
 SETTLED: dict[str, Any] = {"conserves": False, "trusted": 3e-9, "efforts": (5, 10, 20, 40, 80)}
 
 
-def rope(n: int, length: float, span: float, alpha: float) -> tuple[Particles, list[Feature]]:
+def rope(n: int, length: float, span: float, alpha: float) -> Scene:
     """Build a rope of n links between two pins of the same height, released as a V."""
     t, depth = np.linspace(0, 1, n + 1), np.sqrt(length**2 - span**2) / 2
     x = np.stack([span * t, -depth * (1 - np.abs(2 * t - 1))], axis=1)
@@ -35,7 +35,7 @@ def sags(name: str, key: str, n: int, length: float, span: float, alpha: float, 
     )  # fmt: skip
 
 
-def plumb(name: str) -> tuple[Particles, list[Feature]]:
+def plumb(name: str) -> Scene:
     """Build R11: an elastic chain that hangs straight down."""
     p = known(name)["params"]
     n = p["links"]
@@ -64,7 +64,7 @@ def _pull(x, v, t, i):
     return out
 
 
-def cantilever() -> tuple[Particles, list[Feature]]:
+def cantilever() -> Scene:
     """Build S06: a clamped strip of ten rigid links with angular springs, and a force at its tip."""
     n = 10
     k = np.arange(n)
@@ -74,15 +74,12 @@ def cantilever() -> tuple[Particles, list[Feature]]:
     return Particles(x, mass=0.3, pinned=[0, 1]), [Force(_pull), strip, bend, Drag(3.0)]
 
 
-def net(n: int, alpha: float) -> tuple[Particles, list[Feature]]:
+def hammock(n: int, alpha: float) -> Scene:
     """Build S08: a net of n x n cells in a pinned frame of 1 m."""
-    k = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
-    i, j = np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij")
-    pairs = [np.stack([k[:-1].ravel(), k[1:].ravel()], axis=1), np.stack([k[:, :-1].ravel(), k[:, 1:].ravel()], axis=1)]
-    edge = ((i % n == 0) | (j % n == 0)).ravel()
-    x = np.stack([i.ravel() / n, 0.0 * i.ravel(), j.ravel() / n], axis=1)
-    link = Distance(np.concatenate(pairs), 1 / n, compliance=alpha)
-    return Particles(x, mass=1 / n**2, pinned=np.flatnonzero(edge)), [Gravity(9.81), link, Drag(RATE)]
+    flat = net((0, 0, 0), (1, 0, 0), (0, 0, 1), (n + 1, n + 1))
+    edge = (flat.position[:, [0, 2]] % 1 == 0).any(axis=1)
+    link = Distance(flat.links, 1 / n, compliance=alpha)
+    return Particles(flat.position, mass=1 / n**2, pinned=edge), [Gravity(9.81), link, Drag(RATE)]
 
 
 def hollows(n: int, alpha: float, limit: float) -> Case:
@@ -95,7 +92,7 @@ def hollows(n: int, alpha: float, limit: float) -> Case:
         return abs(float(run.world.position[(n + 1) ** 2 // 2, 1]) / want - 1)
 
     return Case(
-        f"S08_net_sag:{key}", f"Net of {n} x {n} cells, {alpha:g} m/N", lambda: net(n, alpha), 12.0, error, limit, 1.0,
+        f"S08_net_sag:{key}", f"Net of {n} x {n} cells, {alpha:g} m/N", lambda: hammock(n, alpha), 12.0, error, limit, 1.0,
         "relative", methods=("CG x 20", "Jacobi"), **{**SETTLED, **FINER},
     )  # fmt: skip
 

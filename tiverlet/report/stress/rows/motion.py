@@ -9,8 +9,7 @@ from ....device import ti
 from ....forces import Drag, Force, Gravity
 from ....measure import angular_momentum
 from ....particles import Particles
-from ...accuracy.cases import known
-from ...accuracy.cases.chains import sphere
+from ...accuracy.cases import CASES, known
 from .row import Findings, refused, rerun, row, world
 
 PAIR = Particles([[0.0, 0], [1, 0]], pinned=[0])
@@ -92,7 +91,7 @@ def _many() -> Findings:
 
 @row(42, "1e6 substeps", "a pendulum keeps its energy to 3e-5 J and its angular momentum to 1e-6")
 def _long() -> Findings:
-    particles, features = sphere()
+    particles, features = CASES["S01_spherical_pendulum"].build()
     want = known("S01_spherical_pendulum")["values"]
     energy, spin = 0.0, []
     with world(particles, features, substeps=1000) as w:
