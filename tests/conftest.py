@@ -239,21 +239,6 @@ def case(name: str) -> dict:
     return CASES[name]
 
 
-def pendulums(name: str):
-    """Return the chain of a D case: position, mass, pairs. Particle 0 is the anchor."""
-    p = case(name)["params"]
-    if name == "D06_chain100":  # "100 x 0.01", "all 90"
-        p = {"theta0_deg": [90.0] * 100, "lengths": [0.01] * 100, "masses": [0.01] * 100}
-    angle = np.radians(p["theta0_deg"])
-    steps = np.stack([np.sin(angle), -np.cos(angle)], axis=1) * np.array(p["lengths"])[:, None]
-    k = np.arange(len(angle))
-    return (
-        np.vstack([[0, 0], np.cumsum(steps, axis=0)]),
-        np.r_[1.0, p["masses"]],
-        np.stack([k, k + 1], axis=1),
-    )
-
-
 def figures(name: str, t: float, substeps: int) -> dict[str, float]:
     """Return the RMS errors [m] of the prototypes of a case at time t, by method."""
     rows = case(name)["prototype_errors"]

@@ -8,7 +8,7 @@ import numpy as np
 import tiverlet as tv
 from tiverlet.report.output import Table
 
-from ..test_structures import LINK, STRUCTURES, built, strain
+from ..scenes.solving import LINK, STRUCTURES, hung
 
 HEADS = (
     "solver",
@@ -38,15 +38,17 @@ def rows(link, substeps) -> Iterator[tuple]:
             for name, solver in SOLVERS.items():
                 worst, where, spent, gained, flags = 0.0, "", 0.0, 0.0, set()
                 for dim, builds in STRUCTURES.items():
-                    w, pairs = built(tv.World, dim, link, (load * LINK,), substeps=n, solver=solver)
-                    lengths, energy = strain(w, pairs, 1.0) + 1, w.step(1 / 60).energy
+                    particles, (gravity, links) = hung(link, *builds, load=load * LINK)
+                    w = tv.World(particles.make(), [gravity.make(), links], substeps=n, solver=solver)
+                    pairs = links.indices
+                    lengths, energy = tv.measure.strain(w, pairs, 1.0) + 1, w.step(1 / 60).energy
                     for k in range(119):
                         begin = time.process_time()
                         report = w.step(1 / 60)
                         spent += (time.process_time() - begin) / 119
                         gained = max(gained, (report.energy - energy) / (9.81 * 3.0 * w.particles.mass.sum()))
                         flags |= {(dim, k, flag) for flag in report.flags}
-                        off = strain(w, pairs, lengths)
+                        off = tv.measure.strain(w, pairs, lengths)
                         off = np.abs(off) if link is tv.Distance else np.maximum(off, 0.0)
                         if k >= 60 and off.max() > worst:
                             worst = float(off.max())

@@ -88,12 +88,12 @@ def tent(s, load):
 STRUCTURES = {2: (ladder, bridge, wheel, drawbridge), 3: (punchbag, crossed, tent)}
 
 
-def hung(link, *builds):
-    """Return these structures side by side with a load of 3 kg each, as calls."""
+def hung(link, *builds, load=3.0):
+    """Return these structures side by side with a load [kg] each: calls, and `link` of their links."""
     x, mass, pinned, pairs = [], [], [], []
     for k, build in enumerate(builds):
         s = Structure()
-        build(s, 3.0)
+        build(s, load)
         first = len(x)
         x += list(np.array(s.x) + 6.0 * k * np.eye(len(s.x[0]))[0])
         mass, pinned = mass + s.mass, pinned + [first + p for p in s.pinned]
