@@ -66,8 +66,3 @@ def wrong(speed: float, how: str = "") -> Any:
     if how == "unsendable":
         raise Unsendable("one", "other")
     return how if how else ball(speed)
-
-
-def wrong_figures(worlds) -> dict[str, Any]:
-    """Do what figures() may do wrong."""
-    raise LookupError("nothing there")

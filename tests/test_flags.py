@@ -82,14 +82,11 @@ def test_a_scene_that_does_not_move_as_it_should_has_the_flag_that_says_why(worl
 
 def test_what_is_damped_loses_its_note_with_as_many_substeps_as_that_says(world):
     # A chain that swings down. A few steps of conjugate gradients leave it violated, by order h or higher.
-    def notes(substeps):
-        w = world(*hanging(29, 0.01, 0.01), substeps=substeps, solver=tv.ConjugateGradient(4), precision="f64")
-        report = w.run(1.0)
-        assert report.clean
-        return report.notes
+    def run(substeps):
+        return world(*hanging(29, 0.01, 0.01), substeps=substeps, solver=tv.ConjugateGradient(4), precision="f64").run(1.0)
 
-    (note,) = notes(10)
-    assert not notes(int(re.search(r"they are damped.* (\d+) substeps", note)[1]))
+    report = run(10)
+    assert report.clean and not run(int(re.search(r"they are damped.* (\d+) substeps", report.notes[0])[1])).notes
 
 
 def test_a_link_that_is_off_by_a_twentieth_is_flagged(world):

@@ -28,11 +28,6 @@ def segment(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.linalg.norm(p - a - t[:, None] * d, axis=1)
 
 
-def turned(p: np.ndarray, wall: Any) -> np.ndarray:
-    """Return points in the frame of a wall that is not rotated."""
-    return p - np.asarray(wall.position)
-
-
 def polygon(p: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     """Return the signed distance to a closed outline, positive outside."""
     ends = np.roll(vertices, -1, axis=0)
@@ -71,7 +66,7 @@ def gap(wall: Any, p: np.ndarray, r: np.ndarray) -> np.ndarray:
         return wall.radius - r - d if wall.inside else d - wall.radius - r
     if name == "Capsule":
         return segment(p, wall.a, wall.b) - wall.radius - r
-    p = turned(p, wall)
+    p = p - np.asarray(wall.position)  # walls that are not rotated
     if name == "Sdf":
         return SDF[plain(wall.function).__name__](p) - wall.radius - r
     d = polygon(p, wall.vertices) if name == "Polygon" else convex(p, wall.vertices)

@@ -73,7 +73,6 @@ class Trial:
         self.knobs = [dict(knobs(f)) for f in self.features]
         self.free = w._runner.scene.inv_mass.copy()
         self.eps = oracles.EPS[w.precision]
-        self.soft = any(getattr(f, "soft", False) for f in self.features)
 
     def close(self) -> None:
         """Free the memory of the world."""
@@ -201,7 +200,10 @@ class Judge:
         self.x = x
 
     def bounded(self, report: tv.StepReport) -> None:
-        """Check that a passive scene gains no more than a thousandth of m g L, with its size L or the way that it has fallen."""
+        """Check that a passive scene gains no more than a thousandth of its energy or of m g L, its size or its way.
+
+        Where "auto" chooses the substeps, it is a fiftieth: it repeats frames whose energy is wrong by that.
+        """
         if self.energy is None:
             self.energy = report.energy - report.energy_change
             if not np.isfinite(self.energy):
@@ -214,9 +216,8 @@ class Judge:
         reach = np.maximum(self.high - self.low, self.p.size)
         fall = oracles.height(t.features, self.p, t.free, self.low, self.low + reach)
         flagged = bool(self.flags & RISKS)  # a flagged frame may be wrong, but must not explode
-        least = 0.02 if self.auto else 1e-3  # "auto" repeats frames whose energy is wrong by a fiftieth
-        share = 1.0 if flagged else 0.5 if t.soft else 1e-3
-        room = max((1.0 if flagged else least) * fall, share * abs(self.energy)) + self.digits(fall)
+        share = 1.0 if flagged else 0.02 if self.auto else 1e-3
+        room = share * max(fall, abs(self.energy)) + self.digits(fall)
         if "energy-gain" in report.flags and report.energy <= self.energy + room:
             self.find("energy-gain", f"{self.energy:.6g} -> {report.energy:.6g} J; {set(self.flags)}, {report}")
         if report.energy > self.energy + room:
