@@ -1,10 +1,9 @@
-"""The neighbour list: it holds all pairs that brute force finds, and no result depends on when and where it is built."""
+"""The neighbour list: no result depends on when and where it is built. test_extremes.py compares its pairs with brute force."""
 
 import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.contact.exclusions import FOLDED, _inside
 from tiverlet.step import checkpoint
 
 
@@ -12,50 +11,6 @@ def roomy(w: tv.World, entries: int) -> None:
     """Make room in the neighbour list before compilation; when a list grows, everything compiles again."""
     w._runner.search.list.allocate(entries)
     w._runner.renew()
-
-
-RNG = np.random.default_rng(7)
-CELL = 0.3 * 1.01  # about that of particles of radius 0.15
-PLACES = np.stack(np.divmod(np.arange(600), 24), axis=1) - 12
-# Clusters at multiples of 256 cells fold onto one bucket, whatever the shape of the table.
-FAR = np.stack(np.divmod(RNG.permutation(81 * 81)[:75], 81), axis=1) - 40
-# Row 25: radii from 1 to 1000 in one scene: large particles among crowds of small ones and points.
-WIDE = np.concatenate([10.0 ** RNG.uniform(-3, 0, 750), RNG.choice([0.0, 0.02, 0.1, 1.0], 230)])
-SPACE = [RNG.uniform(-1.5, 1.5, (980, 3)), RNG.uniform(-900, -890, (980, 3)), RNG.uniform(-1, 1, (980, 3))]
-SPACE[2][-2:] = [4e4, -4e4, 1.2e5], [4e4, -4e4, 1.2e5 + 0.3]
-CLOUDS = {  # path, radii, positions
-    "plane": ("fused", np.full(600, 0.15), [
-        RNG.uniform(-5, 5, (600, 2)),
-        RNG.uniform(0, 0.1, (600, 2)),  # rows 32 to 34: all in one cell
-        np.repeat(FAR, 8, axis=0) * 256 * CELL + RNG.uniform(0.1, 0.9, (600, 2)) * CELL,
-        (PLACES + 0.5) * CELL / 2,  # row 30: cells are as wide at the origin as elsewhere
-        PLACES * CELL / 2,  # on the borders of cells
-    ]),
-    "radii 1:1000 in space, launched": ("launched", WIDE, SPACE),
-}  # fmt: skip
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*near pairs per particle")
-@pytest.mark.parametrize("name", CLOUDS)
-def test_pairs_equal_brute_force(world, name, briefly):
-    # Starts with room for one entry where launched. Static particles, and groups that do not touch, have no pair.
-    path, radius, clouds = CLOUDS[name]
-    n, dim = clouds[0].shape
-    static, group = np.arange(0, n, 5), np.arange(n) % 3
-    start = tv.Particles(clouds[0], radius=radius, pinned=static, group=group)
-    w = world(start, [tv.Contact(groups=[(0, 0), (0, 1), (1, 1), (2, 2)])], precision="f64", path=path)
-    roomy(w, 1 if path == "launched" else 200_000)
-    for x in clouds:
-        w.position = x
-        pairs, depth = tv.measure.overlapping(x, radius)
-        held, apart = np.isin(pairs, static).all(axis=1), (group[pairs] == 2).sum(axis=1) == 1
-        pairs, depth = pairs[~held & ~apart], depth[~held & ~apart]
-        found = w.contacts
-        np.testing.assert_array_equal(found.pairs, pairs)
-        np.testing.assert_allclose(found.overlap, depth, rtol=1e-12, atol=1e-10 * np.abs(x).max())
-        d = x[pairs[:, 0]] - x[pairs[:, 1]]
-        np.testing.assert_allclose(found.normal, d / np.linalg.norm(d, axis=1)[:, None], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -101,30 +56,6 @@ def test_a_few_that_fly_far_meet_what_they_would_with_new_lists(world, flying):
 
 
 # Pairs without contact, because links hold them together.
-
-
-def nearest(links: np.ndarray, lengths: np.ndarray, radius: np.ndarray) -> set[tuple[int, int]]:
-    """Return the pairs whose shortest path along links is at most r_i + r_j, by the Floyd-Warshall algorithm."""
-    n = len(radius)
-    way = np.full((n, n), np.inf)
-    for (i, j), length in zip(links, lengths, strict=True):
-        if length > FOLDED * min(radius[i], radius[j]):
-            way[i, j] = way[j, i] = min(way[i, j], length)
-    for k in range(n):
-        way = np.minimum(way, way[:, [k]] + way[[k], :])
-    return {(i, j) for i in range(n) for j in range(i + 1, n) if way[i, j] <= radius[i] + radius[j]}
-
-
-def test_chains_of_links_are_found_as_by_brute_force():
-    rng = np.random.default_rng(0)
-    for _ in range(300):
-        n, m = rng.integers(2, 14), rng.integers(0, 20)
-        links = rng.integers(0, n, (m, 2), dtype=np.int32)
-        links = links[links[:, 0] != links[:, 1]]
-        lengths, radius = rng.uniform(0, 1, len(links)), rng.uniform(0, 1, n) * rng.choice([0.1, 1, 3])
-        found, direct = (set(map(tuple, pairs.tolist())) for pairs in (_inside(links, lengths, radius), np.sort(links, axis=1)))
-        right = nearest(links, lengths, radius)
-        assert found - direct == right - direct and found <= right
 
 
 @pytest.mark.slow
