@@ -65,13 +65,8 @@ class Area(Scalar):
 class Triangles(Quantity):
     """Areas of triangles."""
 
-    arity, collapses, curved = 3, 2, True
+    arity, collapses, curved, mirror = 3, 2, True, (2, 1, 0)
     exchangeable = ((0, 1, 2),)
-
-    def reversed(self, which: np.ndarray) -> "Triangles":
-        """Return these triangles, with two corners swapped where `which` (m,) is True."""
-        indices = self.members.indices
-        return Triangles(Members("Area", np.where(which[:, None], indices[:, ::-1], indices)))
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return the areas of the triangles, (m,) [m^2]; signed in 2D."""

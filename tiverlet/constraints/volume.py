@@ -80,13 +80,8 @@ class Volume(Scalar):
 class Tetrahedra(Quantity):
     """Volumes of tetrahedra."""
 
-    arity, collapses, transcends, curved = 4, 3, True, True
+    arity, collapses, transcends, curved, mirror = 4, 3, True, True, (0, 1, 3, 2)
     exchangeable = ((0, 1, 2, 3),)
-
-    def reversed(self, which: np.ndarray) -> "Tetrahedra":
-        """Return these tetrahedra, with two corners swapped where `which` (m,) is True."""
-        indices = self.members.indices
-        return Tetrahedra(Members("Volume", np.where(which[:, None], indices[:, [0, 1, 3, 2]], indices)))
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return the signed volumes, (m,) [m^3]."""

@@ -133,7 +133,7 @@ class Slots:
         if self.can_soften:
             memory.write(self.softness, softness)
         if self.system and self.system.has_shared_particles:
-            memory.write(self.system.blocks_of, self._blocks * np.where(self.shared, softness, 1.0))
+            memory.write(self.system.blocks_of, self._blocks * np.where(self._blocks > 1, softness, 1.0))
 
     def sag(self, batch: Batch) -> np.ndarray:
         """Return sigma, (m,), where each constraint of a batch holds a load F by a violation sigma W h^2 F."""
@@ -143,11 +143,6 @@ class Slots:
     def sags_anywhere(self) -> bool:
         """Whether any constraint bears loads by a violation."""
         return self.can_soften and bool(self._inexact.any() or (self.system and self.system.steps))
-
-    @property
-    def shared(self) -> np.ndarray:
-        """Mask of the particles that several blocks of constraints share, (n,)."""
-        return self._blocks > 1
 
     @property
     def _inexact(self) -> np.ndarray:

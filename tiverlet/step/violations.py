@@ -176,7 +176,7 @@ def _forget(b: Scalar, some: np.ndarray) -> None:
     lam = b.scene.memory.read(b.dev.equation.lam)
     lam[: b.count][some] = 0.0
     b.scene.memory.write(b.dev.equation.lam, lam)
-    b.forget_loads(some)
+    b.dev.known.forget(some)
 
 
 def left(batches: list[Batch], x: np.ndarray) -> list[tuple[Batch, np.ndarray]]:

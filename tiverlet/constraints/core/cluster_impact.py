@@ -31,11 +31,6 @@ class ClusterImpact:
         self.state, self.real = cluster.state, cluster.real
 
     @ti.func
-    def is_struck(self, i):
-        """Whether particle i, of a cluster, struck a wall."""
-        return self.impacts.struck[i] != 0
-
-    @ti.func
     def wide(self, v):
         """Return a vector in f64."""
         return ti.cast(v, ti.f64)
@@ -46,7 +41,7 @@ class ClusterImpact:
         begin, end, hit = self.corners.starts[c], self.corners.starts[c + 1], False
         for e in range(begin, end):
             i = self.corners.members[e]
-            hit = hit or (self.impacts.in_cluster(i) and self.is_struck(i))
+            hit = hit or (self.impacts.in_cluster(i) and self.impacts.struck[i] != 0)
         if hit:
             self.move_as_body(c, begin, end)
         else:
@@ -76,7 +71,7 @@ class ClusterImpact:
                 off = False
                 for e in range(begin, end):
                     i = self.corners.members[e]
-                    if self.is_struck(i):
+                    if self.impacts.struck[i] != 0:
                         r, s = self.cluster.relative_position(e, i0, 0) - center, self.cluster.relative_position(e, i0, 1) - start
                         push, change = self.corrected_push(i, r, s, V, W, turn, M, S, self.cluster.mass_of(e, c, FIXED))
                         V += push / M
@@ -88,7 +83,7 @@ class ClusterImpact:
             move = ti.cast(V + T @ r - r, self.real)
             self.cluster.pull[e] = self.cluster.pull[e] + move
             self.count_push(e, 1)
-            if self.is_struck(i):
+            if self.impacts.struck[i] != 0:
                 s = self.cluster.relative_position(e, i0, 1) - start
                 self.impacts.bend[i] = ti.cast(rotation.bend(turn + W, s, self.wide(self.impacts.normal[i])), self.real)
             self.impacts.mark_struck_in_cluster(i)
@@ -151,7 +146,7 @@ class ClusterImpact:
         It is no load of the cluster.
         """
         i = self.corners.members[e]
-        if self.is_struck(i):
+        if self.impacts.struck[i] != 0:
             push = sign * (self.impacts.pushed[i] * self.impacts.normal[i] - self.impacts.held[i])
             self.cluster.pull[e] = self.cluster.pull[e] - push
             self.impacts.log_push(i, push)

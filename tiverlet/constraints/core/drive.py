@@ -24,6 +24,7 @@ def driven_rest(begin: str, text: str) -> property:
     """Return the property `rest` of a driven batch, which has its initial rest values in the attribute `begin`."""
 
     def rest(batch: Any) -> np.ndarray:
+        """Return the rest values on the device, or those at which it begins, (m,)."""
         if "drive" in vars(batch.dev):
             return batch.dev.drive.values()[: batch.count]
         if begin not in vars(batch):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...device import ti
+from .members import Members
 
 if TYPE_CHECKING:
     from ...features.feature import Scene
@@ -33,6 +34,7 @@ class Quantity:
     has_cusp_at_zero = False  # whether gradients are discontinuous at f = 0
     curved = False  # whether f is so curved that a Newton step from afar is meaningless
     collapses = 0  # the power of a length that f is, where gradients vanish with the size of the body; else 0
+    mirror: tuple[int, ...] = ()  # where it collapses: an order of the corners in which f has the other sign
     transcends = False  # needs angles, cube roots or exponentials, which SPIR-V has for f32 only
     foreign = False  # whether f is the user's own, of which nothing is known
     origin: Any = None  # what corners are relative to, as two f32 words, so that f32 does not round it; None: the first corner
@@ -64,7 +66,9 @@ class Quantity:
 
     def reversed(self, which: np.ndarray) -> "Quantity":
         """Where it `collapses`: return the quantity with f of the other sign for constraints in the mask `which`, (m,)."""
-        return self
+        new, rows = copy(self), self.members.indices
+        new.members = Members(self.members.kind, np.where(which[:, None], rows[:, self.mirror], rows))
+        return new
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return f, (m,), of corners x (m, arity, dim) [m]; for outlines, of all positions (n, dim)."""

@@ -321,8 +321,3 @@ class Scalar(Batch):
         """The multipliers of the last substep without known loads, (m,): the load that violations bear."""
         lam = self.scene.memory.read(self.dev.equation.lam)[: self.count].astype(np.float64)
         return lam - self.scene.memory.read(self.dev.known.given)[: self.count] if self.dev.known.learns else lam
-
-    def forget_loads(self, some: np.ndarray) -> None:
-        """Forget the known loads of constraints in the mask `some`, (m,), whose particles were placed elsewhere."""
-        if self.dev.known.learns:
-            self.dev.known.forget(some)
