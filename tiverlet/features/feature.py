@@ -11,8 +11,7 @@ feature that is not in the scene takes no memory, no kernel code and no time. Ki
     Anchored       (constraints/core/anchored.py) a Batch that draws each of its particles to a Place of its own
     Collider       (colliders/collider.py) confine(i, ...) of one particle, after all other corrections
 
-A Batch holds the particles on which it acts in an object, `members`: FixedSize, or VariableSize for constraints on any number of
-particles each (constraints/core/members.py).
+A Batch holds the particles on which it acts in an object, `members` (constraints/core/members.py).
 
 A new constraint on k particles is one file with one Scalar subclass. The class names its Quantity (constraints/core/quantity.py)
 and has an __init__ that checks its arrays. See constraints/distance.py. Arrays with one row per constraint are named in `each`.
@@ -311,8 +310,7 @@ class Acceleration(Feature):
 class Batch(Feature):
     """m constraints of one kind on `arity` particles each. Its `dev` has the kernels of a substep, see passes()."""
 
-    arity = 0  # 0: each constraint has any number, see VariableSize
-    needs_reduce_block = False  # residual_of() needs reduce_block()
+    arity = 0  # 0: each constraint has any number, see Members
     rigid = True  # whether any constraint is rigid
     soft = False  # has springs, which act at a start (the first substep after velocities were set)
     breaks = False  # has constraints that a load can break
@@ -323,7 +321,7 @@ class Batch(Feature):
     solvable_together = False  # the System of a solver may solve its constraints with others; see Scalar
     driven = False  # rest values change by themselves, by the Drive of drive_of()
     transcends = False  # computes angles, cube roots or exponentials, which SPIR-V has for f32 only
-    members: Any  # FixedSize or VariableSize: the particles of each constraint
+    members: Any  # Members: the particles of each constraint
     code_size = 1.0
     each: tuple[str, ...] = ()  # its arrays with one row per constraint, besides the indices
     rest_name = "rest"  # the argument of __init__ for `rest`
