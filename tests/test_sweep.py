@@ -62,7 +62,7 @@ def test_dask_has_the_same_bits_and_survives_a_worker_that_dies(here, tmp_path):
     with (
         dask.set({"distributed.scheduler.allowed-failures": 0}),
         # Threads of one worker would start Taichi in any of them.
-        distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=True, dashboard_address=None) as cluster,
+        distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=True, dashboard_address=":0") as cluster,
         distributed.Client(cluster) as client,
     ):
         found = tv.sweep(pendulum, STARTS, ends, client, at_once=2)
