@@ -134,8 +134,6 @@ def test_gradients_of_paths_are_exact_where_they_are_almost_straight():
         np.testing.assert_allclose(sizes[0], [2.0, 4.0, 2.0], rtol=1e-5)
         np.testing.assert_allclose(bends.gradients(x)[1], differences(bends.values, x[bends.indices])[1], atol=1e-8)
         np.testing.assert_allclose(limits.gradients(x), [[[-1.0]], [[1.0]]] * bends.gradients(x), atol=1e-15)
-    flat = tv.Bend([[0, 1, 3]])
-    np.testing.assert_allclose(flat.gradients(x[:, :2]), differences(flat.values, x[flat.indices][..., :2]), atol=1e-8)
 
 
 def space(feature):
