@@ -124,6 +124,7 @@ def loaded(world, mass, *more, **options):
     return world(start, [tv.Gravity(9.81), tv.Distance(links(30)), *more], **options)
 
 
+@pytest.mark.slow
 def test_what_gives_way_recovers_at_rest(world):
     # The sag at rest is M g L / (4 T), for the largest tension T that the substep can stand, which grows with 1 / h^2. It falls
     # to a quarter in half the substep.

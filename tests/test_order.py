@@ -150,6 +150,7 @@ def test_high_orders_of_springs(world):
     assert order(errors) > 3.7 and errors[-1] < 1e-5, errors
 
 
+@pytest.mark.slow
 def test_order_4_is_reversible_keeps_its_energy_and_its_order_where_substeps_change(world):
     # A composition of reversible stages is reversible: it returns to the start to rounding, whatever the error was in between.
     w = hang(world, CHAIN, order=4, substeps=50)

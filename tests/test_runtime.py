@@ -170,6 +170,7 @@ assert peak[-1] - peak[4] < 60, peak
     )
 
 
+@pytest.mark.slow
 def test_forked_children_and_other_threads_are_told():
     python(
         START

@@ -86,6 +86,7 @@ def test_what_a_process_did_when_it_died_is_named_and_done_again(tmp_path):
     assert "SIGKILL" in str(again) and "done again: 1 part" in repr(found)
 
 
+@pytest.mark.slow
 def test_what_a_pool_loses_is_done_by_other_processes(tmp_path, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "3")  # which the pool uses
     make = functools.partial(ball, marker=str(tmp_path / "died"))
@@ -102,6 +103,7 @@ def test_what_a_pool_loses_is_done_by_other_processes(tmp_path, monkeypatch):
             tv.sweep(ball, SOME, height, executor)
 
 
+@pytest.mark.slow
 def test_parameters_that_end_every_worker_are_named():
     make = functools.partial(ball, marker="any", always=True)
     told = r"parameters 2, make\(speed=2.0\) could not be done, because its worker died 3 times: .*exit code 3"
