@@ -19,7 +19,7 @@ from .device.interrupts import deferred_signals, in_turn
 from .features.feature import Acceleration, Batch, Feature
 from .features.read_only import assign_whole_advice, read_only, structure_advice
 from .features.unknown_names import answer_names, suggest
-from .neighbours.queries import Contacts, PointSearch, near_by_brute_force, nearest
+from .neighbours.queries import Contacts, near, nearest
 from .particles import Particles, at_rest, in_range, spin_of
 from .shapes import Shape
 from .solvers.jacobi import Jacobi
@@ -118,7 +118,6 @@ class World:
         """Make these the parts of the world."""
         self._particles, self._features, self._usual_substeps = particles, features, usual_substeps(features)
         self._runner, self._solver, self._scale = Runner(parts, self._clock), parts.solver, parts.scale
-        self._search: PointSearch | None = None  # compiled at the first query
         parts.scene.residuals = self._runner.residuals
 
     def _rebuild(
@@ -480,32 +479,21 @@ class World:
         """Return which particles have their center within `radius` [m] of which points.
 
         Returns (m, 2): rows of an index into `points` and a particle, in order. points: (k, dim) [m]. radius: number or (k,), at
-        least 0. The grid of the Contact is used if the world has one; otherwise all particles are compared. In a periodic box the
-        nearest image of each particle counts.
+        least 0. In a periodic box the nearest image of each particle counts.
         """
         points = checks.points("World.near", "points", points, dim=self._particles.dim)
         radius = checks.per_item("World.near", "radius", radius, len(points), least=0.0)
         self._runner.memory.check()
         if not len(points) or not len(self._particles):
             return np.zeros((0, 2), dtype=np.int64)
-        box = self._runner.scene.periodic
-        points = points if box is None else box.wrap(points)
-        if not self._runner.search:
-            return near_by_brute_force(self.position, points, radius, box)
-        with deferred_signals:
-            self._runner.list_neighbours()
-            with self._runner.memory.compiler():
-                self._search = self._search or PointSearch(self._runner.search)
-                return self._search.near(points, radius)
+        return near(self.position, points, radius, self._runner.scene.periodic)
 
     def nearest(self, points) -> tuple[np.ndarray, np.ndarray]:
         """Return the particle nearest to each point, by its center, and its distance [m]; the first of equally near ones."""
         points = checks.points("World.nearest", "points", points, dim=self._particles.dim)
         if not len(self._particles):
             raise ValueError("World.nearest: there are no particles.")
-        position, search = self.position, self._runner.search
-        start = search.finest if search else 2 * float(np.abs(position).max() + np.abs(points).max(initial=1.0))
-        return nearest(self.near, position, points, start, self._runner.scene.periodic)
+        return nearest(self.position, points, self._runner.scene.periodic)
 
     def ray(
         self, origin, direction, reach=np.inf, *, radius: float = 0.0, groups=None, skip=(), features: Iterable[Feature] | None =

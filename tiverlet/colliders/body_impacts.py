@@ -269,7 +269,7 @@ class BodyImpacts:
             off = self.is_pulled(i)
             if off:
                 self.log_push(i, self.release(i))
-                self.move(i, self.release(i))
+                self.state.shift(i, self.release(i))
                 self.pushed[i] = ti.zero(self.pushed[i])
         if self.in_cluster(i):
             if ti.static(self.bends):
@@ -283,7 +283,7 @@ class BodyImpacts:
             if self.struck[i] == STRUCK_NOW:  # another wall may have pushed it meanwhile
                 pushed, change = self.first_push[i], miss * n
             elif ti.static(self.exact):
-                if last > 0 and self.has_next_pass(now):
+                if last > 0 and now.it + 1 - now.span.iterations < ti.static(self.passes):  # another pass can follow
                     pushed, change = last + miss, miss * n
             self.struck[i] = STRUCK_BEFORE
             self.pushed[i] = pushed
@@ -298,14 +298,9 @@ class BodyImpacts:
                 held *= self.coefficients[i][1] * support / size
             change -= held - self.held[i]
             self.held[i] = held
-            self.move(i, change)
+            self.state.shift(i, change)
             self.reached[i] = 1
         return off
-
-    @ti.func
-    def move(self, i, change):
-        """Move particle i as a wall does."""
-        self.state.shift(i, change)
 
     @ti.func
     def log_push(self, i, change):
@@ -320,8 +315,3 @@ class BodyImpacts:
         self.reached[i] = 1
         if self.struck[i] == STRUCK_NOW:
             self.struck[i] = STRUCK_BEFORE
-
-    @ti.func
-    def has_next_pass(self, now):
-        """Whether another pass can follow this one."""
-        return now.it + 1 - now.span.iterations < ti.static(self.passes)

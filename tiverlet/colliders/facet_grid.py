@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from ..geometry.places import places_between
+
 CELLS = 1024  # cell budget of a small shape; larger shapes have 8 cells for each facet
 ENTRIES = 256  # of lists for each facet, at most; beyond, cells are made larger
-CHUNK = 1 << 22  # pairs of a facet and a cell that are tested together
 
 
 class FacetGrid:
@@ -52,13 +53,9 @@ class FacetGrid:
         flat = corners.shape[2] == 2
         normal = np.stack([edges[:, 0, 1], -edges[:, 0, 0]], axis=1) if flat else np.cross(edges[:, 0], edges[:, 1])
         normal /= np.linalg.norm(normal, axis=1)[:, None]
-        number = (last - first + 1).prod(axis=1)
         box = corners.min(axis=1), corners.max(axis=1)
         facets, cells = [], []
-        groups = np.split(np.arange(len(corners)), np.flatnonzero(np.diff(np.cumsum(number) // CHUNK)) + 1)
-        for group in groups:
-            row, at = _between(first[group], last[group])
-            facet = group[row]
+        for facet, at in places_between(first, last):
             middle = self.origin + (at + 0.5) * self.cell
             off = np.abs(((middle - corners[facet, 0]) * normal[facet]).sum(axis=1))
             half = self.cell / 2 * np.abs(normal).sum(axis=1)[facet]
@@ -95,7 +92,7 @@ class FacetGrid:
         local = (corners - self.origin - shift) / self.cell - 0.5  # in cells, from the middle of cell 0
         first = np.maximum(np.ceil(local[..., 1:].min(axis=1)).astype(int), 0)
         last = np.minimum(np.floor(local[..., 1:].max(axis=1)).astype(int), self.shape[1:] - 1)
-        facet, ray = _between(first, last)
+        facet, ray = (np.concatenate(some) for some in zip(*places_between(first, last), strict=True))
         c = local[facet]
         if dim == 2:
             weight = (ray[:, 0] - c[:, 0, 1]) / (c[:, 1, 1] - c[:, 0, 1])
@@ -111,16 +108,3 @@ class FacetGrid:
         at = np.clip(np.floor(x).astype(int) + 1, 0, self.shape[0])
         np.add.at(change, (*(ray[:, k] for k in range(dim - 2, -1, -1)), at), sign.astype(int))
         return np.cumsum(change[..., :-1], axis=-1).ravel()
-
-
-def _between(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return all integer places from first to last, (m, k) each, axis 0 fastest: the rows that they belong to, and the places."""
-    size = np.maximum(last - first + 1, 0)
-    number = size.prod(axis=1)
-    row = np.repeat(np.arange(len(first)), number)
-    rest = np.arange(len(row)) - np.repeat(np.cumsum(number) - number, number)
-    place = np.empty((len(row), first.shape[1]), dtype=int)
-    for k in range(first.shape[1]):
-        place[:, k] = first[row, k] + rest % size[row, k]
-        rest = rest // size[row, k]
-    return row, place

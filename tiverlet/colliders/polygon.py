@@ -4,10 +4,9 @@ import numpy as np
 
 from .. import checks
 from ..checks import ArrayLike
+from ..geometry.places import places_between
 from .facets import Facets, facet_normals
 from .moving import Moving
-
-BLOCK = 1 << 20  # pairs of edges that are compared together
 
 
 class Polygon(Moving):
@@ -83,10 +82,8 @@ def _check_simple(vertices: np.ndarray, i: np.ndarray, j: np.ndarray) -> None:
     order = np.argsort(low[:, 0], kind="stable")
     # Edges that begin, along x, before another one ends.
     ends = np.searchsorted(low[order, 0], high[order, 0], side="right")
-    number = ends - np.arange(m) - 1
-    for group in np.split(np.arange(m), np.flatnonzero(np.diff(np.cumsum(number) // BLOCK)) + 1):
-        p = np.repeat(group, number[group])
-        q = p + 1 + np.arange(len(p)) - np.repeat(np.cumsum(number[group]) - number[group], number[group])
+    for p, after in places_between(np.arange(m)[:, None] + 1, ends[:, None] - 1):
+        q = after[:, 0]
         p, q = np.minimum(order[p], order[q]), np.maximum(order[p], order[q])
         near = (low[p, 1] <= high[q, 1]) & (low[q, 1] <= high[p, 1])
         p, q = p[near], q[near]

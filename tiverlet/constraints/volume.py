@@ -8,6 +8,7 @@ from .. import checks
 from ..checks import ArrayLike
 from ..device import ti
 from ..features.feature import Knob, Scene
+from ..geometry.common_sense import common_sense, edges_of
 from ..geometry.intervals import cross
 from ..particles import Particles
 from .core.members import Members
@@ -155,7 +156,7 @@ class Surfaces(Quantity):
 
     def pairs(self) -> np.ndarray:
         """Return the two ends of each edge, (edges, 2)."""
-        return np.unique(np.sort(_edges(self.faces)[:, :2], axis=1), axis=0)
+        return edges_of(self.faces)[0]
 
     def bind(self, scene: Scene, batch: Any, equation: Any) -> "Surfaces":
         """Return the quantity for kernels, with the faces around each corner in fields, in order: their other two corners."""
@@ -184,42 +185,15 @@ class Surfaces(Quantity):
         return total / 6
 
 
-def _edges(faces: np.ndarray) -> np.ndarray:
-    """Return the edges of each face in its sense, and the face: (3 k, 3)."""
-    f = np.arange(len(faces), dtype=faces.dtype)
-    return np.concatenate([np.stack([faces[:, a], faces[:, (a + 1) % 3], f], axis=1) for a in range(3)])
-
-
 def _orient_faces(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Orient faces so that the two at each edge run along it in opposite senses. Returns the faces and the surface of each."""
-    edges = _edges(faces)
-    forward = edges[:, 0] < edges[:, 1]
-    ends = np.sort(edges[:, :2], axis=1)
-    order = np.lexsort((ends[:, 1], ends[:, 0]))
-    unique, first, counts = np.unique(ends[order], axis=0, return_index=True, return_counts=True)
+    edges, which, counts = edges_of(faces)
     if (counts != 2).any():
         k = int(np.argmax(counts != 2))
-        edge, face = tuple(int(v) for v in unique[k]), int(edges[order[first[k]], 2])
+        edge, face = tuple(int(v) for v in edges[k]), int(np.argmax((which == k).any(axis=1)))
         why = "the surface is open there" if counts[k] == 1 else "an edge of a closed surface has two"
         raise ValueError(f"Volume: edge {edge} of cells[{face}] belongs to {counts[k]} face(s); {why}.")
-    one, two = order[0::2], order[1::2]
-    a, b, alike = edges[one, 2], edges[two, 2], forward[one] == forward[two]
-    neighbours: list[list[tuple[int, bool]]] = [[] for _ in faces]
-    for p, q, same in zip(a.tolist(), b.tolist(), alike.tolist(), strict=True):
-        neighbours[p].append((q, same))
-        neighbours[q].append((p, same))
-    surface, turned = np.full(len(faces), -1), np.zeros(len(faces), dtype=bool)
-    for k in range(len(faces)):
-        if surface[k] >= 0:
-            continue
-        surface[k] = surface.max() + 1
-        queue = [k]
-        while queue:
-            p = queue.pop()
-            for q, same in neighbours[p]:
-                if surface[q] < 0:
-                    surface[q], turned[q] = surface[p], turned[p] ^ same
-                    queue.append(q)
-                elif turned[q] != turned[p] ^ same:
-                    raise ValueError(f"Volume: cells[{p}] and cells[{q}] have no common sense; the surface has only one side.")
+    turned, surface, wrong = common_sense(faces)
+    if wrong >= 0:
+        raise ValueError(f"Volume: cells[{wrong}] and its neighbours have no common sense; the surface has only one side.")
     return np.where(turned[:, None], faces[:, ::-1], faces), surface

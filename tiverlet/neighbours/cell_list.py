@@ -20,14 +20,13 @@ from ..device import runtime, ti
 from ..device.number import OnDevice
 from ..device.prefix_sum import Sums
 from ..geometry.ordered import distinct
-from .images import FLOW, GRADIENT
+from .images import GRADIENT
 
 if TYPE_CHECKING:
     from ..device.thread_team import Team
     from ..features.feature import Scene
 
 FARTHEST = 1 << 22  # cells from the origin: beyond it, f32 cannot distinguish adjacent cells
-MOST_CELLS = 1 << 30  # cells from the origin in queries: no particle is there
 LEVELS = 14  # at most; the last level holds all smaller particles, down to points
 
 
@@ -177,24 +176,6 @@ class CellList:
         for k in ti.static(self.axes):
             cell[k] = self.images.cell(x, k, 0, self.cells_per_axis[m][k])
         return cell
-
-    @ti.func
-    def cell_range(self, point, radius, m, k: ti.template()):  # type: ignore[valid-type]
-        """Return the first cell along axis k that may hold particles within `radius` of a point, and their number.
-
-        One cell is added on each side for rounding. In a periodic box the point is in the box; in a sheared one these are all
-        cells along FLOW. There are no more cells than buckets, so that each bucket is read once. Before they are clipped, numbers
-        may be too large for integers.
-        """
-        most, per_meter = 1 << self.axis_bits[m][k], self.scale(m)
-        if ti.static(k in self.axes):
-            most = ti.min(most, self.cells_per_axis[m][k])
-            per_meter = ti.cast(self.cells_per_axis[m][k] / self.images.length[None][k], self.real)
-        low = ti.floor((point[k] - radius) * per_meter) - 1
-        number = ti.cast(ti.min(ti.floor((point[k] + radius) * per_meter) + 2 - low, most), ti.i32)
-        if ti.static(self.sheared and k == FLOW):
-            number = most
-        return ti.cast(ti.max(ti.min(low, MOST_CELLS), -MOST_CELLS), ti.i32), number
 
     @ti.func
     def scale(self, m):

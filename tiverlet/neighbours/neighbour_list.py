@@ -36,7 +36,10 @@ class NeighbourList:
     host_only = ("room",)
     has_own_compile_time = True  # see Feature
 
-    def __init__(self, memory: "Memory", count: Number, rooms: Number, pair_data: list[PairData], team: Team, network_size: int):
+    def __init__(
+        self, memory: "Memory", count: Number, rooms: Number, pair_data: list[PairData], team: Team, network_size: int,
+        lists_walls: bool,
+    ):  # fmt: skip
         self.team, self.n, self.memory, self.network_size = team, count, memory, network_size
         self.capacity, self.pitch = memory.number(0), memory.number(0)
         self.pair_data = pair_data
@@ -44,7 +47,8 @@ class NeighbourList:
         add = memory.field
         self.first = add("grid.first", rooms, kind=ti.i32)
         self.number = add("grid.number", count, kind=ti.i32)
-        self.wall_number: Any = None  # of the entries of walls, which follow those of particles
+        # Of the entries of walls, which follow those of particles.
+        self.wall_number: Any = add("grid.wall_number", count, kind=ti.i32) if lists_walls else None
         self.stale = add("grid.stale", None, kind=ti.i32, values=1)
         self.need = add("grid.need", None, kind=ti.i32)
         self.old_first = add("grid.old_first", count, kind=ti.i32)
@@ -60,14 +64,19 @@ class NeighbourList:
     def __repr__(self) -> str:
         return "neighbour list"
 
-    def list_walls(self, count: Number) -> None:
-        """Let walls have entries, behind those of particles. count: of the particles."""
-        self.wall_number = self.memory.field("grid.wall_number", count, kind=ti.i32)
-
     @inline
     def count(self, i):
         """Return the number of entries of particle i, with those of walls."""
         return at(self.number, i) if self.wall_number is None else at(self.number, i) + at(self.wall_number, i)
+
+    @ti.func
+    def has(self, i, other):
+        """Return 1 if a particle or a face of a wall is on the list of particle i, else 0."""
+        out = 0
+        for e in range(self.first[i], self.first[i] + self.count(i)):
+            if self.neighbour[e] == other:
+                out = 1
+        return out
 
     def allocate(self, capacity: int) -> bool:
         """Allocate `capacity` entries in a tree of fields of their own, so that the list can grow. The old list is kept.

@@ -65,10 +65,8 @@ class NeighbourSearch:
         # Entries of a list that is sorted without branches. Compiling that takes an eighth of the compile time.
         network_size = 1 if scene.memory.compiler.few else 8 if dim == 2 else 16
         rooms = self.sums.room if team.launched else scene.count
-        self.list = NeighbourList(scene.memory, scene.count, rooms, pair_data, team, network_size)
+        self.list = NeighbourList(scene.memory, scene.count, rooms, pair_data, team, network_size, len(walls) > 0)
         self.network = sorting_network(network_size)
-        if walls:
-            self.list.list_walls(scene.count)
         self.dim, self.state, self.radius = dim, scene.state, scene.radius
         self.table = table
         number, real = scene.memory.number, scene.real
@@ -76,11 +74,10 @@ class NeighbourSearch:
         reach = 0 * radius if reach is None else reach
         self.sheared = bool(self.state.images and self.state.images.sheared)
         self._scene = scene
-        skin = max(0.0, self._skin(skin + ahead, radius, reach) - ahead)
-        self.skin, self.sure, self.too_far = (number(value, real) for value in self._margins(skin, ahead))
-        skin += ahead
+        margins = self._margins(skin, ahead, radius, reach)
+        self.skin, self.sure, self.too_far = (number(value, real) for value in margins)
         self._extent: Sequence[float] = [-1.0] * dim
-        self.cells = CellList(scene, radius, reach, skin, team, scratch)
+        self.cells = CellList(scene, radius, reach, margins[0], team, scratch)
         self.several_levels = self.cells.levels > 1
         # Whether a particle finds all neighbours in the 3^dim cells around it, even after it has moved far (see Strays).
         self.finds_all_neighbours = not self.several_levels and not self.state.images and not reach.any()
@@ -100,18 +97,16 @@ class NeighbourSearch:
     def __repr__(self) -> str:
         return repr(self.list)
 
-    def _skin(self, skin: float, radius: np.ndarray, reach: np.ndarray) -> float:
-        """Return the skin that the box allows [m].
+    def _margins(self, skin: float, ahead: float, radius: np.ndarray, reach: np.ndarray) -> tuple[float, float, float]:
+        """Return `skin`, `sure` and `too_far`, as far as the box allows.
 
         In a sheared box, the nearest image along y is the nearest image only within half of the box height.
         """
-        if not self.sheared:
-            return skin
-        return min(skin, float(self._scene.periodic.lengths[GRADIENT]) / 2 - 2 * radius.max(initial=0.0) - reach.max(initial=0.0))
-
-    @staticmethod
-    def _margins(skin: float, ahead: float) -> tuple[float, float, float]:
-        """Return `skin`, `sure` and `too_far`."""
+        far = skin + ahead
+        if self.sheared:
+            half = float(self._scene.periodic.lengths[GRADIENT]) / 2
+            far = min(far, half - 2 * radius.max(initial=0.0) - reach.max(initial=0.0))
+        skin = max(0.0, far - ahead)
         return skin + ahead, ahead + (1 - 2 * STALE) * skin, (STALE * skin) ** 2
 
     def _blocks(self, n: int) -> int:
@@ -141,12 +136,10 @@ class NeighbourSearch:
         if change.has_removed and not self.list.saved:
             self.list.remove_particles(change.number)
             self.cells.remove_particles(change.number)
-        skin = max(0.0, self._skin(skin + ahead, radius, reach) - ahead)
-        margins = self._margins(skin, ahead)
+        margins = self._margins(skin, ahead, radius, reach)
         stays = self.finds_all_neighbours and not self.list.saved and stale != 1 and margins[0] == self.skin
         self.skin, self.sure, self.too_far = margins
-        skin += ahead
-        stays &= self.cells.regroup(radius, reach, skin, np.array(change.now.extent))
+        stays &= self.cells.regroup(radius, reach, margins[0], np.array(change.now.extent))
         if self.sheared:
             self.farthest = float(self.cells.sizes.max())
         self.sums.room = n

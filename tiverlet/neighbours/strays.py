@@ -98,16 +98,7 @@ class Strays:
                     for place in range(begin, end):
                         side = group.wall.side_at(place)
                         if group.wall.least_gap(side, i, self.search.radius.of(i)) < near:
-                            out |= self.is_unlisted_wall(i, WALL + group.face(k, side))
-        return out
-
-    @ti.func
-    def is_unlisted_wall(self, i, face):
-        """Return 1 if a face of a wall is not on the list of stray i."""
-        out, begin = 1, self.list.first[i] + self.list.number[i]
-        for e in range(begin, begin + self.list.wall_number[i]):
-            if self.list.neighbour[e] == face:
-                out = 0
+                            out |= 1 - self.list.has(i, WALL + group.face(k, side))
         return out
 
     @ti.func
@@ -116,8 +107,5 @@ class Strays:
         near = self.search.table.cutoff(self.search.radius, i, j) + ti.cast(self.search.sure, self.real)
         r, out = self.state.separation(i, j), 0
         if r.dot(r) < near * near:
-            out = self.search.is_list_member(i, j, r)
-            for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
-                if self.list.neighbour[e] == j:
-                    out = 0
+            out = self.search.is_list_member(i, j, r) & (1 - self.list.has(i, j))
         return out
