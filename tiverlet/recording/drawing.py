@@ -171,10 +171,7 @@ class Drawing:
         self._log(f"{self._root}/{PARTICLES}", *row)
         for k in changed_features:
             self._wall(k)
-        if self._overlays.forces and self.world._runner.step.contacts:
-            self._load(x)
-        elif self._contacts:
-            self._contact()
+        self._touch(x)
         if self.world.particles.orientation is not None:
             self._mark(x)
         if self._overlays.velocities:
@@ -256,32 +253,30 @@ class Drawing:
             self.bytes += shape.strips.nbytes
         self._log(f"{self._root}/walls/{k}", what)
 
-    def _contact(self) -> None:
-        """Draw the points of contact."""
-        world = self.world
-        middle = np.zeros((0, world.particles.dim))
-        if world._clock.h:
-            found = world.contacts
-            most = np.argsort(-found.impulse, kind="stable")[: -(-len(world.particles) // TOUCH)]
-            middle = found.point[np.sort(most)]
-            box = box_of(world)
-            middle = middle if box is None else box.wrap(middle)
-        if not len(middle) and not self._touched:
+    def _touch(self, x: np.ndarray) -> None:
+        """Draw the loads of contacts if requested, otherwise their points in a scene of few particles."""
+        if self._overlays.forces and self.world._runner.step.contacts:
+            where, radii = (a.astype(np.float32) for a in loads(self.world, x))
+            what = self._strips.from_fields(strips=where, radii=radii, colors=[LOAD], **self._above)
+        elif self._contacts:
+            where = self._contact_points().astype(np.float32)
+            what = self._points(where, radii=[-1.2], colors=[[20, 22, 28]])
+        else:
             return
-        self._touched = bool(len(middle))
-        self._log(f"{self._root}/contacts", self._points(middle.astype(np.float32), radii=[-1.2], colors=[[20, 22, 28]]))
-        self.bytes += middle.nbytes // 2
+        if len(where) or self._touched:  # where there are none any more, an empty row clears the last ones
+            self._touched = bool(len(where))
+            self._log(f"{self._root}/contacts", what)
+            self.bytes += where.nbytes
 
-    def _load(self, x: np.ndarray) -> None:
-        """Draw the loads of contacts."""
-        strips, radii = loads(self.world, x)
-        if len(strips) or self._touched:
-            self._touched = bool(len(strips))
-            strips, radii = strips.astype(np.float32), radii.astype(np.float32)
-            self._log(
-                f"{self._root}/contacts", self._strips.from_fields(strips=strips, radii=radii, colors=[LOAD], **self._above)
-            )
-            self.bytes += strips.nbytes
+    def _contact_points(self) -> np.ndarray:
+        """Return the points of the contacts with the largest impulses, (m, dim) [m]."""
+        world = self.world
+        if not world._clock.h:
+            return np.zeros((0, world.particles.dim))
+        found, box = world.contacts, box_of(world)
+        most = np.argsort(-found.impulse, kind="stable")[: -(-len(world.particles) // TOUCH)]
+        middle = found.point[np.sort(most)]
+        return middle if box is None else box.wrap(middle)
 
     def _breaks(self, x: np.ndarray) -> None:
         """Draw a mark where a constraint broke since the last frame, and add a line to the list of events."""
