@@ -61,9 +61,10 @@ class Clocks:
 
     def return_to(self, other: "Clocks", some: np.ndarray) -> None:
         """Set the worlds in `some` to the values of other clocks. Knobs keep theirs, so drag may be another one."""
+        needs = self.needs_drag[some] | [a != b for a, b in zip(self.drag[some], other.drag[some], strict=True)]
         for name, values in vars(self).items():
             values[some] = getattr(other, name)[some]
-        self.needs_drag[some] = True
+        self.needs_drag[some] = needs
 
     @property
     def drags(self) -> np.ndarray:

@@ -45,7 +45,7 @@ class Knobs:
 
     def _set_flags(self, flags: np.ndarray) -> None:
         for f, each in zip(self.features, flags.tolist(), strict=True):
-            f.changed, f.moving, f.new_force = each
+            vars(f).update(zip(FLAGS, each, strict=True))
 
     def show(self, k: int | None) -> None:
         """Give features the knobs of world k; None: those of all worlds, as the user sees them."""
@@ -54,15 +54,23 @@ class Knobs:
 
     @contextlib.contextmanager
     def shown(self, k: int) -> Iterator[None]:
-        """Give features the knobs and flags of world k while the context lasts, and note the flags at its end."""
+        """Give features the knobs of world k while the context lasts."""
         self.show(k)
-        self._set_flags(self._flags[k])
         try:
             yield
         finally:
-            self._flags[k] = _flags(self.features)
-            self._hide_flags()
             self.show(None)
+
+    @contextlib.contextmanager
+    def flagged(self, k: int) -> Iterator[None]:
+        """Give features the knobs and flags of world k while the context lasts, and note the flags at its end."""
+        with self.shown(k):
+            self._set_flags(self._flags[k])
+            try:
+                yield
+            finally:
+                self._flags[k] = _flags(self.features)
+                self._hide_flags()
 
     def set(self, i: int, chosen: np.ndarray, knobs: dict[str, Any]) -> None:
         """Set knobs of feature i in the chosen worlds, see Worlds.set()."""

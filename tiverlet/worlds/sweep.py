@@ -155,11 +155,7 @@ def _rows(make: Any, parameters: Any, figures: Any) -> list[dict[str, Any]]:
         signature = inspect.signature(make)
     except ValueError:  # make is a builtin
         return rows
-    seen = set()
     for k, row in enumerate(rows):
-        if (names := frozenset(row)) in seen:
-            continue
-        seen.add(names)
         try:
             signature.bind(**row)
         except TypeError as why:

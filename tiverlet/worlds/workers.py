@@ -25,9 +25,6 @@ class ThisProcess:
         future.set_result(compute(job, part))
         return future
 
-    def close(self) -> None:
-        """Do nothing: no part runs between calls."""
-
 
 class Died(Exception):
     """A process ended before its part was done."""
@@ -198,7 +195,7 @@ class Workers:
         for future in self._waiting:
             with contextlib.suppress(Exception):
                 future.cancel()
-        if self._own:
+        if isinstance(self._executor, Processes):
             self._executor.close()
 
 

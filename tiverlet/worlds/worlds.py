@@ -131,7 +131,7 @@ class Worlds:
         runner.set_multipliers_per_newton()
         if self._sources:
             self._sources[k].put_on(world)
-        with self._knobs.shown(k):
+        with self._knobs.flagged(k):
             try:
                 yield world
             finally:
