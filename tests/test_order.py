@@ -56,6 +56,13 @@ def test_passes_are_second_order_where_the_substep_changes_too(world, change):
     assert 1.85 <= order(errors) <= 2.15 and errors[0] <= figures(DOUBLE, 2.0, 20)["SHAKE-direct"]
 
 
+def test_velocities_of_a_spring_are_second_order(world):
+    # An elastic pendulum that swings: what is read has the pull of the spring up to the time of the positions.
+    w, want = hang(world, "S04_spring_pendulum"), case("S04_spring_pendulum")["values"]["t5.0"]["v"]
+    speeds = [rms(rerun(w, 5.0, substeps=n).velocity[1], want) for n in (20, 40, 80)]
+    assert 1.9 <= order(speeds) <= 2.1
+
+
 def test_a_million_substeps_lose_no_energy_and_no_spin(world):
     # A spherical pendulum, L_y = z v_x - x v_z with the velocity that the user reads: the energy stays where the step puts it,
     # and L_y is that of the discrete motion. XPBD would lose all of it much earlier.
