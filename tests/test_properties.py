@@ -14,6 +14,7 @@ from .rows import OTHERS, PATH, ROWS, Row
 
 BLOCKS = ("met", "off", "turned", "held", "stuck", "soft", "free", "swing", "loaded", "weak")
 MASS = np.array([1.0, 2.5, 0.7, 4.0])
+STIFF = np.array([0.02, 0.05, 0.1, 0.2, 0.32, 0.5, 0.8, 1.3, 2.0, 5.0, 20.0])  # omega h, about, at 20 substeps
 DIMS = pytest.mark.parametrize("dim", [pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
 pytestmark = pytest.mark.usefixtures("briefly")
 
@@ -197,6 +198,58 @@ def test_springs_bear_their_load_and_weak_ones_break(zoo, dim):
             np.testing.assert_allclose(b.of("loaded", w.position), b.of("loaded", z.x), atol=2e-7, err_msg=name)
             np.testing.assert_allclose(b.of("loaded", w.velocity), 0.0, atol=1e-8, err_msg=name)
             assert w.features[1 + k].load[c] == pytest.approx(want, rel=1e-5), name
+
+
+def springs(row: Row, first: int) -> tuple:
+    """Return positions, velocities and a feature: blocks that move, as stiff as STIFF, and two at rest, rigid and damped."""
+    m, k = len(STIFF) + 2, len(row.points)
+    x = np.tile(row.points, (m, 1))
+    v = np.tile(0.02 * np.random.default_rng(5).normal(size=row.points.shape), (m, 1))
+    v[-2 * k :] = 0
+    slopes, rest = probed(row, x, m)
+    if row.bilateral:  # one-sided constraints just touch
+        rest[:-2] -= 0.1 * row.off
+    alpha = np.append((slopes**2).reshape(m, -1).sum(axis=1)[:-2] / (1200 * STIFF) ** 2, [0.0, 1e-2])
+    corners, damping = first + np.arange(m * k).reshape(m, k), np.append(np.zeros(m - 1), 3.0)
+    return x, v, row.make(corners, rest, compliance=alpha, damping=damping, break_at=1e9)
+
+
+@DIMS
+def test_starts_from_velocities_that_were_read_change_nothing(dim):
+    # Without gravity a block has the energy of its start. Starts from the velocities that are read, after each frame, may neither
+    # pump a spring nor brake it by more than 1 - (1 - (omega h)^4 / 16). With the force of the substep before in them, they would
+    # grow by 1 + (omega h)^2 / 4 per frame, e^(15 omega^2 h^2) per second. Assigning what was read makes no start.
+    parts, blocks, n = [], [], 0  # blocks: the particles of each moving block
+    for name in named(dim):
+        parts.append(springs(ROWS[name], n))
+        blocks.append(n + np.arange(len(STIFF) * len(ROWS[name].points)).reshape(len(STIFF), -1))
+        n += len(parts[-1][0])
+    x, v = (np.concatenate([part[k] for part in parts]) for k in range(2))
+    mass = np.ones(n)
+    for block in blocks:
+        mass[block] = MASS[: block.shape[1]]
+    start = tv.Particles(x, velocity=v, mass=mass)
+    with built(start, [part[2] for part in parts]) as w:
+
+        def kinetic(back):
+            w.position, w.velocity = start.position, start.velocity
+            out = []
+            for _ in range(frames):
+                if back:
+                    w._start_from(w.velocity)
+                w.step(1 / 60)
+                each = mass * (w.velocity**2).sum(axis=1)
+                out.append([each[block].sum(axis=1) for block in blocks])
+            return np.array(out)
+
+        for substeps, frames in (2, 150), (8, 100), (20, 150), (80, 60):
+            w.substeps = substeps
+            alone, back = kinetic(False), kinetic(True)
+            few = frames // 5
+            most, first, last = alone.max(axis=0), back[:few].max(axis=0), back[-few:].max(axis=0)
+            assert (last <= 1.02 * np.maximum(first, most)).all(), (substeps, last / np.maximum(first, most))
+            resolved = STIFF * 20 / substeps < 0.3
+            assert (last >= 0.9 * alone[-few:].max(axis=0))[:, resolved].all(), (substeps, last)
 
 
 def degenerate(row: Row) -> np.ndarray:

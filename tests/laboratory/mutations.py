@@ -111,7 +111,7 @@ FAULTS = (
           "    z = rate * h\n    if z < 1e-3:", "    z = rate * h\n    if z < 1e3:", "free_motion"),
     Fault("bdd20b14", "the pull of springs in velocities is one substep old", "constraints/core/spring.py",
           "return -(1 - self.stiff(c, h, w)) * grown / (alpha / (h * h) + W / 4)", "return 0 * grown * W",
-          "velocity order conservation"),
+          "properties velocity order conservation"),
     Fault("d3c0fae7", "a spring that turns stores energy that is not there", "constraints/core/spring.py",
           "return stored + theta * (borne - stored)", "return stored", "conservation energy_bound guard"),
     Fault("db7e397a", "velocity forces take no reaction along", "step/integrator.py",
