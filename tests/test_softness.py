@@ -1,12 +1,17 @@
 """Where the substep changes: no energy comes of it, and links rest where they do in the longest frames."""
 
+import contextlib
+
 import numpy as np
 import pytest
 
 import tiverlet as tv
 
-from .properties import DRAWN
+from .fuzz.scenes import Call, Set, Step, Structure
+from .fuzz.trials import Trial
+from .properties import DRAWN, scheduled
 from .properties import SCHEDULES as COMMON
+from .scenes import SCENES
 
 G, R, SUBSTEPS = 9.81, 0.5, 8
 
@@ -175,3 +180,48 @@ def test_a_lattice_that_swings_keeps_its_energy_where_the_substep_gets_shorter(w
     after = [w.step(1 / 60) for _ in range(3)]
     kinetic = before.energy - 9.81 * (w.position[:, 1]).sum()
     assert before.energy - 0.1 * kinetic < min(r.energy for r in after) and max(r.energy for r in after) < before.energy + 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "a taut net between four pins",
+        "a tent and a bag hang by ropes",
+        "a wheel and a drawbridge hang by bars",
+        "cantilevers of areas and of clusters",
+        "a box of links hangs on a rope over discs",
+    ],
+)
+def test_seconds_after_the_last_change_of_the_substep_nothing_tells_of_it(taichi, name):
+    # Beside drag, which takes out motion: positions to 1e-3 of the size, loads to 3e-3 of the largest, whatever happened before.
+    scene, labels, ends = SCENES[name], ("constant", "random", "uneven", "auto", "a hitch of 0.1 s"), []
+    features = [call for call in scene.structure.features if call.name != "Drag"] + [Call("Drag", {"rate": 4.0})]
+    with contextlib.closing(Trial(Structure(scene.structure.particles, tuple(features), scene.structure.settings))) as trial:
+        for label in labels:
+            last = [Set(None, "substeps", 20), *[Step(1 / 60)] * 300]
+            trial.replay([*scheduled(name, COMMON[label]), *last])
+            borne = [f.load for f in trial.features if isinstance(f, (tv.Distance, tv.Rope, tv.ShapeMatch))]
+            loads = np.concatenate([np.abs(load).reshape(len(load), -1).max(axis=1) for load in borne])
+            ends.append((trial.world.position, loads))
+            assert "softened" not in trial.world.last.flags
+    (x, loads), size = ends[0], np.ptp(ends[0][0], axis=0).max()
+    for label, (after, also) in zip(labels, ends, strict=True):
+        assert np.abs(after - x).max() < 1e-3 * size, label
+        assert np.abs(also - loads).max() < 3e-3 * loads.max(), label
+
+
+@pytest.mark.parametrize("points, weight", [(5, 100), (5, 1000), (20, 10), (20, 100)])
+def test_a_chain_that_gave_way_in_a_late_frame_bears_its_weight_again(world, points, weight):
+    # A frame of 0.1 s among ones of 1/60 s: no chain can bear such weights in so long substeps, and each falls apart by a tenth
+    # and more of its length. Later it is whole, and never has it more energy than at the start.
+    x, mass = np.outer(np.linspace(0, 1, points + 1), (0.8, -0.6)), np.full(points + 1, 0.01)
+    mass[-1] *= weight
+    links = np.stack([np.arange(points), np.arange(1, points + 1)], axis=1)
+    w = world(tv.Particles(x, mass=mass, pinned=[0]), [tv.Gravity(G), tv.Distance(links), tv.Drag(1.0)], substeps=SUBSTEPS)
+    stretch = []
+    for k in range(330):
+        report = w.step(0.1 if k == 30 else 1 / 60)
+        assert report.energy < G * mass @ x[:, 1] + 1e-3 * G * mass.sum()
+        stretch.append(np.abs(np.linalg.norm(np.diff(w.position, axis=0), axis=1) * points - 1).max())
+    assert max(stretch[30:60]) > 0.04 and stretch[-1] < 1e-4 and report.clean

@@ -34,10 +34,6 @@ UNKNOWN, UNMET, ENDED = range(3)  # whether a system takes it: decided by the mo
 # gradient of a convex energy, sum lam |r|. Up to 1, it adds at most lam times the shortening of the links.
 SOFTENED_TO = 1.0
 LEAST_SOFTNESS = 2e-12  # of the largest diagonal: the least softness, so that no pivot vanishes
-# A system that was softened for a longer substep becomes stiffer, which takes energy: it has what it lost when a longer substep
-# made it softer, REGAIN of its softness in a substep. At rest, where violations change by less than STILL in one of the longer
-# substeps, it recovers for nothing, by RECOVERY in this time; violations then change half as fast as they may.
-REGAIN, RECOVERY, STILL = 2.0**-4, 2.0**-14, 2.0**-12
 # Strain up to which giving way is not told where no tension bears the load: a straight rope so much longer sags by 0.3 %.
 SLIGHT = 2e-5
 UNBORNE = 1e30  # (omega h)^2 of a tension that is undetermined
@@ -134,10 +130,10 @@ class Elimination(System):
         row, corner, particle = self.corners(scalars, slots)
         self.plan, self.parts, self.entries = found, self.memory.number(found.parts), self.memory.number(len(found.column))
         self.solved, self.has_implied = self.memory.number(len(found.rows)), len(rows) > len(found.rows)
-        # Of each part that gave way in the last substep: (h' / h)^2 for the substep h' that it is softened for, the sum of its
-        # violations, and what it lost to longer substeps, in energy h^2 / tension for h' = h. Else 0. The first number is below
-        # 0 where the part seems to have borne its load, until its violations are seen to be gone. The last is
-        # (omega h)^2 of the tension that it would have borne, UNBORNE where none bears the load.
+        # Of each part that gave way in the last substep: (h' / h)^2 for the substep h' that it is softened for; the sum of its
+        # violations; the energy that these store with the multipliers found, times h^2; and (omega h)^2 of the tension that it
+        # would have borne, UNBORNE where none bears the load. Else 0. The first number is below 0 where the part seems to have
+        # borne its load, until its violations are seen to be gone.
         self.softened = scene.memory.field(SOFTENED, found.parts, width=4, kind=ti.f64, state=True)
         product = found.product.copy()
         product[:, 1:] = slot[product[:, 1:]]
@@ -190,28 +186,34 @@ class Elimination(System):
     def keep_softness(self, ratio: float) -> None:
         """Keep parts that give way as soft as they are, where the next substep is `ratio` times as long as the last one."""
         state = self.memory.read(self.softened)
-        some = np.flatnonzero(state[:, 0])
-        if len(some):
-            soft, off, lost, tension = state[some].T
-            kept = np.maximum(np.abs(soft) / ratio**2, 1.0)
-            lost = (lost + off * (1 / np.abs(soft) - 1 / (kept * ratio**2))) * ratio**2
-            state[some] = np.stack([np.copysign(kept, soft), off, np.maximum(lost, 0.0), tension * ratio**2], axis=1)
-            self.memory.write(self.softened, state)
+        if state.any():
+            soft, off, energy, tension = state.T
+            kept = np.copysign(np.maximum(np.abs(soft) / ratio**2, 1.0), soft) * (soft != 0)
+            self.memory.write(self.softened, np.stack([kept, off, energy * ratio**2, tension * ratio**2], axis=1))
+
+    def softness_of_longer(self, h: float) -> tuple[float, float]:
+        """Return (h' / h)^2 for the longest substep h' that a part is softened for, and the energy that such parts store in
+        substeps h [J]."""
+        soft, _, energy, _ = self.memory.read(self.softened).T
+        longer = np.abs(soft) > 1
+        return float(np.abs(soft).max(initial=1.0)), float(energy[longer].sum()) / h**2
+
+    def stiffen(self, factor: float) -> None:
+        """Let parts that are softened for a longer substep bear tensions that are `factor` times as large."""
+        state = self.memory.read(self.softened)
+        soft = np.abs(state[:, 0])
+        state[:, 0] = np.copysign(np.where(soft > 1, np.maximum(soft / factor, 1.0), soft), state[:, 0])
+        self.memory.write(self.softened, state)
 
     def _can_stiffen(self) -> np.ndarray:
         """Return a mask of the parts that gave way in a longer substep, and need not in this one, (parts,)."""
-        state = self.memory.read(self.softened)
-        return (np.abs(state[:, 0]) > 1) & (state[:, 3] <= SOFTENED_TO)
+        soft, _, _, tension = self.memory.read(self.softened).T
+        return (np.abs(soft) > 1) & (tension <= SOFTENED_TO)
 
     @property
     def can_stiffen(self) -> bool:
         """Whether parts gave way in a longer substep, and may bear their loads in this one."""
         return bool(self._can_stiffen().any())
-
-    @property
-    def keeps_softness_of_longer(self) -> bool:
-        """Whether a part is softened for a longer substep than the present one, so that shorter ones do not help."""
-        return bool((np.abs(self.memory.read(self.softened)[:, 0]) > 1).any())
 
     def gives_way(self, batch: Batch) -> np.ndarray:
         """Return a mask of the constraints of a batch in parts that give way, (m,)."""
@@ -565,29 +567,26 @@ class Elimination(System):
 
     @ti.func
     def softness(self, b, begin, end):
-        """Return (h' / h)^2 for the substep h' that part b is softened for, after it has recovered a little; 0 if it is not."""
-        soft, off, lost = ti.abs(self.softened[b][0]), ti.cast(0, ti.f64), self.softened[b][2]
+        """Return (h' / h)^2 for the substep h' that part b is softened for; 0 if it is not."""
+        soft, off = ti.abs(self.softened[b][0]), ti.cast(0, ti.f64)
         if soft > 0 and begin < end and self.earlier_tension(begin, end) == 0:
             for r in range(begin, end):
                 off += ti.abs(self.violation[r])
             if self.softened[b][0] < 0 and off <= GONE * self.softened[b][1]:
-                soft, off, lost = 0 * soft, 0 * off, 0 * lost
-            elif soft > 1 and off > 0:
-                new = ti.max(soft * (1 - REGAIN), 1 / (1 / soft + lost / off), 1 + 0 * soft)
-                lost -= off * (1 / new - 1 / soft)
-                if ti.abs(off - self.softened[b][1]) * ti.sqrt(soft) < STILL * off:
-                    new = ti.max(new - 2 * RECOVERY * ti.sqrt(new), 1 + 0 * soft)
-                soft = new
-            self.softened[b] = ti.Vector([soft, off, ti.max(lost, 0 * lost), self.softened[b][3]])
+                soft, off = 0 * soft, 0 * off
+            self.softened[b][0] = soft
+            self.softened[b][1] = off
         return soft
 
     @ti.func
-    def record_softness(self, b, soft, gives_way):
+    def record_softness(self, b, begin, end, soft, gives_way):
         """Record whether part b, which had this softness(), gives way."""
-        if gives_way:
-            self.softened[b][0] = ti.max(soft, 1 + 0 * soft)
-        elif soft > 1:
-            self.softened[b][0] = -soft
+        if gives_way or soft > 1:
+            energy = ti.cast(0, ti.f64)
+            for r in range(begin, end):
+                energy += ti.abs((self.lam[r] + self.step[r]) * self.violation[r])
+            self.softened[b][0] = ti.select(gives_way, ti.max(soft, 1 + 0 * soft), -soft)
+            self.softened[b][2] = energy
         else:
             self.softened[b] = ti.Vector.zero(ti.f64, 4)
 
@@ -668,7 +667,7 @@ class Elimination(System):
             if stage <= AGAIN:
                 if (hard == 0 and tension <= TENSEST) or stage == AGAIN:
                     ti.atomic_max(self.tension[None], tension / longer)
-                    self.record_softness(b, soft, False)
+                    self.record_softness(b, begin, end, soft, False)
                     stage = DONE
                     if tension > CALM_TENSION:
                         self.end_newton(b)
@@ -704,7 +703,7 @@ class Elimination(System):
                     gives = bound or k == ROUNDS or self.strain(begin, end, softness) > SLIGHT
                     self.use_end_directions(begin, end)
                     self.limit_tensions(begin, end, longer)
-                    self.record_softness(b, soft, k > 1)
+                    self.record_softness(b, begin, end, soft, k > 1)
                     ti.atomic_max(self.tension[None], ti.select(gives, reported, tension / longer))
                     stage = DONE
                 else:

@@ -37,7 +37,6 @@ class System:
     steps = 0  # iterations of a pass, by start(), iterate() and end(); 0 for a solution by solve()
     refines = False  # whether parts may take a second Newton step in a pass, see takes_step() and is_unmet()
     can_stiffen: Any = False  # whether parts gave way in a longer substep, and may bear their loads in this one
-    keeps_softness_of_longer: Any = False  # whether a part is softened for a longer substep, so that shorter ones do not help
     has_implied = False  # whether rows are links that others imply, which take no step
     late: tuple[str, ...] = ()  # the names of fields in the state that are not hashed where they are 0
     team: Any  # the threads that share the loops of start(), iterate() and end(); set when kernels are built
@@ -126,6 +125,14 @@ class System:
 
     def keep_softness(self, ratio: float) -> None:
         """Keep parts that give way as soft as they are, where the next substep is `ratio` times as long as the last one."""
+
+    def softness_of_longer(self, h: float) -> tuple[float, float]:
+        """Return (h' / h)^2 for the longest substep h' that a part is softened for, and the energy that such parts store in
+        substeps h [J]."""
+        return 1.0, 0.0
+
+    def stiffen(self, factor: float) -> None:
+        """Let parts that are softened for a longer substep bear tensions that are `factor` times as large."""
 
     @ti.func
     def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):

@@ -313,8 +313,7 @@ def turned(world: "World", x: np.ndarray, d: np.ndarray) -> float:
 
 def tension(world: "World", report: StepReport) -> float:
     """Return (omega h)^2 of the fastest vibration across a tension; 0 where systems stay as soft as in a longer substep."""
-    slots = world._runner.scene.slots
-    return 0.0 if "softened" in report.flags and slots.system and slots.system.keeps_softness_of_longer else report.tension
+    return 0.0 if "softened" in report.flags and world._clock.part_softness > 1 else report.tension
 
 
 def stiffness(world: "World") -> float:

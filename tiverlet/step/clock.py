@@ -11,6 +11,7 @@ NAMES = {
     "_frame": "frame", "_drag": "drag", "_started": "started", "_owed": "owed", "_lacked": "lacked",
     "_parted": "velocity_override", "_placed": "first_moved", "_energy": "energy", "_bound": "bound",
     "_kinetic": "kinetic", "_overlap": "overlap", "_parting": "parting", "_softness": "softness", "_softened": "softened",
+    "_part_softness": "part_softness",
 }  # fmt: skip
 
 SHARE = 0.1  # of the largest kinetic energy: the gain, or the loss, that is allowed
@@ -77,14 +78,14 @@ class Clock:
 
     time: simulated [s]. tick, since: number of substeps so far, and since the last start, modulo 2^31. h: the last substep [s].
     d_is_velocity: whether displacements hold velocities, so that the next substep is a start. started: whether the last substep
-    was a start. iterations: of the last frame. softness, softened: how
-    many times as soft as passes make them links are, 1 or more, and when a substep last made them about that soft [s], see
-    softness.py. frame: when frames of the present length began [s], their length [s], their number. drag: its factors for h, see
-    integrator.decay(). owed: the kick by rigid constraints that velocities before a start lack, as a time [s]. lacked: `owed` of
-    the last substep if it was a start, else 0. velocity_override: velocities, valid until the next step, after constraints that
-    contribute to them were removed or velocities were assigned; a start before the next step takes these. first_moved: the first
-    particle that the user placed since the last frame; None if there is none. moved_mask: which of the particles from there on
-    moved, (n,); None: all may have.
+    was a start. iterations: of the last frame. softness, softened: how many times as soft as passes make them links are, 1 or
+    more, and when a substep last made them about that soft [s], see softness.py. part_softness: the same for the softest part of
+    a system that gave way in a longer substep. frame: when frames of the present length began [s], their length [s], their
+    number. drag: its factors for h, see integrator.decay(). owed: the kick by rigid constraints that velocities before a start
+    lack, as a time [s]. lacked: `owed` of the last substep if it was a start, else 0. velocity_override: velocities, valid until
+    the next step, after constraints that contribute to them were removed or velocities were assigned; a start before the next
+    step takes these. first_moved: the first particle that the user placed since the last frame; None if there is none.
+    moved_mask: which of the particles from there on moved, (n,); None: all may have.
     energy: at the end of the last frame [J]; None if unknown. bound, kinetic, parting: the energy that must not be exceeded [J],
     None if unknown; the largest kinetic energy since then [J]; whether particles that were placed into each other still part;
     see energy_bound.py. overlap: of the worst contact at the end of the last frame [radii]. conserves: NO, YES or
@@ -101,6 +102,7 @@ class Clock:
     iterations: int = 1
     softness: float = 1.0
     softened: float = 0.0
+    part_softness: float = 1.0
     frame: tuple[float, float, int] = (0.0, 0.0, 0)
     drag: list[float] | None = None
     owed: float = 0.0
@@ -174,6 +176,7 @@ class Clock:
         right = [type(k) is int and 0 <= k < 2**31 for k in (self.tick, self.since, self.iterations)]
         right += [type(some) is bool for some in (self.d_is_velocity, self.started, self.parting)]
         energies = self.energy or 0, self.bound or 0, self.kinetic
-        right += [type(v) in (int, float) for v in (self.time, self.h, self.softness, self.softened, *self.frame, *energies)]
-        right += [self.first_moved is None or 0 <= self.first_moved <= particles, len(self.frame) == 3, self.softness >= 1]
+        soft = self.softness, self.part_softness
+        right += [type(v) in (int, float) for v in (self.time, self.h, *soft, self.softened, *self.frame, *energies)]
+        right += [self.first_moved is None or 0 <= self.first_moved <= particles, len(self.frame) == 3, min(soft) >= 1]
         return all(right) and (self.drag is None or [type(v) for v in self.drag] == [float] * 5)

@@ -152,7 +152,7 @@ class Runner:
         h, clock, self.released, self.jumped = dt / substeps * self.integrator.first, self.clock, 0.0, False
         drag = self._drag(h)
         if h == clock.h and drag == clock.drag and not clock.d_is_velocity and clock.first_moved is None:
-            if clock.softness > 1 or passes != clock.iterations:
+            if max(clock.softness, clock.part_softness) > 1 or passes != clock.iterations:
                 with self.memory.compiler():
                     softness.keep(self, h, dt, passes, adapts)
             return clock.energy is None

@@ -12,6 +12,9 @@ all before, which takes energy out. Otherwise it approaches 1, (s - 1)' = -(s - 
 adds a share dt / SETTLE of the energy that violations store, but not while the scene would have more energy than ever. Where a
 loop measures dt, links wait until no frame has been about as long for HOLD. What "auto" and systems need not wait for is
 in settling.py. And s is larger where a substep that is longer than what follows has left violations that store more.
+
+Parts of systems that gave way in a longer substep bear no larger tensions than in that one, see Elimination. In each frame these
+grow by half of what the energy allows.
 """
 
 from math import exp
@@ -61,33 +64,37 @@ def keep(runner: "Runner", h: float, dt: float, iterations: int, adapts: bool = 
     stored that is left, where violations have just settled. By so much links may stiffen at once.
     """
     clock = runner.clock
-    if not acts(runner, h, iterations):
-        return
-    growth, measured = _growth(runner, h, iterations), dt != clock.frame[1]
-    s = max(1.0, clock.softness * left / growth)
-    if s > 1 and clock.softness == 1 and needs_no_care(runner, s):
-        s = 1.0
-    elif measured and growth >= NEAR**2 * clock.softness:
-        clock.softened = clock.time
-    elif s > 1 and (adapts or clock.time >= clock.softened + HOLD * (clock.softened > 0)):
-        s = stiffened(runner, s, dt, adapts, left)
-    if growth < 1 < s:
-        s *= too_stiff(runner, left)
-    runner.set_softness(s if s > 1 + SETTLED else 1.0)
+    if acts(runner, h, iterations):
+        growth, measured = _growth(runner, h, iterations), dt != clock.frame[1]
+        s = max(1.0, clock.softness * left / growth)
+        if s > 1 and clock.softness == 1 and needs_no_care(runner, s):
+            s = 1.0
+        elif measured and growth >= NEAR**2 * clock.softness:
+            clock.softened = clock.time
+        elif s > 1 and (adapts or clock.time >= clock.softened + HOLD * (clock.softened > 0)):
+            s /= stiffening(runner, s, h, dt, adapts, left)
+        if growth < 1 < s:
+            s *= too_stiff(runner, left)
+        runner.set_softness(s if s > 1 + SETTLED else 1.0)
+    system = runner.scene.slots.system if runner.scene.slots else None
+    if system:
+        clock.part_softness, _ = system.softness_of_longer(h)
+        if clock.part_softness > 1:
+            system.stiffen((1 + stiffening(runner, clock.part_softness, h, dt, True, left)) / 2)
 
 
-def stiffened(runner: "Runner", s: float, dt: float, adapts: bool, left: float) -> float:
-    """Return the softness to which links may stiffen from s in a frame of dt [s]. adapts: whether the energy alone decides.
+def stiffening(runner: "Runner", s: float, h: float, dt: float, adapts: bool, left: float) -> float:
+    """Return by what factor links of the softness s may stiffen in a frame of dt [s]. adapts: whether the energy alone decides.
 
-    left: as in keep(). With the softness s they store as much as they did before that.
+    h: of the coming frame [s]. left: as in keep(). With the softness s they store as much as they did before that.
     """
-    store, room = _store_and_room(runner, left)
+    store, room = _store_and_room(runner, h, left)
     if not store > 0:
-        return 1.0
+        return s
     most = s / (1 + (s - 1) * exp(-dt / SETTLE))
     if room is not None:
         most = room / store if adapts else min(most, room / store)
-    return s / max(1.0, min(s, most))
+    return max(1.0, min(s, most))
 
 
 def too_stiff(runner: "Runner", left: float) -> float:
@@ -95,16 +102,21 @@ def too_stiff(runner: "Runner", left: float) -> float:
 
     It is 1 but after a long substep that threw bodies about: violations that it left bear no load.
     """
-    store, room = _store_and_room(runner, left)
+    store, room = _store_and_room(runner, 0.0, left)
     if room is None or not (spare := max(room, SLIGHT * runner.clock.kinetic)) > 0:
         return 1.0
     return max(1.0, store / spare)
 
 
-def _store_and_room(runner: "Runner", left: float) -> tuple[float, float | None]:
-    """Return what links store with the softness that keep() gives them, and how much they may [J]; None where that is unknown."""
-    clock = runner.clock
+def _store_and_room(runner: "Runner", h: float, left: float) -> tuple[float, float | None]:
+    """Return what links store with the softness that keep() gives them, and how much they may [J]; None where that is unknown.
+
+    h: the substep of systems that gave way in longer ones [s]; 0: without these.
+    """
+    clock, system = runner.clock, runner.scene.slots.system
     store = stored(runner) / left if left > 0 else 0.0
+    if h and system:
+        store += system.softness_of_longer(h)[1]
     if clock.energy is None or clock.bound is None or clock.bound == CHANGED:
         return store, None
     return store, clock.bound + SLIGHT * clock.kinetic - clock.energy
@@ -152,8 +164,9 @@ def stored(runner: "Runner") -> float:
     x, split = runner.scene.state.get(memory), memory.read(runner.scene.slots.split)
     for b in runner.batches:
         if isinstance(b, Scalar) and b.count:
-            S = runner.scene.slots.sag(b) * b.weights(x, split) * h * h / runner.clock.iterations
-            out += _stored_in(b, b.violation(x) * ~b.broken, S)
+            sag = runner.scene.slots.sag(b)
+            S = sag * b.weights(x, split) * h * h / runner.clock.iterations
+            out += _stored_in(b, b.violation(x) * (~b.broken & (sag > 0)), S)
         elif isinstance(b, Anchored) or b.clusters:
             who = b.indices.ravel()
             lam = memory.read(b.dev.lam if isinstance(b, Anchored) else b.dev.pull)[: len(who)].astype(np.float64)

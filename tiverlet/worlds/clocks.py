@@ -72,6 +72,11 @@ class Clocks:
         return np.array([drag or FREE for drag in self.drag])
 
     @property
+    def softest(self) -> np.ndarray:
+        """How many times as soft links are as passes make them, at most, (worlds,)."""
+        return np.maximum(self.softness, self.part_softness)
+
+    @property
     def overridden(self) -> np.ndarray:
         """Which worlds have a velocity_override, (worlds,)."""
         return np.array([velocity is not None for velocity in self.velocity_override])

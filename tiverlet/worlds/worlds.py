@@ -189,7 +189,7 @@ class Worlds:
                     moved, released = self._begin(dt)
                     # A target moves during one frame, then the host ends the motion: launch that frame alone. The host stiffens
                     # soft links between frames, too.
-                    alone = self._runner.ramping or self._knobs.any_moves or (self._clocks.softness > 1).any()
+                    alone = self._runner.ramping or self._knobs.any_moves or (self._clocks.softest > 1).any()
                     some = 1 if alone else min(at_once, frames - done)
                     report = self._launch(dt, some, moved, released, every, track, done)
                 worst, done = report if worst is None else worst.worse(report), done + some
@@ -209,7 +209,7 @@ class Worlds:
         self._upload()
         h = dt / world.substeps * runner.integrator.first
         ready = (clocks.first_moved == NONE) & (clocks.h == h) & ~clocks.needs_drag
-        ready &= (clocks.softness == 1) & (clocks.iterations == world.iterations)
+        ready &= (clocks.softest == 1) & (clocks.iterations == world.iterations)
         clocks.since[ready & clocks.d_is_velocity] = 0
         moved, released, jumped = np.zeros(len(self)), np.zeros(len(self)), np.zeros(len(self), dtype=bool)
         some = np.flatnonzero(~ready)
