@@ -172,3 +172,27 @@ def test_the_most_overloaded_breaks_and_unloads_the_others(world):
         w = world(particles, [tv.Gravity(9.81), links], precision="f64", solver=tv.Direct())
         w.step(1 / 60)
         assert np.flatnonzero(links.broken).tolist() == [breaks]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("precision, substeps", [("f32", 4), ("f32", 60), ("f32", "auto"), ("f32-compensated", 60), ("f64", 20)])
+def test_a_truss_breaks_at_the_load_of_statics(world, precision, substeps):
+    # A cantilever of 4 squares with a diagonal each: sum over links of S u = -m g for each of 8 free points, 16 equations for 16
+    # links. Loads of the whole length act on the first links, and so does rounding of all positions: it breaks nothing, neither
+    # at the start nor at two thirds of the strength.
+    x = np.array([(i, j) for i in range(5) for j in (0, 1)], dtype=float)
+    links = np.array([(a + k, b + k) for k in range(0, 8, 2) for a, b in ((0, 2), (1, 3), (1, 2), (2, 3))])
+    mass = np.array([1.0] * 9 + [3.0])
+    u = np.diff(x[links], axis=1)[:, 0]
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    sums = np.zeros((20, 16))
+    for k, (a, b) in enumerate(links):
+        sums[2 * a : 2 * a + 2, k], sums[2 * b : 2 * b + 2, k] = u[k], -u[k]
+    strength = 3.0 * np.abs(np.linalg.solve(sums[4:], np.outer(mass[2:], (0, 1)).ravel())).max()  # at g = 3 m/s^2
+    gravity = tv.Gravity(2.0)
+    features = [gravity, tv.Distance(links, break_at=strength), tv.Drag(4.0)]
+    w = world(tv.Particles(x, mass=mass, pinned=[0, 1]), features, substeps=substeps, precision=precision)
+    assert not any(w.step(1 / 60).broken for _ in range(60))
+    while gravity.g < 4.0 and not w.step(1 / 60).broken:
+        gravity.g = gravity.g + 1 / 120
+    assert gravity.g == pytest.approx(3.0, rel=0.03)

@@ -126,7 +126,7 @@ FAULTS = (
           "return dim * int(movable.sum()) - motions[min(fixed, len(motions) - 1)]",
           "return dim * int(movable.sum()) - motions[min(fixed, len(motions) - 1)] - 1", "structures"),
     Fault("90f9d8ee", "what violations store is counted half", "step/softness.py",
-          "out += _stored_in(b, b.violation(x) * ~b.broken, S)", "out += _stored_in(b, b.violation(x) * ~b.broken, S) / 4",
+          "out += _stored_in(b, b.violation(x) * (~b.broken & (sag > 0)), S)", "out += _stored_in(b, b.violation(x) * (~b.broken & (sag > 0)), S) / 4",
           "softness guard"),
     Fault("b3affc6c", "what stays stored is no part of what settling may cost", "step/settling.py",
           "bodies.energy(new, h) + kept - supply", "bodies.energy(new, h) - supply", "softness"),

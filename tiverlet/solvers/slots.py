@@ -83,7 +83,7 @@ class Slots:
         alone = not self.system or self.system.steps > 0 or self.system.count_relaxed_alone(batches) > 0
         self.can_soften = alone and (not answers or any(b.clusters or b.arity == 1 for b in batches))
         if self.loads or any(b.breaks for b in batches):
-            self._connect_bodies(batches, inv_mass)
+            self._connect_bodies(batches, inv_mass, scene.particles.position)
         if self.loads:
             self.bodies = memory.number(1 + max(int(b.max(initial=0)) for b in self._bodies.values()))
             self.body_load = memory.field("slots.bears", self.bodies)
@@ -93,8 +93,9 @@ class Slots:
         factor = solver.relaxed_by(scene, batches, blocks * inv_mass)
         self.relaxation = checks.number(type(solver).__name__, "relaxed_by()", factor, above=0.0)
 
-    def _connect_bodies(self, batches: list[Batch], inv_mass: np.ndarray) -> None:
-        """Find the body of each constraint, by the id of its batch, and the root of the sum of squared masses of each body [kg].
+    def _connect_bodies(self, batches: list[Batch], inv_mass: np.ndarray, x: np.ndarray) -> None:
+        """Find the body of each constraint, by the id of its batch, and for each body the root of the sum of squared masses [kg]
+        and its size [m].
 
         Constraints that share movable particles, directly or through other constraints, are of one body.
         """
@@ -104,6 +105,10 @@ class Slots:
         squares = np.divide(1, inv_mass, out=np.zeros(len(inv_mass)), where=inv_mass > 0) ** 2
         self._rounding_masses = np.sqrt(np.bincount(body, weights=squares, minlength=int(ends[-1]) + 1))
         self._bodies = {id(b): part for b, part in zip(batches, parts, strict=True)}
+        count = np.maximum(np.bincount(body, minlength=int(ends[-1]) + 1), 1)
+        center = np.stack([np.bincount(body, weights=each, minlength=len(count)) / count for each in x.T], axis=1)
+        self._sizes = np.zeros(len(count))
+        np.maximum.at(self._sizes, body, 2 * np.linalg.norm(x - center[body], axis=1))
 
     def body(self, batch: Batch) -> np.ndarray:
         """Return the body of each constraint of a batch, (m,), where constraints learn loads or break."""
@@ -112,6 +117,10 @@ class Slots:
     def rounding_mass(self, batch: Batch) -> np.ndarray:
         """Return the mass in the body of each constraint that rounding of positions moves, (m,) [kg], see Strength."""
         return self._rounding_masses[self.body(batch)]
+
+    def body_size(self, batch: Batch) -> np.ndarray:
+        """Return the size of the body of each constraint where the world is built, (m,) [m], see Strength."""
+        return self._sizes[self.body(batch)]
 
     @property
     def exact_answers(self) -> bool:

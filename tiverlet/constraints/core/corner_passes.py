@@ -427,7 +427,7 @@ class CornerPasses(Passes):
     def overload(self, c, h2_rigid, h2_effective):
         """Return by how much the multiplier of constraint c, or the sum over many substeps, is too large, see Strength.
 
-        Velocities contain its known load, as a spring force. Where low words are carried, lengths are exact.
+        Velocities contain its known load, as a spring force.
         """
         lam, w, out = self.equation.lam[c], ti.cast(0, self.real), ti.cast(0, self.real)
         if ti.static(self.spring.soft):
@@ -439,12 +439,11 @@ class CornerPasses(Passes):
         if self.strength.is_intact(c):
             past, unsure = self.strength.add_excess(c, c, lam, per_newton), 0 * lam
             if past > 0:
-                if ti.static(not (self.quantity.precise and self.state.carries)):
-                    _, g = self.measured(c, 0)
-                    for k in ti.static(range(self.arity)):
-                        if g[k, :].norm() > 0:
-                            rounding = self.strength.rounding(c, self.corners.member(c, k), self.corners.member(c, 0))
-                            unsure = ti.max(unsure, rounding / g[k, :].norm())
+                _, g = self.measured(c, 0)
+                for k in ti.static(range(self.arity)):
+                    if g[k, :].norm() > 0:
+                        rounding = self.strength.rounding(c, self.corners.member(c, k), self.corners.member(c, 0))
+                        unsure = ti.max(unsure, rounding / g[k, :].norm())
                 if past > unsure:
                     out = self.strength.overload_by(c, past, per_newton)
         return out

@@ -36,7 +36,8 @@ class Strength:
         over <- (over + lam) max(0, 1 - break_at h^2 / |over + lam|),    broken where |over| > MARGIN m ulp(x)
 
     Where rounding is small, a load above break_at breaks at once; elsewhere it breaks within the substeps that tell it from
-    rounding. m: the root of the sum of the squares of the masses of the body, since roundings of particles are independent.
+    rounding. m: the root of the sum of the squares of the masses of the body, since roundings of particles are independent. x:
+    the largest coordinate of the body, as links bear the roundings of all that hangs on them.
 
     A batch that never `breaks` costs nothing. overload: the load as a multiple of break_at, 0 up to 1. in_state: its fields in
     the exact state, by name. corners: those of the batch, if its loads are a vector for each corner, not a number for each
@@ -56,6 +57,7 @@ class Strength:
             epsilon = np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps
             least = MARGIN * epsilon * scene.slots.rounding_mass(batch)
             self.rounding_scale = scene.memory.field(f"{name}.unsure", batch.count, values=least)
+            self.size = scene.memory.field(f"{name}.body_size", batch.count, values=scene.slots.body_size(batch))
             self.in_state = {"broken": self.stamp, "over": self.excess}
 
     def upload(self, break_at: np.ndarray | None) -> None:
@@ -111,12 +113,15 @@ class Strength:
 
     @ti.func
     def rounding(self, c, i, j):
-        """Return the most that rounding of particle i adds to sums of multipliers of constraint c, for a gradient of 1. j: the
-        particle from which positions are measured."""
+        """Return the most that rounding adds to sums of multipliers of constraint c, for a gradient of 1 at particle i.
+
+        No particle of the body is further from the origin than i by more than the size of the body; where positions are carried
+        to more digits, lengths are rounded. j: the particle from which positions are measured.
+        """
         x = self.state.x[i]
         if ti.static(self.state.compensated):
             x = self.state.separation(i, j)
-        return self.rounding_scale[c] * x.norm()
+        return self.rounding_scale[c] * (x.norm() + self.size[c])
 
     @ti.func
     def mark_broken(self, c, tick):
