@@ -154,7 +154,8 @@ def test_passes_leave_ever_less_and_residuals_tell_what(zoo, dim):
 
 @DIMS
 def test_momentum_is_constant_and_directions_do_not_matter(zoo, dim):
-    # To rounding, for three passes, that of velocities and its moment; and what starts turned and moved stays so.
+    # To rounding, for three passes, that of velocities and its moment; and what starts turned and moved stays so. The function of
+    # a user has gradients by differences, right to eps^(2/3) = 4e-11 of an impulse, which is a moment: one for each pass.
     z = zoo(dim)
     w, seen = z.again(iterations=3), {name: [] for name in z.rows}
     for _ in range(20):
@@ -168,7 +169,8 @@ def test_momentum_is_constant_and_directions_do_not_matter(zoo, dim):
             np.testing.assert_allclose(b.of("turned", x), turned, atol=1e-11, err_msg=name)
             assert (b.of("stuck", x) == b.of("stuck", z.x)).all(), name
     for name, b in z.rows.items():
-        assert not b.row.internal or np.ptp(seen[name], axis=0).max() <= 1e-14 * 20, name
+        digit = 3 * 4e-11 if isinstance(b.feature, tv.Constraint) else 20 * 1e-15
+        assert not b.row.internal or np.ptp(seen[name], axis=0).max() <= digit * np.abs(seen[name]).max(), name
 
 
 @DIMS
