@@ -143,6 +143,7 @@ def test_structure_is_fixed_and_says_so(world):
         w.clone(gravity=1)
 
 
+@pytest.mark.slow
 def test_features_of_a_world_are_pickled_and_copied_without_it(world):
     start, pairs = tv.Particles([[0.0, 0.0], [1.0, 0.0]], radius=0.1), [[0, 1]]
     features = [tv.Gravity(3.0), tv.Distance(pairs, 2.0, compliance=0.1), tv.HalfSpace((0, 1), friction=0.2)]

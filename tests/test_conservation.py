@@ -79,6 +79,7 @@ def test_motion_has_the_symmetries_of_its_equations(world):
     np.testing.assert_allclose(end(np.eye(2), factor=7.0), plain, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_stiff_spring_that_turns_stores_what_its_load_does(world):
     # A mass m circles a point at a distance L: it has m v^2 / 2, and the spring alpha F^2 / 2 with F = m v^2 / L = 2.5 N, 3e-9 J.
     # In the middle of a substep the mass is nearer by L phi^2 / 8, phi = v h / L; 1 / (2 alpha) times its square would be up to
@@ -100,6 +101,7 @@ def test_a_stiff_spring_that_turns_stores_what_its_load_does(world):
         assert report.energy == pytest.approx(turning + m / 2 * u**2, rel=(v / L / 120) ** 2 / 3)
 
 
+@pytest.mark.slow
 def test_springs_in_f32_gain_nothing(world):
     # Springs that move particles by less than half a digit of x in a substep. Where such moves are lost in x and kept in d, the
     # force is late by h, and the energy grows by exp(omega^2 h t) = 1.44 in t = 1.8 s. Dithered, they are right on average, and

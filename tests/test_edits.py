@@ -318,6 +318,7 @@ def magnet(x, v):
     return 3.0 * ti.Vector([v[1], -v[0]]) - x
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("last", [tv.Drag(0.4), tv.Force(magnet)], ids=repr)
 def test_what_comes_starts_as_in_a_world_of_its_own(world, last):
     # Thrown into a running world between two substeps: the same motion as from a start there, to rounding. With drag and forces
@@ -368,6 +369,7 @@ def length(a, b):
     return (a - b).norm()
 
 
+@pytest.mark.slow
 def test_after_an_error_the_world_is_as_before(world, monkeypatch):
     x = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
     link, user = tv.Distance([[0, 1], [1, 2]], compliance=1e-3), tv.Constraint(length, [[1, 2]], rest=1.0)

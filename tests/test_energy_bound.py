@@ -108,6 +108,7 @@ def test_a_substep_that_resolves_a_spring_loses_nothing(world):
         assert all(w.step(1 / 60).clean for _ in range(30 if g else 2))
 
 
+@pytest.mark.slow
 def test_a_potential_that_is_wrong_is_found(world):
     # E = K - F (|r| - 1) is conserved. With a potential of 0, E = K = F (|r| - 1) grows from the first frame on.
     for potential, wrong in ((of_push, False), (forgotten, True), (None, False)):

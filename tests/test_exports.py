@@ -200,6 +200,7 @@ READERS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", READERS)
 @EACH
 def test_every_frame_is_read_back_as_it_was(scenes, scene, kind, tmp_path):
@@ -410,6 +411,7 @@ def pictures_of(film: str | pathlib.Path) -> np.ndarray:
     return np.frombuffer(done.stdout, np.uint8).reshape(-1, int(size[1]), int(size[0]), 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a.gif", "a.webp", "-10:00.mp4"])
 def test_films_show_what_moves(name, passing, tmp_path, monkeypatch):
     # A picture every 40 ms, of the nearest frame. Names may be what ffmpeg would take for something else.

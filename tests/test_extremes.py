@@ -24,6 +24,7 @@ def test_rows_pass(number, briefly):
     assert result.figure.startswith(said.get(number, ""))
 
 
+@pytest.mark.slow
 def test_thousands_in_one_cell_are_warned_of_and_all_pairs_are_there(world):
     # O(n^2), with a warning and without overflow. Launched phase by phase, where the list has a kernel of its own.
     n = 2048

@@ -80,6 +80,7 @@ def test_a_scene_that_does_not_move_as_it_should_has_the_flag_that_says_why(worl
         assert world(*make(), substeps=int(need[1]), solver=solver).run(1.0).clean
 
 
+@pytest.mark.slow
 def test_what_is_damped_loses_its_note_with_as_many_substeps_as_that_says(world):
     # A chain that swings down. A few steps of conjugate gradients leave it violated, by order h or higher.
     def run(substeps):

@@ -173,6 +173,7 @@ def test_too_much_for_the_budget_is_said(world):
         w.substeps = "adaptive"
 
 
+@pytest.mark.slow
 def test_what_falls_through_a_soft_center_comes_back(world):
     # A Plummer sphere: E = v^2 / 2 - G M / sqrt(r^2 + e^2) per mass. Particles at rest at 1 m fall through the centre, or past
     # it, and come back to that distance. A circle of radius r has omega^2 = G M / (r^2 + e^2)^(3/2).
@@ -205,6 +206,7 @@ def collide_energy(r):
     return 4.0 * (q * q - q) - 4.0 * (end * end - end)
 
 
+@pytest.mark.slow
 def test_how_two_atoms_vibrate_is_resolved_wherever_they_are(world):
     # The same substeps and the same energy of two atoms: alone, at 100 m/s, beside many at rest, and among some that fly.
     x, still = np.array([[0.0, 0.0], [0.115, 0.0]]), 10.0 + np.stack([np.arange(300) % 20, np.arange(300) // 20], axis=1)

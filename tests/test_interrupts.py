@@ -156,6 +156,7 @@ def test_a_step_that_fails_is_recorded_as_it_is(w, tmp_path):
         assert again.hash() == end
 
 
+@pytest.mark.slow
 def test_another_thread_that_looks_on_changes_nothing_and_sees_whole_frames(w):
     def go_on(look=None):
         """Return where the particles are after each frame, while another thread looks on."""

@@ -192,6 +192,7 @@ def weight(world, g):
     return world(particles, [gravity, thread, lid], substeps=4), gravity, thread, lid
 
 
+@pytest.mark.slow
 def test_pages_are_told_what_breaks_moves_comes_and_turns(world, server):
     # m g = 9.8 N: the thread breaks at once. The lid moves while the page takes no frame.
     w, gravity, _, lid = weight(world, 0.0)

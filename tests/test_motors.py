@@ -43,6 +43,7 @@ def test_a_limited_torque_accelerates_and_the_speed_is_then_met(world):
     assert turned(w, begin + speed) == pytest.approx(0, abs=1e-9) and abs(motor.load[0]) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_a_wheel_turns_for_ever_however_slowly(world, precision):
     # The angle passes +-pi again and again; and 2^-24 of a turn per substep, which would be lost in a rest angle in f32.
@@ -116,6 +117,7 @@ def test_a_servo_goes_to_its_angle_and_stays(world):
         assert turned(w, -2.5) == pytest.approx(0, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_a_soft_servo_is_a_spring_and_slips_beyond_its_torque(world):
     # With compliance and a dashpot, a servo rests at the angle a where alpha m g r cos(a) = -a, deflected by far more than a
     # rigid hinge may be off. Where the spring would bear more than the largest torque, the servo slips.
@@ -157,6 +159,7 @@ def hoist(world, speed, substeps=20, **options):
     return world(start, [tv.Gravity(G), winch], substeps=substeps, precision="f64"), winch
 
 
+@pytest.mark.slow
 def test_a_winch_lifts_what_its_force_can(world):
     # m a = F - m g up to the speed v, which is reached at t1 = v / a, then v (t - t1 / 2). Below m g the weight goes down.
     # Without a limit it goes at its speed at once.

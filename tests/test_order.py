@@ -116,6 +116,7 @@ def test_orders_and_the_error_of_a_good_peer(world, high):
         w.close()
 
 
+@pytest.mark.slow
 def test_velocities_have_the_order_too(world):
     # A Kepler ellipse, e = 0.5, from its pericentre: it returns after T = 2 pi with the velocity (0, sqrt(3)). And a conical
     # pendulum, whose rod has to remove the velocity along it: v stays at right angles to the rod, and as fast as at the start.

@@ -87,6 +87,7 @@ def test_momentum_is_kept_whatever_the_function(world, radius):
     assert np.abs(w.velocity - p.velocity).max() > 0.1
 
 
+@pytest.mark.slow
 def test_energy_stays_and_lists_grow(world):
     # Energy is constant to order h^2; and all pairs are found after a contraction to many times as many, by a thread team.
     w = crowd(world, 400, precision="f64", path="parallel")

@@ -120,6 +120,7 @@ def test_a_collision_across_the_boundary_is_that_with_the_image(world):
     np.testing.assert_allclose(w.position[:2], x + t * v + (w.time - t) * after, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_ring_around_the_box_swings_as_a_periodic_chain(world):
     # m u_j'' = k (u_(j+1) - 2 u_j + u_(j-1)): mode p has omega = 2 sqrt(k / m) sin(pi p / N). Verlet:
     # sin(Omega h / 2) = omega h / 2, so with omega h = 0.02 the relative error of the phase is 2e-5. 3 turns.
@@ -154,6 +155,7 @@ def test_soft_bodies_pass_the_boundary_as_if_there_were_none(world):
     np.testing.assert_allclose(*found, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_forces_between_images_are_those_of_brute_force_and_keep_energy(world):
     rng, length, n = np.random.default_rng(2), np.array([4.0, 3.0]), 60
     x, v = (rng.uniform(0, 1, (n, 2)) + rng.integers(-2, 3, (n, 2))) * length, rng.normal(size=(n, 2))
@@ -196,6 +198,7 @@ def test_a_shear_is_live_and_each_of_many_worlds_has_its_own(world):
         np.testing.assert_allclose(many.each(strain), (2 + np.array([0.5, 1.0, -1.0])) * DT, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_obstacles_meet_images(world):
     # Discs of radius 0.1 fly around the box, 4 m long, until they meet an obstacle that reaches 0.5 m from its centre, and back:
     # from x = 3 m they fly 1.9 m of their 4 m to the image of the obstacle, at 5.5 - 0.6 = 4.9 m, and 2.1 m back.

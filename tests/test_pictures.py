@@ -76,6 +76,7 @@ def stack():
     return tv.World(tv.Particles(x, mass=1.0, radius=0.1), features, substeps=20)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 def test_every_frame_shows_the_world_as_it_was(world, tmp_path, dim):
     # A rope, and links between any of its particles, of which some break: each that holds is in one strip.
@@ -176,6 +177,7 @@ def test_lines_are_as_wide_as_the_loads_they_show(tmp_path):
     np.testing.assert_allclose(QUANTITIES["load"](w), 9.81 * np.array([3, 3 + 2, 2 + 1, 1]), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_quantities_of_ones_own_are_kept_and_shown_by_any_printable_name(tmp_path):
     # rerun escapes most characters in a path. "violation" is how the path of the built-in residuals ends.
     names = ["height [m]", "arm/angle", "50 %: x*y", "α² → 😀", "é", "नमस्ते", "violation", "a.b-c"]
@@ -386,6 +388,7 @@ def recorded(path, color) -> tv.recording.Replay:
     return tv.replay(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["floats", "a function and its range"])
 def test_recordings_exports_pages_and_many_worlds_have_the_colours_that_were_chosen(name, tmp_path):
     color, wanted = CHOICES[name]

@@ -40,6 +40,7 @@ def test_a_pin_that_takes_another_particle_lets_the_first_go(world):
     assert hand.indices.tolist() == [[2]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("substeps", [1, 4])
 def test_what_a_pin_drags_bears_the_impulse_of_a_frame_in_its_first_substep(world, substeps):
     # x = -a t^2 / 2 at the ends of frames, about: the speed grows by a dt where frames meet, and F h = 3 m a dt for three links.
@@ -58,6 +59,7 @@ def test_what_a_pin_drags_bears_the_impulse_of_a_frame_in_its_first_substep(worl
         assert links.broken.tolist() == [share < 1, False, False]
 
 
+@pytest.mark.slow
 def test_soft_pins_wires_and_grids_are_springs(world):
     # m x'' = -k (x - target) about a target, across a wire, and along each axis about the nearest node. Others, with dashpots,
     # come to rest there, and under gravity at the static distance g / k, while the wire lets its bead go on.

@@ -14,6 +14,7 @@ def row(n: int = N) -> np.ndarray:
     return np.stack([np.arange(n + 1) / n, np.zeros(n + 1)], axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Direct()], ids=str)
 def test_links_of_other_lengths_bring_no_energy(world, solver):
     # Rest lengths 17 % too short, 0.05 % too short and 10 % too long. A pass would turn such a violation into C^2 / (2 W h^2), up
@@ -74,6 +75,7 @@ def test_springs_that_become_rigid_bring_no_energy(world):
         assert np.abs(w.velocity).max() < 0.01 + G * h / 8
 
 
+@pytest.mark.slow
 def test_a_lattice_that_becomes_rigid_gains_no_energy(world):
     # All clusters of a lattice together are one rigid body. Soft ones that hang from a corner and turn about it go to their rigid
     # shape with the velocities that they have: their energy is m g y there, and the kinetic energy before, at most. Passes would

@@ -295,6 +295,7 @@ def test_nothing_explodes_where_a_constraint_has_no_direction(world, dim):
     w.close()
 
 
+@pytest.mark.slow
 def test_cells_and_planets_move_as_what_lies_on_a_table(world):
     # Lengths times 2^a, masses times 2^b and accelerations times 2^a give the same bits times 2^a, down to cells of 8 um and
     # 1e-12 kg in f32. There w |grad f|^2 of an angle is 1e22, and a multiplier of a spring 1e-23 kg m, whose squares f32 cannot

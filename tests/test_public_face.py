@@ -73,6 +73,7 @@ def pair():
     world.close()
 
 
+@pytest.mark.slow
 def test_completion_of_features_and_solvers_shows_arguments_and_results(pair):
     link = pair.features[1]
     names = ["arguments", "break_at", "broken", "compliance", "count", "damping", "indices", "load", "residual", "rest"]

@@ -45,6 +45,7 @@ def test_a_rope_that_was_drawn_in_is_slack(world):
     assert w.position[1, 0] == pytest.approx(0.8 * L, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_muscle_does_the_work_of_its_load(world):
     # A hanging mass is drawn up by a in n frames, evenly. The work is m g a, but for the kinetic energy m u^2 / 2 of the last
     # frame, which the next frame takes back. The link changes its length at the speed of each frame, never faster.

@@ -262,6 +262,7 @@ def test_points_and_thin_lines(world):
     np.testing.assert_allclose(to_segment(hit.point[None, :2], x[0], x[1]), 0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_who_counts(world):
     # In a row: a particle of group 1, one of group 2, a link across, a particle, a wall.
     x = [(1, 0), (2, 0), (3, -1), (3, 1), (4, 0)]

@@ -26,6 +26,7 @@ def expect(error, words, run):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("apart", [False, True])
 def test_the_host_sees_the_fields_as_kernels_do(monkeypatch, apart):
     # Fields of every kind and shape side by side: a kernel reads what the host writes, and the other way round, bit for bit. As

@@ -50,6 +50,7 @@ def test_a_world_reports_on_itself(world):
         w.report(0.3, substeps=[5])
 
 
+@pytest.mark.slow
 def test_reports_keep_the_order_of_a_world(world):
     # Order 4 needs f64 and links that are solved. The report finds the order and recommends it, and perturbed copies keep it.
     links = [(0, 1), (1, 2)]
@@ -89,6 +90,7 @@ def spoilt(x, v, t, i):
     return f
 
 
+@pytest.mark.slow
 def test_an_autopsy_names_what_went_wrong_first(world, tmp_path):
     # Frames of 0.05 s with 5 substeps: t = 0.14 is at the end of substep 3 of frame 2; the force acts in the next one.
     chain = tv.Distance([[0, 1], [1, 2], [2, 3], [3, 4]])

@@ -12,6 +12,7 @@ from .scenes import SCENES
 TOUCH = False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind, of, what, change",
     [

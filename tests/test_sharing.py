@@ -183,6 +183,7 @@ def test_what_functions_of_the_user_know_is_part_of_the_structure(world):
         assert w.position[0, 0] == pytest.approx(np.cos(np.sqrt(strength * table[1]) * 0.2), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_more_fields_than_taichi_has_nodes_for_are_refused(world):
     # 1024 nodes with the root. Where one more was tried, Taichi left its runtime in pieces, and the process ended later.
     for width, length, most in ((0, 3, 511), (3, 3, 255), (0, 0, 511), (3, 0, 170)):

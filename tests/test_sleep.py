@@ -59,6 +59,7 @@ def test_a_row_that_was_never_disturbed_is_hit_to_the_bit(world):
     assert max(asleep) == 5 > asleep[-1] and worlds[1].velocity[4, 0] > 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slope", [True, False])
 def test_what_is_about_to_turn_round_is_not_at_rest(world, slope):
     # Slow is not at rest: up a slope of 0.2 degrees; drifting at 8 mm/s, beside a spring of 8 s that is released. The way is

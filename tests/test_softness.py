@@ -168,6 +168,7 @@ def test_what_lies_keeps_its_energy_in_frames_that_a_loop_measures(world):
     assert w.last.energy == pytest.approx(rest, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_a_lattice_that_swings_keeps_its_energy_where_the_substep_gets_shorter(world):
     # Clusters of 6 x 6 share particles, hang from one and sag at 2 substeps by what passes leave. At 20 they have the shape that
     # they had at rest, and swing on. Without rows of soft and of large clusters 283 J became 326 and 291; with gradients that
@@ -211,6 +212,7 @@ def test_seconds_after_the_last_change_of_the_substep_nothing_tells_of_it(taichi
         assert np.abs(also - loads).max() < 3e-3 * loads.max(), label
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points, weight", [(5, 100), (5, 1000), (20, 10), (20, 100)])
 def test_a_chain_that_gave_way_in_a_late_frame_bears_its_weight_again(world, points, weight):
     # A frame of 0.1 s among ones of 1/60 s: no chain can bear such weights in so long substeps, and each falls apart by a tenth

@@ -84,6 +84,7 @@ def test_constraints_that_are_not_met_are_flagged_with_what_helps(world, solver)
         assert better.residual < 0.11 and ("unconverged" in better.flags) == (better.residual > 0.05), better
 
 
+@pytest.mark.slow
 def test_a_contradictory_rope_softens_no_other_links(world):
     # Conjugate gradients solve one system with a rope that is too short for its pins: the links of a net beside it are off by as
     # little as alone. With one floor for all rows they would be off by seventy times as much.
@@ -102,6 +103,7 @@ def test_a_contradictory_rope_softens_no_other_links(world):
     assert w.features[1].residual @ rest[n:] > 0.999 * 0.05 and np.abs(w.velocity).max() < 0.1  # as soft as before
 
 
+@pytest.mark.slow
 def test_what_few_steps_take_from_rotations_is_told(world):
     # A ring of links turns freely: links are internal forces along themselves, so angular momentum stays. Those that are left off
     # by more than LOST act along their directions at the end of the substep, which have a moment about those at its begin.
@@ -160,6 +162,7 @@ POLYNOMIALS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver, polynomial", POLYNOMIALS, ids=lambda v: type(v).__name__)
 def test_passes_leave_of_each_mode_what_their_polynomial_says(world, solver, polynomial):
     # A straight chain of m links between two pins, displaced along itself, where constraints are linear: k passes take C to

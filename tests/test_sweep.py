@@ -35,6 +35,7 @@ def pool(count: int, start: str = "spawn"):
         yield made
 
 
+@pytest.mark.slow
 def test_figures_are_those_of_each_world_by_itself_in_parts_of_any_size(here):
     assert list(here) == ["end", "speed", "process", "threads"] and here["end"].shape == (7, 3, 2) and here.repeated == ()
     for k in range(7):

@@ -33,6 +33,7 @@ def rows_of(name: str) -> list[tuple[str, str]]:
     return [(names, clause) for owners, rows in ROWS.items() if name in owners.split() for names, clause in rows.items()]
 
 
+@pytest.mark.slow
 def test_every_term_of_others_is_answered(scene):
     # Where it is read of what users hold, and where it is given to what they call.
     link, contact, wall = scene.features[1:]

@@ -24,6 +24,7 @@ def swing(world, substeps):
     return w, pin, link
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["link", "pin", "particle", "pin that takes another"])
 def test_what_is_let_go_flies_on_to_second_order(world, what):
     # The particle has the velocity of that moment, and from then on x + v t + g t^2 / 2, or is a pendulum about another particle.
@@ -148,6 +149,7 @@ def chain(world, mass=1.0):
     return world(start, features, substeps=4, precision="f64"), links
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["spring", "particle"])
 def test_forces_that_come_change_no_velocity_before_they_act(world, what):
     # A swinging chain, and a spring or a particle that comes, of which nothing is felt: what is read is of now. It lacked what

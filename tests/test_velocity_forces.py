@@ -30,6 +30,7 @@ def again(w, **settings):
         setattr(w, name, value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision, limit", [("f64", 1e-12), ("f32", 2e-5)])
 def test_a_magnet_keeps_the_speed_whatever_the_substep(world, precision, limit):
     # v_n = d_n / h + h a(v_n) / 2 means (1 + i omega h / 2) v_n = d_n / h and d_(n+1) / h = (1 - i omega h / 2) v_n. So v turns
@@ -97,6 +98,7 @@ def test_drag_is_second_order_and_settles_however_stiff(world):
         assert w.velocity[0] == pytest.approx(want * np.array([0.6, -0.8]), rel=1e-9, abs=1e-15) and not w.last.flags
 
 
+@pytest.mark.slow
 def test_links_stay_second_order_beside_what_turns_and_brakes(world):
     # A pendulum under a force that depends on all of v, also along the rod, where v is right only with the rod's reaction.
     @ti.func

@@ -133,6 +133,7 @@ def test_nothing_gets_out_whatever_takes_it_there(world, name):
         w.step(h)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 def test_points_stay_in_corners_far_from_the_origin(world, dim, briefly):
     # Points, which have no radius, fly into the corners of a triangle or a tetrahedron. Far out, the rounding of their positions
@@ -331,6 +332,7 @@ def stage(request, taichi):
     made.w.close()
 
 
+@pytest.mark.slow
 def test_belts_carry_and_stop_what_lies_on_them(stage):
     # Friction accelerates by mu g until the particle is as fast as the belt, at t = v / (mu g): x = v T - v^2 / (2 mu g). Between
     # the two the end of sliding is off by up to a substep, in which it is wrong by up to mu g h^2. The velocity along the normal,
@@ -566,6 +568,7 @@ def platforms():
     ]
 
 
+@pytest.mark.slow
 def test_what_comes_from_below_passes_and_what_comes_from_above_lands(world):
     # Six particles at each platform: one falls onto it; one rises through it and lands; one rises into it and falls back; one
     # starts inside of it; the last two are fast, downwards and upwards. What passes moves as without the wall:

@@ -250,6 +250,7 @@ def test_a_reset_starts_from_places_that_are_given():
         assert report.energy_change[1] == alone.energy_change and report.of(1).flags == alone.flags
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not patched, reason="every world has a tree and kernels of its own")
 def test_worlds_of_the_same_structure_compile_nothing_and_take_no_more_memory():
     with tv.Worlds([pendulum() for _ in range(80)]) as many:
@@ -340,6 +341,7 @@ def test_what_makes_no_worlds_is_refused():
         many.step(0.01)
 
 
+@pytest.mark.slow
 def test_worlds_without_particles_go_on():
     empty = tv.World(tv.Particles(np.zeros((0, 2))), [tv.Gravity()])
     with tv.Worlds(empty, 3) as many:
