@@ -36,6 +36,7 @@ def test_rods_swing_through_straight_in_space_as_in_the_plane(world):
     np.testing.assert_allclose(made[1][1], made[0][1], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_crooked_rod_is_straightened_without_velocity_in_space(world):
     # A rod of rigid angles that starts crooked by 0.2 rad is moved to where it is straight, at rest. If Newton's method may bend
     # a path across its plane at will, it ends at 5e-3 rad, and passes make 0.06 m/s of the rest.
@@ -85,6 +86,7 @@ def test_limbs_stop_at_their_limits(world):
     assert np.arctan2(w.position[2, 1], w.position[2, 0]) == pytest.approx(-1.5, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_hinged_triangles_fold_to_either_side(world):
     # Positive towards e x p: with the edge along x and a wing at +y, towards +z. Flat and folded are as smooth as other angles.
     wings = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 1, 0], [0.5, -1, 0]])

@@ -190,6 +190,7 @@ def test_clusters_fall_apart(world):
     assert np.linalg.norm(np.diff(w.position, axis=0)[[2, 6]], axis=1) == pytest.approx([1, 1], abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_point_without_shape_does_not_turn(world):
     # Two clusters of a pinned and a free particle in the same place draw the free one back by dashpots: x' = -x k / c. It returns
     # more slowly than it left, at any number of passes. If the shape turned with it, the clusters would throw it out: 4e3 to

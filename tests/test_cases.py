@@ -19,6 +19,7 @@ def test_a_case_reaches_its_known_answer(name):
     assert not found.failures and not found.missing and len(found.points) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param("D06_chain100", marks=pytest.mark.slow), "D08_massratio10", "S04_spring_pendulum", "R16_bounce_e0.5"]
 )

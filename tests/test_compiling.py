@@ -50,6 +50,7 @@ def test_the_bits_do_not_depend_on_the_patches():
     assert repr(here) == plain.strip() and len({energy for energy, *_ in here[0]}) > 20
 
 
+@pytest.mark.slow
 def test_what_the_user_compiles_is_compiled_as_ever():
     # parts() assigns a vector to a variable that holds a number. Taichi's analysis finds that the variable is never read; without
     # it, LLVM ends the process. Only frames with such functions are analysed, which takes ten times as long with contacts.

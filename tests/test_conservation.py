@@ -36,6 +36,7 @@ def taken(angle, rate):
     return (share / rate(angle * (1 + node) / 2)).sum() * angle / 2
 
 
+@pytest.mark.slow
 def test_what_slides_over_a_disc_is_second_order(world):
     # An inverted pendulum, while the disc presses: theta'^2 = w^2 + 2 g / l (1 - cos theta), so the time to reach theta is the
     # integral of 1 / theta'. The disc would leave at cos theta = (2 + w^2 l / g) / 3, after 0.56 s.

@@ -13,6 +13,7 @@ def smooth(world, start, wide=(99.0, 99.0), g=9.81, rate=0.0, low=(0.0, 0.0), pr
     return world(start, features, precision=precision, **settings)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*near pairs per particle")
 @pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_overlap_parts_at_push_out_without_velocity(world, dim):

@@ -228,6 +228,7 @@ def test_every_frame_is_read_back_as_it_was(scenes, scene, kind, tmp_path):
                     np.testing.assert_allclose(values, right[name], rtol=digits, atol=digits / 10, err_msg=name)
 
 
+@pytest.mark.slow
 def test_exported_faces_and_texture_coordinates_are_those_of_a_shape(steady, roof, tmp_path):
     import trimesh  # takes a third of a second in every worker that imports this file
 

@@ -91,6 +91,7 @@ def test_the_place_of_a_change_is_named(original, rewritten, quick, tmp_path):
     assert (verdict.kind, verdict.frame, verdict.particle) == ("changed", 4, 1) and "picture" in str(verdict)
 
 
+@pytest.mark.slow
 def test_recordings_of_other_versions_are_named(rewritten, read_here):
     def replaced(old, new, more=lambda e: None):
         def change(e):

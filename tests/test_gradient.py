@@ -53,6 +53,7 @@ def test_the_period_of_a_pendulum():
     assert derivative["other"] == 0.0
 
 
+@pytest.mark.slow
 def test_a_landing_place_by_speed_and_angle():
     v, a = 7.0, 0.6
     value, derivative = tv.gradient(thrown, {"speed": v, "angle": a}, landing)

@@ -64,6 +64,7 @@ def test_reported_impulses_are_changes_of_momentum(world):
     np.testing.assert_allclose(total[18:20], 1.0, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_what_rests_does_not_bounce_where_the_substep_gets_shorter(world):
     # Displacements of what rests stand for -g h / 2 without what it leans on, which bounced where e h_old > h: up to g h_old / 2.
     # A disc lies on a fixed disc, or on a wall in a world without contacts.

@@ -101,6 +101,7 @@ def test_long_frames_in_several_launches_have_the_same_bits(w):
             assert out[0] == out[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("endless", [{"substeps": 2_000_000_000}, {"iterations": 2_000_000_000}])
 def test_an_endless_frame_is_undone(w, endless):
     pin = w.features[-1]

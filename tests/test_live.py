@@ -157,6 +157,7 @@ def test_what_pages_ask_for_is_done_recorded_and_replayed(rope, server, tmp_path
     assert len(tv.replay(tmp_path / "play.rrd").frames) == 2
 
 
+@pytest.mark.slow
 def test_pages_let_go_when_they_go_and_only_of_what_they_hold_and_slow_ones_are_not_waited_for(rope, server, tmp_path):
     live = Session(rope, server)
 
@@ -235,6 +236,7 @@ def test_pages_are_told_what_breaks_moves_comes_and_turns(world, server):
     assert not w._watchers
 
 
+@pytest.mark.slow
 def test_a_restart_brings_back_knobs_and_what_broke(world, server):
     w, gravity, thread, lid = weight(world, 9.81)
     live = Session(w, server)

@@ -25,6 +25,7 @@ def turned(w, since=0.0):
     return (np.arctan2(x[1], x[0]) - since + np.pi) % (2 * np.pi) - np.pi
 
 
+@pytest.mark.slow
 def test_a_limited_torque_accelerates_and_the_speed_is_then_met(world):
     # I w' = T until w = speed: the angle is T t^2 / 2 I, then speed (t - t1 / 2) with t1 = I speed / T. Second order.
     inertia, torque, speed = 2.0 * ARM**2, 1.0, 3.0

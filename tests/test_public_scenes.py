@@ -56,6 +56,7 @@ def test_a_rope_on_a_drum_holds_and_slips_by_the_capstan_equation(world):
     assert f"{drum!r}: what constraints hold creeps under loads" in world(w.particles, [tv.Distance(links), drum]).explain()
 
 
+@pytest.mark.slow
 def test_a_top_precesses_without_nutation(world):
     # jrouwe/JoltPhysics#803: tops fall over where gyroscopic forces are left out. Steady precession of a heavy top at the angle
     # theta: I1 cos(theta) W^2 - I3 w3 W + M g L = 0.

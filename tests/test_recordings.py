@@ -284,6 +284,7 @@ def test_a_file_that_is_removed_or_replaced_is_noticed(one, tmp_path, monkeypatc
     assert tv.replay(tmp_path / "a.rrd").complete and not one._watchers
 
 
+@pytest.mark.slow
 def test_a_killed_process_leaves_what_was_flushed(tmp_path, read_here):
     code = f"""
 import os, signal
@@ -488,6 +489,7 @@ with tv.World(tv.Particles([[0.0, 1.0]]), substeps=2) as world:
     assert main(["run", "fails.py", "--out", "none/a.rrd"]) == 2 and "The folder of none/a.rrd" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_pictures_have_names_and_frames_and_end_their_viewer_when_told(falling, tmp_path, monkeypatch):
     taken, started = [], []
 

@@ -138,6 +138,7 @@ class Deadly:
         return out
 
 
+@pytest.mark.slow
 def test_sweeps_run_on_any_executor_and_survive_a_worker_that_dies():
     # For the parts that processes and Dask take see test_sweep.py.
     found = tv.report.error_vs_time("D01", methods=["Direct"], precisions=("f64",), efforts=(20, 40), runs=1, executor=Deadly())

@@ -138,6 +138,7 @@ world().step(0.1)
     )
 
 
+@pytest.mark.slow
 def test_worlds_are_capped_and_freed_with_their_memory():
     python(
         START

@@ -76,6 +76,7 @@ def test_dask_has_the_same_bits_and_survives_a_worker_that_dies(here, tmp_path):
     assert range(0, 3) in [r.numbers for r in found.repeated] and {r.by for r in found.repeated} == {"the executor"}
 
 
+@pytest.mark.slow
 def test_what_a_process_did_when_it_died_is_named_and_done_again(tmp_path):
     make = functools.partial(ball, marker=str(tmp_path / "died"))
     told = r"parameters 0 to 2, make\(speed=0.0\) to make\(speed=2.0\) is done again: worker process \d+ was ended by SIGKILL"

@@ -171,6 +171,7 @@ def test_forces_that_come_change_no_velocity_before_they_act(world, what):
     np.testing.assert_allclose(w.position[1:5], begin + seen[1:] * t - [0, 9.81 * t**2 / 2], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_braking_a_chain_feeds_nothing(world):
     # Half of a reaction given back to some particles of a chain would strike it: 0.3 J per frame, of 70.
     w, _ = chain(world)

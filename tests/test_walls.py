@@ -592,6 +592,7 @@ def test_what_comes_from_below_passes_and_what_comes_from_above_lands(world):
         assert (w.position[~stays & (speed < 40), 1] < -10).all()
 
 
+@pytest.mark.slow
 def test_a_platform_that_moves_and_turns(world):
     # A platform carries the particle on it up and down, and passes a pinned one from below; its direction turns with it.
     walls = platforms()
