@@ -15,7 +15,7 @@ def smooth(world, start, wide=(99.0, 99.0), g=9.81, rate=0.0, low=(0.0, 0.0), pr
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*near pairs per particle")
-@pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dim", [2, 3])
 def test_overlap_parts_at_push_out_without_velocity(world, dim):
     # Positions part at push_out, whatever the depth, until what is left is the overlap in which contacts rest. What is in the
     # same place parts along a normal that is made from the indices, equal and opposite (rows 16 and 48). Two that overlap; then,
