@@ -63,7 +63,8 @@ def keep(runner: "Runner", h: float, dt: float, iterations: int, adapts: bool = 
     adapts: whether substeps are chosen for accuracy. Then links stiffen as far as the energy allows. left: the part of what they
     stored that is left, where violations have just settled. By so much links may stiffen at once.
     """
-    clock = runner.clock
+    clock, system = runner.clock, runner.scene.slots.system if runner.scene.slots else None
+    clock.part_softness, energy = system.softness_of_longer(h) if system else (1.0, 0.0)
     if acts(runner, h, iterations):
         growth, measured = _growth(runner, h, iterations), dt != clock.frame[1]
         s = max(1.0, clock.softness * left / growth)
@@ -72,54 +73,50 @@ def keep(runner: "Runner", h: float, dt: float, iterations: int, adapts: bool = 
         elif measured and growth >= NEAR**2 * clock.softness:
             clock.softened = clock.time
         elif s > 1 and (adapts or clock.time >= clock.softened + HOLD * (clock.softened > 0)):
-            s /= stiffening(runner, s, h, dt, adapts, left)
+            s /= stiffening(runner, s, _stored_before(runner, left) + energy, dt, adapts)
         if growth < 1 < s:
-            s *= too_stiff(runner, left)
+            s *= too_stiff(runner, _stored_before(runner, left))
         runner.set_softness(s if s > 1 + SETTLED else 1.0)
-    system = runner.scene.slots.system if runner.scene.slots else None
-    if system:
-        clock.part_softness, _ = system.softness_of_longer(h)
-        if clock.part_softness > 1:
-            system.stiffen((1 + stiffening(runner, clock.part_softness, h, dt, True, left)) / 2)
+    if system and clock.part_softness > 1:
+        store = _stored_before(runner, left) + energy
+        system.stiffen((1 + stiffening(runner, clock.part_softness, store, dt, adapts=True)) / 2)
 
 
-def stiffening(runner: "Runner", s: float, h: float, dt: float, adapts: bool, left: float) -> float:
-    """Return by what factor links of the softness s may stiffen in a frame of dt [s]. adapts: whether the energy alone decides.
+def stiffening(runner: "Runner", s: float, store: float, dt: float, adapts: bool) -> float:
+    """Return by what factor links of the softness s, which store so much [J], may stiffen in a frame of dt [s].
 
-    h: of the coming frame [s]. left: as in keep(). With the softness s they store as much as they did before that.
+    adapts: whether the energy alone decides.
     """
-    store, room = _store_and_room(runner, h, left)
     if not store > 0:
         return s
-    most = s / (1 + (s - 1) * exp(-dt / SETTLE))
+    most, room = s / (1 + (s - 1) * exp(-dt / SETTLE)), _room(runner)
     if room is not None:
         most = room / store if adapts else min(most, room / store)
     return max(1.0, min(s, most))
 
 
-def too_stiff(runner: "Runner", left: float) -> float:
-    """Return how many times as soft links must get, so that the scene has no more energy than ever with what they store.
+def too_stiff(runner: "Runner", store: float) -> float:
+    """Return how many times as soft links must get, so that the scene has no more energy than ever with what they store [J].
 
     It is 1 but after a long substep that threw bodies about: violations that it left bear no load.
     """
-    store, room = _store_and_room(runner, 0.0, left)
+    room = _room(runner)
     if room is None or not (spare := max(room, SLIGHT * runner.clock.kinetic)) > 0:
         return 1.0
     return max(1.0, store / spare)
 
 
-def _store_and_room(runner: "Runner", h: float, left: float) -> tuple[float, float | None]:
-    """Return what links store with the softness that keep() gives them, and how much they may [J]; None where that is unknown.
+def _stored_before(runner: "Runner", left: float) -> float:
+    """Return what relaxed links stored before they settled [J], as they do with the softness that keep() gives them."""
+    return stored(runner) / left if left > 0 else 0.0
 
-    h: the substep of systems that gave way in longer ones [s]; 0: without these.
-    """
-    clock, system = runner.clock, runner.scene.slots.system
-    store = stored(runner) / left if left > 0 else 0.0
-    if h and system:
-        store += system.softness_of_longer(h)[1]
+
+def _room(runner: "Runner") -> float | None:
+    """Return how much more energy the scene may have than now [J]; None where that is unknown."""
+    clock = runner.clock
     if clock.energy is None or clock.bound is None or clock.bound == CHANGED:
-        return store, None
-    return store, clock.bound + SLIGHT * clock.kinetic - clock.energy
+        return None
+    return clock.bound + SLIGHT * clock.kinetic - clock.energy
 
 
 def needs_no_care(runner: "Runner", s: float) -> bool:
