@@ -125,6 +125,65 @@ def loaded(world, mass, *more, **options):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("touches", [False, True])
+def test_a_plank_on_two_links_is_a_pendulum(world, touches):
+    # Links of a parallelogram: the plank shifts without turning, so it moves as a point on one of them does, to rounding, and
+    # wherever its center of mass is. One cluster with two rows of the system, which bear unequal loads.
+    swing = np.array([np.sin(1.0), -np.cos(1.0)])
+    plank = np.array([[0, 0], [1, 0], [0, -0.1], [1, -0.1], [0.3, -0.2]]) + swing
+    x, mass = np.concatenate([[[0, 0], [1, 0]], plank, [[9, 0]], [[9, 0] + swing]]), [1, 1, 0.3, 1, 2, 0.1, 5, 1, 1]
+    features = [tv.Gravity(9.81), tv.Distance([(0, 2), (1, 3), (7, 8)]), tv.ShapeMatch([range(2, 7)])]
+    if touches:
+        features.append(tv.Contact())
+    w = world(tv.Particles(x, mass=mass, radius=0.01, pinned=[0, 1, 7]), features, substeps=7, precision="f64")
+    for _ in range(60):
+        assert w.step(1 / 60).clean
+    assert np.ptp(w.position[2:7] - plank - (w.position[8] - x[8]), axis=0).max() < 1e-9
+    assert w.position[2:7] - plank == pytest.approx(np.tile(w.position[8] - x[8], (5, 1)), abs=1e-9)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_linked_bodies_answer_an_impact_as_one(world, dim):
+    # Frictionless, at the corner of the first of two bodies that a link joins: of all changes of velocity that keep lengths,
+    # J dv = 0, and let the pair part at e times the speed at which it met, the one of least energy,
+    #     dv = K n j,    K = W - W J^T (J W J^T)^+ J W,    j = -(1 + e) n.v / (n.K n).
+    body = np.stack(np.meshgrid(*[[0.0, 0.5]] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+    m, e, ball = len(body), 0.5, np.full(dim, 0.3)
+    x = np.concatenate([body, body + np.eye(dim)[0], [body[-1] + ball]])
+    mass, radius = np.linspace(1, 3, 2 * m + 1), np.zeros(2 * m + 1)
+    radius[[m - 1, 2 * m]] = np.linalg.norm(ball) / 2 * (1 - 1e-6)
+    v = np.zeros_like(x)
+    v[-1] = -np.arange(1.0, dim + 1)
+    joint = (m // 2, m)
+    bodies = tv.ShapeMatch([range(m), range(m, 2 * m)])
+    w = world(
+        tv.Particles(x, velocity=v, mass=mass, radius=radius), [tv.Distance([joint]), bodies, tv.Contact(restitution=e)],
+        precision="f64", substeps=4,
+    )  # fmt: skip
+    pairs = [*np.stack(np.triu_indices(m, 1), axis=1), *(np.stack(np.triu_indices(m, 1), axis=1) + m), joint]
+    J, W, n = np.zeros((len(pairs), x.size)), np.diag(np.repeat(1 / mass, dim)), np.zeros(x.size)
+    for row, (i, j) in zip(J, pairs, strict=True):
+        row.reshape(x.shape)[i], row.reshape(x.shape)[j] = x[i] - x[j], x[j] - x[i]
+    n.reshape(x.shape)[[-1, m - 1]] = ball / np.linalg.norm(ball), -ball / np.linalg.norm(ball)
+    K = W - W @ J.T @ np.linalg.pinv(J @ W @ J.T) @ J @ W
+    want = v.ravel() - K @ n * ((1 + e) * (n @ v.ravel()) / (n @ K @ n))
+    w.step(1e-4)
+    assert w.velocity.ravel() == pytest.approx(want, abs=2e-3)  # |v| turns by v dt / 0.5 m meanwhile
+    assert tv.measure.momentum(w) == pytest.approx(mass @ v, abs=1e-9)
+
+
+def test_a_heavy_ball_hangs_on_a_light_chain(world):
+    # Of 500 times the mass of a link: by default its chain is as long as it was. Relaxed beside its cluster, a corner of the ball
+    # gave way by a quarter of a link at 20 substeps.
+    rope, ball = tv.shapes.rope((0, 2), (2, 2), points=11), tv.shapes.ball((2.4, 2), 0.2)
+    nearest = 11 + np.argmin(ball.position[:, 0])
+    features = [tv.Gravity(9.81), tv.Distance([*rope.links, (10, nearest)]), tv.ShapeMatch([range(11, 11 + len(ball))])]
+    mass = np.repeat([0.1, 50 / len(ball)], [11, len(ball)])
+    w = world(tv.Particles(np.concatenate([rope.position, ball.position]), mass=mass, pinned=[0]), features)
+    report = w.run(2.0)
+    assert report.clean and report.residual < 1e-3
+
+
 def test_what_gives_way_recovers_at_rest(world):
     # The sag at rest is M g L / (4 T), for the largest tension T that the substep can stand, which grows with 1 / h^2. It falls
     # to a quarter in half the substep.

@@ -190,3 +190,26 @@ def links_and_a_cluster_break_under_a_falling_weight():
     spring = c.Distance([(8, 9)], compliance=1e-3, break_at=5.0)
     cluster = c.ShapeMatch([[4, 5, 6, 7]], break_at=400.0)
     return c.Particles(x, mass=[*[0.1] * 5, 5.0, 0.1, 0.1, 1.0, 1.0], pinned=[0, 8]), [c.Gravity(G), links, spring, cluster]
+
+
+@scene(smooth=True)
+def heavy_bodies_hang_on_light_chains_in_space():
+    # A chain bears a block of 32 times the mass of a link, and that another one by a link from corner to corner.
+    rope = tv.shapes.rope((0, 2, 0), (1, 1.6, 0.2), points=6)
+    block = np.stack(np.meshgrid([0.0, 0.3], [0.0, 0.2], [0.0, 0.25], indexing="ij"), axis=-1).reshape(-1, 3)
+    x = np.concatenate([rope.position, [1.2, 1.5, 0.2] + block, [1.7, 1.4, 0.1] + block])
+    start = c.Particles(x, mass=np.repeat([0.05, 0.2, 0.1], [6, 8, 8]), pinned=[0])
+    features = [c.Gravity(G), c.Distance([*rope.links, (5, 6), (10, 14)]), c.ShapeMatch([range(6, 14), range(14, 22)])]
+    return start, features, {"precision": "f64"}
+
+
+@scene()
+def a_bridge_of_planks_bears_balls():
+    plank, n = tv.shapes.box((0, 0), (0.4, 0.06), radius=0.01), 6
+    across = np.linspace(0.35, 2.65, n)
+    planks, _ = tv.shapes.join(*(plank.moved((a, 2 - 0.3 * np.sin(np.pi * a / 3))) for a in across))
+    links = [(4 * k + 3, 4 * k + 5) for k in range(n - 1)] + [(4 * n, 1), (4 * n - 1, 4 * n + 1)]
+    x, radius = [*planks.position, (0, 2), (3, 2), (1.1, 2.2), (1.8, 2.3)], [*planks.radius, 0, 0, 0.12, 0.15]
+    start = c.Particles(x, mass=np.repeat([0.5, 1.0, 10.0], [4 * n, 2, 2]), radius=radius, pinned=[4 * n, 4 * n + 1])
+    bodies = [c.ShapeMatch(planks.loops), c.Polygons(planks.loops, friction=0.5)]
+    return start, [c.Gravity(G), c.Distance(links), *bodies]

@@ -11,6 +11,7 @@ from .corners import components, corners_of
 from .direct import Direct
 from .elimination import plan
 from .jacobi import Jacobi
+from .joined import couples, joined_clusters
 from .redundancy import implied_links
 from .solver import WIDTH, Solver
 from .system import solvable
@@ -36,16 +37,16 @@ def choose_solver(batches: "list[Batch]", scene: "Scene", answers: bool) -> Solv
 
     Direct solves what hangs together in systems up to its usual width: chains, trees, ladders, trusses, wheels, bodies. Its
     residual is some 1e-6 of the length of a link, that of Jacobi a hundredth, in one to four times the time. Single links, too,
-    where they `answer` contacts, unless they join clusters: they answer after each pass of contacts then. ConjugateGradient
-    solves what is wider or faster by it, such as cloth and nets, where that is more of the stiff constraints, or MANY_STIFF, in
-    pieces of LARGE_PIECE or more. Its residual is an eighth of that of Jacobi with as many substeps. Jacobi is left with few or
-    soft links, and with what starts violated or is inside of a cluster: such constraints may contradict others; relaxed, they
-    settle on a compromise.
+    where they `answer` contacts or join rigid clusters, but not clusters that are no bodies of a system. ConjugateGradient solves
+    what is wider or faster by it, such as cloth and nets, where that is more of the stiff constraints, or MANY_STIFF, in pieces
+    of LARGE_PIECE or more. Its residual is an eighth of that of Jacobi with as many substeps. Jacobi is left with few or soft
+    links, and with what starts violated or is inside of a cluster: such constraints may contradict others; relaxed, they settle
+    on a compromise.
     """
     links = solvable(batches)
     if not links:
         return Jacobi()
-    pieces = Pieces(links, scene, [b for b in batches if b.clusters])
+    pieces = Pieces(links, scene, batches, answers)
     direct, taken = pieces.choose_direct(answers)
     left, solved = pieces.count_stiff(~taken), pieces.count_stiff(taken)
     if left >= min(MANY_STIFF, max(solved, 1)) and all(_may_iterate(b, scene) for b in links):
@@ -56,7 +57,7 @@ def choose_solver(batches: "list[Batch]", scene: "Scene", answers: bool) -> Solv
 def explain_choice(solver: Solver) -> str:
     """Return why choose_solver() has chosen this solver."""
     if isinstance(solver, Direct):
-        return "links hang together like chains, loops, beams or small nets, or touch something"
+        return "links hang together like chains, loops, beams or small nets, join bodies, or touch something"
     if isinstance(solver, ConjugateGradient):
         return "links are stiff, many, and hang together more closely than elimination takes"
     return "links are few, soft or violated at the start, or there are angles that elimination is not for, or none"
@@ -84,22 +85,25 @@ def _may_iterate(b: "Scalar", scene: "Scene") -> bool:
 
 
 class Pieces:
-    """Connected pieces: sets of constraints that share movable particles, among those that a System could solve."""
+    """Connected pieces: sets of constraints that share movable particles or bodies, among those that a System could solve."""
 
-    def __init__(self, links: "list[Scalar]", scene: "Scene", clusters: "list[Batch]"):
+    def __init__(self, links: "list[Scalar]", scene: "Scene", batches: "list[Batch]", answers: bool):
         w, counts = scene.inv_mass, [b.count for b in links]
         owner, item = corners_of(links)
         free = w[item] > 0
-        self.count, self.owner, self.item = sum(counts), owner[free], item[free]
-        self.piece = components(self.count, self.owner, self.item)
+        alone = np.concatenate([b.relaxed_alone(scene) for b in links])
+        body, clusters = joined_clusters(batches, alone, scene, answers), [b for b in batches if b.clusters]
+        self.count, self.owner, self.item = sum(counts), owner[free], couples(body, item[free])
+        self.piece, self.joins = components(self.count, self.owner, self.item), bool((body >= 0).any())
         self.acts = np.bincount(self.owner, minlength=self.count) > 0
-        held = np.isin(self.item, np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in clusters)]))
+        held = np.isin(item[free], np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in clusters)]))
+        held &= body[item[free]] < 0
         twice, inside = self._any(np.bincount(self.owner, held, self.count) > 0), self._inside(held, clusters)
         self.implied, self.shares = implied_links(links, scene) & ~twice, bool(twice.any())
         off = np.concatenate([_is_violated(b) for b in links])
         self.may_eliminate, self.is_off = all(_may_eliminate(b, scene) for b in links), bool((off | inside).any())
         degree = np.bincount(np.concatenate([b.indices.ravel() for b in links]), minlength=len(w))
-        self.solved = self.acts & ~np.concatenate([b.relaxed_alone(scene) for b in links])
+        self.solved = self.acts & ~alone
         stiff = np.concatenate([_stiff(b, degree * w) for b in links]) & self.solved
         self.stiff, self.rigid = stiff & ~self._any(off), np.concatenate([b.compliance == 0 for b in links]) & self.solved
 
@@ -123,7 +127,8 @@ class Pieces:
         Systems wider than CHAIN are for stiff constraints and ropes. Single links are taken where they answer contacts.
         """
         taken = np.zeros(self.count, dtype=bool)
-        if np.bincount(self.item[self.solved[self.owner]], minlength=1).max() <= 1:  # which cannot contradict each other
+        crowd = np.bincount(self.item[self.solved[self.owner]], minlength=1)
+        if crowd.max() <= 1 and not self.joins:  # which cannot contradict each other
             return Direct(CHAIN) if answers and self.may_eliminate and not self.shares else None, self.solved
         if self.is_off or not self.may_eliminate:
             return None, taken
@@ -139,7 +144,7 @@ class Pieces:
         rows, products = np.diff(found.part_begin), np.diff(found.update_begin[found.part_begin])
         dear = np.repeat(products > PRODUCTS * rows + OVERHEAD, rows)
         taken &= ~self._any(np.isin(np.arange(self.count), found.rows[dear]))
-        return (Direct(max([CHAIN, *found.widths])) if crowd.max() > 1 else None), taken
+        return (Direct(max([CHAIN, *found.widths])) if crowd.max() > 1 or self.joins else None), taken
 
     def count_stiff(self, some: np.ndarray) -> int:
         """Return how many in the mask `some` are stiff, two-sided, and in pieces with LARGE_PIECE or more of these."""

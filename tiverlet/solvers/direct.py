@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import checks
-from ..device import runtime, ti
+from ..device import called, runtime, ti
 from ..device.number import OnDevice
 from ..features.feature import Batch, Scene
 from .corners import corners_of
 from .elimination import Plan, plan
+from .joined import Joined, couples, joined_clusters, row_of_clusters
 from .redundancy import implied_links
 from .slots import TENSEST, Slots
 from .solver import WIDTH, Solver
@@ -58,9 +59,9 @@ class Direct(Solver):
     degree, the same order on every run, with one thread for each system.
 
     width: a set of connected constraints becomes a system when no step of its elimination couples more than this many others.
-    A chain has width 1, a closed loop 2, a joint of k rods k - 1. Wider sets (cloth), and constraints that are not scalar
-    functions, are relaxed as by Jacobi. A particle in both gives each a share of its mass. world.explain() says which
-    constraints are solved in which way.
+    A chain has width 1, a closed loop 2, a joint of k rods k - 1. Rigid clusters that only such constraints join take part as
+    bodies. Wider sets (cloth), and all else, are relaxed as by Jacobi. A particle in both gives each a share of its mass.
+    world.explain() says which constraints are solved in which way.
 
     Ropes, spacers and limits take part by an active set: those whose multiplier has the wrong sign are switched off, and those
     that are violated are switched on, until nothing changes. A constraint that others imply gets no multiplier: a double link, or
@@ -85,13 +86,14 @@ class Direct(Solver):
             return None
         slot = np.concatenate([slots.places(b).ravel() for b in scalars])
         owner, item = corners_of(scalars)
-        alone = np.concatenate([b.relaxed_alone(scene) for b in scalars])
         implied = implied_links(scalars, scene)
+        alone = np.concatenate([b.relaxed_alone(scene) for b in scalars])
+        body = joined_clusters(batches, alone, scene, slots.answers)
         free = (slot >= 0) & ~(alone | implied)[owner]
-        found = plan(len(alone), owner[free], item[free], self.width)
+        found = plan(len(alone), owner[free], couples(body, item[free]), self.width)
         if not found.parts:
             return None
-        return Elimination(scene, batches, slots, scalars, found, slot[free], implied)
+        return Elimination(scene, batches, slots, scalars, found, slot[free], implied, body)
 
     def explain(self, batches: list[Batch], slots: Slots) -> str:
         """Return how many constraints are solved by elimination, and how many relaxed alone."""
@@ -123,10 +125,11 @@ class Elimination(System):
 
     def __init__(
         self, scene: Scene, batches: list[Batch], slots: Slots, scalars: "list[Scalar]", found: Plan, slot: np.ndarray,
-        implied: np.ndarray,
+        implied: np.ndarray, body: np.ndarray,
     ):  # fmt: skip
         rows, self._part = _with_implied(found, scalars, scene, implied)
-        super().__init__(scene, batches, slots, scalars, rows)
+        bodies = row_of_clusters(batches, body, _row_of_particles(rows, scalars, scene.inv_mass))
+        super().__init__(scene, batches, slots, scalars, rows, bodies)
         row, corner, particle = self.corners(scalars, slots)
         self.plan, self.parts, self.entries = found, self.memory.number(found.parts), self.memory.number(len(found.column))
         self.solved, self.has_implied = self.memory.number(len(found.rows)), len(rows) > len(found.rows)
@@ -145,19 +148,21 @@ class Elimination(System):
         self.update_begin, self.product = ints("update_begin", found.update_begin), ints("product", product, 3)
         self.gradient = scene.memory.field("system.gradient", slots.total, width=self.dim)
         self.value, self.diagonal = reals("value", self.solved + 2 * self.entries), reals("weight")
-        self.answers = slots.answers
+        self.corner_begin = ints("corner_begin", np.searchsorted(row, np.arange(len(rows) + 1)))
+        self.corner = ints("corner", corner)
+        self.joined: Any = Joined(scene, batches, slots, bodies, self._part, corner, particle, found.parts) if bodies else None
+        if self.joined:
+            self.shift = reals("shift")
+        self.slots, self.answers = slots, slots.answers
         if self.answers:
-            self.slots = slots
             self.answer, self.change, self.solution, self.gap = (reals(k) for k in ("answer", "change", "solution", "gap"))
             self.added, self.turned_to = (
                 scene.memory.field(f"system.{k}", found.parts, kind=ti.f64) for k in ("added", "turned_to")
             )
-            self.corner_begin = ints("corner_begin", np.searchsorted(row, np.arange(len(rows) + 1)))
-            self.corner = ints("corner", corner)
         who = np.zeros(slots.total, dtype=np.int64)
         who[corner] = particle
         self.particle_of, self.w, self.inverse_size = ints("who", who), scene.state.w, reals("close")
-        self.refines = scene.order == 2 and not self.limits_steps and not self.has_shared_particles
+        self.refines = scene.order == 2 and not (self.limits_steps or self.has_shared_particles)
         if self.refines:
             self.part_of, self.newton = ints("part_of", self._part), ints("newton", np.full(found.parts, UNKNOWN))
             near = np.zeros(len(scene.inv_mass))
@@ -169,7 +174,8 @@ class Elimination(System):
         self.sleeps = bool(scene.state.sleepers)
         if self.sleeps:  # all particles of a system sleep, or none
             self.representative = ints("lead", particle[np.searchsorted(row, found.part_begin[:-1], side="right") - 1])
-        parts = [scene.inv_mass[b.indices] * (b.gradients(b.start.position) ** 2).sum(axis=2) for b in scalars]
+        w = self.joined.lightest(scene.inv_mass) if self.joined else scene.inv_mass
+        parts = [w[b.indices] * (b.gradients(b.start.position) ** 2).sum(axis=2) for b in scalars]
         least = np.concatenate([np.where(p > 0, p, np.inf).min(axis=1, initial=np.inf) for p in parts])[rows]
         small = np.where(np.isfinite(least), SMALL_PIVOT * least, 0.0)
         self.small_pivot = scene.memory.field("system.small", self.rows, kind=ti.f64, values=small)
@@ -252,13 +258,16 @@ class Elimination(System):
             out = self.active[r] != 0
         return out
 
+    @called
     @ti.func
-    def assemble(self, begin, end, softness, at_end):
+    def assemble(self, begin: ti.i32, end: ti.i32, softness: ti.f64, at_end: ti.i32):
         """Assemble the matrix and right side of rows from `begin` up to `end`. Rows that do not act get the multiplier 0.
 
         softness: added to the diagonal. at_end: whether directions are those at the end of the substep.
         """
         rows, entries = self.solved, self.entries
+        if ti.static(bool(self.joined)):
+            self.note_pushes(begin, end, at_end)
         for r in range(begin, end):
             self.value[r] = 0
             for e in range(self.entry_begin[r], self.entry_begin[r + 1]):
@@ -276,12 +285,26 @@ class Elimination(System):
                 self.step[r] = -self.lam[r]
             self.diagonal[r] = self.value[r]
 
+    @called
+    @ti.func
+    def note_pushes(self, begin: ti.i32, end: ti.i32, at_end: ti.i32):
+        """Store how rows from `begin` up to `end` push bodies."""
+        for r in range(begin, end):
+            for q in range(self.corner_begin[r], self.corner_begin[r + 1]):
+                move = self.move[self.corner[q]]
+                if at_end != 0:
+                    move = self.move_at_end(self.corner[q])
+                self.joined.note_push(self.corner[q], move)
+
     @ti.func
     def coupling(self, at, at_end):
-        """Return grad C_j . w . grad C_k for one particle. at_end: both gradients are at the end of the substep."""
+        """Return grad C_j . w . grad C_k for one particle or body. at_end: both gradients are at the end of the substep."""
         move = self.move[at[2]]
         if at_end != 0:
             move = self.move_at_end(at[2])
+        if ti.static(bool(self.joined)):
+            if self.joined.corner_of[at[1]] >= 0:
+                move = self.joined.move_for(at[1], at[2])
         out = ti.cast(0, ti.f64)
         for k in ti.static(range(self.dim)):
             out += ti.cast(self.gradient[at[1]][k], ti.f64) * ti.cast(move[k], ti.f64)
@@ -305,8 +328,9 @@ class Elimination(System):
                 if s == self.product[q][2]:
                     self.move[s] = self.move_at_end(s)
 
+    @called
     @ti.func
-    def eliminate(self, begin, end):
+    def eliminate(self, begin: ti.i32, end: ti.i32) -> ti.i32:
         """Eliminate rows from `begin` up to `end`, then substitute back. Returns 1 if a pivot was small, 2 for a contradiction.
 
         A constraint that others imply gets no step. It contradicts them if its residual is larger than rounding.
@@ -363,6 +387,9 @@ class Elimination(System):
             if ti.static(self.one_sided):
                 if self.side[r] != 0:
                     self.gap[r] = self.violation[r] + self.remaining[r] + self.alpha[r] * self.step[r]
+        if self.added[b] > 0:
+            self.assemble(self.part_begin[b], self.part_begin[b + 1], self.added[b], 0)
+            self.eliminate(self.part_begin[b], self.part_begin[b + 1])
 
     @ti.func
     def turn_answer(self, b, rows: ti.template()):  # type: ignore[valid-type]
@@ -373,6 +400,8 @@ class Elimination(System):
         if when != before:
             turn = (when - before) / ti.max(1 - before, ti.static(2.0**-10))  # what is at the end already stays there
             self.turned_to[b] = when
+            if ti.static(bool(self.joined)):
+                self.joined.place_bodies(b, 1 - when)
             for q in range(self.corner_begin[self.part_begin[b]], self.corner_begin[self.part_begin[b + 1]]):
                 s = self.corner[q]
                 self.move[s] = self.move[s] + turn * (self.move_at_end(s) - self.move[s])
@@ -387,8 +416,10 @@ class Elimination(System):
         """
         begin, end, any_change, switched = self.part_begin[b], self.part_begin[b + 1], False, False
         rows, entries = self.solved, self.entries
+        if ti.static(bool(self.joined)):
+            self.joined.begin_answer(b, self, moved, d)
         for r in range(begin, end):
-            change = -self.scale[r] * self.moved_along(r, moved, d)
+            change = -self.scale[r] * self.moved_along(r, moved, d, True)
             if ti.static(self.one_sided):
                 if self.side[r] != 0 and self.scale[r] != 0:
                     change -= self.gap[r]
@@ -423,6 +454,8 @@ class Elimination(System):
                 for q in range(self.corner_begin[r], self.corner_begin[r + 1]):
                     s = self.corner[q]
                     self.slots.answer[s] = ti.cast(self.answer[r] * ti.cast(self.move[s], ti.f64), self.real)
+        if ti.static(bool(self.joined)):
+            self.joined.end_answer(b, self)
 
     @ti.func
     def end_answer(self, b, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]
@@ -431,19 +464,22 @@ class Elimination(System):
             if ti.static(self.one_sided):
                 if self.side[r] != 0:
                     self.gap[r] = ti.select(
-                        self.active[r] != 0, 0 * self.gap[r], self.gap[r] + self.scale[r] * self.moved_along(r, moved, d)
+                        self.active[r] != 0, 0 * self.gap[r], self.gap[r] + self.scale[r] * self.moved_along(r, moved, d, False)
                     )
                 self.solution[r] = self.solution[r] + self.answer[r]
             self.answer[r] = 0
 
     @ti.func
-    def moved_along(self, r, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]
-        """Return by how much moves of particles, `moved` - d, change the constraint of row r."""
+    def moved_along(self, r, moved: ti.template(), d: ti.template(), fits: ti.template()):  # type: ignore[valid-type]
+        """Return by how much moves of particles, `moved` - d, change the constraint of row r. fits: whether bodies follow yet."""
         out = ti.cast(0, ti.f64)
         for q in range(self.corner_begin[r], self.corner_begin[r + 1]):
             s = self.corner[q]
             i = self.particle_of[s]
             u = self.gradient[s].dot(moved[i] - d[i])
+            if ti.static(fits and bool(self.joined)):
+                if self.joined.corner_of[s] >= 0:
+                    u = self.gradient[s].dot(ti.cast(self.joined.fitted(self.joined.corner_of[s]), self.real))
             if ti.static(self.has_shared_particles):
                 u /= self.blocks_of[i]
             out += u
@@ -564,6 +600,8 @@ class Elimination(System):
                     self.violation[r] = b.dev.quantity.exact_excess(self.number[r])
                     if ti.static(b.dev.limit.acts):
                         self.violation[r] -= b.dev.limit.postponed[self.number[r]]
+                    if ti.static(bool(self.joined)):
+                        self.violation[r] += self.shift[r]
 
     @ti.func
     def softness(self, b, begin, end):
@@ -647,6 +685,9 @@ class Elimination(System):
         if ti.static(self.sleeps):
             if not self.state.awake(self.representative[b]):
                 end = begin
+        if ti.static(bool(self.joined)):
+            if begin < end:
+                self.begin_bodies(b, begin, end)
         zero = ti.cast(0, ti.f64)
         softness, least, inverse, tension_at_start, total_at_start, reported = zero, zero, zero, zero, zero, zero
         stage, k, bound, soft, longer = FORWARD, 0, True, self.softness(b, begin, end), 1 + zero
@@ -657,9 +698,14 @@ class Elimination(System):
         if begin == end:
             stage = DONE
         while stage != DONE:
+            if ti.static(bool(self.joined)):
+                self.joined.place_bodies(b, ti.select(stage >= COMPARE, 0, 1))
             hard = self.solve_active_set(begin, end, softness, ti.cast(stage >= COMPARE, ti.i32))
             if ti.static(self.answers):
                 self.added[b] = softness
+                if hard != 0:  # answers to moves in f32 would be their rounding over a pivot
+                    for r in range(begin, end):
+                        self.added[b] = ti.max(self.added[b], self.small_pivot[r])
             tension, total, stiffness, most = self.tensions(begin, end, ti.cast(stage >= COMPARE, ti.i32), longer)
             if ti.static(self.limits_steps):
                 if stage <= FORWARD and self.limit_steps(begin, end) != 0:
@@ -714,6 +760,32 @@ class Elimination(System):
                         least, inverse = softness, 1 / tension
                         new = ti.max(new, 1.1 * softness)
                     softness = new
+        if ti.static(bool(self.joined)):
+            if begin < end:
+                self.joined.follow(b, self)
+
+    @ti.func
+    def begin_bodies(self, b, begin, end):
+        """Begin a pass of part b: its rows are violated at where their clusters bring the corners. It takes one Newton step."""
+        if self.joined.part_begin[b] < self.joined.part_begin[b + 1]:
+            self.end_newton(b)
+        for r in range(begin, end):
+            moved = ti.cast(0, ti.f64)
+            for q in range(self.corner_begin[r], self.corner_begin[r + 1]):
+                s = self.corner[q]
+                moved += ti.cast(self.gradient[s].dot(self.joined.own_move(s)), ti.f64)
+            self.shift[r] = self.scale[r] * moved
+            self.violation[r] += self.shift[r]
+
+
+def _row_of_particles(rows: np.ndarray, scalars: "list[Scalar]", w: np.ndarray) -> np.ndarray:
+    """Return a row of each particle, (n,), -1 for those in none. rows: the constraint of each row."""
+    owner, item = corners_of(scalars)
+    row, out = np.full(sum(b.count for b in scalars), -1), np.full(len(w), -1)
+    row[rows] = np.arange(len(rows))
+    some = (w[item] > 0) & (row[owner] >= 0)
+    out[item[some]] = row[owner[some]]
+    return out
 
 
 def _with_implied(found: Plan, scalars: "list[Scalar]", scene: Scene, implied: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

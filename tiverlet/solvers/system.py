@@ -1,6 +1,7 @@
 """Systems: constraints that are solved together. The data of their rows, and the moves of their particles."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,7 +43,11 @@ class System:
     team: Any  # the threads that share the loops of start(), iterate() and end(); set when kernels are built
     stride: int  # iterations of such a loop for each block of rows
 
-    def __init__(self, scene: "Scene", batches: "list[Batch]", slots: "Slots", scalars: "list[Scalar]", rows: np.ndarray):
+    def __init__(
+        self, scene: "Scene", batches: "list[Batch]", slots: "Slots", scalars: "list[Scalar]", rows: np.ndarray,
+        clusters: "Mapping[int, np.ndarray]" = MappingProxyType({}),
+    ):  # fmt: skip
+        """clusters: a row of the part that each cluster is a body of, -1 for none, by the id of its batch."""
         self.state, self.real, self.dim = scene.state, scene.real, scene.state.dim
         self.move, self.tension = slots.move, slots.tension
         self.epsilon = float(np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps)
@@ -50,7 +55,7 @@ class System:
         counts = [b.count for b in scalars]
         row = np.full(sum(counts), -1)
         row[rows] = np.arange(len(rows))
-        self._rows = dict(zip(map(id, scalars), np.split(row, np.cumsum(counts)[:-1]), strict=True))
+        self._rows = dict(zip(map(id, scalars), np.split(row, np.cumsum(counts)[:-1]), strict=True)) | dict(clusters)
         self.blocks, self.has_shared_particles = self._blocks(batches, scene)
         row, slot, _ = self.corners(scalars, slots)
         of_slot = np.full(sum(b.indices.size for b in batches), -1)
@@ -85,11 +90,9 @@ class System:
             row = self.row(b)
             if b.acts_as_force(scene).any():
                 row = np.where(b.acts_as_force(scene), 0, row)  # constraints that act as forces take no share of the mass
-            if (row >= 0).any():
-                inside[b.indices[row >= 0]] = True
-                alone += np.bincount(b.indices[row < 0].ravel(), minlength=n)
-            else:
-                alone += np.bincount(b.indices.ravel(), minlength=n)
+            who, there = b.indices.ravel(), (row >= 0)[b.owner]
+            inside[who[there]] = True
+            alone += np.bincount(who[~there], minlength=n)
         free = scene.inv_mass > 0
         return np.where(free, inside + alone, 0), bool((inside & (alone > 0) & free).any())
 

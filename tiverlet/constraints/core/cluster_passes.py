@@ -62,6 +62,9 @@ class ClusterPasses(Passes):
             self.fit = add(f"{name}.fit", m, width=dim * dim, kind=ti.f64, state=for_reports)
             self.middle = add(f"{name}.middle", m, width=dim, kind=ti.f64)
             self.mean = add(f"{name}.mean", m, width=dim, kind=ti.f64, state=for_reports)
+        self.joins = bool((scene.slots.rows(batch) >= 0).any())
+        if self.joins:  # whether a system takes it as a body, see Joined
+            self.joined = add(f"{name}.joined", m, kind=ti.i32, values=scene.slots.rows(batch) >= 0)
         if scene.slots.answers:  # see turn_answer()
             self.inertia = add(f"{name}.inertia", m, width=dim * dim, kind=ti.f64)  # sum m r r^T about the middle
             self.answering = add(f"{name}.answering", m, width=3, kind=ti.f64)  # A, alpha' and the mass
@@ -303,7 +306,10 @@ class ClusterPasses(Passes):
     def answer(self, c, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]
         """Move corners to a rigid motion of the cluster, as far as it is stiff: A (C of the moves) + alpha' answer = 0."""
         begin, end = self.corners.starts[c], self.corners.starts[c + 1]
-        if self.mass[c] > 0 and self.strength.is_intact(c):
+        by_itself = self.mass[c] > 0 and self.strength.is_intact(c)
+        if ti.static(self.joins):
+            by_itself = by_itself and self.joined[c] == 0
+        if by_itself:
             mean, some = self.zero_vector(), False
             S, A, alpha = rotation.from_rows(self.inertia[c]), self.answering[c][0], self.answering[c][1]
             X = 0 * S

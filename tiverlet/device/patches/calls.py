@@ -23,7 +23,7 @@ from taichi.lang import impl, kernel_impl
 from ..language import active, inline, ti
 
 NEVER = "if {0} < -2147483647: self.{1}({2})"  # first statement of a function: LLVM does not inline one that calls itself
-MOST = 8  # most functions of a kernel
+MOST = 16  # most functions of a kernel
 _numbers = count()  # numbers of functions; they are no part of the key of a kernel
 _kernel: Any = None  # the kernel that is being compiled
 _keys: dict[Any, Any] = {}  # keys of its functions that have a body
