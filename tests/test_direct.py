@@ -125,7 +125,7 @@ def loaded(world, mass, *more, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("touches", [False, True])
+@pytest.mark.parametrize("touches", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_plank_on_two_links_is_a_pendulum(world, touches):
     # Links of a parallelogram: the plank shifts without turning, so it moves as a point on one of them does, to rounding, and
     # wherever its center of mass is. One cluster with two rows of the system, which bear unequal loads.
@@ -142,7 +142,7 @@ def test_a_plank_on_two_links_is_a_pendulum(world, touches):
     assert w.position[2:7] - plank == pytest.approx(np.tile(w.position[8] - x[8], (5, 1)), abs=1e-9)
 
 
-@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_linked_bodies_answer_an_impact_as_one(world, dim):
     # Frictionless, at the corner of the first of two bodies that a link joins: of all changes of velocity that keep lengths,
     # J dv = 0, and let the pair part at e times the speed at which it met, the one of least energy,

@@ -194,13 +194,14 @@ def links_and_a_cluster_break_under_a_falling_weight():
 
 @scene(smooth=True)
 def heavy_bodies_hang_on_light_chains_in_space():
-    # A chain bears a block of 32 times the mass of a link, and that another one by a link from corner to corner.
-    rope = tv.shapes.rope((0, 2, 0), (1, 1.6, 0.2), points=6)
+    # From a block that turns about a pinned corner. The chain bears 32 times the mass of a link, and that another block by a link
+    # from corner to corner.
+    rope = tv.shapes.rope((0.3, 1.9, 0), (1, 1.6, 0.2), points=5)
     block = np.stack(np.meshgrid([0.0, 0.3], [0.0, 0.2], [0.0, 0.25], indexing="ij"), axis=-1).reshape(-1, 3)
-    x = np.concatenate([rope.position, [1.2, 1.5, 0.2] + block, [1.7, 1.4, 0.1] + block])
-    start = c.Particles(x, mass=np.repeat([0.05, 0.2, 0.1], [6, 8, 8]), pinned=[0])
-    features = [c.Gravity(G), c.Distance([*rope.links, (5, 6), (10, 14)]), c.ShapeMatch([range(6, 14), range(14, 22)])]
-    return start, features, {"precision": "f64"}
+    x = np.concatenate([rope.position, [-0.1, 1.85, 0.0] + block, [1.2, 1.5, 0.2] + block, [1.7, 1.4, 0.1] + block])
+    start = c.Particles(x, mass=np.repeat([0.05, 0.2, 0.2, 0.1], [5, 8, 8, 8]), pinned=[7])
+    blocks = c.ShapeMatch([range(5, 13), range(13, 21), range(21, 29)])
+    return start, [c.Gravity(G), c.Distance([*rope.links, (10, 0), (4, 13), (17, 21)]), blocks], {"precision": "f64"}
 
 
 @scene()

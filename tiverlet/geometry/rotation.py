@@ -8,6 +8,7 @@ import numpy as np
 from ..device import ti
 
 STEPS = 16  # Newton iterations at most; from the rotation of the last substep it takes two or three
+HEAVY = 1024  # masses of its body: that of a particle that cannot move
 
 
 def identity(dim: int) -> np.ndarray:

@@ -91,7 +91,7 @@ class Pieces:
         w, counts = scene.inv_mass, [b.count for b in links]
         owner, item = corners_of(links)
         free = w[item] > 0
-        alone = np.concatenate([b.relaxed_alone(scene) for b in links])
+        alone = np.concatenate([b.relaxed_alone(scene, bounded=True) for b in links])
         body, clusters = joined_clusters(batches, alone, scene, answers), [b for b in batches if b.clusters]
         self.count, self.owner, self.item = sum(counts), owner[free], couples(body, item[free])
         self.piece, self.joins = components(self.count, self.owner, self.item), bool((body >= 0).any())

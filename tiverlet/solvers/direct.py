@@ -63,10 +63,10 @@ class Direct(Solver):
     bodies. Wider sets (cloth), and all else, are relaxed as by Jacobi. A particle in both gives each a share of its mass.
     world.explain() says which constraints are solved in which way.
 
-    Ropes, spacers and limits take part by an active set: those whose multiplier has the wrong sign are switched off, and those
-    that are violated are switched on, until nothing changes. A constraint that others imply gets no multiplier: a double link, or
-    the second diagonal of a square, whose other links hold it (implied_links()). Elimination is in f64 in every world, because
-    its pivots span the mass ratio.
+    Ropes, spacers, limits and winches of limited force take part by an active set: those whose multiplier is beyond a bound are
+    held there, and those that need another one are let go, until nothing changes. A constraint that others imply gets no
+    multiplier: a double link, or the second diagonal of a square, whose other links hold it (implied_links()). Elimination is in
+    f64 in every world, because its pivots span the mass ratio.
 
     A load that cannot be borne to first order (a straight rope between two pins) leaves the tension undetermined with directions
     at the start of the substep. Such a system is solved with directions at the end, and softened until (omega h)^2 <= 1; so is
@@ -87,7 +87,7 @@ class Direct(Solver):
         slot = np.concatenate([slots.places(b).ravel() for b in scalars])
         owner, item = corners_of(scalars)
         implied = implied_links(scalars, scene)
-        alone = np.concatenate([b.relaxed_alone(scene) for b in scalars])
+        alone = np.concatenate([b.relaxed_alone(scene, bounded=True) for b in scalars])
         body = joined_clusters(batches, alone, scene, slots.answers)
         free = (slot >= 0) & ~(alone | implied)[owner]
         found = plan(len(alone), owner[free], couples(body, item[free]), self.width)
@@ -104,6 +104,7 @@ class Direct(Solver):
         parts = f"{system.solved} constraints by elimination (systems: {system.parts}, width: {max(system.plan.widths)})"
         implied = system.rows - system.solved
         implied = f"; {implied} that these imply" if implied else ""
+        implied += f"; {system.bodies} clusters as bodies" if system.bodies else ""
         alone = f"; {alone} relaxed as by Jacobi (wider than {self.width}, or not one number)" if alone else ""
         return f"{self!r}: {parts}{implied}{alone}"
 
@@ -114,10 +115,11 @@ class Direct(Solver):
 class Elimination(System):
     """The systems of one world on the device. Rows are constraints in the order of elimination.
 
-    solved: the number of rows that are solved. Behind them come those of links that others imply: they take no step.
+    solved: the number of rows that are solved. Behind them come those of links that others imply: they take no step. bodies: the
+    number of clusters that take part.
     """
 
-    host_only = ("plan", "late", "has_implied")
+    host_only = ("plan", "late", "has_implied", "bodies")
     late = (SOFTENED,)
     parts: Any = OnDevice()  # number of systems
     entries: Any = OnDevice()  # number of couplings of two rows
@@ -130,6 +132,7 @@ class Elimination(System):
         rows, self._part = _with_implied(found, scalars, scene, implied)
         bodies = row_of_clusters(batches, body, _row_of_particles(rows, scalars, scene.inv_mass))
         super().__init__(scene, batches, slots, scalars, rows, bodies)
+        self.bodies = sum(int((own >= 0).sum()) for own in bodies.values())
         row, corner, particle = self.corners(scalars, slots)
         self.plan, self.parts, self.entries = found, self.memory.number(found.parts), self.memory.number(len(found.column))
         self.solved, self.has_implied = self.memory.number(len(found.rows)), len(rows) > len(found.rows)
@@ -141,7 +144,9 @@ class Elimination(System):
         product = found.product.copy()
         product[:, 1:] = slot[product[:, 1:]]
         side = np.repeat([b.side for b in scalars], [b.count for b in scalars])[rows]
-        self.one_sided = bool(side.any())
+        limited = (side != 0) | np.concatenate([b.driven & np.isfinite(b.course()[2]) if b.driven else np.zeros(b.count, bool)
+                                                for b in scalars])[rows]  # fmt: skip
+        self.bounds = bool(limited.any())
         ints, reals = self.ints, self.reals
         self.part_begin, self.column, self.update = (ints(k, getattr(found, k)) for k in ("part_begin", "column", "update"))
         self.entry_begin, self.product_begin = ints("entry_begin", found.entry_begin), ints("product_begin", found.product_begin)
@@ -186,8 +191,12 @@ class Elimination(System):
             batch = np.repeat(np.arange(len(scalars)), [b.count for b in scalars])[rows]
             number = np.concatenate([np.arange(b.count) for b in scalars])[rows]
             self.batch, self.number = ints("batch", batch), ints("number", number)
-        if self.one_sided:
-            self.side, self.active, self.remaining = ints("side", side), ints("active", 0 * side), reals("left")
+        if self.bounds:  # of multipliers; bound: that of a row which is at one
+            self.limited, self.active, self.remaining = ints("limited", limited), ints("active", 0 * side), reals("left")
+            low, high = np.where(side < 0, 0.0, -np.inf), np.where(side > 0, 0.0, np.inf)
+            self.low, self.high = (self.memory.field(f"system.{k}", self.rows, kind=ti.f64, values=v) for k, v in
+                                   (("low", low), ("high", high)))  # fmt: skip
+            self.bound = reals("bound")
 
     def keep_softness(self, ratio: float) -> None:
         """Keep parts that give way as soft as they are, where the next substep is `ratio` times as long as the last one."""
@@ -238,9 +247,31 @@ class Elimination(System):
         System.set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness)
         if W > 0:
             self.inverse_size[r] = geometric_stiffness / (2 * W)
-        if ti.static(self.one_sided):
-            acts = self.side[r] == 0 or self.side[r] * violation > 0 or lam != 0
-            self.active[r] = ti.cast(acts and W > 0, ti.i32)
+        if ti.static(self.bounds):
+            self.bound[r] = ti.select(W > 0, ti.max(self.low[r], ti.min(self.high[r], self.lam[r])), 0 * self.lam[r])
+            acts = self.is_inside(r, self.lam[r]) or self.leaves_bound(r, self.lam[r], self.violation[r])
+            self.active[r] = ti.cast(W > 0 and acts, ti.i32)
+
+    @ti.func
+    def bound_row(self, r, low, high):
+        """Set the bounds of the multiplier of row r, see System.bound_row()."""
+        if ti.static(self.bounds):
+            self.low[r], self.high[r] = low, high
+
+    @ti.func
+    def is_inside(self, r, lam):
+        """Whether a multiplier of row r is within its bounds."""
+        return self.low[r] < lam and lam < self.high[r]
+
+    @ti.func
+    def leaves_bound(self, r, lam, violation):
+        """Whether row r, whose multiplier is at a bound, needs another one for such a violation."""
+        return self.low[r] < self.high[r] and ((lam >= self.high[r] and violation > 0) or (lam <= self.low[r] and violation < 0))
+
+    @ti.func
+    def nearest_bound(self, r, lam):
+        """Return the bound of row r that a multiplier is beyond."""
+        return ti.select(lam >= self.high[r], self.high[r], self.low[r])
 
     @ti.func
     def set_gradient(self, place, i, gradient):
@@ -254,7 +285,7 @@ class Elimination(System):
     def is_active(self, r):
         """Whether row r takes part in the system."""
         out = self.scale[r] != 0
-        if ti.static(self.one_sided):
+        if ti.static(self.bounds):
             out = self.active[r] != 0
         return out
 
@@ -283,6 +314,8 @@ class Elimination(System):
             else:
                 self.value[r] = 1
                 self.step[r] = -self.lam[r]
+                if ti.static(self.bounds):
+                    self.step[r] = self.bound[r] - self.lam[r]
             self.diagonal[r] = self.value[r]
 
     @called
@@ -384,8 +417,8 @@ class Elimination(System):
         self.turned_to[b] = 0
         for r in range(self.part_begin[b], self.part_begin[b + 1]):
             self.answer[r], self.solution[r], self.gap[r] = 0, self.lam[r] + self.step[r], 0
-            if ti.static(self.one_sided):
-                if self.side[r] != 0:
+            if ti.static(self.bounds):
+                if self.limited[r] != 0:
                     self.gap[r] = self.violation[r] + self.remaining[r] + self.alpha[r] * self.step[r]
         if self.added[b] > 0:
             self.assemble(self.part_begin[b], self.part_begin[b + 1], self.added[b], 0)
@@ -420,16 +453,16 @@ class Elimination(System):
             self.joined.begin_answer(b, self, moved, d)
         for r in range(begin, end):
             change = -self.scale[r] * self.moved_along(r, moved, d, True)
-            if ti.static(self.one_sided):
-                if self.side[r] != 0 and self.scale[r] != 0:
+            if ti.static(self.bounds):
+                if self.limited[r] != 0 and self.scale[r] != 0:
                     change -= self.gap[r]
-                    acts = ti.select(
-                        self.active[r] != 0, self.side[r] * (self.solution[r] + self.answer[r]) < 0, self.side[r] * change < 0
-                    )
+                    lam = self.solution[r] + self.answer[r]
+                    acts = ti.select(self.active[r] != 0, self.is_inside(r, lam), self.leaves_bound(r, lam, -change))
                     if acts != (self.active[r] != 0):
                         self.active[r], switched = 1 - self.active[r], True
                         if not acts:
-                            self.answer[r] = -self.solution[r]
+                            self.bound[r] = self.nearest_bound(r, lam)
+                            self.answer[r] = self.bound[r] - self.solution[r]
             if self.is_active(r):
                 change -= (self.alpha[r] + self.added[b]) * self.answer[r]
             else:
@@ -461,8 +494,8 @@ class Elimination(System):
     def end_answer(self, b, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]
         """End the answers of part b to moves of its particles, `moved` - d: further moves are answered from here on."""
         for r in range(self.part_begin[b], self.part_begin[b + 1]):
-            if ti.static(self.one_sided):
-                if self.side[r] != 0:
+            if ti.static(self.bounds):
+                if self.limited[r] != 0:
                     self.gap[r] = ti.select(
                         self.active[r] != 0, 0 * self.gap[r], self.gap[r] + self.scale[r] * self.moved_along(r, moved, d, False)
                     )
@@ -487,7 +520,7 @@ class Elimination(System):
 
     @ti.func
     def update_active_set(self, begin, end, at_end):
-        """Switch off one-sided rows with the wrong sign, and switch on violated ones. Returns whether any changed."""
+        """Hold rows at bounds that they passed, and let go those that need other multipliers. Returns whether any changed."""
         for r in range(begin, end):
             self.remaining[r] = 0
         changed = 0
@@ -495,20 +528,21 @@ class Elimination(System):
             for q in range(self.product_begin[r], self.product_begin[r + 1]):
                 at = self.product[q]
                 self.remaining[r] = self.remaining[r] + self.scale[r] * self.coupling(at, at_end) * self.step[self.row_of[at[2]]]
-            if self.side[r] != 0 and self.scale[r] != 0:
+            if self.limited[r] != 0 and self.scale[r] != 0:
                 new = self.lam[r] + self.step[r]
                 left = self.violation[r] + self.remaining[r] + self.alpha[r] * self.step[r]
-                acts = ti.select(self.active[r] != 0, self.side[r] * new < 0, self.side[r] * left > 0)
+                acts = ti.select(self.active[r] != 0, self.is_inside(r, new), self.leaves_bound(r, self.bound[r], left))
                 if acts != (self.active[r] != 0):
-                    self.active[r] = 1 - self.active[r]
-                    changed = 1
+                    self.active[r], changed = 1 - self.active[r], 1
+                    if not acts:
+                        self.bound[r] = self.nearest_bound(r, new)
         return changed
 
     @ti.func
     def solve_active_set(self, begin, end, softness, at_end):
         """Find the steps of all rows that act, by an active set. Returns the result of eliminate()."""
         hard = 0
-        if ti.static(self.one_sided):
+        if ti.static(self.bounds):
             k = 0
             while k < ROUNDS:
                 self.assemble(begin, end, softness, at_end)
@@ -516,8 +550,8 @@ class Elimination(System):
                 hard = ti.max(found, ti.select(hard == 2, 2, 0))  # a contradiction is kept: its row may be switched off next
                 k = ti.select(self.update_active_set(begin, end, at_end) != 0, k + 1, ROUNDS)
             for r in range(begin, end):
-                if self.side[r] * (self.lam[r] + self.step[r]) > 0:
-                    self.step[r] = -self.lam[r]
+                if self.limited[r] != 0 and self.scale[r] != 0:
+                    self.step[r] = ti.max(self.low[r], ti.min(self.high[r], self.lam[r] + self.step[r])) - self.lam[r]
         else:
             self.assemble(begin, end, softness, at_end)
             hard = self.eliminate(begin, end)
@@ -539,8 +573,8 @@ class Elimination(System):
             for r in range(begin, end):
                 if self.trusted_step[r] < ti.math.inf and self.scale[r] != 0:
                     self.scale[r], self.lam[r], self.geometric_stiffness[r], found = 0, self.own_step[r], 0, 1
-                    if ti.static(self.one_sided):
-                        self.active[r] = 0
+                    if ti.static(self.bounds):
+                        self.active[r], self.bound[r] = 0, 0
         return found
 
     @ti.func

@@ -47,7 +47,7 @@ def joined_clusters(batches: "list[Batch]", alone: np.ndarray, scene: "Scene", a
         linked[b.indices.ravel()[~shares]] = True
     some = body >= 0
     refused = np.bincount(body[some & linked], minlength=first) == 0
-    refused[body[some & ((held != 1) | (scene.inv_mass == 0))]] = True
+    refused[body[some & (held != 1)]] = True
     body[some] = np.where(refused[body[some]], -1, body[some])
     return body
 
@@ -76,11 +76,11 @@ def row_of_clusters(batches: "list[Batch]", body: np.ndarray, row: np.ndarray) -
 class Joined:
     """The bodies of an elimination, part by part.
 
-    part_begin, corner_begin: the first body of each part, the first corner of each body. particle, place: of each corner, and the
-    slot of its cluster's move. batch, number: the batch of clusters that each corner is in, and as which corner. corner_of: the
-    corner on which the row with a slot acts, -1 where that is on no body. arm: of corners from the center, at the start of the
-    substep [m]. S: sum m r r^T. push, spin: of each slot, how the body moves for a multiplier of 1 of its row. u: moves of
-    corners [m]. moved, turned: of each body, what fit() found.
+    part_begin, corner_begin: the first body of each part, the first corner of each body. particle, m: of each corner, its mass
+    [kg]. place: the slot of its cluster's move, -1 for a pinned one. batch, number: the batch of clusters that it is in, and as
+    which corner. corner_of: the corner on which the row with a slot acts, -1 where that is on no body. arm: of corners from the
+    center, at the start of the substep [m]. S: sum m r r^T. push, spin: of each slot, how the body moves for a multiplier of 1 of
+    its row. u: moves of corners [m]. moved, turned: of each body, what fit() found.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class Joined:
     ):  # fmt: skip
         """rows: see row_of_clusters(). part: of each row. slot, who: of each corner of a row, its slot and particle."""
         memory, dim, n = scene.memory, scene.state.dim, len(scene.inv_mass)
-        self.state, self.real, self.dim, self.slots, self.w = scene.state, scene.real, dim, slots, scene.state.w
+        self.state, self.real, self.dim, self.slots = scene.state, scene.real, dim, slots
         self.clusters = [b for b in batches if id(b) in rows]
         found = []  # part, particle, slot, batch, corner
         for k, b in enumerate(self.clusters):
@@ -104,7 +104,10 @@ class Joined:
         at[table[:, 1]] = np.arange(len(table))
         corner_of[slot] = at[who]
         owner = np.searchsorted(begins, np.arange(len(table)), side="right") - 1
-        self._body, self._particles = owner, table[:, 1]
+        w = scene.inv_mass[table[:, 1]]
+        mass = np.divide(1, w, out=np.zeros(len(w)), where=w > 0)
+        mass[w == 0] = rotation.HEAVY * np.bincount(owner, weights=mass)[owner[w == 0]]
+        self._least, self._particles = 1 / np.bincount(owner, weights=mass)[owner], table[:, 1]
 
         def ints(name: str, values: np.ndarray):
             """Declare a field of integers."""
@@ -123,13 +126,13 @@ class Joined:
 
         self.arm, self.u, self.moved = reals("arm", len(table)), reals("u", len(table)), reals("moved", len(begins))
         self.S, self.turned = reals("S", len(begins), dim * dim), reals("turned", len(begins), dim * dim)
-        self.mass = reals("mass", len(begins), 0)
+        self.mass, self.m = reals("mass", len(begins), 0), memory.field("system.body_m", len(table), kind=ti.f64, values=mass)
         self.push, self.spin = reals("push", slots.total), reals("spin", slots.total, dim * dim)
 
     def lightest(self, inv_mass: np.ndarray) -> np.ndarray:
         """Return inverse masses, (n,), with that of the whole body for its particles."""
         out = inv_mass.copy()
-        out[self._particles] = 1 / np.bincount(self._body, weights=1 / inv_mass[self._particles])[self._body]
+        out[self._particles] = self._least
         return out
 
     @ti.func
@@ -146,8 +149,7 @@ class Joined:
             i0, M, middle = self.particle[begin], ti.cast(0, ti.f64), self.zero()
             S = middle.outer_product(middle)
             for e in range(begin, end):
-                i = self.particle[e]
-                m = 1 / ti.cast(self.w[i], ti.f64)
+                i, m = self.particle[e], self.m[e]
                 moved = ti.cast(self.state.d[i], ti.f64) - ti.cast(self.state.d[i0], ti.f64)
                 r = self.state.between(i, i0) - back * moved
                 self.arm[e] = r
@@ -173,7 +175,7 @@ class Joined:
         e = self.corner_of[s]
         if e >= 0:
             k = self.owner[e]
-            p = ti.cast(move, ti.f64) / ti.cast(self.w[self.particle[e]], ti.f64)
+            p = self.m[e] * ti.cast(move, ti.f64)
             self.push[s] = p / self.mass[k]
             self.write(self.spin, s, rotation.rigid_rotation(rotation.from_rows(self.S[k]), self.arm[e].outer_product(p)))
 
@@ -197,9 +199,8 @@ class Joined:
         push = self.zero()
         X = push.outer_product(push)
         for e in range(self.corner_begin[k], self.corner_begin[k + 1]):
-            m = 1 / ti.cast(self.w[self.particle[e]], ti.f64)
-            push += m * self.u[e]
-            X += m * self.arm[e].outer_product(self.u[e])
+            push += self.m[e] * self.u[e]
+            X += self.m[e] * self.arm[e].outer_product(self.u[e])
         self.moved[k] = push / self.mass[k]
         self.write(self.turned, k, rotation.rigid_rotation(rotation.from_rows(self.S[k]), X))
 
@@ -224,10 +225,11 @@ class Joined:
             self.fit(k)
             for e in range(begin, end):
                 more, place = ti.cast(self.fitted(e) - self.u[e], self.real), self.place[e]
-                self.slots.move[place] = self.slots.move[place] + more
-                for n, f in ti.static(enumerate(self.clusters)):
-                    if self.batch[e] == n:
-                        f.dev.pull[self.number[e]] = f.dev.pull[self.number[e]] + more
+                if place >= 0:
+                    self.slots.move[place] = self.slots.move[place] + more
+                    for n, f in ti.static(enumerate(self.clusters)):
+                        if self.batch[e] == n:
+                            f.dev.pull[self.number[e]] = f.dev.pull[self.number[e]] + more
 
     @ti.func
     def begin_answer(self, b, system: ti.template(), moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]
@@ -250,7 +252,8 @@ class Joined:
             self.fit(k)
             for e in range(begin, end):
                 more, place = ti.cast(self.fitted(e) - self.u[e], self.real), self.place[e]
-                self.slots.answer[place] = self.slots.answer[place] + more
+                if place >= 0:
+                    self.slots.answer[place] = self.slots.answer[place] + more
 
     @ti.func
     def answered(self, e, system: ti.template()):  # type: ignore[valid-type]

@@ -138,6 +138,10 @@ class System:
         """Let parts that are softened for a longer substep bear tensions that are `factor` times as large."""
 
     @ti.func
+    def bound_row(self, r, low, high):
+        """Set the bounds of the multiplier of row r for this pass, before set_row(). Called where a drive has a largest load."""
+
+    @ti.func
     def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):
         """Set the data of row r for this pass, except gradients.
 

@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-HEAVY = 1024  # masses of the cluster: the mass of a particle that cannot move
+from ..geometry import rotation
+
 SEEN, BORNE = 1e-3, 4.0  # of the radius: out of shape by more, and by so many times what loads do to a cluster
 
 
@@ -27,7 +28,7 @@ class Solids:
         self.who, q, pull = (np.concatenate([part[k] for part in parts]) for k in (0, 2, 3))
         self.free = w[self.who] > 0
         m = np.divide(1, w[self.who], out=np.zeros(len(self.who)), where=self.free)
-        self.m = np.where(self.free, m, HEAVY * np.bincount(self.owner, m)[self.owner])
+        self.m = np.where(self.free, m, rotation.HEAVY * np.bincount(self.owner, m)[self.owner])
         self.total = np.bincount(self.owner, self.m)
         self.shape = q - self._means(q)
         self.radius = np.sqrt(np.bincount(self.owner, self.m * (self.shape**2).sum(axis=1)) / self.total)[self.owner]

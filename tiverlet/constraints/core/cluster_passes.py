@@ -14,7 +14,6 @@ from .strength import Strength
 if TYPE_CHECKING:
     from ...features.feature import Scene
 
-HEAVY = 1024  # mass of a particle that cannot move, in masses of its cluster
 LEAST = 2.0**-46  # smaller relative changes of a rotation are rounding
 
 
@@ -114,13 +113,13 @@ class ClusterPasses(Passes):
     def mass_in_pass(self, e, A, alpha_prime):
         """Return mu of corner e in a pass: its mass, times its move for a violation of 1."""
         i = self.corners.members[e]
-        w, mu = self.w[i], ti.cast(HEAVY * self.mass[self.corners.owner[e]], ti.f64)
+        w, mu = self.w[i], ti.cast(rotation.HEAVY * self.mass[self.corners.owner[e]], ti.f64)
         if w > 0:
             mu = 1 / ti.cast(A * self.slots.split[i] + alpha_prime * w, ti.f64)
         return mu
 
     @ti.func
-    def mass_of(self, e, c, heavy=HEAVY):
+    def mass_of(self, e, c, heavy=rotation.HEAVY):
         """Return the mass of corner e, `heavy` times that of its cluster c for a particle that cannot move."""
         w, mu = self.w[self.corners.members[e]], ti.cast(heavy * self.mass[c], ti.f64)
         if w > 0:

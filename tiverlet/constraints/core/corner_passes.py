@@ -199,6 +199,10 @@ class CornerPasses(Passes):
                 new, far = self.limit_step(c, lam, new, n, share, 1)
                 if far:  # its step is fixed, and the others follow: a row without a weight has the step -start
                     start, weight = lam - new, 0 * W
+        if ti.static(self.equation.driven):
+            if ti.static(self.drive.capped):
+                low, high = self.drive.bounds(c, self.side)
+                self.slots.system.bound_row(row, low, high)
         self.slots.system.set_row(row, violation, A, alpha, start, weight, self.geometric_stiffness(c, weight))
         if ti.static(self.slots.system.limits_steps):
             u, split, longest, _ = self.motion(c, n, 0)

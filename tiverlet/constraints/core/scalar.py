@@ -242,13 +242,14 @@ class Scalar(Batch):
         """Return which constraints act as forces, (m,): soft ones in substeps of an order above 2. See high_order.py."""
         return (self.compliance > 0) & (scene.order > 2)
 
-    def relaxed_alone(self, scene: Scene) -> np.ndarray:
-        """Return which constraints are never part of a system, (m,).
+    def relaxed_alone(self, scene: Scene, bounded: bool = False) -> np.ndarray:
+        """Return which constraints are never part of a system, (m,). bounded: of one whose multipliers may have bounds.
 
-        These are constraints that act as forces, rigid ones at a cusp, and drives with a limited load.
+        These are constraints that act as forces, rigid ones at a cusp, and motors with a limited load; winches, too, where
+        multipliers have no bounds.
         """
         if self.driven:
-            return self.acts_as_force(scene) | np.isfinite(self.course()[2])
+            return self.acts_as_force(scene) | (np.isfinite(self.course()[2]) & (not bounded or self.arity > 2))
         return self.acts_as_force(scene) | (self.cusp & (self.goal == 0) & (self.compliance == 0))
 
     @property
