@@ -252,7 +252,8 @@ class Joined:
             self.fit(k)
             for e in range(begin, end):
                 more, place = ti.cast(self.fitted(e) - self.u[e], self.real), self.place[e]
-                if place >= 0 and (more != 0).any():  # a 0 keeps its sign, as without a pass
+                some = (more != 0).any()  # type: ignore[reportOptionalCall]
+                if place >= 0 and some:  # else a 0 keeps its sign, as without a pass
                     self.slots.answer[place] = self.slots.answer[place] + more
 
     @ti.func
