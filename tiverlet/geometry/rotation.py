@@ -138,6 +138,14 @@ def from_rows(v):
 
 
 @ti.func
+def write_rows(field: ti.template(), i, B):  # type: ignore[valid-type]
+    """Write a square matrix to element i of a field, as from_rows() reads it."""
+    for j in ti.static(range(B.n)):
+        for k in ti.static(range(B.n)):
+            field[i][ti.static(B.n * j + k)] = B[j, k]
+
+
+@ti.func
 def bend(turn, r, n):
     """Return n.(T x (T x r)) / 2: how far the path of a point at r of a body that turns by T bends along n."""
     B = skew(turn, n.outer_product(n))

@@ -136,6 +136,11 @@ class State:
             r += ti.cast(self.low[i], ti.f64) - ti.cast(self.low[j], ti.f64)
         return self.nearest(r)
 
+    @ti.func
+    def between_before(self, i, j, back):
+        """Return x_i - x_j at x - back d in f64, so that positions at the start and predicted ones differ by exactly d."""
+        return self.between(i, j) - back * (ti.cast(self.d[i], ti.f64) - ti.cast(self.d[j], ti.f64))
+
     @inline
     def nearest(self, r):
         """Map a difference of positions to that of the nearest images, in a periodic box."""

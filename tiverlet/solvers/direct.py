@@ -153,13 +153,15 @@ class Elimination(System):
         self.update_begin, self.product = ints("update_begin", found.update_begin), ints("product", product, 3)
         self.gradient = scene.memory.field("system.gradient", slots.total, width=self.dim)
         self.value, self.diagonal = reals("value", self.solved + 2 * self.entries), reals("weight")
-        self.corner_begin = ints("corner_begin", np.searchsorted(row, np.arange(len(rows) + 1)))
-        self.corner = ints("corner", corner)
         self.joined: Any = Joined(scene, batches, slots, bodies, self._part, corner, particle, found.parts) if bodies else None
+        self.answers = slots.answers
+        if self.joined or self.answers:
+            self.corner_begin = ints("corner_begin", np.searchsorted(row, np.arange(len(rows) + 1)))
+            self.corner = ints("corner", corner)
         if self.joined:
             self.shift = reals("shift")
-        self.slots, self.answers = slots, slots.answers
         if self.answers:
+            self.slots = slots
             self.answer, self.change, self.solution, self.gap = (reals(k) for k in ("answer", "change", "solution", "gap"))
             self.added, self.turned_to = (
                 scene.memory.field(f"system.{k}", found.parts, kind=ti.f64) for k in ("added", "turned_to")

@@ -149,9 +149,7 @@ class Joined:
             i0, M, middle = self.particle[begin], ti.cast(0, ti.f64), self.zero()
             S = middle.outer_product(middle)
             for e in range(begin, end):
-                i, m = self.particle[e], self.m[e]
-                moved = ti.cast(self.state.d[i], ti.f64) - ti.cast(self.state.d[i0], ti.f64)
-                r = self.state.between(i, i0) - back * moved
+                m, r = self.m[e], self.state.between_before(self.particle[e], i0, back)
                 self.arm[e] = r
                 M += m
                 middle += m * r
@@ -160,14 +158,7 @@ class Joined:
             for e in range(begin, end):
                 self.arm[e] = self.arm[e] - middle
             self.mass[k] = M
-            self.write(self.S, k, S - M * middle.outer_product(middle))
-
-    @ti.func
-    def write(self, field: ti.template(), k, B):  # type: ignore[valid-type]
-        """Write a matrix."""
-        for i in ti.static(range(self.dim)):
-            for j in ti.static(range(self.dim)):
-                field[k][self.dim * i + j] = B[i, j]
+            rotation.write_rows(self.S, k, S - M * middle.outer_product(middle))
 
     @ti.func
     def note_push(self, s, move):
@@ -177,7 +168,9 @@ class Joined:
             k = self.owner[e]
             p = self.m[e] * ti.cast(move, ti.f64)
             self.push[s] = p / self.mass[k]
-            self.write(self.spin, s, rotation.rigid_rotation(rotation.from_rows(self.S[k]), self.arm[e].outer_product(p)))
+            rotation.write_rows(
+                self.spin, s, rotation.rigid_rotation(rotation.from_rows(self.S[k]), self.arm[e].outer_product(p))
+            )
 
     @ti.func
     def move_for(self, s, by):
@@ -202,7 +195,7 @@ class Joined:
             push += self.m[e] * self.u[e]
             X += self.m[e] * self.arm[e].outer_product(self.u[e])
         self.moved[k] = push / self.mass[k]
-        self.write(self.turned, k, rotation.rigid_rotation(rotation.from_rows(self.S[k]), X))
+        rotation.write_rows(self.turned, k, rotation.rigid_rotation(rotation.from_rows(self.S[k]), X))
 
     @ti.func
     def fitted(self, e):

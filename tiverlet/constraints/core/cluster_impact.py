@@ -88,7 +88,7 @@ class ClusterImpact:
                 self.impacts.bend[i] = ti.cast(rotation.bend(turn + W, s, self.wide(self.impacts.normal[i])), self.real)
             self.impacts.mark_struck_in_cluster(i)
             self.corners.write_move(e, move)
-        self.cluster.write_matrix(self.cluster.pose, c, T @ rotation.from_rows(self.cluster.pose[c]))
+        rotation.write_rows(self.cluster.pose, c, T @ rotation.from_rows(self.cluster.pose[c]))
 
     @ti.func
     def turn_so_far(self, c, begin, end, i0, start, S):

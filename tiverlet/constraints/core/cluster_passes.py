@@ -85,13 +85,8 @@ class ClusterPasses(Passes):
 
     @ti.func
     def relative_position(self, e, i0, back):
-        """Return corner e relative to particle i0, at x - back d.
-
-        It is in f64, so that positions at the start and predicted positions differ by exactly d.
-        """
-        i = self.corners.members[e]
-        move = ti.cast(self.state.d[i], ti.f64) - ti.cast(self.state.d[i0], ti.f64)
-        return self.state.between(i, i0) - back * move
+        """Return corner e relative to particle i0, at x - back d, in f64."""
+        return self.state.between_before(self.corners.members[e], i0, back)
 
     @ti.func
     def law(self, c, h, h2_effective, fresh):
@@ -161,11 +156,11 @@ class ClusterPasses(Passes):
                 v1 += v
                 U += v.outer_product(s)
         self.total[b], self.p[b], self.q[b], self.s[b] = total, p1, q1, s1
-        self.write_matrix(self.K, b, K)
-        self.write_matrix(self.X, b, X)
+        rotation.write_rows(self.K, b, K)
+        rotation.write_rows(self.X, b, X)
         if ti.static(self.spring.soft):
             self.v[b] = v1
-            self.write_matrix(self.U, b, U)
+            rotation.write_rows(self.U, b, U)
 
     @ti.func
     def moments(self, c):
@@ -182,13 +177,6 @@ class ClusterPasses(Passes):
             X += rotation.from_rows(self.X[b])
         p, q, s = p / total, q / total, s / total
         return total, p, q, s, K - total * q.outer_product(s), X - total * p.outer_product(s)
-
-    @ti.func
-    def write_matrix(self, field: ti.template(), c, R):
-        """Write a matrix."""
-        for j in ti.static(range(self.state.dim)):
-            for k in ti.static(range(self.state.dim)):
-                field[c][self.state.dim * j + k] = R[j, k]
 
     @ti.func
     def is_firm(self, c, h):
@@ -232,14 +220,14 @@ class ClusterPasses(Passes):
             if not ti.math.isnan(end.sum()):  # type: ignore[reportOptionalCall]
                 # A NaN is not stored: the cluster keeps its last rotation.
                 self.turn[c] = end
-            self.write_matrix(self.pose, c, pose)
+            rotation.write_rows(self.pose, c, pose)
             self.slots.record_turn(self.slots.classify_turn(cosine, 1.0))
             if ti.static(self.spring.soft):
                 R = rotation.matrix(start)
                 if first > 0:  # in the body frame
                     mean = R @ mean
                 self.middle[c], self.mean[c] = s - R @ q, mean
-                self.write_matrix(self.fit, c, R)
+                rotation.write_rows(self.fit, c, R)
 
     @ti.func
     def begin_answer(self, c, h, h2_effective, fresh, bodies: ti.template()):  # type: ignore[valid-type]
@@ -279,7 +267,7 @@ class ClusterPasses(Passes):
         S -= total * middle.outer_product(middle)
         for e in range(begin, end):
             self.arm[e] = self.arm[e] - middle
-        self.write_matrix(self.inertia, c, S)
+        rotation.write_rows(self.inertia, c, S)
         self.answering[c][2] = total
         if own and self.mass[c] > 0:
             give, rows, arm, turns, free = alpha / (A + alpha), 0 * total, self.zero_vector(), 0 * total, 0 * A
@@ -364,7 +352,7 @@ class ClusterPasses(Passes):
             total, p, q, s, K, X = self.moments(c)
             R = rotation.matrix(rotation.fit(K, self.turn[c], LEAST))
             self.place[c] = s - R @ q
-            self.write_matrix(self.pose, c, R)
+            rotation.write_rows(self.pose, c, R)
 
     @ti.func
     def push_reaction(self, c, h, firm, soft):
