@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+import tiverlet as tv
+
 from .laboratory import grains, granular, rolling
 from .laboratory.grains import SIZE, Silo
+from .launches import launches
 
 
 def test_a_super_ball_under_gravity_obeys_its_law():
@@ -57,3 +60,18 @@ def test_a_gas_of_discs_has_its_pressure_and_speeds():
 def test_discs_jam_where_they_should():
     # R22: frictionless discs, half of them 1.4 times as large, jam at 0.842; the target is 0.835 to 0.850.
     assert 0.835 <= granular.packing(250, 2, 0.1)["fraction"] <= 0.850
+
+
+@pytest.mark.slow
+def test_a_heap_bears_in_few_passes_what_bounces_on_it(world):
+    # Bricks of grains fall by their gaps, land for a second, and one grain lands on them later. A blow is solved until its energy
+    # is right, in 200 passes at most, and so are the grains that it reaches. What others bear takes 20 passes at most.
+    rng, k = np.random.default_rng(0), np.arange(600)
+    x = np.stack([k % 12, k // 12], axis=1) * 0.1 + rng.uniform(-0.002, 0.002, (600, 2)) + 0.05
+    start = tv.Particles(np.vstack([x, [0.6, 5.8]]), radius=np.append(rng.uniform(0.03, 0.048, 600), 0.04))
+    walls = tv.Box((0, 0), (1.2, 9), friction=0.3, restitution=0.3)
+    w = world(start, [tv.Gravity(), walls, tv.Contact(friction=0.3, restitution=0.3)], substeps=4, path="launched")
+    w.run(1.0)
+    with launches() as count:
+        w.run(0.5)
+    assert tv.measure.kinetic_energy(w) > 0 and 3 <= count["relax_impulses"] / (30 * 4) <= 100

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 import tiverlet as tv
-from tiverlet.contact.limits import SLOP
+from tiverlet.contact.limits import BEYOND, SLOP
 from tiverlet.recording.scene import knobs, set_knobs
 from tiverlet.step import checkpoint
 
@@ -260,8 +260,10 @@ class Judge:
                 worst = max(worst, oracles.in_walls(t.features, p, t.free, x) if not t.structure.periodic else report.overlap)
                 some = p.radius[p.radius > 0].min()
                 blur = 64 * t.eps * reach / some
-                # What lies in a wall by less than twice the slop presses with no row, and is not told.
-                slack = 2 * SLOP if any(type(f).__name__ in oracles.WALLS for f in t.features) else 0.0
+                # What lies in a wall by less than twice the slop presses with no row, and is not told. What rests on a one-way
+                # wall is told, as deep as places leave it, and is not found by brute force.
+                walls = [f for f in t.features if type(f).__name__ in oracles.WALLS]
+                slack = 0.0 if not walls else 2 * SLOP if all(f.one_way is None for f in walls) else BEYOND * SLOP
                 if blur < 1e-2 and abs(report.overlap - worst) > max(1e-4 * worst, 1e-4 + blur, slack):
                     self.find(
                         "overlap",

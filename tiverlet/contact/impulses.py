@@ -56,6 +56,7 @@ from .limits import (
     SCALE,
     SHARE,
     SLOW,
+    STEADY,
     STRUCK,
     SUMS,
     THETA,
@@ -149,7 +150,7 @@ class Impulses:
     def prepare(self, i, part):
         """Compute the effective masses of a part of the rows of particle i, and give particles what these rows bore."""
         p_own, m_own = 0 * self.state.d[i], self.no_moment()
-        share, kept, pressed = self.rows.share[i], self.rows.kept[i], self.rows.pressed[i]
+        share, kept, pressed, struck = self.rows.share[i], self.rows.kept[i], self.rows.pressed[i], self.flags[None][STRUCK]
         if ti.static(not self.has_friction):
             share = self.rows.eigenvalue[i]
         w_own, across_own = self.bodies.split(i), self.bodies.split_tangential(i)
@@ -177,10 +178,10 @@ class Impulses:
                 p = ti.max(p, 0)
             self.rows.p.field[row] = p
             if ti.static(self.rows.bounces):
-                if (
-                    self.rows.bounce.field[row] == 0
-                ):  # it aims at nothing: its column keeps what it bears at the start, for wrong()
-                    self.rows.target.field[row] = self.rows.along(p, n)
+                if struck != 0:
+                    self.rows.slight.field[row] = ti.static(SLOW) * self.weight_on(i, row)
+                    if self.rows.bounce.field[row] == 0:  # it aims at nothing: the column keeps what it bears at the start
+                        self.rows.target.field[row] = self.rows.along(p, n)
             v = self.rows.vector(p, n)
             p_own += v
             if ti.static(self.bodies.spins):
@@ -277,7 +278,7 @@ class Impulses:
         s_own = self.no_moment()
         if ti.static(self.bodies.spins):
             s_own = self.bodies.s[i]
-        kept, pressed = self.rows.kept[i], self.rows.pressed[i]
+        kept, pressed, struck = self.rows.kept[i], self.rows.pressed[i], self.flags[None][STRUCK]
         lack, uphill, load, wrong = ti.Vector.zero(self.real, 4)
         for row in range(self.rows.first(i, part), self.rows.last(i, part)):
             other, n = self.rows.other.field[row], self.rows.normal.field[row]
@@ -310,14 +311,14 @@ class Impulses:
                 lack += miss * miss
                 uphill += (y - new).dot(new - before)
                 load += ti.abs(normal)
-                wrong += self.wrong(row, normal, gap)
+                wrong += self.wrong(row, normal, gap, struck)
             else:
                 new = ti.max(y - gap * stiff, -self.rows.most_taken(row))
                 miss = (new - y) / stiff
                 lack += miss * miss
                 uphill += (y - new) * (new - before)
                 load += ti.abs(new)
-                wrong += self.wrong(row, new, gap)
+                wrong += self.wrong(row, new, gap, struck)
             self.rows.p.field[row] = new
             self.rows.step.field[row] = new - before
             p = self.rows.vector(new, n)
@@ -337,16 +338,20 @@ class Impulses:
         return ti.Vector([lack, uphill, load, wrong] if ti.static(self.rows.bounces) else [lack, uphill, load])
 
     @ti.func
-    def wrong(self, row, p, gap):
-        """Return the energy that is wrong by what a row lacks, times h^2, if anything bounces [kg m^2].
+    def wrong(self, row, p, gap, struck):
+        """Return the energy of impacts that is wrong by what a row lacks, times h^2 [kg m^2]. struck: whether anything bounces.
 
-        p: what it presses with. Its work would be 0 with a gap of 0. A load does none, as it was there before.
+        p: what it presses with. Its work would be 0 with a gap of 0. A load does none, nor what forces change of it, as in
+        Rows.is_steady(): else a heap would be solved as if all of it were struck, wherever a grain bounces on it.
         """
         out = 0 * p
         if ti.static(self.rows.bounces):
-            if p != 0:
-                before = ti.select(self.rows.bounce.field[row] > 0, 0, self.rows.target.field[row])
-                out = ti.abs((p - before) * gap)
+            if p != 0 and struck != 0:
+                impact = ti.abs(p)
+                if self.rows.bounce.field[row] == 0:
+                    change = ti.abs(p - self.rows.target.field[row])
+                    impact = ti.max(change - self.rows.slight.field[row] - ti.static(STEADY) * impact, 0)
+                out = impact * ti.abs(gap)
         return out
 
     @ti.func
@@ -477,21 +482,27 @@ class Impulses:
         return out
 
     @ti.func
+    def weight_on(self, i, row):
+        """Return the impulse of the forces on particle i and on what its row presses on, as far as the row feels them [kg m]."""
+        out = self.weight(i)
+        if row < self.rows.pressed[i]:
+            for k in ti.static(range(self.rows.ends)):
+                out += self.rows.part(row, k) * self.weight(self.rows.pressed_on(row, k))
+        return out
+
+    @ti.func
     def sum_impacts(self, i, part):
         """Add up the part of the impulses on particle i that is none of a load.
 
         A load is what a row bore before, but for what forces may change in a substep and a small part; an impact passes.
         """
         p_own, m_own = 0 * self.state.d[i], self.no_moment()
-        scale, weight = self.rows.times[None][SCALE], self.weight(i)
+        scale = self.rows.times[None][SCALE]
         for row in range(self.rows.first(i, part), self.rows.last(i, part)):
             n = self.rows.normal.field[row]
             p, before = self.rows.p.field[row], self.rows.memory.field[self.rows.entry.field[row]]
             size, borne = self.rows.along(p, n), ti.max(scale * self.rows.along(before, n), 0)
-            load, slight = size, weight
-            if row < self.rows.pressed[i]:
-                for k in ti.static(range(self.rows.ends)):
-                    slight += self.rows.part(row, k) * self.weight(self.rows.pressed_on(row, k))
+            load, slight = size, self.weight_on(i, row)
             if not self.rows.is_steady(ti.abs(size - borne), size, slight):
                 load = ti.static(SLOW) * slight
             if ti.static(self.rows.bounces):

@@ -113,7 +113,8 @@ class Rows:
             # Whether a pair touched in the last substep: then it goes on together instead of bouncing.
             self.touched = PairData("touches", 0, persistent=True, kind=ti.i32, has_owner=not edges)
             self.bounce, self.time, self.target = Column("row_bounce"), Column("row_time"), Column("row_target")
-            self.columns += [self.bounce, self.time, self.target]
+            self.slight = Column("row_slight")  # by how much forces may change a load in a substep [kg m]
+            self.columns += [self.bounce, self.time, self.target, self.slight]
             self.when = add("Contact.when", n)  # the part of the substep before the impact of the island of a particle
         self.impacts: Any = Impacts(scene, self) if in_turn else None
         self.belts = bool(self.impacts) and self.impacts.belts
