@@ -11,6 +11,7 @@ from .span import LISTS, MOST, Moment, Span
 if TYPE_CHECKING:
     from .runner import Runner
 
+Phase = Callable[[Moment], None]  # one of Step
 FEW = 2  # rounds of impacts, passes of places, and times the fewest passes of impulses, that are launched without being asked for
 MANY = {ROUNDS: BOUNCES, IMPULSES: BOUNCES, PLACES: MOVES}  # most of them in a substep
 
@@ -27,7 +28,8 @@ class Launcher:
     """
 
     def __init__(self, runner: "Runner"):
-        self.runner, step = runner, runner.step
+        self.runner, self.step = runner, runner.step
+        step = runner.step
         self.halves, self.newton_steps, self.finishes = step.halves, step.newton_steps, step.finishes
         self.has_pair_forces, self.lists_pairs = step.has_pair_forces, bool(step.listed_forces)
         self.systems, self.steps = bool(step.constraints.systems), step.constraints.steps
@@ -36,35 +38,35 @@ class Launcher:
         self.few = {ROUNDS: FEW, IMPULSES: FEW * self.rows.impulses.least if self.rows else 0, PLACES: FEW}
         self.taken = dict(MANY)
         self.needs_more = True  # whether extra passes of this substep may be needed, see BodyImpacts
-        self.waiting: list[str] = []
+        self.waiting: list[Phase] = []  # phases of one moment, for the next launch
         self.now: Any = None  # the moment of the waiting phases
         # Phases that are one launch, or part of one, where the scene needs them.
-        self.integrate = self.phase("integrate")
-        self.drive = self.phase("drive", bool(step.drivers))
-        self.solve_constraints = self.phase("solve_constraints", bool(step.batches))
-        self.update_multipliers = self.phase("update_multipliers", self.systems)
-        self.apply_constraints = self.phase("apply_constraints", step.particles.applies_first)
-        self.apply_corrections = self.phase("apply_corrections", step.particles.acts)
+        self.integrate = self.phase(step.integrate)
+        self.drive = self.phase(step.drive, bool(step.drivers))
+        self.solve_constraints = self.phase(step.solve_constraints, bool(step.batches))
+        self.update_multipliers = self.phase(step.update_multipliers, self.systems)
+        self.apply_constraints = self.phase(step.apply_constraints, step.particles.applies_first)
+        self.apply_corrections = self.phase(step.apply_corrections, step.particles.acts)
 
-    def phase(self, name: str, needed: bool = True) -> Callable[[Moment], None]:
+    def phase(self, phase: Phase, needed: bool = True) -> Phase:
         """Return a function that adds a phase to the waiting ones."""
-        return partial(self.put, name=name) if needed else lambda now: None
+        return partial(self.put, phase=phase) if needed else lambda now: None
 
     def flush(self) -> None:
         """Launch the waiting phases."""
         if self.waiting:
-            names, now, span = template(" ".join(self.waiting)), self.now, self.now.span
+            names, now, span = template(" ".join(phase.__name__ for phase in self.waiting)), self.now, self.now.span
             self.waiting = []
             self.runner.step.phases(
                 names, span.h64, span.start, span.tick, span.since, span.fresh, span.owed, now.s, span.substeps,
                 span.iterations, now.half, now.newton,
             )  # fmt: skip
 
-    def put(self, now: Moment, name: str) -> None:
+    def put(self, now: Moment, phase: Phase) -> None:
         """Add a phase to those that wait for the next launch. If these belong to another moment, launch them first."""
         if self.waiting and (self.now.s, self.now.half, self.now.newton) != (now.s, now.half, now.newton):
             self.flush()
-        self.waiting.append(name)
+        self.waiting.append(phase)
         self.now = now
 
     def moment(self, span: Span, s: int) -> Moment:
@@ -99,27 +101,27 @@ class Launcher:
     def evaluate_pair_forces(self, now: Moment) -> None:
         """Add the first phases of a substep. The frame may stop here until lists are rebuilt."""
         if self.lists_pairs:
-            self.put(now, "ask_for_pairs")
-        self.put(now, "sum_pair_forces")
+            self.put(now, self.step.ask_for_pairs)
+        self.put(now, self.step.sum_pair_forces)
 
     def update_neighbours(self, now: Moment, half: int) -> None:
         """Add the check of the neighbour list. The frame may stop here until the list is rebuilt, or islands are woken."""
         if half and not half % self.halves:
             self.runner.raise_signals()
         if self.runner.search:
-            self.put(self.pass_of(now, half), "ask_for_list")
+            self.put(self.pass_of(now, half), self.step.ask_for_list)
         if self.looks and now.s < now.span.substeps:
-            self.put(self.pass_of(now, half), "look_for_sleepers")
-            self.put(self.pass_of(now, half), "ask_to_wake")
+            self.put(self.pass_of(now, half), self.step.look_for_sleepers)
+            self.put(self.pass_of(now, half), self.step.ask_to_wake)
 
     def solve_systems(self, now: Moment) -> None:
         """Add the phases that solve systems. Each iteration of an iterative system is a launch of its own."""
         if not self.systems:
             return
-        self.put(now, "start_systems" if self.steps else "solve_systems")
+        self.put(now, self.step.start_systems if self.steps else self.step.solve_systems)
         for _ in range(self.steps):
             self.flush()
-            self.put(now, "iterate_systems")
+            self.put(now, self.step.iterate_systems)
         if self.steps:
             self.flush()
 
@@ -136,20 +138,20 @@ class Launcher:
             return
         what = now.span.what if now.resumed and now.half == now.span.half else LISTS
         if what == LISTS:
-            self.put(now, "start_events")
-            self.put(now, "find_rows")
+            self.put(now, self.step.start_events)
+            self.put(now, self.step.find_rows)
         if self.rows.in_turn and what <= ROUNDS:
-            self.repeat(now, "strike", ROUNDS)
-            self.put(now, "ask_for_rounds")
-            self.put(now, "begin_impulses")
+            self.repeat(now, self.step.strike, ROUNDS)
+            self.put(now, self.step.ask_for_rounds)
+            self.put(now, self.step.begin_impulses)
         if what <= IMPULSES:
-            self.repeat(now, "relax_impulses", IMPULSES)
-            self.put(now, "ask_for_impulses")
-            self.put(now, "finish_impulses")
-        self.repeat(now, "relax_places", PLACES)
-        self.put(now, "ask_for_places")
+            self.repeat(now, self.step.relax_impulses, IMPULSES)
+            self.put(now, self.step.ask_for_impulses)
+            self.put(now, self.step.finish_impulses)
+        self.repeat(now, self.step.relax_places, PLACES)
+        self.put(now, self.step.ask_for_places)
 
-    def repeat(self, now: Moment, name: str, what: int) -> None:
+    def repeat(self, now: Moment, phase: Phase, what: int) -> None:
         """Launch as many passes as a substep took in the last frame. Where that is many, ask whether they are enough.
 
         Then launch each time as many as there were before: an answer takes the host as long as a few launches, and at most half
@@ -160,7 +162,7 @@ class Launcher:
         while more:
             for _ in range(more):
                 self.flush()
-                self.put(now, name)
+                self.put(now, phase)
             self.flush()
             done += more
             more = min(done, MANY[what] - done) if self.taken[what] > self.few[what] else 0
@@ -188,7 +190,7 @@ class Launcher:
 
     def finish_substep(self, now: Moment) -> None:
         """Add the phase finish_substep, after the last pass."""
-        self.put(self.now if self.waiting else now, "finish_substep")
+        self.put(self.now if self.waiting else now, self.step.finish_substep)
 
     def diagnose(self, now: Moment) -> None:
         """Launch the diagnostics, the last launch of a frame."""
