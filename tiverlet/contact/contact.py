@@ -12,7 +12,7 @@ from ..device.thread_team import Team
 from ..features.feature import Batch, Knob, Scene
 from ..features.material import is_elastic, refuse_turning
 from ..features.regrouping import Regrouping
-from ..geometry.ordered import median
+from ..geometry.ordered import typical
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from .answers import answer_at_once
@@ -79,9 +79,9 @@ class Contact(PairContact):
     def _measure(self, radius: np.ndarray) -> None:
         """Store the skin [m] and the smallest radius [m] of particles with these radii (n,) [m]."""
         some = radius[radius > 0]
-        auto = 0.75 * median(some) if len(some) else 1.0
-        self._present_skin = auto if self.skin == "auto" else float(self.skin)
-        self._ahead = (THROWN if self.in_turn else AHEAD) * median(some) if len(some) else 0.0
+        size = typical(some) if len(some) else 0.0
+        self._present_skin = (0.75 * size or 1.0) if self.skin == "auto" else float(self.skin)
+        self._ahead = (THROWN if self.in_turn else AHEAD) * size
         self._smallest_radius = float(radius.min(initial=np.inf))
 
     def can_regroup(self, change: Regrouping) -> bool:

@@ -11,7 +11,7 @@ from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Feature, Knob, Scene, extended
 from ..features.regrouping import Regrouping
-from ..geometry.ordered import median
+from ..geometry.ordered import typical
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from .edges import Edges, Outline
@@ -67,10 +67,10 @@ class Polygons(PairContact):
         x = particles.position
         self.dev.outline = Outline(*laid(self.loops, x))
         sizes = np.where(self.dev.outline.body >= 0, SKIN * self.dev.outline.length, 0.75 * particles.radius)
-        auto = median(sizes[sizes > 0]) if (sizes > 0).any() else 1.0
+        auto = typical(sizes[sizes > 0]) if (sizes > 0).any() else 1.0
         self._present_skin = auto if self.skin == "auto" else float(self.skin)
         own = self.dev.outline.size(particles.radius)
-        self._ahead = AHEAD * median(own[own > 0]) if (own > 0).any() else 0.0
+        self._ahead = AHEAD * typical(own[own > 0]) if (own > 0).any() else 0.0
         self._smallest_radius = float((particles.radius + self.dev.outline.reach / 2).min(initial=np.inf))
         can_touch = particles.count > 0 and bool(self.loops or (particles.radius > 0).any())
         self._keep(can_touch=can_touch, table=self.wanted)

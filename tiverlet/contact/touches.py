@@ -125,6 +125,8 @@ class ContactEvents:
 
         time: the present one [s].
         """
+        if not len(self):
+            return self, self
         new = self.renumbered(first, second).touches
         gone = ((new.pairs < 0) & (self.touches.pairs >= 0)).any(axis=1)
         lost = new[gone & np.isnan(new.ended)]

@@ -11,9 +11,9 @@ from .language import ti
 SMALL = 300_000  # how many numbers one thread copies in a millisecond
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Entry:
-    """One field: its shape and type, its role in the state, and what explain() reports about it."""
+    """One field: its shape and type, its role in the state, and what explain() reports about it. Its Memory sets the length."""
 
     name: str
     field: Any
@@ -25,13 +25,6 @@ class Entry:
     rows: Any = None  # the Number that its length follows; None where it follows none
     for_reports: bool = False  # state that only reports read, hence not part of hash()
     index_limit: int | None = None  # where kernels use its elements as indices: the size of what they index
-
-    def of_length(self, length: int) -> "Entry":
-        """Return the same entry with another length; dataclasses.replace() takes three times as long."""
-        return Entry(
-            self.name, self.field, self.width, length, self.kind, self.state, self.copies, self.rows, self.for_reports,
-            self.index_limit,
-        )  # fmt: skip
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -273,7 +273,8 @@ class Memory:
         if self.copies or not (self._layout and self._layout.shared and length <= self._layout.room):
             return False  # the offsets of copies would change with the length
         self._views = {}
-        self.entries = [e.of_length(length) for e in self.entries]
+        for e in self.entries:
+            e.length = length
         return True
 
     @property
@@ -312,19 +313,19 @@ class Memory:
 
     def _resized(self, k: int, length: int) -> np.ndarray:
         """Change the length of a field, by its index, and return the field as an array."""
-        old, views, length = self.entries[k], self._host_views(), max(1, length)
-        if old.length == length:
-            return views[id(old)]
+        e, length = self.entries[k], max(1, length)
+        if e.length == length:
+            return self._host_views()[id(e)]
         assert self._layout
-        self.entries[k] = new = old.of_length(length)
-        if k not in self._rooms:
-            shape = (self._layout.room, *old.whole[1:])
-            (self._rooms[k],) = self._layout.views(self._address, [(self._which[k], shape, old.kind)])
-        del views[id(old)]
-        views[id(new)] = view = self._rooms[k][:length]
-        most = max(length, self._most.get(k, old.length))
+        before, e.length = e.length, length
+        room = self._rooms.get(k)
+        if room is None:
+            (room,) = self._layout.views(self._address, [(self._which[k], (self._layout.room, *e.whole[1:]), e.kind)])
+            self._rooms[k] = room
+        self._host_views()[id(e)] = view = room[:length]
+        most = max(length, self._most.get(k, before))
         if most > 2 * length:
-            self._release_pages(self._rooms[k][length:most])
+            self._release_pages(room[length:most])
             most = length
         self._most[k] = most
         return view

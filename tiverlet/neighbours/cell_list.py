@@ -19,7 +19,6 @@ import numpy as np
 from ..device import runtime, ti
 from ..device.number import OnDevice
 from ..device.prefix_sum import Sums
-from ..geometry.ordered import distinct
 from .images import GRADIENT
 
 if TYPE_CHECKING:
@@ -292,7 +291,7 @@ def levels_of(radius: np.ndarray, reach: np.ndarray) -> np.ndarray:
         return np.zeros(len(size), dtype=int)
     with np.errstate(divide="ignore"):
         level = np.minimum(np.floor(np.log2(size.max() / size)), most_levels() - 1).astype(int)
-    return distinct(level)[1]
+    return (np.cumsum(np.bincount(level) > 0) - 1)[level]
 
 
 def most_levels() -> int:

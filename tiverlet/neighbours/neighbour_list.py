@@ -169,13 +169,14 @@ class NeighbourList:
         assert self.store
         return self.store.read(piece.field)[at].astype(np.float64)
 
-    def _entries(self, first, number, with_walls: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Return the particle of every entry and the place of the entry, (m,) each."""
-        first, number = self.memory.read(first)[: self.n], self.memory.read(number)[: self.n]
+    def _entries(self, first, number, with_walls: bool = False, some: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the particle of every entry and the place of the entry, (m,) each. some: particles in order; None for all."""
+        some = np.arange(self.n) if some is None else some
+        count = self.memory.read(number)[some]
         if with_walls:
-            number = number + self.memory.read(self.wall_number)[: self.n]
-        i = np.repeat(np.arange(self.n), number)
-        return i, np.repeat(first, number) + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)
+            count = count + self.memory.read(self.wall_number)[some]
+        i = some.repeat(count)
+        return i, (self.memory.read(first)[some] - count.cumsum() + count).repeat(count) + np.arange(len(i))
 
     def persistent_data(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Return the listed pairs (i, j) with persistent data other than 0, sorted, and their data by name.
@@ -279,21 +280,13 @@ class NeighbourList:
         """
         assert self.store
         near, movable, piece = self.store.view(self.neighbour), self.movable(), self.team.piece
-        if some is None:
-            i, at = self._entries(self.first, self.number)
-            j = near[at]
-            lower = (i < j).nonzero()[0]
-        else:
-            first: Any = self.memory.view(self.first)
-            number: Any = self.memory.view(self.number)
-            around = movable & False
-            around[some] = True
-            for c in some:
-                around[near[first[c] : first[c] + number[c]]] = True
-            i = around.nonzero()[0]
-            at = np.concatenate([first[c] + np.arange(number[c]) for c in i])
-            i, j = i.repeat(number[i]), near[at]
-            lower = (around[j] & (i < j)).nonzero()[0]
+        around = movable | True
+        if some is not None:
+            around[:] = False
+            around[some] = around[near[self._entries(self.first, self.number, some=some)[1]]] = True
+        i, at = self._entries(self.first, self.number, some=around.nonzero()[0])
+        j = near[at]
+        lower = (around[j] & (i < j)).nonzero()[0]
         there = at[(i * WALL + j).searchsorted(j[lower].astype(np.int64) * WALL + i[lower])]
         here, i, j = at[lower], i[lower], j[lower]
         own, other = movable[i], movable[j] & ~(movable[i] & (i // piece == j // piece))

@@ -77,6 +77,7 @@ class NeighbourSearch:
         margins = self._margins(skin, ahead, radius, reach)
         self.skin, self.sure, self.too_far = (number(value, real) for value in margins)
         self._extent: Sequence[float] = [-1.0] * dim
+        self._piece: int = team.piece  # when owners of pair data were last settled
         self.cells = CellList(scene, radius, reach, margins[0], team, scratch)
         self.several_levels = self.cells.levels > 1
         # Whether a particle finds all neighbours in the 3^dim cells around it, even after it has moved far (see Strays).
@@ -147,8 +148,10 @@ class NeighbourSearch:
             room = self.list.room  # the old list uses this memory
             self.list.blocks = self._blocks(n)
             self.list.allocate(room)
+        before, self._piece = self._piece, self.team.piece
         if self.list.movable is not None and self.team.size > 1 and not self.list.saved:
-            self.list.settle_owners()
+            pieces = change.kept_indices // before, np.arange(change.kept) // self._piece
+            self.list.settle_owners((pieces[0] != pieces[1]).nonzero()[0])
         if self.has_excluded:
             begin = self.memory.view(self.excluded_begin)[change.first]
             self.memory.resize(self.excluded_begin, n + 1)
