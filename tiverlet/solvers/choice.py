@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..constraints.core.corner_passes import LOST
 from .conjugate import ConjugateGradient
 from .corners import components, corners_of
 from .direct import Direct
@@ -40,8 +39,7 @@ def choose_solver(batches: "list[Batch]", scene: "Scene", answers: bool) -> Solv
     where they `answer` contacts or join rigid clusters, but not clusters that are no bodies of a system. ConjugateGradient solves
     what is wider or faster by it, such as cloth and nets, where that is more of the stiff constraints, or MANY_STIFF, in pieces
     of LARGE_PIECE or more. Its residual is an eighth of that of Jacobi with as many substeps. Jacobi is left with few or soft
-    links, and with what starts violated or is inside of a cluster: such constraints may contradict others; relaxed, they settle
-    on a compromise.
+    links, and with what is inside of a cluster: such constraints may contradict it; relaxed, they settle on a compromise.
     """
     links = solvable(batches)
     if not links:
@@ -60,7 +58,7 @@ def explain_choice(solver: Solver) -> str:
         return "links hang together like chains, loops, beams or small nets, join bodies, or touch something"
     if isinstance(solver, ConjugateGradient):
         return "links are stiff, many, and hang together more closely than elimination takes"
-    return "links are few, soft or violated at the start, or there are angles that elimination is not for, or none"
+    return "links are few, soft or inside of a cluster, or there are angles that elimination is not for, or none"
 
 
 def _may_eliminate(b: "Scalar", scene: "Scene") -> bool:
@@ -100,12 +98,11 @@ class Pieces:
         held &= body[item[free]] < 0
         twice, inside = self._any(np.bincount(self.owner, held, self.count) > 0), self._inside(held, clusters)
         self.implied, self.shares = implied_links(links, scene) & ~twice, bool(twice.any())
-        off = np.concatenate([_is_violated(b) for b in links])
-        self.may_eliminate, self.is_off = all(_may_eliminate(b, scene) for b in links), bool((off | inside).any())
+        self.may_eliminate, self.is_inside = all(_may_eliminate(b, scene) for b in links), bool(inside.any())
         degree = np.bincount(np.concatenate([b.indices.ravel() for b in links]), minlength=len(w))
         self.solved = self.acts & ~alone
-        stiff = np.concatenate([_stiff(b, degree * w) for b in links]) & self.solved
-        self.stiff, self.rigid = stiff & ~self._any(off), np.concatenate([b.compliance == 0 for b in links]) & self.solved
+        self.stiff = np.concatenate([_stiff(b, degree * w) for b in links]) & self.solved
+        self.rigid = np.concatenate([b.compliance == 0 for b in links]) & self.solved
 
     def _any(self, some: np.ndarray) -> np.ndarray:
         """Return for each constraint, (m,), whether its piece has any constraint in the mask `some`, (m,)."""
@@ -130,7 +127,7 @@ class Pieces:
         crowd = np.bincount(self.item[self.solved[self.owner]], minlength=1)
         if crowd.max() <= 1 and not self.joins:  # which cannot contradict each other
             return Direct(CHAIN) if answers and self.may_eliminate and not self.shares else None, self.solved
-        if self.is_off or not self.may_eliminate:
+        if self.is_inside or not self.may_eliminate:
             return None, taken
         longest, needed = np.bincount(self.piece[self.acts], minlength=1).max(), ~self.implied[self.owner]
         for width in (CHAIN,) if longest > MOST_TRIED else (WIDTH, CHAIN):
@@ -160,9 +157,3 @@ def _stiff(b: "Scalar", split: np.ndarray) -> np.ndarray:
     if b.side or b.arity != 2:
         return (b.compliance == 0) & (not b.side)
     return b.compliance < split[b.indices].sum(axis=1) * USUAL_SUBSTEP**2
-
-
-def _is_violated(b: "Scalar") -> np.ndarray:
-    """Return which constraints are violated at the start by more than LOST of their size, (m,)."""
-    C = b.violation(b.start.position)
-    return np.where(b.side, np.maximum(b.side * C, 0), np.abs(C)) * b.inverse_size(b.start.position) > LOST
