@@ -64,12 +64,14 @@ def explain_choice(solver: Solver) -> str:
 def _may_eliminate(b: "Scalar", scene: "Scene") -> bool:
     """Whether the default may use elimination in scenes with these constraints.
 
-    It may for links, and for angles in 2D that are springs or are relaxed alone, such as motors of limited torque. Elimination
-    pumps energy in with limits of angles; with angles in 3D, where a straight path has no plane in which to turn; and with rigid
-    angles, for which it takes one Newton step: a chain of 20 links that whips gains 0.2 of m g times its length in a minute.
+    It may for links, for limits of angles, and for angles in 2D that are springs or are relaxed alone, such as motors of limited
+    torque. Elimination pumps energy in with springs of angles in 3D, where a straight path has no plane in which to turn, and
+    with rigid angles, for which it takes one Newton step: a chain of 20 links that whips gains 0.2 of m g times its length in a
+    minute.
     """
     soft = b.relaxed_alone(scene) if b.driven else b.compliance > 0
-    return b.arity <= 2 or bool(b.quantity.curved and b.arity == 3 and scene.particles.dim == 2 and not b.side and soft.all())
+    bends = b.quantity.curved and b.arity == 3
+    return b.arity <= 2 or bool(bends and (b.side or (scene.particles.dim == 2 and soft.all())))
 
 
 def _may_iterate(b: "Scalar", scene: "Scene") -> bool:
