@@ -78,8 +78,7 @@ class Contact(PairContact):
 
     def _measure(self, radius: np.ndarray) -> None:
         """Store the skin [m] and the smallest radius [m] of particles with these radii (n,) [m]."""
-        some = radius[radius > 0]
-        size = typical(some) if len(some) else 0.0
+        size = typical(radius)
         self._present_skin = (0.75 * size or 1.0) if self.skin == "auto" else float(self.skin)
         self._ahead = (THROWN if self.in_turn else AHEAD) * size
         self._smallest_radius = float(radius.min(initial=np.inf))

@@ -56,7 +56,6 @@ from .limits import (
     SCALE,
     SHARE,
     SLOW,
-    STEADY,
     STRUCK,
     SUMS,
     THETA,
@@ -107,6 +106,11 @@ class Impulses:
         """Return 1 while passes go on, else 0."""
         return at(at(self.flags, None), GOING)
 
+    @inline
+    def struck(self):
+        """Return 1 if anything bounces in the substep, else 0."""
+        return at(at(self.flags, None), STRUCK) if self.rows.bounces else 0
+
     @ti.func
     def note_turn(self, k: ti.template(), turn):  # type: ignore[valid-type]
         """On the launched path: note how many passes of a kind this substep took so far."""
@@ -150,10 +154,14 @@ class Impulses:
     def prepare(self, i, part):
         """Compute the effective masses of a part of the rows of particle i, and give particles what these rows bore."""
         p_own, m_own = 0 * self.state.d[i], self.no_moment()
-        share, kept, pressed, struck = self.rows.share[i], self.rows.kept[i], self.rows.pressed[i], self.flags[None][STRUCK]
+        share, kept, pressed, struck = self.rows.share[i], self.rows.kept[i], self.rows.pressed[i], self.struck()
         if ti.static(not self.has_friction):
             share = self.rows.eigenvalue[i]
         w_own, across_own = self.bodies.split(i), self.bodies.split_tangential(i)
+        weight = ti.cast(0, self.real)
+        if ti.static(self.rows.bounces):
+            if struck != 0:
+                weight = self.weight(i)
         for row in range(self.rows.first(i, part), self.rows.last(i, part)):
             other, n = self.rows.other.field[row], self.rows.normal.field[row]
             w, across, most, e = w_own, across_own, share, self.bodies.split_place(i)
@@ -178,10 +186,9 @@ class Impulses:
                 p = ti.max(p, 0)
             self.rows.p.field[row] = p
             if ti.static(self.rows.bounces):
-                if struck != 0:
-                    self.rows.slight.field[row] = ti.static(SLOW) * self.weight_on(i, row)
-                    if self.rows.bounce.field[row] == 0:  # it aims at nothing: the column keeps what it bears at the start
-                        self.rows.target.field[row] = self.rows.along(p, n)
+                if struck != 0 and self.rows.bounce.field[row] == 0:  # it aims at nothing: here stands what it bears at first
+                    self.rows.target.field[row] = self.rows.along(p, n)
+                    self.rows.slight.field[row] = self.weight_on(row, weight, pressed)
             v = self.rows.vector(p, n)
             p_own += v
             if ti.static(self.bodies.spins):
@@ -278,7 +285,7 @@ class Impulses:
         s_own = self.no_moment()
         if ti.static(self.bodies.spins):
             s_own = self.bodies.s[i]
-        kept, pressed, struck = self.rows.kept[i], self.rows.pressed[i], self.flags[None][STRUCK]
+        kept, pressed, struck = self.rows.kept[i], self.rows.pressed[i], self.struck()
         lack, uphill, load, wrong = ti.Vector.zero(self.real, 4)
         for row in range(self.rows.first(i, part), self.rows.last(i, part)):
             other, n = self.rows.other.field[row], self.rows.normal.field[row]
@@ -342,7 +349,7 @@ class Impulses:
         """Return the energy of impacts that is wrong by what a row lacks, times h^2 [kg m^2]. struck: whether anything bounces.
 
         p: what it presses with. Its work would be 0 with a gap of 0. A load does none, nor what forces change of it, as in
-        Rows.is_steady(): else a heap would be solved as if all of it were struck, wherever a grain bounces on it.
+        Rows.steady_change(): else a heap would be solved as if all of it were struck, wherever a grain bounces on it.
         """
         out = 0 * p
         if ti.static(self.rows.bounces):
@@ -350,7 +357,7 @@ class Impulses:
                 impact = ti.abs(p)
                 if self.rows.bounce.field[row] == 0:
                     change = ti.abs(p - self.rows.target.field[row])
-                    impact = ti.max(change - self.rows.slight.field[row] - ti.static(STEADY) * impact, 0)
+                    impact = ti.max(change - self.rows.steady_change(impact, self.rows.slight.field[row]), 0)
                 out = impact * ti.abs(gap)
         return out
 
@@ -482,13 +489,12 @@ class Impulses:
         return out
 
     @ti.func
-    def weight_on(self, i, row):
-        """Return the impulse of the forces on particle i and on what its row presses on, as far as the row feels them [kg m]."""
-        out = self.weight(i)
-        if row < self.rows.pressed[i]:
+    def weight_on(self, row, weight, pressed):
+        """Return the impulse of forces that a row feels: of a particle, its `weight`, and of what its row presses on [kg m]."""
+        if row < pressed:
             for k in ti.static(range(self.rows.ends)):
-                out += self.rows.part(row, k) * self.weight(self.rows.pressed_on(row, k))
-        return out
+                weight += self.rows.part(row, k) * self.weight(self.rows.pressed_on(row, k))
+        return weight
 
     @ti.func
     def sum_impacts(self, i, part):
@@ -497,12 +503,12 @@ class Impulses:
         A load is what a row bore before, but for what forces may change in a substep and a small part; an impact passes.
         """
         p_own, m_own = 0 * self.state.d[i], self.no_moment()
-        scale = self.rows.times[None][SCALE]
+        scale, weight, pressed = self.rows.times[None][SCALE], self.weight(i), self.rows.pressed[i]
         for row in range(self.rows.first(i, part), self.rows.last(i, part)):
             n = self.rows.normal.field[row]
             p, before = self.rows.p.field[row], self.rows.memory.field[self.rows.entry.field[row]]
             size, borne = self.rows.along(p, n), ti.max(scale * self.rows.along(before, n), 0)
-            load, slight = size, self.weight_on(i, row)
+            load, slight = size, self.weight_on(row, weight, pressed)
             if not self.rows.is_steady(ti.abs(size - borne), size, slight):
                 load = ti.static(SLOW) * slight
             if ti.static(self.rows.bounces):

@@ -67,10 +67,8 @@ class Polygons(PairContact):
         x = particles.position
         self.dev.outline = Outline(*laid(self.loops, x))
         sizes = np.where(self.dev.outline.body >= 0, SKIN * self.dev.outline.length, 0.75 * particles.radius)
-        auto = typical(sizes[sizes > 0]) if (sizes > 0).any() else 1.0
-        self._present_skin = auto if self.skin == "auto" else float(self.skin)
-        own = self.dev.outline.size(particles.radius)
-        self._ahead = AHEAD * typical(own[own > 0]) if (own > 0).any() else 0.0
+        self._present_skin = (typical(sizes) or 1.0) if self.skin == "auto" else float(self.skin)
+        self._ahead = AHEAD * typical(self.dev.outline.size(particles.radius))
         self._smallest_radius = float((particles.radius + self.dev.outline.reach / 2).min(initial=np.inf))
         can_touch = particles.count > 0 and bool(self.loops or (particles.radius > 0).any())
         self._keep(can_touch=can_touch, table=self.wanted)

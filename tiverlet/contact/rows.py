@@ -113,7 +113,7 @@ class Rows:
             # Whether a pair touched in the last substep: then it goes on together instead of bouncing.
             self.touched = PairData("touches", 0, persistent=True, kind=ti.i32, has_owner=not edges)
             self.bounce, self.time, self.target = Column("row_bounce"), Column("row_time"), Column("row_target")
-            self.slight = Column("row_slight")  # by how much forces may change a load in a substep [kg m]
+            self.slight = Column("row_slight")  # what forces can change of a load in a substep [kg m]
             self.columns += [self.bounce, self.time, self.target, self.slight]
             self.when = add("Contact.when", n)  # the part of the substep before the impact of the island of a particle
         self.impacts: Any = Impacts(scene, self) if in_turn else None
@@ -279,11 +279,13 @@ class Rows:
 
     @ti.func
     def is_steady(self, change, size, slight):
-        """Whether an impulse of this size, which has changed by `change`, is a load. slight: what forces can change.
+        """Whether an impulse of this size, which has changed by `change`, is a load. An impact passes."""
+        return change <= self.steady_change(size, slight)
 
-        An impact passes. All three are in one unit.
-        """
-        return change <= ti.static(SLOW) * slight + ti.static(STEADY) * size
+    @ti.func
+    def steady_change(self, size, slight):
+        """Return by how much a load of this size may change in a substep. slight: what forces can change. All are in one unit."""
+        return ti.static(SLOW) * slight + ti.static(STEADY) * size
 
     @ti.func
     def relative_kick(self, i, row):

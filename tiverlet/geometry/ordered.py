@@ -17,7 +17,12 @@ def distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def typical(sizes: np.ndarray) -> float:
-    """Return the median of positive numbers, rounded up to a power of 2^(1/8), so that it stays where a few come and go."""
-    ordered = np.sort(sizes, axis=None)
+    """Return the median of the numbers above 0, rounded up to a power of 2^(1/8), so that it stays where a few come and go.
+
+    It is 0 without any.
+    """
+    ordered = np.sort(sizes[sizes > 0])
+    if not len(ordered):
+        return 0.0
     median = float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2
     return 2.0 ** (math.ceil(8 * math.log2(median)) / 8)

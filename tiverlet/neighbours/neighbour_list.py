@@ -171,12 +171,12 @@ class NeighbourList:
 
     def _entries(self, first, number, with_walls: bool = False, some: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the particle of every entry and the place of the entry, (m,) each. some: particles in order; None for all."""
-        some = np.arange(self.n) if some is None else some
-        count = self.memory.read(number)[some]
+        seen, some = self.memory.view if self.memory.elastic else self.memory.read, np.arange(self.n) if some is None else some
+        count = seen(number)[some]
         if with_walls:
-            count = count + self.memory.read(self.wall_number)[some]
+            count = count + seen(self.wall_number)[some]
         i = some.repeat(count)
-        return i, (self.memory.read(first)[some] - count.cumsum() + count).repeat(count) + np.arange(len(i))
+        return i, (seen(first)[some] - count.cumsum() + count).repeat(count) + np.arange(len(i))
 
     def persistent_data(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Return the listed pairs (i, j) with persistent data other than 0, sorted, and their data by name.
@@ -280,9 +280,8 @@ class NeighbourList:
         """
         assert self.store
         near, movable, piece = self.store.view(self.neighbour), self.movable(), self.team.piece
-        around = movable | True
+        around = np.full(self.n, some is None)
         if some is not None:
-            around[:] = False
             around[some] = around[near[self._entries(self.first, self.number, some=some)[1]]] = True
         i, at = self._entries(self.first, self.number, some=around.nonzero()[0])
         j = near[at]

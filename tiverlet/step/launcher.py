@@ -28,8 +28,7 @@ class Launcher:
     """
 
     def __init__(self, runner: "Runner"):
-        self.runner, self.step = runner, runner.step
-        step = runner.step
+        self.runner, step = runner, runner.step
         self.halves, self.newton_steps, self.finishes = step.halves, step.newton_steps, step.finishes
         self.has_pair_forces, self.lists_pairs = step.has_pair_forces, bool(step.listed_forces)
         self.systems, self.steps = bool(step.constraints.systems), step.constraints.steps
@@ -48,6 +47,11 @@ class Launcher:
         self.apply_constraints = self.phase(step.apply_constraints, step.particles.applies_first)
         self.apply_corrections = self.phase(step.apply_corrections, step.particles.acts)
 
+    @property
+    def step(self) -> Any:
+        """The phases, in the kernels of the present lists."""
+        return self.runner.step
+
     def phase(self, phase: Phase, needed: bool = True) -> Phase:
         """Return a function that adds a phase to the waiting ones."""
         return partial(self.put, phase=phase) if needed else lambda now: None
@@ -57,7 +61,7 @@ class Launcher:
         if self.waiting:
             names, now, span = template(" ".join(phase.__name__ for phase in self.waiting)), self.now, self.now.span
             self.waiting = []
-            self.runner.step.phases(
+            self.step.phases(
                 names, span.h64, span.start, span.tick, span.since, span.fresh, span.owed, now.s, span.substeps,
                 span.iterations, now.half, now.newton,
             )  # fmt: skip
