@@ -23,7 +23,7 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.device import thread_team, ti
-from tiverlet.device.patches import patched
+from tiverlet.device.patches import enabled
 from tiverlet.device.patches.compiler import BRIEF
 from tiverlet.recording import reader, rrd, scene
 from tiverlet.report.accuracy.cases import entries, known
@@ -38,7 +38,8 @@ os.environ.setdefault("TI_OFFLINE_CACHE_MAX_SIZE_OF_FILES", str(512 << 20))
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # ignored in background jobs of a shell; tests send it
     signal.signal(signal.SIGINT, signal.default_int_handler)
-collect_ignore = [] if patched else ["test_compiling.py", "test_sharing.py"]  # these files test the patches
+PATCHED = "sharing" in enabled
+collect_ignore = [] if PATCHED else ["test_compiling.py", "test_sharing.py"]  # these files test the patches
 # Files that take longest run first: otherwise one worker would still run one of them when the others are done.
 LONG = (
     "touching_scenes", "scenes", "cases", "walls", "knobs", "edits", "worlds", "properties", "pictures", "answers", "statics",
@@ -133,7 +134,7 @@ def process():
     gc.collect()
     gc.freeze()
     gc.enable()
-    with checked_assignments() if patched else contextlib.nullcontext():
+    with checked_assignments() if PATCHED else contextlib.nullcontext():
         yield
     build.CROSSOVER = CROSSOVER
     if server.cache_info().currsize:

@@ -9,11 +9,11 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.device import ti
-from tiverlet.device.patches import patched, timing
+from tiverlet.device.patches import chosen, timing
 from tiverlet.device.patches.compiler import BRIEF, LEAN, UNSEARCHED, Compiler
 from tiverlet.step import build
 
-from .conftest import ARCH, compiled, python
+from .conftest import ARCH, PATCHED, compiled, python
 
 ROOT = str(pathlib.Path(__file__).parents[1])
 
@@ -30,7 +30,7 @@ def made():
 """
 
 
-@pytest.mark.skipif(not patched, reason="how Taichi names its files")
+@pytest.mark.skipif(not PATCHED, reason="how Taichi names its files")
 def test_what_a_plain_script_compiles_is_kept_for_its_next_start(tmp_path):
     # Taichi writes its cache when its program ends, which what lives on at the end of the process must not prevent.
     script = "import tiverlet as tv\nworld = tv.World(tv.Particles([(0.0, 1.0)]), [tv.HalfSpace((0, 1))])\nworld.step(1 / 60)\n"
@@ -38,15 +38,23 @@ def test_what_a_plain_script_compiles_is_kept_for_its_next_start(tmp_path):
     assert any(tmp_path.glob("*.tic"))
 
 
+def test_a_patch_that_needs_another_one_is_off_without_it():
+    assert chosen("") == chosen("1") == chosen("-sources") | {"sources", "calls"} == chosen("-sharing") | {"sharing", "loops"}
+    assert chosen("0") == set() and chosen("-calls,-launches") == chosen("") - {"calls", "launches"}
+    with pytest.raises(ImportError, match="'-call', but .* like \"-calls,-launches\"; their names are passes, sources"):
+        chosen("-call")
+
+
 @pytest.mark.slow
-def test_the_bits_do_not_depend_on_the_patches():
-    # Taichi without patches, in another process (as for versions other than 1.7.4): the same hash and the same reports, also of
-    # comparisons and choices of all kinds, of which ours make one statement each. Contacts would compile for half a minute.
+@pytest.mark.parametrize("off", ["0", "-sources,-launches", "-sharing,-statements"])
+def test_the_bits_do_not_depend_on_the_patches(off):
+    # In another process without all or some patches (as for versions other than 1.7.4): the same hash and the same reports, also
+    # of comparisons and choices of all kinds, of which ours make one statement each. Contacts would compile for half a minute.
     space: dict = {}
     exec(ROPES, space)
     here = space["made"]()
-    code = ROPES + "from tiverlet.device.patches import compiler\nassert not compiler.patched\nprint(made())\n"
-    plain = python(code, TIVERLET_PATCHES="0", PYTHONPATH=ROOT).stdout
+    code = ROPES + "from tiverlet.device.patches import PATCHES, enabled\nassert enabled < {*PATCHES}\nprint(made())\n"
+    plain = python(code, TIVERLET_PATCHES=off, PYTHONPATH=ROOT).stdout
     assert repr(here) == plain.strip() and len({energy for energy, *_ in here[0]}) > 20
 
 
@@ -107,7 +115,7 @@ assert own() == -200.0
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(ARCH != "cpu" or not patched, reason="of the patches of Taichi on a CPU")
+@pytest.mark.skipif(ARCH != "cpu" or not PATCHED, reason="of the patches of Taichi on a CPU")
 def test_how_kernels_are_compiled_changes_no_bit(world, monkeypatch):
     # Kernels of large worlds, of small ones, which call long functions, and those into which these are copied: of walls with
     # events, which have code of their own, and of a chain with limited angles.

@@ -7,16 +7,15 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.device import ti
-from tiverlet.device.patches import patched
 from tiverlet.features.arguments import knobs_of
 from tiverlet.features.feature import Batch
 from tiverlet.step import edit_in_place
 from tiverlet.step.runner import Runner
 
-from .conftest import ARCH, compiled
+from .conftest import ARCH, PATCHED, compiled
 
 pytestmark = pytest.mark.usefixtures("read_here")
-in_place = pytest.mark.skipif(not patched or ARCH != "cpu", reason="every edit builds the world anew there")
+in_place = pytest.mark.skipif(not PATCHED or ARCH != "cpu", reason="every edit builds the world anew there")
 RADIUS = 0.1
 
 
@@ -265,7 +264,7 @@ def test_a_world_that_was_extended_is_the_one_that_has_all(kind, tmp_path):
         extended(w, 3)
         w.run(3 / 60, recorder=recorder)
     assert tv.replay(tmp_path / "more.rrd").verify()
-    assert not patched or ARCH != "cpu" or set(names) <= {"velocities", "to_velocity"}  # not requested before
+    assert not PATCHED or ARCH != "cpu" or set(names) <= {"velocities", "to_velocity"}  # not requested before
     if kind is solid:
         for extend, text in (
             ({w.features[0]: tv.Motor([[0, 1, 2]], 1.0, angle=1.0)}, "one Motor turns to an angle"),

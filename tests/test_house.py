@@ -12,11 +12,10 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.constraints.core.corner_passes import CornerPasses
-from tiverlet.device.patches import patched
 from tiverlet.features.feature import Batch
 from tiverlet.neighbours.neighbour_list import NeighbourList
 
-from .conftest import ARCH, parsed
+from .conftest import ARCH, PATCHED, parsed
 
 ROOT = Path(__file__).parents[1] / "tiverlet"
 DEPTH = 16  # modules in a chain of imports
@@ -144,7 +143,7 @@ def test_the_root_of_the_package_can_be_taken_in_at_a_glance():
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(ARCH != "cpu" or not patched, reason="launches go through other files there")
+@pytest.mark.skipif(ARCH != "cpu" or not PATCHED, reason="launches go through other files there")
 def test_a_frame_goes_through_few_files(world):
     # Host files only, with links and discs. These and the kernel's are the files to read for what a frame does.
     rope = tv.shapes.rope((0, 2), (1, 2), points=8)

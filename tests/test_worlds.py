@@ -8,9 +8,8 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.device.language import COMPILER
-from tiverlet.device.patches import patched
 
-from .conftest import compiled
+from .conftest import PATCHED, compiled
 from .rows import OTHERS, ROWS
 
 pytestmark = pytest.mark.usefixtures("taichi")
@@ -251,7 +250,7 @@ def test_a_reset_starts_from_places_that_are_given():
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not patched, reason="every world has a tree and kernels of its own")
+@pytest.mark.skipif(not PATCHED, reason="every world has a tree and kernels of its own")
 def test_worlds_of_the_same_structure_compile_nothing_and_take_no_more_memory():
     with tv.Worlds([pendulum() for _ in range(80)]) as many:
         many.run(0.1)

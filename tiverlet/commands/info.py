@@ -1,8 +1,8 @@
-"""Print versions, architectures and cores, for bug reports."""
+"""Print versions, architectures, cores and patches, for bug reports."""
 
 import argparse
 
-ABOUT = "versions, architectures and cores"
+ABOUT = "versions, architectures, cores and patches"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -16,6 +16,7 @@ def main(args: argparse.Namespace) -> int:
 
     from ..device import runtime
     from ..device.language import NAME
+    from ..device.patches import PATCHES, enabled
     from ..report.output import machine
 
     print(f"machine        {machine()}")
@@ -28,4 +29,6 @@ def main(args: argparse.Namespace) -> int:
     print(f"architectures  {', '.join(runtime.available())}")
     runtime.ensure_started()
     print(f"{NAME} runs on {runtime.architecture()}, {runtime.threads()} threads")
+    for name, (what, _) in PATCHES.items():
+        print(f"patch          {name:10} {'on ' if name in enabled else 'off'}  {what}  (TIVERLET_PATCHES=-{name})")
     return 0

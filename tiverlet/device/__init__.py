@@ -3,23 +3,33 @@
 from typing import Any
 
 from .language import at, copied, copied_with, inline, record, ti
-from .patches import assignments, lean, patched
+from .patches import enabled
 
-if lean:
+called: Any = copied
+called_with: Any = copied_with
+if "passes" in enabled:
+    from .patches import assignments
+
     assignments.apply()
-if patched:
-    from .patches import calls, sharing, source_cache, statements, syntax_cache, timing
+if "sources" in enabled:
+    from .patches import source_cache, syntax_cache
 
     source_cache.apply()  # first: the modules imported after it then import in half the time
     syntax_cache.apply()
+if "statements" in enabled:
+    from .patches import statements
+
     statements.apply()
+if "sharing" in enabled:
+    from .patches import sharing, timing
+
     sharing.apply(timing.compiled)
     timing.apply()
-    called: Any = calls.called
-    called_with: Any = calls.called_with
-else:
-    called, called_with = copied, copied_with
-from . import copies
+if "calls" in enabled:
+    from .patches import calls
+
+    called, called_with = calls.called, calls.called_with
+from . import copies  # noqa: E402
 
 copies.apply()  # last, with and without patches: it wraps the final subscript function
 

@@ -2,7 +2,7 @@
 
 A Taichi kernel has compiled into it the tree of each field and the offset within the tree. It looks up the tree's address at each
 launch. So worlds whose fields are of the same kinds share one tree. Before a launch, the address of the world's own bytes is
-written to the place where kernels look it up, see patches/roots.py.
+written to the place where kernels look it up, see patches/sharing.py.
 
 Every field of a shared tree reserves room; the system gives memory page by page, as it is used. So fields grow in place, and no
 kernel changes. A shared tree exists as long as Taichi runs, and takes no memory itself. Once there are MANY trees, the next one
@@ -25,7 +25,10 @@ import numpy as np
 from . import language, runtime
 from .host_copy import AddressFinder, offsets_in_tree
 from .language import ti
-from .patches import patched, roots
+from .patches import enabled
+
+if "sharing" in enabled:
+    from .patches import sharing
 
 MAX_TREES = 400  # Taichi holds at most 511 trees, without a check; the rest is left to the user's own fields
 NODES = 900  # nodes of a tree from which it has no spare fields
@@ -81,16 +84,16 @@ class Layout:
             builders[apart] = ti.FieldsBuilder()
         for d, field in zip(declared, self.fields, strict=True):
             (builders[d.apart].dense(ti.i, d.length) if d.length else builders[d.apart]).place(field)
-        self.trees = [roots.finalize_without_memory(builder) if shared else builder.finalize() for builder in builders.values()]
+        self.trees = [sharing.finalize_without_memory(builder) if shared else builder.finalize() for builder in builders.values()]
         runtime.trees += len(self.trees)
         self.numbers: dict[Kind, list[int]] = {}  # if shared: the indices of its fields, by kind
         self.room = 0  # if shared: the most elements of a field
         self._now = 0  # the address of the bytes that kernels use
         self._places: list[tuple[int, tuple[int, ...]]] = []  # offset and strides of each field; empty without host access
         self.size = 0  # [bytes] of the tree; 0 without host access
-        if shared or patched:
+        if shared or "sharing" in enabled:
             self.find_addresses()
-        if not shared and patched and _table[0] is not self.runtime:
+        if not shared and "sharing" in enabled and _table[0] is not self.runtime:
             _keep_table(self.runtime, None)
 
     def find_addresses(self) -> None:
@@ -101,8 +104,8 @@ class Layout:
         if not self.shared:
             addresses = np.zeros(1, dtype=np.uint64)
             finder = AddressFinder(self.fields[0])
-            if patched and _table[0] is not self.runtime:
-                _keep_table(self.runtime, roots.table_of(finder, "find", addresses, self.trees[0].id, first))
+            if "sharing" in enabled and _table[0] is not self.runtime:
+                _keep_table(self.runtime, sharing.table_of(finder, "find", addresses, self.trees[0].id, first))
             else:
                 finder.find(addresses)
             self._now = int(addresses[0]) - first
@@ -188,7 +191,7 @@ def make_field(kind: Any, width: int) -> Any:
 
 def field(kind: Any, width: int) -> Any:
     """Make a field that get_layout() will place."""
-    return language.unplaced_field(width) if patched else make_field(kind, width)
+    return language.unplaced_field(width) if "sharing" in enabled else make_field(kind, width)
 
 
 def _keep_table(of: Any, table: Any) -> None:
@@ -197,9 +200,9 @@ def _keep_table(of: Any, table: Any) -> None:
     _table = of, table
 
 
-def sharing() -> bool:
+def can_share() -> bool:
     """Whether worlds can share trees."""
-    if patched and _table[0] is not language.current():
+    if "sharing" in enabled and _table[0] is not language.current():
         Layout((Declared(ti.i32, 0, 1, False),)).destroy()  # its find_addresses() searches for the table
     return bool(LAZY) and _table[1] is not None and not _unshared
 
@@ -208,16 +211,16 @@ def get_layout(declared: list[Declared], fields: list[Any], held: list[Layout], 
     """Return a layout with the declared fields, and the index of each of them in it.
 
     fields: from field(); this function places them. held: the layouts that the world has already; they are not returned again,
-    since each memory of a world needs a tree of its own. shared: see sharing().
+    since each memory of a world needs a tree of its own. shared: see can_share().
     """
     if not shared:
-        layout, which = Layout(tuple(declared), None if patched else fields), list(range(len(declared)))
+        layout, which = Layout(tuple(declared), None if "sharing" in enabled else fields), list(range(len(declared)))
     else:
         kinds = [d.sort for d in declared]
         layout = _shared(Counter(kinds), max(d.length for d in declared), held)
         numbers = {kind: iter(some) for kind, some in layout.numbers.items()}
         which = [next(numbers[kind]) for kind in kinds]
-    if patched:
+    if "sharing" in enabled:
         for k, unplaced in zip(which, fields, strict=True):
             language.place_field(unplaced, layout.fields[k], (layout.serial, k))
     return layout, which

@@ -22,7 +22,7 @@ from .language import ti
 from .layout import WIDE, Declared, Layout
 from .members import Members
 from .number import Number
-from .patches import patched
+from .patches import enabled
 from .patches.compiler import LEAN, Compiler
 from .redeclaration import Redeclaration
 
@@ -58,7 +58,7 @@ class Memory:
         self, real, few: bool = False, passes: Mapping[str, Any] = LEAN, compiler: Compiler | None = None,
         copies: Copies | None = None,
     ):  # fmt: skip
-        if not patched:  # fields are then made at once, and need a place
+        if "sharing" not in enabled:  # fields are then made at once, and need a place
             layout.check_trees()
         self.real, self.copies = real, copies
         self.compiler = compiler or Compiler(real, few, passes, copies is not None)
@@ -249,7 +249,7 @@ class Memory:
         """Allocate the declared fields and write their first values (all others are zero)."""
         self._declare_numbers()
         with self.compiler():
-            shared = layout.sharing()
+            shared = layout.can_share()
             held = [one for one, _ in self.compiler.places]
             self._layout, self._which = layout.get_layout(self._declared, [e.field for e in self.entries], held, shared)
         for e in self.entries:
@@ -379,7 +379,7 @@ class Memory:
         """Free the fields. Calling it twice, or after another ti.init, does nothing."""
         if self._ends:
             self._ends()
-        elif self.entries and not patched:  # fields without a place would break everything that Taichi does later
+        elif self.entries and "sharing" not in enabled:  # fields without a place would break everything that Taichi does later
             self._declare_numbers()
             Layout(tuple(self._declared), [e.field for e in self.entries]).destroy()
         self._layout, self._views, self._rooms, self._most, self._room = None, {}, {}, {}, None

@@ -9,7 +9,7 @@ from ..colliders.box import Box
 from ..colliders.collider import Collider
 from ..colliders.half_space import HalfSpace
 from ..device import runtime
-from ..device.patches import patched
+from ..device.patches import enabled
 from ..features.feature import Acceleration, Batch
 from ..forces import Gravity
 from ..neighbours.neighbour_search import NeighbourSearch
@@ -65,7 +65,7 @@ def compiling(world: "World") -> list[str]:
     """Return lines with the compile times; none where Taichi is not the version that device/patches supports."""
     times = world._runner.memory.compiler.times
     if not times.kernels:
-        return ["Nothing was compiled for it, or not yet."] if patched else []
+        return ["Nothing was compiled for it, or not yet."] if "sharing" in enabled else []
     total = sum(times.kernels.values())
     rest = {"motion and the rest": total - sum(times.features.values())}
     lines = [f"Compiled in {total:.2f} s: {', '.join(f'{name} {t:.2f}' for name, t in times.kernels.items())}"]

@@ -22,7 +22,7 @@ import numpy as np
 
 from ..language import active, impl, sources
 from ..user_errors import shortened
-from . import lean, patched
+from . import enabled
 from .llvm_switches import restore_switches, set_switches
 
 HOSTS = ("Arch.x64", "Arch.arm64")  # where LLVM makes kernels as fast without Taichi's passes; measured on x64
@@ -71,7 +71,7 @@ class Compiler:
     def __init__(self, real, few: bool = False, passes: Mapping[str, Any] = LEAN, many: bool = False):
         self.real, self.few, self.passes, self.many = real, few, passes, many
         self.launches = False  # whether Taichi spreads top-level loops over the threads of a CPU or GPU
-        self.thorough = not lean  # never reset: Taichi may retry a kernel that failed to compile
+        self.thorough = "passes" not in enabled  # never reset: Taichi may retry a kernel that failed to compile
         self.config: Any = None  # Taichi's settings, while kernels compile
         self._host: bool | None = None  # whether kernels run on the host; cached, since asking Taichi takes 6 us
         self._settings: dict[str, Any] = {}  # the settings that Taichi was started with
@@ -140,7 +140,7 @@ class Compiler:
 
     def compile_fast(self) -> None:
         """Have LLVM spend less time on the kernel that is compiled next. Its first launch must come before the context ends."""
-        if self._host and not self.thorough:
+        if self._host and not self.thorough and "loops" in enabled:
             set_switches(search=self.passes is LEAN)
             self._fast = True
 
@@ -183,7 +183,7 @@ class CachedLaunch:
         if self._ready is None:
             with self.compiler():
                 getattr(self.owner, self.name)(*self.arrays)
-                if patched:
+                if "launches" in enabled:
                     self._ready = self._prepared()
         else:
             self.launch()

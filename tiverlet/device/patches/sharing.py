@@ -1,4 +1,4 @@
-"""Sharing of kernels: objects share a kernel if everything that it could read of them is equal.
+"""Sharing of kernels: objects share a kernel if everything that it could read of them is equal. Each has its own memory.
 
 Taichi compiles a kernel again for every object that it belongs to. The compiled code is a function of everything that Taichi
 reads meanwhile: attributes of the object and of all objects that it refers to, and functions. This module writes all of that to a
@@ -10,9 +10,14 @@ class lists as `host_only`, or does not list in its `kernels_read` if it has tha
 these; tests/test_sharing.py checks it. Everything else counts, whether kernels read it or not. So an overlooked attribute can
 cause one more compilation, never a wrong kernel.
 
+Each launch reads the addresses of trees of fields from a table of Taichi's runtime. After another address is written to the
+table, the same kernel works on other memory of the same layout. Where the table is not found, or kernels do not follow it, every
+world has a tree and kernels of its own.
+
 Everything here depends on the internals of Taichi 1.7.4; with another version, every object has kernels of its own.
 """
 
+import ctypes
 import types
 import weakref
 from collections.abc import Callable
@@ -25,9 +30,11 @@ import taichi as ti
 from taichi.lang.field import Field
 from taichi.lang.kernel_impl import Func, Kernel
 
-from ..language import OURS, TAICHI, active
+from ..language import OURS, TAICHI, active, impl
 
 OF_TAICHI = ("taichi", "numpy", "math")  # modules that do not change
+NEAR = 64  # the table begins within so many words of the runtime's begin; it begins at the twelfth
+TREES = 512  # entries of the table
 COMPARED_BY_VALUE = frozenset((int, str, bool, type(None), bytes, complex))  # types compared by value
 COMPARED_BY_IDENTITY = frozenset((type, types.ModuleType, types.BuiltinFunctionType, np.ufunc, np.dtype, type(ti.f32)))
 
@@ -232,6 +239,50 @@ def _ensured(self: Any, *args: Any) -> Any:
     name = next((a for a in args if isinstance(a, str)), self.func.__name__)
     _compile(self, key, name, lambda: self.materialize(key=key, args=args, arg_features=features))
     return key
+
+
+def finalize_without_memory(builder: Any) -> Any:
+    """Finalize a tree of fields without memory. Kernels can be compiled for it; it needs an address before they run."""
+    return builder._finalize_for_aot()
+
+
+def table_of(finder: Any, kernel: str, addresses: np.ndarray, tree: int, offset: int) -> Any:
+    """Return the table as an array of addresses, indexed by tree; None if it is not found, or kernels do not follow it.
+
+    finder: an object with a kernel that writes the address of a field to the array `addresses`; the field is `offset` bytes
+    behind the begin of the tree with number `tree`.
+    """
+    program: Any = impl.get_runtime().prog
+    find = getattr(finder, kernel)
+    find(addresses)
+    begin = int(addresses[0]) - offset
+    if str(program.config().arch) not in ("Arch.x64", "Arch.arm64"):
+        return None
+    primal: Any = getattr(type(finder), kernel)._primal
+    made = primal.compiled_kernels[primal.ensure_compiled(finder, addresses)]
+    context = made.make_launch_context()
+    context.set_arg_external_array_with_shape((0,), addresses.ctypes.data, addresses.nbytes, addresses.shape, 0)
+    program.launch_kernel(program.compile_kernel(program.config(), program.get_device_caps(), made), context)
+    builder = _words(_words(id(context), 3)[2], 3)  # the third word of pybind's object is the address of the C++ object
+    owned, borrowed = builder[1], builder[2]  # two equal pointers to the context that kernels get
+    if not owned or owned != borrowed:
+        return None
+    runtime = _words(owned, 2)[1]
+    if not runtime or runtime % 8:
+        return None
+    found = [k for k, word in enumerate(_words(runtime, NEAR)) if word == begin]
+    if len(found) != 1 or found[0] < tree:
+        return None
+    table = np.ctypeslib.as_array((ctypes.c_uint64 * TREES).from_address(runtime + 8 * (found[0] - tree)))
+    table[tree] = begin + NEAR  # the kernel only computes an address there, and reads nothing
+    find(addresses)
+    table[tree] = begin
+    follows, addresses[0] = int(addresses[0]) == begin + NEAR + offset, begin + offset
+    return table if follows else None
+
+
+def _words(address: int, count: int) -> Any:
+    return (ctypes.c_uint64 * count).from_address(address)
 
 
 def apply(compile_: Callable) -> None:
