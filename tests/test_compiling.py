@@ -1,8 +1,12 @@
 """The patches of Taichi shorten compilation without changing a bit, and do not affect what users compile."""
 
 import io
+import os
 import pathlib
+import shutil
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -36,6 +40,29 @@ def test_what_a_plain_script_compiles_is_kept_for_its_next_start(tmp_path):
     script = "import tiverlet as tv\nworld = tv.World(tv.Particles([(0.0, 1.0)]), [tv.HalfSpace((0, 1))])\nworld.step(1 / 60)\n"
     python(script, TI_OFFLINE_CACHE_FILE_PATH=str(tmp_path))
     assert any(tmp_path.glob("*.tic"))
+
+
+@pytest.mark.skipif(not PATCHED, reason="how Taichi names its files")
+@pytest.mark.slow
+def test_a_killed_process_and_two_at_once_leave_a_cache_that_works(tmp_path):
+    # A process that is killed while it reads or writes the cache leaves its lock. One of 70 s is of the dead, one of 50 s need
+    # not be. Two processes that compile the same at once, and one after them, have the same bits.
+    code, lock = ROPES + "print(made())\n", tmp_path / "ticache.lock"
+
+    def run(_=None) -> str:
+        return python(code, PYTHONPATH=ROOT, TI_OFFLINE_CACHE_FILE_PATH=str(tmp_path)).stdout
+
+    for age, stays in ((50, True), (70, False)):
+        lock.touch()
+        os.utime(lock, (0.0, time.time() - age))
+        first = run()
+        assert lock.exists() == stays != any(tmp_path.glob("*.tic"))
+    shutil.rmtree(tmp_path)
+    tmp_path.mkdir()
+    with ThreadPoolExecutor() as pool:
+        assert {*pool.map(run, range(2))} == {first}
+    kept = {path.name for path in tmp_path.glob("*.tic")}
+    assert run() == first and kept == {path.name for path in tmp_path.glob("*.tic")} != set()
 
 
 def test_a_patch_that_needs_another_one_is_off_without_it():

@@ -5,7 +5,9 @@ import contextlib
 import ctypes
 import numbers
 import os
+import pathlib
 import threading
+import time
 from typing import Any
 
 from . import language
@@ -26,6 +28,7 @@ def _ask_for_start() -> None:
 language.check_before_fields(_ask_for_start)
 
 ARCHITECTURES = ("cpu", "cuda", "metal", "vulkan")
+HELD = 60.0  # [s]: Taichi holds the lock of its cache while it reads or writes, seconds at most; an older lock was left behind
 LLVM = ("cpu", "cuda")  # compiled by LLVM; for the others Taichi writes SPIR-V
 
 _started: dict = {}  # the arguments of init(), and the process and thread that called it
@@ -190,4 +193,13 @@ def _register(wanted: dict | None = None) -> None:
     """Register the running Taichi, with the arguments of init() if init() started it."""
     global trees
     trees = 0
+    _remove_old_lock()
     _started.update(runtime=language.current(), pid=os.getpid(), thread=threading.get_ident(), wanted=wanted)
+
+
+def _remove_old_lock() -> None:
+    """Remove the lock of Taichi's cache that a killed process left. Without a word, all later ones would compile everything."""
+    with contextlib.suppress(OSError, AttributeError):  # no lock; Quadrants has other settings
+        lock = pathlib.Path(_config().offline_cache_file_path, "ticache.lock")
+        if time.time() - lock.stat().st_mtime > HELD:
+            lock.unlink()
