@@ -328,7 +328,7 @@ def test_bodies_and_their_surfaces_are_found(world):
     x = np.concatenate([cube, sheet.position, np.eye(4, 3) + 9])
     corners = surfaces.triangles(world(tv.Particles(x), [tv.Volume(tets), tv.Distance(edges)]))
     areas = np.linalg.norm(np.cross(x[corners[:, 1]] - x[corners[:, 0]], x[corners[:, 2]] - x[corners[:, 0]]), axis=1) / 2
-    assert (corners < 8).all(axis=1).sum() == len(surfaces.skin(np.array(tets))) == 12
+    assert (corners < 8).all(axis=1).sum() == len(surfaces.surface_of(np.array(tets))) == 12
     flat = (corners >= 8).all(axis=1) & (corners < 38).all(axis=1)
     assert flat.sum() == 2 * 5 * 4 and areas[flat].sum() == pytest.approx(1.0) and (corners >= 38).all(axis=1).sum() == 4
 

@@ -24,7 +24,7 @@ from tests.test_exports import parsed, values
 from tiverlet.__main__ import main
 from tiverlet.live.scene import scene
 from tiverlet.live.session import Session
-from tiverlet.recording import messages, viewer, watch
+from tiverlet.recording import messages, viewer
 from tiverlet.recording.bodies import rims
 from tiverlet.recording.drawing import view_up
 from tiverlet.recording.exports.geometry import geometry, linear
@@ -304,7 +304,7 @@ def test_y_points_down_where_the_view_is_asked_for_it(tmp_path):
 @pytest.mark.slow
 def test_a_recording_is_watched_while_it_is_made_and_goes_on_without_its_viewer(tmp_path, monkeypatch, capsys):
     opened, w = [], rising()
-    monkeypatch.setattr(watch.webbrowser, "open", opened.append)
+    monkeypatch.setattr(viewer.webbrowser, "open", opened.append)
     with tv.Recorder(tmp_path / "a.rrd", w, live="web") as recorder:
         w.run(0.2, recorder=recorder)
         recorder.flush()
@@ -316,7 +316,7 @@ def test_a_recording_is_watched_while_it_is_made_and_goes_on_without_its_viewer(
     with viewer.scratch() as folder:
         words = ("--serve-web", "--port", str(port), "--web-viewer-port", str(viewer.free_port()))
         process = viewer.launch(folder, *words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        watch._wait_for_port(process, port)
+        viewer._wait_for_port(process, port)
         with tv.Recorder(tmp_path / "b.rrd", w, live=f"rerun+http://127.0.0.1:{port}/proxy") as recorder:
             for k in range(3):
                 w.run(0.1, recorder=recorder)
@@ -327,7 +327,7 @@ def test_a_recording_is_watched_while_it_is_made_and_goes_on_without_its_viewer(
     assert recording.verify() and recording.frames[-1] == 18
     monkeypatch.setattr(viewer, "launch", lambda *words, **options: subprocess.Popen(["false"], start_new_session=True))
     with pytest.raises(RuntimeError, match='without them use live="web"'):
-        watch.address(True)
+        viewer.address(True)
 
 
 def drawn(html) -> np.ndarray:

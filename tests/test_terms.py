@@ -11,7 +11,7 @@ from tiverlet.contact.pair_contact import PairContact
 from tiverlet.contact.rays import Hits
 from tiverlet.contact.touches import Touches
 from tiverlet.features.feature import Batch, Feature
-from tiverlet.features.terms import ROWS, TERMS
+from tiverlet.features.terms import rows, terms
 from tiverlet.neighbours.queries import Contacts
 from tiverlet.recording.replay import Replay
 
@@ -30,7 +30,7 @@ def scene():
 
 def rows_of(name: str) -> list[tuple[str, str]]:
     """Return the rows of an owner: names, and the clause that answers them."""
-    return [(names, clause) for owners, rows in ROWS.items() if name in owners.split() for names, clause in rows.items()]
+    return [(names, clause) for owners, found in rows().items() if name in owners.split() for names, clause in found.items()]
 
 
 @pytest.mark.slow
@@ -44,12 +44,12 @@ def test_every_term_of_others_is_answered(scene):
         "Shape": tv.shapes.rope((0, 0), (1, 0), 3),
     }  # fmt: skip
     called = {"World.step": scene.step, "World.run": scene.run, "Batch": tv.Distance, "PairContact": tv.Contact}
-    named = {name: getattr(tv, name, None) or getattr(tv.shapes, name, None) for name in TERMS}
+    named = {name: getattr(tv, name, None) or getattr(tv.shapes, name, None) for name in terms()}
     called |= {name: call for name, call in named.items() if callable(call) and name not in ("StepReport", "Shape")}
     asked = 0
-    for name in TERMS:
-        for terms, clause in rows_of(name):
-            for term in terms.split():
+    for name in terms():
+        for words, clause in rows_of(name):
+            for term in words.split():
                 if name in read and not hasattr(read[name], term):
                     asked += 1
                     with pytest.raises(AttributeError, match=re.escape(clause)):
@@ -116,12 +116,12 @@ def names_of(thing: Any) -> set[str]:
     return {n for n in {*dir(thing), *vars(thing)} if not n.startswith("_")} if plain else {*inspect.signature(thing).parameters}
 
 
-@pytest.mark.parametrize("name", TERMS)
+@pytest.mark.parametrize("name", terms())
 def test_terms_are_of_others_and_their_answers_exist(name, scene):
-    rows = rows_of(name)
-    asked = [one for names, _ in rows for one in names.split()]
+    given = rows_of(name)
+    asked = [one for names, _ in given for one in names.split()]
     assert len({*asked}) == len(asked) and not {*asked} & names_of(owner(name))  # no name twice, and none that exists
-    for _, clause in rows:
+    for _, clause in given:
         for path, arguments in re.findall(r"\btv\.([\w.]*\w)(?:\(((?:[^()]|\([^()]*\))*)\))?", clause):
             thing = tv
             for part in path.split("."):

@@ -7,7 +7,7 @@ import difflib
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
-from .terms import TERMS, spelt
+from .terms import spelt, terms
 
 Kind = TypeVar("Kind", bound=type)
 _guesses: dict[tuple[type, str], str] = {}  # by class and name: hasattr() may ask often, and searching takes 1.6 ms
@@ -20,7 +20,7 @@ def suggest(name: str, owners: Iterable[str], names: Iterable[str]) -> str:
     """
     wanted = spelt(name)
     for owner in owners:
-        if clause := TERMS.get(owner, {}).get(wanted):
+        if clause := terms().get(owner, {}).get(wanted):
             return f"; {clause}."
     there = {spelt(n): n for n in names}
     near = difflib.get_close_matches(wanted, there, 1)

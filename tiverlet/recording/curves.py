@@ -53,9 +53,10 @@ def own_name(path: str) -> str | None:
 
 
 def curves_of(world: "World") -> dict[str, tuple[str, dict[str, Any]]]:
-    """Return the views of CURVES that a world has: angular momentum about the origin only if particles spin."""
-    axes = world.particles.axes if world.particles.spins else 0
-    some = {title: (end, dict(list(c.items())[:axes]) if end == TURNING else c) for title, (end, c) in CURVES.items()}
+    """Return the views of CURVES that a world has, of as many axes: angular momentum about the origin only if particles spin."""
+    p = world.particles
+    most = {TURNING: p.axes if p.spins else 0}
+    some = {title: (end, dict(list(c.items())[: most.get(end, max(2, p.dim))])) for title, (end, c) in CURVES.items()}
     return {title: (end, curves) for title, (end, curves) in some.items() if curves}
 
 
@@ -70,16 +71,9 @@ def informative_views(world: "World") -> dict[str, tuple[str, list[bool]]]:
         "substeps": world.settings["substeps"] != "auto", **{f"momentum/{axis}": held for axis in "xyz"},
         **{f"angular momentum/{axis}": held for axis in "xyz"},
     }  # fmt: skip
-    out = {
-        title: (end, [not hidden.get(name, False) for name in _names(curves, world)])
-        for title, (end, curves) in curves_of(world).items()
-    }
+    views = curves_of(world).items()
+    out = {title: (end, [not hidden.get(name, False) for name in curves]) for title, (end, curves) in views}
     return {title: (end, those) for title, (end, those) in out.items() if any(those)}
-
-
-def _names(curves: dict[str, Any], world: "World") -> list[str]:
-    """Return the names of the curves of a view: as many as the dimension, at least two."""
-    return list(curves)[: max(2, world.particles.dim)]
 
 
 class Curves:
@@ -95,7 +89,7 @@ class Curves:
         self._begun = False
         self.own: list[str] = []  # names of the user's quantities
         for title, (end, curves) in self._curves.items():
-            titles, colors = zip(*(curves[name] for name in _names(curves, world)), strict=True)
+            titles, colors = zip(*curves.values(), strict=True)
             _, those = informative_views(world).get(title, (end, [False] * len(titles)))
             lines = rr.SeriesLines(names=titles, colors=colors, visible_series=those)
             stream.log(f"figures/{end}", lines, static=True, strict=True)

@@ -59,7 +59,7 @@ class Drawing:
         self.scenes = 0  # the number of the scene that is drawn, from 1 on
         self._in_box = InBox()
         self._touched = self._broke_before = False
-        self._broke: dict[int, list[int]] = {}  # see pop_broken()
+        self._broke: dict[str, list[int]] = {}  # see pop_broken()
 
     def static(self, entity: str, *what: Any) -> None:
         """Log data that hold for all frames."""
@@ -82,7 +82,7 @@ class Drawing:
         self.scenes = scenes
         self._contacts = len(p) <= FEW and bool(world._runner.step.contacts)
         self._broken = {k: f.broken for k, f in enumerate(world.features) if isinstance(f, Batch) and f.breaks}
-        self._broke = {k: np.flatnonzero(gone).tolist() for k, gone in self._broken.items() if gone.any()}
+        self._broke = {str(k): np.flatnonzero(gone).tolist() for k, gone in self._broken.items() if gone.any()}
         self._join()
         radii = np.where(p.radius > 0, p.radius, POINT)
         if len(self._corners):
@@ -287,17 +287,14 @@ class Drawing:
             new = np.flatnonzero(now & ~before)
             self._broken[k] = now
             if len(new):
-                self._broke.setdefault(k, []).extend(new.tolist())
-            for c in new.tolist():
-                members = f.members_of(c)  # type: ignore[attr-defined]
-                marks.append(x[members].mean(axis=0, keepdims=True))
-            if len(new):
+                self._broke.setdefault(str(k), []).extend(new.tolist())
+                marks += [x[f.members_of(c)].mean(axis=0, keepdims=True) for c in new.tolist()]  # type: ignore[attr-defined]
                 named = ", ".join(map(str, new[:20].tolist())) + (" ..." if len(new) > 20 else "")
                 self.event(f"{f!r} (feature {k}): {len(new)} broke: {named}", "WARN")
         at = np.concatenate(marks).astype(np.float32)
         self._log(f"{self._root}/breaks", self._points(at, radii=[-7.0], colors=[[255, 60, 60, 180]]))
 
-    def pop_broken(self) -> dict[int, list[int]]:
+    def pop_broken(self) -> dict[str, list[int]]:
         """Return the constraints that broke since the last call or had broken when the scene began, by the feature's number."""
         broke, self._broke = self._broke, {}
         return broke

@@ -8,6 +8,7 @@ from ..constraints import Area
 from ..contact import Polygons
 from .bodies import bodies
 from .strain import packed, tinted
+from .surfaces import cross
 
 if TYPE_CHECKING:
     from ..world import World
@@ -30,7 +31,7 @@ def outlines(world: "World") -> list[np.ndarray]:
     x, out = world.particles.position, {}
     for loop in found:
         a, b = x[loop], x[np.roll(loop, -1)]
-        out.setdefault(tuple(sorted(loop.tolist())), loop if _cross(a, b).sum() > 0 else loop[::-1])
+        out.setdefault(tuple(sorted(loop.tolist())), loop if cross(a, b).sum() > 0 else loop[::-1])
     return list(out.values())[:MANY]
 
 
@@ -103,7 +104,3 @@ class Fill:
         totals = [np.bincount(self._owner, column) for column in hues[self._corner].T]
         mean = SHADE * np.stack(totals, axis=1) / np.bincount(self._owner)[:, None]
         return packed(tinted(mean, self._body, level))[self._shown]
-
-
-def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]

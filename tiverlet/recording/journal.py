@@ -130,11 +130,11 @@ def read(path: str, contents: rrd.Contents) -> tuple[list[Entry], str, int | Non
     for n, (serial, _, text, blob, wanted) in enumerate(rows):
         k, lines = len(entries), text.split(b"\n")
         if serial > k:
-            later = sum(_kind(line) == "frame" for row in rows[n:] for line in row[2].split(b"\n"))
+            later = sum(kind_of(line) == "frame" for row in rows[n:] for line in row[2].split(b"\n"))
             return entries, f"entry {k} of the journal is missing", later
         mark = checksum(mark, text.decode(errors="replace"), blob)
         if serial < k or mark.encode() != wanted:
-            what = f"entry {k}, {_kind(lines[0])!r} of frame {json.loads(lines[0]).get('frame')}"
+            what = f"entry {k}, {kind_of(lines[0])!r} of frame {json.loads(lines[0]).get('frame')}"
             raise Changed(f"replay: {path} was changed after it was recorded: {what}.", frames)
         entries += [Entry.unpack(line.decode(), blob) for line in lines]
         frames += sum(entry.kind == "frame" for entry in entries[k:])
@@ -151,12 +151,8 @@ def read(path: str, contents: rrd.Contents) -> tuple[list[Entry], str, int | Non
     return entries, "", None
 
 
-def is_frame(text: str) -> bool:
-    """Whether an entry is that of a frame."""
-    return _kind(text) == "frame"
-
-
-def _kind(text: bytes | str) -> str:
+def kind_of(text: bytes | str) -> str:
+    """Return the kind of an entry."""
     return json.loads(text).get("kind")
 
 

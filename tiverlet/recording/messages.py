@@ -159,7 +159,7 @@ def _in_runs(rows: Any, mark: str) -> tuple[Any, str]:
     texts, blobs = [text for (text,) in rows.column("text").to_pylist()], [bytes(b) for b in rows.column("blob").to_pylist()]
     firsts, together, marks = [], [], [mark]
     for k, text in enumerate(texts):
-        alike = k and all(not blobs[j] and journal.is_frame(texts[j]) for j in (k - 1, k))
+        alike = k and all(not blobs[j] and journal.kind_of(texts[j]) == "frame" for j in (k - 1, k))
         if alike and k - firsts[-1] < PACKED:
             together[-1].append(text)
         else:

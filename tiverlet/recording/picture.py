@@ -3,13 +3,15 @@
 Everything in it follows from the world, its reports and the journal, so that verify() can draw it again and compare.
 """
 
+import zlib
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..step.checkpoint import Checkpoint
+from ..step import checkpoint
 from ..step.step_report import StepReport
+from .journal import brief
 
 if TYPE_CHECKING:
     from ..world import World
@@ -57,15 +59,18 @@ class Picture:
         self._stream.set_time("frame", sequence=number)
         self._stream.set_time("time", duration=self.world.time)
 
+    @np.errstate(over="ignore")  # positions of a diverged simulation may exceed f32
     def frame(
-        self, number: int, now: Checkpoint, x: np.ndarray, x32: np.ndarray, report: StepReport | None, scenes: int,
-        changed_features: Iterable[int],
-    ) -> None:  # fmt: skip
-        """Draw a frame.
+        self, number: int, report: StepReport | None, scenes: int, changed_features: Iterable[int]
+    ) -> tuple[dict[str, Any], np.ndarray]:
+        """Draw a frame. Returns what the journal says of it, and where particles are drawn, (n, dim) [m] in f32.
 
-        now: the world's state. x, x32: positions, (n, dim), in full and in f32. report: the worst of the steps since the last
-        frame. scenes: the number of scenes so far. changed_features: features whose knobs were set since the last frame.
+        report: the worst of the steps since the last frame. scenes: the number of scenes so far. changed_features: features whose
+        knobs were set since the last frame.
         """
+        now = checkpoint.keep(self.world, pairs=False)
+        x = self.drawing.drawn_positions(now.position(len(self.world.particles)))
+        x32 = x.astype(np.float32)
         if scenes > self.drawing.scenes:
             self.curves.read_masses(self.world)
             self.drawing.begin(scenes)
@@ -75,6 +80,9 @@ class Picture:
             if report.flags - self._seen:
                 self._seen |= report.flags
                 self.drawing.event(" ".join(report.notes), "WARN")
+        data = {"time": self.world.time, "hash": brief(checkpoint.digest(self.world, now)), "crc": zlib.crc32(x32.tobytes())}
+        broke = self.drawing.pop_broken()
+        return data | ({"broke": broke} if broke else {}), x32
 
     def log(self, number: int, values: dict[str, Any]) -> None:
         """Add the user's quantities for the coming frame: numbers, and arrays of one number per particle, (n,)."""
@@ -125,20 +133,13 @@ def about(
     world: "World", explained: str, environment: dict[str, Any], worst: StepReport | None = None, frames: int = 0, note: str = ""
 ) -> str:
     """Return a page about the scene, and about all frames once there are some."""
-    rows = [
-        f"# {len(world.particles)} particles in {world.particles.dim}D",
-        "",
-        "```",
-        explained,
-        "```",
-        "",
-        f"Recorded with {', '.join(f'{name} {value}' for name, value in environment.items())}.",
-    ]
+    head, summary = f"# {len(world.particles)} particles in {world.particles.dim}D", []
     if worst is not None:
-        rows[1:1] = [
+        summary = [
             "", f"{frames} frames, {world.time:.4g} s simulated.", "", *([note, ""] if note else []),
             "| worst of all frames | |", "|---|---|", f"| constraint violation | {worst.residual:.2e} |",
             f"| overlap | {worst.overlap:.2e} radii |", f"| contacts | {worst.contacts} |", f"| broken | {worst.broken} |",
             f"| flags | {', '.join(sorted(worst.flags)) or 'none'} |", *(f"\n{note}" for note in worst.notes),
         ]  # fmt: skip
-    return "\n".join(rows)
+    by = ", ".join(f"{name} {value}" for name, value in environment.items())
+    return "\n".join([head, *summary, "", "```", explained, "```", "", f"Recorded with {by}."])

@@ -3,7 +3,6 @@
 import contextlib
 import os
 import weakref
-import zlib
 from time import perf_counter
 from typing import Any
 
@@ -12,12 +11,11 @@ import numpy as np
 from .. import checks
 from ..device import interrupts
 from ..features.unknown_names import answer_names
-from ..step import checkpoint
 from ..step.explain import explain
 from ..world import World
 from ..worlds.worlds import Worlds
 from .hues import Coloring
-from .journal import JOURNAL, brief, flags_to_record
+from .journal import JOURNAL, flags_to_record
 from .journal_writer import Journal
 from .overlays import Overlays, checked_y_down
 from .picture import Picture, layout
@@ -101,30 +99,23 @@ class Recorder:
 
     @interrupts.uninterrupted
     def _open(self, title: str, overwrite: bool) -> None:
-        world = self.world
-        viewer = None
-        if self._live:
-            from . import watch  # imported late, since it imports a server
+        from . import viewer  # imported late, since it imports rerun and a server
 
-            viewer = watch.address(self._live)
-        opens = layout(world, self._overlays)
-        self._sink = Sink(self.path, f"tiverlet_{world.particles.dim}d", opens, title, overwrite, viewer)
+        address = viewer.address(self._live) if self._live else None
+        opens = layout(self.world, self._overlays)
+        self._sink = Sink(self.path, f"tiverlet_{self.world.particles.dim}d", opens, title, overwrite, address)
         self._closing = weakref.finalize(self, self._sink.close)  # runs also when the process ends
         self._stream = self._sink.stream
         if self._live == "notebook":
-            from . import watch
-
-            watch.below_the_cell(self._stream)
+            viewer.show_below_the_cell(self._stream)
             self._sink.show(opens, at_once=True)
         try:
-            self._begin(title)
+            with self._sink.beginning("Recorder"):
+                self._begin(title)
         except BaseException:
             if "_journal" in vars(self):
                 self._journal.close()
-            self._closing()
-            self._sink.discard()
             raise
-        self._sink.keep()
 
     def _begin(self, title: str) -> None:
         """Write what holds for all frames, and the first frame."""
@@ -139,10 +130,8 @@ class Recorder:
         self._note_state(self._journal.size)
         self._frame(0)
         self.flush()  # so that a process that ends early leaves a readable file
-        if error := self._sink.error:
-            raise file_error(error, f"Recorder: nothing could be written to {self.path}")
         least = self._sink.bytes + RESERVE
-        if self.budget is not None and self.budget < 2 * least:
+        if self.budget is not None and self.budget < 2 * least and not self._sink.error:
             raise ValueError(
                 f"Recorder: budget = {self.budget} bytes, but the scene and its first frame take {least}. "
                 f"Give at least {2 * least}."
@@ -267,7 +256,6 @@ class Recorder:
         self._bytes_between_states = SHARE * size
         self._drawn, self._last_state = self._picture.drawing.bytes, self._calls
 
-    @np.errstate(over="ignore")  # positions of a diverged simulation may exceed f32
     def _frame(self, number: int) -> None:
         world, journal, picture = self.world, self._journal, self._picture
         journal.frame = number
@@ -284,13 +272,8 @@ class Recorder:
             journal.put("logged", {"numbers": numbers}, arrays)
             picture.log(number, self._own)
             self._own = {}
-        now = checkpoint.keep(world, pairs=False)
-        x = picture.drawing.drawn_positions(now.position(len(world.particles)))
-        x32 = x.astype(np.float32)
-        picture.frame(number, now, x, x32, journal.rounded(), journal.scenes, journal.changed_features)
-        data = {"time": world.time, "hash": brief(checkpoint.digest(world, now)), "crc": zlib.crc32(x32.tobytes())}
-        broke = picture.drawing.pop_broken()
-        journal.frame_drawn(data | {"broke": broke} if broke else data)
+        data, _ = picture.frame(number, journal.rounded(), journal.scenes, journal.changed_features)
+        journal.frame_drawn(data)
         self.frames += 1
 
     @interrupts.uninterrupted

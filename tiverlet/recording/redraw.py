@@ -18,7 +18,6 @@ from .reader import LAYOUTS
 from .rrd import Contents
 
 if TYPE_CHECKING:
-    from ..step.checkpoint import Checkpoint
     from ..world import World
 
 NOTHING = hashlib.blake2b(digest_size=16).digest()  # digest of a row without components: the start time of the file
@@ -37,7 +36,7 @@ class Rows:
         if timeline == "frame":
             self._frame = sequence
         elif timeline == "time":
-            self._time = _nanoseconds(duration)
+            self._time = round(1e9 * float(duration))
 
     def log(self, entity: str, *what: Any, static: bool = False, strict: bool | None = None) -> None:
         """Keep one row, as rerun's stream logs it."""
@@ -53,10 +52,6 @@ class Rows:
             self.rows.append((entity, False, frame, time, _digest({name: a[k].values for name, a in lists.items()})))
 
 
-def _nanoseconds(seconds: float) -> int:
-    return round(1e9 * float(seconds))
-
-
 def _digest(parts: dict[Any, Any]) -> bytes:
     into = hashlib.blake2b(digest_size=16)
     for name in sorted(parts, key=lambda name: name.component):
@@ -69,7 +64,8 @@ class Redraw:
     """Draws the contents of a journal, from worlds that are computed again."""
 
     def __init__(self, scene_data: dict[str, Any]):
-        self._scene_data, self._rows, self._changed_features, self.scenes = scene_data, Rows(), set[int](), 0
+        self._scene_data, self._rows, self._scenes = scene_data, Rows(), 1
+        self._changed_features = set(range(len(scene_data["features"])))
         self._picture: Picture | None = None
         self._world: Any = None
         self._recent: StepReport | None = None
@@ -77,7 +73,7 @@ class Redraw:
         self.layouts: list[list[Row]] = []  # the layout at the start, and the one at the end
         self.frames = 0
         self.ended = False
-        self.stride, self.thin = 1, -1  # up to frame `thin`, the picture may have only one of `stride` frames
+        self._stride, self._thin = 1, -1  # up to frame `_thin`, the picture may have only one of `_stride` frames
 
     @property
     def rows(self) -> list[Row]:
@@ -114,71 +110,56 @@ class Redraw:
     def broken_off(self) -> None:
         """After a failed step: do nothing."""
 
-    def scene(self, features: int) -> None:
-        """Begin a new scene."""
-        self.scenes += 1
-        self._changed_features = set(range(features))
+    def apply(self, entry: Entry) -> str | None:
+        """Take what an entry means for the picture, other than a frame. Returns what is wrong with it, or None."""
+        assert self._picture
+        if entry.kind == "scene":
+            self._scenes += 1
+            self._changed_features = set(range(len(self._world.features)))
+        elif entry.kind == "turned":
+            self._changed_features.update(map(int, entry.data["features"]))
+        elif entry.kind == "thinned":
+            self._stride, self._thin = checks.integer("replay", "stride", entry.data["stride"], least=1), entry.frame
+        elif entry.kind == "logged":  # quantities of the user's; those of every world are computed
+            color = self._overlays.color
+            arrays = {name: values for name, values in entry.arrays.items() if not (color.function and name == color.name)}
+            self._picture.log(entry.frame, {**entry.data["numbers"], **arrays})
+        return self._end(entry) if entry.kind == "end" else None
 
-    def record_knobs(self, features: dict[str, Any]) -> None:
-        """Record which features had knobs set."""
-        self._changed_features.update(map(int, features))
-
-    def thinned(self, entry: Entry) -> None:
-        """Record that frames were removed from the picture."""
-        self.stride, self.thin = checks.integer("replay", "stride", entry.data["stride"], least=1), entry.frame
-
-    def _thinned(self, found: list[Row]) -> list[Row]:
-        """Return the drawn rows, except rows that are missing in the file because it was thinned."""
+    def expected(self, found: list[Row]) -> list[Row]:
+        """Return the rows that must be in the file: those drawn, except rows that are missing because the file was thinned."""
         there = Counter(found)
         frames: dict[str, list[int]] = defaultdict(list)
         for entity, static, frame, *_ in self.rows:
             if not static and thins(f"/{entity}"):
                 frames[entity].append(frame)
         gone = {entity: np.unique(numbers) for entity, numbers in frames.items()}
-        may = {entity: set(numbers[droppable(numbers, self.stride)].tolist()) for entity, numbers in gone.items()}
+        may = {entity: set(numbers[droppable(numbers, self._stride)].tolist()) for entity, numbers in gone.items()}
         out = []
         for row in self.rows:
             if there[row] > 0:
                 there[row] -= 1
-            elif row[2] <= self.thin and row[2] in may.get(row[0], ()):
+            elif row[2] <= self._thin and row[2] in may.get(row[0], ()):
                 continue
             out.append(row)
         return out
 
-    def expected(self, found: list[Row]) -> list[Row]:
-        """Return the rows that must be in the file."""
-        return self.rows if self.stride == 1 else self._thinned(found)
-
-    def drawn_positions(self, x: np.ndarray) -> np.ndarray:
-        """Return where particles at x, (n, dim) [m], are drawn."""
+    def frame(self, entry: Entry) -> tuple[dict[str, Any], np.ndarray, str | None]:
+        """Draw a frame. Returns what Picture.frame() does, and what is wrong with its entry in the journal, or None."""
         assert self._picture
-        return self._picture.drawing.drawn_positions(x)
-
-    def frame(self, entry: Entry, now: "Checkpoint", x: np.ndarray, x32: np.ndarray) -> str | None:
-        """Draw a frame. Returns what is wrong with its entry in the journal, or None."""
-        assert self._picture
-        report = self._recent
+        report, wrong = self._recent, None
         if report:
             report, wrong = _amended(report, entry.data)
-            if wrong:
-                return wrong
             report = replace(report, seconds=entry.data["seconds"])
         self._picture.stamp(entry.frame)
-        self._picture.frame(entry.frame, now, x, x32, report, self.scenes, self._changed_features)
+        data, x32 = self._picture.frame(entry.frame, report, self._scenes, self._changed_features)
         self._recent, self._changed_features = None, set()
         self.frames += 1
-        if {str(k): rows for k, rows in self._picture.drawing.pop_broken().items()} != entry.data.get("broke", {}):
-            return "other constraints broke than were recorded"
-        return None
+        if data.get("broke", {}) != entry.data.get("broke", {}):
+            wrong = wrong or "other constraints broke than were recorded"
+        return data, x32, wrong
 
-    def logged(self, entry: Entry) -> None:
-        """Add the user's quantities; those of every world are computed."""
-        assert self._picture
-        computed = {self._overlays.color.name} if self._overlays.color.function else set()
-        arrays = {name: values for name, values in entry.arrays.items() if name not in computed}
-        self._picture.log(entry.frame, {**entry.data["numbers"], **arrays})
-
-    def end(self, entry: Entry) -> str | None:
+    def _end(self, entry: Entry) -> str | None:
         """Draw the last entry. Returns what is wrong with it, or None."""
         assert self._picture
         self.ended = True
@@ -289,10 +270,9 @@ def _first(found: list[Row], drawn: list[Row], complete: bool) -> tuple[int | No
                 differences.append((there[len(wanted)][2], f"{entity} has rows that were not recorded"))
             elif len(there) < len(wanted):
                 missing = wanted[len(there)]
-                if complete or missing[1]:
-                    if not (missing[1] and not complete):
-                        differences.append((missing[2], f"{entity} is missing"))
-                elif not entity.startswith("figures/"):
+                if complete:
+                    differences.append((missing[2], f"{entity} is missing"))
+                elif not missing[1] and not entity.startswith("figures/"):
                     least.append(missing[2])
     if differences:
         frame, what = min(differences)

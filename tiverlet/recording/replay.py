@@ -54,20 +54,6 @@ class Verdict:
         return self.text
 
 
-@dataclass(frozen=True)
-class SceneFrames:
-    """A scene of a recording: its entry in the journal, and the numbers of the frames that show it.
-
-    knobs: those that the user set, (frame, number of the feature, knobs). broken: constraints that broke, (frame, number of the
-    feature, numbers of the constraints). Both hold from that frame on.
-    """
-
-    entry: Entry
-    frames: list[int]
-    knobs: list[tuple[int, int, dict[str, Any]]]
-    broken: list[tuple[int, int, np.ndarray]]
-
-
 @contextlib.contextmanager
 def _clear_errors(path: Any) -> Iterator[None]:
     """Within this context, the errors that a damaged file causes in Python become one ValueError that names the file."""
@@ -191,7 +177,6 @@ class Replay:
             raise
 
     @_with_clear_errors
-    @np.errstate(over="ignore")  # positions of a diverged simulation may exceed f32, as in Recorder
     def verify(self) -> Verdict:
         """Compute and draw everything again from the first frame on, and compare hashes, states and every row of the picture.
 
@@ -211,43 +196,29 @@ class Replay:
         contents = rrd.read(self.path, rows=True)
         if [row[3] for row in contents.journal()] != [row[3] for row in self._contents.journal()]:
             raise ValueError(f"replay: {self.path} has changed since it was read; read it again.")
-        redraw = Redraw(self.scene)
-        redraw.scene(len(self.scene["features"]))
-        wrong, world = None, None
+        redraw, wrong, world = Redraw(self.scene), None, None
         known = sum(e.kind == "frame" for e in self._entries) + (self._later or 0)
         try:
             for world, entry in self._run(1, len(self._entries) - 1):
                 off, why, same = None, None, True
                 redraw.watch(world)
                 if entry.kind == "frame":
-                    now = checkpoint.keep(world, pairs=False)
-                    same = _short_hash(world, now) == entry.data["hash"] and world.time == entry.data["time"]
-                    x = redraw.drawn_positions(now.position(len(world.particles)))
-                    x32 = x.astype(np.float32)
+                    drawn, x32, why = redraw.frame(entry)
+                    same = drawn["hash"] == entry.data["hash"] and drawn["time"] == entry.data["time"]
                     off = _differing(x32, self._shown(entry.frame, x32.shape))
                     if same and off is not None:
                         why = f"the picture of frame {entry.frame} shows particle {off} where it was not; the state is as it was."
-                        return self._changed(redraw.frames, known, entry.frame, off, why)
-                    if zlib.crc32(x32.tobytes()) != entry.data["crc"]:
-                        same = False
-                    why = redraw.frame(entry, now, x, x32)
+                        return self._changed(redraw.frames - 1, known, entry.frame, off, why)
+                    same = same and drawn["crc"] == entry.data["crc"]
                 elif entry.kind == "state":
                     now, then = checkpoint.keep(world), _recorded_checkpoint(entry, world)
                     same = checkpoint.digest(world, now) == checkpoint.digest(world, then)
                     changed = (k for k, v in now.values.items() if k in then.values and len(v) == len(world.particles))
                     found = (_differing(now.values[k], then.values[k]) for k in changed)
                     off = next((i for i in found if i is not None), None)
-                elif entry.kind == "scene":
-                    redraw.scene(len(world.features))
-                elif entry.kind == "logged":
-                    redraw.logged(entry)
-                elif entry.kind == "thinned":
-                    redraw.thinned(entry)
-                elif entry.kind == "turned":
-                    redraw.record_knobs(entry.data["features"])
-                elif entry.kind == "end":
-                    same = "hash" not in entry.data or world.hash() == entry.data["hash"]
-                    why = redraw.end(entry)
+                else:
+                    why = redraw.apply(entry)
+                    same = entry.kind != "end" or "hash" not in entry.data or world.hash() == entry.data["hash"]
                 if same and wrong is None and why:
                     return self._changed(redraw.frames, known, entry.frame, None, f"frame {entry.frame}: {why}.")
                 if not same and wrong is None:
@@ -373,26 +344,27 @@ class Replay:
 
     def _compare(self, world: "World", entry: Entry) -> None:
         """Raise RuntimeError if a world is not in the state of a frame."""
-        if _short_hash(world, checkpoint.keep(world, pairs=False)) != entry.data["hash"]:
+        if journal.brief(checkpoint.digest(world, checkpoint.keep(world, pairs=False))) != entry.data["hash"]:
             raise RuntimeError(f"replay: frame {entry.frame} of {self.path} does not come out as recorded. {self._why()}")
 
     @property
     @_with_clear_errors
-    def scenes(self) -> list[SceneFrames]:
-        """The scenes, and the frames that show them. One begins where particles or features were added or removed."""
+    def scenes(self) -> list[tuple[Entry, list[int], list[tuple[int, int, Any]], list[tuple[int, int, Any]]]]:
+        """The scenes, each with its entry, and the frames that show it; one begins where particles or features were added or
+        removed. Also the knobs that the user set and the constraints that broke: from which frame on, of which feature, which."""
         out, knobs, broken = [], [], []
         for e in self._entries:
             if e.kind == "scene":
-                out.append(SceneFrames(e, [], [], []))
+                out.append((e, [], [], []))
                 knobs, broken = [], []
             elif e.kind == "turned":
                 knobs += self._knob_values(e)
             elif e.kind == "frame":
                 broken += [(int(k), np.array(rows, dtype=np.int64)) for k, rows in e.data.get("broke", {}).items()]
                 if e.frame in self._frames:
-                    out[-1].frames.append(e.frame)
-                    out[-1].knobs.extend((e.frame, *change) for change in knobs)
-                    out[-1].broken.extend((e.frame, *change) for change in broken)
+                    out[-1][1].append(e.frame)
+                    out[-1][2].extend((e.frame, *change) for change in knobs)
+                    out[-1][3].extend((e.frame, *change) for change in broken)
                     knobs, broken = [], []
         return out
 
@@ -478,11 +450,6 @@ def _compiler(environment: dict[str, Any]) -> str:
 def _set_controller(world: "World", settings: list) -> None:
     """Set substeps, iterations and the controller's memory as recorded."""
     world.substeps, world.iterations, world._controller.memory = *settings[:2], tuple(settings[2])
-
-
-def _short_hash(world: "World", kept: checkpoint.Checkpoint) -> str:
-    """Return the hash of a state in the short form of the journal."""
-    return journal.brief(checkpoint.digest(world, kept))
 
 
 def _recorded_checkpoint(entry: Entry, world: "World") -> checkpoint.Checkpoint:

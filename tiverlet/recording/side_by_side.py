@@ -77,18 +77,11 @@ class WorldsRecorder:
         opens = self._layout(*self._extent)
         self._sink = Sink(self.path, f"tiverlet_worlds_{dim}d", opens, title, overwrite)
         self._closing = weakref.finalize(self, self._sink.close)  # runs also when the process ends
-        try:
+        with self._sink.beginning("WorldsRecorder"):
             below = iter([_Below(f"worlds/{k}", self._sink.stream) for k in self.chosen])
             self._views = self.worlds.each(lambda world: _View(world, next(below), self._extent, overlays), self.chosen)
             self._draw()
             self._sink.flush()
-            if error := self._sink.error:
-                raise file_error(error, f"WorldsRecorder: nothing could be written to {self.path}")
-        except BaseException:
-            self._closing()
-            self._sink.discard()
-            raise
-        self._sink.keep()
 
     def __enter__(self) -> "WorldsRecorder":
         return self

@@ -1,5 +1,6 @@
 """The path of a recording from rerun to its file."""
 
+import contextlib
 import errno
 import hashlib
 import os
@@ -7,6 +8,7 @@ import select
 import stat
 import threading
 import uuid
+from collections.abc import Iterator
 from time import monotonic, sleep
 from typing import Any
 
@@ -55,7 +57,7 @@ class Sink:
     set. On the way data are compressed better. rerun's footer is left out, an index of all chunks that takes 90 kB; `rerun rrd
     optimize` makes it again. Without /dev/fd, rerun writes the file itself.
 
-    A file to be overwritten stays as it is until keep(). viewer: the address of a viewer that shows the recording meanwhile.
+    A file to be overwritten stays as it is until beginning() ends. viewer: the address of a viewer that shows it meanwhile.
     """
 
     def __init__(
@@ -132,16 +134,24 @@ class Sink:
         self._regular = stat.S_ISREG(found.st_mode)
         self._file_id = (found.st_dev, found.st_ino)
 
-    def keep(self) -> None:
-        """Give the file its final name."""
+    @contextlib.contextmanager
+    def beginning(self, who: str) -> Iterator[None]:
+        """Within this context the first frame is written. Then the file gets its final name.
+
+        After an error the file is closed and, if it is a regular file, removed; one that was to be overwritten stays.
+        """
+        try:
+            yield
+            if self.error:
+                raise file_error(self.error, f"{who}: nothing could be written to {self.path}")
+        except BaseException:
+            self.close()
+            if self._regular and self._is_own_file(self._new or self.path):
+                os.unlink(self._new or self.path)
+            raise
         if self._new:
             os.replace(self._new, os.path.realpath(self.path))
             self._new = None
-
-    def discard(self) -> None:
-        """Remove the file, if it is a regular file; one that was to be overwritten stays."""
-        if self._regular and self._is_own_file(self._new or self.path):
-            os.unlink(self._new or self.path)
 
     def _is_own_file(self, path: str) -> bool:
         try:
@@ -222,29 +232,24 @@ class Sink:
             old = os.path.realpath(self.path) if self._new is None else self._new
             with open(old, "rb") as file:
                 data = file.read()
-            new, before, taken = self._temporary_name(), (self._file, self._sum, self.bytes), False
+            new, whole = self._temporary_name(), hashlib.sha256()
             try:
-                file = open(new, "xb", buffering=0)
-            except OSError:  # the folder takes no further file
-                return False
-            try:
-                self._file, self._sum, self.bytes = file, hashlib.sha256(), 0
-                os.chmod(new, stat.S_IMODE(os.fstat(before[0].fileno()).st_mode))
-                self._put(data[:HEADER])
-                for kind, message in thinned(split(data), stride):
-                    self._put(HEAD.pack(kind, len(message)) + message)
+                with open(new, "xb") as file:
+                    os.chmod(new, stat.S_IMODE(os.fstat(self._file.fileno()).st_mode))
+                    pieces = (HEAD.pack(kind, len(message)) + message for kind, message in thinned(split(data), stride))
+                    for piece in (data[:HEADER], *pieces):
+                        file.write(piece)
+                        whole.update(piece)
+                after = open(new, "ab", buffering=0)
                 os.replace(new, old)
-                taken = True
-            except OSError:  # no space for both files
-                os.unlink(new)
-            finally:
-                if not taken:
-                    self._file.close()
-                    self._file, self._sum, self.bytes = before
-            if taken:
-                before[0].close()
+            except OSError:  # the folder takes no further file, or there is no space for both
+                with contextlib.suppress(OSError):
+                    os.unlink(new)
+                return False
+            self._file.close()
+            self._file, self._sum, self.bytes = after, whole, after.tell()
             self._remember_file()
-        return taken
+        return True
 
     def forked(self) -> bool:
         """Whether this is a child of the recording process, where rerun and the copying thread do not work."""

@@ -8,6 +8,7 @@ import numpy as np
 from ..constraints import Area, Dihedral, ShapeMatch, Volume
 from ..contact import Polygons
 from ..features.feature import Batch
+from ..shapes.shape import surface_of
 from .lines import cells
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def triangles(world: "World | Parts") -> np.ndarray:
             found.append(f.indices.reshape(-1, 3))
         elif isinstance(f, Volume):
             listing = np.asarray(f.listing)
-            found.append(skin(listing) if listing.shape[-1] == 4 else listing)
+            found.append(surface_of(listing) if listing.shape[-1] == 4 else listing)
         elif isinstance(f, Dihedral):
             a, b, c, d = f.indices.T
             found += [np.stack([a, b, c], axis=1), np.stack([b, a, d], axis=1)]
@@ -105,26 +106,19 @@ def cliques(pairs: np.ndarray) -> np.ndarray:
     return np.array(sorted(out), dtype=np.int64).reshape(-1, 3)
 
 
-def skin(tetrahedra: np.ndarray) -> np.ndarray:
-    """Return the faces that belong to one tetrahedron only, (t, 3)."""
-    faces = np.concatenate([tetrahedra[:, k] for k in ([0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2])])
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return faces[np.sort(first[count == 1])]
-
-
 def clipped(loop: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return triangles that fill a loop in 2D, (k - 2, 3), by ear clipping."""
     q = x[loop]
-    if np.sum(q[:, 0] * np.roll(q[:, 1], -1) - q[:, 1] * np.roll(q[:, 0], -1)) < 0:
+    if cross(q, np.roll(q, -1, axis=0)).sum() < 0:
         loop = loop[::-1]
     left, out = loop.tolist(), []
     while len(left) > 3:
         corner = np.array([left[-1:] + left[:-1], left, left[1:] + left[:1]]).T
         a, b, c = x[corner[:, 0]], x[corner[:, 1]], x[corner[:, 2]]
-        turn = _cross(b - a, c - b)
+        turn = cross(b - a, c - b)
         for k in np.argsort(-turn, kind="stable").tolist():
             others = x[[i for i in left if i not in corner[k]]]
-            sides = [_cross(np.tile(v - u, (len(others), 1)), others - u) for u, v in ((a[k], b[k]), (b[k], c[k]), (c[k], a[k]))]
+            sides = [cross(np.tile(v - u, (len(others), 1)), others - u) for u, v in ((a[k], b[k]), (b[k], c[k]), (c[k], a[k]))]
             if turn[k] <= 0 or not (np.array(sides) > 0).all(axis=0).any():
                 break
         out.append(corner[k].tolist())
@@ -139,12 +133,13 @@ def hull(cluster: np.ndarray, x: np.ndarray) -> np.ndarray:
     for way in (order, order[::-1]):
         side: list[int] = []
         for i in way:
-            while len(side) > 1 and _cross(x[side[-1:]] - x[side[-2]], x[[i]] - x[side[-2]])[0] <= 0:
+            while len(side) > 1 and cross(x[side[-1:]] - x[side[-2]], x[[i]] - x[side[-2]])[0] <= 0:
                 side.pop()
             side.append(i)
         ring += side[:-1]
     return np.array([[ring[0], *pair] for pair in zip(ring[1:-1], ring[2:], strict=True)], dtype=np.int64).reshape(-1, 3)
 
 
-def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Return the cross products of vectors in 2D, (m,)."""
     return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]

@@ -1,5 +1,6 @@
-"""The rerun viewer, started from the command line: a window, a page in the browser, or a picture without either."""
+"""The rerun viewer: a window, a page in the browser or below a cell, also while a recording is made, or a picture without any."""
 
+import atexit
 import contextlib
 import http.server
 import os
@@ -13,6 +14,7 @@ import tempfile
 import threading
 import time
 import urllib.request
+import webbrowser
 from collections.abc import Iterator
 from typing import Any
 
@@ -22,9 +24,11 @@ from .layout import SCENE_VIEW
 
 LOCAL = "127.0.0.1"
 NUMBER = re.compile(r"%0?\d*d")  # in a file name; any other % stands for itself
-PATIENCE = 40.0  # [s] longest wait for a picture
+PATIENCE = 40.0  # [s] longest wait for a picture, or for a viewer to start
 # These settings stop rerun from sending usage statistics (no connection, no file) and from printing messages.
 QUIET = {"CI": "true", "RUST_LOG": "error"}
+PLACES = (True, "web")  # of a live recording
+_scratch: list[tempfile.TemporaryDirectory] = []  # folders of viewers of live recordings, removed when this process ends
 
 
 def launch(folder: str, *words: str, **options) -> subprocess.Popen:
@@ -85,37 +89,89 @@ def show(path: str) -> int:
 
 
 def serve(path: str, port: int) -> int:
-    """Serve a recording to browsers on this machine, until interrupted.
+    """Serve a recording to browsers on this machine, until interrupted."""
+    data = free_port()
+    with _install_exit_signals(), scratch() as folder, Pages(port, data) as pages:
+        process = launch(folder, *pages.words, path)
+        print(f"{pages.url}   (Ctrl-C ends it)", flush=True)
+        return _wait(process)
+
+
+def address(live: bool | str) -> str | None:
+    """Return the address of the viewer for a live recording, and start one unless `live` is an address.
+
+    Returns None for a notebook, whose viewer is part of the page. Raises ValueError for any other value, and RuntimeError if the
+    viewer does not start.
+    """
+    if live == "notebook":
+        return None
+    if isinstance(live, str) and live.startswith("rerun+http"):
+        return live
+    if live not in PLACES:
+        raise ValueError(
+            f'Recorder: live = {live!r}, but it is True for a window, "web" for a page in the browser, "notebook" for one below '
+            'the cell, or the address of a viewer that runs, such as "rerun+http://127.0.0.1:9876/proxy".'
+        )
+    port, folder = free_port(), scratch()
+    _scratch.append(folder)
+    pages = Pages(free_port(), port) if live == "web" else None
+    words = pages.words if pages else ("--port", str(port))
+    process = launch(folder.name, *words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    if pages:
+        atexit.register(stop, process)  # the user can close a window, but not a server
+        print(f"Recorder: watch it at {pages.url}", flush=True)
+        webbrowser.open(pages.url)
+    _wait_for_port(process, port)
+    return f"rerun+http://{LOCAL}:{port}/proxy"
+
+
+def _wait_for_port(process: subprocess.Popen, port: int) -> None:
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end and process.poll() is None:
+        with socket.socket() as s:
+            if s.connect_ex((LOCAL, port)) == 0:
+                return
+        time.sleep(0.05)
+    stop(process)
+    raise RuntimeError(
+        "Recorder: rerun's viewer has not started. A window needs a display and a graphics driver; without them use "
+        'live="web", or record first and look later.'
+    )
+
+
+def show_below_the_cell(stream: Any) -> None:
+    """Show a rerun stream below the cell of a notebook, from now on.
+
+    Raises ImportError if rerun's part for notebooks is missing.
+    """
+    import rerun.notebook
+
+    if not rerun.notebook.HAS_NOTEBOOK:
+        raise ImportError("live=\"notebook\" needs rerun's part for notebooks: pip install 'tiverlet[notebook]'.")
+    rerun.notebook.Viewer(recording=stream).display()
+
+
+class Pages(http.server.ThreadingHTTPServer):
+    """Serves, at a port, the pages that rerun makes when launched with `words`; they show the data from port `data`.
 
     rerun's page requests news, fonts and examples from other hosts. So it passes through here, with a header by which the browser
     blocks all hosts but this machine.
     """
-    data, page = free_port(), free_port()
-    with _install_exit_signals(), scratch() as folder, Pages((LOCAL, port), page, data) as pages:
-        process = launch(folder, "--serve-web", "--port", str(data), "--web-viewer-port", str(page), path)
-        threading.Thread(target=pages.serve_forever, daemon=True).start()
-        print(f"{url_of(port, data)}   (Ctrl-C ends it)", flush=True)
-        return _wait(process)
-
-
-def url_of(page: int, data: int) -> str:
-    """Return the address of a page at port `page` that shows the data from port `data`."""
-    return f"http://{LOCAL}:{page}/?url=rerun%2Bhttp%3A%2F%2F{LOCAL}%3A{data}%2Fproxy"
-
-
-class Pages(http.server.ThreadingHTTPServer):
-    """Passes on the pages of rerun's server at port `page`. They may connect to it and to port `data`, and to no other host."""
 
     daemon_threads = True
 
-    def __init__(self, address: tuple[str, int], page: int, data: int):
-        super().__init__(address, _Page)
+    def __init__(self, port: int, data: int):
+        super().__init__((LOCAL, port), _Page)
+        page = free_port()
+        self.words = ("--serve-web", "--port", str(data), "--web-viewer-port", str(page))
+        self.url = f"http://{LOCAL}:{port}/?url=rerun%2Bhttp%3A%2F%2F{LOCAL}%3A{data}%2Fproxy"
         self.source = f"http://{LOCAL}:{page}"
         here = "'self' data: blob:"
         self.policy = (
             f"default-src {here} 'unsafe-inline' 'unsafe-eval'; connect-src {here} http://{LOCAL}:{data}; "
             "form-action 'none'; frame-ancestors 'none'; base-uri 'none'"
         )
+        threading.Thread(target=self.serve_forever, daemon=True).start()
 
 
 class _Page(http.server.BaseHTTPRequestHandler):

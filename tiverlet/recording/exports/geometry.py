@@ -10,7 +10,7 @@ from ...shapes import Shape
 from ..drawing import links, upwards
 from ..hues import BY_BODY, Coloring
 from ..scene import Parts
-from ..surfaces import covered, triangles
+from ..surfaces import covered, cross, triangles
 
 
 @dataclass(frozen=True)
@@ -104,8 +104,7 @@ def oriented(faces: np.ndarray, x: np.ndarray, up: np.ndarray) -> np.ndarray:
     """
     if x.shape[1] == 2:
         a, b, c = (x[k] for k in faces.T)
-        u, v = b - a, c - a
-        return np.where((u[:, 0] * v[:, 1] < u[:, 1] * v[:, 0])[:, None], faces[:, ::-1], faces)
+        return np.where(cross(b - a, c - a)[:, None] < 0, faces[:, ::-1], faces)
     out = faces.copy()
     for piece, turned, closed in _pieces(faces):
         out[piece[turned]] = faces[piece[turned]][:, ::-1]
@@ -135,6 +134,11 @@ def turn(up: np.ndarray) -> list[float]:
     if axis == 1:
         return [0.0, 0.0, 0.0, 1.0] if sign > 0 else [1.0, 0.0, 0.0, 0.0]
     return [0.0, 0.0, sign * half, half] if axis == 0 else [-sign * half, 0.0, 0.0, half]
+
+
+def flat(x: np.ndarray) -> np.ndarray:
+    """Return vectors (..., dim) in 3D; a 2D scene lies at z = 0."""
+    return np.pad(x, [*[(0, 0)] * (x.ndim - 1), (0, 3 - x.shape[-1])])
 
 
 def linear(hue: np.ndarray) -> np.ndarray:

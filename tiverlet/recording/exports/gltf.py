@@ -17,7 +17,7 @@ import numpy as np
 from ...colliders.round_mesh import rounded
 from ...shapes import Shape
 from ..surfaces import normals
-from .geometry import Geometry, linear, turn
+from .geometry import Geometry, flat, linear, turn
 from .sketch import extent
 from .stretch import Stretch, in_space, only
 from .walls import Wall, drawn_walls
@@ -41,7 +41,7 @@ def write(recording: "Replay", path: str, *, shape: Shape | None = None, motion:
     stretch = only(recording, path, "mesh", ".csv, .obj, .pvd, .usd or .xyz", motion, color)
     geometries = [*stretch.geometries(shape)]
     geometry = replace(geometries[0], hues=geometries[-1].hues)
-    both = [(stretch.flat(x), in_space(moved)) for (_, _, x), moved in zip(stretch, stretch.motion, strict=False)]
+    both = [(flat(x), in_space(moved)) for (_, _, x), moved in zip(stretch, stretch.motion, strict=False)]
     x = np.array([x for x, _ in both], dtype=np.float32)
     if not (x.size and np.isfinite(x).all()):
         why = "has positions that are not finite" if x.size else "has no particles"

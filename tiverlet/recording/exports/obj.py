@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from ...shapes import Shape
 from ...shapes.files import obj_faces
 from ..viewer import numbered
+from .geometry import flat
 from .stretch import stretches
 
 if TYPE_CHECKING:
@@ -28,6 +29,6 @@ def write(recording: "Replay", path: str, *, shape: Shape | None = None) -> list
             out.append(numbered(path, frame))
             with open(out[-1], "w", encoding="ascii") as file:
                 file.write(f"# frame {frame}, {time!r} s\n")
-                file.write(rows % tuple(stretch.flat(x).ravel().tolist()))
+                file.write(rows % tuple(flat(x).ravel().tolist()))
                 file.write(tail)
     return out

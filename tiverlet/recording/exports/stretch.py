@@ -13,7 +13,7 @@ from ..hues import BY_BODY, Coloring
 from ..journal import Entry
 from ..quantities import QUANTITIES
 from ..scene import Parts, set_knobs
-from .geometry import Geometry, geometry, without_broken
+from .geometry import Geometry, flat, geometry, without_broken
 
 if TYPE_CHECKING:
     from ...world import World
@@ -87,19 +87,13 @@ class Stretch:
 
         return turn
 
-    def flat(self, x: np.ndarray) -> np.ndarray:
-        """Return positions in 3D; a 2D scene lies at z = 0."""
-        out = np.zeros((len(x), 3), dtype=x.dtype)
-        out[:, : x.shape[1]] = x
-        return out
-
 
 def in_space(moved: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return velocities (n, 3), spins (n, 3) and orientations as quaternions (n, 4) (x, y, z, w). A 2D scene lies at z = 0."""
     out = {}
     for name, values in moved.items():
         if name == "velocity":
-            values = np.column_stack([values, np.zeros((len(values), 3 - values.shape[1]))])
+            values = flat(values)
         elif values.ndim == 1:
             none = np.zeros((len(values), 2))
             values = np.column_stack([none, values] if name == "spin" else [none, np.sin(values / 2), np.cos(values / 2)])
@@ -126,20 +120,15 @@ def stretches(recording: "Replay", motion: bool = False, color: Any = None) -> l
     """
     moved, coloring = recording.motion() if motion else itertools.repeat({}), recording.overlays.color
     if color is not None:
-        count = len(recording.scenes[0].entry.arrays["position"])
+        count = len(recording.scenes[0][0].arrays["position"])
         coloring = Coloring.checked("replay", color, count, recording.quantities)
     known = _known(recording, coloring)
     times = dict(zip(recording.frames.tolist(), recording.times.tolist(), strict=True))
-    out = []
-    for scene in recording.scenes:
-        if scene.frames:
-            moments = np.array([times[k] for k in scene.frames])
-            out.append(
-                Stretch(
-                    recording, scene.entry, np.array(scene.frames), moments, scene.knobs, scene.broken, moved, coloring, known
-                )
-            )
-    return out
+    return [
+        Stretch(recording, entry, np.array(frames), np.array([times[k] for k in frames]), knobs, broken, moved, coloring, known)
+        for entry, frames, knobs, broken in recording.scenes
+        if frames
+    ]
 
 
 def only(recording: "Replay", path: str, what: str, others: str, motion: bool = False, color: Any = None) -> Stretch:

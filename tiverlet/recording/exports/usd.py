@@ -9,7 +9,7 @@ import numpy as np
 
 from ...shapes import Shape
 from .extras import needed
-from .geometry import Geometry, linear, turn
+from .geometry import Geometry, flat, linear, turn
 from .sketch import extent
 from .stretch import Stretch, in_space, stretches
 from .walls import Wall, drawn_walls
@@ -69,7 +69,7 @@ class _Part:
     def write(self) -> None:
         """Write all frames."""
         of = self.geometry
-        rows = [(RATE * time, self.stretch.flat(x), in_space(moved)) for (_, time, x), moved in self._frames()]
+        rows = [(RATE * time, flat(x), in_space(moved)) for (_, time, x), moved in self._frames()]
         x = np.array([x for _, x, _ in rows])
         size = self._thin(x)
         if len(of.faces):

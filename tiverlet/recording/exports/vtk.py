@@ -13,7 +13,7 @@ import numpy as np
 
 from ...shapes import Shape
 from ..viewer import numbered
-from .geometry import Geometry
+from .geometry import Geometry, flat
 from .stretch import Stretch, in_space, stretches
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def write(recording: "Replay", path: str, *, shape: Shape | None = None, motion:
             name = numbered(f"{base}.vtu", frame)
             with open(name, "wb") as file:
                 more = [_array(name, values) for name, values in in_space(moved).items()]
-                place = _array("position", stretch.flat(x).astype(np.float32))
+                place = _array("position", flat(x).astype(np.float32))
                 file.writelines([before, *more, b"</PointData>\n<Points>\n", place, after])
             out.append(name)
             sets.append(f'<DataSet timestep="{time!r}" file={quoteattr(os.path.basename(name))}/>\n')

@@ -1,5 +1,6 @@
 """The walls and wires of a recording as triangles or lines, at their places in each frame."""
 
+from collections import defaultdict
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ from ...colliders.collider import Collider
 from ...constraints import Path
 from ...features.feature import Feature
 from ..walls import EDGE, WALL, outline
+from .geometry import flat
 
 if TYPE_CHECKING:
     from .stretch import Stretch
@@ -39,21 +41,17 @@ class Wall:
 
 def drawn_walls(stretch: "Stretch", low: np.ndarray, high: np.ndarray) -> list[Wall]:
     """Return walls and wires in each frame of a stretch, as far as they are between two corners (dim,) [m]."""
-    dim = len(low)
-    walls = [(k, f) for k, f in zip(stretch.parts.numbers, stretch.parts.features, strict=True) if isinstance(f, Collider | Path)]
-    turn, found = stretch.knobs_at(), [[] for _ in walls]
+    turn, found, out = stretch.knobs_at(), defaultdict(list), []
     for frame in stretch.frames.tolist():
         turn(frame)
-        for (_, wall), shown in zip(walls, found, strict=True):
-            shown.append(_shape(wall, low, high))
-    out = []
-    for (k, wall), shown in zip(walls, found, strict=True):
+        for k, f in zip(stretch.parts.numbers, stretch.parts.features, strict=True):
+            if isinstance(f, Collider | Path):
+                found[f"{type(f).__name__} {k}"].append(_shape(f, low, high))
+    for name, shown in found.items():
         corners, parts = shown[0]
-        same = [now if now.shape == corners.shape else corners for now, _ in shown]
-        flat = np.zeros((len(same), len(corners), 3), dtype=np.float32)
-        flat[..., :dim] = same
+        same = np.array([now if now.shape == corners.shape else corners for now, _ in shown], dtype=np.float32)
         if len(parts):
-            out.append(Wall(f"{type(wall).__name__} {k}", flat, parts, WALL if parts.shape[1] == 3 else np.array([EDGE])))
+            out.append(Wall(name, flat(same), parts, WALL if parts.shape[1] == 3 else np.array([EDGE])))
     return out
 
 

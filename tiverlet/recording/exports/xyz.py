@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .geometry import flat
 from .stretch import in_space, stretches
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ def write(recording: "Replay", path: str, *, motion: bool = False) -> list[str]:
             radii, rows = stretch.column("radius").tolist(), ""
             for (frame, time, x), moved in zip(stretch, stretch.motion, strict=False):
                 turned = in_space(moved)
-                table = np.column_stack([stretch.flat(x), *turned.values()])
+                table = np.column_stack([flat(x), *turned.values()])
                 rows = rows or "".join(f"X %.9g %.9g %.9g {r:.9g}{' %.9g' * (table.shape[1] - 3)}\n" for r in radii)
                 columns = ":".join(["species:S:1:pos:R:3:radius:R:1", *(NAMES[name] for name in turned)])
                 out.write(f'{len(x)}\nProperties={columns} Time={time!r} Frame={frame} pbc="F F F"\n')
