@@ -85,11 +85,8 @@ def limit_length(v, most, length):
 MAX_GROUPS = 1000  # groups of particles that the table can distinguish
 # The columns of a Table, the last three only where `turns`.
 STATIC, DYNAMIC, RESTITUTION, TOUCH, ROLLING, TWISTING, TANGENTIAL = COLUMNS = range(7)
-TOUCHES, SENSES, SENSED = (
-    1,
-    2,
-    3,
-)  # in column TOUCH: a particle of the one group pushes that of the other, senses it, is sensed by it
+# In column TOUCH: a particle of the one group pushes that of the other, senses it, is sensed by it.
+TOUCHES, SENSES, SENSED = 1, 2, 3
 
 
 class Table:

@@ -213,7 +213,10 @@ class Drawing:
             row.append(self._rr.Mesh3D.from_fields(vertex_positions=x32, vertex_colors=shades))
             self.bytes += shades.nbytes + x32.nbytes
         if self._lines:
-            particles, ends, shades = self._lines.strips(self._shades(level[self._line_links]))
+            shown = level[self._line_links]
+            by_strain = self._overlays.color is BY_BODY
+            shades = SCALE[shown] if by_strain else packed(self._hues[self._pairs[self._line_links]].mean(axis=1))
+            particles, ends, shades = self._lines.strips(np.where(shown < 0, -1, shades.astype(np.int64)))
             row.append(self._strips.from_fields(strips=self._packed(x32[particles], ends), colors=shades))
             self.bytes += shades.nbytes
         if self._fill:
@@ -222,12 +225,6 @@ class Drawing:
             self._log(f"{self._root}/fill", self._strips.from_fields(strips=self._packed(points, ends), colors=shades))
             self.bytes += shades.nbytes
         return row
-
-    def _shades(self, level: np.ndarray) -> np.ndarray:
-        """Return the colours of links that are lines as i64, (m,): of their strain, or the mean of their ends; -1: not drawn."""
-        by_strain = self._overlays.color is BY_BODY
-        shades = SCALE[level] if by_strain else packed(self._hues[self._pairs[self._line_links]].mean(axis=1))
-        return np.where(level < 0, -1, shades.astype(np.int64))
 
     def _packed(self, points: np.ndarray, ends: np.ndarray) -> Any:
         """Return strips of points (k, dim) in f32, the s-th from ends[s] to ends[s + 1], in rerun's own layout."""

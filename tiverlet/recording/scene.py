@@ -66,9 +66,8 @@ class Needs:
 
 def source(thing: Any) -> str:
     """Return the source of a function, a ti.func or a class; "" if there is none."""
-    plain = undecorated(thing)
     try:
-        return textwrap.dedent(inspect.getsource(plain))
+        return textwrap.dedent(inspect.getsource(undecorated(thing)))
     except (OSError, TypeError):
         return ""
 
@@ -222,13 +221,19 @@ def parts(scene: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Parts:
     for k, data in enumerate(scene["features"]):
         if any(isinstance(value, dict) and "given" in value for value in (data["class"], *data["arguments"].values())):
             continue
-        feature = _made(data, Feature, arrays, {})
-        set_knobs(feature, {name: decode(value, arrays) for name, value in data["knobs"].items()})
+        feature = _feature(data, arrays, {})
         if isinstance(feature, Batch | Collider):  # sets the dimension, and the orientation of surfaces
             came = Particles(decode(data["start"], arrays)) if "start" in data else particles
             feature.prepare(came, came.inv_mass.copy())
         features[k] = feature
     return Parts(particles, tuple(features.values()), tuple(features))
+
+
+def _feature(data: dict[str, Any], arrays: Mapping[str, np.ndarray], given: Mapping[str, Any]) -> Feature:
+    """Make a feature from its class, arguments and knobs."""
+    feature = _made(data, Feature, arrays, given)
+    set_knobs(feature, {name: decode(value, arrays) for name, value in data["knobs"].items()})
+    return feature
 
 
 def _particles(scene: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Particles:
@@ -259,14 +264,8 @@ def rebuild(
             checks.warn(f"replay: {name} reads otherwise than when it was recorded; the bits may differ.")
 
     particles = _particles(scene, arrays)
-    everyone = np.ones(len(particles), dtype=bool)
-    features, starts = [], []
-    for data in scene["features"]:
-        start = decode(data["start"], arrays) if "start" in data else None
-        starts.append(None if start is None else particles.regrouped(everyone, position=start))
-        feature = _made(data, Feature, arrays, given)
-        set_knobs(feature, {name: decode(value, arrays) for name, value in data["knobs"].items()})
-        features.append(feature)
+    starts = [particles.placed(decode(data["start"], arrays)) if "start" in data else None for data in scene["features"]]
+    features = [_feature(data, arrays, given) for data in scene["features"]]
     for k, values in knob_values:
         set_knobs(features[k], values)
     for feature, names in zip(features, once, strict=True):

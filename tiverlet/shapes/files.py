@@ -94,36 +94,29 @@ def _obj(name: str, data: bytes):
 
     def numbers(words: list[str], count: int) -> list[int]:
         """Convert vertex numbers of a file to indices from 0; -1 for the invalid number 0."""
-        found = [int(w) for w in words]
-        return [i - 1 if i > 0 else count + i if i < 0 else -1 for i in found]
+        return [i - 1 if i > 0 else count + i if i < 0 else -1 for i in map(int, words)]
 
     text = re.sub(r"\\\r?\n", " ", data.decode("utf-8-sig", "replace"))  # some programs begin a file with a byte order mark
     for number, line in enumerate(text.splitlines(), 1):
-        words = line.partition("#")[0].split()
-        if not words or words[0] not in ("v", "vt", "l", "f"):
-            continue
+        kind, *words = line.partition("#")[0].split() or [""]
         try:
-            if words[0] == "v":
-                points.append([float(w) for w in words[1:4]])
-                if len(points[-1]) != 3:
-                    raise ValueError
-            elif words[0] == "vt":
-                places.append([*(float(w) for w in words[1:3]), 0.0][:2])
-                if len(words) < 2:
-                    raise ValueError
-            else:
-                corners = [w.split("/") for w in words[1:]]
+            if kind == "v":
+                x, y, z = words[:3]
+                points.append([float(x), float(y), float(z)])
+            elif kind == "vt":
+                u, v = [*words[:2], "0"][:2]
+                places.append([float(u), float(v)])
+            elif kind in ("l", "f"):
+                corners = [f"{w}/".split("/") for w in words]
                 indices = numbers([c[0] for c in corners], len(points))
-                if len(indices) < (2 if words[0] == "l" else 3):
+                at = numbers([c[1] for c in corners], len(places)) if kind == "f" and all(c[1] for c in corners) else []
+                if len(indices) < (2 if kind == "l" else 3) or (at and not 0 <= min(at) <= max(at) < len(places)):
                     raise ValueError
-                if words[0] == "l":
-                    edges += list(zip(indices, indices[1:], strict=False))
-                    continue
-                polygons.append(indices)
-                has = all(len(c) > 1 and c[1] for c in corners)
-                textures.append(numbers([c[1] for c in corners], len(places)) if has else [])
-                if textures[-1] and not 0 <= min(textures[-1]) <= max(textures[-1]) < len(places):
-                    raise ValueError
+                if kind == "l":
+                    edges += zip(indices, indices[1:], strict=False)
+                else:
+                    polygons.append(indices)
+                    textures.append(at)
         except ValueError:
             raise ValueError(f"load: {name}, line {number}: {line.strip()!r} cannot be understood.") from None
     none = np.zeros((0, 4), dtype=np.int64)
@@ -197,14 +190,9 @@ def _ply(name: str, data: bytes):
             if len(cell) != 4:
                 raise ValueError(f"load: {name}: element {element} {k} has {len(cell)} corners, but tetrahedra have 4.")
             cells.append(cell)
-    return (
-        np.stack([np.array(vertex[c], dtype=np.float64) for c in "xyz"], axis=1),
-        np.array([edge.get("vertex1", []), edge.get("vertex2", [])], dtype=np.int64).T.reshape(-1, 2),
-        _fans(_lists(found, "face")),
-        np.array(cells, dtype=np.int64).reshape(-1, 4),
-        (),
-        (),
-    )
+    position = np.column_stack([np.array(vertex[c], dtype=np.float64) for c in "xyz"])
+    edges = np.array([edge.get("vertex1", []), edge.get("vertex2", [])], dtype=np.int64).T
+    return position, edges, _fans(_lists(found, "face")), np.array(cells, dtype=np.int64).reshape(-1, 4), (), ()
 
 
 def _lists(found: dict, element: str) -> list:

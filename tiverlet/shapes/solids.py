@@ -221,10 +221,7 @@ def _delaunay(points: np.ndarray) -> np.ndarray:
             + lengths[1] * (c[:, 0] * a[:, 1] - c[:, 1] * a[:, 0])
             + lengths[2] * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
         ) > 0
-        old = triangles[inside]
-        edges = np.concatenate([old[:, [0, 1]], old[:, [1, 2]], old[:, [2, 0]]])
-        _, inverse, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
-        rim = edges[counts[inverse.ravel()] == 1]
+        rim, _ = single_edges(triangles[inside])
         triangles = np.concatenate([triangles[~inside], np.column_stack([rim, np.full(len(rim), k)])])
     triangles = triangles[(triangles < n).all(axis=1)]
     u, v = x[triangles[:, 1]] - x[triangles[:, 0]], x[triangles[:, 2]] - x[triangles[:, 0]]

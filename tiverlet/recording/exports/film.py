@@ -36,7 +36,7 @@ def write(
     """Write a film in the scene's own time, RATE pictures a second; each picture shows the nearest frame."""
     look = Look.checked(size, camera, theme, recording.scenes[0][0].arrays["position"].shape[1])
     kind = os.path.splitext(path)[1].lower()
-    video = _ffmpeg(path) if kind == ".mp4" else ""
+    video = kind == ".mp4" and (shutil.which("ffmpeg") or needed("imageio_ffmpeg", path).get_ffmpeg_exe())
     if not len(recording.frames):
         raise ValueError(f"replay: {recording.path} has no frame, so there is nothing for {path}.")
     pictures = _pictures(recording, stretches(recording, color=color), shape, look)
@@ -57,11 +57,6 @@ def write(
         if process.returncode:
             raise RuntimeError(f"replay: ffmpeg did not write {path}: {said.read().decode(errors='replace').strip()}")
     return [path]
-
-
-def _ffmpeg(path: str) -> str:
-    """Return the path of ffmpeg."""
-    return shutil.which("ffmpeg") or needed("imageio_ffmpeg", path).get_ffmpeg_exe()
 
 
 def _pictures(recording: "Replay", found: list[Stretch], shape: Shape | None, look: Look) -> Iterator[Any]:

@@ -1,6 +1,6 @@
 """The geometry of a recording for other programs: faces, links, and single particles."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,7 +67,9 @@ def geometry(parts: Parts, shape: Shape | None = None, coloring: Coloring = BY_B
         )
     up = upwards(parts)
     if shape is None:
-        found = oriented(distinct(triangles(parts)), particles.position, up)
+        every = triangles(parts)
+        _, first = np.unique(np.sort(every, axis=1), axis=0, return_index=True)  # some are there several times
+        found = oriented(every[np.sort(first)], particles.position, up)
         faces, uv = tuple(found), (np.zeros((0, 2)),) * len(found)
     else:
         faces, uv = shape.surface
@@ -91,12 +93,6 @@ def without_broken(of: Geometry, parts: Parts, broken: Mapping[int, np.ndarray])
     return replace(of, links=pairs, loose=np.flatnonzero(~hidden & ~np.isin(every, pairs)))
 
 
-def distinct(faces: np.ndarray) -> np.ndarray:
-    """Return each triangle once, (t, 3): constraints at several edges of a triangle each give it."""
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    return faces[np.sort(first)]
-
-
 def oriented(faces: np.ndarray, x: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Return triangles with a consistent orientation: of two that share an edge, both have the same sense.
 
@@ -105,26 +101,16 @@ def oriented(faces: np.ndarray, x: np.ndarray, up: np.ndarray) -> np.ndarray:
     if x.shape[1] == 2:
         a, b, c = (x[k] for k in faces.T)
         return np.where(cross(b - a, c - a)[:, None] < 0, faces[:, ::-1], faces)
-    out = faces.copy()
-    for piece, turned, closed in _pieces(faces):
-        out[piece[turned]] = faces[piece[turned]][:, ::-1]
+    _, which, number = edges_of(faces)
+    turned, pieces, _ = common_sense(faces)
+    out = np.where(turned[:, None], faces[:, ::-1], faces)
+    for piece in np.split(np.argsort(pieces, kind="stable"), np.cumsum(np.bincount(pieces))[:-1]) if len(faces) else []:
+        closed = (number[which[piece]] == 2).all()  # it has no edge that is not shared by two triangles
         a, b, c = (x[k] - x[faces[piece[0], 0]] for k in out[piece].T)
         normal = np.cross(b - a, c - a)
         if float((a * normal).sum() if closed else (normal @ up).sum()) < 0:
             out[piece] = out[piece][:, ::-1]
     return out
-
-
-def _pieces(faces: np.ndarray) -> Iterable[tuple[np.ndarray, np.ndarray, bool]]:
-    """Yield the pieces connected by edges that two triangles share.
-
-    For each piece: its triangles, which of them have the other sense than the first, and whether the piece is closed (has no
-    other edges).
-    """
-    _, which, number = edges_of(faces)
-    turned, pieces, _ = common_sense(faces)
-    for piece in np.split(np.argsort(pieces, kind="stable"), np.cumsum(np.bincount(pieces))[:-1]) if len(faces) else []:
-        yield piece, turned[piece], bool((number[which[piece]] == 2).all())
 
 
 def turn(up: np.ndarray) -> list[float]:

@@ -101,6 +101,11 @@ def extent(parts: Parts, frames: Sequence[np.ndarray] | np.ndarray) -> tuple[np.
     return walled(parts.features, low, high)
 
 
+def means(hues: np.ndarray, corners: np.ndarray) -> list[tuple[int, ...]]:
+    """Return the mean colours of the corners (m, k) of faces or lines."""
+    return [tuple(hue) for hue in hues[corners].mean(axis=1).astype(int).tolist()]
+
+
 class Sketch:
     """Draws frames of a scene. view: the view of all frames. extent: two corners [m] between which walls are drawn."""
 
@@ -131,8 +136,7 @@ class Sketch:
         """Return triangles to draw. depth: reduces the depths of three corners to that of the triangle."""
         at, near = self._view.place(x)
         places, nearness = at[triangles].reshape(-1, 6).tolist(), depth(near[triangles], axis=1).tolist()
-        shades = map(tuple, hues[triangles].mean(axis=1).astype(int).tolist())
-        return [(d, "face", p, hue, 0) for d, p, hue in zip(nearness, places, shades, strict=True)]
+        return [(d, "face", p, hue, 0) for d, p, hue in zip(nearness, places, means(hues, triangles), strict=True)]
 
     def _faces(self, x: np.ndarray) -> list[tuple]:
         hues = self._hues if self._flat else np.rint(lit(self._hues, self._triangles, x, self._up))
@@ -146,19 +150,15 @@ class Sketch:
         along = (b - a) / np.maximum(np.linalg.norm(b - a, axis=1), 1e-30)[:, None]
         out = (self._view.scale * radius)[:, None] * np.stack([along[:, 1], -along[:, 0]], axis=1)
         bands = np.concatenate([a + out, b + out, b - out, a - out], axis=1).tolist()
-        hues = map(tuple, self._hues[edges].mean(axis=1).astype(int).tolist())
-        return [(0.0, "face", band, hue, 0) for band, hue in zip(bands, hues, strict=True)] + self._discs(x, edges[:, 0])
+        faces = [(0.0, "face", band, hue, 0) for band, hue in zip(bands, means(self._hues, edges), strict=True)]
+        return faces + self._discs(x, edges[:, 0])
 
     def _links(self, x: np.ndarray, links: np.ndarray) -> list[tuple]:
         at, near = self._view.place(x)
-        out, width = [], round(2 * self._view.line * LINE)
-        across = crosses_box(box_of(self._parts), x[links[:, 0]] - x[links[:, 1]]) if len(links) else np.zeros(0, dtype=bool)
-        for i, j in links[~across].tolist():
-            places = [*at[i].tolist(), *at[j].tolist()]
-            out.append(
-                ((near[i] + near[j]) / 2, "line", places, tuple(self._hues[[i, j]].mean(axis=0).astype(int).tolist()), width)
-            )
-        return out
+        pairs = links[~crosses_box(box_of(self._parts), x[links[:, 0]] - x[links[:, 1]])]
+        width = round(2 * self._view.line * LINE)
+        places, nearness = at[pairs].reshape(-1, 4).tolist(), near[pairs].mean(axis=1).tolist()
+        return [(d, "line", p, hue, width) for d, p, hue in zip(nearness, places, means(self._hues, pairs), strict=True)]
 
     def _discs(self, x: np.ndarray, some: np.ndarray) -> list[tuple]:
         at, near = self._view.place(x)

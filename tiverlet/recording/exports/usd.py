@@ -69,9 +69,10 @@ class _Part:
     def write(self) -> None:
         """Write all frames."""
         of = self.geometry
-        rows = [(RATE * time, flat(x), in_space(moved)) for (_, time, x), moved in self._frames()]
+        both = zip(self.stretch, self.stretch.motion, strict=False)
+        rows = [(RATE * time, flat(x), in_space(moved)) for (_, time, x), moved in both]
         x = np.array([x for _, x, _ in rows])
-        size = self._thin(x)
+        size = THIN * (float(np.ptp(x, axis=(0, 1)).max()) or 1.0) if x.size else THIN  # width of lines [m]
         if len(of.faces):
             at = np.unique(of.around)
             mesh = self._mesh("surfaces", [len(face) for face in of.faces], np.searchsorted(at, of.around))
@@ -86,13 +87,6 @@ class _Part:
             self._particles(rows, single, size)
         for wall in drawn_walls(self.stretch, *extent(self.stretch.parts, x[:, :, : self.stretch.parts.particles.dim])):
             self._wall(wall, [code for code, _, _ in rows], size)
-
-    def _frames(self) -> Any:
-        return zip(self.stretch, self.stretch.motion, strict=False)
-
-    def _thin(self, x: np.ndarray) -> float:
-        """Return the width of lines [m]."""
-        return THIN * (float(np.ptp(x, axis=(0, 1)).max()) or 1.0) if x.size else THIN
 
     def _links(self, rows: list[tuple], size: float) -> None:
         """Write links as lines of two points; those that broke are left out."""

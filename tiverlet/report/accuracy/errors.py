@@ -151,18 +151,12 @@ class ErrorReport(Report):
     def json(self) -> str:
         """Return the report as JSON."""
         cases = {n: {k: getattr(CASES[n], k) for k in ("title", "unit", "seconds", "limit", "trusted")} for n in self.cases}
-        return json.dumps(
-            {
-                "machine": self.machine,
-                "cases": cases,
-                "points": [plain(asdict(p)) for p in self.points],
-                "orders": {f"{c}, {m}": o for c in self.cases for m in CASES[c].methods if (o := self.order(c, m))},
-                "failures": {k: list(v) for k, v in self.failures.items()},
-                "missing": [asdict(m) for m in self.missing],
-                "omissions": self.omissions,
-            },
-            indent=1, allow_nan=False,
-        )  # fmt: skip
+        orders = {f"{c}, {m}": o for c in self.cases for m in CASES[c].methods if (o := self.order(c, m))}
+        report = {
+            "machine": self.machine, "cases": cases, "points": [plain(asdict(p)) for p in self.points], "orders": orders,
+            "failures": self.failures, "missing": [asdict(m) for m in self.missing], "omissions": self.omissions,
+        }  # fmt: skip
+        return json.dumps(report, indent=1, allow_nan=False)
 
     def plot(self, folder) -> list[str]:
         """Plot each case log-log, as PNG in `folder`; return the paths. Needs matplotlib (the extra "plots").

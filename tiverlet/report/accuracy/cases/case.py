@@ -64,7 +64,7 @@ class Case:
     """A scene with a known answer, built only through public names.
 
     name: the name of its entry in cases.json, with a suffix if the entry has several cases.
-    build: () -> particles and features, new ones at each call.
+    build: () -> particles, and new features at each call.
     seconds: when the error is measured [s], a whole number of frames of `frame` [s].
     error: Run -> error in `unit`. watch: World -> an array to store after every frame, for errors of whole runs.
     size: the error in `unit` beyond which a run counts as diverged: that of a run unrelated to the answer.

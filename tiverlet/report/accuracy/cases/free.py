@@ -96,14 +96,12 @@ def mode(j: int, limit: float) -> Case:
     u[-1] = 0
     want = x + np.cos(values[f"mode{j}"]["omega"] * seconds) * u
 
-    def build() -> Scene:
-        """Build a chain, displaced along its mode."""
-        link = Distance(links(n + 1), p["rest"], compliance=p["alpha"])
-        return Particles(x + u, mass=p["m"], pinned=[0, n + 1]), [link]
-
-    title = f"Mode {j} of a chain of {n} masses on springs"
-    methods = ("Direct", "Jacobi")
-    return Case(f"R12_chain_modes:{j}", title, build, seconds, ends_at(slice(None), want), limit, 0.01, methods=methods)
+    start = Particles(x + u, mass=p["m"], pinned=[0, n + 1])
+    return Case(
+        f"R12_chain_modes:{j}", f"Mode {j} of a chain of {n} masses on springs",
+        lambda: (start, [Distance(links(n + 1), p["rest"], compliance=p["alpha"])]), seconds, ends_at(slice(None), want), limit,
+        0.01, methods=("Direct", "Jacobi"),
+    )  # fmt: skip
 
 
 def sway(n: int, limit: float) -> Case:
@@ -114,14 +112,10 @@ def sway(n: int, limit: float) -> Case:
     u = np.concatenate([[0.0], np.linalg.eigh(K)[1][:, 0]])
     x = np.stack([1e-4 * u / np.abs(u).max(), np.zeros(n + 1)], axis=1)
     x[1:, 1] = -np.cumsum(np.sqrt(1 / n**2 - np.diff(x[:, 0]) ** 2))
-    want = np.cos(omega * seconds)
-
-    def build() -> Scene:
-        """Build a hanging chain, displaced along its slowest mode."""
-        return Particles(x, pinned=[0]), [Gravity(9.81), Distance(links(n), 1 / n)]
-
+    want, start = np.cos(omega * seconds), Particles(x, pinned=[0])
     return Case(
-        f"R13_hanging_chain_modes:N{n}", f"Slowest mode of a hanging chain of {n} links", build, seconds,
+        f"R13_hanging_chain_modes:N{n}", f"Slowest mode of a hanging chain of {n} links",
+        lambda: (start, [Gravity(9.81), Distance(links(n), 1 / n)]), seconds,
         lambda run: abs(float(run.world.position[:, 0] @ u / (x[:, 0] @ u)) - want), limit, 1.0, "relative",
         methods=("Direct", "Jacobi"), trusted=1e-8, conserves=False,
     )  # fmt: skip

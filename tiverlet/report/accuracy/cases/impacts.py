@@ -9,19 +9,14 @@ from ....particles import Particles
 from .case import Case, Run, Scene, known, rms, sideways
 
 
-def bumped(masses: tuple[float, float], speeds: tuple[float, float], e: float) -> Scene:
-    """Build R14: two balls that collide head on."""
-    start = Particles([[-0.3, 0], [0.3, 0]], velocity=[[speeds[0], 0], [speeds[1], 0]], mass=masses, radius=0.1)
-    return start, [Contact(restitution=e)]
-
-
 def head_on(m1: float, m2: float, u1: float, u2: float, e: float) -> Case:
-    """Return a case of R14: the velocities after the collision."""
+    """Return a case of R14: the velocities of two balls after a collision head on."""
+    start = Particles([[-0.3, 0], [0.3, 0]], velocity=[[u1, 0], [u2, 0]], mass=(m1, m2), radius=0.1)
     key = f"m{m1:g}_{m2:g}_u{u1:g}_{u2:g}_e{e:g}"
     v = known("R14_collision_1d")["values"][key]
     title = f"Head-on collision, masses {m1:g} and {m2:g}, e = {e:g}"
     return Case(
-        f"R14_collision_1d:{key}", title, lambda: bumped((m1, m2), (u1, u2), e), 0.4,
+        f"R14_collision_1d:{key}", title, lambda: (start, [Contact(restitution=e)]), 0.4,
         lambda run: rms(run.world.velocity, [[v["v1"], 0], [v["v2"], 0]]), 1e-9, u1, "m/s", efforts=(5, 10, 20, 40),
         order=None, momentum=sideways, conserves=e == 1,
     )  # fmt: skip
@@ -41,15 +36,11 @@ def turned(run: Run) -> float:
     return float(np.abs(np.arctan2(v[:, 1], v[:, 0]) - np.arctan2(want[:, 1], want[:, 0])).max())
 
 
-def dropped(e: float) -> Scene:
-    """Build R16: a ball dropped on a floor."""
-    return Particles([[0.0, 1.1]], radius=0.1), [Gravity(9.81), HalfSpace((0, 1), restitution=e)]
-
-
 def bounces(e: float, limit: float) -> Case:
     """Return a case of R16: the relative errors of the first three bounce heights, from the parabolas between impacts."""
     want = np.array(known(f"R16_bounce_e{e}")["values"]["heights"][:3])
     times = known(f"R16_bounce_e{e}")["values"]["impact_times"]
+    start = Particles([[0.0, 1.1]], radius=0.1)
 
     def error(run: Run) -> float:
         """Return the largest relative error of the heights between impacts."""
@@ -61,7 +52,8 @@ def bounces(e: float, limit: float) -> Case:
         return float(np.abs(np.array(found[:3]) / want - 1).max())
 
     return Case(
-        f"R16_bounce_e{e}", f"Ball that bounces, e = {e}", lambda: dropped(e), times[4],
+        f"R16_bounce_e{e}", f"Ball that bounces, e = {e}",
+        lambda: (start, [Gravity(9.81), HalfSpace((0, 1), restitution=e)]), times[4],
         error, limit, 1.0, "relative", times[4] / 150,
         lambda w: np.array([w.position[0, 1] - 0.1, w.velocity[0, 1]]), efforts=(2, 5, 10, 20, 40), order=None, conserves=False,
     )  # fmt: skip
@@ -76,20 +68,14 @@ def cradle() -> Scene:
     return Particles(x, velocity=[[1.0, 0]] + [[0, 0]] * 4, radius=p["r"]), [Contact(restitution=1.0)]
 
 
-def slope(degrees: float, mu: float, speed: float) -> Scene:
-    """Build R18: a disc that slides down an incline at `speed` [m/s]."""
-    a = np.radians(degrees)
-    n, t = np.array([np.sin(a), np.cos(a)]), np.array([np.cos(a), -np.sin(a)])
-    return Particles([0.1 * n], velocity=speed * t, radius=0.1), [Gravity(9.81), HalfSpace(n, friction=mu)]
-
-
 def slides(degrees: int, mu: float, speed: int, limit: float) -> Case:
-    """Return a case of R18: the distance until the disc stops, or in a second."""
+    """Return a case of R18: a disc on an incline, the distance until it stops, or in a second."""
     key = f"{degrees}deg_mu{mu:g}_v{speed}"
     v = known("R18_incline_friction")["values"][key]
     stops, a = v["state"] != "slides", np.radians(degrees)
     want = v["stop_distance"] if stops else v["distance_1s"]
-    way = np.array([np.cos(a), -np.sin(a)])
+    way, up = np.array([np.cos(a), -np.sin(a)]), np.array([np.sin(a), np.cos(a)])
+    start = Particles([0.1 * up], velocity=speed * way, radius=0.1)
 
     def error(run: Run) -> float:
         """Return the relative error of the sliding distance."""
@@ -97,8 +83,8 @@ def slides(degrees: int, mu: float, speed: int, limit: float) -> Case:
 
     return Case(
         f"R18_incline_friction:{key}", f"Incline of {degrees} degrees, friction {mu:g}, {speed} m/s",
-        lambda: slope(degrees, mu, speed), 3.0 if stops else 1.0, error, limit, 1.0, "relative", efforts=(2, 5, 10, 20, 40),
-        order=None, conserves=False,
+        lambda: (start, [Gravity(9.81), HalfSpace(up, friction=mu)]), 3.0 if stops else 1.0, error,
+        limit, 1.0, "relative", efforts=(2, 5, 10, 20, 40), order=None, conserves=False,
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from ....device import ti
 from ....forces import Drag, Force, Gravity
 from ....particles import Particles
 from ....shapes import net
-from .case import Case, Run, Scene, ends_at, known, links
+from .case import Case, Scene, ends_at, known, links
 
 RATE = 4.0  # [1/s] of the drag that brings scenes to rest; after 10 s exp(-20) of a swing is left
 FINER: dict[str, Any] = {"efforts": (10, 20, 40, 80, 160)}  # for scenes that need more substeps for the order of Jacobi
@@ -35,21 +35,15 @@ def sags(name: str, key: str, n: int, length: float, span: float, alpha: float, 
     )  # fmt: skip
 
 
-def plumb(name: str) -> Scene:
-    """Build R11: an elastic chain that hangs straight down."""
-    p = known(name)["params"]
-    n = p["links"]
-    x = np.stack([np.zeros(n + 1), -p["rest"] * np.arange(n + 1)], axis=1)
-    link = Distance(links(n), p["rest"], compliance=p["alpha"])
-    return Particles(x, mass=p["m"], pinned=[0]), [Gravity(p["g"]), link, Drag(2.0)]
-
-
 def stretches(name: str, limit: float, **more) -> Case:
-    """Return the case of a hanging elastic chain: the relative error of its elongation alpha m g N (N + 1) / 2."""
+    """Return the case of an elastic chain that hangs straight down: the relative error of its elongation
+    alpha m g N (N + 1) / 2."""
     p, v = known(name)["params"], known(name)["values"]
-    length = p["links"] * p["rest"]
+    n, length = p["links"], p["links"] * p["rest"]
+    start = Particles(np.stack([np.zeros(n + 1), -p["rest"] * np.arange(n + 1)], axis=1), mass=p["m"], pinned=[0])
     return Case(
-        name, f"Elastic chain of {p['links']} links, {p['alpha']:g} m/N, hanging", lambda: plumb(name), 20.0,
+        name, f"Elastic chain of {n} links, {p['alpha']:g} m/N, hanging",
+        lambda: (start, [Gravity(p["g"]), Distance(links(n), p["rest"], compliance=p["alpha"]), Drag(2.0)]), 20.0,
         lambda run: abs(float(-run.world.position[-1, 1] - length) / v["total_elongation"] - 1), limit, 1.0, "relative",
         methods=("Direct", "Jacobi"), **SETTLED, **more,
     )  # fmt: skip
@@ -74,26 +68,16 @@ def cantilever() -> Scene:
     return Particles(x, mass=0.3, pinned=[0, 1]), [Force(_pull), strip, bend, Drag(3.0)]
 
 
-def hammock(n: int, alpha: float) -> Scene:
-    """Build S08: a net of n x n cells in a pinned frame of 1 m."""
-    flat = net((0, 0, 0), (1, 0, 0), (0, 0, 1), (n + 1, n + 1))
-    edge = (flat.position[:, [0, 2]] % 1 == 0).any(axis=1)
-    link = Distance(flat.links, 1 / n, compliance=alpha)
-    return Particles(flat.position, mass=1 / n**2, pinned=edge), [Gravity(9.81), link, Drag(RATE)]
-
-
 def hollows(n: int, alpha: float, limit: float) -> Case:
-    """Return the case of a net under its weight: the relative error of the sag of its middle."""
-    key = f"n{n}_alpha{alpha:g}"
+    """Return the case of a net in a pinned frame of 1 m under its weight: the relative error of the sag of its middle."""
+    key, flat = f"n{n}_alpha{alpha:g}", net((0, 0, 0), (1, 0, 0), (0, 0, 1), (n + 1, n + 1))
     want = known("S08_net_sag")["values"][key]["center_y"]
-
-    def error(run: Run) -> float:
-        """Return the relative error of the sag in the middle."""
-        return abs(float(run.world.position[(n + 1) ** 2 // 2, 1]) / want - 1)
-
+    start = Particles(flat.position, mass=1 / n**2, pinned=(flat.position[:, [0, 2]] % 1 == 0).any(axis=1))
     return Case(
-        f"S08_net_sag:{key}", f"Net of {n} x {n} cells, {alpha:g} m/N", lambda: hammock(n, alpha), 12.0, error, limit, 1.0,
-        "relative", methods=("CG x 20", "Jacobi"), **{**SETTLED, **FINER},
+        f"S08_net_sag:{key}", f"Net of {n} x {n} cells, {alpha:g} m/N",
+        lambda: (start, [Gravity(9.81), Distance(flat.links, 1 / n, compliance=alpha), Drag(RATE)]), 12.0,
+        lambda run: abs(float(run.world.position[(n + 1) ** 2 // 2, 1]) / want - 1), limit, 1.0, "relative",
+        methods=("CG x 20", "Jacobi"), **{**SETTLED, **FINER},
     )  # fmt: skip
 
 

@@ -34,11 +34,8 @@ def _ratio() -> Findings:
         yield f"Jacobi reports {residual:.1e}", residual >= now * (1 - 1e-9) and residual > 1e-3
 
 
-@row(
-    2,
-    "mass ratio of 1:1e6",
-    "as accurate with enough substeps, by hand or by the controller (1e-6 m); with too few bounded and flagged",
-)
+@row(2, "mass ratio of 1:1e6",
+     "as accurate with enough substeps, by hand or by the controller (1e-6 m); with too few bounded and flagged")  # fmt: skip
 def _million() -> Findings:
     want = known("D07_massratio_1000000")["values"]["t0.5"]["heavy_xy"]
     particles, features = hung("D07_massratio_1000000")

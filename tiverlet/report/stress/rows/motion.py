@@ -184,11 +184,8 @@ def _floor() -> Findings:
     yield f"{error:.1e} m", error <= 2e-4
 
 
-@row(
-    84,
-    "drag, rate h = 1e-6 ... 1e4",
-    "the velocity is that of the closed form to 1e-6, in every precision, also after another dt",
-)
+@row(84, "drag, rate h = 1e-6 ... 1e4",
+     "the velocity is that of the closed form to 1e-6, in every precision, also after another dt")  # fmt: skip
 def _dragged() -> Findings:
     h = 1e-3
     for precision in ("f32", "f32-compensated", "f64"):

@@ -15,11 +15,8 @@ from .row import Findings, finite, row, summary, world
 G = 9.81
 
 
-@row(
-    73,
-    "nets pinned at the rim, at four corners, drawn straight between two pins",
-    "no energy: any solver, 2, 20, 200 substeps and auto",
-)
+@row(73, "nets pinned at the rim, at four corners, drawn straight between two pins",
+     "no energy: any solver, 2, 20, 200 substeps and auto")  # fmt: skip
 def _taut() -> Findings:
     n, m = 10, 1e-3
     sheet, k = net((0, 0, 0), (1, 0, 0), (0, 0, 1), (n, n)), np.arange(n * n).reshape(n, n)
@@ -43,11 +40,8 @@ def _taut() -> Findings:
     yield from summary(f"energy {most:+.0e} of m g L at most", holds)
 
 
-@row(
-    79,
-    "cloth, rigid or of 1e-6 m/N, with Dihedral, in wind, under a ball that moves",
-    "no energy, and flagged where it stretches",
-)
+@row(79, "cloth, rigid or of 1e-6 m/N, with Dihedral, in wind, under a ball that moves",
+     "no energy, and flagged where it stretches")  # fmt: skip
 def _wide() -> Findings:
     n, mass, gale, speed = 60, 0.2, 3.0, 1.0
     sheet = cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (n, n))

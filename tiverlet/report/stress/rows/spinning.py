@@ -41,11 +41,8 @@ def _unequal() -> Findings:
             yield f"1 : {heavy:g} hit", w.velocity[1, 0] > -2.0
 
 
-@row(
-    102,
-    "particles without a radius among those that spin",
-    "a spin of theirs is refused by name; without one they touch as before",
-)
+@row(102, "particles without a radius among those that spin",
+     "a spin of theirs is refused by name; without one they touch as before")  # fmt: skip
 def _points() -> Findings:
     yield from refused((lambda: Particles([(0, 0), (1, 0)], radius=[0.1, 0.0], spin=[1.0, 2.0]), r"spin\[1\]"))
     start = Particles([(0, 0.5), (0.05, 0.9)], radius=[0.1, 0.0], spin=[30.0, 0.0])
