@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .features.unknown_names import no_name
+from .geometry.intervals import cross_2d
 from .neighbours.queries import between
 from .particles.spin import moments_of_inertia
 
@@ -38,7 +39,7 @@ def angular_momentum(world: "World", about=None) -> np.ndarray:
 def moment_sum(r: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Return the sum of r x p of vectors (n, dim): (1,) in 2D, (3,) in 3D."""
     if r.shape[1] == 2:
-        return np.array([np.sum(r[:, 0] * p[:, 1] - r[:, 1] * p[:, 0])])
+        return np.array([np.sum(cross_2d(r, p))])
     return np.cross(r, p).sum(axis=0)
 
 
@@ -49,10 +50,7 @@ def torque(world: "World") -> np.ndarray:
 
 
 def center_of_mass(world: "World") -> np.ndarray:
-    """Return the center of mass of the particles that can move [m], (dim,). Raises ValueError if there are none.
-
-    Particles that the scene holds (pinned, of infinite mass) have no weight beside others.
-    """
+    """Return the center of mass of particles that can move [m], (dim,). Raises ValueError if there are none."""
     m = _mass(world)
     if not m.any():
         raise ValueError("measure.center_of_mass: no particle can move. The mean position is world.position.mean(axis=0).")

@@ -69,10 +69,7 @@ class Ball(Collider):
 
     @property
     def needs_repeat(self) -> bool:
-        """Whether one round may not be enough.
-
-        Inside, motion along the surface leads out, and a bounce may lead to the other end.
-        """
+        """Whether one round may not be enough: inside, motion along the surface or a bounce may lead to the other end."""
         return self.inside and (self.dev.surface.has_friction or self.dev.surface.has_restitution)
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
@@ -149,10 +146,7 @@ class Ball(Collider):
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, mode):
-        """Press the particle at the surface where it was met, or where it is nearest.
-
-        For particles that slide inside, the normal is the one at the start of the displacement.
-        """
+        """Press the particle where it met the surface or is nearest; one that slides inside, along the normal at its start."""
         center, moved = self.dev.center.at(frame_fraction[1]), self.dev.center.step(frame_fraction)
         r = self.dev.state.nearest(self.dev.state.place(i) - center)
         own = self.own()

@@ -23,10 +23,7 @@ def holding_bodies(batches: "list[Batch]") -> "list[Batch]":
 
 
 def can_have_impacts(scene: "Scene", batches: "list[Batch]") -> bool:
-    """Whether there can be passes beside the regular ones of every substep.
-
-    Particles bounce alone in stages of higher orders, and where passes are steps of a semi-iteration, whose number is fixed.
-    """
+    """Whether there can be extra passes: not in stages of higher orders, nor in a semi-iteration of a fixed number."""
     return bool(holding_bodies(batches)) and scene.order == 2 and not scene.slots.semi_iteration
 
 
@@ -46,36 +43,28 @@ def stops_bodies(scene: "Scene", batches: "list[Batch]") -> bool:
 class BodyImpacts:
     """A linked particle that strikes a wall leaves it with -e times its normal velocity, and takes its body along.
 
-    A wall alone would stop the particle and not its body. The links would find that one substep later, take half of it back, and
-    so on: with y the height of the upper end of an upright rod above where the rod is unstrained, and d its displacement,
-
-        y' = (y + d) / 2,    d' = (d - y) / 2,    eigenvalues (1 +- i) / 2.
-
-    This is a vibration with a period of eight substeps, whatever their length, and after a quarter of it the rod takes off, at a
-    quarter of its speed. So in a substep with such an impact there are more passes, at most FEW or MANY, until two conditions
-    hold. Constraints are met, as far as a pass meets them, and the struck particle has the normal displacement t = -e d_n, with
-    d_n that before the substep. So the impact is at the start of the substep, and positions agree with displacements. For e = 0,
-    t is that with which the particle ends the substep on the wall. After each pass the sum p >= 0 of all pushes on the particle
-    is corrected, p' = max(p + t - d.n, 0).
+    A wall alone would stop the particle and not its body, whose links would take half of that back a substep later, and so on: an
+    upright rod would take off at a quarter of its speed, whatever the substep. So in a substep with such an impact there are more
+    passes, at most FEW or MANY, until constraints are met, as far as a pass meets them, and the struck particle has the normal
+    displacement t = -e d_n, with d_n that before the substep: the impact is at its start, and positions agree with displacements.
+    For e = 0, t is that with which the particle ends the substep on the wall. After each pass the sum p >= 0 of all pushes on the
+    particle is corrected, p' = max(p + t - d.n, 0).
 
     Constraints take into account that the wall will do that: while p > 0, they have their gradients at the particle, and so its
     part in the matrix, without the direction of the normal. So one pass suffices where they are solved exactly, for any body and
     any number of struck particles; there is another one if a particle was struck by it or came free, and for e > 0, until what is
     left of second order is small. A wall that would have to pull, p < 0, does so until the next pass, in which constraints take
-    into account that it lets go. If it let go at once, its particle would be thrown as far as the wall has to hold it: the second
-    corner of a plank that lands almost upright, both of which are struck in one substep, by several times its length. What the
-    last pass leaves is lost. All impacts of a substep together are Newton's law for a rigid body. At e = 1 it neither removes nor
-    adds energy; energy is conserved to O(h) in an impact, since a body turns in a substep, and to O(h^2) if the body is a
-    cluster. Friction holds the tangential displacement by up to its coefficient times p.
+    into account that it lets go; at once, it would throw its particle as far as it has to hold it. What the last pass leaves is
+    lost. All impacts of a substep together are Newton's law for a rigid body. At e = 1 energy is conserved to O(h) in an impact,
+    since a body turns in a substep, and to O(h^2) if it is a cluster. Friction holds the tangential displacement by up to its
+    coefficient times p.
 
     These passes leave the violations that the regular passes left, and those of springs: removed all at once, they would become
     speed. Contacts, outlines, places, and clusters that share particles wait for the next substep. A particle that approaches by
     no more than SLOW substeps of forces and links add does not take part, see Surface.
 
-    A rigid cluster that shares none of its particles moves as a rigid body in these passes, see ClusterImpact. If some of them
-    cannot move, it turns about these.
-
-    Only where there are no contacts: there, walls are rows.
+    A rigid cluster that shares none of its particles moves as a rigid body in these passes, about those that cannot move, see
+    ClusterImpact. Where there are contacts, walls are rows, and nothing of this is needed.
 
     open: for each pass beyond the regular ones of every substep, whether it is needed.
     """
@@ -122,10 +111,7 @@ class BodyImpacts:
 
     @ti.func
     def mark_linked(self, batch: ti.template(), c, h):  # type: ignore[valid-type]
-        """At the start of a frame: mark the particles that constraint c holds, if it is rigid for a substep h.
-
-        An impact is too short for other springs to act.
-        """
+        """At the start of a frame: mark the particles of constraint c if it is rigid for a substep h, as an impact sees it."""
         holds = batch.dev.is_firm(c, h)
         if ti.static(batch.dev.strength.breaks):
             holds = holds and batch.dev.strength.is_intact(c)
@@ -251,10 +237,7 @@ class BodyImpacts:
 
     @ti.func
     def cancel_bounce(self, i, n):
-        """Cancel the bounce of particle i off the wall that it struck, if a wall with normal n presses it from the other side.
-
-        Otherwise each of the two walls would amplify the push of the other.
-        """
+        """Cancel the bounce of particle i if a wall presses it from the other side: each would amplify the other's push."""
         if self.struck[i] == STRUCK_BEFORE and n.dot(self.normal[i]) < 0:
             self.target[i] = ti.min(self.target[i], 0)
 

@@ -79,10 +79,7 @@ class Box(Collider):
 
     @property
     def needs_repeat(self) -> bool:
-        """Whether one round may not be enough.
-
-        In a corner, friction on one side may lead into another, and a bounce may lead to the other end.
-        """
+        """Whether one round may not be enough: friction on one side, or a bounce, may lead into another."""
         return self.dev.surface.has_friction or self.dev.surface.has_restitution
 
     def bind(self, scene: Scene) -> None:

@@ -96,10 +96,7 @@ class Capsule(Collider):
 
     @ti.func
     def along(self, x, a, b, frame_fraction):
-        """Return where a point at x, at the start of the substep, would be if the rod carried it along.
-
-        The point keeps its place beside the axis, whose ends move to a and b, and its distance from the axis.
-        """
+        """Return where a point at x would be if the rod, with its ends at a and b now, carried it along in the substep."""
         t, length, n = self.nearest(x, self.dev.a.at(frame_fraction[0]), self.dev.b.at(frame_fraction[0]))
         axis = b - a
         if 0 < t < 1:

@@ -10,6 +10,7 @@ from .. import checks
 from ..device import ti
 from ..features.arguments import knobs_of
 from ..features.feature import Feature, Knob, Scene
+from ..features.flag import Flag
 from ..features.material import Bounce, Coefficients, as_given, friction_of, is_elastic, restitution_of
 from ..features.regrouping import Regrouping
 from .surface import Surface
@@ -43,6 +44,14 @@ class Collider(Feature):
     push_out = Knob(lambda f, v: None if v is None else checks.number(repr(f), "push_out", v, least=0.0), "[m/s], or None.")
     events = Knob(lambda f, v: checks.flag(repr(f), "events", v), "Whether World.wall_events() tells of it.", compiled=True)
     surface_velocity = Knob(lambda f, v: _surface_velocity(f, v), "Of the surface relative to the wall, (dim,) [m/s].")
+    has_friction = Flag(lambda f: f.turns or f.coefficients.static > 0, "Whether there is friction.")
+    has_restitution = Flag(lambda f: f.bounce.normal > 0, "Whether there is restitution.")
+    has_switch = Flag(lambda f: f._switch or not f.active, "Whether the wall can be switched off.")
+    has_surface_velocity = Flag(lambda f: f.surface_velocity is not None, "Whether the surface has a velocity, if only 0.")
+    turns = Flag(
+        lambda f: max(f.coefficients.rolling, f.coefficients.twisting, f.bounce.tangential) > 0,
+        "Whether it resists rolling, or bounces across the normal.",
+    )
     compiled_for = ("has_friction", "has_restitution", "has_switch", "has_surface_velocity", "turns")
     host_only = ("widest",)
     for_users = ("clearance",)
@@ -77,27 +86,6 @@ class Collider(Feature):
         return is_elastic(self.friction, self.restitution)
 
     @property
-    def has_friction(self) -> bool:
-        """Whether there is friction, or was when kernels were compiled."""
-        return self.turns or self.coefficients.static > 0 or "has_friction" in self.compiled_so_far
-
-    @property
-    def has_restitution(self) -> bool:
-        """Whether there is restitution, or was when kernels were compiled."""
-        return self.bounce.normal > 0 or "has_restitution" in self.compiled_so_far
-
-    @property
-    def turns(self) -> bool:
-        """Whether it resists rolling, or bounces across the normal, or did when kernels were compiled."""
-        rub = self.coefficients
-        return max(rub.rolling, rub.twisting, self.bounce.tangential) > 0 or "turns" in self.compiled_so_far
-
-    @property
-    def has_surface_velocity(self) -> bool:
-        """Whether the surface has a velocity, if only 0, or had when kernels were compiled."""
-        return self.surface_velocity is not None or "has_surface_velocity" in self.compiled_so_far
-
-    @property
     def does_work(self) -> bool:
         """Whether the surface moves, by which friction may add energy."""
         return self.surface_velocity is not None and bool(self.surface_velocity.any())
@@ -123,16 +111,8 @@ class Collider(Feature):
         return self.active if self.scene is None else self.dev.surface.was_active
 
     @property
-    def has_switch(self) -> bool:
-        """Whether the wall can be switched off, by the compiled kernels or those to be compiled."""
-        return self._switch or not self.active or "has_switch" in self.compiled_so_far
-
-    @property
     def code_key(self) -> Any:
-        """What decides the code of its kernels, so that walls with equal keys form a WallGroup; None for code of its own.
-
-        The log of events has a row for each particle, so a wall with events is alone.
-        """
+        """What decides the code of its kernels: walls with equal keys form a WallGroup. None, as with a log, for one alone."""
         if self.events or not vars(type(self)).get("shares_code"):
             return None
         values = (getattr(self, name) for name in ("dim", "inside", "closed", *self.compiled_for))
@@ -190,24 +170,15 @@ class Collider(Feature):
         return change.now.radius.max(initial=0.0) == change.before.radius.max(initial=0.0)
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return line strips (m, k, dim) and half their width [m], for pictures of a scene between two corners.
-
-        A width of 0 is a thin line.
-        """
+        """Return line strips (m, k, dim) and half their width [m], 0 if thin, for pictures of a scene between two corners."""
         return np.zeros((0, 2, len(low))), 0.0
 
     def solid(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return vertices (v, 3) and triangles (t, 3), for pictures of a 3D scene between two corners.
-
-        There are none where lines show more.
-        """
+        """Return vertices (v, 3) and triangles (t, 3) for pictures of a 3D scene; none where lines show more."""
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """Return C(x) of points (k, dim): their distance from the wall [m], negative inside of it, (k,).
-
-        In a world, the wall is where the last frame took it. An assigned position is reached in the next frame.
-        """
+        """Return the distances of points (k, dim) from the wall where it is now [m], (k,), negative inside of it."""
         raise NotImplementedError
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
@@ -266,10 +237,7 @@ class Collider(Feature):
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, mode):
-        """Move particle i out of the wall, with self.dev.surface.push().
-
-        mode: ANY_DEPTH, BEYOND_ROUNDING, or FRICTIONLESS.
-        """
+        """Move particle i out of the wall by self.dev.surface.push(). mode: ANY_DEPTH, BEYOND_ROUNDING, or FRICTIONLESS."""
 
 
 def _friction(wall: Collider, value: Any) -> Any:

@@ -72,10 +72,7 @@ class FacetShape(Shape):
 
     @ti.func
     def nearest(self, f, q):
-        """Return the distance from q to facet f, the direction from the nearest point to q, and the feature of that point.
-
-        The feature is -1 where the nearest point is inside of the facet.
-        """
+        """Return the distance from facet f to q, its direction, and the feature nearest to q; -1 for the inside of the facet."""
         n = self.normal[f]
         r, at, over = q - self.corner(f, 0), -1, True
         least = r.dot(r)
@@ -189,10 +186,7 @@ class FacetShape(Shape):
 
     @ti.func
     def find_first_touch(self, a, e, contact_distance, close, limit):
-        """Find the first touch of any facet on the way, see Shape.find_first_touch().
-
-        Where the start is inside of a closed shape, the nearest facet lets the particle out.
-        """
+        """See Shape.find_first_touch(). From inside of a closed shape, the nearest facet lets the particle out."""
         way, s, piece, on = e.norm(), 0 * contact_distance, 0, ti.max(self.touch, 4 * close)
         best, depth, normal = 0 * contact_distance + 2, 0 * contact_distance, 0 * e
         least, outside, exit = contact_distance + way + 1, 0 * contact_distance + 1, 0 * e

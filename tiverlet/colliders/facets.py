@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from ..features.feature import Scene
-from ..geometry.bounding_tree import BoundingTree, distance_bound, ray_entry_bound, ray_exit_bound
+from ..geometry.bounding_tree import BoundingTree, distance_bound, ray_entry_bound
 from ..geometry.intervals import ROUNDING, dot, entry, rounded, rounding, triangle
 from ..geometry.nearest import closest_facet_point, surface_normal
 from .facet_shape import FacetShape
@@ -31,13 +31,9 @@ class Facets:
     closed: bool
     inside: bool
 
-    @property
+    @cached_property
     def normals(self) -> np.ndarray:
         """Outward unit normals of the facets, (m, dim)."""
-        return self._normals
-
-    @cached_property
-    def _normals(self) -> np.ndarray:
         return facet_normals(self.corners)
 
     @cached_property
@@ -50,11 +46,7 @@ class Facets:
         return FacetShape(self, scene, who, radius)
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """Return the distance of points to the facets, (k,) [m]; negative behind them where they are closed.
-
-        A point is behind where the mean normal of the nearest facet, edge or corner points away from it (Baerentzen and Aanaes
-        2005).
-        """
+        """Return the distances of points to the facets, (k,) [m], negative where the mean normal nearest to them points away."""
         corners = self.corners
 
         def distance(q: np.ndarray, f: np.ndarray) -> np.ndarray:
@@ -65,21 +57,18 @@ class Facets:
         length, f = self._tree.find_least(len(points), np.full(len(points), np.inf), distance_bound(points), distance)
         if self.closed and len(points):
             at, part = closest_facet_point(points, corners[f])
-            facing = np.where((part < 0)[:, None], self._normals[f], self.facing[self.features[f, part]])
+            facing = np.where((part < 0)[:, None], self.normals[f], self.facing[self.features[f, part]])
             length = np.where(dot(points - at, facing) < 0, -length, length)
         return length
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return how far rays go until they come within `radius` of the facets from outside, and the normals.
-
-        origin, direction: (k, dim). Returns lengths (k,) [m] and normals (k, dim).
-        """
+        """Return how far rays (k, dim) go until within `radius` of the facets from outside, (k,) [m], and normals (k, dim)."""
         distance, f = self._bare(origin, direction) if radius == 0 else self._thick(origin, direction, radius)
         met = f >= 0
         d, corners = direction[met], self.corners[f[met]]
         normal = np.full(origin.shape, np.nan)
         if radius == 0:
-            n = self._normals[f[met]]
+            n = self.normals[f[met]]
             normal[met] = np.where((dot(n, d) > 0)[:, None], -n, n)
         else:
             x = origin[met] + distance[met, None] * d
@@ -94,7 +83,7 @@ class Facets:
             """Return where rays q[i] pass facets f[i]."""
             o, d, c = origin[q], direction[q], corners[f]
             t, _ = triangle(o, d, c)
-            slope = dot(d, self._normals[f])
+            slope = dot(d, self.normals[f])
             with np.errstate(divide="ignore"):
                 close = rounding(o, c[:, 0], c[:, 1]) / np.abs(slope)
             if not closed:
@@ -140,12 +129,9 @@ class Facets:
         return t
 
     def _step_out(self, x: np.ndarray, d: np.ndarray, radius: float, close: np.ndarray, deep: np.ndarray) -> np.ndarray:
-        """Return the step from points in the solid to the end of the facet surroundings that they are in.
-
-        deep: points further inside than the surroundings of any facet; their step is to the next facet.
-        """
+        """Return the step from points in the solid to where they leave the surroundings of facets; if `deep`, enter these."""
         corners = self.corners
-        to_boxes, out_of_boxes = ray_entry_bound(x, d, 0.0), ray_exit_bound(x, d, radius)
+        to_boxes, out_of_boxes = ray_entry_bound(x, d, 0.0), ray_entry_bound(x, d, radius, exits=True)
 
         def bound(q: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
             """Return bounds of the values in boxes around facets."""

@@ -89,14 +89,9 @@ class HalfSpace(Collider):
         return self.dev.normal[None].dot(self.dev.state.place(i)) - higher - radius
 
     @ti.func
-    def offset_at(self, frame_fraction):
-        """Return the offset at a fraction of the frame [m]."""
-        return self.dev.offset.at(frame_fraction)[0]
-
-    @ti.func
     def gap(self, face, i, radius, frame_fraction, at_start: ti.template()):  # type: ignore[valid-type]
         """Return the gap to the plane."""
-        n, before, now = self.dev.normal[None], self.offset_at(frame_fraction[0]), self.offset_at(frame_fraction[1])
+        n, before, now = self.dev.normal[None], self.dev.offset.at(frame_fraction[0])[0], self.dev.offset.at(frame_fraction[1])[0]
         gap = n.dot(self.dev.state.place(i))
         if ti.static(at_start):
             gap = gap - n.dot(self.dev.state.d[i]) - before - radius
@@ -107,6 +102,6 @@ class HalfSpace(Collider):
     @ti.func
     def confine(self, i, radius, h, frame_fraction, mode):
         """Press the particle if it is below the plane."""
-        n, before, now = self.dev.normal[None], self.offset_at(frame_fraction[0]), self.offset_at(frame_fraction[1])
+        n, before, now = self.dev.normal[None], self.dev.offset.at(frame_fraction[0])[0], self.dev.offset.at(frame_fraction[1])[0]
         depth, moved = now + radius - n.dot(self.dev.state.place(i)), (now - before) * n
         self.dev.surface.push(i, depth, depth + self.dev.surface.path(i, moved).dot(n), n, moved, h, mode, False)

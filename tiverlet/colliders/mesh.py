@@ -4,12 +4,13 @@ import numpy as np
 
 from .. import checks
 from ..checks import ArrayLike
-from ..geometry.common_sense import common_sense, edges_of
+from ..geometry.common_sense import edges_of, oriented
 from .collider import Collider
 from .facets import Facets, facet_normals
 from .moving import Moving
 
 FLAT = 0.999  # cosine between faces whose common edge is not drawn
+REMEDY = " Merge vertices that are in the same place, close the hole, or use closed = False for a thin sheet."
 
 
 class Mesh(Moving):
@@ -50,32 +51,14 @@ class Mesh(Moving):
             k = int(np.argmax(flat))
             raise ValueError(f"Mesh: faces[{k}] = {tuple(faces[k].tolist())} has no area; leave it out.")
         if self.closed:
-            faces = self._outward(vertices, faces)
+            faces, part = oriented("Mesh", "faces", faces, REMEDY)
+            faces = np.where((_inwards(vertices[faces], part) != self.inside)[:, None], faces[:, ::-1], faces)
         self.vertices, self.faces = vertices, faces
         for array in (vertices, faces):
             array.flags.writeable = False
         self.position, self.rotation = position, rotation
         self.set_surface(friction, restitution, push_out, active, events, one_way, 3, surface_velocity=surface_velocity)
         self.facets = self._joined()
-
-    def _outward(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """Return the faces with their corners in the order that makes normals point away from the solid."""
-        edges, which, number = edges_of(faces)
-        if (number != 2).any():
-            e = int(np.argmax(number != 2))
-            k = int(np.argmax((which == e).any(axis=1)))
-            what = "one face only" if number[e] == 1 else f"{number[e]} faces"
-            raise ValueError(
-                f"Mesh: the edge {tuple(edges[e].tolist())} of faces[{k}] belongs to {what}, but each edge of a closed mesh has "
-                "two. Merge vertices that are in the same place, close the hole, or use closed = False for a thin sheet."
-            )
-        turned, part, wrong = common_sense(faces)
-        if wrong >= 0:
-            raise ValueError(
-                f"Mesh: the faces around faces[{wrong}] have no outside; a Moebius strip or a Klein bottle has none."
-            )
-        faces = np.where(turned[:, None], faces[:, ::-1], faces)
-        return np.where((_inwards(vertices[faces], part) != self.inside)[:, None], faces[:, ::-1], faces)
 
     def _joined(self) -> Facets:
         """Compute corners and edges, the directions in which the faces continue from them, and the mean normals there."""

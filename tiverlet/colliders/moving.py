@@ -51,10 +51,7 @@ class Moving(Collider):
     needs_start_position = poses = bends = True
     tracks = MappingProxyType({"position": None, "rotation": ti.f64})
     radius: Any = Knob(
-        lambda f, v: checks.number(repr(f), "radius", v, least=0.0),
-        "Rounded by so much [m].",
-        built=True,
-        device="thickness",
+        lambda f, v: checks.number(repr(f), "radius", v, least=0.0), "Rounded by so much [m].", built=True, device="thickness"
     )
     position = Knob(_position, "Where the origin of the wall's frame is [m].", place=shifted)
     rotation = Knob(_rotation, "Angle (2D) or rotation vector (3D) [rad].")
@@ -189,11 +186,7 @@ class Moving(Collider):
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, mode):
-        """Follow the displacement of particle i, and correct touch by touch.
-
-        The wall moves by the motion of its point under the start of the particle, so a sticking particle rides along and does not
-        creep.
-        """
+        """Follow the displacement of particle i touch by touch, relative to the wall under its start: what sticks rides along."""
         start, contact_distance = self.dev.state.inside(self.dev.state.begin(i)), radius + ti.cast(self.radius, self.dev.real)
         first = self.dev.pose.inward(0, start - self.dev.pose.place[0])
         moved = self.dev.pose.place[2] + self.dev.pose.outward(2, first)

@@ -4,6 +4,7 @@ import numpy as np
 
 from .. import checks
 from ..checks import ArrayLike
+from ..geometry.intervals import cross_2d
 from ..geometry.places import places_between
 from .facets import Facets, facet_normals
 from .moving import Moving
@@ -48,7 +49,7 @@ class Polygon(Moving):
         if self.closed:
             _check_simple(vertices, i, j)
             v = vertices - vertices.mean(axis=0)
-            area = float((v[i, 0] * v[j, 1] - v[j, 0] * v[i, 1]).sum()) / 2
+            area = float(cross_2d(v[i], v[j]).sum()) / 2
             if abs(area) <= 1e-12 * size**2:
                 raise ValueError(f"Polygon: vertices enclose an area of {area:g} m^2; closed = False makes a line of them.")
             if (area < 0) != self.inside:
@@ -93,7 +94,7 @@ def _check_simple(vertices: np.ndarray, i: np.ndarray, j: np.ndarray) -> None:
         shared = np.where((q - p == 1)[:, None], a[q], a[p])
         one, two = np.where((shared == a[p]).all(1)[:, None], b[p], a[p]), np.where((shared == a[q]).all(1)[:, None], b[q], a[q])
         u, v = one - shared, two - shared
-        folded = (np.abs(_cross(u, v)) <= 1e-12 * np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1)) & ((u * v).sum(1) > 0)
+        folded = (np.abs(cross_2d(u, v)) <= 1e-12 * np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1)) & ((u * v).sum(1) > 0)
         wrong = np.where(joined, folded, wrong)
         if wrong.any():
             k = int(np.argmax(wrong))
@@ -101,13 +102,9 @@ def _check_simple(vertices: np.ndarray, i: np.ndarray, j: np.ndarray) -> None:
             raise ValueError(f"Polygon: the edges {e} and {f} of vertices meet, so it has no clear inside; take them apart.")
 
 
-def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
-
-
 def _meet(a, b, c, d) -> np.ndarray:
     """Whether segments a-b and c-d have a point in common."""
-    s, t = np.sign(_cross(b - a, c - a)), np.sign(_cross(b - a, d - a))
-    u, v = np.sign(_cross(d - c, a - c)), np.sign(_cross(d - c, b - c))
+    s, t = np.sign(cross_2d(b - a, c - a)), np.sign(cross_2d(b - a, d - a))
+    u, v = np.sign(cross_2d(d - c, a - c)), np.sign(cross_2d(d - c, b - c))
     flat = (s == 0) & (t == 0)  # all four points on one line: the segments meet, since their boxes overlap
     return ((s != t) & (u != v)) | flat

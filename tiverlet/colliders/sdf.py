@@ -191,10 +191,7 @@ class FunctionShape(Shape):
 
     @ti.func
     def slope(self, q, contact_distance):
-        """Return the gradient, from the user's function or by central differences.
-
-        The step of differences depends only on q and `contact_distance`, not on other parts of the scene.
-        """
+        """Return the gradient: the user's, or central differences, whose step depends only on q and `contact_distance`."""
         out = 0 * q
         if ti.static(bool(self.gradient)):
             out = self.gradient(q)
@@ -219,10 +216,7 @@ class FunctionShape(Shape):
 
     @ti.func
     def blur(self, q, contact_distance):
-        """Return the angle by which rounding may turn the gradient [rad].
-
-        To hold a particle above a plane more exactly would take endless corrections.
-        """
+        """Return the angle by which rounding may turn the gradient [rad], so that no more is corrected in vain."""
         out = ti.cast(self.slight, self.real)
         if ti.static(not self.gradient):
             out += self.rounding(q) / ti.max(self.difference(q, contact_distance), self.rounding(q))
@@ -328,10 +322,7 @@ class _Probe:
         return out
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return how far rays go until the function falls to `radius` from above, and its gradients there as normals, (n, dim).
-
-        The lengths (n,) [m] are inf where the function does not fall to it in CAST steps of sphere tracing.
-        """
+        """Return how far rays go until the function falls to `radius`, (n,) [m], inf if not in CAST steps; and normals there."""
         distance, normal = np.zeros(len(origin)), np.full(origin.shape, np.nan)
         with self.compiler():
             self._cast(np.ascontiguousarray(origin), np.ascontiguousarray(direction), radius, distance)
@@ -380,10 +371,7 @@ class _Probe:
         self, points: ti.types.ndarray(ti.f64, 2), direction: ti.types.ndarray(ti.f64, 2), radius: ti.f64,
         out: ti.types.ndarray(ti.f64, 1),
     ):  # type: ignore[valid-type]  # fmt: skip
-        """Trace rays by steps as long as the function guarantees to be free (Hart 1996).
-
-        A ray that starts in the solid first leaves it. The step that passes the surface is bisected to the last digit.
-        """
+        """Trace rays by steps that are free (Hart 1996), first out of the solid; bisect the one that passes the surface."""
         for i in range(points.shape[0]):
             o, d = self._point(points, i), self._point(direction, i)
             size = ti.abs(o).max()  # type: ignore[reportOptionalCall]

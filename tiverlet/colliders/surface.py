@@ -137,7 +137,8 @@ class Surface:
         It was inside by rounding only, with the normal `first`, and is not inside on the same side at the end, at this depth with
         the normal n. size: of the lengths from which the start is computed [m].
         """
-        return start_depth < self.state.digits_with(i, size) and (depth <= 0 or n.dot(first) < 0)
+        close = self.state.digits(i) + ti.static(self.state.two_digits) * size
+        return start_depth < close and (depth <= 0 or n.dot(first) < 0)
 
     @ti.func
     def lets_through(self, i, n, start_depth, contact_distance):

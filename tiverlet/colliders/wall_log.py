@@ -49,10 +49,7 @@ class WallLog:
 
     @ti.func
     def open(self, i):
-        """At the start of a frame: clear the events of particle i, and note its velocity, which d_i is if the frame is a start.
-
-        Whether it touched before is kept.
-        """
+        """At the start of a frame: clear the events of particle i, and note its velocity: d_i, if the frame is a start."""
         self.given[i] = self.state.d[i]
         began = ti.select(self.touching[i] != 0, BEFORE, NEVER)
         self.when[i] = [began, began]
@@ -114,10 +111,7 @@ class WallLog:
         self._scene.memory.write(self.counter, 0)
 
     def read(self, number: int, h: float, time: float) -> Touches:
-        """Return the events of the last frame, which ended at `time` [s].
-
-        number: of the wall in world.features. h: length of its substeps [s].
-        """
+        """Return the events of the last frame, until `time` [s]. number: of the wall in world.features. h: the substep [s]."""
         memory = self._scene.memory
         substeps, when = int(memory.read(self.substep)[0]), memory.read(self.when)[: self._scene.particles.count]
         some = np.flatnonzero(when[:, 0] != NEVER) if substeps else np.zeros(0, dtype=np.int64)

@@ -94,10 +94,8 @@ class AngleLimit(Scalar):
 
     def tracks(self) -> list[tuple[Any, np.ndarray, Callable]]:
         """List what an assignment moves: half of the range, and its middle."""
-        return [
-            (self.dev.equation.rest, self.rest, np.subtract),
-            (self.dev.quantity.middle, self.middle, self.quantity.difference),
-        ]
+        middle = self.dev.quantity.middle, self.middle, self.quantity.difference
+        return [(self.dev.equation.rest, self.rest, np.subtract), middle]
 
     def violation(self, position: np.ndarray) -> np.ndarray:
         """Return C at the given positions, (m,)."""

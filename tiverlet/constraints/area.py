@@ -8,7 +8,7 @@ from .. import checks
 from ..checks import ArrayLike
 from ..device import ti
 from ..features.feature import Knob, Scene
-from ..geometry.intervals import cross
+from ..geometry.intervals import cross, cross_2d
 from ..particles import Particles
 from .core.members import Members, rows
 from .core.outline_passes import GOAL, PRESSURE
@@ -72,8 +72,7 @@ class Triangles(Quantity):
         """Return the areas of the triangles, (m,) [m^2]; signed in 2D."""
         a, b, c = x[:, 0], x[:, 1], x[:, 2]
         if x.shape[2] == 2:
-            (ux, uy), (vx, vy) = (b - a).T, (c - a).T
-            return (ux * vy - uy * vx) / 2
+            return cross_2d(b - a, c - a) / 2
         return np.linalg.norm(cross(b - a, c - a), axis=1) / 2
 
     @ti.func
@@ -113,7 +112,7 @@ class Loops(Quantity):
             return np.zeros(0)
         r = x[indices] - np.repeat(x[indices[starts[:-1]]], np.diff(starts), axis=0)
         s = r[self.after]
-        return np.add.reduceat(r[:, 0] * s[:, 1] - r[:, 1] * s[:, 0], starts[:-1]) / 2
+        return np.add.reduceat(cross_2d(r, s), starts[:-1]) / 2
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
         """Return the gradients of the areas by each corner, (total, 2)."""

@@ -162,10 +162,7 @@ class Constraint(Scalar):
             self._check_gradient(particles.position)
 
     def _is_nowhere_negative(self, position: np.ndarray) -> bool:
-        """Whether function is nowhere below 0 where it is 0, so that it has a kink or a flat minimum there.
-
-        Newton's method goes to f = 0. Around a place where f crosses 0, f(q + e) and f(q - e) have opposite signs.
-        """
+        """Whether f is not below 0 on either side of where Newton's method finds f = 0: a kink or a flat minimum."""
         q = self._corners(position)
         for _ in range(APPROACH):
             f, g, _ = self._derivative(q, self._size)
@@ -179,10 +176,7 @@ class Constraint(Scalar):
         return True
 
     def _check_gradient(self, position: np.ndarray) -> None:
-        """Compare the gradient with differences at the initial positions and at three places near by.
-
-        Two of four must agree, since the function may have kinks.
-        """
+        """Compare the gradient with differences, here and at three places near by: two of four must agree, for kinks."""
         wrong, found = np.zeros((self.count, self.arity, position.shape[1]), dtype=int), []
         for k in range(4):
             q = self._corners(position)

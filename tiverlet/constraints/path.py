@@ -63,13 +63,10 @@ class Path(Anchored):
 
     @property
     def is_kinematic(self) -> bool:
-        """Whether the particles are driven."""
+        """Whether the particles are driven, which may add energy."""
         return bool(self.driver)
 
-    @property
-    def does_work(self) -> bool:
-        """Whether the particles are driven, which may add energy."""
-        return self.is_kinematic
+    exclusive = does_work = is_kinematic
 
     def _drive(self, name: str, value) -> np.ndarray:
         if name != self.driver:
@@ -83,8 +80,6 @@ class Path(Anchored):
             raise ValueError("Path: driven particles take no compliance; they go along whatever pulls at them.")
         return value
 
-    exclusive = is_kinematic
-
     @property
     def length(self) -> float:
         """Length of the curve [m]."""
@@ -95,13 +90,10 @@ class Path(Anchored):
         return self.curve.at(s)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Find the start on the curve, and set the inverse mass of driven particles to 0."""
+        """Find the start on the curve."""
         super().prepare(particles, inv_mass)
         checks.points("Path", "points", self.points, dim=particles.dim)
-        rows = self.indices[:, 0]
-        self._start = self.curve.nearest(particles.position[rows])
-        if self.is_kinematic:
-            inv_mass[rows] = 0.0
+        self._start = self.curve.nearest(particles.position[self.indices[:, 0]])
 
     def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Warn of particles that do not start on the curve."""
@@ -154,8 +146,3 @@ class Path(Anchored):
         if not self.curve.closed:
             speed = np.where((s <= 0) & (speed < 0) | (s >= self.length) & (speed > 0), 0.0, speed)
         velocity[..., self.indices[:, 0], :] = speed[..., None] * self.curve.tangent(s)
-
-    def end_motion(self) -> None:
-        """Start the next frame from the arc lengths where the last one ended."""
-        if self.acts:
-            self.scene.memory.write(self.dev.place.source, self.scene.memory.read(self.dev.place.target))

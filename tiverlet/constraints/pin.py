@@ -160,13 +160,10 @@ class Pin(Anchored):
         self.__dict__.pop("needs_new_state", None)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check indices and targets, and set the inverse mass of driven particles to 0."""
+        """Check indices and targets."""
         super().prepare(particles, inv_mass)
-        rows = self.indices[:, 0]
         self._keep(dim=particles.dim)
-        self.target = self.__dict__.get("target", particles.position[rows])
-        if self.is_kinematic:
-            inv_mass[rows] = 0.0
+        self.target = self.__dict__.get("target", particles.position[self.indices[:, 0]])
 
     def offset(self, position: np.ndarray) -> np.ndarray:
         """Return x - target, (m, dim)."""
@@ -178,13 +175,7 @@ class Pin(Anchored):
 
     def upload(self) -> None:
         """Write the new target, which the next frame moves to."""
+        super().upload()
         if self.acts:
-            if not self.is_kinematic:
-                self.dev.spring.upload(self.compliance, self.damping)
             self.scene.memory.write(self.dev.place.target, vars(self)["target"])
             self.moving = True
-
-    def end_motion(self) -> None:
-        """Start the next frame from the target of the last one."""
-        if self.acts:
-            self.scene.memory.write(self.dev.place.source, self.scene.memory.read(self.dev.place.target))

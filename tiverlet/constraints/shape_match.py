@@ -8,10 +8,10 @@ from .. import checks
 from ..checks import ArrayLike
 from ..device.interrupts import in_turn
 from ..features.feature import Batch, Knob, Scene
+from ..features.flag import BREAKS, SOFT, Flag
 from ..geometry.ordered import distinct
 from ..particles import Particles
 from .core.cluster_passes import ClusterPasses
-from .core.flag import BREAKS, SOFT, Flag
 from .core.members import Members, rows
 from .core.spring import SOFTEST, bears_nothing, per_newton
 from .core.strength import strength_of
@@ -90,11 +90,7 @@ class ShapeMatch(Batch):
             self.dev.strength.upload(self.break_at)
 
     def _forget_springs(self) -> None:
-        """Before new stiffnesses are written: let clusters that become rigid forget what their springs bore.
-
-        What they have given way by then is no deformation that passes leave under loads, so they are put into shape, however soft
-        they were.
-        """
+        """Let clusters that become rigid forget what their springs bore: they are put into shape, however soft they were."""
         spring, read = self.dev.spring, self.scene.memory.read
         if spring.soft and (stiffened := (read(spring.alpha)[: self.count] > 0) & (self.compliance == 0)).any():
             pull = read(self.dev.pull)

@@ -36,10 +36,7 @@ class Nodes(Place):
 
     @ti.func
     def offsets(self, c, frame_fraction, first, fresh):
-        """Return x - node, now and at the start of the substep.
-
-        The first pass takes the new node, and expresses the remembered C in terms of it.
-        """
+        """Return x - node, now and at the start. The first pass takes the new node, and refers the remembered C to it."""
         i = self.corners.member(c, 0)
         x, start = self.state.place(i), self.state.place(i) - self.state.d[i]
         if first != 0:

@@ -8,7 +8,7 @@ from .. import checks
 from ..checks import ArrayLike
 from ..device import ti
 from ..features.feature import Knob, Scene
-from ..geometry.common_sense import common_sense, edges_of
+from ..geometry.common_sense import edges_of, oriented
 from ..geometry.intervals import cross
 from ..particles import Particles
 from .core.members import Members
@@ -54,7 +54,7 @@ class Volume(Scalar):
     def quantity_of(self, indices) -> Quantity:
         """Return Surfaces for faces (k, 3), else Tetrahedra, which have simpler kernels of their own."""
         if np.ndim(indices) == 2 and np.shape(indices)[1] == 3:
-            return Surfaces(*_orient_faces(checks.indices("Volume", "cells", indices, checks.ANY, arity=3)))
+            return Surfaces(*oriented("Volume", "cells", checks.indices("Volume", "cells", indices, checks.ANY, arity=3)))
         return Tetrahedra(self.fixed(indices, 4))
 
     @property
@@ -171,10 +171,7 @@ class Surfaces(Quantity):
 
     @ti.func
     def slope(self, e, back):
-        """Return the sum of b x c / 6 over the faces around a corner, with b and c relative to it.
-
-        The reference point does not change the sum over a closed ring.
-        """
+        """Return the sum of b x c / 6 over the faces around a corner, relative to it, which changes nothing in a closed ring."""
         i = self.corners.members[e]
         total = 0 * self.state.d[i]
         for k in range(self.starts[e], self.starts[e + 1]):
@@ -183,17 +180,3 @@ class Surfaces(Quantity):
             c = self.state.separation(m, i) - back * (self.state.d[m] - self.state.d[i])
             total += b.cross(c)
         return total / 6
-
-
-def _orient_faces(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Orient faces so that the two at each edge run along it in opposite senses. Returns the faces and the surface of each."""
-    edges, which, counts = edges_of(faces)
-    if (counts != 2).any():
-        k = int(np.argmax(counts != 2))
-        edge, face = tuple(int(v) for v in edges[k]), int(np.argmax((which == k).any(axis=1)))
-        why = "the surface is open there" if counts[k] == 1 else "an edge of a closed surface has two"
-        raise ValueError(f"Volume: edge {edge} of cells[{face}] belongs to {counts[k]} face(s); {why}.")
-    turned, surface, wrong = common_sense(faces)
-    if wrong >= 0:
-        raise ValueError(f"Volume: cells[{wrong}] and its neighbours have no common sense; the surface has only one side.")
-    return np.where(turned[:, None], faces[:, ::-1], faces), surface

@@ -160,11 +160,7 @@ class PairForce(Acceleration):
 
     @ti.func
     def evaluate(self, i):
-        """Compute the acceleration of particle i by all others, in the order of their indices.
-
-        The sum begins at +0. A product with 0 might be -0 if no particle acts, and the hash of the state would then depend on
-        whether a far particle is listed.
-        """
+        """Compute the acceleration of particle i by all others, in order. Sums begin at +0, so what is listed changes no bit."""
         self.dev.last[i] = self.dev.now[i]
         total, w = ti.Vector.zero(self.dev.real, self.dim), self.dev.w[i]
         if w > 0:
@@ -186,10 +182,8 @@ class PairForce(Acceleration):
     @ti.func
     def stiffness_between(self, i, j):
         """Return omega^2 of a pair [1/s^2], (w_i + w_j) |F(r) - F(r - u)| / |u|, where r changed by u in the last substep."""
-        r, u = (
-            self.dev.state.separation(i, j),
-            self.dev.state.relative_displacement(self.dev.state.d[i] - self.dev.state.d[j], i, j),
-        )
+        r = self.dev.state.separation(i, j)
+        u = self.dev.state.relative_displacement(self.dev.state.d[i] - self.dev.state.d[j], i, j)
         out, uu = 0 * r[0], u.norm_sqr()
         if uu > 0:
             out = (self.dev.w[i] + self.dev.w[j]) * (self.pull(i, j, r) - self.pull(i, j, r - u)).norm() / ti.sqrt(uu)

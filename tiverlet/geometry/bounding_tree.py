@@ -40,10 +40,8 @@ class BoundingTree:
         chunks = [np.arange(q, min(q + step, queries)) for q in range(0, queries, step)]
         if not compare_all and self._first < 0:
             self._build()
-        answers = [
-            self._compare_all(q, most[q], bound, value) if compare_all else self._descend(q, most[q], bound, value)
-            for q in chunks
-        ]
+        search = self._compare_all if compare_all else self._descend
+        answers = [search(q, most[q], bound, value) for q in chunks]
         return np.concatenate([a for a, _ in answers]), np.concatenate([b for _, b in answers])
 
     def _compare_all(self, some: np.ndarray, most: np.ndarray, bound: Callable, value: Callable) -> Answer:
@@ -71,10 +69,8 @@ class BoundingTree:
         low[: self.count], high[: self.count] = self.low[order], self.high[order]
         lows, highs = [], []
         for _ in range(depth + 1):
-            low, high = (
-                np.fmin.reduce(low.reshape(-1, CHILDREN, dim), axis=1),
-                np.fmax.reduce(high.reshape(-1, CHILDREN, dim), axis=1),
-            )
+            low = np.fmin.reduce(low.reshape(-1, CHILDREN, dim), axis=1)
+            high = np.fmax.reduce(high.reshape(-1, CHILDREN, dim), axis=1)
             lows.append(low)
             highs.append(high)
         self._low, self._high = np.concatenate(lows[::-1]), np.concatenate(highs[::-1])
@@ -125,28 +121,22 @@ class BoundingTree:
         best[rows[better]], found[rows[better]] = least[better], number[better]
 
 
-def ray_entry_bound(origin: np.ndarray, direction: np.ndarray, extra: float) -> Callable:
-    """Return a bound for rays: the distance to a box that is enlarged by `extra` [m]."""
+def ray_entry_bound(origin: np.ndarray, direction: np.ndarray, extra: float, exits: bool = False) -> Callable:
+    """Return a bound for rays: the distance to a box that is enlarged by `extra` [m].
+
+    exits: instead minus the distance to the end of the box, for boxes in which rays start.
+    """
     inverse = 1.0 / np.where(np.abs(direction) < TINY, TINY, direction)
     extra = extra + SLACK * np.abs(origin).max(axis=1)
 
     def bound(q: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return the distance at which rays have entered the slabs of all axes; inf where a slab is left before."""
-        enter, leave = _slabs(origin[q], inverse[q], extra[q], low, high)
+        """Return the bounds in boxes (k, b, dim): rays enter the last slab of them, and leave the first one."""
+        o, i, e = origin[q][:, None], inverse[q][:, None], extra[q][:, None, None]
+        one, two = (low - e - o) * i, (high + e - o) * i
+        enter, leave = np.minimum(one, two).max(axis=-1), np.maximum(one, two).min(axis=-1)
+        if exits:
+            return np.where((enter <= 0) & (leave >= 0), -leave, np.inf)
         return np.where((enter <= leave) & (leave >= 0), np.maximum(enter, 0.0), np.inf)
-
-    return bound
-
-
-def ray_exit_bound(origin: np.ndarray, direction: np.ndarray, extra: float) -> Callable:
-    """Return a bound for rays in boxes that are enlarged by `extra` [m]: minus the distance to the exit from the box."""
-    inverse = 1.0 / np.where(np.abs(direction) < TINY, TINY, direction)
-    extra = extra + SLACK * np.abs(origin).max(axis=1)
-
-    def bound(q: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return minus the distance at which rays leave the first slab; inf for boxes in which they do not start."""
-        enter, leave = _slabs(origin[q], inverse[q], extra[q], low, high)
-        return np.where((enter <= 0) & (leave >= 0), -leave, np.inf)
 
     return bound
 
@@ -162,13 +152,6 @@ def distance_bound(points: np.ndarray) -> Callable:
         return np.where(distance >= 0, distance, np.inf)
 
     return bound
-
-
-def _slabs(origin, inverse, extra, low, high) -> tuple[np.ndarray, np.ndarray]:
-    """Return where rays enter the last slab of boxes (k, b, dim), and where they leave the first slab."""
-    o, i, e = origin[:, None], inverse[:, None], extra[:, None, None]
-    one, two = (low - e - o) * i, (high + e - o) * i
-    return np.minimum(one, two).max(axis=-1), np.maximum(one, two).min(axis=-1)
 
 
 def _morton(middle: np.ndarray) -> np.ndarray:

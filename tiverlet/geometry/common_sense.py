@@ -11,6 +11,24 @@ def edges_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return edges, which.reshape(-1, 3), number
 
 
+def oriented(who: str, name: str, faces: np.ndarray, remedy: str = "") -> tuple[np.ndarray, np.ndarray]:
+    """Return triangles (k, 3) of closed surfaces with the same sense on each, and the number of the surface of each, (k,).
+
+    Raises ValueError for an edge that does not have two triangles, and for a surface with one side only. who, name: whose
+    argument they are. remedy: what to do about such an edge.
+    """
+    edges, which, number = edges_of(faces)
+    if (number != 2).any():
+        e = int(np.argmax(number != 2))
+        edge, k = tuple(edges[e].tolist()), int(np.argmax((which == e).any(axis=1)))
+        why = "so the surface is open there" if number[e] == 1 else "but an edge of a closed surface has two"
+        raise ValueError(f"{who}: the edge {edge} of {name}[{k}] belongs to {number[e]} face(s), {why}.{remedy}")
+    turned, piece, wrong = common_sense(faces)
+    if wrong >= 0:
+        raise ValueError(f"{who}: {name}[{wrong}] and its neighbours have no common sense; the surface has only one side.")
+    return np.where(turned[:, None], faces[:, ::-1], faces), piece
+
+
 def common_sense(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
     """Return which triangles (k, 3) to reverse, so that those that share an edge with one other have the same sense, (k,).
 

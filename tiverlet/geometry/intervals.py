@@ -24,6 +24,11 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
 
 
+def cross_2d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the cross products of rows (..., 2)."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
 def rounding(*vectors: np.ndarray) -> np.ndarray:
     """Return the rounding error of results that are computed from these rows, (m,) [m]."""
     size = np.abs(vectors[0]).max(axis=-1)
@@ -94,10 +99,7 @@ def capsule(origin: np.ndarray, direction: np.ndarray, a: np.ndarray, b: np.ndar
 
 
 def slab(place: np.ndarray, speed: np.ndarray, low, high, close: np.ndarray | float = 0.0) -> Interval:
-    """Return the intervals of t with low <= place + t speed <= high.
-
-    low, high: may be infinite. close: a place as near as this to a bound counts as on the bound.
-    """
+    """Return the intervals of t with low <= place + t speed <= high, up to infinity. close: as near as this is on a bound."""
     is_parallel = speed == 0
     inverse = 1.0 / np.where(is_parallel, 1.0, speed)
     below, above = low - place, high - place
@@ -121,7 +123,7 @@ def triangle(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray) -> 
     bit alike for all facets that share it.
     """
     if origin.shape[1] == 2:
-        sides = _cross_2d(direction[:, None], corners - origin[:, None])
+        sides = cross_2d(direction[:, None], corners - origin[:, None])
         sides = np.stack([sides[:, 0], -sides[:, 1]], axis=1)
         edge = corners[:, 1] - corners[:, 0]
         normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1)
@@ -151,17 +153,10 @@ def rounded(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray, radi
 
 
 def _chord(middle: np.ndarray, off: np.ndarray, square: np.ndarray, radius, close: np.ndarray) -> Interval:
-    """Return the intervals in which lines of speed sqrt(square) are within `radius` of a center.
-
-    middle: (m,) parameter of the nearest point. off: (m, dim) vector from the center to the nearest point [m].
-    """
+    """Return where lines of speed sqrt(square) are within `radius` of a center; middle, off: nearest parameter, vector there."""
     h = np.sqrt(dot(off, off))
     half = np.sqrt(np.maximum((radius - h) * (radius + h), 0.0) / square)
     return _unless_missed((h > radius + close) | (np.asarray(radius) < 0), middle - half, middle + half)
-
-
-def _cross_2d(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
 def _unless_missed(missed: np.ndarray, enter: np.ndarray, leave: np.ndarray) -> Interval:

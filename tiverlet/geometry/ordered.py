@@ -17,10 +17,7 @@ def distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def typical(sizes: np.ndarray) -> float:
-    """Return the median of the numbers above 0, rounded up to a power of 2^(1/8), so that it stays where a few come and go.
-
-    It is 0 without any.
-    """
+    """Return the median of numbers above 0, up to a power of 2^(1/8), so that it stays where a few come and go; 0 for none."""
     ordered = np.sort(sizes[sizes > 0])
     if not len(ordered):
         return 0.0

@@ -78,10 +78,7 @@ def solve_3x3(H, r):
 
 @ti.func
 def turning_compliance(S, r):
-    """Return by how much a unit impulse at r moves that point at most by turning a body, tr((r x)^T I^-1 (r x)) [1/kg].
-
-    S: sum m r r^T about the centre, with the moment of inertia I = tr S - S.
-    """
+    """Return by how much a unit impulse at r moves that point at most by turning, tr((r x)^T I^-1 (r x)) with I = tr S - S."""
     out = 0 * S[0, 0]
     if ti.static(S.n == 2):
         if S.trace() > 0:
@@ -167,10 +164,7 @@ def cayley(x, like):
 
 @ti.func
 def newton_step(M, gap, least):
-    """Return a rotation vector that closes the gap of axial(M) for M = R K, and whether it is longer than `least`.
-
-    It is along the gap where M has no curvature to use.
-    """
+    """Return a rotation vector that closes the gap of axial(M), along it where M is no use; and whether it exceeds `least`."""
     size, step = M.norm(), 0 * gap
     if size > 0:
         step = gap / size

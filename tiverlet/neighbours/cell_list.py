@@ -42,9 +42,8 @@ class CellList:
 
     def __init__(self, scene: "Scene", radius: np.ndarray, reach: np.ndarray, skin: float, team: "Team", scratch: Any):
         self.team = team
-        self.sorted_position = (
-            scratch  # positions in sorted order, while a list is built: the search then reads memory sequentially
-        )
+        # Positions in sorted order, while a list is built: the search then reads memory sequentially.
+        self.sorted_position = scratch
         self.memory = scene.memory
         dim, add = scene.particles.dim, scene.memory.field
         self.n, self.dim, self.state, self.real = scene.count, dim, scene.state, scene.real
@@ -72,9 +71,7 @@ class CellList:
             self.level_scale = add("grid.cells_per_meter", self.levels, values=1 / self.sizes)
             self.offset = add("grid.offset", self.levels, kind=ti.i32, values=offsets[:-1])
 
-    def _size_tables(
-        self, radius: np.ndarray, reach: np.ndarray, skin: float, level: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    def _size_tables(self, radius, reach, skin: float, level) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return cell sizes [m] and log2 of bucket numbers, (levels,), and the first bucket of each table, (levels + 1,)."""
         finer, longest = (np.array([v[level >= m].max(initial=0.0) for m in range(self.levels)]) for v in (radius, reach))
         own = finer if self.levels == 1 else np.array([radius[level == m].max(initial=0.0) for m in range(self.levels)])
@@ -98,10 +95,7 @@ class CellList:
         edge -= np.searchsorted(gone, edge).astype(edge.dtype)
 
     def regroup(self, radius: np.ndarray, reach: np.ndarray, skin: float, extent: np.ndarray) -> bool:
-        """Adapt the tables to added and removed particles, see NeighbourSearch.regroup().
-
-        extent: (dim,) size of the bounding box of all particles [m]. Returns whether the tables still have the same cells.
-        """
+        """Adapt the tables to particles in a box of size `extent`, (dim,) [m]. Returns whether the cells are the same."""
         level, memory = levels_of(radius, reach), self.memory
         memory.resize(self.sorted, len(radius))
         sizes, bits, offsets = self._size_tables(radius, reach, skin, level)
@@ -120,10 +114,7 @@ class CellList:
         return False
 
     def choose_axis_bits(self, extent: np.ndarray) -> np.ndarray:
-        """Return log2 of the buckets along each axis of each table, (levels, dim).
-
-        Each axis has at least 2 bits. Further bits go to the axis with the most cells per bucket.
-        """
+        """Return log2 of the buckets of each table along each axis, (levels, dim): 2 at least, more where cells are many."""
         out = []
         extent = np.where(np.isfinite(self._lengths), self._lengths, extent)
         for size, bits in zip(self.sizes, self.bits.tolist(), strict=True):
@@ -135,10 +126,7 @@ class CellList:
         return np.array(out)
 
     def fit(self, extent: np.ndarray) -> bool:
-        """Shape the tables for particles in a box of size `extent`, (dim,) [m]; affects speed only.
-
-        Returns whether any changed.
-        """
+        """Shape the tables for particles in a box of size `extent`, (dim,) [m], for speed only. Returns whether any changed."""
         axis_bits = self.choose_axis_bits(extent)
         changed = not np.array_equal(axis_bits, self._axis_bits)
         if changed:
@@ -268,9 +256,8 @@ class CellList:
                 span, parts = 3, 1
             parts = ti.min(parts, count)
             if ti.static(self.sheared):
-                if (
-                    self.cells_per_axis[m][GRADIENT] < 3 and parts > 0
-                ):  # the next row is a neighbour on both sides, at two offsets
+                # With few cells, the next row is a neighbour on both sides, at two offsets.
+                if self.cells_per_axis[m][GRADIENT] < 3 and parts > 0:
                     span, parts = 1, ti.min(count, mask + 1)
         elif (low & mask) + 2 <= mask:
             span, parts = 3, parts // 3
@@ -295,10 +282,7 @@ def levels_of(radius: np.ndarray, reach: np.ndarray) -> np.ndarray:
 
 
 def most_levels() -> int:
-    """Return LEVELS, or 1 where Taichi compiles to SPIR-V.
-
-    There (1.7.4, Vulkan in software) lists to which both particles of a pair write lack entries.
-    """
+    """Return LEVELS, or 1 on SPIR-V, where lists to which both particles of a pair write lack entries (1.7.4, Vulkan)."""
     return LEVELS if runtime.architecture() in runtime.LLVM else 1
 
 

@@ -43,21 +43,15 @@ class Images:
 
     @ti.func
     def nearest(self, r):
-        """Return the shortest of the differences r + whole boxes. Fast path: for most pairs this is r itself."""
+        """Return the shortest of the differences r + whole boxes, axis by axis. Fast path: for most pairs this is r itself."""
         if r.dot(r) > self.half_box_squared[None]:
-            r = self.minimum_image(r)
-        return r
-
-    @ti.func
-    def minimum_image(self, r):
-        """Return the shortest of the differences r + whole boxes, axis by axis."""
-        if ti.static(self.sheared):
-            k = self.count_boxes(r, GRADIENT)
-            r[GRADIENT] -= k * self.length[None][GRADIENT]
-            r[FLOW] -= k * self.shift[None][0]
-        for axis in ti.static(self.axes):
-            if ti.static(not (self.sheared and axis == GRADIENT)):
-                r[axis] -= self.count_boxes(r, axis) * self.length[None][axis]
+            if ti.static(self.sheared):
+                k = self.count_boxes(r, GRADIENT)
+                r[GRADIENT] -= k * self.length[None][GRADIENT]
+                r[FLOW] -= k * self.shift[None][0]
+            for axis in ti.static(self.axes):
+                if ti.static(not (self.sheared and axis == GRADIENT)):
+                    r[axis] -= self.count_boxes(r, axis) * self.length[None][axis]
         return r
 
     @ti.func
@@ -68,19 +62,13 @@ class Images:
 
     @ti.func
     def relative_displacement(self, moved, r):
-        """Return the relative displacement of the nearest images of two particles in a substep [m].
-
-        moved: their relative displacement [m]. r: the vector between them [m].
-        """
+        """Return the relative displacement [m] of nearest images, from that of two particles, `moved`, at the difference r."""
         moved[FLOW] -= self.count_boxes(r, GRADIENT) * self.shift[None][1]
         return moved
 
     @ti.func
     def cell(self, x, axis: ti.template(), turn, count):  # type: ignore[valid-type]
-        """Return which of `count` cells along an axis holds position x, for a viewer `turn` boxes further along GRADIENT.
-
-        The arithmetic is in f64: even for a particle many boxes away, the place in the box is as accurate as its position.
-        """
+        """Return the cell of `count` along an axis that holds x, in f64, for a viewer `turn` boxes along GRADIENT."""
         at = ti.cast(x[axis], ti.f64)
         if ti.static(self.sheared and axis == FLOW):
             boxes = ti.floor(ti.cast(x[GRADIENT], ti.f64) / self.length[None][GRADIENT])

@@ -79,10 +79,7 @@ class NeighbourList:
         return out
 
     def allocate(self, capacity: int) -> bool:
-        """Allocate `capacity` entries in a tree of fields of their own, so that the list can grow. The old list is kept.
-
-        Returns whether there are new fields.
-        """
+        """Allocate `capacity` entries in fields of their own, and keep the old list. Returns whether there are new fields."""
         if 2 * capacity > 2**31 - 1:
             raise MemoryError(f"{capacity} near pairs exceed what a list can index; the particles overlap too much.")
         self.capacity_number.set(max(1, -(-capacity // self.blocks)))
@@ -111,10 +108,7 @@ class NeighbourList:
         return True
 
     def grow(self) -> bool:
-        """Make room for the entries that the last build needed, plus a quarter.
-
-        Returns whether kernels must be compiled again.
-        """
+        """Make room for the entries of the last build, plus a quarter. Returns whether kernels must be compiled again."""
         with self._all_copies():
             need = int(self.memory.read(self.need).max())
         each = need * self.blocks / self.n
@@ -128,10 +122,7 @@ class NeighbourList:
         return new
 
     def _fields(self) -> list:
-        """Return the fields that must survive reallocation.
-
-        A single world has saved its data in the old list by then. Of many copies, some continue with their present list.
-        """
+        """Return the fields to keep: those of the old list; of many copies, some continue with their present list."""
         old = [self.old_neighbour, *(piece.old for piece in self.transferred), *(column.field for column in self.columns)]
         return [*old, self.neighbour, *(piece.field for piece in self.pair_data)] if self.memory.copies else old
 
@@ -274,10 +265,7 @@ class NeighbourList:
         count[fewer] = np.bincount(i, near.take(first[i] + place) < WALL, self.n)[fewer]
 
     def settle_owners(self, some: np.ndarray | None = None) -> None:
-        """Give data that have an owner to it, after pieces of the team changed, or which particles can move.
-
-        some: (k,) particles for whose pairs this is done; None for all. For an elastic list that is not saved.
-        """
+        """Give data to their owners, after pieces or movable particles changed. some: particles, (k,); the list is not saved."""
         assert self.store
         near, movable, piece = self.store.view(self.neighbour), self.movable(), self.team.piece
         around = np.full(self.n, some is None)

@@ -99,10 +99,7 @@ class NeighbourSearch:
         return repr(self.list)
 
     def _margins(self, skin: float, ahead: float, radius: np.ndarray, reach: np.ndarray) -> tuple[float, float, float]:
-        """Return `skin`, `sure` and `too_far`, as far as the box allows.
-
-        In a sheared box, the nearest image along y is the nearest image only within half of the box height.
-        """
+        """Return `skin`, `sure` and `too_far`; sheared images are the nearest only within half of the box height."""
         far = skin + ahead
         if self.sheared:
             half = float(self._scene.periodic.lengths[GRADIENT]) / 2
@@ -120,9 +117,8 @@ class NeighbourSearch:
         n, store = change.now.count, self.list.store
         room = store is not None and store.has_room(self.list.room + (self.list.network_size + 1) * (n + 1))
         finds_all = not self.several_levels and not self.state.images and not reach.any()
-        return (
-            room and not self.team.launched and finds_all == self.finds_all_neighbours and self.cells.can_regroup(radius, reach)
-        )
+        same = not self.team.launched and finds_all == self.finds_all_neighbours
+        return room and same and self.cells.can_regroup(radius, reach)
 
     def regroup(
         self, change: Regrouping, skin: float, radius: np.ndarray, reach: np.ndarray | None = None, ahead: float = 0.0
@@ -231,10 +227,7 @@ class NeighbourSearch:
 
     @ti.func
     def fill_block(self, block):
-        """List the neighbours of a block of particles, one after the other, where there is one level of cells.
-
-        Neighbours for which there is no room are only counted.
-        """
+        """List the neighbours of a block of particles, for one level of cells; those without room are only counted."""
         start, room = block * self.list.pitch, self.list.capacity
         size = (self.n + self.list.blocks - 1) // self.list.blocks
         used = 0

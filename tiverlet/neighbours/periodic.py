@@ -10,6 +10,7 @@ import numpy as np
 from .. import checks
 from ..checks import ArrayLike
 from ..features.feature import Feature, Knob, Scene
+from ..features.flag import Flag
 from ..features.regrouping import Regrouping
 from .images import FLOW, GRADIENT, Images
 
@@ -47,6 +48,7 @@ class Periodic(Feature):
 
     is_fixed_in_space = True
     compiled_for = ("sheared",)
+    sheared = Flag(lambda f: f.shear != 0, "Whether there is a shear.")
     host_only = ("low", "high")
     for_users = ("lengths", "offset", "strain")
     _last_strain_and_offset = 0.0, 0.0
@@ -84,11 +86,6 @@ class Periodic(Feature):
     def does_work(self) -> bool:
         """Whether images move, which does work on the particles."""
         return self.shear != 0
-
-    @property
-    def sheared(self) -> bool:
-        """Whether there is a shear, or kernels were compiled for one."""
-        return self.shear != 0 or "sheared" in self.compiled_so_far
 
     @property
     def lengths(self) -> np.ndarray:
@@ -175,10 +172,7 @@ class Periodic(Feature):
         return self._strain_and_offset[1]
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return the edges of the box for drawing, (m, 2, dim) [m].
-
-        low, high: corners of the scene, (dim,) [m], at which the box ends along axes that are not periodic.
-        """
+        """Return the edges of the box, (m, 2, dim) [m], open axes from low to high (dim,) [m]."""
         some = np.isfinite(self.lengths)
         ends = np.stack([np.where(some, self.low, low), np.where(some, self.high, high)])
         corners = np.array(list(product((0, 1), repeat=len(some))))
@@ -210,10 +204,7 @@ class Periodic(Feature):
         return out
 
     def ghosts(self, position: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return all images within `reach` [m] of the box: their particles and positions.
-
-        Images in the box come first, in order.
-        """
+        """Return all images within `reach` [m] of the box: their particles and positions, first those in the box, in order."""
         x = self.wrap(position)
         found, places = [np.arange(len(x))], [x]
         along = 2 if self.offset else 1  # in a shear, boxes further along y are offset along x

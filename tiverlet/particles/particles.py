@@ -45,7 +45,7 @@ class Particles:
         self.position = checks.points(who, "position", position)
         self.count, self.dim = self.position.shape
         in_range(who, "position", self.position)
-        self.velocity = _velocity(who, velocity, self.position.shape)
+        self.velocity = _vectors(who, "velocity", velocity, self.position.shape, "direction")
         self.mass = checks.per_item(who, "mass", mass, self.count, above=0.0, infinite=True)
         self.radius = checks.per_item(who, "radius", radius, self.count, least=0.0)
         self.pinned = _pinned(who, pinned, self.count)
@@ -84,10 +84,7 @@ class Particles:
         return self.spin is not None
 
     def regrouped(self, some: np.ndarray, added: "Particles | None" = None, position: np.ndarray | None = None) -> "Particles":
-        """Return the particles in the mask `some`, then the `added` ones.
-
-        position: present positions of all old particles, (n, dim) [m]; None for those of this object.
-        """
+        """Return the particles in the mask `some`, then the `added` ones. position: of the old ones, (n, dim) [m], or None."""
         names, own = ("velocity", "mass", "radius", "pinned", "group", "inv_mass"), vars(self)
         both: dict[str, np.ndarray] = {"position": self.position if position is None else position}
         both |= {name: own[name] for name in names}
@@ -109,10 +106,7 @@ class Particles:
         return new
 
     def _turning_of(self, some: np.ndarray, added: "Particles | None") -> dict[str, np.ndarray | None]:
-        """Return spin, inertia and orientation of the particles in the mask and the added ones.
-
-        If only some of them spin, the others spin from now on, starting at rest.
-        """
+        """Return spin, inertia and orientation of particles in the mask and of added ones, which rest if only the others spin."""
         groups = [(self, some), *([(added, np.ones(len(added), dtype=bool))] if added is not None else [])]
         if not any(p.spins for p, _ in groups):
             return dict.fromkeys(TURNING)
@@ -196,16 +190,11 @@ def turning(particles: "Particles", spin, inertia, orientation) -> tuple[np.ndar
 
 def spin_of(who: str, spin, particles: "Particles") -> np.ndarray:
     """Return checked angular velocities: (n,) in 2D, (n, 3) in 3D [rad/s]. Points must not spin."""
-    n, zero = particles.count, at_rest("spin", particles)
+    n = particles.count
     if particles.dim == 2:
         rates = checks.per_item(who, "spin", spin, n)
     else:
-        array = checks.plain(who, "spin", spin)
-        if array.ndim == 0 and float(checks.number(who, "spin", spin)) != 0:
-            raise ValueError(f"{who}: spin = {spin}; a single number other than 0 has no axis. Give (0, 0, {spin}), for example.")
-        if array.ndim == 1 and array.shape != (0,):
-            array = np.broadcast_to(checks.vector(who, "spin", spin, 3), zero.shape)
-        rates = zero if array.ndim == 0 else checks.points(who, "spin", array, dim=3, count=n)
+        rates = _vectors(who, "spin", spin, (n, 3), f"axis. Give (0, 0, {spin}), for example")
     turned = (rates != 0).reshape(n, particles.axes).any(axis=1) & (particles.radius == 0)
     if turned.any():
         i = int(np.argmax(turned))
@@ -234,16 +223,16 @@ def orientation_of(who: str, orientation, particles: "Particles") -> np.ndarray:
     return turned / length[:, None]
 
 
-def _velocity(who: str, velocity, shape: tuple[int, int]) -> np.ndarray:
-    array = checks.plain(who, "velocity", velocity)
+def _vectors(who: str, name: str, value, shape: tuple[int, int], lacks: str) -> np.ndarray:
+    """Return vectors, one for each particle, of 0, (dim,) or (n, dim). lacks: what a single number has none of."""
+    array = checks.plain(who, name, value)
     if array.ndim == 0:
-        checks.number(who, "velocity", velocity)
-        if float(velocity) != 0.0:
-            raise ValueError(f"{who}: velocity = {velocity}; a single number other than 0 has no direction.")
+        if float(checks.number(who, name, value)) != 0:
+            raise ValueError(f"{who}: {name} = {value}; a single number other than 0 has no {lacks}.")
         return np.zeros(shape)
-    if array.ndim == 1:
-        return np.broadcast_to(checks.vector(who, "velocity", velocity, shape[1]), shape).copy()
-    return checks.points(who, "velocity", velocity, dim=shape[1], count=shape[0])
+    if array.ndim == 1 and array.shape != (0,):
+        return np.broadcast_to(checks.vector(who, name, value, shape[1]), shape).copy()
+    return checks.points(who, name, value, dim=shape[1], count=shape[0])
 
 
 def _group(who: str, group, count: int) -> np.ndarray:

@@ -159,11 +159,8 @@ class State:
     @inline
     def relative_displacement(self, moved, i, j):
         """Return how much further particle i moved than particle j, as images of a periodic box that may be sheared."""
-        return (
-            self.images.relative_displacement(moved, at(self.x, i) - at(self.x, j))
-            if self.images and self.images.sheared
-            else moved
-        )
+        sheared = self.images and self.images.sheared
+        return self.images.relative_displacement(moved, at(self.x, i) - at(self.x, j)) if sheared else moved
 
     @inline
     def place(self, i):
@@ -230,11 +227,6 @@ class State:
         if ti.static(self.compensated):
             close = ti.static(self.two_digits) * (abs(n).dot(abs(self.x[i])) + size)
         return close
-
-    @ti.func
-    def digits_with(self, i, size):
-        """Return the size of the last two binary digits of sums of coordinates of particle i and of others of this size [m]."""
-        return self.digits(i) + ti.static(self.two_digits) * size
 
     @ti.func
     def restart(self, i):

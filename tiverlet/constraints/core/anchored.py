@@ -73,8 +73,15 @@ class Anchored(Batch):
             self.dev.spring.upload(self.compliance, self.damping)
 
     def prepare(self, particles: "Particles", inv_mass: np.ndarray) -> None:
-        """Check that the particles exist."""
-        checks.indices(repr(self), "indices", self.indices[:, 0], particles.count)
+        """Check that the particles exist, and set the inverse mass of driven ones to 0."""
+        rows = checks.indices(repr(self), "indices", self.indices[:, 0], particles.count)
+        if self.is_kinematic:
+            inv_mass[rows] = 0.0
+
+    def end_motion(self) -> None:
+        """Start the next frame from the targets of the last one, where particles go to such."""
+        if self.acts:
+            self.scene.memory.write(self.dev.place.source, self.scene.memory.read(self.dev.place.target))
 
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether none of its particles goes or gets another number."""
@@ -124,17 +131,13 @@ class Anchored(Batch):
 
 
 def refuse_held_twice(particles: "Particles", features: tuple[Feature, ...], some: Sequence[Feature] | None = None) -> None:
-    """Raise ValueError for pins and driven paths on a particle that is pinned, or that another feature holds.
-
-    some: the features that hold other particles than before; None for all.
-    """
+    """Raise ValueError for a particle that two features hold, or one that is pinned. some: features that changed; None: all."""
     tethers = [(k, f) for k, f in enumerate(features) if isinstance(f, Anchored) and f.exclusive]
     if some is not None and len(tethers) == 1 and not particles.pinned[tethers[0][1].members.rows].any():
         return
     holder = np.full(len(particles), -1)
-    for k, f in sorted(
-        tethers, key=lambda item: not item[1].is_kinematic
-    ):  # springs last: they have no effect on driven particles
+    # Springs last: they have no effect on driven particles.
+    for k, f in sorted(tethers, key=lambda item: not item[1].is_kinematic):
         rows = f.indices[:, 0]
         wrong = particles.pinned[rows] | (holder[rows] >= 0)
         if wrong.any():

@@ -8,7 +8,7 @@ import numpy as np
 from ... import checks
 from ...device import called_with, inline, ti
 from ...features.feature import Knob, Scene
-from ...geometry.intervals import cross
+from ...geometry.intervals import cross, cross_2d
 from .quantity import Quantity, exact_rest
 
 TURN = 2 * np.pi
@@ -20,23 +20,16 @@ REST_ANGLE = Knob(lambda f, v: checks.per_item(repr(f), f.rest_name, v, f.count,
 
 
 def angles_of_paths(batch: Any, name: str, value: Any, dim: int | None = None) -> np.ndarray:
-    """Return angles of paths as the user gives them, checked, (m,): within a turn, and in 3D in [0, pi], where they have no sign.
-
-    dim: of the world; None for that of the batch, which it has once it is in a world.
-    """
+    """Return checked angles of paths, (m,), within a turn, in 3D in [0, pi]. dim: of the world; None for that of the batch."""
     if (batch.start.dim if dim is None and batch.start else dim) == 3:
         return checks.per_item(repr(batch), f"{name} (in 3D)", value, batch.count, least=0.0, most=np.pi)
     return checks.per_item(repr(batch), name, value, batch.count, least=-TURN, most=TURN)
 
 
 @cache
-def _matrix(rows: int, columns: int, real: Any) -> Any:
-    return ti.types.matrix(rows, columns, real)
-
-
-def corner_matrix(angle: Any) -> Any:
-    """Return the matrix type of the angle's corners and gradients."""
-    return _matrix(angle.arity, angle.state.dim, angle.real)
+def _types(arity: int, dim: int, real: Any) -> Any:
+    corners = ti.types.matrix(arity, dim, real)
+    return (ti.i32, corners), (real, corners)
 
 
 class Angle(Quantity):
@@ -63,7 +56,7 @@ class Angle(Quantity):
         """f - rest in f64, within half a turn of 0."""
         return exactly_off(self, c)
 
-    @called_with(lambda self: ((ti.i32, corner_matrix(self)), (self.real, corner_matrix(self))))
+    @called_with(lambda self: _types(self.arity, self.state.dim, self.real))
     @ti.func
     def remeasure(self, c, q):
         """Return measure(c, q), as one function: it is long and called from up to three places."""
@@ -94,14 +87,11 @@ class PathAngle(Angle):
         a, b = x[:, 1] - x[:, 0], x[:, 2] - x[:, 1]
         dot = (a * b).sum(axis=1)
         if x.shape[2] == 2:
-            return np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], dot)
+            return np.arctan2(cross_2d(a, b), dot)
         return np.arctan2(np.linalg.norm(cross(a, b), axis=1), dot)
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
-        """Return the gradients of values() by each corner, (m, 3, dim), as path_angle() does; 0 where corners coincide.
-
-        Differences would be 0 for a straight path in 3D, whose angle grows in all directions alike: it gets those in one plane.
-        """
+        """Return the gradients of values(), (m, 3, dim), as path_angle() does: in some plane for a straight path in 3D."""
         (u, a), (v, b) = directions(x[:, 1] - x[:, 0]), directions(x[:, 2] - x[:, 1])
         if x.shape[2] == 2:
             across = [np.stack([-r[:, 1], r[:, 0]], axis=1) for r in (u, v)]
@@ -174,10 +164,7 @@ class PathAngle(Angle):
 
     @ti.func
     def start_substep(self, c, now, start, fresh):
-        """Remember the normal, with the sign that suits the last one.
-
-        Where the path is straight at the start, the normal at the end is used.
-        """
+        """Remember the normal at the start, or at the end if it is straight there, with the sign that suits the last one."""
         if ti.static(self.has_axis):
             if fresh != 0:
                 self.axis[c] = ti.Vector.zero(self.real, 3)

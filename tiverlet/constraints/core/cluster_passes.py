@@ -135,12 +135,8 @@ class ClusterPasses(Passes):
         K = p1.outer_product(p1)
         X, v1, U = 0 * K, 0 * p1, 0 * K
         for e in range(begin, end):
-            mu, p, q, s = (
-                self.mass_in_pass(e, rigid + soft, alpha_prime),
-                self.relative_position(e, i0, 0),
-                self.shape[e],
-                self.relative_position(e, i0, 1),
-            )
+            mu, p = self.mass_in_pass(e, rigid + soft, alpha_prime), self.relative_position(e, i0, 0)
+            q, s = self.shape[e], self.relative_position(e, i0, 1)
             if first < 0:
                 mu, s = self.mass_of(e, c), p
             total += mu
@@ -246,10 +242,7 @@ class ClusterPasses(Passes):
 
     @ti.func
     def turn_answer(self, c, bodies: ti.template()):  # type: ignore[valid-type]
-        """Find how cluster c moves as a rigid body, at the start of the substep or at the time of an impact.
-
-        What is shared counts with a part of its mass, as in a pass, so that unequal parts take no momentum away.
-        """
+        """Find how cluster c moves as a rigid body in an impact. Shared particles count with a part of their mass."""
         begin, end, i0 = self.corners.starts[c], self.corners.starts[c + 1], self.corners.reference_particle(c)
         total, middle, own = ti.cast(0, ti.f64), self.zero_vector(), self.is_body(c) and self.strength.is_intact(c)
         back = 1 - bodies.rows.when_of(self.corners.members[begin])
@@ -344,10 +337,7 @@ class ClusterPasses(Passes):
 
     @ti.func
     def push_spring_force(self, c, h, soft, alone):
-        """Compute the present position and rotation of the cluster.
-
-        scatter_corner() then adds h^2 times the spring acceleration.
-        """
+        """Compute the present position and rotation, for scatter_corner(), which adds h^2 times the spring acceleration."""
         if self.mass[c] > 0:
             total, p, q, s, K, X = self.moments(c)
             R = rotation.matrix(rotation.fit(K, self.turn[c], LEAST))
@@ -368,11 +358,8 @@ class ClusterPasses(Passes):
         X = 0 * S
         for e in range(begin, end):
             held = held or self.w[self.corners.members[e]] == 0
-            m, r, move = (
-                self.mass_of(e, c),
-                self.relative_position(e, i0, 0),
-                self.reaction(e, c, middle, center, R, h, firm, soft),
-            )
+            m, r = self.mass_of(e, c), self.relative_position(e, i0, 0)
+            move = self.reaction(e, c, middle, center, R, h, firm, soft)
             total += m
             mean += m * r
             pull += m * move
@@ -388,10 +375,7 @@ class ClusterPasses(Passes):
 
     @ti.func
     def reaction(self, e, c, middle, center, R, h, firm, soft):
-        """Return the move of corner e: of the last substep, plus the change of its spring force since.
-
-        It is 0 if its cluster has broken. middle, center, R: see best_fit().
-        """
+        """Return the last move of corner e, plus the change of its spring force since; 0 if broken. middle: see best_fit()."""
         pull = ti.cast(self.pull[e], ti.f64)
         if ti.static(self.slots.answers):
             pull -= ti.cast(self.blow[e], ti.f64)
@@ -434,11 +418,8 @@ class ClusterPasses(Passes):
     @ti.func
     def offset_of(self, e, c):
         """Return C_i at the present positions."""
-        return (
-            self.relative_position(e, self.corners.reference_particle(c), 0)
-            - self.place[c]
-            - rotation.from_rows(self.pose[c]) @ self.shape[e]
-        )
+        x = self.relative_position(e, self.corners.reference_particle(c), 0)
+        return x - self.place[c] - rotation.from_rows(self.pose[c]) @ self.shape[e]
 
     @ti.func
     def scatter_corner(self, e, h, h2_effective, first, fresh):
@@ -542,10 +523,7 @@ class ClusterPasses(Passes):
 
     @ti.func
     def energy(self, c, back, h2_effective, residual):
-        """Return the elastic energy [J]: the sum of m |C|^2 / (2 alpha M) at x - back d, about the best fit there.
-
-        It counts only the part that bears loads, see Spring.bearing_share().
-        """
+        """Return the elastic energy [J] about the best fit at x - back d, of the part that bears loads, see Spring."""
         out = ti.cast(0, ti.f64)
         if ti.static(self.spring.soft):
             alpha, mass, i0 = self.spring.alpha[c], self.mass[c], self.corners.reference_particle(c)

@@ -56,10 +56,7 @@ class CornerPasses(Passes):
 
     @ti.func
     def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
-        """Move each corner by w_j dlam grad_j C.
-
-        Where c belongs to a system, dlam comes from the system: c fills in its row there, and writes w_j grad_j C into its slots.
-        """
+        """Move each corner by w_j dlam grad_j C. In a system, fill in the row: dlam comes from there."""
         if ti.static(self.equation.ramp.is_allocated):
             if first != 0:
                 self.equation.ramp.update_rest(c, frame_fraction)
@@ -188,10 +185,7 @@ class CornerPasses(Passes):
 
     @ti.func
     def fill_row(self, c, violation, A, alpha, lam, W, n, g, turn, moved, share):
-        """Fill in the row of constraint c, from what linearise() returns.
-
-        share: the length of the substep as a share of the frame.
-        """
+        """Fill in the row of constraint c, from what linearise() returns. share: of the frame, of the substep."""
         row, start, weight, new = self.row[c], lam, W, lam
         if ti.static(self.limit.acts):
             if W > 0:
@@ -229,9 +223,8 @@ class CornerPasses(Passes):
             for k in ti.static(range(self.arity)):
                 w = self.w[self.corners.member(c, k)]
                 move += w * w * n[k, :].dot(n[k, :])
-            new = self.limit.limit_collapse(
-                lam, new, self.equation.rest[c], self.corners.relative_positions(c, 0).norm_sqr(), move
-            )
+            extent = self.corners.relative_positions(c, 0).norm_sqr()
+            new = self.limit.limit_collapse(lam, new, self.equation.rest[c], extent, move)
         step = new - lam
         if ti.static(self.semi_iterates):
             last, wanted = self.step[c], new
@@ -268,10 +261,7 @@ class CornerPasses(Passes):
 
     @ti.func
     def violation_left(self, c, violation, lam, g, h):
-        """Return the violation that an extra pass leaves: that which the regular passes left, and all of that of a spring.
-
-        In the first extra pass, walls have already pushed what struck them.
-        """
+        """Return what an extra pass leaves: what regular passes left and walls did not change, and all of it for a spring."""
         out = violation
         if self.is_firm(c, h):
             out = 0 * violation
@@ -290,10 +280,7 @@ class CornerPasses(Passes):
 
     @ti.func
     def held_by_walls(self, c, W, n, g):
-        """Return the weight W and the gradients g without the directions in which walls hold corners that struck them.
-
-        A constraint whose corners cannot move otherwise keeps both.
-        """
+        """Return W and the gradients without the directions in which walls hold corners, unless nothing else can move."""
         free, held, all_of_it = g, 0 * W, 0 * W
         for k in ti.static(range(self.arity)):
             i = self.corners.member(c, k)
@@ -310,10 +297,7 @@ class CornerPasses(Passes):
 
     @ti.func
     def known_violation(self, c, start, W, h, h2_effective):
-        """Return the violation that corresponds to the known load of constraint c.
-
-        start: the violation at the start of the substep.
-        """
+        """Return the violation of the known load of constraint c. start: the violation at the start of the substep."""
         out = 0 * start
         if W > 0 and self.spring.is_rigid(c) and not self.equation.has_cusp(c):
             missing = self.slots.relaxation * start / W
@@ -341,10 +325,7 @@ class CornerPasses(Passes):
 
     @ti.func
     def geometric_stiffness(self, c, W):
-        """Return (omega h)^2 of the fastest transverse vibration under a multiplier of 1.
-
-        In a chain of links l it is 4 w / l, where W = 2 w.
-        """
+        """Return (omega h)^2 of the fastest transverse vibration per multiplier: 4 w / l in a chain of links l, where W = 2 w."""
         out = 2 * W * self.inverse_size[c]
         if ti.static(self.slots.converges and self.slots.can_soften):  # W contains it
             out /= self.slots.softness[None]
@@ -377,10 +358,7 @@ class CornerPasses(Passes):
 
     @ti.func
     def push_spring_force(self, c, h, soft, alone):
-        """Push h^2 w_j F grad_j C, with F of Equation.spring_force().
-
-        Rigid links get their force in the next substep, except for the load that they know.
-        """
+        """Push h^2 w_j F grad_j C, F of Equation.spring_force(); for rigid links, F is the load that they know."""
         f, g = self.measured(c, 0)
         f = self.quantity.unwrap(f, self.equation.rest[c])
         w, W = self.weights(c, g)
@@ -429,10 +407,7 @@ class CornerPasses(Passes):
 
     @ti.func
     def overload(self, c, h2_rigid, h2_effective):
-        """Return by how much the multiplier of constraint c, or the sum over many substeps, is too large, see Strength.
-
-        Velocities contain its known load, as a spring force.
-        """
+        """Return by how much the load, known or summed over substeps, is too large, see Strength."""
         lam, w, out = self.equation.lam[c], ti.cast(0, self.real), ti.cast(0, self.real)
         if ti.static(self.spring.soft):
             if h2_rigid > h2_effective:

@@ -94,10 +94,7 @@ class Drive:
 
     @ti.func
     def advance(self, c, f, side: ti.template(), W, alpha, lam, h, h2_effective, size):  # type: ignore[valid-type]
-        """Move the rest value of constraint c, and return it at the end of a substep that starts at f.
-
-        side, W: see Equation. alpha: compliance. lam: the multiplier of the last substep. size: of the constraint.
-        """
+        """Return the moved rest value at the end of a substep from f. side, W: see Equation. lam: the last multiplier."""
         old, speed = self.target[c], self.speed[c]
         lag = ti.cast(f, ti.f64) - old
         lag = self.nearest_equivalent(lag, 0 * lag)

@@ -87,10 +87,7 @@ class Equation:
 
     @ti.func
     def terms(self, c, f, f0, w, W, h, h2_effective, first, fresh):
-        """Return A C + B + alpha' lam, A, alpha', lam and W (0 for a broken constraint).
-
-        f, f0: f at the end and at the start of the substep. w: see stiff().
-        """
+        """Return A C + B + alpha' lam, A, alpha', lam and W (0 if broken). f, f0: at the end and the start. w: see stiff()."""
         if ti.static(self.strength.breaks):
             if not self.strength.is_intact(c):
                 W = 0
@@ -113,9 +110,8 @@ class Equation:
                 alpha = self.spring.alpha[c] / h2_effective
                 if first != 0:
                     f_last = self.quantity.unwrap(self.spring.last_value(c, f0, fresh), f0)
-                    B = now * self.clip_to_side(self.earlier_violation(c, f0, 1)) + last * self.clip_to_side(
-                        self.earlier_violation(c, f_last, 2)
-                    )
+                    C_now, C_last = self.earlier_violation(c, f0, 1), self.earlier_violation(c, f_last, 2)
+                    B = now * self.clip_to_side(C_now) + last * self.clip_to_side(C_last)
                     if ti.static(not self.forces):
                         if fresh == RESTARTED:
                             B += (1 - self.spring.stiff(c, h, w)) * self.spring.offset[c]
@@ -140,10 +136,7 @@ class Equation:
 
     @ti.func
     def postpone(self, c, f0, W, share, first):
-        """Return the part of the violation that is left for later substeps, see StepLimit.
-
-        share: the length of the substep as a share of the frame; 0 outside of a substep.
-        """
+        """Return the part of the violation that is left for later, see StepLimit. share: of the frame; 0 outside of a substep."""
         out = ti.cast(0, self.real)
         if first != 0:
             C = f0 - self.rest[c]
@@ -241,10 +234,7 @@ class Equation:
 
     @ti.func
     def reaction(self, c, f, w, W, h, firm, soft):
-        """Return h^2 F of the last substep; for a spring, corrected by how much F has changed since; 0 once it has broken.
-
-        f: now. w, W: as in Spring.force_change(). firm, soft: as in Passes.push_reaction().
-        """
+        """Return h^2 F of the last substep and its change since, 0 if broken, see Spring and Passes.push_reaction()."""
         lam = self.lam[c]
         if ti.static(self.answers):
             lam -= self.blow[c]
@@ -270,10 +260,7 @@ class Equation:
 
     @ti.func
     def energy(self, c, f, w, h2_effective, residual):
-        """Return the elastic energy [J] of a spring at f: F C / 2, which is C^2 / (2 alpha) once solved.
-
-        See Spring.bearing_share() and Spring.energy(). h2_effective: F = -lam / h2_effective; 0 before the first substep.
-        """
+        """Return the elastic energy [J] of a spring at f, F C / 2 with F = -lam / h2_effective, see Spring.energy()."""
         alpha = self.spring.alpha[c]
         C = self.clip_to_side(self.quantity.unwrap(f, self.rest[c]) - self.rest[c])
         out = ti.cast(C, ti.f64) * C / (2 * alpha)

@@ -83,9 +83,8 @@ class NumericGradient:
         who, name = f"Constraint({undecorated(self.function).__name__})", undecorated(self.given).__name__
         several = self.arity > 1
         if several and (isinstance(value, Expression) or len(value) != self.arity):
-            refuse(
-                TypeError(f"{who}: {name} must return {self.arity} vectors, the gradient by each corner: return g_0, g_1, ...")
-            )
+            wanted = f"{self.arity} vectors, the gradient by each corner: return g_0, g_1, ..."
+            refuse(TypeError(f"{who}: {name} must return {wanted}"))
         for one in value if several else [value]:
             check_vector(who, name, one, self.dim, "the gradient by a corner", "")
         return value
@@ -114,10 +113,7 @@ class NumericGradient:
 
     @ti.func
     def differentiate(self, c, q, scale):
-        """Return function and its central differences at q. scale: of the step where q is 0, in units of STEP.
-
-        One loop, which is not unrolled, holds the only copy of the function.
-        """
+        """Return function and its central differences at q, by a loop with its only copy. scale: of the step at 0, in STEP."""
         size = 0 * q[0, 0]
         for k, a in ti.static(ti.ndrange(self.arity, self.dim)):
             size = ti.max(size, ti.abs(q[k, a]))

@@ -52,10 +52,7 @@ class KnownLoad:
 
     @ti.func
     def apply_load(self, c, share, h, h2_effective):
-        """Return the multiplier of the load that constraint c knows.
-
-        Add `share` to the missing load: the multiplier that the violation at the start of the substep needs besides.
-        """
+        """Return the multiplier of the known load. share: the multiplier that is missing, as the violation at the start shows."""
         self.missing[c] = self.missing[c] + share / (h * h)
         lam = -h2_effective * self.load[c]
         self.given[c] = lam

@@ -145,10 +145,7 @@ class OnCurve(Place):
 
     @ti.func
     def offsets(self, c, frame_fraction, first, fresh):
-        """Return x - P across the curve, with P where the plane across it meets it.
-
-        At an end or a bend, P is the nearest point.
-        """
+        """Return x - P across the curve, with P where the plane across it meets it; at an end or a bend, the nearest point."""
         i = self.corners.member(c, 0)
         x, t, C0 = self.position(i), self.tangent[c], ti.Vector.zero(self.real, self.state.dim)
         k, r = self.piece[c], self.rest[c]

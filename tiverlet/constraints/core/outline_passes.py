@@ -39,10 +39,7 @@ class OutlinePasses(Passes):
 
     @ti.func
     def reduce_block(self, b, h, h2_effective, first, fresh):
-        """Sum over a block: f and f0; w |grad|^2; mass-split along both, current, start; squared size; squared move.
-
-        The last is the squared displacement by a multiplier of 1.
-        """
+        """Sum f, f0, w |grad|^2; mass-split along both, current, start; squared size; squared move by a multiplier of 1."""
         begin, end, c = self.corners.block[b]
         i0 = self.corners.reference_particle(c)
         sums = ti.Vector.zero(self.real, 8)
@@ -74,10 +71,7 @@ class OutlinePasses(Passes):
 
     @ti.func
     def linearise(self, c, h, h2_effective, share, fresh):
-        """Return the violation A C + B + alpha' lam, A, alpha', lam and the weight W, where the solver has left constraint c.
-
-        share: of the frame, of the substep.
-        """
+        """Return A C + B + alpha' lam, A, alpha', lam and W where the solver has left constraint c. share: of the frame."""
         i0 = self.corners.reference_particle(c)
         f, f0, w, W = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
         for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
@@ -140,11 +134,8 @@ class OutlinePasses(Passes):
         out = 0 * h2_rigid
         if self.strength.is_intact(c):
             per_newton = self.equation.spring.multiplier_per_newton(c, self.weight(c), h2_rigid, h2_effective)
-            past, unsure, i0 = (
-                self.strength.add_excess(c, c, self.equation.lam[c], per_newton),
-                0 * per_newton,
-                self.corners.reference_particle(c),
-            )
+            past = self.strength.add_excess(c, c, self.equation.lam[c], per_newton)
+            unsure, i0 = 0 * per_newton, self.corners.reference_particle(c)
             if past > 0:
                 for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
                     g = self.quantity.slope(e, 0).norm()

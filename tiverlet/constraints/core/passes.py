@@ -76,10 +76,7 @@ class Passes:
 
     @ti.func
     def overload(self, c, h2_rigid, h2_effective):
-        """Where the batch `breaks`: return the load of constraint c as a multiple of break_at if it is too large, else 0.
-
-        h2_rigid, h2_effective: its multiplier for 1 N, for rigid and for soft constraints.
-        """
+        """Where the batch `breaks`: return the overload of constraint c, else 0. h2_rigid, h2_effective: multipliers of 1 N."""
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
@@ -88,8 +85,5 @@ class Passes:
 
     @ti.func
     def energy(self, c, back, h2_effective, residual):
-        """Return the elastic energy [J] at x - back d.
-
-        residual: what residual_of() returns. h2_effective: as in relax(), 0 before the first substep.
-        """
+        """Return the elastic energy [J] at x - back d. residual: of residual_of(). h2_effective: 0 before the first substep."""
         return 0.0

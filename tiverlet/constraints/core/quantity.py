@@ -121,10 +121,7 @@ class Quantity:
 
     @ti.func
     def trust_radius(self, q):
-        """Return how far a corner may move before the gradient no longer describes f.
-
-        q: the corners. The result is about the size of the body.
-        """
+        """Return how far a corner at q may move before the gradient no longer describes f, about the size of the body."""
         return q.norm()
 
     @ti.func
@@ -133,10 +130,7 @@ class Quantity:
 
     @ti.func
     def is_radial(self, c):
-        """Whether f - rest of constraint c is like the distance from a point.
-
-        A spring then has a smooth force while it passes close to f = rest, however far its direction turns there.
-        """
+        """Whether f - rest is like the distance from a point: a spring's force is smooth there, however far it turns."""
         return False
 
     @ti.func
@@ -167,10 +161,7 @@ def exact_rest(quantity: ti.template(), c):  # type: ignore[valid-type]
 
 
 def differences(values: Callable, x: np.ndarray) -> np.ndarray:
-    """Return gradients of values(x) by each corner of x (m, arity, dim), by central differences.
-
-    values: takes several copies of all of x, one after the other. A few rows take as long as one.
-    """
+    """Return gradients of values(x) by x (m, arity, dim), by central differences. values: takes copies of x in sequence."""
     step, m = 1e-6 * (float(np.ptp(x, axis=1).max(initial=0.0)) or 1.0), len(x)
     flat = x.reshape(m, x.shape[1] * x.shape[2])
     out, each = np.zeros_like(flat), max(1, TOGETHER // max(1, 2 * m))

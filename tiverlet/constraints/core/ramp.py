@@ -62,10 +62,7 @@ class Ramp:
         return any((now != goal.astype(real)).any() for now, goal in zip(self.now(), goals, strict=True))
 
     def jump_to_goals(self, some: np.ndarray) -> None:
-        """Set the rest values of constraints in the mask `some`, (m,), to their goals before the frame.
-
-        Their particles were placed where the goals are met.
-        """
+        """Set the rest values of constraints in the mask `some`, (m,), to their goals: their particles were placed there."""
         goals = [goal for _, goal, _ in self._batch.tracks()]
         self.put([np.where(some, goal, now) for now, goal in zip(self.now(), goals, strict=True)])
 
@@ -75,10 +72,7 @@ class Ramp:
             self._write_goals(self.now(), self.now())
 
     def start_moving(self) -> bool:
-        """Start moving rest values, so that they reach their goals as the coming frame ends.
-
-        Returns whether kernels have to be compiled for it.
-        """
+        """Start moving rest values to their goals in the coming frame. Returns whether kernels have to be compiled for it."""
         self.under_way = self._off_goal()
         new = self.under_way and not self.is_allocated
         if new:
@@ -100,10 +94,7 @@ class Ramp:
         self.under_way = False
 
     def _refer_to_goals(self) -> None:
-        """Shift the f that springs remember by the last step, so that it refers to the goal, and set the step to 0.
-
-        The step is no part of the state: without the shift, clones would read other velocities.
-        """
+        """Make the f that springs remember refer to the goals: the last step is no part of the state, which clones read."""
         spring, m = self._batch.dev.spring, self._batch.count
         if spring.soft and not self._batch.quantity.centred:
             last = self._memory.read(spring.last)

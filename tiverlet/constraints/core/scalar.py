@@ -8,13 +8,13 @@ import numpy as np
 from ... import checks
 from ...device.interrupts import in_turn
 from ...features.feature import Batch, Knob, Scene
+from ...features.flag import BREAKS, SOFT, Flag
 from ...features.read_only import as_read_only, assign_whole_advice
 from ...features.regrouping import Regrouping
 from ...geometry.ordered import distinct
 from .corner_passes import CornerPasses
 from .drive import Drive
 from .equation import SMALLEST
-from .flag import BREAKS, SOFT, Flag
 from .members import Members
 from .outline_passes import OutlinePasses
 from .quantity import Quantity, checked
@@ -143,10 +143,7 @@ class Scalar(Batch):
         return self.values(self.placed(position) if self.arity else position)
 
     def placed(self, position: np.ndarray) -> np.ndarray:
-        """Return the positions of the corners of each constraint, (m, arity, dim).
-
-        In a periodic box these are the images nearest to the first corner.
-        """
+        """Return the corners of each constraint, (m, arity, dim); in a periodic box the images nearest to the first one."""
         x = position[self.indices]
         return x if self.periodic is None else x[:, :1] + self.periodic.difference(x, x[:, :1])
 
@@ -222,9 +219,8 @@ class Scalar(Batch):
         stuck = self.immovable(inv_mass)
         if stuck.any():
             C = self.violation(particles.position)
-            wrong = stuck & (
-                np.abs(C if self.side == 0 else np.maximum(self.side * C, 0)) > 1e-6 * np.maximum(np.abs(self.goal), 1e-6)
-            )
+            off = np.abs(C if self.side == 0 else np.maximum(self.side * C, 0))
+            wrong = stuck & (off > 1e-6 * np.maximum(np.abs(self.goal), 1e-6))
             if wrong.any():
                 k = int(np.argmax(wrong))
                 at = tuple(int(i) for i in self.members_of(k))
@@ -254,10 +250,7 @@ class Scalar(Batch):
 
     @property
     def needs_other_kernels(self) -> bool:
-        """Whether the world has to be rebuilt: also where other constraints than before are relaxed alone, and see _values().
-
-        The result depends on the current values of knobs, not on earlier ones.
-        """
+        """Whether the world has to be rebuilt: also where others than before are relaxed alone now, and see _values()."""
         if not (self.scene and self.acts):
             return super().needs_other_kernels
         others = self.solvable_together and bool((self._alone != self.relaxed_alone(self.scene)).any())

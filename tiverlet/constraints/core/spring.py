@@ -161,10 +161,7 @@ class Spring:
 
     @ti.func
     def law(self, c, h, w, fresh):
-        """Return the coefficients of C_(n+1), C_n, C_(n-1) in C* + alpha c dC/dt: central where resolved, backward where stiff.
-
-        w: see stiff(). fresh: not 0 at a start.
-        """
+        """Return the coefficients of C_(n+1), C_n, C_(n-1) in C* + alpha c dC/dt: central if resolved, backward if stiff."""
         rigid, gamma = self.stiff(c, h, w), ti.cast(0, self.real)
         if ti.static(self.damped):
             gamma = self.damping[c] * self.alpha[c] / h

@@ -49,11 +49,7 @@ class StepLimit:
 
     @ti.func
     def postpone(self, c, C, borne, size, share):
-        """Return the part of a violation C, at the start of a substep, that is left for later substeps.
-
-        borne: the part of C that bears the load of constraint c. size: of c. share: the length of the substep as a share of the
-        frame.
-        """
+        """Return the part of C at the start that is left for later. borne: bears the load. size: of c. share: of the frame."""
         out = 0 * C
         if ti.static(not self.collapses):
             borne = ti.min(borne, BORNE * size)

@@ -79,10 +79,7 @@ class Strength:
 
     @ti.func
     def add_excess(self, c, e, load, per_newton):
-        """Add the load of entry e of constraint c in this substep, a multiplier, to the sum of its excess.
-
-        Returns the size of the sum, negative while there is no excess. per_newton: the multiplier of 1 N.
-        """
+        """Add a load of constraint c, the multiplier of entry e, to its excess. Returns the size, negative without excess."""
         total = self.excess[e] + load
         size = 0 * per_newton
         if ti.static(bool(self.corners)):
