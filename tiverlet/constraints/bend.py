@@ -1,18 +1,14 @@
 """Angles between links."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from ..checks import ArrayLike
 from ..features.feature import Knob
 from ..geometry.intervals import cross
+from ..particles import Particles
 from .core.angle import PathAngle, angles_of_paths
 from .core.quantity import Quantity
 from .core.scalar import Scalar
-
-if TYPE_CHECKING:
-    from ..particles import Particles
 
 STRAIGHT = 1e-9  # [rad] below which an initial angle in 3D is rounding of positions
 
@@ -44,7 +40,7 @@ class Bend(Scalar):
         """Return the angles of these paths, which in 3D remember their planes: a straight path does not define one."""
         return PathAngle(self.fixed(indices, 3), remembers=True)
 
-    def prepare(self, particles: "Particles", inv_mass: np.ndarray) -> None:
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the indices and the rest angles. Initial angles are exactly 0 where a path in 3D is straight but for rounding."""
         first = "rest" not in vars(self) and self._rest_given is None
         super().prepare(particles, inv_mass)

@@ -22,7 +22,8 @@ def oriented(who: str, name: str, faces: np.ndarray, remedy: str = "") -> tuple[
         e = int(np.argmax(number != 2))
         edge, k = tuple(edges[e].tolist()), int(np.argmax((which == e).any(axis=1)))
         why = "so the surface is open there" if number[e] == 1 else "but an edge of a closed surface has two"
-        raise ValueError(f"{who}: the edge {edge} of {name}[{k}] belongs to {number[e]} face(s), {why}.{remedy}")
+        faces_there = "1 face" if number[e] == 1 else f"{number[e]} faces"
+        raise ValueError(f"{who}: the edge {edge} of {name}[{k}] belongs to {faces_there}, {why}.{remedy}")
     turned, piece, wrong = common_sense(faces)
     if wrong >= 0:
         raise ValueError(f"{who}: {name}[{wrong}] and its neighbours have no common sense; the surface has only one side.")
