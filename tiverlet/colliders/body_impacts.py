@@ -190,10 +190,7 @@ class BodyImpacts:
     @ti.func
     def held_part(self, i, g):
         """Return the part of the gradient g, of particle i, along which a wall holds the particle."""
-        out = 0 * g
-        if self.is_held(i):
-            out = g.dot(self.normal[i]) * self.normal[i]
-        return out
+        return ti.select(self.is_held(i), g.dot(self.normal[i]) * self.normal[i], 0 * g)
 
     @ti.func
     def is_pulled(self, i):
@@ -203,18 +200,12 @@ class BodyImpacts:
     @ti.func
     def release(self, i):
         """Return how far particle i will move as the wall that pulls it lets go, or 0."""
-        out = 0 * self.normal[i]
-        if self.is_pulled(i):
-            out = -self.pushed[i] * self.normal[i]
-        return out
+        return ti.select(self.is_pulled(i), -self.pushed[i] * self.normal[i], 0 * self.normal[i])
 
     @ti.func
     def wall_change(self, i):
         """Return how far a wall that it struck has changed the displacement of particle i."""
-        out = 0 * self.normal[i]
-        if self.is_held(i):
-            out = self.pushed[i] * self.normal[i] - self.held[i]
-        return out
+        return ti.select(self.is_held(i), self.pushed[i] * self.normal[i] - self.held[i], 0 * self.normal[i])
 
     @ti.func
     def record_impact(self, i, n, moved, target, leaving, static, dynamic, log):

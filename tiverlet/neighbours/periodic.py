@@ -222,16 +222,10 @@ class Periodic(Feature):
     def _count_boxes(self, r: np.ndarray) -> np.ndarray:
         """Return the number of boxes along each axis nearest to r, (..., dim); 0 where r is NaN or exceeds COUNTED boxes."""
         out = np.zeros(r.shape, dtype=np.int64)
-
-        def count(k: int) -> None:
-            """Count boxes along axis k."""
+        r = r.copy()
+        for k in sorted(self.axes, key=lambda k: k != GRADIENT):  # GRADIENT first: images along it are offset along FLOW
             boxes = np.floor(r[..., k] / self.lengths[k] + 0.5)
             out[..., k] = np.where(np.abs(boxes) < COUNTED, boxes, 0)
-
-        if FLOW in self.axes and GRADIENT in self.axes:
-            count(GRADIENT)
-            r = r.copy()
-            r[..., FLOW] -= out[..., GRADIENT] * self.offset
-        for k in self.axes:
-            count(k)
+            if k == GRADIENT and FLOW in self.axes:
+                r[..., FLOW] -= out[..., GRADIENT] * self.offset
         return out

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ...device import ti
+from ...device import at, inline, ti
 from ...features.feature import FAR, Scene
 from .equation import Equation
 from .known_load import KnownLoad
@@ -331,13 +331,10 @@ class CornerPasses(Passes):
             out /= self.slots.softness[None]
         return out
 
-    @ti.func
+    @inline
     def is_outside_systems(self, c):
         """Whether constraint c belongs to no system."""
-        out = True
-        if ti.static(self.in_system):
-            out = self.row[c] < 0
-        return out
+        return at(self.row, c) < 0 if self.in_system else ti.cast(1, ti.i32) > 0
 
     @ti.func
     def unmet(self, c):

@@ -52,23 +52,22 @@ class Equation:
         self.driven = batch.driven
         self.drive: Any = batch.drive_of(scene) if batch.driven else None
         self.lam = add(f"{name}.multiplier", m, state=True)
+        self.in_state = {"lam": self.lam}
         self.answers = scene.slots.answers
         if self.answers:
             self.touched = add(f"{name}.touched", m, kind=ti.i32, state=True)  # whether contacts moved it in the last substep
             self.left = add(f"{name}.left", m, state=True)  # what they left it violated by: no reason for an impulse
             self.answered = add(f"{name}.answered", m, state=True)  # the answer of the last substep, with lam where relaxed alone
             self.blow = add(f"{name}.blow", m, state=True)  # the part of lam that is over
+            self.in_state |= {"touched": self.touched, "left": self.left, "answered": self.answered, "blow": self.blow}
+        if batch.driven:
+            self.in_state["rest"] = self.rest
         compliance, damping = batch.compliance if batch.soft else None, batch.damping if batch.damped else None
         self.spring = Spring(scene, name, compliance, damping, start, restarts=not self.forces)
         self.strength = Strength(scene, name, batch)
         self.limit = StepLimit(scene, name, batch)
         self.cusp, self.ramp = batch.cusp, Ramp(scene.memory, batch)
         self.quantity = batch.quantity.bind(scene, batch, self)
-        self.in_state = (
-            {"lam": self.lam}
-            | ({key: vars(self)[key] for key in ("touched", "left", "answered", "blow")} if self.answers else {})
-            | ({"rest": self.rest} if batch.driven else {})
-        )
 
     @ti.func
     def clip_to_side(self, value):

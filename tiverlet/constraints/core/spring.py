@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...device import ti
+from ...device import at, inline, ti
 
 if TYPE_CHECKING:
     from ...features.feature import Batch, Scene
@@ -97,13 +97,10 @@ class Spring:
         if self.damped:
             self._memory.write(self.damping, damping)
 
-    @ti.func
+    @inline
     def is_rigid(self, c):
         """Whether constraint c has no compliance."""
-        out = True
-        if ti.static(self.soft):
-            out = self.alpha[c] == 0
-        return out
+        return at(self.alpha, c) == 0 if self.soft else ti.cast(1, ti.i32) > 0
 
     @ti.func
     def multiplier_per_newton(self, c, w, h2_rigid, h2_effective):

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ... import checks
-from ...device import ti
+from ...device import at, inline, ti
 
 if TYPE_CHECKING:
     from ...features.feature import Batch, Scene
@@ -69,13 +69,10 @@ class Strength:
         """Return when each constraint broke, (m,): the number of the substep from 1 on, modulo BREAKS; 0 where it holds."""
         return self._memory.read(self.stamp)
 
-    @ti.func
+    @inline
     def is_intact(self, c):
         """Whether constraint c has not broken."""
-        out = True
-        if ti.static(self.breaks):
-            out = self.stamp[c] == 0
-        return out
+        return at(self.stamp, c) == 0 if self.breaks else ti.cast(1, ti.i32) > 0
 
     @ti.func
     def add_excess(self, c, e, load, per_newton):
