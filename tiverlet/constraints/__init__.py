@@ -5,12 +5,14 @@ from .area import Area
 from .bend import Bend
 from .constraint import Constraint
 from .dihedral import Dihedral
-from .distance import Distance, Rope, Spacer
+from .distance import Distance
 from .motor import Motor
 from .path import Path
 from .pin import Pin
+from .rope import Rope
 from .shape_match import ShapeMatch
 from .snap import Snap
+from .spacer import Spacer
 from .volume import Volume
 from .winch import Winch
 
