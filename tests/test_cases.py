@@ -20,7 +20,9 @@ def test_a_case_reaches_its_known_answer(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["D06_chain100", "D08_massratio10", "S04_spring_pendulum", "R16_bounce_e0.5"])
+@pytest.mark.parametrize(
+    "name", ["D06_chain100", "D08_massratio10", "S04_spring_pendulum", "S05_tennis_racket", "R16_bounce_e0.5"]
+)
 def test_f32_keeps_the_error_of_a_case(name):
     found = tv.report.error_vs_time([name], methods=CASES[name].methods[:1], efforts=[CASES[name].at], baselines=False, runs=1)
     assert not found.failures and {p.precision for p in found.points} == {"f32", "f64"}

@@ -1,4 +1,4 @@
-"""The neighbour list: no result depends on when and where it is built. test_extremes.py compares its pairs with brute force."""
+"""The neighbour list: no result depends on when and where it is built. tiverlet stress compares its pairs with brute force."""
 
 import numpy as np
 import pytest

@@ -17,6 +17,9 @@ from ....step.step_report import StepReport
 from ....world import World
 
 NAN, INF = float("nan"), float("inf")
+# How many frames a passive scene runs, by substeps. Energy grows substep by substep: frames of 200 show as many of these in 2 s
+# as frames of 20 in 20 s. "auto" goes up to some hundred, and everything rests or swings evenly after 4 s.
+FRAMES: dict[Any, int] = {2: 600, 20: 600, 200: 120, "auto": 240}
 Findings = Iterator[tuple[str, Any]]  # statements of what was seen, each with whether it is as it should be
 Attempt = tuple[Callable[[], object], str]  # a call that must be refused, and a pattern in the text of the error
 

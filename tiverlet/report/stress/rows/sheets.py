@@ -10,7 +10,7 @@ from ....shapes import cloth, net
 from ....solvers import Chebyshev, ConjugateGradient, Jacobi
 from ....step.adaptive import StepController
 from ....step.step_report import UNCONVERGED
-from .row import Findings, finite, row, summary, world
+from .row import FRAMES, Findings, finite, row, summary, world
 
 G = 9.81
 
@@ -30,10 +30,9 @@ def _taut() -> Findings:
         start = Particles(x, mass=m, pinned=pinned)
         passes = 4 if isinstance(solver, Chebyshev) else 1
         with world(start, [Gravity(G), Distance(pairs)], solver=solver, precision=precision, iterations=passes) as w:
-            for substeps in (2, 20, 200, "auto"):
+            for substeps, frames in FRAMES.items():
                 w.position, w.velocity, w._controller = x, 0 * x, StepController()
                 w.substeps = substeps
-                frames = 120 if substeps == 200 else 600
                 gain = max(w.step(1 / 60).energy for _ in range(frames)) / supply
                 holds[f"{w._solver}, {substeps} substeps: {gain:.1e} m g L"] = finite(w) and gain <= 1e-3
                 most = max(most, gain)

@@ -14,12 +14,10 @@ from ....particles import Particles
 from ....solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
 from ....step.adaptive import StepController
 from ...accuracy.cases.case import links
-from .row import Findings, row, summary, world
+from .row import FRAMES, Findings, row, summary, world
 
 G, MASS = 9.81, 0.01
-STEPS = (2, 20, 200, "auto")
 RULE = "energy never above what it was plus 1e-3 of m g times the size, no speed above free fall, what is not met is flagged"
-SECONDS = 10
 WHIP = 2.0  # bound of speed over that of free fall: the end of a swinging chain is faster than free fall
 
 Scenes = Iterator[tuple[str, Particles, Sequence[Feature], dict[str, Any]]]  # name, particles, features, options of watched()
@@ -37,7 +35,7 @@ def passive(number: int, what: str, criterion: str = RULE, softened: bool = Fals
 
 
 def watched(scenes: Scenes, softened: bool) -> Findings:
-    """Run passive scenes with every number of substeps in STEPS, and yield the worst figures.
+    """Run passive scenes with every number of substeps in FRAMES, and yield the worst figures.
 
     Options of a scene: settings of its world (f32 by default), and
     most: the residual above which a frame under "auto" must have a flag.
@@ -51,11 +49,11 @@ def watched(scenes: Scenes, softened: bool) -> Findings:
         size = float(np.ptp(x, axis=0).max())
         supply = MASS * G * np.count_nonzero(~particles.pinned) * size
         with world(particles, features, **settings) as w:
-            for n in STEPS:
+            for n, frames in FRAMES.items():
                 w.position, w.velocity, w._controller = x, particles.velocity, StepController()
                 w.substeps = n
                 start, gain, fastest, lowest, silent, flags = None, -np.inf, 0.0, x[:, 1].min(), False, set()
-                for _ in range(SECONDS * 60):
+                for _ in range(frames):
                     report = w.step(1 / 60)
                     start = report.energy - report.energy_change if start is None else start
                     gain = max(gain, (report.energy - start) / supply)
