@@ -6,7 +6,6 @@ import pytest
 import tiverlet as tv
 from tiverlet.step import step
 
-from .conftest import python
 from .launches import launches
 
 
@@ -31,33 +30,6 @@ def test_launches_are_counted_and_the_host_asks_once_in_a_frame(world):
     with launches() as count:
         w.step(0.01)
     assert count.total() == 1 and "1 launch per frame" in w.explain()
-
-
-@pytest.mark.slow
-def test_systems_have_the_same_bits_on_1_and_8_threads():
-    # Sums over all constraints, and systems that several threads solve. On one thread they run phase by phase, as on a GPU.
-    # Compiled as small worlds are: a third of the time, the same bits.
-    code = """
-import numpy as np
-from tiverlet.device import ti
-from tiverlet.device.patches.compiler import BRIEF
-from tiverlet.step import build
-import tiverlet as tv
-build._passes = lambda *_: BRIEF
-k = np.arange(900).reshape(30, 30)
-ropes, across = np.stack([k[:, :-1].ravel(), k[:, 1:].ravel()], 1), np.stack([k[:-1].ravel(), k[1:].ravel()], 1)
-start = tv.Particles(np.stack([k // 30, 30 + 0 * k, k % 30], axis=2).reshape(-1, 3) / 30.0, pinned=[0, 870])
-for threads in (1, 8):
-    tv.init(threads=threads)
-    for solver, pairs in ((tv.Direct(), ropes), (tv.ConjugateGradient(steps=4), np.vstack([ropes, across]))):
-        features = [tv.Gravity(9.81), tv.Distance(pairs)]
-        with tv.World(start, features, solver=solver, path="parallel", substeps=5, iterations=4) as world:
-            world.run(0.1)
-            print(world.hash())
-    ti.reset()
-"""
-    made = python(code).stdout.split()
-    assert len(made) == 4 and made[0] != made[1] and made[:2] == made[2:]
 
 
 @pytest.mark.slow

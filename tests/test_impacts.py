@@ -213,19 +213,6 @@ def test_a_disc_on_a_fixed_disc_slips_above_its_coefficient(world):
     np.testing.assert_allclose(held * 60 * w.substeps, 9.81 * np.cos(a), rtol=1e-9)
 
 
-def test_coefficients_out_of_range_are_refused():
-    # Row 60.
-    for name, value, says in (
-        ("friction", -0.1, "at least 0"), ("friction", float("nan"), "finite"), ("friction", (0.2, 0.5), "must not exceed"),
-        ("restitution", 1.5, "restitution"), ("restitution", -0.1, "restitution"),
-    ):  # fmt: skip
-        for make in (tv.Contact, lambda **one: tv.Box((0, 0), (1, 1), **one)):
-            with pytest.raises(ValueError, match=says):
-                make(**{name: value})
-    with pytest.raises(ValueError, match="two values"):
-        tv.Contact(friction={(0, 1): 0.5, (1, 0): 0.1})
-
-
 @pytest.mark.slow
 def test_what_is_driven_strikes_as_an_infinite_mass(world):
     # A racket at V hits a ball at rest, which leaves at (1 + e) V: the racket acts like an infinite mass.

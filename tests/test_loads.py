@@ -99,30 +99,3 @@ def test_a_start_finds_the_loads_that_links_know(world):
     w.position = moved
     forgotten = w._runner.memory.read(links.dev.known.load)[:10]
     assert forgotten[9] == 0.0 and (forgotten[:9] == known[:9]).all() and (known > 0).all()
-
-
-def test_ropes_tear_where_they_are_told_to_and_where_they_bear_most(world):
-    # Link k of a hanging chain of 8 carries (8 - k) m g = 9.81 (8 - k) N. Only link 3 is too weak: it carries 49 N and has
-    # break_at = 45. In the other chain links 2 and 3 become too weak at once, 3 by more: it breaks and unloads link 2.
-    strength, pairs = np.full(16, 200.0), np.stack([np.arange(8), np.arange(1, 9)], axis=1)
-    strength[[3, 6]] = 45.0, 25.0
-    rope = tv.Distance(np.concatenate([pairs, pairs + 9]), 1.0, break_at=strength)
-    y = np.stack([np.zeros(9), -np.arange(9.0)], axis=1)
-    start = tv.Particles(np.concatenate([y, y + [5, 0]]), pinned=[0, 9])
-    w = hanging(world, start, rope, 0.0, 5.0, known=False, substeps=10, iterations=12)
-    events, gravity = [], w.features[0]
-    for frame in range(30):
-        gravity.g = (0.0, -9.81 * min(1.0, frame / 15))  # slowly, so that nothing swings
-        report = w.step(1 / 60)
-        assert report.broken == sum(len(at) for _, at in w.broken)
-        events += [(frame, f is rope, at.tolist()) for f, at in w.broken]
-    assert [event[1:] for event in events] == [(True, [3])] and np.flatnonzero(rope.broken).tolist() == [3]
-    assert events[0][0] == pytest.approx(15 * 45 / (5 * 9.81), abs=1.01)  # the link that carries 5 of 8
-    assert w.position[4, 1] < -4.05 and rope.load[3] == 0 and rope.residual[3] == 0
-    np.testing.assert_allclose(rope.load[:3], 9.81 * np.array([3, 2, 1]), rtol=1e-2)
-    strength[[10, 11]] = 50.0, 35.0  # of 59 and 49 N
-    rope.break_at = strength
-    w.step(1 / 60)
-    assert np.flatnonzero(rope.broken).tolist() == [3, 11]
-    with pytest.raises(ValueError, match=r"Distance: break_at\[2\] = 0, but it must be above 0"):
-        tv.Distance(pairs[:3], break_at=[1.0, 1.0, 0.0])

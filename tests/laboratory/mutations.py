@@ -32,7 +32,7 @@ class Fault:
 
 FAULTS = (
     Fault("acc8c21f", "displacement_at_start is no state: clones of soft nets differ", "particles/state.py",
-          "width=self.dim, state=kept)", "width=self.dim, state=False)", "softness"),
+          "width=self.dim, state=kept)", "width=self.dim, state=False)", "scenes"),
     Fault("0c60d46f", "near() and contacts read in the middle of a frame", "device/interrupts.py",
           "        _turns.acquire()", "        _turns.acquire() if get_ident() == self._main else None", "interrupts"),
     Fault("2e02d9a5", "steady changes of the substep settle nothing", "step/runner.py",
@@ -47,7 +47,7 @@ FAULTS = (
     Fault("f5e4e243", "catches at seams of level walls", "contact/rows.py",
           "                self.gap.field[row] += depth * ti.max(up.dot(n), 0)",
           "                self.gap.field[row] += 0 * depth",
-          "public_scenes walls polygons"),
+          "public_scenes polygons"),
     Fault("07f6193e", "explain() of a soft Pin raises", "step/explain.py",
           "        if not f.breaks:\n            continue\n", "", "reported_loads pins docs"),
     Fault("47520826", "lists before the first frame find no walls", "colliders/wall_tree.py",
@@ -75,7 +75,7 @@ FAULTS = (
           "UNCONVERGED = 0.05", "UNCONVERGED = 0.2", "flags"),
     Fault("7795bec6", "the first overloaded constraint breaks, not the most", "solvers/breaks.py",
           "if overload >= ti.static(1 - ALIKE) * self.largest[i]:", "if overload >= 0 * self.largest[i]:",
-          "reported_loads loads"),
+          "reported_loads"),
     Fault("34775e33", "friction does not act where discs land: heaps half as steep", "contact/impulses.py",
           "        load = normal + hit\n", "        load = normal / 2 + hit\n", "grains rows statics"),
     Fault("3a993469", "a pair that passes within a substep is no row", "contact/rows.py",
