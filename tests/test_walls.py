@@ -221,24 +221,6 @@ def test_nothing_passes_a_shell_of_a_fiftieth_of_its_way(world, briefly):
         assert (side * (np.linalg.norm(w.position, axis=1) - 0.7)).min() > 0.02 - 4e-6
 
 
-@pytest.mark.slow
-def test_a_fine_sphere_is_a_ball(world):
-    # The 5120 faces of an icosphere are at most R (1 - cos(a)) inside the sphere, where a is half the angle of an edge; so are
-    # the particles. After half a second of sliding they are where those on a ball are, up to the angle of the faces.
-    rng, fine = np.random.default_rng(0), tv.shapes.balloon((0, 0, 0), 0.5, 4)
-    x = rng.normal(size=(60, 3))
-    x *= 0.8 / np.linalg.norm(x, axis=1)[:, None]
-    edge = np.linalg.norm(fine.position[fine.faces[:, 0]] - fine.position[fine.faces[:, 1]], axis=1).max() / 0.5
-    ends = []
-    for wall in (tv.Ball((0, 0, 0), 0.5, friction=0.3), tv.Mesh(fine.position, fine.faces, friction=0.3)):
-        w = world(tv.Particles(x, velocity=-2 * x, radius=0.1), [tv.Gravity(G), wall], precision="f64")
-        for _ in range(30):
-            w.step(1 / 60)
-            assert np.linalg.norm(w.position, axis=1).min() >= 0.6 - 0.5 * (1 - np.cos(edge / np.sqrt(3))) - 1e-9
-        ends.append(w.position)
-    assert np.median(np.linalg.norm(ends[1] - ends[0], axis=1)) < 0.01
-
-
 # All walls obey one law. Their tops are at y = 0; all but one are switched off, so that all are in one structure.
 
 MU, V, R = 0.3, 1.0, 0.05
