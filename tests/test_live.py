@@ -1,8 +1,6 @@
-"""Scenes under a mouse: the law of the hand, requests of pages, and a real mouse in a real browser."""
+"""Scenes under a mouse: the law of the hand, and requests of pages."""
 
 import json
-import shutil
-import threading
 import time
 import urllib.error
 import urllib.request
@@ -353,52 +351,3 @@ def test_the_eye_stays_above_the_highest_floor():
     assert json.loads(scene.walls(world, (low, high)))["floor"] == -0.5
     above = tv.World(tv.Particles(np.array([[0.0, 0, 1]])), [tv.Gravity((0, 0, -9.81)), tv.HalfSpace((0, 0, 1), -0.1)])
     assert json.loads(scene.walls(above, (low, high)))["floor"] == pytest.approx(-0.1)
-
-
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
-def test_a_mouse_in_a_browser_drags_a_particle(rope, server):
-    # Real events: press on the last particle of a rope that is paused and still straight, and pull it up.
-    sync = pytest.importorskip("playwright.sync_api")
-    live, errors = Session(rope, server), []
-    live.paused = True
-    done = threading.Event()
-
-    def mouse():
-        try:
-            with sync.sync_playwright() as play:
-                browser = play.chromium.launch(
-                    executable_path=CHROMIUM,
-                    args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"],
-                )
-                # lets the test evaluate scripts
-                there = browser.new_page(viewport={"width": 600, "height": 500}, bypass_csp=True)
-                there.on("pageerror", lambda e: errors.append(str(e)))
-                there.goto(server.url)
-                there.wait_for_function("x && scene && canvas.width == 600")
-                px, py = there.evaluate("(() => { aim(); return project(at(5)); })()")[:2]
-                there.mouse.move(px, py)
-                there.mouse.down()
-                there.mouse.move(px - 100, py - 150, steps=5)
-                there.keyboard.press("Space")
-                there.wait_for_function("figures.held == 5 && figures.time > 0.5")
-                told.append(there.evaluate(f"[x[10], x[11], under({px - 100}, {py - 150})]"))
-                there.mouse.up()
-                there.wait_for_function("!('held' in figures)")
-                there.mouse.click(px, py)
-                browser.close()
-        except BaseException as e:
-            errors.append(repr(e))
-        done.set()
-
-    told: list = []
-    thread = threading.Thread(target=mouse, daemon=True)
-    thread.start()
-    while not done.is_set():
-        live.run(1)
-    assert not errors
-    x, y, point = told[0]
-    # The end is where the mouse is, but for the weight of all five: 5 g / k^2 = 0.12 m, at most twice that while it swings.
-    assert np.hypot(x - point[0], y - point[1]) < 2 * 5 * 9.81 / 20**2 and y > 2.2

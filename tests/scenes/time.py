@@ -29,14 +29,6 @@ def taut_ropes_and_a_chain_with_a_weight():
     return c.Particles(x, mass=mass, pinned=[0, 4, 5, 18, 19]), [c.Gravity(G), c.Distance(links)], {"solver": c.Jacobi()}
 
 
-@scene(flags={"unconverged"})
-def taut_ropes_that_few_steps_of_conjugate_gradients_solve():
-    ropes = [tv.shapes.rope((0, y), (1, y), points=n) for y, n in ((0, 5), (1, 40))]
-    links = np.concatenate([ropes[0].links, ropes[1].links + 5])
-    start = c.Particles(np.concatenate([rope.position for rope in ropes]), mass=0.1, pinned=[0, 4, 5, 44])
-    return start, [c.Gravity(G), c.Distance(links)], {"solver": c.ConjugateGradient(5)}
-
-
 @scene()
 def jelly_of_clusters_and_a_ladder_of_masses_fall_on_a_floor_without_contacts():
     squares = [[4 * i + j + k for k in (0, 1, 4, 5)] for i in range(3) for j in range(3)]

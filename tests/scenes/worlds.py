@@ -2,6 +2,8 @@
 
 import numpy as np
 
+import tiverlet as tv
+
 from ..fuzz import functions
 from .scene import c, scene
 
@@ -77,3 +79,11 @@ def forces_of_all_kinds_drive_links_between_walls():
     walls = [c.Box((0, 0), (4, 9)), c.HalfSpace((0.2, 1), 0.1)]
     start = c.Particles(x, radius=0.08, mass=1 + np.arange(n) % 5)
     return start, [*forces, *links, *walls], {"precision": "f32-compensated", "substeps": 7, "iterations": 2}
+
+
+@scene(flags={"unconverged"})
+def taut_ropes_that_few_steps_of_conjugate_gradients_solve():
+    ropes = [tv.shapes.rope((0, y), (1, y), points=n) for y, n in ((0, 5), (1, 40))]
+    links = np.concatenate([ropes[0].links, ropes[1].links + 5])
+    start = c.Particles(np.concatenate([rope.position for rope in ropes]), mass=0.1, pinned=[0, 4, 5, 44])
+    return start, [c.Gravity(G), c.Distance(links)], {"solver": c.ConjugateGradient(5)}
