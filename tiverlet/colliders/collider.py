@@ -53,7 +53,7 @@ class Collider(Feature):
         "Whether it resists rolling, or bounces across the normal.",
     )
     compiled_for = ("has_friction", "has_restitution", "has_switch", "has_surface_velocity", "turns")
-    host_only = ("widest",)
+    host_only = ("widest", "_switch")
     for_users = ("clearance",)
     tracks: Mapping[str, Any] = MappingProxyType({})
     one_way: Any = None  # unit vector along which particles pass

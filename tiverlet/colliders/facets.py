@@ -24,6 +24,8 @@ class Facets:
     closed: the facets enclose a volume. inside: particles are kept inside, so that the solid is all around.
     """
 
+    host_only = ("_normals",)
+
     corners: np.ndarray
     features: np.ndarray
     wings: tuple[np.ndarray, np.ndarray]

@@ -35,7 +35,7 @@ class Surface:
     or None.
     """
 
-    host_only = ("fields",)
+    host_only = ("fields", "_memory")
     push_out: Any
     friction: Any
     restitution: Any

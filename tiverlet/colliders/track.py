@@ -17,6 +17,8 @@ class Track:
     in_state: its fields in the exact state, by name.
     """
 
+    host_only = ("_memory",)
+
     def __init__(self, memory: "Memory", name: str, value: np.ndarray, kind=None):
         self._memory = memory
         self.ends = memory.field(name, 2, width=len(value), kind=kind, values=[value, value], state=True)

@@ -25,6 +25,8 @@ class WallLog:
     gives counts `late` times more, as far as it is not the blow of the velocity `given`, as whose impulse it is whole.
     """
 
+    host_only = ("_scene",)
+
     per_particle = True
 
     def __init__(self, scene: "Scene", name: str):

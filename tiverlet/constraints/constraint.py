@@ -28,6 +28,7 @@ class Function(Quantity):
     particles.
     """
 
+    host_only = ("_size",)
     foreign = True
     size: Any  # on the device
 
@@ -83,6 +84,7 @@ class Constraint(Scalar):
     needs to be where function is smooth, or 0 where function is nowhere negative.
     """
 
+    host_only = ("_derivative", "_measured", "_size", "_unit")
     index_name = "indices"
     can_extend = False  # the function may read the number of a constraint
     _size = 0.0  # of the part of the scene that it acts on [m]

@@ -40,6 +40,8 @@ class Motor(Scalar):
     its power. `rest` is the current rest angle [rad]: under a load the angle lags behind by what bears the load, as in a Bend.
     """
 
+    host_only = ("_begin",)
+
     index_name = "hinges"
     driven = True
     each = ("speed", "angle", "torque", "compliance", "damping", "break_at")

@@ -33,6 +33,8 @@ class Path(Anchored):
     `length` is the length of the curve [m], `place(s)` its points, `load` the force of the wire on each particle [N].
     """
 
+    host_only = ("_start",)
+
     for_users = ("length",)
     is_fixed_in_space = True
     each = ("compliance", "damping", "speed", "at")

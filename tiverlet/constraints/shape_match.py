@@ -44,6 +44,8 @@ class ShapeMatch(Batch):
     In f32, rounding changes the angular momentum by 3e-8 of itself in a substep, at random; "f64" avoids it.
     """
 
+    host_only = ("_radius", "_rest", "_shape")
+
     clusters = True
     answers_alone = True
     each = ("compliance", "damping", "creep", "yield_strain", "break_at")

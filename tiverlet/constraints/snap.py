@@ -74,6 +74,8 @@ class Snap(Anchored):
     `load` is the force on each particle [N].
     """
 
+    host_only = ("_origin", "_spacing")
+
     is_fixed_in_space = True
     can_extend = True
 

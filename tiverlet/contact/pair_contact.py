@@ -65,7 +65,7 @@ class PairContact(Feature):
     _smallest_radius = _present_skin = _ahead = 0.0
     table: Table  # bound to one world
     bodies: Sequence[np.ndarray] = ()
-    host_only = ("ties", "walls")
+    host_only = ("ties", "walls", "_ahead", "_asked", "_present_skin", "_smallest_radius")
     kept_by_world = (*Feature.kept_by_world, "ties", "walls")
     ties: Sequence[Batch] = ()
     walls: Sequence[Any] = ()  # the colliders of its world

@@ -19,6 +19,8 @@ class Number:
     place: its index; None where it is all that the field holds.
     """
 
+    host_only = ("_memory", "_value")
+
     def __init__(self, memory: Any, field: Any, place: int | None, value: float):
         self.field, self.place = field, place
         self._memory, self._value = memory, value

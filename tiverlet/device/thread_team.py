@@ -79,6 +79,8 @@ class Team:
     pass]; phases launched after that do nothing. None where this cannot happen, or is handled in another way.
     """
 
+    host_only = ("_alone", "_frames", "_in_substep", "_pieces")
+
     halt: Any = None
 
     piece: Any = OnDevice()

@@ -96,7 +96,9 @@ class Feature:
         "scene", "start", "periodic", "changed", "moving", "new_force", "arguments", "compiled_so_far",
     )  # fmt: skip
     # Attributes that kernels do not read.
-    host_only: tuple[str, ...] = ("start", "periodic", "changed", "moving", "new_force", "arguments", "compiled_so_far")
+    host_only: tuple[str, ...] = (
+        "start", "periodic", "changed", "moving", "new_force", "arguments", "compiled_so_far", "_built_values",
+    )  # fmt: skip
     for_users: tuple[str, ...] = ()  # attributes that users read, beside arguments and knobs, see names_for_users()
     uploads_all = False  # upload() and end_motion() also work for many worlds, where knobs have an additional first axis
     compiled_for: tuple[str, ...] = ()  # properties that decide the code of its kernels

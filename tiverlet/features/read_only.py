@@ -68,6 +68,8 @@ def read_only(array: np.ndarray, advice: str) -> ReadOnly:
 class ReadOnlyMapping(Mapping):
     """A mapping that cannot be written to."""
 
+    host_only = ("_values", "_advice")
+
     def __init__(self, values: Mapping, advice: str):
         self._values, self._advice = dict(values), advice
 

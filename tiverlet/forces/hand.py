@@ -39,6 +39,8 @@ class Hand(Acceleration):
     1, and is stable below 2. All are live: assign between frames, without compiling. A pinned particle stays where it is.
     """
 
+    host_only = ("_count",)
+
     is_fixed_in_space = False
     uses_velocity = True
     conservative = True

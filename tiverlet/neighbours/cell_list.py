@@ -36,6 +36,8 @@ class CellList:
     of their reaches, plus the skin.
     """
 
+    host_only = ("_axis_bits", "_lengths")
+
     n: Any = OnDevice()  # number of particles
     buckets: Any = OnDevice()  # number of buckets in all tables
     level_0_scale: Any = OnDevice()  # cells per meter at level 0

@@ -46,6 +46,8 @@ class NeighbourSearch:
     differs from that of the particles.
     """
 
+    host_only = ("_excluded_pairs", "_extent", "_piece", "_scene")
+
     skin: Any = OnDevice()  # the gap up to which pairs are listed [m]
     sure: Any = OnDevice()  # the gap up to which all pairs are on a valid list [m]
     too_far: Any = OnDevice()  # the square of the displacement beyond which the list is stale [m^2]

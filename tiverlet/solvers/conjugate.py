@@ -85,6 +85,8 @@ class ConjugateGradient(Solver):
 class CGSystem(System):
     """The system of one world on the device. Rows are constraints in the order of their batches."""
 
+    host_only = ("_least", "_part_of")
+
     n: Any = OnDevice()  # number of particles
     least: Any = OnDevice()  # first value of a floor
     part_count: Any = OnDevice()  # number of parts, plus one for particles in none

@@ -119,7 +119,7 @@ class Elimination(System):
     number of clusters that take part.
     """
 
-    host_only = ("plan", "late", "has_implied", "bodies")
+    host_only = ("plan", "late", "has_implied", "bodies", "_part")
     late = (SOFTENED,)
     parts: Any = OnDevice()  # number of systems
     entries: Any = OnDevice()  # number of couplings of two rows

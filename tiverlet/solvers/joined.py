@@ -83,6 +83,8 @@ class Joined:
     its row. u: moves of corners [m]. moved, turned: of each body, what fit() found.
     """
 
+    host_only = ("_least", "_particles")
+
     def __init__(
         self, scene: "Scene", batches: "list[Batch]", slots: "Slots", rows: dict[int, np.ndarray], part: np.ndarray,
         slot: np.ndarray, who: np.ndarray, parts: int,

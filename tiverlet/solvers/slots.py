@@ -51,7 +51,9 @@ class Slots:
 
     bodies: Any = OnDevice()
 
-    host_only = ("total", "exact")
+    host_only = (
+        "total", "exact", "_alone", "_blocks", "_bodies", "_places", "_rounding_masses", "_sagging", "_scalars", "_sizes",
+    )  # fmt: skip
 
     def __init__(self, scene: Scene, batches: list[Batch], solver, answers: bool):
         memory, state, inv_mass = scene.memory, scene.state, scene.inv_mass

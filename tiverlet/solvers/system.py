@@ -32,6 +32,8 @@ class System:
     scalars: the batches that take part, with constraints numbered through. rows: these numbers, in the order of the solver.
     """
 
+    host_only = ("_rows",)
+
     rows: Any = OnDevice()
     parts: Any = 1  # number of independent systems
     answers = False  # whether parts answer the impulses of contacts, see Elimination.answer_part()

@@ -32,6 +32,8 @@ class Anchored(Batch):
     Each axis follows the law of Equation, with unit vectors for gradients. place_of() of each kind makes the place on the device.
     """
 
+    host_only = ("_soft_cache",)
+
     arity = 1
     answers_alone = True
     each = ("compliance", "damping")

@@ -55,6 +55,8 @@ class Drive:
     for none. time_constant: [s]. in_state: its fields in the exact state, by name.
     """
 
+    host_only = ("_memory",)
+
     def __init__(self, scene: "Scene", batch: Any, start: np.ndarray, endless=False, period=0.0, time_constant=0.0):
         add, m, name, (goal, speed, largest) = scene.memory.field, len(start), repr(batch), batch.course()
         self._memory, self.real = scene.memory, scene.real

@@ -31,6 +31,8 @@ class KnownLoad:
     relaxed alone. in_state: its fields in the exact state, by name.
     """
 
+    host_only = ("_memory",)
+
     def __init__(self, scene: "Scene", name: str, batch: Any):
         not_flat = batch.driven or batch.quantity.curved or batch.quantity.collapses
         self.learns, self.in_state = scene.slots.loads and not not_flat, {}

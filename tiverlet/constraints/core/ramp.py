@@ -25,7 +25,7 @@ class Ramp:
     takes from its present value.
     """
 
-    host_only = ("memory", "under_way")
+    host_only = ("memory", "under_way", "_batch", "_memory")
 
     def __init__(self, memory: "Memory", batch: Any):
         self._memory, self._batch, self.memory = memory, batch, memory

@@ -36,6 +36,8 @@ class Scalar(Batch):
     (angles, areas, volumes), steps of rigid constraints are limited, see StepLimit.
     """
 
+    host_only = ("_alone", "_made_for", "_rest_given", "_scene_sized")
+
     index_name = "pairs"
     measures: type[Quantity] = Quantity  # f, of a fixed number of corners
     quantity: Quantity  # f of the batch's constraints

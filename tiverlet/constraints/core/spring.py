@@ -73,6 +73,8 @@ class Spring:
     in_state: its fields in the exact state, by name.
     """
 
+    host_only = ("_memory",)
+
     def __init__(
         self, scene: "Scene", name: str, compliance: np.ndarray | None, damping: np.ndarray | None, start: np.ndarray,
         restarts: bool = False,

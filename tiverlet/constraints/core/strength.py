@@ -44,6 +44,8 @@ class Strength:
     constraint.
     """
 
+    host_only = ("_memory",)
+
     def __init__(self, scene: "Scene", name: str, batch: Any, corners: Any = None):
         self._memory, self.breaks, self.corners, self.in_state = scene.memory, batch.breaks, corners, {}
         if self.breaks:

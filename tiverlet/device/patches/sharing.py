@@ -5,10 +5,9 @@ reads meanwhile: attributes of the object and of all objects that it refers to, 
 list, in an order that depends on the objects alone: numbers by their bits, fields by their places, functions by their code and
 the values that they refer to. If two objects give the same list, the second uses the kernel of the first.
 
-Three things are left out of the list: attributes of tiverlet's objects whose names begin with an underscore; attributes that a
-class lists as `host_only`, or does not list in its `kernels_read` if it has that; and the values of arrays. Kernels must not read
-these; tests/test_sharing.py checks it. Everything else counts, whether kernels read it or not. So an overlooked attribute can
-cause one more compilation, never a wrong kernel.
+Two things are left out of the list: attributes that a class lists as `host_only`, or does not list in its `kernels_read` if it
+has that; and the values of arrays. Kernels must not read these; tests/test_sharing.py checks it. Everything else counts, whether
+kernels read it or not. So an overlooked attribute can cause one more compilation, never a wrong kernel.
 
 Each launch reads the addresses of trees of fields from a table of Taichi's runtime. After another address is written to the
 table, the same kernel works on other memory of the same layout. Where the table is not found, or kernels do not follow it, every
@@ -205,8 +204,6 @@ def _read_of(kind: type, names: tuple[str, ...]) -> list[str]:
 @lru_cache(None)
 def may_read(kind: type, name: str) -> bool:
     """Whether kernels may read an attribute of objects of a class."""
-    if _is_ours(kind) and name.startswith("_"):
-        return False
     said = [vars(base) for base in kind.__mro__]
     only = next((base["kernels_read"] for base in said if "kernels_read" in base), (name,))
     return name in only and not any(name in base.get("host_only", ()) for base in said)
