@@ -6,9 +6,9 @@ import numpy as np
 
 from ..constraints import Area
 from ..contact import Polygons
+from ..geometry.intervals import cross_2d
 from .bodies import bodies
 from .strain import packed, tinted
-from .surfaces import cross
 
 if TYPE_CHECKING:
     from ..world import World
@@ -31,7 +31,7 @@ def outlines(world: "World") -> list[np.ndarray]:
     x, out = world.particles.position, {}
     for loop in found:
         a, b = x[loop], x[np.roll(loop, -1)]
-        out.setdefault(tuple(sorted(loop.tolist())), loop if cross(a, b).sum() > 0 else loop[::-1])
+        out.setdefault(tuple(sorted(loop.tolist())), loop if cross_2d(a, b).sum() > 0 else loop[::-1])
     return list(out.values())[:MANY]
 
 

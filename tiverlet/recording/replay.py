@@ -8,7 +8,7 @@ import os
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -52,6 +52,19 @@ class Verdict:
 
     def __str__(self) -> str:
         return self.text
+
+
+class SceneFrames(NamedTuple):
+    """A scene of a recording: its entry in the journal, and the numbers of the frames that show it.
+
+    knobs: those that the user set, (frame, number of the feature, knobs). broken: constraints that broke, (frame, number of the
+    feature, numbers of the constraints). Both hold from that frame on.
+    """
+
+    entry: Entry
+    frames: list[int]
+    knobs: list[tuple[int, int, dict[str, Any]]]
+    broken: list[tuple[int, int, np.ndarray]]
 
 
 @contextlib.contextmanager
@@ -349,22 +362,21 @@ class Replay:
 
     @property
     @_with_clear_errors
-    def scenes(self) -> list[tuple[Entry, list[int], list[tuple[int, int, Any]], list[tuple[int, int, Any]]]]:
-        """The scenes, each with its entry, and the frames that show it; one begins where particles or features were added or
-        removed. Also the knobs that the user set and the constraints that broke: from which frame on, of which feature, which."""
+    def scenes(self) -> list[SceneFrames]:
+        """The scenes, and the frames that show them. One begins where particles or features were added or removed."""
         out, knobs, broken = [], [], []
         for e in self._entries:
             if e.kind == "scene":
-                out.append((e, [], [], []))
+                out.append(SceneFrames(e, [], [], []))
                 knobs, broken = [], []
             elif e.kind == "turned":
                 knobs += self._knob_values(e)
             elif e.kind == "frame":
                 broken += [(int(k), np.array(rows, dtype=np.int64)) for k, rows in e.data.get("broke", {}).items()]
                 if e.frame in self._frames:
-                    out[-1][1].append(e.frame)
-                    out[-1][2].extend((e.frame, *change) for change in knobs)
-                    out[-1][3].extend((e.frame, *change) for change in broken)
+                    out[-1].frames.append(e.frame)
+                    out[-1].knobs.extend((e.frame, *change) for change in knobs)
+                    out[-1].broken.extend((e.frame, *change) for change in broken)
                     knobs, broken = [], []
         return out
 

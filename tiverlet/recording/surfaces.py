@@ -8,6 +8,7 @@ import numpy as np
 from ..constraints import Area, Dihedral, ShapeMatch, Volume
 from ..contact import Polygons
 from ..features.feature import Batch
+from ..geometry.intervals import cross_2d
 from ..shapes.shape import surface_of
 from .lines import cells
 
@@ -109,16 +110,16 @@ def cliques(pairs: np.ndarray) -> np.ndarray:
 def clipped(loop: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return triangles that fill a loop in 2D, (k - 2, 3), by ear clipping."""
     q = x[loop]
-    if cross(q, np.roll(q, -1, axis=0)).sum() < 0:
+    if cross_2d(q, np.roll(q, -1, axis=0)).sum() < 0:
         loop = loop[::-1]
     left, out = loop.tolist(), []
     while len(left) > 3:
         corner = np.array([left[-1:] + left[:-1], left, left[1:] + left[:1]]).T
         a, b, c = x[corner[:, 0]], x[corner[:, 1]], x[corner[:, 2]]
-        turn = cross(b - a, c - b)
+        turn = cross_2d(b - a, c - b)
         for k in np.argsort(-turn, kind="stable").tolist():
             others = x[[i for i in left if i not in corner[k]]]
-            sides = [cross(np.tile(v - u, (len(others), 1)), others - u) for u, v in ((a[k], b[k]), (b[k], c[k]), (c[k], a[k]))]
+            sides = [cross_2d(v - u, others - u) for u, v in ((a[k], b[k]), (b[k], c[k]), (c[k], a[k]))]
             if turn[k] <= 0 or not (np.array(sides) > 0).all(axis=0).any():
                 break
         out.append(corner[k].tolist())
@@ -133,13 +134,8 @@ def hull(cluster: np.ndarray, x: np.ndarray) -> np.ndarray:
     for way in (order, order[::-1]):
         side: list[int] = []
         for i in way:
-            while len(side) > 1 and cross(x[side[-1:]] - x[side[-2]], x[[i]] - x[side[-2]])[0] <= 0:
+            while len(side) > 1 and cross_2d(x[side[-1:]] - x[side[-2]], x[[i]] - x[side[-2]])[0] <= 0:
                 side.pop()
             side.append(i)
         ring += side[:-1]
     return np.array([[ring[0], *pair] for pair in zip(ring[1:-1], ring[2:], strict=True)], dtype=np.int64).reshape(-1, 3)
-
-
-def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return the cross products of vectors in 2D, (m,)."""
-    return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]

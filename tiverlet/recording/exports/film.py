@@ -34,7 +34,7 @@ def write(
     color: Any = None,
 ) -> list[str]:
     """Write a film in the scene's own time, RATE pictures a second; each picture shows the nearest frame."""
-    look = Look.checked(size, camera, theme, recording.scenes[0][0].arrays["position"].shape[1])
+    look = Look.checked(size, camera, theme, recording.scenes[0].entry.arrays["position"].shape[1])
     kind = os.path.splitext(path)[1].lower()
     video = kind == ".mp4" and (shutil.which("ffmpeg") or needed("imageio_ffmpeg", path).get_ffmpeg_exe())
     if not len(recording.frames):

@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...geometry.common_sense import common_sense, edges_of
+from ...geometry.intervals import cross_2d
 from ...shapes import Shape
 from ..drawing import links, upwards
 from ..hues import BY_BODY, Coloring
 from ..scene import Parts
-from ..surfaces import covered, cross, triangles
+from ..surfaces import covered, triangles
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ def oriented(faces: np.ndarray, x: np.ndarray, up: np.ndarray) -> np.ndarray:
     """
     if x.shape[1] == 2:
         a, b, c = (x[k] for k in faces.T)
-        return np.where(cross(b - a, c - a)[:, None] < 0, faces[:, ::-1], faces)
+        return np.where(cross_2d(b - a, c - a)[:, None] < 0, faces[:, ::-1], faces)
     _, which, number = edges_of(faces)
     turned, pieces, _ = common_sense(faces)
     out = np.where(turned[:, None], faces[:, ::-1], faces)

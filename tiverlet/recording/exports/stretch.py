@@ -120,7 +120,7 @@ def stretches(recording: "Replay", motion: bool = False, color: Any = None) -> l
     """
     moved, coloring = recording.motion() if motion else itertools.repeat({}), recording.overlays.color
     if color is not None:
-        count = len(recording.scenes[0][0].arrays["position"])
+        count = len(recording.scenes[0].entry.arrays["position"])
         coloring = Coloring.checked("replay", color, count, recording.quantities)
     known = _known(recording, coloring)
     times = dict(zip(recording.frames.tolist(), recording.times.tolist(), strict=True))
