@@ -31,8 +31,6 @@ class Fault:
 
 
 FAULTS = (
-    Fault("acc8c21f", "displacement_at_start is no state: clones of soft nets differ", "particles/state.py",
-          "width=self.dim, state=kept)", "width=self.dim, state=False)", "scenes"),
     Fault("0c60d46f", "near() and contacts read in the middle of a frame", "device/interrupts.py",
           "        _turns.acquire()", "        _turns.acquire() if get_ident() == self._main else None", "interrupts"),
     Fault("2e02d9a5", "steady changes of the substep settle nothing", "step/runner.py",

@@ -180,11 +180,11 @@ class State:
             x += self.low0[i]
         return x
 
-    def remember(self, memory: "Memory", start: bool, before: bool, lifts: bool, kept: bool) -> None:
+    def remember(self, memory: "Memory", start: bool, before: bool, lifts: bool) -> None:
         """Declare what friction, swept walls and impacts need.
 
         start, before: position and displacement at the start of the substep. lifts: whether particles that bounced may not be
-        where their displacement says. kept: whether velocities depend on `before`, so that it belongs to the state.
+        where their displacement says.
         """
         self.starts, self.befores, self.lifts = start, before, lifts
         if start:
@@ -192,7 +192,7 @@ class State:
             if self.sums:
                 self.low0 = memory.field("position_low_at_start", self.number, width=self.dim)
         if before:
-            self.before = memory.field("displacement_at_start", self.number, width=self.dim, state=kept)
+            self.before = memory.field("displacement_at_start", self.number, width=self.dim)
 
     @inline
     def kick(self, i):

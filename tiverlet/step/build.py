@@ -184,13 +184,11 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         if any(w.has_restitution for w in walls) or (walls and stops_bodies(scene, batches)):
             scene.impacts = BodyImpacts(scene, batches)
     search = contact.make_search(scene, batches, team) if contact else None
-    limits = bool(scene.slots and scene.slots.has_system)  # velocities contain no more of loads than happened in the substep
     state.remember(
         memory,
         has_friction or rows or any(w.needs_start_position for w in walls) or scene.bounces,
-        bounces or bool(scene.impacts) or rows or limits,
+        bounces or bool(scene.impacts) or rows,
         bounces,
-        limits,
     )
     for feature in of(Batch):
         feature.scene = scene  # also for those that do nothing, because all of their particles are held

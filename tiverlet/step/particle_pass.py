@@ -348,8 +348,6 @@ class ParticlePass:
         The push of walls counts as far as it balances all other forces. So a body at rest has velocity 0, but half of a blow is
         not added to the velocity of a particle that has just bounced, nor to the other particles of its body, whose walls and
         rigid constraints count for nothing.
-        All together are no more than twice of what happened in the substep. Loads that cancel may be many times larger where a
-        structure has a link too many, and do not cancel along the directions at the end, or if a part of them came of a blow.
         """
         reaction, part = 0 * self.state.d[i], 1 + 0 * h
         if ti.static(self.held):
@@ -374,13 +372,6 @@ class ParticlePass:
                 if impacts.reached[i] != 0:
                     part = 0 * part
             reaction += part * push
-        if ti.static(self.held):
-            if ti.static(self.slots.has_system):
-                force = h * h * self.forces.accelerate(i, self.state.place(i), self.state.d[i] / h, t, self.forces.pull(t))
-                most = 2 * ((self.state.d[i] - self.state.before[i]).norm() + force.norm())
-                size = reaction.norm()
-                if size > most:
-                    reaction *= most / size
         return reaction, part
 
     @ti.func
