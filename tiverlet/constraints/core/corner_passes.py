@@ -107,7 +107,10 @@ class CornerPasses(Passes):
         if self.equation.has_cusp(c):
             lost, turn = True, 0
         if ti.static(self.converges):
-            if self.spring.is_rigid(c):
+            tight = self.spring.is_rigid(c)
+            if ti.static(self.in_system):
+                tight = tight and self.row[c] >= 0
+            if tight:
                 lost = lost or ti.abs(self.equation.clip_to_side(f0 - self.equation.rest[c])) * self.inverse_size[c] > LOST
         if lost:
             resolved = False
