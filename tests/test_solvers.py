@@ -199,13 +199,13 @@ def choices():
             (four, tv.Distance(braced, [1.0, 1.5, 1.0, 1.0, 1.5, 1.0])),
             (truss.position, tv.Distance(np.concatenate([truss.links, truss.braces])), tv.Pin([0, 1, 20, 21])),
         ],
-        "Jacobi": [  # single links, angles unfit for elimination, what clusters hold, soft cloth
-            (x,), (flat, tv.Distance([(0, 1), (2, 3)])),
-            (x, chain, tv.Bend(three)), (np.c_[x, x[:, 1] * x[:, 0]], chain, tv.Bend(three, compliance=1.0)),
-            (x, chain, tv.Motor(three, 0.0)),
+        "Jacobi": [  # single links, what clusters hold, soft cloth
+            (x,), (flat, tv.Distance([(0, 1), (2, 3)])), (x, tv.Motor(three, 0.0)),
             (four, tv.Distance(braced), tv.ShapeMatch([range(4)])), (sheet.position, tv.Distance(sheet.links, compliance=1e-3)),
         ],
-        "ConjugateGradient": [  # stiff cloth, whatever else there is
+        "ConjugateGradient": [  # stiff cloth, whatever else there is, and angles unfit for elimination
+            (x, chain, tv.Bend(three)), (np.c_[x, x[:, 1] * x[:, 0]], chain, tv.Bend(three, compliance=1.0)),
+            (x, chain, tv.Motor(three, 0.0)),
             (sheet.position, cloth, tv.Dihedral(sheet.quads)), (both, cloth, rope, tv.AngleLimit(elbow, 0.0, 2.0)),
         ],
     }.items():  # fmt: skip

@@ -297,9 +297,7 @@ class Judge:
         reach = np.abs(x).max() + np.abs(self.x).max()
         n = np.sqrt(self.w.last.substeps * self.w.last.iterations * self.steps * len(m))
         near = 64 * self.t.eps * n * size + 1e-300
-        # Where linked things strike, what is read limits loads by particle, see the debts of the step.
-        strikes = self.rows and any(getattr(f, "count", 0) for f in self.t.features)
-        if not strikes and np.abs(m @ v - m @ self.v).max() > near:
+        if np.abs(m @ v - m @ self.v).max() > near:
             self.find("momentum", f"of velocities {m @ self.v} -> {m @ v}, allowed {near:.3g}, {self.w.last}")
         blur = 64 * self.t.eps * n * m.sum() * reach / event.dt
         # Not checked if the host moved bodies, which it solves to 1e-9 of their size, or if particles sleep.

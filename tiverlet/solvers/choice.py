@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 USUAL_SUBSTEP = 1 / 1200  # [s] substep: 20 of a frame of 1/60 s
 MANY_STIFF = 200  # stiff constraints from which conjugate gradients are worth their sums, whatever elimination would take
-# Stiff constraints in a piece from which they count: in a pile of braced boxes Jacobi is best at equal time, 6e-3.
-LARGE_PIECE = 25
 CG_STEPS = 5  # of conjugate gradients: at equal time, residuals of 5 to 20 steps are about the same; 5 take the least of a frame
 # Products of an elimination that take as long as conjugate gradients: for each constraint, and for each system. A chain has 1 for
 # each constraint, a ladder 6, a wheel of 12 spokes 36, nets of 8 x 8 and 9 x 9 60 and 75.
@@ -37,9 +35,9 @@ def choose_solver(batches: "list[Batch]", scene: "Scene", answers: bool) -> Solv
     Direct solves what hangs together in systems up to its usual width: chains, trees, ladders, trusses, wheels, bodies. Its
     residual is some 1e-6 of the length of a link, that of Jacobi a hundredth, in one to four times the time. Single links, too,
     where they `answer` contacts or join rigid clusters, but not clusters that are no bodies of a system. ConjugateGradient solves
-    what is wider or faster by it, such as cloth and nets, where that is more of the stiff constraints, or MANY_STIFF, in pieces
-    of LARGE_PIECE or more. Its residual is an eighth of that of Jacobi with as many substeps. Jacobi is left with few or soft
-    links, and with what is inside of a cluster: such constraints may contradict it; relaxed, they settle on a compromise.
+    what is wider or faster by it, such as cloth and nets, where that is more of the stiff constraints, or MANY_STIFF. Its
+    residual is an eighth of that of Jacobi with as many substeps. Jacobi is left with soft links, with each by itself, and
+    with few inside of a cluster: these may contradict it; relaxed, they settle on a compromise.
     """
     links = solvable(batches)
     if not links:
@@ -47,7 +45,8 @@ def choose_solver(batches: "list[Batch]", scene: "Scene", answers: bool) -> Solv
     pieces = Pieces(links, scene, batches, answers)
     direct, taken = pieces.choose_direct(answers)
     left, solved = pieces.count_stiff(~taken), pieces.count_stiff(taken)
-    if left >= min(MANY_STIFF, max(solved, 1)) and all(_may_iterate(b, scene) for b in links):
+    enough = MANY_STIFF if pieces.is_inside else min(MANY_STIFF, max(solved, 1))
+    if left >= enough and all(_may_iterate(b, scene) for b in links):
         return ConjugateGradient(CG_STEPS)
     return direct or Jacobi()
 
@@ -57,8 +56,8 @@ def explain_choice(solver: Solver) -> str:
     if isinstance(solver, Direct):
         return "links hang together like chains, loops, beams or small nets, join bodies, or touch something"
     if isinstance(solver, ConjugateGradient):
-        return "links are stiff, many, and hang together more closely than elimination takes"
-    return "links are few, soft or inside of a cluster, or there are angles that elimination is not for, or none"
+        return "links are stiff, and hang together more closely than elimination takes, or by angles that it is not for"
+    return "links are soft, each by itself, inside of a cluster or beside many that elimination takes, or there are none"
 
 
 def _may_eliminate(b: "Scalar", scene: "Scene") -> bool:
@@ -146,9 +145,9 @@ class Pieces:
         return (Direct(max([CHAIN, *found.widths])) if crowd.max() > 1 or self.joins else None), taken
 
     def count_stiff(self, some: np.ndarray) -> int:
-        """Return how many in the mask `some` are stiff, two-sided, and in pieces with LARGE_PIECE or more of these."""
+        """Return how many in the mask `some` are stiff, two-sided, and in a piece with others: one by itself is solved anyway."""
         sizes = np.bincount(self.piece[some & self.stiff], minlength=1)
-        return int(sizes[sizes >= LARGE_PIECE].sum())
+        return int(sizes[sizes > 1].sum())
 
 
 def _stiff(b: "Scalar", split: np.ndarray) -> np.ndarray:
