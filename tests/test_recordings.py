@@ -57,6 +57,29 @@ def recorded(w, path, frames, before=lambda frame: None, after=lambda frame: Non
     return tv.replay(path)
 
 
+@pytest.mark.parametrize("edit", ["shift", "remove", "add", "take"])
+def test_links_that_a_late_frame_softened_are_edited_and_replayed(world, tmp_path, edit):
+    # A soft pin shares the first particle with the rope, so passes leave violations, and links stay soft after the late frame.
+    rope = tv.shapes.rope((-1.0, 1.5), (0.5, 1.5), points=16)
+    pin, links = tv.Pin([0], compliance=1e-3, damping=2.0), tv.Distance(rope.links)
+    w = world(tv.Particles(rope.position, mass=0.1), [tv.Gravity(), pin, links], substeps=20)
+    with tv.Recorder(tmp_path / "a.rrd", w) as recorder:
+        for k in range(16):
+            if k == (4 if edit == "shift" else 8):
+                match edit:
+                    case "shift":
+                        w.shift((10.0, 0.1))
+                    case "remove":
+                        w.remove(features=[links])
+                    case "add":
+                        w.add(tv.Particles([(0.0, 3.0)]))
+                    case "take":
+                        w.remove([15])
+            w.step(0.1 if k in (4, 12) else FRAME)
+            recorder.log()
+    assert tv.replay(tmp_path / "a.rrd").verify()
+
+
 def test_frames_times_knobs_and_curves_read_back(falling, tmp_path):
     recording = tv.replay(falling)
     assert list(recording.frames) == list(range(0, 21, 2)) and recording.times[-1] == pytest.approx(20 / 60)

@@ -81,7 +81,8 @@ class Journal:
         more = {"flags": checkpoint.flags(world), "reach": world._runner.scene.multipliers_per_newton}
         more["once"] = [sorted(f.compiled_so_far) for f in world.features]
         parted = kept.clock.velocity_override
-        arrays = kept.values if parted is None else kept.values | {PARTED: np.asarray(parted)}
+        working = {name: rows for name, rows in checkpoint.working_fields(world).items() if rows.dtype.kind == "f"}
+        arrays = kept.values | working | ({} if parted is None else {PARTED: np.asarray(parted)})
         return self.put(kind, {"clock": kept.clock.named() | {"_parted": None}, **more}, arrays)
 
     def before(self) -> None:

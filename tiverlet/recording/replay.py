@@ -285,8 +285,7 @@ class Replay:
         once = state.data.get("once", [[] for _ in source.data["features"]])
         world = scene.rebuild(source.data, source.arrays, self._given, before, once)
         _set_controller(world, [e.data["now"] for e in self._entries[: start + 1] if "now" in e.data][-1])
-        checkpoint.install(world, _recorded_checkpoint(state, world), state.data["flags"])
-        world._runner.scene.multipliers_per_newton = tuple(state.data["reach"])
+        _install(world, state)
         return world
 
     def _run(self, start: int, end: int) -> Iterator[tuple["World", Entry]]:
@@ -315,8 +314,7 @@ class Replay:
             for k, values in self._knob_values(entry):
                 scene.set_knobs(world.features[k], values)
         elif entry.kind == "taken":
-            checkpoint.install(world, _recorded_checkpoint(entry, world), entry.data["flags"])
-            world._runner.scene.multipliers_per_newton = tuple(entry.data["reach"])
+            _install(world, entry)
         elif entry.kind == "assigned":
             if entry.data["name"] not in ("position", "velocity", "spin"):
                 raise ValueError(f"replay: {self.path} says that {plain(entry.data['name'])!r} was assigned.")
@@ -464,8 +462,16 @@ def _set_controller(world: "World", settings: list) -> None:
     world.substeps, world.iterations, world._controller.memory = *settings[:2], tuple(settings[2])
 
 
+def _install(world: "World", entry: Entry) -> None:
+    """Set the state that an entry records."""
+    checkpoint.install(world, _recorded_checkpoint(entry, world), entry.data["flags"])
+    world._runner.scene.multipliers_per_newton = tuple(entry.data["reach"])
+    numbers_only = {name: rows for name, rows in entry.arrays.items() if rows.dtype.kind == "f"}  # integers may be indices
+    checkpoint.put_working_fields(world, numbers_only)
+
+
 def _recorded_checkpoint(entry: Entry, world: "World") -> checkpoint.Checkpoint:
-    values = {name: value for name, value in entry.arrays.items() if name != journal.PARTED}
+    values = {k: value for k, value in entry.arrays.items() if k != journal.PARTED and not k.startswith(checkpoint.WORKING)}
     clock = Clock.of(entry.data["clock"] | {"_parted": entry.arrays.get(journal.PARTED)})
     kept = checkpoint.Checkpoint(values, clock, world._controller.memory)
     checkpoint.check(world, kept, entry.data["flags"])

@@ -136,11 +136,7 @@ class Slots:
         by sigma W h^2 F, with their floor sigma. Constraints that a pass solves exactly, as no other one shares their particles,
         stay exact.
         """
-        sags = self.sags(inv_mass, batches)
-        n = len(sags)
-        split = np.zeros(len(inv_mass))
-        split[:n] = self._blocks[:n] * inv_mass[:n] * np.where(sags, softness, 1.0)
-        memory.write(self.split, split)
+        memory.write(self.split, self._blocks * inv_mass * np.where(self.sags(inv_mass, batches), softness, 1.0))
         if self.can_soften:
             memory.write(self.softness, softness)
         if self.system and self.system.has_shared_particles:
@@ -169,7 +165,7 @@ class Slots:
     def _in_sagging_bodies(self, batches: list[Batch], inv_mass: np.ndarray) -> np.ndarray:
         """Return a mask of the particles whose constraints a pass does not solve exactly, with all that is connected to them."""
         rows = sum(b.count for b in batches)
-        body = bodies_of(rows, *corners_of(batches), inv_mass)[1][: len(self._blocks)]
+        body = bodies_of(rows, *corners_of(batches), inv_mass)[1]
         sags = self._inexact
         for b in batches if self.system and self.system.steps else ():  # conjugate gradients
             sags[b.indices.ravel()[(self.rows(b) >= 0)[b.owner]]] = True
@@ -181,7 +177,7 @@ class Slots:
     def regroup(self, memory: Memory, change: Regrouping) -> None:
         """Adapt the slots to added and removed particles, none of which any constraint holds."""
         n, first = change.now.count, change.first
-        self._blocks, self._sagging = self._blocks[:first], None
+        self._blocks, self._sagging = np.append(self._blocks[:first], np.zeros(n - first, dtype=int)), None
         memory.resize(self.begin, n + 1)
         memory.write_from(self.begin, first, np.full(n + 1 - first, self.total))
 

@@ -234,13 +234,18 @@ def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
             )
     if len({id(f) for f in features}) < len(features):
         raise ValueError("World: the same feature is listed twice.")
-    if sum(isinstance(f, PairContact) for f in features) > 1:
-        raise ValueError("World: more than one Contact; one covers all particles.")
-    if sum(isinstance(f, Periodic) for f in features) > 1:
-        raise ValueError("World: more than one Periodic; give one box, with all of its axes.")
-    if sum(isinstance(f, Sleep) for f in features) > 1:
-        raise ValueError("World: more than one Sleep; one is for all particles.")
+    refuse_several("World", features)
     return features
+
+
+def refuse_several(who: str, features: tuple[Feature, ...]) -> None:
+    """Raise ValueError for kinds of features of which a world has one at most."""
+    if sum(isinstance(f, PairContact) for f in features) > 1:
+        raise ValueError(f"{who}: more than one Contact; one covers all particles.")
+    if sum(isinstance(f, Periodic) for f in features) > 1:
+        raise ValueError(f"{who}: more than one Periodic; give one box, with all of its axes.")
+    if sum(isinstance(f, Sleep) for f in features) > 1:
+        raise ValueError(f"{who}: more than one Sleep; one is for all particles.")
 
 
 def usual_substeps(features: tuple[Feature, ...]) -> int:

@@ -158,6 +158,7 @@ class Rebuild:
         for f, rows in self.noted.items():
             if f in self.features:
                 runner.memory.put_scratch(f, rows, self.masks[f])
+        runner.renew_softness()
         runner.wake()
         if contact and contact in runner.step.contacts:
             self._give_contacts(faces)

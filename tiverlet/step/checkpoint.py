@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 PAIRS, PAIR = "Contact.pairs", "Contact."  # name of the array of pairs with data; prefix of the names of these data
 RESTS = "rests."  # prefix of rest values while knobs wait, before a ramp to new values; the number of the feature follows
+WORKING = "working."  # prefix of working fields; the number of the feature and of the field follow
 
 
 @dataclass(frozen=True)
@@ -178,6 +179,25 @@ def undo(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
         feature.changed, feature.moving = changed, moving
 
 
+def working_fields(world: "World") -> dict[str, np.ndarray]:
+    """Return the numbers that the last substep left in constraints, by name: residuals are computed from them, and the energy."""
+    read, batches = world._runner.memory.scratch, [(k, f) for k, f in enumerate(world.features) if isinstance(f, Batch)]
+    return {f"{WORKING}{k}.{n}": rows for k, f in batches for n, rows in enumerate(read(f))}
+
+
+def put_working_fields(world: "World", values: dict[str, np.ndarray]) -> None:
+    """Write back what working_fields() returned, as far as the world has such fields."""
+    memory = world._runner.memory
+    for k, f in enumerate(world.features):
+        if isinstance(f, Batch):
+            rows: list[np.ndarray] = memory.scratch(f)
+            for n, now in enumerate(rows):
+                new = values.get(f"{WORKING}{k}.{n}", now)
+                if (new.dtype, new.ndim) == (now.dtype, now.ndim):
+                    rows[n] = new
+            memory.put_scratch(f, rows)
+
+
 def transfer(old: "World", new: "World") -> None:
     """Copy the state of a world to another one, bit for bit if both have the same precision and order."""
     kept = keep(old)
@@ -185,9 +205,7 @@ def transfer(old: "World", new: "World") -> None:
         install(new, kept, flags(old))
         # the factors from multipliers to loads
         new._runner.scene.multipliers_per_newton = old._runner.scene.multipliers_per_newton
-        for mine, other in zip(new.features, old.features, strict=True):
-            if isinstance(mine, Batch):  # its scratch data of the last substep; not those of walls, since a clone ran no frame
-                new._runner.memory.put_scratch(mine, old._runner.memory.scratch(other))
+        put_working_fields(new, working_fields(old))
         return
     ours, theirs = new._clock, old._clock
     ours.time, ours.tick, ours.since, ours.frame = theirs.time, theirs.tick, theirs.since, theirs.frame

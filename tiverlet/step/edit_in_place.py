@@ -120,6 +120,7 @@ def regroup(world: Any, edit: Edit, added: Particles | None) -> None:
             f.changed, f.moving, f.new_force = waits
     if bound:
         bind(world, change, bound)
+        runner.renew_softness()
     if runner.sleep:
         runner.sleep.bind_again(step.drivers, runner.batches)
     runner.regroup()
@@ -194,6 +195,7 @@ def grab(world: Any, change: Grab) -> None:
     if change.soft:
         scene.particles = particles.placed(scene.state.get(memory))
         scene.slots.reassign(memory, change.inv_mass, runner.batches)
+        runner.renew_softness()
         rows = runner.step.contact_pass.rows
         if rows and rows.answers:
             rows.answers.reassign(memory, change.inv_mass)

@@ -17,12 +17,10 @@ from ..contact.pair_contact import PairContact
 from ..contact.touches import Told, joined_events
 from ..device.memory import numbers_of
 from ..features.feature import Batch, Feature
-from ..neighbours.periodic import Periodic
 from ..particles import Particles
 from ..shapes import Shape
 from . import added_shape, edit_in_place, impulse, solids, violations
-from .build import check_settings, checked_features, listed
-from .sleep import Sleep
+from .build import check_settings, checked_features, listed, refuse_several
 
 NONE: Mapping[Feature, Feature] = MappingProxyType({})
 
@@ -79,12 +77,7 @@ def add(
         own, both = added_shape.features(world, shape)
         late, extend = (*late, *own), {**both, **extend}
     checked_features((*late, *extend.values()))
-    if sum(isinstance(f, PairContact) for f in (*world.features, *late)) > 1:
-        raise ValueError("World.add: more than one Contact; one covers all particles.")
-    if sum(isinstance(f, Periodic) for f in (*world.features, *late)) > 1:
-        raise ValueError("World.add: more than one Periodic; remove the old box first.")
-    if sum(isinstance(f, Sleep) for f in (*world.features, *late)) > 1:
-        raise ValueError("World.add: more than one Sleep; one is for all particles.")
+    refuse_several("World.add", (*world.features, *late))
     check_settings(world._precision, world._requested[1], world._order, (*world.features, *late))
     n, count = len(world.particles), 0 if particles is None else len(particles)
     if late or count or extend:

@@ -36,13 +36,11 @@ def shift(world: Any, by: np.ndarray) -> None:
                 f"World.shift: {f!r} is fixed in space. Remove it before, and add it again where it belongs then: "
                 "world.remove(features=[...]), world.add(features=[...])."
             )
-    runner, position = world._runner, world.position + by
+    position = world.position + by
     world._check_places("World.shift", position)
     knobs = {f: {name: getattr(type(f), name) for name in knobs_of(type(f))} for f in world.features}
     values = {f: {n: knob.place(f, getattr(f, n), by) for n, knob in own.items() if knob.place} for f, own in knobs.items()}
     _take(world, values, position)
-    runner.clock.energy, runner.clock.moved_mask = None, None
-    runner.clock.forget_bound()
 
 
 def _set(values: Values) -> None:
@@ -76,6 +74,8 @@ def _take(world: Any, values: Values, position: np.ndarray | None = None) -> Non
             f.end_motion()
     if position is not None:
         runner.scene.state.put(runner.memory, position)
+        runner.clock.energy, runner.clock.moved_mask = None, None
+        runner.clock.forget_bound()
     runner.wake()
     runner.invalidate()
     for watcher in world._watchers:
