@@ -22,12 +22,14 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.device import thread_team, ti
+from tiverlet.device import ti
 from tiverlet.device.patches import enabled
 from tiverlet.device.patches.compiler import BRIEF
 from tiverlet.recording import reader, rrd, scene
 from tiverlet.report.accuracy.cases import entries, known
 from tiverlet.step import build
+
+from .launches import launching
 
 # Off until the first test begins: collecting tests leaves little garbage, and searching for it takes a third of the time.
 gc.disable()
@@ -161,7 +163,7 @@ def world():
     def build(*args, **kwargs):
         launched = kwargs.get("path") == "launched"
         try:
-            with thread_team.launching() if launched else contextlib.nullcontext():
+            with launching() if launched else contextlib.nullcontext():
                 made.append(tv.World(*args, **(kwargs | {"path": "parallel"} if launched else kwargs)))
         except ValueError as e:
             if ARCH not in tv.runtime.LLVM and ARCH in str(e):  # the architecture does not support it

@@ -1,4 +1,4 @@
-"""Counts the kernels that Taichi launches."""
+"""Counts the kernels that Taichi launches, and launches phases one by one."""
 
 import contextlib
 from collections import Counter
@@ -11,6 +11,7 @@ import pytest
 
 from tiverlet.device.language import COMPILER, module, ti
 from tiverlet.device.patches.compiler import CachedLaunch
+from tiverlet.step import build
 
 Kernel: Any = module("kernel_impl" if COMPILER == "taichi" else "kernel").Kernel
 
@@ -30,6 +31,14 @@ class Launches(Counter[str]):
         super().__init__()
         self.seconds: dict[str, float] = {}
         self.answers = 0
+
+
+@contextlib.contextmanager
+def launching() -> Iterator[None]:
+    """Within this context, worlds built for the parallel path are launched phase by phase, as on a GPU."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(build, "size_of", lambda path, work: 1)
+        yield
 
 
 @contextlib.contextmanager

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.device import thread_team
 
 from .laboratory import grains, granular, rolling
 from .laboratory.grains import SIZE, Silo
-from .launches import launches
+from .launches import launches, launching
 
 
 def test_a_super_ball_under_gravity_obeys_its_law():
@@ -73,6 +72,6 @@ def test_a_heap_bears_in_few_passes_what_bounces_on_it(world):
     walls = tv.Box((0, 0), (1.2, 9), friction=0.3, restitution=0.3)
     w = world(start, [tv.Gravity(), walls, tv.Contact(friction=0.3, restitution=0.3)], substeps=4)
     w.run(1.0)
-    with thread_team.launching(), w.clone(path="parallel") as other, launches() as count:  # a pass is a launch
+    with launching(), w.clone(path="parallel") as other, launches() as count:  # a pass is a launch
         other.run(0.5)
         assert tv.measure.kinetic_energy(other) > 0 and 3 <= count["relax_impulses"] / (30 * 4) <= 64

@@ -32,7 +32,8 @@ def test_the_host_sees_the_fields_as_kernels_do(monkeypatch, apart):
     # Fields of every kind and shape side by side: a kernel reads what the host writes, and the other way round, bit for bit. As
     # on Vulkan, f64 fields have a tree of their own (apart), which shows in nothing else.
     monkeypatch.setattr(fields, "aligned", lambda: not apart)
-    monkeypatch.setattr(layout, "_unshared", apart)
+    if apart:
+        monkeypatch.setattr(layout, "can_share", lambda: False)
     memory, rng, want = Memory(ti.f32), np.random.default_rng(0), {}
     for kind, exact in ((ti.f32, np.float32), (ti.f64, np.float64), (ti.i32, np.int32)):
         for k, (length, width) in enumerate(((None, 0), (1, 2), (7, 0), (7, 3), (1000, 4))):
@@ -148,9 +149,10 @@ from tiverlet.device import layout
 tv.init()
 point = tv.Particles([[0.0, 0.0]])
 layout.MAX_TREES = 12  # the rule, without the minutes that 400 worlds take
-with layout.unshared():
-    many = [tv.World(point) for _ in range(12)]
-    expect(RuntimeError, "worlds are alive", lambda: tv.World(point))
+can_share, layout.can_share = layout.can_share, lambda: False
+many = [tv.World(point) for _ in range(12)]
+expect(RuntimeError, "worlds are alive", lambda: tv.World(point))
+layout.can_share = can_share
 for w in many:
     w.close()
 class Broken(tv.Gravity):

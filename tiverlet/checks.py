@@ -37,13 +37,13 @@ def warn(text: str, category: type[Warning] = UserWarning) -> None:
     warnings.warn(text, category, stacklevel=level)
 
 
-def number(who: str, name: str, value: Any, *, above=None, least=None, most=None, below=None) -> float:
+def number(who: str, name: str, value: Any, *, above=None, least=None, most=None) -> float:
     """Check a finite real number within the given bounds."""
     if type(value) is not float:
         value = _real(who, name, value)
     if not math.isfinite(value):
         raise ValueError(f"{who}: {name} = {value}, but it must be finite.")
-    if words := _missed(value, above, least, most, below):
+    if words := _missed(value, above, least, most):
         raise ValueError(f"{who}: {name} = {value:g}, but it must be {words}.")
     return value
 
@@ -202,7 +202,7 @@ def _floats(who: str, name: str, value) -> np.ndarray:
     return np.array(array, dtype=np.float64)
 
 
-def _missed(value: float, above=None, least=None, most=None, below=None) -> str:
+def _missed(value: float, above=None, least=None, most=None) -> str:
     """Return the bound that a value violates, in words; empty if it is within the bounds."""
     if above is not None and not value > above:
         return f"above {above:g}"
@@ -210,8 +210,6 @@ def _missed(value: float, above=None, least=None, most=None, below=None) -> str:
         return f"at least {least:g}"
     if most is not None and not value <= most:
         return f"at most {most:g}"
-    if below is not None and not value < below:
-        return f"below {below:g}"
     return ""
 
 

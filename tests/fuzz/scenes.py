@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import strategies as st
 
 import tiverlet as tv
-from tiverlet.device import thread_team
 
+from ..launches import launching
 from . import functions
 
 
@@ -63,7 +63,7 @@ class Structure:
         settings = {k: v.make() if isinstance(v, Call) else v for k, v in self.settings.items()}
         if settings.get("path") != "launched":
             return tv.World(self.particles.make(), features, **settings), features
-        with thread_team.launching():
+        with launching():
             return tv.World(self.particles.make(), features, **{**settings, "path": "parallel"}), features
 
     @property
@@ -129,7 +129,7 @@ def script(structure: Structure, events: list[Event], says: str = "") -> str:
     used = [plain(v) for v in values if callable(v) or getattr(v, "_is_taichi_function", False)]
     body = structure.lines()
     if structure.settings.get("path") == "launched":
-        body = ["from tiverlet.device import thread_team", *body[:-1], "with thread_team.launching():", "    " + body[-1]]
+        body = ["from tests.launches import launching", *body[:-1], "with launching():", "    " + body[-1]]
     return "\n".join(
         [
             *(f"# {line}" for line in says.splitlines()), "import taichi as ti", "", "import tiverlet as tv", "",

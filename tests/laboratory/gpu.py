@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 import tiverlet as tv
-from tiverlet.device import runtime, thread_team, ti
+from tiverlet.device import runtime, ti
 from tiverlet.report.output import Table, machine
 
-from ..launches import launches
+from ..launches import launches, launching
 from .peers import Newton, overlap
 from .processes import ROOT
 from .scenes import DT, SCENES, scattered
@@ -181,7 +181,7 @@ def _made(job: dict[str, Any]) -> tv.World:
     build, substeps = BUILD[job["scene"]]
     particles, features = build(job["n"])
     path = {"fused": "fused", "cpu": "parallel"}.get(job["arch"], "auto")
-    with thread_team.launching() if job["arch"] == "cpu" else contextlib.nullcontext():
+    with launching() if job["arch"] == "cpu" else contextlib.nullcontext():
         return tv.World(particles, features, substeps=substeps, path=path)
 
 

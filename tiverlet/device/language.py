@@ -91,27 +91,22 @@ def unplaced_field(width: int) -> Any:
     return object.__new__(_VECTORS if width else _NUMBERS)
 
 
-def place_field(field: Any, placed: Any, name: Any) -> None:
-    """Give a field the memory of `placed`. name: the name of this place, by which shared kernels are keyed."""
-    field.__dict__.update(vars(placed), place_name=name)
-
-
 def plain_field(thing: Any) -> bool:
     """Whether a thing is a field of numbers or of vectors."""
     return type(thing) is _NUMBERS or type(thing) is _VECTORS
 
 
-def check_before_fields(check: Callable[[], None]) -> None:
-    """Have `check` called before any field is made, by anyone."""
-    create: Any = impl.create_field_member
+def _create_field_member(*args: Any, **kwargs: Any) -> Any:
+    """Create the member of a field. Before Taichi runs, its own message would name ti.init, whose defaults round otherwise."""
+    if current().prog is None:
+        raise RuntimeError(
+            "A field of Taichi was asked for before Taichi runs. Call tv.init() first; else the first tv.World starts it."
+        )
+    return _create(*args, **kwargs)
 
-    @functools.wraps(create)
-    def created(*args, **kwargs):
-        """Run the check, then create the field's member."""
-        check()
-        return create(*args, **kwargs)
 
-    impl.create_field_member = created
+_create: Any = impl.create_field_member
+impl.create_field_member = functools.wraps(_create)(_create_field_member)
 
 
 def at(field: Any, index: Any) -> Any:

@@ -10,12 +10,10 @@ has the fields of all kinds that any earlier tree had, so that few further ones 
 GPU, every world has its own, with fields just as long as needed.
 """
 
-import contextlib
 import ctypes
 import mmap
 import sys
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count, pairwise
 from typing import Any
@@ -105,7 +103,7 @@ class Layout:
             addresses = np.zeros(1, dtype=np.uint64)
             finder = AddressFinder(self.fields[0])
             if "sharing" in enabled and _table[0] is not self.runtime:
-                _keep_table(self.runtime, sharing.table_of(finder, "find", addresses, self.trees[0].id, first))
+                _keep_table(self.runtime, sharing.table_of(finder, addresses, self.trees[0].id, first))
             else:
                 finder.find(addresses)
             self._now = int(addresses[0]) - first
@@ -173,17 +171,6 @@ def check_trees() -> None:
         )
 
 
-@contextlib.contextmanager
-def unshared() -> Iterator[None]:
-    """Within this context, worlds are built with trees and kernels of their own."""
-    global _unshared
-    before, _unshared = _unshared, True
-    try:
-        yield
-    finally:
-        _unshared = before
-
-
 def make_field(kind: Any, width: int) -> Any:
     """Make a field."""
     return ti.Vector.field(width, kind) if width else ti.field(kind)
@@ -204,7 +191,7 @@ def can_share() -> bool:
     """Whether worlds can share trees."""
     if "sharing" in enabled and _table[0] is not language.current():
         Layout((Declared(ti.i32, 0, 1, False),)).destroy()  # its find_addresses() searches for the table
-    return bool(LAZY) and _table[1] is not None and not _unshared
+    return bool(LAZY) and _table[1] is not None
 
 
 def get_layout(declared: list[Declared], fields: list[Any], held: list[Layout], shared: bool) -> tuple[Layout, list[int]]:
@@ -222,7 +209,7 @@ def get_layout(declared: list[Declared], fields: list[Any], held: list[Layout], 
         which = [next(numbers[kind]) for kind in kinds]
     if "sharing" in enabled:
         for k, unplaced in zip(which, fields, strict=True):
-            language.place_field(unplaced, layout.fields[k], (layout.serial, k))
+            vars(unplaced).update(vars(layout.fields[k]), place_name=(layout.serial, k))  # by which shared kernels are keyed
     return layout, which
 
 
@@ -281,5 +268,4 @@ def _with_room(kind: Any, width: int, many: bool, room: int) -> Declared:
 
 _leaving: list[Layout] = []  # layouts to free
 _known: dict[Layout, Counter[Kind]] = {}  # the shared layouts, and how many fields of each kind they have
-_unshared = False
 _table: tuple[Any, Any] = (None, None)  # a runtime, and the table in which its kernels look up tree addresses

@@ -13,20 +13,6 @@ from typing import Any
 from . import language
 from .language import ti
 
-
-def _ask_for_start() -> None:
-    """Raise RuntimeError if a field is made before Taichi runs, and name tv.init as the remedy.
-
-    Taichi's own message names ti.init, whose defaults round otherwise.
-    """
-    if language.current().prog is None:
-        raise RuntimeError(
-            "A field of Taichi was asked for before Taichi runs. Call tv.init() first; else the first tv.World starts it."
-        )
-
-
-language.check_before_fields(_ask_for_start)
-
 ARCHITECTURES = ("cpu", "cuda", "metal", "vulkan")
 HELD = 60.0  # [s]: Taichi holds the lock of its cache while it reads or writes, seconds at most; an older lock was left behind
 LLVM = ("cpu", "cuda")  # compiled by LLVM; for the others Taichi writes SPIR-V

@@ -6,8 +6,6 @@ as long as each thread has a core. If other programs use the cores too, a thread
 After a few such waits the first thread continues alone, and the others rejoin some frames later.
 """
 
-import contextlib
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from . import called, runtime
@@ -30,23 +28,9 @@ LINE = 32  # integers so far apart are in different cache lines
 SHIFT = 4096  # frames after which the count of arrivals restarts from 0, while no thread waits
 
 
-_launching = False
-
-
-@contextlib.contextmanager
-def launching() -> Iterator[None]:
-    """Within this context, worlds built for the parallel path are launched phase by phase, as on a GPU."""
-    global _launching
-    before, _launching = _launching, True
-    try:
-        yield
-    finally:
-        _launching = before
-
-
 def size_of(path: str, work: int) -> int:
     """Return the number of threads in a world's team. work: its number of particles and constraints."""
-    return min(runtime.cores(), max(2, work // SHARE)) if path == "parallel" and not _launching else 1
+    return min(runtime.cores(), max(2, work // SHARE)) if path == "parallel" else 1
 
 
 @inline

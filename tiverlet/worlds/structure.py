@@ -66,20 +66,8 @@ def _structure(world: "World") -> dict[str, Any]:
         "kernels": None,
     }
     if COMPILER == "taichi":  # the only compiler whose internals are known
-        out["kernels"] = _written(world)
+        from ..device.patches.sharing import KernelInputs  # noqa: PLC0415
+
+        fields = tuple(field for memory in world._runner.memories for field in memory.fields)
+        out["kernels"] = KernelInputs(world._runner.step, known=fields).key  # with numbers in place of fields
     return out
-
-
-def _written(world: "World") -> Any:
-    """Return the source of a world's kernels, with numbers in place of its fields."""
-    from ..device.patches.sharing import KernelInputs  # noqa: PLC0415
-
-    fields = [vars(field) for memory in world._runner.memories for field in memory.fields]
-    before = [known.get("place_name") for known in fields]
-    for k, known in enumerate(fields):
-        known["place_name"] = "field", k
-    try:
-        return KernelInputs(world._runner.step).key
-    finally:
-        for known, name in zip(fields, before, strict=True):
-            known["place_name"] = name

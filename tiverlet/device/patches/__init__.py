@@ -1,6 +1,7 @@
 """Replacements for parts of Taichi 1.7.4's Python: kernels compile and launch sooner, bit for bit the same.
 
 TIVERLET_PATCHES=0 switches all of them off, TIVERLET_PATCHES=-calls,-launches these two. device/__init__.py applies the others.
+All but "passes" depend on the internals of Taichi 1.7.4, and are off with another version.
 """
 
 import os

@@ -4,8 +4,6 @@ LLVM, and Taichi's simplifier even more so, take longer for one long function th
 is long and used in several places, or that runs once per frame or phase, is compiled once and called: a pile of 1600 spheres with
 friction starts in 2.7 s instead of 5.3, and its frames take as long. In many copies of a world and on a GPU, functions are copied
 into each place.
-
-Everything here depends on the internals of Taichi 1.7.4; with another version, all functions are copied.
 """
 
 import ast

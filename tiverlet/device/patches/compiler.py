@@ -4,10 +4,8 @@ Most of Taichi's time goes into its analysis of control flow and, in small world
 switched off while a kernel of tiverlet compiles, and only then; kernels that the user compiles in the same process are not
 affected. A kernel keeps both passes if it assigns a vector to a variable that is a number. The user's functions may do so where
 no statement reads the variable (`_, gap, _ = nearest(x)`). Taichi's analysis removes the assignment; LLVM would end the process.
-source_cache.py is about how functions are read, syntax_cache.py about how they become statements.
 
-These are settings, which Quadrants has too. CachedLaunch, which skips the checks of a launch, depends on the internals of Taichi
-1.7.4; with another version, every launch makes them.
+These are settings, which Quadrants has too.
 """
 
 import contextlib
@@ -15,17 +13,17 @@ import gc
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
+from .. import runtime
 from ..language import active, impl, sources
 from ..user_errors import shortened
 from . import enabled
 from .llvm_switches import restore_switches, set_switches
 
-HOSTS = ("Arch.x64", "Arch.arm64")  # where LLVM makes kernels as fast without Taichi's passes; measured on x64
 # Loops do not cache a field element in a variable: Taichi misses that another index may be the same element, such as field[k] for
 # field[0].
 SAFE = {"cache_loop_invariant_global_vars": False}
@@ -73,13 +71,16 @@ class Compiler:
         self.launches = False  # whether Taichi spreads top-level loops over the threads of a CPU or GPU
         self.thorough = "passes" not in enabled  # never reset: Taichi may retry a kernel that failed to compile
         self.config: Any = None  # Taichi's settings, while kernels compile
-        self._host: bool | None = None  # whether kernels run on the host; cached, since asking Taichi takes 6 us
         self._settings: dict[str, Any] = {}  # the settings that Taichi was started with
         self._thread = 0
-        self._fast = False
         self.refused: Exception | None = None  # the error in a function that is being compiled, see refuse()
         self.times = Times({}, {})
         self.places: list[tuple[Any, int]] = []  # layouts and addresses of the world's fields
+
+    @cached_property
+    def _host(self) -> bool:
+        """Whether kernels run on the host, where LLVM makes them as fast without Taichi's passes. Asking Taichi takes 6 us."""
+        return runtime.architecture() == "cpu"
 
     @property
     def calls(self) -> bool:
@@ -87,7 +88,7 @@ class Compiler:
 
         Called functions cannot read which copy of a world is current, and their loops are not spread over threads.
         """
-        return bool(self._host) and not (self.many or self.launches or self.thorough)
+        return self._host and not (self.many or self.launches or self.thorough)
 
     def use_fields(self) -> None:
         """Let kernels use the fields of this world."""
@@ -103,15 +104,13 @@ class Compiler:
 
     @contextlib.contextmanager
     def _entered(self) -> Iterator[None]:
-        runtime: Any = impl.get_runtime()
+        taichi: Any = impl.get_runtime()
         with _lock:
-            config, literals = runtime.prog.config(), runtime.default_fp
+            config, literals = taichi.prog.config(), taichi.default_fp
             self.config = config
             before = {name: getattr(config, name) for name in SETTINGS}
             self._settings = active[0]._settings if active else before
-            runtime.set_default_fp(self.real)
-            if self._host is None:
-                self._host = str(config.arch) in HOSTS
+            taichi.set_default_fp(self.real)
             _set(config, self.passes if self._host and not self.thorough else SAFE)
             active.append(self)
             self._thread = threading.get_ident()
@@ -127,12 +126,10 @@ class Compiler:
                 raise error from None
             finally:
                 active.pop()
-                if self._fast:
-                    restore_switches()
-                    self._fast = False
+                restore_switches()
                 if active:
                     active[-1].use_fields()
-                runtime.set_default_fp(literals)
+                taichi.set_default_fp(literals)
                 _set(config, before)
                 if collects:
                     _age_objects()
@@ -142,13 +139,11 @@ class Compiler:
         """Have LLVM spend less time on the kernel that is compiled next. Its first launch must come before the context ends."""
         if self._host and not self.thorough and "loops" in enabled:
             set_switches(search=self.passes is LEAN)
-            self._fast = True
 
     def compile_thoroughly(self) -> None:
         """Compile with all passes from here on: the kernel has an assignment that LLVM cannot handle."""
-        runtime: Any = impl.get_runtime()
         self.thorough = True
-        _set(runtime.prog.config(), self._settings | SAFE)
+        _set(self.config, self._settings | SAFE)
 
 
 def refuse(error: Exception) -> None:
@@ -200,7 +195,7 @@ class CachedLaunch:
         kernel = primal.compiled_kernels[primal.ensure_compiled(self.owner, *self.arrays)]
         program: Any = impl.get_runtime().prog
         compiled = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
-        if str(program.config().arch) in HOSTS:
+        if runtime.architecture() == "cpu":
             return partial(program.launch_kernel, compiled, self._context(kernel))
         return lambda: program.launch_kernel(compiled, self._context(kernel))
 

@@ -12,8 +12,6 @@ kernels read it or not. So an overlooked attribute can cause one more compilatio
 Each launch reads the addresses of trees of fields from a table of Taichi's runtime. After another address is written to the
 table, the same kernel works on other memory of the same layout. Where the table is not found, or kernels do not follow it, every
 world has a tree and kernels of its own.
-
-Everything here depends on the internals of Taichi 1.7.4; with another version, every object has kernels of its own.
 """
 
 import ctypes
@@ -243,19 +241,15 @@ def finalize_without_memory(builder: Any) -> Any:
     return builder._finalize_for_aot()
 
 
-def table_of(finder: Any, kernel: str, addresses: np.ndarray, tree: int, offset: int) -> Any:
+def table_of(finder: Any, addresses: np.ndarray, tree: int, offset: int) -> Any:
     """Return the table as an array of addresses, indexed by tree; None if it is not found, or kernels do not follow it.
 
-    finder: an object with a kernel that writes the address of a field to the array `addresses`; the field is `offset` bytes
-    behind the begin of the tree with number `tree`.
+    finder: an AddressFinder of a field, `offset` bytes behind the begin of the tree with number `tree`. It writes to `addresses`.
     """
     program: Any = impl.get_runtime().prog
-    find = getattr(finder, kernel)
-    find(addresses)
+    finder.find(addresses)
     begin = int(addresses[0]) - offset
-    if str(program.config().arch) not in ("Arch.x64", "Arch.arm64"):
-        return None
-    primal: Any = getattr(type(finder), kernel)._primal
+    primal: Any = type(finder).find._primal
     made = primal.compiled_kernels[primal.ensure_compiled(finder, addresses)]
     context = made.make_launch_context()
     context.set_arg_external_array_with_shape((0,), addresses.ctypes.data, addresses.nbytes, addresses.shape, 0)
@@ -272,7 +266,7 @@ def table_of(finder: Any, kernel: str, addresses: np.ndarray, tree: int, offset:
         return None
     table = np.ctypeslib.as_array((ctypes.c_uint64 * TREES).from_address(runtime + 8 * (found[0] - tree)))
     table[tree] = begin + NEAR  # the kernel only computes an address there, and reads nothing
-    find(addresses)
+    finder.find(addresses)
     table[tree] = begin
     follows, addresses[0] = int(addresses[0]) == begin + NEAR + offset, begin + offset
     return table if follows else None

@@ -3,8 +3,6 @@
 Taichi expands every call of a ti.func. Each time it searches for the source and formats source excerpts for errors that do not
 occur. Here this happens once, or not at all, while a kernel of tiverlet compiles, and only then; kernels that the user compiles
 in the same process are not affected.
-
-Everything here depends on the internals of Taichi 1.7.4; with another version, Taichi reads functions by itself.
 """
 
 import ast

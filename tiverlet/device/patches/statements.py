@@ -1,7 +1,4 @@
-"""Fewer statements than Taichi makes, bit for bit the same result: Taichi's have superfluous branches and functions.
-
-Everything here depends on the internals of Taichi 1.7.4; with another version, Taichi makes its own statements.
-"""
+"""Fewer statements than Taichi makes, bit for bit the same result: Taichi's have superfluous branches and functions."""
 
 import ast
 import operator

@@ -3,8 +3,6 @@
 At each node Taichi computes again what it has computed before: the node's position, its own settings, which of a dozen kinds of
 values a node has. Here this is computed once, or the few kinds that tiverlet's kernels use are tested first. All others take
 Taichi's own path, and so do kernels that the user compiles in the same process.
-
-Everything here depends on the internals of Taichi 1.7.4; with another version, Taichi translates by itself.
 """
 
 import ast
