@@ -20,8 +20,9 @@ class Entry:
     width: int  # components of one element; 0 for a scalar
     length: int  # elements; 0 for a single one
     kind: np.dtype
-    state: bool  # part of the exact state, hence of hash() and clone()
-    copies: int = 0  # number of copies with `length` elements each; 0 where all copies share the field
+    copies: int  # number of copies with `length` elements each; 0 where all copies share the field
+    valued: bool  # declared with values
+    state: bool = False  # part of the exact state, hence of hash() and clone()
     rows: Any = None  # the Number that its length follows; None where it follows none
     for_reports: bool = False  # state that only reports read, hence not part of hash()
     index_limit: int | None = None  # where kernels use its elements as indices: the size of what they index

@@ -77,9 +77,7 @@ class Layout:
             )
         self.serial, self.runtime, self.shared = next(self._serials), language.current(), shared
         self.fields = fields or [make_field(d.kind, d.width) for d in declared]
-        builders: dict[bool, Any] = {d.apart: None for d in declared}
-        for apart in builders:
-            builders[apart] = ti.FieldsBuilder()
+        builders: dict[bool, Any] = {apart: ti.FieldsBuilder() for apart in dict.fromkeys(d.apart for d in declared)}
         for d, field in zip(declared, self.fields, strict=True):
             (builders[d.apart].dense(ti.i, d.length) if d.length else builders[d.apart]).place(field)
         self.trees = [sharing.finalize_without_memory(builder) if shared else builder.finalize() for builder in builders.values()]
@@ -89,10 +87,8 @@ class Layout:
         self._now = 0  # the address of the bytes that kernels use
         self._places: list[tuple[int, tuple[int, ...]]] = []  # offset and strides of each field; empty without host access
         self.size = 0  # [bytes] of the tree; 0 without host access
-        if shared or "sharing" in enabled:
+        if shared:
             self.find_addresses()
-        if not shared and "sharing" in enabled and _table[0] is not self.runtime:
-            _keep_table(self.runtime, None)
 
     def find_addresses(self) -> None:
         """Find the addresses of the tree and its fields, where the host can access them. All fields must be placed already."""
@@ -101,11 +97,7 @@ class Layout:
         (first, *_), tree = offsets_in_tree(self.fields[0])
         if not self.shared:
             addresses = np.zeros(1, dtype=np.uint64)
-            finder = AddressFinder(self.fields[0])
-            if "sharing" in enabled and _table[0] is not self.runtime:
-                _keep_table(self.runtime, sharing.table_of(finder, addresses, self.trees[0].id, first))
-            else:
-                finder.find(addresses)
+            AddressFinder(self.fields[0]).find(addresses)
             self._now = int(addresses[0]) - first
         self.size = tree.cell_size_bytes
         for field in self.fields:
@@ -181,16 +173,15 @@ def field(kind: Any, width: int) -> Any:
     return language.unplaced_field(width) if "sharing" in enabled else make_field(kind, width)
 
 
-def _keep_table(of: Any, table: Any) -> None:
-    """Keep the table of tree addresses of a runtime; None if it has none."""
-    global _table
-    _table = of, table
-
-
 def can_share() -> bool:
-    """Whether worlds can share trees."""
+    """Whether worlds can share trees: the table in which kernels look up their addresses is found by means of one tree."""
+    global _table
     if "sharing" in enabled and _table[0] is not language.current():
-        Layout((Declared(ti.i32, 0, 1, False),)).destroy()  # its find_addresses() searches for the table
+        probe, table = Layout((Declared(ti.i32, 0, 1, False),)), None
+        if runtime.architecture() == "cpu":
+            table = sharing.table_of(AddressFinder(probe.fields[0]), probe.trees[0].id, offsets_in_tree(probe.fields[0])[0][0])
+        _table = language.current(), table
+        probe.destroy()
     return bool(LAZY) and _table[1] is not None
 
 

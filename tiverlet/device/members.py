@@ -71,7 +71,7 @@ class Members:
         self.count = memory.number(count)
         self.shared: list[Shared] = []
         self._next = 0  # index of the field that the present member declares next
-        self._pitches: dict[Any, Any] = {}  # see Shared, by key
+        self._pitches: list[Any] = []  # see Shared
         self._now: tuple[Any, dict[Any, Any]] = (None, {})  # a kernel, and the first element of its member by pitch
 
     kernels_read = ("count_number",)
@@ -81,7 +81,7 @@ class Members:
         self._next = 0
 
     def field(
-        self, make: Callable[[Any, int], Any], name: str, length: Any, width: int, kind: Any, values: Any, state: bool
+        self, make: Callable[[Any, int], Any], name: str, length: Any, width: int, kind: Any, values: Any, state: bool = False
     ) -> Any:
         """Return the present member's handle of the field that it declares next. make: makes a field of a kind and a width."""
         if isinstance(length, Number):
@@ -96,25 +96,21 @@ class Members:
 
     def number(self, make: Callable[[Any, int], Any], value: float, kind: Any) -> Number:
         """Return the present member's number that it declares next, in a field of its own."""
-        return Number(self._memory, self.field(make, "number", None, 0, kind, value, False), None, value)
+        return Number(self._memory, self.field(make, "number", None, 0, kind, value), None, value)
 
     def place(self) -> None:
         """Let kernels use the fields, once these are placed. Pitches are part of the names by which shared kernels are keyed."""
+        self._pitches = [*dict.fromkeys(one.pitch for one in self.shared)]
         for one in self.shared:
-            regular = isinstance(one.pitch, int)
-            key = one.pitch if regular else id(one.pitch)
-            self._pitches[key] = one.pitch
             own = vars(one.field)
-            own.update(vars(one.whole), members=self, pitch=key)
+            own.update(vars(one.whole), members=self, pitch=one.pitch)
             if "place_name" in own:
-                own["place_name"] += ("members", one.pitch if regular else vars(one.pitch)["place_name"])
+                own["place_name"] += ("members", one.pitch if isinstance(one.pitch, int) else vars(one.pitch)["place_name"])
 
     @inline
     def enter(self, member):
         """In a kernel: from here on, subscripts address this member."""
-        begins = {}
-        for key, pitch in self._pitches.items():
-            begins[key] = impl.expr_init(member * pitch if isinstance(pitch, int) else at(pitch, member))
+        begins = {p: impl.expr_init(member * p if isinstance(p, int) else at(p, member)) for p in self._pitches}
         self._now = current().compiling_callable, begins
 
     def begin(self, pitch: Any) -> Any:

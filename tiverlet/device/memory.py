@@ -67,7 +67,6 @@ class Memory:
         self._named: Counter[str] = Counter()
         self._in_order: list[Number] = []
         self._owned: dict[Any, tuple[range, list[Number]]] = {}  # fields and numbers, by owner
-        self._valued: set[int] = set()  # indices of fields declared with values
         self._redeclaration: Redeclaration | None = None  # set while owners declare their fields a second time
         self._members: Members | None = None  # set while one of several members declares its fields
         self._parts: dict[int, tuple[Any, int, slice]] = {}  # of members, by the id of a handle: it, its entry, its elements
@@ -94,33 +93,29 @@ class Memory:
         return Memory(self.real, compiler=self.compiler, copies=self.copies)
 
     def field(
-        self, name: str, length: int | Number | None, *, width: int = 0, kind=None, values=None, state: bool = False,
-        shared: bool = False, for_reports: bool = False, index_limit: int | None = None,
+        self, name: str, length: int | Number | None, *, width: int = 0, kind=None, values=None, shared: bool = False, **role: Any
     ) -> Any:  # fmt: skip
         """Declare a field of `length` elements (None: one element, of 0 dimensions) and give it its first values.
 
         length: a Number makes the length follow that number, see regroup(). shared: all copies of the world share the field.
-        state, for_reports, index_limit: see Entry.
+        role: state, for_reports and index_limit, see Entry.
         """
         kind, rows = self.real if kind is None else kind, None
         if self._members:
-            return self._members.field(layout.field, name, length, width, kind, values, state)
+            return self._members.field(layout.field, name, length, width, kind, values, **role)
         if self._redeclaration:
             return self._redeclaration.field(length, width, np.dtype(_NUMPY[kind]), values)
         if isinstance(length, Number):
             rows, length = length, int(length.now)
         length = 0 if length is None else max(1, length)  # a field of 0 elements breaks the runtime
         made = layout.field(kind, width)
-        self._declare(name, made, length, width, kind, state, shared, rows, for_reports, index_limit)
-        if values is not None and np.size(values):
-            self._valued.add(len(self.entries) - 1)
-            self._later.append((self.entries[-1], np.asarray(values, dtype=np.float64)))
+        self._declare(name, made, length, width, kind, values, shared, rows=rows, **role)
         return made
 
     def _declare(
-        self, name: str, made: Any, length: int, width: int, kind: Any, state: bool, shared: bool = False, rows: Any = None,
-        for_reports: bool = False, index_limit: int | None = None,
+        self, name: str, made: Any, length: int, width: int, kind: Any, values: Any = None, shared: bool = False, **role: Any
     ) -> None:  # fmt: skip
+        """Declare a field. Arguments as those of field()."""
         copies = 0 if shared or not self.copies else self.copies.count
         in_all = max(1, length) * copies if copies else length
         if in_all >= 2**31:
@@ -129,10 +124,11 @@ class Memory:
         self._named[name] += 1
         same = self._named[name]
         name = f"{name} #{same}" if same > 1 else name  # several batches of a kind
+        valued = values is not None and np.size(values) > 0
         self._at[id(made)] = len(self.entries)
-        self.entries.append(
-            Entry(name, made, width, length, np.dtype(_NUMPY[kind]), state, copies, rows, for_reports, index_limit)
-        )
+        self.entries.append(Entry(name, made, width, length, np.dtype(_NUMPY[kind]), copies, valued, **role))
+        if valued:
+            self._later.append((self.entries[-1], np.asarray(values, dtype=np.float64)))
 
     def number(self, value: float, kind=None) -> Number:
         """Declare a number that kernels read from a field, so that worlds with other values share kernels.
@@ -181,9 +177,7 @@ class Memory:
             if any(length != pitch for length in one.lengths):
                 pitch = self.field(f"{one.name}.begins", len(begins), kind=ti.i32, values=begins)
             one.pitch = pitch
-            self._declare(one.name, one.whole, int(ends[-1]), one.width, one.kind, one.state)
-            if (values := one.first_values) is not None:
-                self._later.append((self.entries[-1], values))
+            self._declare(one.name, one.whole, int(ends[-1]), one.width, one.kind, one.first_values, state=one.state)
             for handle, begin, end in zip(one.handles, begins.tolist(), ends.tolist(), strict=True):
                 self._parts[id(handle)] = handle, len(self.entries) - 1, slice(begin, end)
 
@@ -221,12 +215,11 @@ class Memory:
 
     def _scratch(self, owner: Any) -> list[Entry]:
         fields = self._owned[owner][0] if owner in self._owned else ()
-        return [self.entries[k] for k in fields if k not in self._valued and not self.entries[k].state]
+        return [e for e in (self.entries[k] for k in fields) if not (e.valued or e.state)]
 
     def fill(self, k: int, length: int, values: Any) -> None:
         """Give a field of an elastic memory, by its index, a length and the value of its elements."""
-        view = self._resized(k, length) if length else self._host_views()[id(self.entries[k])]
-        view[...] = values
+        self._resized(k, length)[...] = values
 
     def set_number(self, number: Number) -> None:
         """Write a number to the device, if it is placed already. All copies get it, since they share kernels."""
@@ -242,8 +235,7 @@ class Memory:
 
     def _declare_numbers(self) -> None:
         for kind, (field, known) in self.numbers.items():
-            self._declare(f"numbers.{np.dtype(_NUMPY[kind]).name}", field, len(known), 0, kind, False)
-            self._later.append((self.entries[-1], np.array([number._value for number in known], dtype=np.float64)))
+            self._declare(f"numbers.{np.dtype(_NUMPY[kind]).name}", field, len(known), 0, kind, [n._value for n in known])
 
     def place(self) -> None:
         """Allocate the declared fields and write their first values (all others are zero)."""
@@ -301,19 +293,18 @@ class Memory:
         for k, e in enumerate(self.entries):
             if e.rows is rows:
                 moved = self._host_views()[id(e)].take(behind, axis=0) if len(behind) else 0
-                view = self._resized(k, count)
+                view = self._resized(k, max(1, count))
                 view[first:kept], view[kept:] = moved, 0
 
     def resize(self, field, length: int) -> None:
         """Change the length of a field in an elastic memory: present elements stay, and new ones are 0."""
         k = self._at[id(field)]
         before = self.entries[k].length
-        if length != before:
-            self._resized(k, length)[before:] = 0
+        self._resized(k, max(1, length))[before:] = 0
 
     def _resized(self, k: int, length: int) -> np.ndarray:
         """Change the length of a field, by its index, and return the field as an array."""
-        e, length = self.entries[k], max(1, length)
+        e = self.entries[k]
         if e.length == length:
             return self._host_views()[id(e)]
         assert self._layout
@@ -396,20 +387,16 @@ class Memory:
         self.check()
         array = np.asarray(values, dtype=np.float64)
         if array.size and id(field) in self._parts:
-            self._write_part(field, array)
+            entry, whole, part = self._part(field)
+            part[...] = array
+            if not self._host_views():
+                self._load([entry], [whole])
         elif array.size:
             self._load([self._find(field)], [array])
 
     def write_from(self, field, first: int, values) -> None:
         """Overwrite elements of a field from index `first` on. For a single world (not one of many copies)."""
-        self.check()
-        view = self._host_views().get(id(self._find(field)))
-        if view is None:
-            rows = self.read(field)
-            rows[first : first + len(values)] = values
-            self.write(field, rows)
-        else:
-            view[first : first + len(values)] = values
+        self.write_rows(slice(first, first + len(values)), (field, values))
 
     def write_rows(self, some: Rows, *values: tuple[Any, Any]) -> None:
         """Overwrite some elements of fields. For a single world (not one of many copies)."""
@@ -417,7 +404,7 @@ class Memory:
         views = self._host_views()
         for field, rows in values:
             if views:
-                views[id(self.entries[self._at[id(field)]])][some] = rows
+                views[id(self._find(field))][some] = rows
             else:
                 whole = self.read(field)
                 whole[some] = rows
@@ -426,17 +413,7 @@ class Memory:
     def write_some(self, field, values, some: np.ndarray) -> None:
         """Overwrite a field of some copies. values: one value for all of them, or one row per copy."""
         self.check()
-        entry = self._find(field)
-        self._load_some([entry], [np.asarray(values)], some)
-
-    def restore_some(self, state: dict[str, np.ndarray], some: np.ndarray) -> None:
-        """Write back, for some copies, what state() returned: one row for all of them, or one per copy.
-
-        Fields that it does not have become 0.
-        """
-        self.check()
-        chosen = [e for e in self.entries if e.state]
-        self._load_some(chosen, [state.get(e.name, np.zeros(1)) for e in chosen], some)
+        self._load_some([self._find(field)], [np.asarray(values)], some)
 
     def _load_some(self, entries: list[Entry], arrays: list[np.ndarray], some: np.ndarray) -> None:
         views = self._host_views()
@@ -458,29 +435,18 @@ class Memory:
         """
         self.check()
         if id(field) in self._parts:
-            return np.array(self._part(field), dtype=kind)
+            return np.array(self._part(field)[2], dtype=kind)
         entry, views = self._find(field), self._host_views()
         if views:
             return np.array(self._one(entry, views[id(entry)]), dtype=kind)
         return self._dump([entry])[0].astype(kind or entry.kind, copy=False)
 
-    def _part(self, field) -> np.ndarray:
-        """Return a member's elements of a field: the field itself where the host has access, otherwise a copy."""
+    def _part(self, field) -> tuple[Entry, np.ndarray, np.ndarray]:
+        """Return a field that members share, its elements, and a member's part of these. They are copies without host access."""
         _, k, some = self._parts[id(field)]
         entry, views = self.entries[k], self._host_views()
         whole = self._one(entry, views[id(entry)]) if views else self._dump([entry])[0]
-        return whole[:, some] if whole.ndim > len(entry.shape) else whole[some]
-
-    def _write_part(self, field, values: np.ndarray) -> None:
-        """Overwrite a member's elements of a field."""
-        _, k, some = self._parts[id(field)]
-        entry = self.entries[k]
-        if self._host_views():
-            self._part(field)[...] = values
-            return
-        (whole,) = self._dump([entry])
-        (whole[:, some] if whole.ndim > len(entry.shape) else whole[some])[...] = values
-        self._load([entry], [whole])
+        return entry, whole, whole[:, some] if whole.ndim > len(entry.shape) else whole[some]
 
     def view(self, field) -> np.ndarray:
         """Return the field itself as an array, where the host has access; otherwise a copy."""
@@ -492,7 +458,7 @@ class Memory:
     def rows(self, some: Rows, *fields) -> list[np.ndarray]:
         """Return some elements of fields, which the caller must not change. For a single world (not one of many copies)."""
         self.check()
-        views, entries = self._host_views(), [self.entries[self._at[id(field)]] for field in fields]
+        views, entries = self._host_views(), [self._find(field) for field in fields]
         return [(views[id(e)] if views else self._dump([e])[0])[some] for e in entries]
 
     @in_turn
@@ -507,12 +473,18 @@ class Memory:
         out = {id(e.field): (e.name, ALL) for e in self.entries if e.state}
         return out | {i: (self.entries[k].name, some) for i, (_, k, some) in self._parts.items() if self.entries[k].state}
 
-    def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Write back what state() returned, bit for bit. Fields not in it become 0."""
+    def restore(self, state: dict[str, np.ndarray], some: np.ndarray | None = None) -> None:
+        """Write back what state() returned, bit for bit. Fields not in it become 0.
+
+        some: copies, each of which gets a row of the arrays, or all the only one.
+        """
         self.check()
         chosen = [e for e in self.entries if e.state]
-        if chosen:
-            self._load(chosen, [state.get(e.name, np.zeros(1)) for e in chosen])
+        arrays = [state.get(e.name, np.zeros(1)) for e in chosen]
+        if some is None:
+            self._load(chosen, arrays)
+        else:
+            self._load_some(chosen, arrays, some)
 
     def copy_from(self, other: "Memory") -> None:
         """Copy into the chosen copy all fields of another memory with the same names.

@@ -691,7 +691,7 @@ class _Start:
         runner = worlds._runner
         state = {name: values[chosen] if len(values) > 1 else values for name, values in self.values.items()}
         for memory in runner.memories:
-            memory.restore_some(state, chosen)
+            memory.restore(state, chosen)
         if runner.search:
             for field, value in ((runner.search.list.old_number, 0), (runner.search.list.old_saved, 1)):
                 runner.memory.write_some(field, value, chosen)

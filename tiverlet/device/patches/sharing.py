@@ -241,12 +241,13 @@ def finalize_without_memory(builder: Any) -> Any:
     return builder._finalize_for_aot()
 
 
-def table_of(finder: Any, addresses: np.ndarray, tree: int, offset: int) -> Any:
+def table_of(finder: Any, tree: int, offset: int) -> Any:
     """Return the table as an array of addresses, indexed by tree; None if it is not found, or kernels do not follow it.
 
-    finder: an AddressFinder of a field, `offset` bytes behind the begin of the tree with number `tree`. It writes to `addresses`.
+    finder: an AddressFinder of a field, `offset` bytes behind the begin of the tree with number `tree`.
     """
     program: Any = impl.get_runtime().prog
+    addresses = np.zeros(1, dtype=np.uint64)
     finder.find(addresses)
     begin = int(addresses[0]) - offset
     primal: Any = type(finder).find._primal
@@ -268,8 +269,7 @@ def table_of(finder: Any, addresses: np.ndarray, tree: int, offset: int) -> Any:
     table[tree] = begin + NEAR  # the kernel only computes an address there, and reads nothing
     finder.find(addresses)
     table[tree] = begin
-    follows, addresses[0] = int(addresses[0]) == begin + NEAR + offset, begin + offset
-    return table if follows else None
+    return table if int(addresses[0]) == begin + NEAR + offset else None
 
 
 def _words(address: int, count: int) -> Any:
