@@ -11,7 +11,7 @@ from tiverlet.contact.pair_contact import PairContact
 from tiverlet.contact.rays import Hits
 from tiverlet.contact.touches import Touches
 from tiverlet.features.feature import Batch, Feature
-from tiverlet.features.terms import rows, terms
+from tiverlet.features.unknown_names import rows, terms
 from tiverlet.neighbours.queries import Contacts
 from tiverlet.recording.replay import Replay
 

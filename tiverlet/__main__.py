@@ -7,15 +7,7 @@ from . import __version__
 from .commands import demos, info, play, replay, report, run, stress
 
 # Each module has ABOUT (one line), add(parser) for its arguments, and main(args) -> exit status.
-COMMANDS = {
-    "run": run,
-    "play": play,
-    "replay": replay,
-    "report": report,
-    "stress": stress,
-    "demos": demos,
-    "info": info,
-}
+COMMANDS = {"run": run, "play": play, "replay": replay, "report": report, "stress": stress, "demos": demos, "info": info}
 
 
 def main(words: list[str] | None = None) -> int:

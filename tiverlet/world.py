@@ -228,23 +228,22 @@ class World:
         They are turned into velocities, unless displacements can be changed instead. The old force is lost when it is
         overwritten, or left out of a copy. steps: see _rebuild_for_knobs().
         """
-        changed = [f for f in self._features if f.changed]
-        if any([f.has_released_load for f in changed]):
+        if self._releases_load:
             if not steps:
                 self._runner.note_displacements()
             self._restart_with_reactions()
-        elif any([f.new_force or isinstance(f, Acceleration) for f in changed]) and not self._take_forces(changed, steps):
+        elif self._has_new_force and not self._take_forces(steps):
             with self._runner.memory.compiler():
                 (self._runner.restart if steps else self._runner.restart_between)(self._iterations)
 
-    def _take_forces(self, changed: list[Feature], steps: bool = False) -> bool:
+    def _take_forces(self, steps: bool = False) -> bool:
         """Write changed forces to the device, and let particles go on with the velocities that they have.
 
         A start would do so, too, but would disturb all that rests for as long as the user steers: contacts and walls find half of
         their loads in it. Returns False, and does nothing, where a start is needed: where springs or drags change, or kernels.
-        changed: the features that have changed. steps: see _rebuild_for_knobs().
+        steps: see _rebuild_for_knobs().
         """
-        runner, clock = self._runner, self._clock
+        runner, clock, changed = self._runner, self._clock, [f for f in self._features if f.changed]
         forces = [f for f in changed if isinstance(f, Acceleration)]
         if not forces or clock.d_is_velocity or not impulse.has_enough_digits(runner):
             return False
@@ -678,7 +677,7 @@ class World:
     @property
     def fields(self) -> dict[str, int]:
         """The size of every field on the device [bytes], by name."""
-        return {e.name: e.bytes for memory in self._runner.memories for e in memory.entries}
+        return {e.name: e.bytes * max(1, e.copies) for memory in self._runner.memories for e in memory.entries}
 
     def add(
         self,

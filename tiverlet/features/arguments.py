@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from .. import checks
-from ..device import at
-from ..device.language import inside_kernel
+from ..device.language import at, inside_kernel
 from .read_only import as_read_only, assign_whole_advice, structure_advice
 from .unknown_names import owners_of, suggest
 

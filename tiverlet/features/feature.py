@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from ..particles import Particles, State
     from .regrouping import Regrouping
 
+OF_WORLD = ("start", "periodic", "changed", "moving", "new_force")  # attributes of a feature in a world
 ONE = (float, int, str, np.generic, type(None))  # types of one value for all constraints
 BENT, FAR = 1, 2  # a constraint turned in a substep by more than 26 degrees, by more than 41
 
@@ -91,14 +92,8 @@ class Feature:
     """
 
     arguments: Mapping[str, Any] = MappingProxyType({})
-    # Attributes that a world may set.
-    kept_by_world: tuple[str, ...] = (
-        "scene", "start", "periodic", "changed", "moving", "new_force", "arguments", "compiled_so_far",
-    )  # fmt: skip
-    # Attributes that kernels do not read.
-    host_only: tuple[str, ...] = (
-        "start", "periodic", "changed", "moving", "new_force", "arguments", "compiled_so_far", "_built_values",
-    )  # fmt: skip
+    kept_by_world: tuple[str, ...] = ("scene", *OF_WORLD, "arguments", "compiled_so_far")  # attributes that a world may set
+    host_only: tuple[str, ...] = (*OF_WORLD, "arguments", "compiled_so_far", "_built_values")  # that kernels do not read
     for_users: tuple[str, ...] = ()  # attributes that users read, beside arguments and knobs, see names_for_users()
     uploads_all = False  # upload() and end_motion() also work for many worlds, where knobs have an additional first axis
     compiled_for: tuple[str, ...] = ()  # properties that decide the code of its kernels
@@ -189,7 +184,7 @@ class Feature:
 
     def release(self) -> None:
         """Forget the world in which it acted. `compiled_so_far` stays, since that world may be rebuilt with it."""
-        for name in ("scene", "start", "periodic", "changed", "moving", "new_force", "dev", "_built_values"):
+        for name in ("scene", *OF_WORLD, "dev", "_built_values"):
             self.__dict__.pop(name, None)
 
     def kept_mask(self, number: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -1,7 +1,7 @@
 """Friction and restitution: checked arguments, and tables for kernels."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -103,8 +103,7 @@ class Table:
     kernels_read = ("uniform", "has_friction", "has_restitution", "turns", "senses", "groups", "rank", "entries")
 
     def __init__(self, who: str, friction: Any, restitution: Any, touching: Iterable | None, sensing: Any = ()):
-        self.who, self.friction, self.restitution = who, friction, restitution
-        self.touching = None
+        self.who, self.touching = who, None
         if touching is not None:
             pairs = checks.rows(who, "groups", touching, "a list of pairs of groups, such as [(0, 1)],")
             self.touching = self._pairs("groups", pairs)
@@ -116,13 +115,9 @@ class Table:
                 raise ValueError(f"{who}: groups has {(a, b)}, which touch, and so has sensors; leave one of them out.")
         single = not isinstance(friction, Mapping) and not isinstance(restitution, Mapping)
         self.uniform = single and touching is None and not self.senses
-        values = friction.values() if isinstance(friction, Mapping) else [friction]
-        rub = [friction_of(who, "friction", v) for v in values]
-        values = restitution.values() if isinstance(restitution, Mapping) else [restitution]
-        bounce = [restitution_of(who, "restitution", v) for v in values]
-        for name, given, parsed in (("friction", friction, rub), ("restitution", restitution, bounce)):
-            if isinstance(given, Mapping):
-                self._refuse_contradictions(name, {self._pair(name, pair): v for pair, v in zip(given, parsed, strict=True)})
+        self.friction = self._by_groups("friction", friction, friction_of)
+        self.restitution = self._by_groups("restitution", restitution, restitution_of)
+        rub, bounce = (list(v.values()) if isinstance(v, dict) else [v] for v in (self.friction, self.restitution))
         self.has_restitution = any(v.normal > 0 for v in bounce)
         self.turns = any(v.rolling > 0 or v.twisting > 0 for v in rub) or any(v.tangential > 0 for v in bounce)
         self.has_friction = any(v.static > 0 for v in rub) or self.turns
@@ -131,13 +126,17 @@ class Table:
         """Return what pickle stores: all but the fields of bind()."""
         return {name: value for name, value in vars(self).items() if name not in ("rank", "entries")}
 
-    def _refuse_contradictions(self, name: str, values: Mapping[tuple[int, int], Any]) -> None:
-        """Raise ValueError if a pair of groups has two values, one in each order."""
-        for (a, b), value in values.items():
-            if values.get((b, a), value) != value:
+    def _by_groups(self, name: str, given: Any, parse: Callable[[str, str, Any], Any]) -> Any:
+        """Return checked coefficients for all, or by pairs of groups. Raises ValueError for a pair with two values."""
+        if not isinstance(given, Mapping):
+            return parse(self.who, name, given)
+        out = {self._pair(name, pair): parse(self.who, name, value) for pair, value in given.items()}
+        for (a, b), value in out.items():
+            if out.get((b, a), value) != value:
                 raise ValueError(
                     f"{self.who}: {name} has {(a, b)} and {(b, a)}, the same groups, with two values; leave one out."
                 )
+        return out
 
     def pushing(self, group: np.ndarray, pairs: np.ndarray) -> np.ndarray:
         """Return which pairs (m, 2) of particles of these groups push each other, (m,)."""
@@ -150,7 +149,7 @@ class Table:
     @property
     def named(self) -> frozenset[int]:
         """The groups that the arguments name."""
-        given = [v for v in (self.friction, self.restitution) if isinstance(v, Mapping)]
+        given = [v for v in (self.friction, self.restitution) if isinstance(v, dict)]
         return frozenset(k for pairs in (*given, self.touching or (), self.sensing) for pair in pairs for k in pair)
 
     def rows(self, group: np.ndarray, also: frozenset[int] = frozenset()) -> tuple[np.ndarray, np.ndarray]:
@@ -172,16 +171,13 @@ class Table:
         for a, b in self.sensing:
             if table[at[a], at[b], TOUCH] != SENSES:
                 table[at[a], at[b], TOUCH], table[at[b], at[a], TOUCH] = SENSED, SENSES
-        for name, columns, given, parse in (
-            ("friction", [STATIC, DYNAMIC, ROLLING, TWISTING], self.friction, friction_of),
-            ("restitution", [RESTITUTION, TANGENTIAL], self.restitution, restitution_of),
-        ):
-            if not isinstance(given, Mapping):
-                table[..., columns] = parse(self.who, name, given)
+        columns = [STATIC, DYNAMIC, ROLLING, TWISTING], [RESTITUTION, TANGENTIAL]
+        for some, values in zip(columns, (self.friction, self.restitution), strict=True):
+            if not isinstance(values, dict):
+                table[..., some] = values
                 continue
-            for pair, value in given.items():
-                a, b = self._pair(name, pair)
-                table[at[a], at[b], columns] = table[at[b], at[a], columns] = parse(self.who, f"value of {pair}", value)
+            for (a, b), value in values.items():
+                table[at[a], at[b], some] = table[at[b], at[a], some] = value
         return rank, table.reshape(m * m, len(COLUMNS))
 
     def set_columns(self, has_friction: bool, has_restitution: bool, turns: bool) -> None:

@@ -1,16 +1,48 @@
 """Errors for names that do not exist, read or passed: they say which is meant, by terms of other programs and by spelling.
 
-Public classes are decorated by answer_names(), and by answer_calls() of checks.py, which answers arguments.
+Public classes are decorated by answer_names(), and by answer_calls() of checks.py, which answers arguments. terms.ini has rows of
+terms by the class, module or function that is asked for a name: names, and the clause that ends the error. Rows of a class hold
+for its subclasses, too. Names are compared without case, underscores, and a get or set before them.
 """
 
 import difflib
 from collections.abc import Iterable
+from configparser import ConfigParser, ExtendedInterpolation
+from functools import cache
+from importlib import resources
 from typing import Any, TypeVar
-
-from .terms import spelt, terms
 
 Kind = TypeVar("Kind", bound=type)
 _guesses: dict[tuple[type, str], str] = {}  # by class and name: hasattr() may ask often, and searching takes 1.6 ms
+
+
+@cache
+def rows() -> dict[str, dict[str, str]]:
+    """Return names and clauses by owners, as terms.ini has them."""
+    file = ConfigParser(delimiters=(":",), interpolation=ExtendedInterpolation())
+    file.optionxform = str  # type: ignore[assignment, method-assign]  # names keep their case
+    file.read_string(resources.files("tiverlet.features").joinpath("terms.ini").read_text(encoding="utf-8"))
+    return {owners: dict(file[owners]) for owners in file.sections() if owners != "clauses"}
+
+
+@cache
+def terms() -> dict[str, dict[str, str]]:
+    """Return the clause of each name, see spelt(), by owner."""
+    out: dict[str, dict[str, str]] = {}
+    for owners, found in rows().items():
+        for owner in owners.split():
+            out.setdefault(owner, {}).update((spelt(name), clause) for names, clause in found.items() for name in names.split())
+    return out
+
+
+def spelt(name: str) -> str:
+    """Return a name without what differs between styles: case, underscores, and a get or set before it."""
+    plain = name.lower()
+    for word in ("get_", "set_"):
+        plain = plain.removeprefix(word)
+    if name[:3] in ("get", "set", "Get", "Set") and name[3:4].isupper():
+        plain = plain[3:]
+    return plain.replace("_", "")
 
 
 def suggest(name: str, owners: Iterable[str], names: Iterable[str]) -> str:

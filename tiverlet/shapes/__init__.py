@@ -12,25 +12,9 @@ from .sheets import cloth, net
 from .solids import ball, balloon, blob, pile, polygon, truss
 
 __all__ = [
-    "Shape",
-    "ball",
-    "balloon",
-    "blob",
-    "box",
-    "bridge",
-    "chain",
-    "cloth",
-    "join",
-    "load",
-    "net",
-    "pile",
-    "polygon",
-    "ragdoll",
-    "rope",
-    "save",
-    "tree",
-    "truss",
-]
+    "Shape", "ball", "balloon", "blob", "box", "bridge", "chain", "cloth", "join", "load", "net", "pile", "polygon", "ragdoll",
+    "rope", "save", "tree", "truss",
+]  # fmt: skip
 
 if not TYPE_CHECKING:  # type checkers know which names there are
 

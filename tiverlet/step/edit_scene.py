@@ -140,7 +140,7 @@ def change(
     number = np.where(some, np.cumsum(some) - 1, -1)
     planned = None
     world._runner.memory.check()
-    world._take_forces([f for f in world.features if f.changed])
+    world._take_forces()
     if features == world.features:
         planned = edit_in_place.planned(world, some, number, added, extend)
     if planned is None:

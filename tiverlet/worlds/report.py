@@ -7,9 +7,10 @@ import numpy as np
 
 from ..step.step_report import StepReport
 
-SUMS = ("energy_change", "broken")  # summed over frames
-LAST = ("time", "energy")
-FIRST = ("bad",)  # the first value that is not -1
+COMBINED = {  # how figures of several frames are combined; others by their maximum
+    "time": lambda a, b: b, "energy": lambda a, b: b, "energy_change": np.add, "broken": np.add,
+    "bad": lambda a, b: np.where(a < 0, b, a),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -56,17 +57,7 @@ class WorldsReport:
 
     def worse(self, later: "WorldsReport") -> "WorldsReport":
         """Combine with the report of later frames: the worst figures of both."""
-        out: dict[str, Any] = {}
-        for name in ARRAYS:
-            a, b = getattr(self, name), getattr(later, name)
-            if name in LAST:
-                out[name] = b
-            elif name in SUMS:
-                out[name] = a + b
-            elif name in FIRST:
-                out[name] = np.where(a < 0, b, a)
-            else:
-                out[name] = np.maximum(a, b)
+        out: dict[str, Any] = {name: COMBINED.get(name, np.maximum)(getattr(self, name), getattr(later, name)) for name in ARRAYS}
         none = np.zeros(len(self), dtype=bool)
         names = [*self.flags, *(name for name in later.flags if name not in self.flags)]
         flags = {name: self.flags.get(name, none) | later.flags.get(name, none) for name in names}

@@ -17,7 +17,6 @@ from ..features.arguments import knobs_of
 from ..features.feature import Feature
 from ..features.read_only import assign_whole_advice, read_only
 from ..features.unknown_names import answer_names, suggest
-from ..particles import in_range
 from ..step import checkpoint, energy_bound, impulse
 from ..step import frames as kernel
 from ..step.clock import CHANGED, energy_floor, energy_limit, exceeds, falls_short, initial_margin
@@ -481,10 +480,7 @@ class Worlds:
 
     def _in_range(self, position: np.ndarray) -> np.ndarray:
         """Return positions (worlds, n, dim) [m], checked."""
-        rows = position.reshape(-1, position.shape[2])
-        in_range("Worlds", "position", rows)
-        for contact in self._runner.step.contacts:
-            contact.check_range(rows)
+        self._world._check_places("Worlds", position.reshape(-1, position.shape[2]))
         return position
 
     def _place(self, position: np.ndarray, chosen: np.ndarray) -> None:
@@ -634,7 +630,7 @@ class Worlds:
     @property
     def fields(self) -> dict[str, int]:
         """The size of every field on the device for all worlds [bytes], by name."""
-        return {e.name: e.bytes * max(1, e.copies) for memory in self._runner.memories for e in memory.entries}
+        return self._world.fields
 
     def close(self) -> None:
         """Free the memory on the device. Using the worlds afterwards raises RuntimeError."""
