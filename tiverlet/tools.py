@@ -8,7 +8,7 @@ import numpy as np
 
 from . import checks
 from .device import ti
-from .device.language import callable_in_kernels, inside_kernel
+from .device.language import inline, inside_kernel
 
 # x**(d + 1) = x + 1 has one positive root, the golden ratio of dimension d (Roberts 2018, the R_d sequence). Its
 # inverse powers are the steps along each axis. As odd 32-bit integers, i * step mod 2**32 visits every value once,
@@ -36,7 +36,7 @@ def _both(kernel: Callable) -> Callable[[Callable], Callable]:
             """Call the function for the present context."""
             return kernel(*args, **kwargs) if inside_kernel() else python(*args, **kwargs)
 
-        return callable_in_kernels(chosen)
+        return inline(chosen)
 
     return decorate
 

@@ -12,6 +12,7 @@ import signal
 import threading
 from _thread import interrupt_main
 from collections.abc import Callable
+from contextlib import ContextDecorator
 from threading import get_ident
 from types import FrameType
 from typing import Any
@@ -22,8 +23,9 @@ if hasattr(os, "register_at_fork"):  # a fork waits for its turn, too: the child
 SIGNALS = tuple(int(getattr(signal, name)) for name in ("SIGINT", "SIGTERM", "SIGALRM") if hasattr(signal, name))
 
 
-class DeferredSignals:
+class DeferredSignals(ContextDecorator):
     """A context, `with deferred_signals:`, that no signal handler may interrupt, and that one thread at a time may be in.
+    `@deferred_signals` runs a whole function in it.
 
     Python runs handlers in the main thread, so only there are they deferred, and only those written in Python, as others cannot
     raise. Contexts may be nested: handlers run after the outermost one. Entering and leaving takes 0.9 us.
@@ -85,22 +87,13 @@ class DeferredSignals:
 deferred_signals = DeferredSignals()
 
 
-def within(context: Any) -> Callable[[Callable], Callable]:
-    """Return a decorator for functions that run within a context."""
+def in_turn(function: Callable) -> Callable:
+    """Decorate a function: no other thread changes a world meanwhile. A call takes 0.1 us more."""
 
-    def wrapped(function: Callable) -> Callable:
-        """Return the function, run within the context."""
+    @functools.wraps(function)
+    def waiting(*args, **kwargs):
+        """Wait for the turn, and call the function."""
+        with _turns:
+            return function(*args, **kwargs)
 
-        @functools.wraps(function)
-        def guarded(*args, **kwargs):
-            """Call the function within the context."""
-            with context:
-                return function(*args, **kwargs)
-
-        return guarded
-
-    return wrapped
-
-
-uninterrupted = within(deferred_signals)  # no signal handler comes in between, nor another thread
-in_turn = within(_turns)  # no other thread changes a world meanwhile; takes 0.1 us
+    return waiting

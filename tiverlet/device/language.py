@@ -124,20 +124,15 @@ def template(text: str) -> str:
     return _Text(text)
 
 
-def callable_in_kernels(function: Any) -> Any:
-    """Let kernels call a Python function or class as it is, without a warning: the compiler checks for these two attributes."""
-    setattr(function, _MARK, True)
-    setattr(function, _INNER, SimpleNamespace(has_print=False))
-    return function
-
-
 def inline(function: Any) -> Any:
-    """Let kernels call a function of one expression as Python does: they get the expression itself.
+    """Let kernels call a Python function of one expression, or a class, as it is: they get the expression itself.
 
     For a call of a ti.func, Taichi reads the source and copies each argument and each result to a variable: as much work as for
     ten more operations.
     """
-    return callable_in_kernels(function)
+    setattr(function, _MARK, True)  # without these two attributes, the compiler warns
+    setattr(function, _INNER, SimpleNamespace(has_print=False))
+    return function
 
 
 def copied(function: Any) -> Any:

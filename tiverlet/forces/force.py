@@ -40,20 +40,14 @@ class Force(Acceleration):
         self.dev.w = scene.state.w
 
     @inline
-    def force(self, value):
+    def force(self, *arguments):
         """Return the value of the function if it is a vector, else refuse it."""
+        value = self.function(*arguments[: self.arity])
         return check_vector("Force", undecorated(self.function).__name__, value, self.dim)
 
     @ti.func
     def acceleration(self, i, x, v, t):
         """Return F / m [m/s^2]."""
-        out = 0 * x
-        if ti.static(self.arity == 1):
-            out = self.force(self.function(x))
-        elif ti.static(self.arity == 2):
-            out = self.force(self.function(x, v))
-        elif ti.static(self.arity == 3):
-            out = self.force(self.function(x, v, t))
-        else:
-            out = self.force(self.function(x, v, t, i))
+        out = 0 * x  # of the type of x, whatever the function returns
+        out = self.force(x, v, t, i)
         return self.dev.w[i] * out

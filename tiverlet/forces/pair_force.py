@@ -119,23 +119,22 @@ class PairForce(Acceleration):
         return ROOM[self.dim - 2]
 
     @inline
-    def checked(self, value):
+    def force(self, *arguments):
         """Return the value of the function if it is a vector, else refuse it."""
+        value = self.function(*arguments[: self.arity])
         return check_vector("PairForce", undecorated(self.function).__name__, value, self.dim)
 
     @inline
-    def checked_energy(self, value):
+    def potential_energy(self, *arguments):
         """Return the value of the potential if it is a number, else refuse it."""
+        value = self.potential_of(*arguments[: self.potential_arity])
         return check_number("PairForce", undecorated(self.potential_of).__name__, value)
 
     @ti.func
     def between(self, i, j, r):
         """Return the force of the function on particle i by particle j [N], for i < j and r = x_i - x_j."""
-        out = 0 * r
-        if ti.static(self.arity == 1):
-            out = self.checked(self.function(r))
-        else:
-            out = self.checked(self.function(r, i, j))
+        out = 0 * r  # of the type of r, whatever the function returns
+        out = self.force(r, i, j)
         return out
 
     @ti.func
@@ -211,10 +210,7 @@ class PairForce(Acceleration):
         if self.near(r):
             low, high = ti.min(i, j), ti.max(i, j)
             way = ti.select(i < j, r, -r)
-            if ti.static(self.potential_arity == 1):
-                out = ti.cast(self.checked_energy(self.potential_of(way)), ti.f64)
-            else:
-                out = ti.cast(self.checked_energy(self.potential_of(way, low, high)), ti.f64)
+            out = ti.cast(self.potential_energy(way, low, high), ti.f64)
             if self.dev.w[j] > 0:
                 out *= 0.5
         return out

@@ -97,7 +97,7 @@ class Recorder:
     def __exit__(self, *exc) -> None:
         self.close()
 
-    @interrupts.uninterrupted
+    @interrupts.deferred_signals
     def _open(self, title: str, overwrite: bool) -> None:
         from . import viewer  # imported late, since it imports rerun and a server
 
@@ -149,7 +149,7 @@ class Recorder:
         """About how many bytes the file will have when it is closed."""
         return self._sink.bytes + self._logged - self._sink.flushed
 
-    @interrupts.uninterrupted
+    @interrupts.deferred_signals
     def log(self, **quantities) -> None:
         """Write the present frame, if it is one of `every`, and quantities of your own.
 
@@ -183,7 +183,7 @@ class Recorder:
         if self._sink.error:
             self._fail()
 
-    @interrupts.uninterrupted
+    @interrupts.deferred_signals
     def flush(self) -> None:
         """Wait until everything logged is in the file, where it stays even if the process is killed."""
         if self._full:
@@ -276,7 +276,7 @@ class Recorder:
         journal.frame_drawn(data)
         self.frames += 1
 
-    @interrupts.uninterrupted
+    @interrupts.deferred_signals
     def close(self) -> None:
         """Write the summary and finish the file. Calling it twice does nothing."""
         if self._closed or self._sink.forked():

@@ -89,7 +89,7 @@ class WorldsRecorder:
     def __exit__(self, *exc) -> None:
         self.close()
 
-    @interrupts.uninterrupted
+    @interrupts.deferred_signals
     def log(self) -> None:
         """Write the present frame, if it is one of `every`."""
         if self._sink.forked() or self._sink.stream is None:
@@ -126,7 +126,7 @@ class WorldsRecorder:
             self._closing()
             raise file_error(error, f"WorldsRecorder: writing {self.path} failed at frame {self._calls}")
 
-    @interrupts.uninterrupted
+    @interrupts.deferred_signals
     def close(self) -> None:
         """Finish the file. Calling it twice does nothing."""
         if self._sink.forked() or self._sink.stream is None:
