@@ -17,7 +17,7 @@ from ..device.memory import Memory
 from ..device.patches.compiler import BRIEF, FEW, LEAN, UNSEARCHED
 from ..device.thread_team import PIECES, Team, size_of
 from ..features.feature import Acceleration, Batch, Feature, Scene
-from ..features.learning import OwnWeight
+from ..features.own_weight import OwnWeight
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.periodic import Periodic
 from ..particles import Particles, Radii, State

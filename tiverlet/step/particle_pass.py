@@ -8,7 +8,7 @@ from ..device import inline, ti
 from ..device.number import OnDevice
 from ..device.thread_team import Team, block, blocks
 from ..features.feature import Batch, Scene
-from ..features.learning import WEIGHED
+from ..features.own_weight import WEIGHED
 
 if TYPE_CHECKING:
     from ..colliders.wall_group import WallGroup

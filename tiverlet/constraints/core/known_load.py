@@ -3,13 +3,14 @@
 from typing import TYPE_CHECKING, Any
 
 from ...device import ti
-from ...features.learning import is_steady, learnt_share
 
 if TYPE_CHECKING:
     from ...features.feature import Scene
 
 WINDOW = 64  # substeps over which the missing load is averaged
-SLOW = 2.0  # substeps to learn the load of k particles, per k^2
+LAG, SLOW = 64, 2.0  # substeps to learn the load of k particles: at least, and per k^2
+STEADY = 0.2  # relative difference of the missing load between two windows, at most
+GAIN = 0.8  # largest share of the missing load that is learnt at once
 STILL = 1.0  # of the violation that would bear its load: how far corners may move, relative to each other, in a window
 MOST = 0.5  # of its size: the violation that would bear the largest load
 
@@ -20,7 +21,7 @@ class KnownLoad:
     With one pass per substep, a load is borne by a violation C = W h^2 F, as by a spring of stiffness 1 / (W h^2), and a net of
     such springs sags. A known load needs no violation: the first pass gives lam = -(C / W + h^2 F). F is learnt gradually, by
     integral control. Over a window, violations at the start of substeps push by C / (W h^2) on average. If that is within a fifth
-    of the average of the window before, F grows by a share of it, see learnt_share().
+    of the average of the window before, F grows by a share of it.
 
     With L, an eigenvalue of the pass, a mode has s^2 + L s + L (1 + K / s) = 0, with time in substeps, and K the share that is
     learnt in each: stable where K < L. For k links that hang in a chain the least L is 0.62 / k^2, and K = 1 / (SLOW k^2), with
@@ -84,9 +85,11 @@ class KnownLoad:
         substep.
         """
         load, mean = self.load[c], self.missing[c] / WINDOW
-        if is_steady(mean, self.earlier[c]) and WINDOW * moved < STILL * violation_per_newton * ti.abs(load + mean):
+        is_steady = ti.abs(mean - self.earlier[c]) < STEADY * ti.abs(mean)
+        if is_steady and WINDOW * moved < STILL * violation_per_newton * ti.abs(load + mean):
             k = self.body_load[self.body[c]]
-            share = learnt_share(1.0, SLOW * k * k, WINDOW)
+            # It has to be slower than the decay of the slowest sound of the body, which takes some k^2 substeps.
+            share = ti.min(WINDOW / (LAG + SLOW * k * k), GAIN)
             load, mean = load + share * mean, (1 - share) * mean
             load = ti.max(-MOST * size / violation_per_newton, ti.min(load, MOST * size / violation_per_newton))
         self.load[c], self.earlier[c], self.missing[c] = load, mean, 0 * mean
