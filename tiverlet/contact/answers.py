@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..device import ti
-from ..solvers.corners import bodies_of, corners_of
+from ..device import at, inline, ti
+from ..solvers.corners import bodies_of
 from .links import Links
 
 if TYPE_CHECKING:
@@ -65,10 +65,9 @@ class Answers:
 
     def _below(self, inv_mass: np.ndarray) -> np.ndarray:
         """Return `below`, (n,)."""
-        count = sum(b.count for b in self.batches)
-        label = bodies_of(count, *corners_of(self.batches), inv_mass)[1]
+        label = bodies_of(self.batches, inv_mass)[1]
         _labels, first, where = np.unique(label, return_index=True, return_inverse=True)
-        return np.where(label < count, np.arange(len(label)) - first[where], 0)
+        return np.where(label < sum(b.count for b in self.batches), np.arange(len(label)) - first[where], 0)
 
     def reassign(self, memory: "Memory", inv_mass: np.ndarray) -> None:
         """Follow constraints that moved to other particles, as many of which can move as before."""
@@ -107,13 +106,10 @@ class Answers:
         self.held[i] = held
         return change
 
-    @ti.func
+    @inline
     def beyond(self, i):
         """Return how far answers of passes move particle i, without those of rounds [m]."""
-        out = self.held[i]
-        if ti.static(self.in_turn):
-            out -= self.given[i]
-        return out
+        return at(self.held, i) - at(self.given, i) if self.in_turn else at(self.held, i)
 
     @ti.func
     def keep(self, i):

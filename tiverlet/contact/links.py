@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..device import ti
+from ..device import always, inline, ti
 from ..device.number import OnDevice
 from ..solvers.corners import corners_of
 from .limits import CLOSE, FEW, RELAXATION
@@ -65,10 +65,9 @@ class Links:
 
     def _tables(self, n: int) -> dict[str, np.ndarray]:
         """Return the arrays of rows and their corners, by name, from the present corners. n: number of particles."""
-        nothing = np.zeros(0, dtype=int)
-        owner, item = corners_of(self.batches) if self.batches else (nothing, nothing)
-        place = np.concatenate([nothing, *(self.slots.places(b).ravel() for b in self.batches)])
-        is_row = np.concatenate([nothing, *self.free]) > 0
+        owner, item = corners_of(self.batches)
+        place = np.concatenate([np.zeros(0, dtype=int), *(self.slots.places(b).ravel() for b in self.batches)])
+        is_row = np.concatenate([np.zeros(0, dtype=bool), *self.free])
         used = (place >= 0) & is_row[owner]
         owner, item, place = owner[used], item[used], place[used]
         row_of = np.full(self.slots.total, -1)
@@ -188,13 +187,10 @@ class Links:
             mu = 0 * mu
         self.mu[r], self.start[r], self.step[r] = mu, mu, 0 * mu
 
-    @ti.func
-    def is_alone(self, batch: ti.template(), c):  # type: ignore[valid-type]
+    @inline
+    def is_alone(self, batch, c):
         """Whether constraint c belongs to no system, so that its solver goes part of the way."""
-        out = True
-        if ti.static(batch.arity > 0):
-            out = batch.dev.is_outside_systems(c)
-        return out
+        return batch.dev.is_outside_systems(c) if batch.arity else always()
 
     @ti.func
     def relax(self, r, bodies: ti.template(), beta):  # type: ignore[valid-type]

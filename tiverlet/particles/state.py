@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..device import at, inline, ti
+from ..device import always, at, inline, ti
 from ..features.regrouping import Regrouping
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ class State:
     @inline
     def awake(self, i):
         """Whether particle i is awake. Compiles to no branch if none can sleep."""
-        return self.sleepers.awake(i) if self.sleepers else ti.cast(1, ti.i32) > 0
+        return self.sleepers.awake(i) if self.sleepers else always()
 
     @inline
     def moves(self, i):

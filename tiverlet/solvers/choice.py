@@ -87,20 +87,19 @@ class Pieces:
     """Connected pieces: sets of constraints that share movable particles or bodies, among those that a System could solve."""
 
     def __init__(self, links: "list[Scalar]", scene: "Scene", batches: "list[Batch]", answers: bool):
-        w, counts = scene.inv_mass, [b.count for b in links]
+        w = scene.inv_mass
         owner, item = corners_of(links)
         free = w[item] > 0
         alone = np.concatenate([b.relaxed_alone(scene, bounded=True) for b in links])
         body, clusters = joined_clusters(batches, alone, scene, answers), [b for b in batches if b.clusters]
-        self.count, self.owner, self.item = sum(counts), owner[free], couples(body, item[free])
+        self.count, self.owner, self.item = sum(b.count for b in links), owner[free], couples(body, item[free])
         self.piece, self.joins = components(self.count, self.owner, self.item), bool((body >= 0).any())
         self.acts = np.bincount(self.owner, minlength=self.count) > 0
-        held = np.isin(item[free], np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in clusters)]))
-        held &= body[item[free]] < 0
+        held = np.isin(item[free], corners_of(clusters)[1]) & (body[item[free]] < 0)
         twice, inside = self._any(np.bincount(self.owner, held, self.count) > 0), self._inside(held, clusters)
         self.implied, self.shares = implied_links(links, scene) & ~twice, bool(twice.any())
         self.may_eliminate, self.is_inside = all(_may_eliminate(b, scene) for b in links), bool(inside.any())
-        degree = np.bincount(np.concatenate([b.indices.ravel() for b in links]), minlength=len(w))
+        degree = np.bincount(item, minlength=len(w))
         self.solved = self.acts & ~alone
         self.stiff = np.concatenate([_stiff(b, degree * w) for b in links]) & self.solved
         self.rigid = np.concatenate([b.compliance == 0 for b in links]) & self.solved
@@ -112,9 +111,8 @@ class Pieces:
     def _inside(self, held: np.ndarray, clusters: "list[Batch]") -> np.ndarray:
         """Return which constraints have several corners, and all of them in one cluster, (m,). held: mask of corners in any."""
         holds, common = defaultdict(set), dict[int, set]()
-        for k, b in enumerate(clusters):
-            for i, cluster in zip(b.indices.ravel().tolist(), b.owner.tolist(), strict=True):
-                holds[i].add((k, cluster))
+        for cluster, i in zip(*(one.tolist() for one in corners_of(clusters)), strict=True):
+            holds[i].add(cluster)
         for c, i in zip(self.owner.tolist(), self.item.tolist(), strict=True) if held.any() else ():
             common[c] = common.get(c, holds[i]) & holds[i]
         return np.array([bool(common.get(c)) for c in range(self.count)]) & (np.bincount(self.owner, minlength=self.count) > 1)

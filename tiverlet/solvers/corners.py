@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 
 def corners_of(batches: "Sequence[Batch]") -> tuple[np.ndarray, np.ndarray]:
     """Return the constraint, numbered through all batches, and the particle of every corner, batch by batch."""
-    first = np.cumsum([0] + [b.count for b in batches])
-    owner = np.concatenate([b.owner + k for b, k in zip(batches, first, strict=False)])
-    return owner, np.concatenate([b.indices.ravel() for b in batches])
+    first, none = np.cumsum([0] + [b.count for b in batches]), np.zeros(0, dtype=np.int32)
+    owner = np.concatenate([none, *(b.owner + k for b, k in zip(batches, first, strict=False))])
+    return owner, np.concatenate([none, *(b.indices.ravel() for b in batches)])
 
 
 def components(n: int, owner: np.ndarray, item: np.ndarray) -> np.ndarray:
@@ -33,14 +33,19 @@ def components(n: int, owner: np.ndarray, item: np.ndarray) -> np.ndarray:
         label = new
 
 
-def bodies_of(m: int, row: np.ndarray, who: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return labels of bodies, for constraints (m,) and particles (n,). A body is what movable particles connect.
+def by_batch(batches: "Sequence[Batch]", values: np.ndarray) -> list[np.ndarray]:
+    """Split values of constraints, numbered through all batches, into those of each batch."""
+    return np.split(values, np.cumsum([b.count for b in batches])[:-1])[: len(batches)]
 
-    Corner k belongs to constraint row[k] of m, and is particle who[k]. w: inverse masses, (n,). Particles that no constraint can
-    move have the label m.
+
+def bodies_of(batches: "Sequence[Batch]", inv_mass: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return labels of bodies, which movable particles connect: for the constraints of each batch, and for particles, (n,).
+
+    Particles that no constraint can move have the number of constraints as their label.
     """
-    free = w[who] > 0
-    label = components(m, row[free], who[free])
-    body = np.full(len(w), m)
+    count, (row, who) = sum(b.count for b in batches), corners_of(batches)
+    free = inv_mass[who] > 0
+    label = components(count, row[free], who[free])
+    body = np.full(len(inv_mass), count)
     body[who[free]] = label[row[free]]
-    return label, body
+    return by_batch(batches, label), body

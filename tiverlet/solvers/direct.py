@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import checks
-from ..device import called, runtime, ti
+from ..device import at, called, inline, runtime, ti
 from ..device.number import OnDevice
 from ..features.feature import Batch, Scene
 from .corners import corners_of
 from .elimination import Plan, plan
-from .joined import Joined, couples, joined_clusters, row_of_clusters
+from .joined import Joined, couples, joined_clusters
 from .redundancy import implied_links
 from .slots import TENSEST, Slots
 from .solver import WIDTH, Solver
@@ -130,9 +130,7 @@ class Elimination(System):
         implied: np.ndarray, body: np.ndarray,
     ):  # fmt: skip
         rows, self._part = _with_implied(found, scalars, scene, implied)
-        bodies = row_of_clusters(batches, body, _row_of_particles(rows, scalars, scene.inv_mass))
-        super().__init__(scene, batches, slots, scalars, rows, bodies)
-        self.bodies = sum(int((own >= 0).sum()) for own in bodies.values())
+        super().__init__(scene, batches, slots, scalars, rows, body)
         row, corner, particle = self.corners(scalars, slots)
         self.plan, self.parts, self.entries = found, self.memory.number(found.parts), self.memory.number(len(found.column))
         self.solved, self.has_implied = self.memory.number(len(found.rows)), len(rows) > len(found.rows)
@@ -144,8 +142,8 @@ class Elimination(System):
         product = found.product.copy()
         product[:, 1:] = slot[product[:, 1:]]
         side = np.repeat([b.side for b in scalars], [b.count for b in scalars])[rows]
-        limited = (side != 0) | np.concatenate([b.driven & np.isfinite(b.course()[2]) if b.driven else np.zeros(b.count, bool)
-                                                for b in scalars])[rows]  # fmt: skip
+        bounded = [np.isfinite(b.course()[2]) if b.driven else np.zeros(b.count, dtype=bool) for b in scalars]
+        limited = (side != 0) | np.concatenate(bounded)[rows]
         self.bounds = bool(limited.any())
         ints, reals = self.ints, self.reals
         self.part_begin, self.column, self.update = (ints(k, getattr(found, k)) for k in ("part_begin", "column", "update"))
@@ -153,7 +151,9 @@ class Elimination(System):
         self.update_begin, self.product = ints("update_begin", found.update_begin), ints("product", product, 3)
         self.gradient = scene.memory.field("system.gradient", slots.total, width=self.dim)
         self.value, self.diagonal = reals("value", self.solved + 2 * self.entries), reals("weight")
-        self.joined: Any = Joined(scene, batches, slots, bodies, self._part, corner, particle, found.parts) if bodies else None
+        bodies = [b for b in batches if b.clusters and (self.row(b) >= 0).any()]
+        self.bodies = sum(int((self.row(b) >= 0).sum()) for b in bodies)
+        self.joined: Any = Joined(scene, self, bodies, slots, self._part, corner, particle, found.parts) if bodies else None
         self.answers = slots.answers
         if self.joined or self.answers:
             self.corner_begin = ints("corner_begin", np.searchsorted(row, np.arange(len(rows) + 1)))
@@ -163,9 +163,7 @@ class Elimination(System):
         if self.answers:
             self.slots = slots
             self.answer, self.change, self.solution, self.gap = (reals(k) for k in ("answer", "change", "solution", "gap"))
-            self.added, self.turned_to = (
-                scene.memory.field(f"system.{k}", found.parts, kind=ti.f64) for k in ("added", "turned_to")
-            )
+            self.added, self.turned_to = reals("added", found.parts), reals("turned_to", found.parts)
         who = np.zeros(slots.total, dtype=np.int64)
         who[corner] = particle
         self.particle_of, self.w, self.inverse_size = ints("who", who), scene.state.w, reals("close")
@@ -184,8 +182,7 @@ class Elimination(System):
         w = self.joined.lightest(scene.inv_mass) if self.joined else scene.inv_mass
         parts = [w[b.indices] * (b.gradients(b.start.position) ** 2).sum(axis=2) for b in scalars]
         least = np.concatenate([np.where(p > 0, p, np.inf).min(axis=1, initial=np.inf) for p in parts])[rows]
-        small = np.where(np.isfinite(least), SMALL_PIVOT * least, 0.0)
-        self.small_pivot = scene.memory.field("system.small", self.rows, kind=ti.f64, values=small)
+        self.small_pivot = reals("small", values=np.where(np.isfinite(least), SMALL_PIVOT * least, 0.0))
         llvm = runtime.architecture() in runtime.LLVM  # LLVM has all functions in f64
         exact = [b.quantity.precise and scene.real == ti.f32 and (llvm or not b.quantity.transcends) for b in scalars]
         self.precise = [(k, b) for k, b in enumerate(scalars) if exact[k]]
@@ -195,9 +192,8 @@ class Elimination(System):
             self.batch, self.number = ints("batch", batch), ints("number", number)
         if self.bounds:  # of multipliers; bound: that of a row which is at one
             self.limited, self.active, self.remaining = ints("limited", limited), ints("active", 0 * side), reals("left")
-            low, high = np.where(side < 0, 0.0, -np.inf), np.where(side > 0, 0.0, np.inf)
-            self.low, self.high = (self.memory.field(f"system.{k}", self.rows, kind=ti.f64, values=v) for k, v in
-                                   (("low", low), ("high", high)))  # fmt: skip
+            self.low = reals("low", values=np.where(side < 0, 0.0, -np.inf))
+            self.high = reals("high", values=np.where(side > 0, 0.0, np.inf))
             self.bound = reals("bound")
 
     def keep_softness(self, ratio: float) -> None:
@@ -283,13 +279,10 @@ class Elimination(System):
                 gradient *= self.blocks_of[i]
             self.gradient[place] = gradient
 
-    @ti.func
+    @inline
     def is_active(self, r):
         """Whether row r takes part in the system."""
-        out = self.scale[r] != 0
-        if ti.static(self.bounds):
-            out = self.active[r] != 0
-        return out
+        return at(self.active if self.bounds else self.scale, r) != 0
 
     @called
     @ti.func
@@ -812,16 +805,6 @@ class Elimination(System):
                 moved += ti.cast(self.gradient[s].dot(self.joined.own_move(s)), ti.f64)
             self.shift[r] = self.scale[r] * moved
             self.violation[r] += self.shift[r]
-
-
-def _row_of_particles(rows: np.ndarray, scalars: "list[Scalar]", w: np.ndarray) -> np.ndarray:
-    """Return a row of each particle, (n,), -1 for those in none. rows: the constraint of each row."""
-    owner, item = corners_of(scalars)
-    row, out = np.full(sum(b.count for b in scalars), -1), np.full(len(w), -1)
-    row[rows] = np.arange(len(rows))
-    some = (w[item] > 0) & (row[owner] >= 0)
-    out[item[some]] = row[owner[some]]
-    return out
 
 
 def _with_implied(found: Plan, scalars: "list[Scalar]", scene: Scene, implied: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

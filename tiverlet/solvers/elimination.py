@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from ..geometry.ordered import distinct
-from .corners import components, corners_of
+from .corners import components
 
 MOST_CACHED = 4096  # corners of a part up to which its plan is cached
 BEGINS = (("entry", "column"), ("product", "product"), ("update", "update"))  # X of each X_begin, and the array it indexes
@@ -36,13 +36,6 @@ class Plan:
     def parts(self) -> int:
         """Number of independent systems."""
         return len(self.part_begin) - 1
-
-
-def plan_of(links: list, inv_mass: np.ndarray, width: int) -> Plan:
-    """Return the plan of all constraints in these batches, see plan(). Particles that cannot move couple no constraints."""
-    owner, item = corners_of(links)
-    free = inv_mass[item] > 0
-    return plan(sum(b.count for b in links), owner[free], item[free], width)
 
 
 def plan(count: int, owner: np.ndarray, item: np.ndarray, width: int) -> Plan:

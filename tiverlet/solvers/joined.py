@@ -13,11 +13,13 @@ import numpy as np
 
 from ..device import called, ti
 from ..geometry import rotation
+from .corners import by_batch, corners_of
 from .system import solvable
 
 if TYPE_CHECKING:
     from ..features.feature import Batch, Scene
     from .slots import Slots
+    from .system import System
 
 
 def joined_clusters(batches: "list[Batch]", alone: np.ndarray, scene: "Scene", answers: bool) -> np.ndarray:
@@ -27,26 +29,21 @@ def joined_clusters(batches: "list[Batch]", alone: np.ndarray, scene: "Scene", a
     system. What else holds a corner, and a link inside of a cluster, has to share its mass with the cluster, as by Jacobi. So
     have all where walls have the last word, since constraints do not answer contacts, see BodyImpacts.
     """
-    n, first, links = len(scene.inv_mass), 0, solvable(batches)
-    body, held, linked = np.full(n, -1), np.zeros(n, dtype=np.int64), np.zeros(n, dtype=bool)
-    for b in batches:
-        if not b.solvable_together:
-            held += np.bincount(b.indices.ravel(), minlength=n)
-        if b.clusters:
-            if not (b.soft or b.breaks):
-                body[b.indices.ravel()] = first + b.owner
-            first += b.count
-    if scene.walls and not answers:
-        body[:] = -1
-    if (body < 0).all():
+    n, links, clusters = len(scene.inv_mass), solvable(batches), [b for b in batches if b.clusters]
+    body, linked = np.full(n, -1), np.zeros(n, dtype=bool)
+    owner, item = corners_of(clusters)
+    rigid = np.repeat([not (b.soft or b.breaks) for b in clusters], [b.indices.size for b in clusters])
+    if (scene.walls and not answers) or not rigid.any():
         return body
-    for b, by_itself in zip(links, np.split(alone, np.cumsum([b.count for b in links])[:-1]), strict=True):
+    body[item[rigid]] = owner[rigid]
+    held = np.bincount(corners_of([b for b in batches if not b.solvable_together])[1], minlength=n)
+    for b, by_itself in zip(links, by_batch(links, alone), strict=True):
         inside = (b.arity > 1) & (body[b.indices] >= 0).all(axis=1) & (np.ptp(body[b.indices], axis=1) == 0)
         shares = (by_itself | inside)[b.owner]
         held += np.bincount(b.indices.ravel()[shares], minlength=n)
         linked[b.indices.ravel()[~shares]] = True
     some = body >= 0
-    refused = np.bincount(body[some & linked], minlength=first) == 0
+    refused = np.bincount(body[some & linked], minlength=int(body.max()) + 1) == 0
     refused[body[some & (held != 1)]] = True
     body[some] = np.where(refused[body[some]], -1, body[some])
     return body
@@ -55,22 +52,6 @@ def joined_clusters(batches: "list[Batch]", alone: np.ndarray, scene: "Scene", a
 def couples(body: np.ndarray, item: np.ndarray) -> np.ndarray:
     """Return what couples the constraints of corners at these particles: a number for each body, and for each other particle."""
     return np.where(body[item] >= 0, len(body) + body[item], item)
-
-
-def row_of_clusters(batches: "list[Batch]", body: np.ndarray, row: np.ndarray) -> dict[int, np.ndarray]:
-    """Return for each batch with bodies, by its id, a row that acts on each of its clusters, -1 for those that are no bodies.
-
-    body: see joined_clusters(). row: of each particle, (n,), -1 for none.
-    """
-    out, first = {}, 0
-    for b in (b for b in batches if b.clusters):
-        who, own = b.indices.ravel(), np.full(b.count, -1)
-        inside = body[who] == first + b.owner
-        np.maximum.at(own, b.owner[inside], row[who[inside]])
-        if (own >= 0).any():
-            out[id(b)] = own
-        first += b.count
-    return out
 
 
 class Joined:
@@ -86,23 +67,22 @@ class Joined:
     host_only = ("_least", "_particles")
 
     def __init__(
-        self, scene: "Scene", batches: "list[Batch]", slots: "Slots", rows: dict[int, np.ndarray], part: np.ndarray,
-        slot: np.ndarray, who: np.ndarray, parts: int,
+        self, scene: "Scene", system: "System", clusters: "list[Batch]", slots: "Slots", part: np.ndarray, slot: np.ndarray,
+        who: np.ndarray, parts: int,
     ):  # fmt: skip
-        """rows: see row_of_clusters(). part: of each row. slot, who: of each corner of a row, its slot and particle."""
-        memory, dim, n = scene.memory, scene.state.dim, len(scene.inv_mass)
-        self.state, self.real, self.dim, self.slots = scene.state, scene.real, dim, slots
-        self.clusters = [b for b in batches if id(b) in rows]
-        found = []  # part, particle, slot, batch, corner
-        for k, b in enumerate(self.clusters):
-            row = rows[id(b)][b.owner]
+        """clusters: those with bodies. part: of each row. slot, who: of each corner of a row, its slot and particle."""
+        dim, ints, reals = scene.state.dim, system.ints, system.reals
+        self.state, self.real, self.dim, self.slots, self.clusters = scene.state, scene.real, dim, slots, clusters
+        found = []  # part, particle, slot, batch, corner, cluster
+        for k, b in enumerate(clusters):
+            row = system.row(b)[b.owner]
             corner = np.flatnonzero(row >= 0)
             table = part[row], b.indices.ravel(), slots.places(b).ravel(), np.full(len(row), k), np.arange(len(row)), b.owner
             found.append(np.stack(table, axis=1)[corner])
         table = np.concatenate(found)
         table = table[np.lexsort((table[:, 4], table[:, 3], table[:, 0]))]
         begins = np.flatnonzero((np.diff(table[:, [3, 5]], axis=0, prepend=-1) != 0).any(axis=1))
-        at, corner_of = np.full(n, -1), np.full(slots.total, -1)
+        at, corner_of = np.full(len(scene.inv_mass), -1), np.full(slots.total, -1)
         at[table[:, 1]] = np.arange(len(table))
         corner_of[slot] = at[who]
         owner = np.searchsorted(begins, np.arange(len(table)), side="right") - 1
@@ -110,26 +90,17 @@ class Joined:
         mass = np.divide(1, w, out=np.zeros(len(w)), where=w > 0)
         mass[w == 0] = rotation.HEAVY * np.bincount(owner, weights=mass)[owner[w == 0]]
         self._least, self._particles = 1 / np.bincount(owner, weights=mass)[owner], table[:, 1]
-
-        def ints(name: str, values: np.ndarray):
-            """Declare a field of integers."""
-            return memory.field(f"system.body_{name}", len(values), kind=ti.i32, values=values)
-
-        self.part_begin = ints("part_begin", np.searchsorted(table[begins, 0], np.arange(parts + 1)))
-        self.corner_begin = ints("corner_begin", np.append(begins, len(table)))
+        self.part_begin = ints("body_part_begin", np.searchsorted(table[begins, 0], np.arange(parts + 1)))
+        self.corner_begin = ints("body_corner_begin", np.append(begins, len(table)))
         self.particle, self.place, self.batch, self.number = (
-            ints(name, table[:, k]) for k, name in enumerate(("particle", "place", "batch", "number"), 1)
+            ints(f"body_{name}", table[:, k]) for k, name in enumerate(("particle", "place", "batch", "number"), 1)
         )
-        self.owner, self.corner_of = ints("owner", owner), ints("corner_of", corner_of)
-
-        def reals(name: str, length: int, width: int = dim):
-            """Declare a field of f64."""
-            return memory.field(f"system.body_{name}", length, width=width, kind=ti.f64)
-
-        self.arm, self.u, self.moved = reals("arm", len(table)), reals("u", len(table)), reals("moved", len(begins))
-        self.S, self.turned = reals("S", len(begins), dim * dim), reals("turned", len(begins), dim * dim)
-        self.mass, self.m = reals("mass", len(begins), 0), memory.field("system.body_m", len(table), kind=ti.f64, values=mass)
-        self.push, self.spin = reals("push", slots.total), reals("spin", slots.total, dim * dim)
+        self.owner, self.corner_of = ints("body_owner", owner), ints("body_corner_of", corner_of)
+        self.arm, self.u = reals("body_arm", len(table), dim), reals("body_u", len(table), dim)
+        self.m, self.mass = reals("body_m", len(table), values=mass), reals("body_mass", len(begins))
+        self.S, self.moved = reals("body_S", len(begins), dim * dim), reals("body_moved", len(begins), dim)
+        self.turned = reals("body_turned", len(begins), dim * dim)
+        self.push, self.spin = reals("body_push", slots.total, dim), reals("body_spin", slots.total, dim * dim)
 
     def lightest(self, inv_mass: np.ndarray) -> np.ndarray:
         """Return inverse masses, (n,), with that of the whole body for its particles."""

@@ -34,7 +34,7 @@ def implied_links(links: "list[Any]", scene: "Scene") -> np.ndarray:
     pair[of_pairs] = np.concatenate([b.indices for b in links if b.arity == 2])
     ends = np.concatenate([b.placed(b.start.position) for b in links if b.arity == 2])
     along[of_pairs] = ends[:, 0] - ends[:, 1]
-    fit = np.concatenate([_may_be_implied(b, scene) for b in links])
+    fit = np.concatenate([_may_be_implied(b) for b in links])
     some = _core(np.flatnonzero(fit & (w[pair] > 0).any(axis=1)), pair, w > 0, dim)
     if not len(some):
         return out
@@ -149,7 +149,7 @@ def _most_independent(movable: np.ndarray, dim: int) -> int:
     return dim * int(movable.sum()) - motions[min(fixed, len(motions) - 1)]
 
 
-def _may_be_implied(b: Any, scene: "Scene") -> np.ndarray:
+def _may_be_implied(b: Any) -> np.ndarray:
     """Return which constraints are rigid links with constant lengths that they have at the start, (m,)."""
     if b.arity != 2 or not b.quantity.is_distance or b.side or b.breaks or b.driven:
         return np.zeros(b.count, dtype=bool)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from .. import checks
-from ..device import ti
+from ..device import at, inline, ti
 from ..device.memory import Memory
 from ..device.number import OnDevice
 from ..features.feature import BENT, FAR, Batch, Scene
@@ -52,7 +52,7 @@ class Slots:
     bodies: Any = OnDevice()
 
     host_only = (
-        "total", "exact", "_alone", "_blocks", "_bodies", "_places", "_rounding_masses", "_sagging", "_scalars", "_sizes",
+        "total", "exact", "body_sizes", "rounding_masses", "_alone", "_blocks", "_bodies", "_places", "_sagging", "_scalars",
     )  # fmt: skip
 
     def __init__(self, scene: Scene, batches: list[Batch], solver, answers: bool):
@@ -96,33 +96,24 @@ class Slots:
         self.relaxation = checks.number(type(solver).__name__, "relaxed_by()", factor, above=0.0)
 
     def _connect_bodies(self, batches: list[Batch], inv_mass: np.ndarray, x: np.ndarray) -> None:
-        """Find the body of each constraint, by the id of its batch, and for each body the root of the sum of squared masses [kg]
-        and its size [m].
+        """Find the body of each constraint, by the id of its batch, and for each body its size [m], and the mass that rounding of
+        positions moves [kg], the root of the sum of squared masses, see Strength.
 
         Constraints that share movable particles, directly or through other constraints, are of one body.
         """
-        ends = np.cumsum([b.count for b in batches])
-        label, body = bodies_of(int(ends[-1]), *corners_of(batches), inv_mass)
-        parts = np.split(label, ends[:-1])
+        parts, body = bodies_of(batches, inv_mass)
+        most = 1 + sum(b.count for b in batches)
         squares = np.divide(1, inv_mass, out=np.zeros(len(inv_mass)), where=inv_mass > 0) ** 2
-        self._rounding_masses = np.sqrt(np.bincount(body, weights=squares, minlength=int(ends[-1]) + 1))
+        self.rounding_masses = np.sqrt(np.bincount(body, weights=squares, minlength=most))
         self._bodies = {id(b): part for b, part in zip(batches, parts, strict=True)}
-        count = np.maximum(np.bincount(body, minlength=int(ends[-1]) + 1), 1)
-        center = np.stack([np.bincount(body, weights=each, minlength=len(count)) / count for each in x.T], axis=1)
-        self._sizes = np.zeros(len(count))
-        np.maximum.at(self._sizes, body, 2 * np.linalg.norm(x - center[body], axis=1))
+        count = np.maximum(np.bincount(body, minlength=most), 1)
+        center = np.stack([np.bincount(body, weights=each, minlength=most) / count for each in x.T], axis=1)
+        self.body_sizes = np.zeros(most)
+        np.maximum.at(self.body_sizes, body, 2 * np.linalg.norm(x - center[body], axis=1))
 
     def body(self, batch: Batch) -> np.ndarray:
         """Return the body of each constraint of a batch, (m,), where constraints learn loads or break."""
         return self._bodies[id(batch)]
-
-    def rounding_mass(self, batch: Batch) -> np.ndarray:
-        """Return the mass in the body of each constraint that rounding of positions moves, (m,) [kg], see Strength."""
-        return self._rounding_masses[self.body(batch)]
-
-    def body_size(self, batch: Batch) -> np.ndarray:
-        """Return the size of the body of each constraint where the world is built, (m,) [m], see Strength."""
-        return self._sizes[self.body(batch)]
 
     @property
     def exact_answers(self) -> bool:
@@ -165,7 +156,7 @@ class Slots:
     def _in_sagging_bodies(self, batches: list[Batch], inv_mass: np.ndarray) -> np.ndarray:
         """Return a mask of the particles whose constraints a pass does not solve exactly, with all that is connected to them."""
         rows = sum(b.count for b in batches)
-        body = bodies_of(rows, *corners_of(batches), inv_mass)[1]
+        body = bodies_of(batches, inv_mass)[1]
         sags = self._inexact
         for b in batches if self.system and self.system.steps else ():  # conjugate gradients
             sags[b.indices.ravel()[(self.rows(b) >= 0)[b.owner]]] = True
@@ -208,13 +199,10 @@ class Slots:
         """Return the row of each constraint of a batch in the system, (m,), -1 for constraints that are relaxed alone."""
         return self.system.row(batch) if self.system else np.full(batch.count, -1)
 
-    @ti.func
+    @inline
     def softened(self, w):
         """Return w h^2 / h'^2, where h' is the substep whose stiffness constraints have, see softness.py."""
-        out = w
-        if ti.static(self.can_soften):
-            out *= self.softness[None]
-        return out
+        return w * at(self.softness, None) if self.can_soften else w
 
     @ti.func
     def most_tense(self, geometric_stiffness):

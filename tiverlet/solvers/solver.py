@@ -10,7 +10,8 @@ from ..device import ti
 from ..features.arguments import keep, names_for_users, record_arguments, refuse_deletion, set_attribute
 from ..features.feature import Batch, Scene
 from ..features.unknown_names import answer_names
-from .elimination import plan_of
+from .corners import corners_of
+from .elimination import plan
 from .system import solvable
 
 WIDTH = 16  # default width up to which Direct takes systems
@@ -78,8 +79,10 @@ class Solver:
         alone = [b for b in some if (slots.rows(b) < 0).any()]
         if not alone:
             return ""
-        rows = len(plan_of(alone, inv_mass, WIDTH).rows)
-        return "solver=tv.Direct()" if rows == sum(b.count for b in alone) else "solver=tv.ConjugateGradient()"
+        count, (owner, item) = sum(b.count for b in alone), corners_of(alone)
+        free = inv_mass[item] > 0
+        takes_all = len(plan(count, owner[free], item[free], WIDTH).rows) == count
+        return "solver=tv.Direct()" if takes_all else "solver=tv.ConjugateGradient()"
 
     def explain(self, batches: list[Batch], slots) -> str:
         """Return which constraints are solved in which way, for World.explain()."""

@@ -1,13 +1,13 @@
 """Systems: constraints that are solved together. The data of their rows, and the moves of their particles."""
 
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..device import ti
 from ..device.number import OnDevice
+from .corners import by_batch
 
 if TYPE_CHECKING:
     from ..constraints.core.scalar import Scalar
@@ -47,19 +47,23 @@ class System:
 
     def __init__(
         self, scene: "Scene", batches: "list[Batch]", slots: "Slots", scalars: "list[Scalar]", rows: np.ndarray,
-        clusters: "Mapping[int, np.ndarray]" = MappingProxyType({}),
+        body: "np.ndarray | None" = None,
     ):  # fmt: skip
-        """clusters: a row of the part that each cluster is a body of, -1 for none, by the id of its batch."""
+        """body: the body of each particle, see joined_clusters(). Clusters that are bodies get a row that acts on them."""
         self.state, self.real, self.dim = scene.state, scene.real, scene.state.dim
         self.move, self.tension = slots.move, slots.tension
         self.epsilon = float(np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps)
         self.memory, self.inv_mass, self.rows = scene.memory, scene.inv_mass, scene.memory.number(len(rows))
-        counts = [b.count for b in scalars]
-        row = np.full(sum(counts), -1)
+        row = np.full(sum(b.count for b in scalars), -1)
         row[rows] = np.arange(len(rows))
-        self._rows = dict(zip(map(id, scalars), np.split(row, np.cumsum(counts)[:-1]), strict=True)) | dict(clusters)
+        self._rows = dict(zip(map(id, scalars), by_batch(scalars, row), strict=True))
+        row, slot, who = self.corners(scalars, slots)
+        if body is not None:
+            clusters = [b for b in batches if b.clusters]
+            own, some = np.full(sum(b.count for b in clusters), -1), body[who] >= 0
+            np.maximum.at(own, body[who[some]], row[some])
+            self._rows |= zip(map(id, clusters), by_batch(clusters, own), strict=True)
         self.blocks, self.has_shared_particles = self._blocks(batches, scene)
-        row, slot, _ = self.corners(scalars, slots)
         of_slot = np.full(sum(b.indices.size for b in batches), -1)
         of_slot[slot] = row
         self.row_of = self.ints("row_of_slot", of_slot)
@@ -77,9 +81,10 @@ class System:
         """Declare a field of integers with these values."""
         return self.memory.field(f"system.{name}", len(values), width=width, kind=ti.i32, values=values)
 
-    def reals(self, name: str, length: int | None = None):
-        """Declare a field of f64, with one number for each row, or `length` numbers."""
-        return self.memory.field(f"system.{name}", self.rows if length is None else length, kind=ti.f64)
+    def reals(self, name: str, length: int | None = None, width: int = 0, values: "np.ndarray | None" = None):
+        """Declare a field of f64, with one number or vector for each row, or `length` of them."""
+        length = self.rows if length is None else length
+        return self.memory.field(f"system.{name}", length, width=width, kind=ti.f64, values=values)
 
     def _blocks(self, batches: "list[Batch]", scene: "Scene") -> tuple[np.ndarray, bool]:
         """Return the number of blocks of each particle, (n,), and whether any particle is both in a system and in other blocks.

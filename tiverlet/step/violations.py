@@ -11,7 +11,7 @@ from ..constraints.path import Path
 from ..device import ti
 from ..features.feature import Batch, Feature, Scene
 from ..neighbours.queries import between
-from ..solvers.corners import bodies_of, corners_of
+from ..solvers.corners import bodies_of
 from .clock import MET
 from .solids import Solids
 
@@ -30,8 +30,7 @@ class Bodies:
     def __init__(self, scene: Scene, batches: list[Batch]):
         self.scene, self.batches = scene, [b for b in batches if b.count]
         self.count = 1 + sum(b.count for b in self.batches)
-        label, self.body = bodies_of(self.count - 1, *corners_of(self.batches), scene.inv_mass)
-        self.of = np.split(label, np.cumsum([b.count for b in self.batches])[:-1])
+        self.of, self.body = bodies_of(self.batches, scene.inv_mass)
         self.solids = Solids(self.batches, scene.inv_mass)
         self.close = {b: b.inverse_size(b.start.position) for b in self.batches if isinstance(b, Scalar)}
         self.rounding = ROUNDING[ti.f64 if scene.state.sums else scene.real]
@@ -234,6 +233,6 @@ def _is_rigid(b: Batch) -> TypeGuard[Scalar]:
 def tied(scene: Scene, batches: list[Batch], placed: int) -> np.ndarray:
     """Return a mask of the particles whose body has any placed particle, (n,). placed: the first placed particle."""
     some = [b for b in batches if isinstance(b, Scalar) and b.count]
-    body = bodies_of(sum(b.count for b in some), *corners_of(some), scene.inv_mass)[1]
+    body = bodies_of(some, scene.inv_mass)[1]
     going = np.bincount(body[placed:], minlength=1 + sum(b.count for b in some)) > 0
     return (going[body] & (scene.inv_mass > 0)) | (np.arange(len(body)) >= placed)

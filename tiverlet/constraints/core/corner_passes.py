@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ...device import at, inline, ti
+from ...device import always, at, inline, ti
 from ...features.feature import FAR, Scene
 from .equation import Equation
 from .known_load import KnownLoad
@@ -337,7 +337,7 @@ class CornerPasses(Passes):
     @inline
     def is_outside_systems(self, c):
         """Whether constraint c belongs to no system."""
-        return at(self.row, c) < 0 if self.in_system else ti.cast(1, ti.i32) > 0
+        return at(self.row, c) < 0 if self.in_system else always()
 
     @ti.func
     def unmet(self, c):

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...device import at, inline, ti
+from ...device import always, at, inline, ti
 from ...device.number import OnDevice
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class FixedCorners:
         """Whether no particle of constraint c is asleep. All of its particles that can move sleep, or none does."""
         sleepers = self.state.sleepers
         if not sleepers:
-            return ti.cast(1, ti.i32) > 0
+            return always()
         asleep = at(sleepers.asleep, self.member(c, 0))
         for k in range(1, self.arity):
             asleep = ti.max(asleep, at(sleepers.asleep, self.member(c, k)))
@@ -149,7 +149,7 @@ class VariableCorners:
     def awake(self, c):
         """Whether constraint c is awake."""
         sleepers = self.state.sleepers
-        return at(sleepers.asleep, at(self.mover, c)) == 0 if sleepers else ti.cast(1, ti.i32) > 0
+        return at(sleepers.asleep, at(self.mover, c)) == 0 if sleepers else always()
 
     @ti.func
     def compare(self, loop: ti.template(), c, overload, number):  # type: ignore[valid-type]

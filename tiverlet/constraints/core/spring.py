@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...device import at, inline, ti
+from ...device import always, at, inline, ti
 
 if TYPE_CHECKING:
     from ...features.feature import Batch, Scene
@@ -102,7 +102,7 @@ class Spring:
     @inline
     def is_rigid(self, c):
         """Whether constraint c has no compliance."""
-        return at(self.alpha, c) == 0 if self.soft else ti.cast(1, ti.i32) > 0
+        return at(self.alpha, c) == 0 if self.soft else always()
 
     @ti.func
     def multiplier_per_newton(self, c, w, h2_rigid, h2_effective):

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ... import checks
-from ...device import at, inline, ti
+from ...device import always, at, inline, ti
 
 if TYPE_CHECKING:
     from ...features.feature import Batch, Scene
@@ -57,9 +57,9 @@ class Strength:
             total, width = (corners.total, scene.state.dim) if corners else (batch.count, 0)
             self.excess = scene.memory.field(f"{name}.over", total, width=width, state=True)
             epsilon = np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps
-            least = MARGIN * epsilon * scene.slots.rounding_mass(batch)
-            self.rounding_scale = scene.memory.field(f"{name}.unsure", batch.count, values=least)
-            self.size = scene.memory.field(f"{name}.body_size", batch.count, values=scene.slots.body_size(batch))
+            body, least = scene.slots.body(batch), MARGIN * epsilon * scene.slots.rounding_masses
+            self.rounding_scale = scene.memory.field(f"{name}.unsure", batch.count, values=least[body])
+            self.size = scene.memory.field(f"{name}.body_size", batch.count, values=scene.slots.body_sizes[body])
             self.in_state = {"broken": self.stamp, "over": self.excess}
 
     def upload(self, break_at: np.ndarray | None) -> None:
@@ -74,7 +74,7 @@ class Strength:
     @inline
     def is_intact(self, c):
         """Whether constraint c has not broken."""
-        return at(self.stamp, c) == 0 if self.breaks else ti.cast(1, ti.i32) > 0
+        return at(self.stamp, c) == 0 if self.breaks else always()
 
     @ti.func
     def add_excess(self, c, e, load, per_newton):
