@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.contact.limits import MET
+from tiverlet.contact.impulses import MET
 
 G, R = 10.0, 0.5
 LOADS = 2 * MET  # of a load: what passes of contacts without friction leave of it

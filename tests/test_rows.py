@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.contact.limits import BEYOND, LEFT, MET, SLOP
+from tiverlet.contact.impulses import LEFT, MET
+from tiverlet.contact.limits import BEYOND, SLOP
 
 from .test_impacts import discs
 

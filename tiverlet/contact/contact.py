@@ -16,8 +16,11 @@ from ..geometry.ordered import typical
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from .answers import answer_at_once
-from .limits import AHEAD, CRADLE, THROWN
+from .limits import AHEAD
 from .pair_contact import PairContact
+
+CRADLE = 0.97  # coefficient of restitution above which a world lets impacts pass on one after the other
+THROWN = 0.5  # of the median radius: how far impacts in turn may throw something in a substep and it still meets others
 
 
 class Contact(PairContact):
@@ -111,17 +114,6 @@ class Contact(PairContact):
         return is_elastic(self.friction, self.restitution)
 
     @ti.func
-    def is_pressed(self, i, e):
-        """Whether particle i and the particle at entry e of its list press on each other."""
-        j = self.dev.list.neighbour[e]
-        return self.dev.rows.is_set(self.dev.rows.memory.field[e]) or self.dev.geometry.push_each_other(i, j, 0)
-
-    @ti.func
-    def pressed_particle(self, j):
-        """Return the particle that is pressed where an entry of a list is j: for discs, j itself."""
-        return j
-
-    @ti.func
     def touched_sleeper(self, i, e, margin):
         """Return the particle at entry e of the list of i if it sleeps and i is within `margin` [m] of it, else -1.
 
@@ -129,7 +121,7 @@ class Contact(PairContact):
         """
         j, out = self.dev.list.neighbour[e], -1
         if not self.dev.state.awake(j):
-            met = self.dev.geometry.push_each_other(i, j, margin)
+            met = self.dev.geometry.touches(i, j, margin)
             if self.dev.w[i] == 0:
                 r, distance = self.dev.state.separation(i, j) - self.dev.state.d[i], self.dev.geometry.contact_distance(i, j)
                 met = met or r.dot(r) < distance * distance

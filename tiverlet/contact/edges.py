@@ -624,7 +624,7 @@ class Edges:
                 near = self.contact_radius(i, j, self.after(j), ti.min(ti.max(t, 0), 1)) + margin + SLOP * self.size[j]
                 out = out or height < near
         if not out and self.radius.of(i) + self.radius.of(j) > 0:
-            out = self.discs.push_each_other(i, j, margin) and self.corner(i, j, 0) > 0
+            out = self.discs.touches(i, j, margin) and self.corner(i, j, 0) > 0
         return out
 
     @ti.func

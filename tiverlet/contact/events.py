@@ -9,7 +9,7 @@ Rows come in any order, and the host sorts them. One particle of the pair writes
 same on any number of threads.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -45,7 +45,7 @@ class EventLog:
         self.pair, self.when = Column("events.pair", 2, ti.i32), Column("events.when", 2, ti.i32)
         self.impulse, self.speed = Column("events.impulse"), Column("events.speed")
         self.normal, self.point = Column("events.normal", dim), Column("events.point", dim)
-        self.rows = add("events.rows", None, kind=ti.i32)
+        self.counter = add("events.rows", None, kind=ti.i32)  # the number of rows
         self.substep = add("events.substep", None, kind=ti.i32)  # the number of the substep in the frame, from 1 on
         if self.senses:
             _, rows = table.rows(scene.particles.group)
@@ -64,7 +64,7 @@ class EventLog:
         """Store the number of substep s as a pass begins, and empty the table as a frame begins. One thread calls it."""
         self.substep[None] = s + 1
         if s == 0 and first != 0:
-            self.rows[None] = 0
+            self.counter[None] = 0
 
     @ti.func
     def open(self, begin, end):
@@ -74,7 +74,7 @@ class EventLog:
             for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
                 number += ti.cast(self.touched.field[e] != 0, ti.i32)
         if number > 0:
-            row = ti.atomic_add(self.rows[None], number)
+            row = ti.atomic_add(self.counter[None], number)
             for i in range(begin, end):
                 for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
                     if self.touched.field[e] != 0:
@@ -104,7 +104,7 @@ class EventLog:
         """Write a touch to the row of entry e: its impulse [kg m] and, if the pair meets now, its speed, normal and point."""
         row, now = self.touched.field[e] - 1, self.substep[None]
         if row < 0:
-            row = ti.atomic_add(self.rows[None], 1)
+            row = ti.atomic_add(self.counter[None], 1)
             self.enter(row, i, e, now, NEVER)
             self.place(row, i, j, n)
         began, last = self.when.field[row][0], self.when.field[row][1]
@@ -124,11 +124,10 @@ class EventLog:
         self.point.field[row] = self.state.place(i) + way / 2
 
     @ti.func
-    def note_impact(self, e, impulse, speed):
-        """Add the impulse [kg m] of an impact at a speed [m per substep] to the row of entry e, if this side has the row."""
+    def note_speed(self, e, speed):
+        """Note the speed of an impact [m per substep] in the row of entry e, if this side has the row."""
         row = self.touched.field[e] - 1
         if row >= 0:
-            self.impulse.field[row] = self.impulse.field[row] + impulse
             self.speed.field[row] = ti.max(self.speed.field[row], speed)
 
     @ti.func
@@ -182,11 +181,6 @@ class EventLog:
                         self.place(row, i, j, self.geometry.fallback_normal(i, j, r))
                 self.touched.field[e] = ti.cast(last == self.substep[None], ti.i32)
 
-    @property
-    def counter(self) -> Any:
-        """The field that is 0 if there are no events to report."""
-        return self.rows
-
     def forget(self) -> None:
         """Empty the table, because the state is not the end of a frame that was just computed."""
         self.list.memory.write(self.counter, 0)
@@ -198,7 +192,7 @@ class EventLog:
         """
         memory, store = self.list.memory, self.list.store
         assert store
-        count, substeps = int(memory.read(self.rows)[0]), int(memory.read(self.substep)[0])
+        count, substeps = int(memory.read(self.counter)[0]), int(memory.read(self.substep)[0])
         pair, when, *values = (store.read(column.field)[:count] for column in self.columns)
         impulse, speed, normal, point = (value.astype(np.float64) for value in values)
         pairs = np.sort(pair, axis=1).astype(np.int64)

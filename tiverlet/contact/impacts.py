@@ -20,7 +20,6 @@ back what impulses gave too much of.
 from typing import TYPE_CHECKING, Any
 
 from ..device import ti
-from ..neighbours.pair_data import Column
 from .limits import APART, FEW, NEAR, NEVER, OWN, SLOP, SLOW, TOGETHER, WHOLE
 from .meeting import meeting
 
@@ -43,18 +42,12 @@ class Impacts:
     def __init__(self, scene: "Scene", rows: "Rows"):
         self.rows: Any = rows
         self.state, self.real, self.dim = scene.state, scene.real, scene.particles.dim
-        self.restitution, self.joined = Column("row_restitution"), Column("row_joined", kind=ti.i32)
-        self.open, self.arc, self.way = Column("row_open"), Column("row_arc"), Column("row_way", self.dim)
-        self.time, self.facing, self.closing = Column("row_next"), Column("row_facing", self.dim), Column("row_closing")
-        self.blow, self.hit, self.approach = Column("row_blow"), Column("row_hit"), Column("row_approach")
-        self.columns = [
-            self.restitution, self.joined, self.open, self.arc, self.way, self.time, self.facing, self.closing, self.blow,
-            self.hit, self.approach,
-        ]  # fmt: skip
+        self.restitution, self.joined = rows.column("restitution"), rows.column("joined", kind=ti.i32)
+        self.open, self.arc, self.way = rows.column("open"), rows.column("arc"), rows.column("way", self.dim)
+        self.time, self.facing, self.closing = rows.column("next"), rows.column("facing", self.dim), rows.column("closing")
+        self.blow, self.hit, self.approach = rows.column("blow"), rows.column("hit"), rows.column("approach")
         self.belts = any(group.wall.has_surface_velocity for group in rows.walls)
-        self.belt: Any = Column("row_belt", self.dim) if self.belts else None
-        if self.belts:
-            self.columns.append(self.belt)
+        self.belt: Any = rows.column("belt", self.dim) if self.belts else None
         add = scene.memory.field
         self.thrown, self.shift = (add(f"Contact.{name}", scene.count, width=self.dim) for name in ("thrown", "shift"))
         self.since = add("Contact.since", scene.count)
@@ -83,14 +76,6 @@ class Impacts:
     def part(self, row):
         """Return (1 + e) / 2 of a row in a round of impacts; e is 1 where it touched at the start."""
         return (1 + ti.select(self.joined.field[row] == TOGETHER, 1, self.restitution.field[row])) / 2
-
-    @ti.func
-    def rubs(self, row):
-        """Whether a row has friction."""
-        out = False
-        if ti.static(self.rows.has_friction):
-            out = self.rows.friction.field[row][0] > 0
-        return out
 
     @ti.func
     def blur(self, i, row, u):
@@ -204,7 +189,10 @@ class Impacts:
                     p_own += p
                     some = self.part(row) * blow * self.closing.field[row]
                     work += some
-                    if self.restitution.field[row] == 1 and not self.rubs(row):
+                    keeps = self.restitution.field[row] == 1
+                    if ti.static(self.rows.has_friction):
+                        keeps = keeps and self.rows.friction.field[row][0] == 0
+                    if keeps:
                         kept += some
                     if part == OWN and row < self.rows.kept[i]:
                         if (bodies.push[other] != 0).any():
@@ -223,10 +211,9 @@ class Impacts:
     @ti.func
     def change(self, i, bodies: ti.template()):  # type: ignore[valid-type]
         """Return how far the impulses of a round move particle i before they are scaled, with what answers [m]."""
-        out = bodies.compliance(i) * bodies.push[i]
         if ti.static(bool(bodies.answers)):
-            out = bodies.last[i]
-        return out
+            return bodies.last[i]
+        return bodies.compliance(i) * bodies.push[i]
 
     @ti.func
     def terms(self, i, bodies: ti.template()):  # type: ignore[valid-type]

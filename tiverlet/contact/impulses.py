@@ -25,11 +25,9 @@ from ..device.number import OnDevice
 from ..features.material import limit_length
 from .limits import (
     ALLOWED,
-    ALONE,
     BETA,
     BLOCK,
     BOUNCES,
-    ERROR,
     FEW,
     FORCE,
     GAINS,
@@ -40,21 +38,14 @@ from .limits import (
     KINETIC,
     LACK,
     LANDING,
-    LANDS,
-    LEAST,
-    LEFT,
     LOAD,
-    MET,
-    MOMENTUM,
+    MOVES,
     OWN,
-    PASSES,
     PLACES,
     RELAXATION,
-    ROUNDING,
     ROUNDS,
     ROWS,
     SCALE,
-    SHARE,
     SLOW,
     STRUCK,
     SUMS,
@@ -71,6 +62,17 @@ if TYPE_CHECKING:
     from ..features.feature import Scene
     from .responses import Responses
     from .rows import Rows
+
+ALONE = 1.001  # by what masses are split where a row shares its particles with none, to rounding
+MET = 0.0005  # of the displacement by forces in a substep: what rows may lack. It adds up over the height of a pile
+PASSES = 20  # most passes of impulses in a substep
+LANDS = 0.2  # of the displacement by forces: where rows lack more after PASSES, something lands
+LEAST = 6, 3  # fewest of them, without and with friction: what rests comes to rest down to rounding
+MOMENTUM = 10.0  # Nesterov's theta of the first pass, after about twice as many
+LEFT = 1e-7  # share of the mean square of what rows lack in the first pass that may be left, where no forces act
+ERROR = 0.002  # of the kinetic energy of all: the energy that may be wrong after a bounce
+ROUNDING = 0.1  # of what rows may lack: times the impulses, the work that they may do
+SHARE = 1.2  # of an overlap that a pass of places moves, by masses split by the largest eigenvalue; below 4/3
 
 
 class Impulses:
@@ -171,7 +173,7 @@ class Impulses:
                     w += c * self.bodies.split(j)
                     across += c * self.bodies.split_tangential(j)
                     e += c * self.bodies.split_place(j)
-                    if self.bodies.moves(j):
+                    if self.state.moves(j):
                         most = ti.max(most, self.rows.share[j] if ti.static(self.has_friction) else self.rows.eigenvalue[j])
             step, move = ti.cast(RELAXATION, self.real), ti.cast(SHARE, self.real)
             if most < ALONE:  # a row that shares its particles with none that it could disturb is solved in one pass
@@ -419,13 +421,13 @@ class Impulses:
         self.flags[None] = [ti.cast(self.total(ROWS) > 0, ti.i32), 0, 0, 0]
 
     @ti.func
-    def decide_places(self, most):
+    def decide_places(self):
         """Decide after a pass of stage 2 whether it moves anything, and whether another one follows. One thread calls it."""
         turn = self.flags[None][TURN] + 1
         self.numbers[None][BETA], self.numbers[None][THETA] = self.momentum()
         moves = ti.cast(self.total(LACK) > 0, ti.i32)
         self.note_turn(PLACES, turn)
-        self.flags[None] = [ti.select(turn < most, moves, 0), turn, moves, 0]
+        self.flags[None] = [ti.select(turn < MOVES, moves, 0), turn, moves, 0]
 
     @ti.func
     def check_work(self):
@@ -572,14 +574,14 @@ class Impulses:
                     if self.rows.bounced(row):
                         f = 0 * f
                 self.rows.borne_moment.field[e] = f
-        if ti.static(self.rows.logs_pairs):
+        if ti.static(bool(self.rows.events)):
             for row in range(self.rows.own[i], self.rows.pressed[i]):
                 n = self.rows.normal.field[row]
                 p = self.rows.along(self.rows.p.field[row], n) + self.rows.hit(row)
                 if p > 0:
                     self.rows.events.record(i, self.rows.other.field[row], self.rows.entry.field[row], n, p, final)
                     if ti.static(bool(self.rows.impacts)):
-                        self.rows.events.note_impact(self.rows.entry.field[row], 0 * p, self.rows.impacts.approach.field[row])
+                        self.rows.events.note_speed(self.rows.entry.field[row], self.rows.impacts.approach.field[row])
         if ti.static(len(self.rows.logging) > 0):
             for row in range(self.rows.pressed[i], self.rows.end[i]):
                 self.rows.log_wall(i, row)

@@ -38,7 +38,7 @@ class Islands:
     n: Any = OnDevice()
 
     def __init__(self, scene: "Scene", rows: "Rows", bodies: "Responses", team: "Team"):
-        self.rows, self.bodies, self.real = rows, bodies, scene.real
+        self.rows, self.bodies, self.state, self.real = rows, bodies, scene.state, scene.real
         self.n, add = scene.count, scene.memory.field
         # One thread needs no atomic operations, which SPIR-V does not have for 64 bits and f32.
         self.serial = runtime.architecture() not in runtime.LLVM or (team.size == 1 and not team.launched)
@@ -55,13 +55,13 @@ class Islands:
             self.sums[i][k], self.largest[i][k] = 0, LEAST
 
     @ti.func
-    def lower(self, i, root):
-        """Let particle i point at `root`, unless it points at a lower one. Returns at which it pointed."""
-        before = self.root[i]
+    def keep_least(self, values: ti.template(), k, value):  # type: ignore[valid-type]
+        """Lower values[k] to a value, unless it is lower. Returns what it was."""
+        before = values[k]
         if ti.static(self.serial):
-            self.root[i] = ti.min(before, root)
+            values[k] = ti.min(before, value)
         else:
-            before = ti.atomic_min(self.root[i], root)
+            before = ti.atomic_min(values[k], value)
         return before
 
     @ti.func
@@ -71,7 +71,7 @@ class Islands:
         while parent != i:
             above = self.root[parent]
             if above != parent:
-                self.lower(i, above)
+                self.keep_least(self.root, i, above)
             i = parent
             parent = above
         return i
@@ -90,15 +90,15 @@ class Islands:
             if ti.static(bool(self.rows.edges)):
                 if joins:
                     self.join_edge(i, other, self.rows.edges.end.field[row])
-            elif joins and self.bodies.moves(other):
+            elif joins and self.state.moves(other):
                 self.join_two(i, other)
 
     @ti.func
     def join_edge(self, v, a, b):
         """Join the islands of vertex v, whose row it is whether it moves or not, and of the ends that can move."""
-        if self.bodies.moves(a):
+        if self.state.moves(a):
             self.join_two(v, a)
-        if self.bodies.moves(b):
+        if self.state.moves(b):
             self.join_two(v, b)
 
     @ti.func
@@ -107,7 +107,7 @@ class Islands:
         a, b = self.root_of(i), self.root_of(j)
         while a != b:
             high, low = ti.max(a, b), ti.min(a, b)
-            before = self.lower(high, low)
+            before = self.keep_least(self.root, high, low)
             a = low
             b = low
             if before != high:  # another thread was faster: join what it pointed at
@@ -119,15 +119,7 @@ class Islands:
         root = self.root_of(i)
         for row in range(self.rows.own[i], self.rows.end[i]):
             if self.rows.bounce.field[row] > 0:
-                self.keep_earlier(self.scale, root, self.rows.time.field[row])
-
-    @ti.func
-    def keep_earlier(self, times: ti.template(), k, time):  # type: ignore[valid-type]
-        """Lower times[k] to a time, unless it is earlier."""
-        if ti.static(self.serial):
-            times[k] = ti.min(times[k], time)
-        else:
-            ti.atomic_min(times[k], time)
+                self.keep_least(self.scale, root, self.rows.time.field[row])
 
     @ti.func
     def time_of(self, i):
@@ -210,17 +202,9 @@ class Islands:
 
     @ti.func
     def terms(self, i, which: ti.template()):  # type: ignore[valid-type]
-        """Return the part of particle i in the sums of its island."""
-        out = ti.Vector.zero(ti.f64, 3)
+        """Return the part of particle i in the sums of its island: the work of impulses, its square, and those along normals."""
         if ti.static(which == BOUNCING):
-            out = self.rows.impacts.terms(i, self.bodies)
-        else:
-            out = self.terms_of_work(i)
-        return out
-
-    @ti.func
-    def terms_of_work(self, i):
-        """Return the part of particle i in the work of impulses, its square, and the impulses along normals."""
+            return self.rows.impacts.terms(i, self.bodies)
         work, square = self.bodies.work(i)
         load = ti.cast(0, ti.f64)
         for row in range(self.rows.own[i], self.rows.end[i]):

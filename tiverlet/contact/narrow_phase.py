@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..device import ti
+from ..device import inline, ti
 from ..features.feature import Scene
 from ..features.material import TOUCH, TOUCHES
 from ..neighbours.pair_data import PairData
@@ -35,10 +35,9 @@ class DiscGeometry:
     @ti.func
     def pushes(self, i, j):
         """Return 1 if particles i and j push each other where they overlap, 0 if they do not, as for sensors."""
-        out = 1
         if ti.static(self.senses):
-            out = ti.cast(ti.cast(self.search.table.of(i, j)[TOUCH], ti.i32) == TOUCHES, ti.i32)
-        return out
+            return ti.cast(ti.cast(self.search.table.of(i, j)[TOUCH], ti.i32) == TOUCHES, ti.i32)
+        return 1
 
     @ti.func
     def overlap(self, i, j, contact_distance):
@@ -91,10 +90,15 @@ class DiscGeometry:
         return ti.select(d.dot(d) <= limit * limit, 0, 1)
 
     @ti.func
-    def push_each_other(self, i, j, margin):
+    def touches(self, i, j, margin):
         """Whether particles i and j push each other, and are less than `margin` [m] from overlapping."""
         r, distance = self.state.separation(i, j), self.contact_distance(i, j) + margin
         return r.dot(r) < distance * distance and self.pushes(i, j) != 0
+
+    @inline
+    def pressed_particle(self, j):
+        """Return the particle on which a disc presses that is next to particle j: j itself."""
+        return j
 
     @ti.func
     def worst_overlap(self, i):

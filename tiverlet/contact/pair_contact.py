@@ -1,7 +1,7 @@
 """The contract of contact features: their common settings, and the methods that a step calls."""
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -27,31 +27,16 @@ from .responses import Responses
 from .rows import Rows
 
 
-class Geometry(Protocol):
-    """The geometry of contacts in one world. DiscGeometry and Edges also give their feature overlaps and normals."""
-
-    def overshoots(self, i) -> Any:
-        """Return 1 if particle i moves so far in one substep that a contact may be missed."""
-
-    def worst_overlap(self, i) -> Any:
-        """Return the number of contacts that particle i counts for the report, and its worst overlap relative to its size."""
-
-    def found(self, x: np.ndarray, h: float) -> Contacts:
-        """Return the contacts of particles at x (n, dim) [m] after a substep h [s], for world.contacts."""
-        ...
-
-
 class PairContact(Feature):
     """A feature that keeps particles from overlapping. A world has at most one.
 
     bodies: arrays of particles that sleep and wake together. ties: the constraints of its world.
 
     A subclass defines prepare() and make_search(), which calls declare_rows(). Contacts are rows, see rows.py, and are solved by
-    RowPass.
+    RowPass. `dev.geometry`, a DiscGeometry or Edges, defines what both kinds of contacts need.
 
-    For sleep, is_pressed(i, e) returns whether there is a contact at entry e of the list of particle i. pressed_particle(j)
-    returns the other particle of that contact. touched_sleeper(i, e, margin) returns the sleeping particle at entry e that
-    the awake particle i touches, or nearly touches, or -1.
+    For sleep, touched_sleeper(i, e, margin) returns the sleeping particle at entry e that the awake particle i touches, or nearly
+    touches, or -1.
     """
 
     friction = Knob(lambda f, v: f._surface("friction", v), "Of all pairs, or by pairs of groups.")
@@ -149,7 +134,7 @@ class PairContact(Feature):
         dev.responses = Responses(scene, dev.rows, scene.state.spins and friction, dev.answers)
         dev.islands = Islands(scene, dev.rows, dev.responses, team)
         dev.impulses = Impulses(scene, dev.rows, dev.responses, team)
-        dev.places = Places(scene, dev.rows, dev.responses, dev.impulses, team)
+        dev.places = Places(scene, dev.rows, dev.responses, dev.impulses)
         linked = excluded_pairs(batches, scene.particles.radius, edges.outline if edges else None)
         dev.events = EventLog(scene, self.table) if dev.has_events else None
         pair_data = [
@@ -239,6 +224,16 @@ class PairContact(Feature):
     def overshoots(self, i):
         """Return 1 if particle i moves so far in one substep that a contact may be missed."""
         return self.dev.geometry.overshoots(i)
+
+    @ti.func
+    def is_pressed(self, i, e):
+        """Whether particle i presses on what stands at entry e of its list."""
+        return self.dev.rows.is_set(self.dev.rows.memory.field[e]) or self.dev.geometry.touches(i, self.dev.list.neighbour[e], 0)
+
+    @ti.func
+    def pressed_particle(self, j):
+        """Return the particle that is pressed where an entry of a list is j."""
+        return self.dev.geometry.pressed_particle(j)
 
     @ti.func
     def note_motion(self, stale, fast):

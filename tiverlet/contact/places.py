@@ -12,7 +12,6 @@ from ..neighbours.neighbour_list import WALL
 from .limits import BEYOND, OWN, SLOP, TURN
 
 if TYPE_CHECKING:
-    from ..device.thread_team import Team
     from ..features.feature import Scene
     from .impulses import Impulses
     from .responses import Responses
@@ -22,9 +21,8 @@ if TYPE_CHECKING:
 class Places:
     """Stage 2 of the contacts of one world."""
 
-    def __init__(self, scene: "Scene", rows: "Rows", bodies: "Responses", impulses: "Impulses", team: "Team"):
-        self.rows, self.bodies, self.impulses, self.state = rows, bodies, impulses, scene.state
-        self.radius = scene.radius
+    def __init__(self, scene: "Scene", rows: "Rows", bodies: "Responses", impulses: "Impulses"):
+        self.rows, self.bodies, self.impulses, self.state, self.real = rows, bodies, impulses, scene.state, scene.real
 
     @ti.func
     def begin(self, i):
@@ -41,7 +39,7 @@ class Places:
 
         Rows of particles that have not moved since they were found apart are not tested again.
         """
-        out, total = ti.zero(self.radius.of(i)), 0 * self.state.d[i]
+        out, total = ti.cast(0, self.real), 0 * self.state.d[i]
         kept, pressed, own = self.rows.kept[i], self.rows.pressed[i], self.rows.size(i)
         again = self.impulses.flags[None][TURN] > 0
         still = again and (self.bodies.last[i] == 0).all()

@@ -182,9 +182,8 @@ class Polygons(PairContact):
 
     def rods(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the edges (k, 2) of all bodies, and their numbers (k,), counted from body to body. Rays meet them."""
-        if not self.loops:
-            return PairContact.rods(self)
-        ends = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in self.loops])
+        edges = [np.stack([loop, np.roll(loop, -1)], axis=1) for loop in self.loops]
+        ends = np.concatenate([np.zeros((0, 2), dtype=np.int64), *edges])
         return ends, np.arange(len(ends))
 
     def make_search(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
@@ -195,16 +194,6 @@ class Polygons(PairContact):
     def bodies(self) -> list[np.ndarray]:  # type: ignore[override]
         """The particles of each body, which sleep and wake together."""
         return self.loops
-
-    @ti.func
-    def is_pressed(self, i, e):
-        """Whether particle i, as a vertex, presses on the edge or disc at entry e of its list."""
-        return self.dev.rows.is_set(self.dev.rows.memory.field[e]) or self.dev.geometry.touches(i, self.dev.list.neighbour[e], 0)
-
-    @ti.func
-    def pressed_particle(self, j):
-        """Return the particle that a vertex presses on where its entry is j, see Edges.pressed_particle()."""
-        return self.dev.geometry.pressed_particle(j)
 
     @ti.func
     def touched_sleeper(self, i, e, margin):

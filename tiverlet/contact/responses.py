@@ -24,6 +24,7 @@ class Responses:
     def __init__(self, scene: "Scene", rows: "Rows", spins: bool, answers: "Answers | None"):
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.answers: Any = answers
+        self.has_clusters = bool(answers) and answers.has_clusters
         self.rows = rows
         self.state, self.spins, self.real, self.dim = scene.state, spins, scene.real, dim
         self.v, self.last, self.push = (add(f"Contact.{name}", n, width=dim) for name in ("v", "v_last", "push"))
@@ -35,11 +36,6 @@ class Responses:
             )
 
     @inline
-    def moves(self, i):
-        """Whether impulses move particle i."""
-        return self.state.moves(i)
-
-    @inline
     def compliance(self, i):
         """Return by how much a unit impulse along a normal moves particle i [1/kg]."""
         w = at(self.state.w, i)
@@ -49,25 +45,21 @@ class Responses:
     def mobility(self, i):
         """Return by how much a unit impulse on particle i moves it at most, with the body that it belongs to [1/kg]."""
         w = self.compliance(i)
-        if ti.static(bool(self.answers)):
-            if ti.static(self.answers.has_clusters):
-                if w > 0:
-                    w = self.answers.mobility[i]
+        if ti.static(self.has_clusters):
+            if w > 0:
+                w = self.answers.mobility[i]
         return w
 
     @ti.func
     def split(self, i):
         """Return the same, with masses split among the rows of the body [1/kg]."""
-        out = self.compliance(i)
         if ti.static(not self.rows.has_friction):
-            out = self.split_place(i)
-        else:
-            if ti.static(bool(self.answers)):
-                if ti.static(self.answers.has_clusters):
-                    if out > 0:
-                        out = self.answers.shared[i]
-            out *= self.rows.share[i]
-        return out
+            return self.split_place(i)
+        w = self.compliance(i)
+        if ti.static(self.has_clusters):
+            if w > 0:
+                w = self.answers.shared[i]
+        return self.rows.share[i] * w
 
     @ti.func
     def split_place(self, i):
@@ -153,12 +145,11 @@ class Responses:
         new = self.new[i]
         self.v[i] = new + beta * (new - self.last[i])
         self.last[i] = new
-        self.push[i] = 0 * new
         if ti.static(self.spins):
             s = self.new_s[i]
             self.s[i] = s + beta * (s - self.last_s[i])
             self.last_s[i] = s
-            self.moment[i] = 0 * s
+        self.forget_sums(i)
 
     @ti.func
     def work(self, i):

@@ -18,25 +18,7 @@ from ..features.material import DYNAMIC, RESTITUTION, ROLLING, STATIC, TANGENTIA
 from ..neighbours.neighbour_list import WALL
 from ..neighbours.pair_data import Column, PairData
 from .impacts import Impacts
-from .limits import (
-    AHEAD,
-    BEGIN,
-    BEYOND,
-    END,
-    FEW,
-    FOREIGN,
-    NOISE,
-    OWN,
-    QUARTER,
-    SCALE,
-    SLOP,
-    SLOW,
-    STEADY,
-    TIMES,
-    TOGETHER,
-    WHOLE,
-    H,
-)  # fmt: skip
+from .limits import AHEAD, BEGIN, BEYOND, END, FEW, FOREIGN, OWN, SCALE, SLOP, SLOW, TIMES, TOGETHER, WHOLE, H
 from .meeting import meeting
 
 if TYPE_CHECKING:
@@ -45,10 +27,16 @@ if TYPE_CHECKING:
     from .edges import Edges
     from .narrow_phase import DiscGeometry
 
+NOISE = 64.0  # times the rounding of a displacement: what comes together no faster is at rest
+STEADY = 1 / 16  # of an impulse: it may change by so much in a substep, beside what forces change, and be a load
+QUARTER = 0.25  # of the smaller radius: by how much a pair that overlaps parts in a substep at most
 
 # In which turn a particle lists a pair, by where the other one is: in a piece before, behind it in the same piece, in a piece
 # behind, or where impulses do not move it. The last is for pairs that the other particle lists.
 BEFORE, MOVED, BEHIND, HELD, LISTED = range(5)
+
+# The different entries of a symmetric matrix, by dimension.
+ENTRIES = {2: ((0, 0), (1, 1), (0, 1)), 3: ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))}
 
 
 class Rows:
@@ -74,6 +62,7 @@ class Rows:
         n, add = scene.count, scene.memory.field
         self.scene, self.state, self.table = scene, scene.state, table
         self.has_friction, self.real, self.dim, self.radius = has_friction, scene.real, scene.particles.dim, scene.radius
+        self.sheared = bool(scene.state.images and scene.state.images.sheared)  # whether images move relative to each other
         self.edges: Any = edges
         self.ends = 2 if edges else 1  # particles on which a row presses
         self.walls, self.width = walls, scene.particles.dim if has_friction else 0
@@ -81,28 +70,20 @@ class Rows:
             add(f"Contact.rows_{name}", n, kind=ti.i32) for name in ("begin", "own", "kept", "pressed", "end")
         )
         self.share, self.eigenvalue = add("Contact.share", n), add("Contact.eigenvalue", n)
-        self.spread = add("Contact.spread", n, width=3 if self.dim == 2 else 6, kind=ti.i32)  # sum of n n^T, in 2^-20
+        self.spread = add("Contact.spread", n, width=len(ENTRIES[self.dim]), kind=ti.i32)  # sum of n n^T, in 2^-20
         # How far rows that bear a load moved each particle in the last substep, and turned its surface [m].
         self.borne = add("Contact.borne", n, width=self.dim, state=True)
         if scene.state.spins:
             self.turned = add("Contact.turned", n, width=scene.particles.axes, state=True)
         # What each pair and wall bore in the last substep [kg m]: along the normal, or with friction the whole vector.
         self.memory = PairData("impulse" if has_friction else "push", self.width, persistent=True, has_owner=not edges)
-        self.other, self.entry = Column("row_other", kind=ti.i32), Column("row_entry", kind=ti.i32)
-        self.normal, self.gap, self.bend = Column("row_normal", self.dim), Column("row_gap"), Column("row_bend")
-        self.stiff, self.firm = Column("row_stiff", 2 if has_friction else 0), Column("row_firm")
-        self.p, self.step = Column("row_p", self.width), Column("row_step", self.width)
-        self.columns = [self.other, self.entry, self.normal, self.gap, self.bend, self.stiff, self.firm, self.p, self.step]
-        if edges:
-            self.columns += edges.columns
-        self.moved: Any = None
-        self.friction: Any = None
-        if walls:
-            self.moved = Column("row_moved", self.dim)
-            self.columns.append(self.moved)
-        if has_friction:
-            self.friction = Column("row_friction", 2)
-            self.columns.append(self.friction)
+        self.columns: list[Column] = [*edges.columns] if edges else []
+        self.other, self.entry = self.column("other", kind=ti.i32), self.column("entry", kind=ti.i32)
+        self.normal, self.gap, self.bend = self.column("normal", self.dim), self.column("gap"), self.column("bend")
+        self.stiff, self.firm = self.column("stiff", 2 if has_friction else 0), self.column("firm")
+        self.p, self.step = self.column("p", self.width), self.column("step", self.width)
+        self.moved: Any = self.column("moved", self.dim) if walls else None
+        self.friction: Any = self.column("friction", 2) if has_friction else None
         number = scene.memory.number
         self.push_out, self.ahead = number(-1.0 if push_out is None else push_out, scene.real), number(ahead, scene.real)
         self.bounces, self.rounding = bounces, NOISE * (2.0**-52 if scene.real == ti.f64 else 2.0**-23)
@@ -112,14 +93,11 @@ class Rows:
             self.given = PairData("given", 0, persistent=True, for_reports=True, has_owner=not edges)
             # Whether a pair touched in the last substep: then it goes on together instead of bouncing.
             self.touched = PairData("touches", 0, persistent=True, kind=ti.i32, has_owner=not edges)
-            self.bounce, self.time, self.target = Column("row_bounce"), Column("row_time"), Column("row_target")
-            self.slight = Column("row_slight")  # what forces can change of a load in a substep [kg m]
-            self.columns += [self.bounce, self.time, self.target, self.slight]
+            self.bounce, self.time, self.target = self.column("bounce"), self.column("time"), self.column("target")
+            self.slight = self.column("slight")  # what forces can change of a load in a substep [kg m]
             self.when = add("Contact.when", n)  # the part of the substep before the impact of the island of a particle
         self.impacts: Any = Impacts(scene, self) if in_turn else None
         self.belts = bool(self.impacts) and self.impacts.belts
-        if self.impacts:
-            self.columns += self.impacts.columns
         self.one_way = [group for group in walls if group.wall.one_way is not None]
         self.logging = [group for group in walls if group.wall.events]  # each has a log of its own
         self.events: Any = None
@@ -127,16 +105,20 @@ class Rows:
         if turns:
             # Moments against rolling and twisting, over the radius of the pair [kg m]; what was borne of them.
             self.borne_moment = PairData("moment", self.axes, persistent=True, has_owner=True)
-            self.f, self.f_step = Column("row_moment", self.axes), Column("row_moment_step", self.axes)
-            self.arms, self.rolling, self.turn_stiff = (Column(f"row_{name}", 2) for name in ("arms", "rolling", "turn_stiff"))
-            self.across = Column("row_across", self.dim)  # tangential displacement that the points which touch aim at [m]
-            self.columns += [self.f, self.f_step, self.arms, self.rolling, self.turn_stiff, self.across]
+            self.f, self.f_step = self.column("moment", self.axes), self.column("moment_step", self.axes)
+            self.arms, self.rolling, self.turn_stiff = (self.column(name, 2) for name in ("arms", "rolling", "turn_stiff"))
+            self.across = self.column("across", self.dim)  # tangential displacement that the points which touch aim at [m]
         self.divided = (team.size > 1 or team.launched) and not edges
         # H: the substep [s]. BEGIN, END: the fractions of the frame at its ends. SCALE: by how much what rows bore is scaled.
         # WHOLE: the part of State.kick() that the substep adds to displacements. SHARES: spin_shares().
         self.times = add("Contact.times", None, width=len(TIMES))
         self.list: Any = None
         self.geometry: Any = None
+
+    def column(self, name: str, width: int = 0, kind: Any = None) -> Column:
+        """Add a column of numbers, or of vectors of a width, by row."""
+        self.columns.append(Column(f"row_{name}", width, kind))
+        return self.columns[-1]
 
     def bind(self, listed: Any, geometry: "DiscGeometry") -> None:
         """Add the columns to the neighbour list, before it is allocated."""
@@ -147,16 +129,6 @@ class Rows:
         else:
             listed.movable = lambda: self.scene.inv_mass > 0
 
-    @property
-    def sheared(self) -> bool:
-        """Whether images of particles move relative to each other."""
-        return bool(self.state.images and self.state.images.sheared)
-
-    @property
-    def logs_pairs(self) -> bool:
-        """Whether pairs that press are recorded for events."""
-        return self.events is not None
-
     @inline
     def zero(self):
         """Return an impulse of 0."""
@@ -165,22 +137,14 @@ class Rows:
     @ti.func
     def along(self, p, n):
         """Return the part of an impulse along the normal n."""
-        out = ti.cast(0, self.real)
         if ti.static(self.has_friction):
-            out = p.dot(n)
-        else:
-            out = p
-        return out
+            return p.dot(n)
+        return p
 
-    @ti.func
+    @inline
     def vector(self, p, n):
         """Return an impulse as a vector."""
-        out = 0 * n
-        if ti.static(self.has_friction):
-            out = p
-        else:
-            out = p * n
-        return out
+        return p if self.has_friction else p * n
 
     @inline
     def hit(self, row):
@@ -195,12 +159,9 @@ class Rows:
     @ti.func
     def is_set(self, p):
         """Whether an impulse is not 0."""
-        out = False
         if ti.static(self.has_friction):
-            out = (p != 0).any()
-        else:
-            out = p != 0
-        return out
+            return (p != 0).any()
+        return p != 0
 
     @inline
     def h(self):
@@ -263,13 +224,10 @@ class Rows:
         """Return the size of particle i, of which slop is a part [m]."""
         return at(self.edges.size, i) if self.edges else self.radius.of(i)
 
-    @ti.func
+    @inline
     def when_of(self, i):
         """Return the part of the substep before the impact of the island of particle i, 0 without one."""
-        out = ti.cast(0, self.real)
-        if ti.static(self.bounces):
-            out = self.when[i]
-        return out
+        return at(self.when, i) if self.bounces else ti.cast(0, self.real)
 
     @ti.func
     def note_when(self, i, when):
@@ -397,13 +355,8 @@ class Rows:
     @ti.func
     def square(self, n):
         """Return the different entries of n n^T in integers, whose sums have the same bits in any order."""
-        out = ti.Vector.zero(ti.i32, ti.static(3 if self.dim == 2 else 6))
-        if ti.static(self.dim == 2):
-            out = ti.cast(ti.Vector([n[0] * n[0], n[1] * n[1], n[0] * n[1]]) * ti.static(2.0**20), ti.i32)
-        else:
-            products = [n[0] * n[0], n[1] * n[1], n[2] * n[2], n[0] * n[1], n[1] * n[2], n[2] * n[0]]
-            out = ti.cast(ti.Vector(products) * ti.static(2.0**20), ti.i32)
-        return out
+        products = ti.Vector([n[a] * n[b] for a, b in ti.static(ENTRIES[self.dim])])
+        return ti.cast(products * ti.static(2.0**20), ti.i32)
 
     @ti.func
     def find_eigenvalue(self, i):

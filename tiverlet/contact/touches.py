@@ -115,8 +115,6 @@ class ContactEvents:
         keep their order.
         """
         old = self.touches.pairs
-        if not len(self):
-            return self
         new = np.stack([first[old[:, 0]], second[old[:, 1]]], axis=1)
         return ContactEvents(replace(self.touches, pairs=np.where(old >= 0, new, -1)))
 
@@ -125,8 +123,6 @@ class ContactEvents:
 
         time: the present one [s].
         """
-        if not len(self):
-            return self, self
         new = self.renumbered(first, second).touches
         gone = ((new.pairs < 0) & (self.touches.pairs >= 0)).any(axis=1)
         lost = new[gone & np.isnan(new.ended)]

@@ -11,13 +11,11 @@ from ..contact.limits import (
     DIGIT,
     FORCE,
     GAINS,
-    GOING,
     GROUP,
     HITS,
     KINETIC,
     LACK,
     LOAD,
-    MOVES,
     OWN,
     ROWS,
     STRUCK,
@@ -25,7 +23,7 @@ from ..contact.limits import (
     UPHILL,
     WORK,
     WRONG,
-)  # fmt: skip
+)
 from ..device import called, inline, ti
 from ..device.number import OnDevice
 
@@ -77,10 +75,10 @@ class RowPass:
     @ti.func
     def solve_rows(self, thread: ti.i32, final: ti.i32, tick: ti.i32):
         """Stages 1 and 2."""
-        while self.impulses.flags[None][GOING] != 0:
+        while self.impulses.going() != 0:
             self.relax_impulses(thread)
         self.finish_impulses(thread, final, tick)
-        while self.impulses.flags[None][GOING] != 0:
+        while self.impulses.going() != 0:
             self.relax_places(thread)
 
     @inline
@@ -117,7 +115,7 @@ class RowPass:
                     kick = self.rows.kick(i)
                     self.bodies.begin(i)
                     self.rows.begin_empty(i, row)
-                    if ti.static(self.edges) or self.bodies.moves(i):
+                    if ti.static(self.edges) or self.state.moves(i):
                         row = self.rows.find(i, begin, end, row)
                         own = ti.cast(row - self.rows.own[i], self.real)
                         noise += self.noise(i) * own
@@ -199,7 +197,7 @@ class RowPass:
         if ti.static(bool(self.answers)):
             ti.loop_config(serialize=self.islands.serial)
             for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-                self.islands.keep_earlier(self.impacts.first, self.answers.body(i), self.impacts.first[i])
+                self.islands.keep_least(self.impacts.first, self.answers.body(i), self.impacts.first[i])
             self.team.wait()
             for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                 self.impacts.first[i] = self.impacts.first[self.answers.body(i)]
@@ -245,7 +243,7 @@ class RowPass:
     @ti.func
     def strike_all(self, thread: ti.i32):
         """All rounds of impacts in turn."""
-        while self.impulses.flags[None][GOING] != 0:
+        while self.impulses.going() != 0:
             self.strike(thread)
 
     @ti.func
@@ -312,7 +310,7 @@ class RowPass:
     def answer(self, thread, n):
         """Let systems, clusters and places answer the impulses of a pass to n particles: all, or none where no passes go on."""
         if ti.static(self.answers_later):
-            self.move_answers(thread, self.going() if ti.static(self.team.launched) else 1, True)
+            self.move_answers(thread, self.going(), True)
             for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                 self.bodies.new[i] = self.bodies.new[i] + self.answers.hold(i)
             self.team.wait()
@@ -529,7 +527,7 @@ class RowPass:
         self.add_up(thread, OF_PLACES)
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread) * self.going()):
-            self.impulses.decide_places(MOVES)
+            self.impulses.decide_places()
         self.team.wait()
         going *= self.impulses.moving()
         n = self.n * going
