@@ -118,29 +118,6 @@ def test_what_keeps_its_velocity_goes_on_to_the_bit_beside_what_is_steered(world
     assert back.hash() == free.hash()
 
 
-@pytest.mark.slow
-def test_what_is_borne_by_loads_that_are_known_flies(world):
-    # Where loads are known to the last digit, contacts and ropes add nothing, and particles seem to rest on nothing.
-    x = [(0, 0.1), (0, 0.3), (0, 0.5), (2, 3), (2, 2), (2, 1)]
-    features = [
-        tv.Gravity(9.81),
-        tv.Contact(friction=0.5, loads=True),
-        tv.HalfSpace((0, 1), friction=0.5),
-        tv.Rope([[3, 4], [4, 5]]),
-    ]
-    start = tv.Particles(x, radius=0.1, pinned=[3])
-    w = world(start, features, solver=tv.Jacobi(loads=True), substeps=8, precision="f64")
-    w.run(20)
-    with w.clone(substeps=1) as other:  # a start gives half of what is known, which read as -g h / 2
-        other.step(1 / 60)
-        assert np.abs(other.velocity[:3]).max() < 1e-9
-    v = w.velocity.copy()
-    v[[2, 5]] += (0.0, 2.0)
-    w.velocity = v
-    w.run(0.1)
-    np.testing.assert_allclose(w.velocity[[2, 5]], v[[2, 5]] - (0, 9.81 * 0.1), rtol=0, atol=1e-9)
-
-
 def chain(world, mass=1.0):
     """Return a world with a chain that swings down from level, and with a pair force of which nothing is felt."""
     k, x = np.arange(4), np.stack([0.3 * np.arange(5), -0.1 * np.arange(5)], axis=1)

@@ -114,14 +114,6 @@ def beads_slide_on_wires_in_space():
 
 
 @scene()
-def a_chain_hangs_and_learns_its_loads():
-    x = np.stack([np.zeros(8), -5.0 * np.arange(8)], axis=1)  # so long that a substep of 0.25 s is short
-    start = c.Particles(x, mass=0.2, pinned=[0])
-    features = [c.Gravity(G), c.Distance(chain(8, 2)), c.Drag(1.0)]
-    return start, features, {"solver": c.Jacobi(loads=True), "substeps": 8}
-
-
-@scene()
 def limbs_doors_and_struts_swing_against_their_stops():
     x = np.array(
         [[0, 0, 0], [0.5, 0, 0], [1, 0.1, 0], [3, 0, 0], [4, 0, 0], [3.5, 0, 0.8], [3.5, 0.3, -0.8], [6, 0, 0], [6.3, 0, 0]]

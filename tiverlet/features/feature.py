@@ -59,7 +59,6 @@ class Scene:
     inv_mass: np.ndarray  # (n,) after pins: 0 for particles that constraints cannot move
     radius: Any = None  # set where a feature needs radii
     slots: Any = None  # the slots into which constraints write corrections
-    own_weight: Any = None  # the OwnWeight of particles, where loads become known loads, or discs land on others
     bounces: bool = False  # whether there are walls, and particles bounce off these or off each other
     walls: Any = ()  # the colliders, as WallGroups
     impacts: Any = None  # the BodyImpacts, where linked particles may bounce off walls

@@ -20,13 +20,9 @@ class Jacobi(Solver):
     lambda_max <= 1 for any geometry. A net that is not folded up has less (a square one 0.66, cloth with shear 0.53). When the
     world is built, power iteration finds the value of the scene as it starts. A relaxation beyond the limit is refused. "auto"
     takes 1.2 / lambda_max, or 1 where constraints are soft (their stiffness would change) or are not scalar functions.
-
-    loads: whether rigid links learn the loads that they bear at rest, and pull with them without being stretched. See
-    tiverlet/solvers/README.md.
     """
 
-    def __init__(self, relaxation: float | str = 1.0, *, loads: bool = False):
-        self.loads = checks.flag("Jacobi", "loads", loads)
+    def __init__(self, relaxation: float | str = 1.0):
         if relaxation != "auto":
             relaxation = checks.number("Jacobi", "relaxation", relaxation, above=0.0)
         self.relaxation = relaxation
@@ -62,4 +58,4 @@ class Jacobi(Solver):
 
     def __repr__(self) -> str:
         factor = repr(self.relaxation) if self.relaxation == "auto" else f"{self.relaxation:g}"
-        return f"Jacobi(relaxation={factor}{', loads=True' if self.loads else ''})"
+        return f"Jacobi(relaxation={factor})"

@@ -7,7 +7,6 @@ import numpy as np
 from .. import checks
 from ..device import at, inline, ti
 from ..device.memory import Memory
-from ..device.number import OnDevice
 from ..features.feature import BENT, FAR, Batch, Scene
 from ..features.regrouping import Regrouping
 from ..tools import golden_steps
@@ -44,12 +43,9 @@ class Slots:
     order. Corners that cannot move have no slot.
 
     answers: whether constraints answer the impulses of contacts; `answer` is how far each moves its corner then [m].
-    loads: whether constraints that are relaxed by themselves learn their loads, see KnownLoad. body_load: if so, the largest load
-    in each body at the end of a window, in weights of a particle. split: the mass-split weight n w of each particle, for the n
-    blocks of constraints that it belongs to. A block is a system, or a constraint that is relaxed by itself.
+    split: the mass-split weight n w of each particle, for the n blocks of constraints that it belongs to. A block is a system,
+    or a constraint that is relaxed by itself.
     """
-
-    bodies: Any = OnDevice()
 
     host_only = (
         "total", "exact", "body_sizes", "rounding_masses", "_alone", "_blocks", "_bodies", "_places", "_sagging", "_scalars",
@@ -63,7 +59,7 @@ class Slots:
         self.move = memory.field("slots.move", self.total, width=state.dim)
         self.begin = memory.field("slots.begin", len(begin), kind=ti.i32, values=begin)
         self.semi_iteration = solver.semi_iteration(scene)
-        self.converges, self.loads, self.answers = solver.converges, solver.loads, answers
+        self.converges, self.answers = solver.converges, answers
         if answers:
             self.answer = memory.field("slots.answer", self.total, width=state.dim)
         if self.converges:
@@ -84,11 +80,8 @@ class Slots:
         # Whether passes leave violations that bear loads, see softness.py. Links that answer contacts are solved with them.
         alone = not self.system or self.system.steps > 0 or self.system.count_relaxed_alone(batches) > 0
         self.can_soften = alone and (not answers or any(b.clusters or b.arity == 1 for b in batches))
-        if self.loads or any(b.breaks for b in batches):
+        if any(b.breaks for b in batches):
             self._connect_bodies(batches, inv_mass, scene.particles.position)
-        if self.loads:
-            self.bodies = memory.number(1 + max(int(b.max(initial=0)) for b in self._bodies.values()))
-            self.body_load = memory.field("slots.bears", self.bodies)
         self.split = memory.field("slots.split_mass", scene.count, values=blocks * inv_mass)
         if self.can_soften:
             self.softness = memory.field("slots.softness", None, values=[1.0])
@@ -112,7 +105,7 @@ class Slots:
         np.maximum.at(self.body_sizes, body, 2 * np.linalg.norm(x - center[body], axis=1))
 
     def body(self, batch: Batch) -> np.ndarray:
-        """Return the body of each constraint of a batch, (m,), where constraints learn loads or break."""
+        """Return the body of each constraint of a batch, (m,), where constraints break."""
         return self._bodies[id(batch)]
 
     @property

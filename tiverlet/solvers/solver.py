@@ -49,7 +49,6 @@ class Solver:
     solvers/__init__.py, and a row in tests/test_solvers.py.
     """
 
-    loads = False  # whether constraints that are relaxed by themselves learn the loads that they bear, see KnownLoad
     converges = False  # whether it converges within a substep, so that tensions can be too large for the substep
     arguments: Mapping[str, Any] = MappingProxyType({})
     kept_by_world: tuple[str, ...] = ()  # attributes that a world sets

@@ -17,7 +17,6 @@ from ..device.memory import Memory
 from ..device.patches.compiler import BRIEF, FEW, LEAN, UNSEARCHED
 from ..device.thread_team import PIECES, Team, size_of
 from ..features.feature import Acceleration, Batch, Feature, Scene
-from ..features.own_weight import OwnWeight
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.periodic import Periodic
 from ..particles import Particles, Radii, State
@@ -163,8 +162,6 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     has_friction, bounces = any(f.has_friction for f in surfaces), any(f.has_restitution for f in surfaces)
     scene.bounces = bounces and bool(walls)
     solver = solver or (choose_solver(batches, scene, rows) if scene.order == 2 else Direct())
-    if batches and solver.loads:
-        scene.own_weight = OwnWeight(scene)
     if batches:
         with memory.owned("slots"):
             scene.slots = Slots(scene, batches, solver, rows)
@@ -204,8 +201,6 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         feature.note_built()
     forces = Forces(scene, accelerations)
     integrator = Verlet(scene, forces, bool(contact)) if scene.order == 2 else high_order.Composition(scene, forces, batches)
-    if scene.own_weight:
-        scene.own_weight.follow(integrator)
     step = Step(scene, integrator, batches, drivers, contact, search, walls, team)
     if state.sleepers:
         step.sleep = SleepPass(step, state.sleepers, drivers, batches)

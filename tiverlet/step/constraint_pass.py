@@ -3,7 +3,6 @@
 from typing import Any
 
 from ..colliders.body_impacts import holding_bodies
-from ..constraints.core.known_load import WINDOW
 from ..constraints.core.spring import RESTARTED
 from ..device import ti
 from ..device.thread_team import Team
@@ -27,8 +26,7 @@ class ConstraintPass:
         self.ragged = [b for b in batches if not b.arity]
         self.capped: list[Any] = [b for b in batches if b.driven and b.dev.drive.capped]
         self.real = scene.real
-        self.learners = [b for b in batches if b.solvable_together and b.dev.known.learns]
-        self.springs = any(b.soft for b in batches) or bool(self.learners)
+        self.springs = any(b.soft for b in batches)
 
     @ti.func
     def reduce_blocks(self, thread, h, h2_effective, first, fresh, some: ti.template(), newton=0):  # type: ignore[valid-type]
@@ -141,27 +139,6 @@ class ConstraintPass:
         if ti.static(len(self.batches) > 0):
             self.team.wait()
         self.scatter_blocks(now.thread, now.h, h2_effective, now.first, fresh, now.newton)
-
-    @ti.func
-    def learn(self, now):
-        """At the end of a window of substeps: add steady loads to the known loads, the more slowly the more a body bears."""
-        if ti.static(len(self.learners) > 0):
-            ends = ti.cast((now.span.since + now.s) % WINDOW == WINDOW - 1, ti.i32)
-            n = ends * self.slots.bodies
-            for b in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
-                self.slots.body_load[b] = 0
-            self.team.wait()
-            for f in ti.static(self.learners):
-                n = ends * f.count
-                for c in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
-                    if f.dev.corners.awake(c):
-                        f.dev.weigh_load(c)
-            self.team.wait()
-            for f in ti.static(self.learners):
-                n = ends * f.count
-                for c in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
-                    if f.dev.corners.awake(c):
-                        f.dev.learn_load(c, now.h)
 
     @ti.func
     def solve_systems(self, thread, newton, kick):

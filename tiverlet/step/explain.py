@@ -196,7 +196,6 @@ def _absent(world: "World") -> list[str]:
             any(not r.in_turn for r in [step.contact_pass.rows] if r),
             "impacts one after the other: no restitution above 0.97, or links that are relaxed",
         ),
-        (bool(step.batches) and not step.constraints.learners, "loads that links know: no Jacobi(loads=True)"),
         (not step.sleepers, "islands and who sleeps: no Sleep"),
         (not step.integrator.forces.all, "accelerations: no force"),
         (not step.integrator.decays, "exponential drag: no Drag or Wind"),

@@ -1,8 +1,8 @@
 """Velocities that are assigned between two substeps, as impulses: of added particles, released particles, and steered ones.
 
 The velocity is v = (share d + rest (h^2 a + reaction)) / h, see Integrator.velocity_after(). So d grows by the missing velocity
-times h / share. Nothing else of the state changes: particles whose velocity is not changed continue bit for bit, known loads stay
-known, and sound continues to be damped. None of that would hold after a start, the first substep after velocities were set.
+times h / share. Nothing else of the state changes: particles whose velocity is not changed continue bit for bit, which they
+would not after a start, the first substep after velocities were set.
 
 Half of the reaction of the last substep is left in d, and must act on in the next substep. The reaction of links does, since they
 stay. The reaction of contacts and walls may end, if the particle is sent off or friction reverses. Then the particle gets this

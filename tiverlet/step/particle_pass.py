@@ -8,7 +8,6 @@ from ..device import inline, ti
 from ..device.number import OnDevice
 from ..device.thread_team import Team, block, blocks
 from ..features.feature import Batch, Scene
-from ..features.own_weight import WEIGHED
 
 if TYPE_CHECKING:
     from ..colliders.wall_group import WallGroup
@@ -51,7 +50,6 @@ class ParticlePass:
         self.contacts = [contact] if contact else []
         self.acts = self.gathers or bool(contact or walls)
         self.impacts = [scene.impacts] if scene.impacts else []
-        self.weights = [scene.own_weight] if scene.own_weight else []
         self.rough = any(w.has_friction or w.has_restitution for w in walls)
         self.bounces = any(w.has_restitution for w in walls)
         self.turned_by_walls = scene.state.spins and any(w.has_friction for w in walls)
@@ -133,10 +131,6 @@ class ParticlePass:
                 for i in range(first, end):
                     impacts.rigid[i] = 0
         self.integrator.advance(first, end, now)
-        for weights in ti.static(self.weights):
-            if (now.span.since + now.s + 1) % ti.static(WEIGHED) == 0 or now.fresh != 0:
-                for i in range(first, end):
-                    weights.store_weight(i, now)
         for c in ti.static(self.contacts):
             stale, fast = 0, 0
             for i in range(first, end):

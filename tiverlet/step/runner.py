@@ -351,7 +351,7 @@ class Runner:
                 self.set_softness(1.0)
 
     def forget_loads(self, position: np.ndarray) -> None:
-        """Before positions are set: forget the known loads of constraints and contacts that the new positions change."""
+        """Before positions are set: forget the loads of constraints and contacts that the new positions change."""
         violations.forget(self.scene, self.batches, position)
         if self.springs:
             self._forget_springs(self.scene.state.get(self.memory), position)

@@ -130,7 +130,7 @@ class Step:
         self.newton_steps = 2 if scene.slots and scene.slots.refines else 1  # most of them in a pass
         self.orients = self.state.spins and self.state.spin.orients
         keeps = self.contact_pass.remembers or bool(self.breakers)
-        self.finishes = keeps or self.orients or bool(self.wall_logs) or bool(self.constraints.learners)
+        self.finishes = keeps or self.orients or bool(self.wall_logs)
         self.hashes = bool(search)
         self.sleepers = scene.state.sleepers
         self.looks = bool(search) and bool(self.sleepers)  # for contacts between awake and sleeping particles
@@ -479,7 +479,7 @@ class Step:
 
     @ti.func
     def finish_substep(self, now):
-        """Break overloaded constraints, learn loads, store what friction and restitution need, and turn orientations. In the last
+        """Break overloaded constraints, store what friction and restitution need, and turn orientations. In the last
         substep of a frame, walls close their logs of events.
 
         At a start loads act for half a kick, and rigid constraints also supply the kick that velocities lack: see
@@ -489,7 +489,6 @@ class Step:
         h2_rigid = self.integrator.h2_rigid(now.h, now.fresh, ti.cast(now.span.owed, self.real))
         if ti.static(bool(self.breakers)):
             self.break_pass.run(now, h2_rigid, h2_effective)
-        self.constraints.learn(now)
         self.contact_pass.finish(now)
         if ti.static(self.orients):
             for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):

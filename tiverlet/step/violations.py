@@ -16,7 +16,7 @@ from .clock import MET
 from .solids import Solids
 
 SEEN = 1e-3  # of its size: a violation from which on the report says that it was removed
-ENOUGH = 0.2  # of its size: a violation after which known loads are reset
+ENOUGH = 0.2  # of its size: a violation after which loads are reset
 THIN = 1e-3  # of the longest axis: below, a body does not extend along an axis
 ROUNDING = {ti.f32: 8 * 2.0**-24, ti.f64: 8 * 2.0**-53}  # of coordinates: the error of lengths
 
@@ -154,7 +154,7 @@ class Bodies:
 def _borne(scene: Scene, b: Scalar, x: np.ndarray, C: np.ndarray) -> np.ndarray:
     """Return the part -W lam of the violations C, (m,), by which passes bear the load of the last substep."""
     slots = scene.slots
-    W, lam = b.weights(x, scene.memory.read(slots.split)[: len(x)].astype(np.float64)), b.sagging
+    W, lam = b.weights(x, scene.memory.read(slots.split)[: len(x)].astype(np.float64)), b.multipliers
     held = -np.sign(lam) * np.minimum(W * np.abs(lam), np.abs(C))
     if slots.system:  # systems bear loads without violations, but where they give way or are not solved exactly
         soft = (slots.system.gives_way(b) | (slots.sag(b) > 0)) & (lam != 0)
@@ -163,7 +163,7 @@ def _borne(scene: Scene, b: Scalar, x: np.ndarray, C: np.ndarray) -> np.ndarray:
 
 
 def forget(scene: Scene, batches: list[Batch], x: np.ndarray) -> None:
-    """Reset the known loads of constraints whose violation changes, before particles are put to x, (n, dim) [m]."""
+    """Reset the loads of constraints whose violation changes, before particles are put to x, (n, dim) [m]."""
     for b in _rigid(batches):
         if scene.memory.read(b.dev.equation.lam).any():
             old = scene.state.get(scene.memory)
@@ -175,7 +175,6 @@ def _forget(b: Scalar, some: np.ndarray) -> None:
     lam = b.scene.memory.read(b.dev.equation.lam)
     lam[: b.count][some] = 0.0
     b.scene.memory.write(b.dev.equation.lam, lam)
-    b.dev.known.forget(some)
 
 
 def left(batches: list[Batch], x: np.ndarray) -> list[tuple[Batch, np.ndarray]]:

@@ -7,7 +7,6 @@ import numpy as np
 from ...device import always, at, inline, ti
 from ...features.feature import FAR, Scene
 from .equation import Equation
-from .known_load import KnownLoad
 from .passes import Passes
 from .spring import FIRM, stiff
 from .step_limit import TRUST
@@ -48,7 +47,6 @@ class CornerPasses(Passes):
         self.semi_iterates = bool(alone and not (self.side or batch.driven))
         if self.semi_iterates:
             self.step = add(f"{name}.step", m)
-        self.known = KnownLoad(scene, name, batch)
         self.impacts: Any = scene.impacts
         self.stores_left = bool(self.impacts) and self.impacts.leaves  # extra passes leave what the regular ones left
         if self.stores_left:
@@ -72,9 +70,6 @@ class CornerPasses(Passes):
                 self.fill_row(c, violation, A, alpha, lam, W, n, g, turn, moved, share)
         if ti.static(self.has_outside):
             if self.is_outside_systems(c):
-                if ti.static(self.known.learns):
-                    if first != 0:
-                        violation += self.known_violation(c, violation - moved, W, h, h2_effective)
                 step = self.relax_alone(c, violation, A, alpha, lam, W, n, turn, share, first)
         for k in ti.static(range(self.arity)):
             self.corners.write_move(c, k, self.w[self.corners.member(c, k)] * step * n[k, :])
@@ -246,9 +241,6 @@ class CornerPasses(Passes):
         if ti.static(self.semi_iterates):
             self.step[c] = step
         self.equation.lam[c] = new
-        if ti.static(self.known.learns):
-            if new == 0 and (W == 0 or ti.static(self.side != 0)):
-                self.known.drop_load(c)
         return step
 
     @ti.func
@@ -299,34 +291,6 @@ class CornerPasses(Passes):
         return W, free
 
     @ti.func
-    def known_violation(self, c, start, W, h, h2_effective):
-        """Return the violation of the known load of constraint c. start: the violation at the start of the substep."""
-        out = 0 * start
-        if W > 0 and self.spring.is_rigid(c) and not self.equation.has_cusp(c):
-            missing = self.slots.relaxation * start / W
-            if ti.static(self.side != 0):
-                missing = ti.select(self.side * (missing + h2_effective * self.known.load[c]) > 0, missing, 0 * missing)
-            out = -self.known.apply_load(c, missing, h, h2_effective) * W / self.slots.relaxation
-        return out
-
-    @ti.func
-    def weigh_load(self, c):
-        """At the end of a window: call KnownLoad.record_body_load()."""
-        _, g = self.measured(c, 0)
-        _, _, most, _ = self.motion(c, g, 0)
-        own = ti.cast(0, self.real)
-        for k in ti.static(range(self.arity)):
-            own = ti.max(own, self.known.weights.field[self.corners.member(c, k)])
-        self.known.record_body_load(c, most, own)
-
-    @ti.func
-    def learn_load(self, c, h):
-        """After weigh_load(): call KnownLoad.learn()."""
-        _, g = self.measured(c, 0)
-        _, W, _, fastest = self.motion(c, g, 0)
-        self.known.learn(c, h * h * W, self.equation.residual_scale(c), ti.sqrt(fastest))
-
-    @ti.func
     def geometric_stiffness(self, c, W):
         """Return (omega h)^2 of the fastest transverse vibration per multiplier: 4 w / l in a chain of links l, where W = 2 w."""
         out = 2 * W * self.inverse_size[c]
@@ -368,9 +332,6 @@ class CornerPasses(Passes):
         if alone == 0 or not self.is_outside_systems(c):
             W = w
         force = self.equation.spring_force(c, f, self.quantity.unwrap(f0, f), w, W, h, soft)
-        if ti.static(self.known.learns):
-            if self.spring.is_rigid(c):
-                force = -self.known.load[c]
         for k in ti.static(range(self.arity)):
             self.corners.write_move(c, k, h * h * self.w[self.corners.member(c, k)] * force * g[k, :])
 
@@ -399,22 +360,17 @@ class CornerPasses(Passes):
             if self.spring.is_rigid(c):
                 for k in ti.static(range(self.arity)):
                     pull *= ti.select(self.impacts.reached[self.corners.member(c, k)] != 0, 0 * pull, 1 + 0 * pull)
-        if ti.static(self.known.learns):
-            if self.spring.is_rigid(c):
-                pull += ti.select(firm == 0, 0 * firm, soft - firm) * self.known.given[c]
         for k in ti.static(range(self.arity)):
             self.corners.write_move(c, k, self.w[self.corners.member(c, k)] * pull * g[k, :])
 
     @ti.func
     def overload(self, c, h2_rigid, h2_effective):
-        """Return by how much the load, known or summed over substeps, is too large, see Strength."""
+        """Return by how much the load, summed over substeps, is too large, see Strength."""
         lam, w, out = self.equation.lam[c], ti.cast(0, self.real), ti.cast(0, self.real)
         if ti.static(self.spring.soft):
             if h2_rigid > h2_effective:
                 w, _ = self.weights(c, self.measured(c, 0)[1])
         per_newton = self.spring.multiplier_per_newton(c, w, h2_rigid, h2_effective)
-        if ti.static(self.known.learns):
-            lam += (per_newton / h2_effective - 1) * self.known.given[c]
         if self.strength.is_intact(c):
             past, unsure = self.strength.add_excess(c, c, lam, per_newton), 0 * lam
             if past > 0:

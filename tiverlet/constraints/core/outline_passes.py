@@ -8,7 +8,6 @@ from ... import checks
 from ...device import ti
 from ...features.feature import FAR, Knob, Scene
 from .equation import Equation
-from .known_load import KnownLoad
 from .passes import Passes
 
 GOAL = property(lambda f: f.pressure * f.rest, doc="The target values of f, pressure * rest, (m,).")
@@ -31,7 +30,7 @@ class OutlinePasses(Passes):
         self.corners = batch.members.bind(scene, batch)
         self.equation = Equation(scene, batch, self.corners, start)
         self.spring, self.strength, self.limit = self.equation.spring, self.equation.strength, self.equation.limit
-        self.quantity, self.drive, self.known = self.equation.quantity, self.equation.drive, KnownLoad(scene, name, batch)
+        self.quantity, self.drive = self.equation.quantity, self.equation.drive
         self.sums = add(f"{name}.sums", self.corners.block_count, width=8)
         self.start = add(f"{name}.gradient", self.corners.total, width=self.dim)
         self.change = add(f"{name}.change", m)

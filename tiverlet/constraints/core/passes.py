@@ -47,7 +47,7 @@ class Passes:
 
         That is its move in the last substep, and for a spring also the change of its force since, see Spring.force_change().
         firm, soft: h^2 divided by the multiplier of 1 N, for rigid and for soft constraints. With firm = 0, rigid constraints
-        push nothing, not even a known load.
+        push nothing.
         """
 
     @ti.func

@@ -307,13 +307,11 @@ class Scalar(Batch):
         """
         if bears_nothing(self):
             return np.zeros(self.count)
-        memory, missing, factors = self.scene.memory, self.sagging, self.scene.multipliers_per_newton
-        known = memory.read(self.dev.equation.lam)[: self.count] - missing  # velocities contain it, as a spring force
+        memory, factors = self.scene.memory, self.scene.multipliers_per_newton
         scale = per_newton(factors, self.compliance, lambda: self.weights(self.scene.state.get(memory)))
-        return -scale * missing - np.divide(known, factors[1], out=np.zeros(self.count), where=known != 0)
+        return -scale * self.multipliers
 
     @property
-    def sagging(self) -> np.ndarray:
-        """The multipliers of the last substep without known loads, (m,): the load that violations bear."""
-        lam = self.scene.memory.read(self.dev.equation.lam)[: self.count].astype(np.float64)
-        return lam - self.scene.memory.read(self.dev.known.given)[: self.count] if self.dev.known.learns else lam
+    def multipliers(self) -> np.ndarray:
+        """The multipliers of the last substep, (m,)."""
+        return self.scene.memory.read(self.dev.equation.lam)[: self.count].astype(np.float64)
