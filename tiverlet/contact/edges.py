@@ -333,7 +333,7 @@ class Edges:
     @ti.func
     def list_row(self, v: ti.i32, e: ti.i32, begin: ti.i32) -> ti.i32:
         """List the contact of vertex v at entry e if it may press. Returns the next free row."""
-        scale = self.rows.scale()
+        scale = self.rows.scale[None]
         a = self.list.neighbour[e]
         b, row = self.after(a), begin
         moves = self.state.moves(v) or self.state.moves(a)

@@ -20,7 +20,7 @@ back what impulses gave too much of.
 from typing import TYPE_CHECKING, Any
 
 from ..device import ti
-from .limits import APART, FEW, NEAR, NEVER, OWN, SLOP, SLOW, TOGETHER, WHOLE
+from .limits import APART, FEW, NEAR, NEVER, OWN, SLOP, SLOW, TOGETHER
 from .meeting import meeting
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ class Impacts:
             if ti.static(at_first):
                 rests = rests or self.joined.field[row] == TOGETHER
             if rests:
-                least += ti.static(SLOW) * ti.max(self.rows.times[None][WHOLE], 1) * slight
+                least += ti.static(SLOW) * ti.max(self.rows.whole[None], 1) * slight
             returns = e * closing <= ti.max(-f.dot(n), 0) * (1 - then) / 2
             if after >= 0 and (then - 1) * closing <= blur and closing > least and not returns:
                 s = ti.min(then, 1)

@@ -23,39 +23,7 @@ from typing import TYPE_CHECKING, Any
 from ..device import at, inline, ti
 from ..device.number import OnDevice
 from ..features.material import limit_length
-from .limits import (
-    ALLOWED,
-    BETA,
-    BLOCK,
-    BOUNCES,
-    FEW,
-    FORCE,
-    GAINS,
-    GOING,
-    GROUP,
-    HITS,
-    IMPULSES,
-    KINETIC,
-    LACK,
-    LANDING,
-    LOAD,
-    MOVES,
-    OWN,
-    PLACES,
-    RELAXATION,
-    ROUNDS,
-    ROWS,
-    SCALE,
-    SLOW,
-    STRUCK,
-    SUMS,
-    THETA,
-    TOLERANCE,
-    TURN,
-    UPHILL,
-    WORK,
-    WRONG,
-)
+from .limits import BLOCK, FEW, FORCE, GROUP, HITS, KINETIC, LACK, LOAD, OWN, RELAXATION, ROWS, SLOW, SUMS, UPHILL, WORK, WRONG
 
 if TYPE_CHECKING:
     from ..device.thread_team import Team
@@ -67,12 +35,15 @@ ALONE = 1.001  # by what masses are split where a row shares its particles with 
 MET = 0.0005  # of the displacement by forces in a substep: what rows may lack. It adds up over the height of a pile
 PASSES = 20  # most passes of impulses in a substep
 LANDS = 0.2  # of the displacement by forces: where rows lack more after PASSES, something lands
+BOUNCES = 200  # most of them where anything bounces or lands: the impulse has to reach the other end of what touches
 LEAST = 6, 3  # fewest of them, without and with friction: what rests comes to rest down to rounding
 MOMENTUM = 10.0  # Nesterov's theta of the first pass, after about twice as many
 LEFT = 1e-7  # share of the mean square of what rows lack in the first pass that may be left, where no forces act
 ERROR = 0.002  # of the kinetic energy of all: the energy that may be wrong after a bounce
 ROUNDING = 0.1  # of what rows may lack: times the impulses, the work that they may do
+MOVES = 8  # most passes of places in a substep
 SHARE = 1.2  # of an overlap that a pass of places moves, by masses split by the largest eigenvalue; below 4/3
+ROUNDS, IMPULSES, PLACES = range(3)  # kinds of passes: of impacts in turn, of stage 1, of stage 2
 
 
 class Impulses:
@@ -92,8 +63,15 @@ class Impulses:
         self.groups: Any = (
             add("Contact.sums_of_groups", -(-max(1, self.blocks) // GROUP), width=len(SUMS)) if team.launched else None
         )
-        self.numbers = add("Contact.passes", None, width=5)
-        self.flags = add("Contact.flags", None, width=4, kind=ti.i32)
+        # Of the passes: how far the next one extrapolates, with Nesterov's theta; what rows may lack, and what they lack in
+        # impacts; and work per impulse that is rounding [m].
+        self.beta, self.theta, self.tolerance, self.landing, self.allowed = (
+            add(f"Contact.{name}", None) for name in ("beta", "theta", "tolerance", "landing", "allowed")
+        )
+        # Whether another pass follows, its number, whether any particle gains energy or is moved, and whether anything bounces.
+        self.going, self.turn, self.gains, self.strikes = (
+            add(f"Contact.{name}", None, kind=ti.i32) for name in ("going", "turn", "gains", "strikes")
+        )
         # Rounds, passes of impulses and of places that a substep of a frame took at most.
         self.most: Any = add("Contact.most", None, width=3, kind=ti.i32) if team.launched else None
         self.last_h2 = add("Contact.last_h2", None, state=True)  # h^2 of what rows bore [s^2]; 0 before the first substep
@@ -104,25 +82,15 @@ class Impulses:
         self.memory.resize(self.sums, max(1, self.blocks))
 
     @inline
-    def going(self):
-        """Return 1 while passes go on, else 0."""
-        return at(at(self.flags, None), GOING)
-
-    @inline
     def struck(self):
         """Return 1 if anything bounces in the substep, else 0."""
-        return at(at(self.flags, None), STRUCK) if self.rows.bounces else 0
+        return at(self.strikes, None) if self.rows.bounces else 0
 
     @ti.func
     def note_turn(self, k: ti.template(), turn):  # type: ignore[valid-type]
         """On the launched path: note how many passes of a kind this substep took so far."""
         if ti.static(self.team.launched):
             self.most[None][k] = ti.max(self.most[None][k], turn)
-
-    @inline
-    def moving(self):
-        """Return 1 if the last pass of stage 2 moves anything, else 0."""
-        return at(at(self.flags, None), GAINS)
 
     @ti.func
     def note(self, i, k: ti.template(), value):  # type: ignore[valid-type]
@@ -148,9 +116,10 @@ class Impulses:
         if before > 0:
             scale = h2 / before
         self.last_h2[None] = h2
-        whole, shares = h2 / (now.h * now.h), self.rows.spin_shares()
-        self.rows.times[None] = [now.h, now.frame_fraction[0], now.frame_fraction[1], scale, whole, shares]
-        self.flags[None] = [1, 0, 0, 0]
+        self.rows.h[None], self.rows.scale[None], self.rows.whole[None] = now.h, scale, h2 / (now.h * now.h)
+        self.rows.frame_fraction[None] = [now.frame_fraction[0], now.frame_fraction[1]]
+        self.rows.turn_shares[None] = self.rows.spin_shares()
+        self.going[None], self.strikes[None] = 1, 0
 
     @ti.func
     def prepare(self, i, part):
@@ -282,7 +251,7 @@ class Impulses:
     def relax(self, i, part):
         """One pass over a part of the rows of particle i. Returns what they lack, how far they go uphill, what they
         bear, and wrong()."""
-        beta = self.numbers[None][BETA]
+        beta = self.beta[None]
         v, p_own, m_own = self.bodies.v[i], 0 * self.state.d[i], self.no_moment()
         s_own = self.no_moment()
         if ti.static(self.bodies.spins):
@@ -384,13 +353,13 @@ class Impulses:
         """Before the first pass: no extrapolation, and what rows may lack. One thread calls it."""
         rows, force = self.total(ROWS), self.total(FORCE)  # the sum over rows of the squared displacement by forces
         met, lands = ti.static(MET * MET) * force + self.total(LOAD), ti.static(LANDS * LANDS) * force
-        self.numbers[None] = [0, ti.static(MOMENTUM), met, lands, 0]
-        self.flags[None][GOING], self.flags[None][TURN] = ti.cast(rows > 0, ti.i32), 0
+        self.beta[None], self.theta[None], self.tolerance[None], self.landing[None] = 0, ti.static(MOMENTUM), met, lands
+        self.going[None], self.turn[None] = ti.cast(rows > 0, ti.i32), 0
 
     @ti.func
     def momentum(self):
         """Return how far the next pass extrapolates, and the theta after it (Nesterov)."""
-        theta = self.numbers[None][THETA]
+        theta = self.theta[None]
         ahead = (1 + ti.sqrt(1 + 4 * theta * theta)) / 2
         return (theta - 1) / ahead, ahead
 
@@ -398,50 +367,50 @@ class Impulses:
     def decide(self):
         """Decide after a pass whether another one follows, and how far it extrapolates. One thread calls it."""
         lack, uphill = self.total(LACK), self.total(UPHILL)
-        turn = self.flags[None][TURN] + 1
+        turn = self.turn[None] + 1
         if turn == 1:
-            self.numbers[None][TOLERANCE] = ti.max(self.numbers[None][TOLERANCE], ti.static(LEFT) * lack)
+            self.tolerance[None] = ti.max(self.tolerance[None], ti.static(LEFT) * lack)
         beta, ahead = self.momentum()
         if uphill > 0:
             beta, ahead = 0 * beta, 1 + 0 * ahead
-        self.numbers[None][BETA], self.numbers[None][THETA] = beta, ahead
-        self.flags[None][TURN] = turn
+        self.beta[None], self.theta[None] = beta, ahead
+        self.turn[None] = turn
         self.note_turn(IMPULSES, turn)
-        most = ti.select(lack > self.numbers[None][LANDING], BOUNCES, PASSES)
-        goes_on = turn < most and lack > self.numbers[None][TOLERANCE]
+        most = ti.select(lack > self.landing[None], BOUNCES, PASSES)
+        goes_on = turn < most and lack > self.tolerance[None]
         if ti.static(self.rows.bounces and not self.rows.impacts):  # else rounds have done it
-            if self.flags[None][STRUCK] != 0 and self.total(WRONG) > ti.static(ERROR) * self.total(KINETIC):
+            if self.strikes[None] != 0 and self.total(WRONG) > ti.static(ERROR) * self.total(KINETIC):
                 goes_on = turn < BOUNCES
-        self.flags[None][GOING] = ti.cast((goes_on or turn < self.least) and self.total(ROWS) > 0, ti.i32)
+        self.going[None] = ti.cast((goes_on or turn < self.least) and self.total(ROWS) > 0, ti.i32)
 
     @ti.func
     def start_places(self):
         """Before the first pass of stage 2. One thread calls it."""
-        self.numbers[None] = [0, 1, 0, 0, 0]
-        self.flags[None] = [ti.cast(self.total(ROWS) > 0, ti.i32), 0, 0, 0]
+        self.beta[None], self.theta[None] = 0, 1
+        self.going[None], self.turn[None] = ti.cast(self.total(ROWS) > 0, ti.i32), 0
 
     @ti.func
     def decide_places(self):
         """Decide after a pass of stage 2 whether it moves anything, and whether another one follows. One thread calls it."""
-        turn = self.flags[None][TURN] + 1
-        self.numbers[None][BETA], self.numbers[None][THETA] = self.momentum()
+        turn = self.turn[None] + 1
+        self.beta[None], self.theta[None] = self.momentum()
         moves = ti.cast(self.total(LACK) > 0, ti.i32)
         self.note_turn(PLACES, turn)
-        self.flags[None] = [ti.select(turn < MOVES, moves, 0), turn, moves, 0]
+        self.going[None], self.turn[None], self.gains[None] = ti.select(turn < MOVES, moves, 0), turn, moves
 
     @ti.func
     def check_work(self):
         """Find whether any particle gains energy beyond rounding. One thread calls it."""
-        allowed = ti.static(ROUNDING) * ti.sqrt(self.numbers[None][TOLERANCE] / ti.max(self.total(ROWS), 1))
-        self.numbers[None][ALLOWED] = allowed
-        self.flags[None][GAINS] = ti.cast(self.total(WORK) > allowed * self.total(LOAD), ti.i32)
+        allowed = ti.static(ROUNDING) * ti.sqrt(self.tolerance[None] / ti.max(self.total(ROWS), 1))
+        self.allowed[None] = allowed
+        self.gains[None] = ti.cast(self.total(WORK) > allowed * self.total(LOAD), ti.i32)
 
     @ti.func
     def check_hits(self):
         """Find whether anything bounces. One thread calls it."""
         hits = ti.cast(self.total(HITS) > 0, ti.i32)
-        self.flags[None][STRUCK], self.flags[None][GOING], self.flags[None][TURN] = hits, hits, 0
-        self.numbers[None][TOLERANCE] = 0
+        self.strikes[None], self.going[None], self.turn[None] = hits, hits, 0
+        self.tolerance[None] = 0
 
     @ti.func
     def decide_round(self):
@@ -449,14 +418,14 @@ class Impulses:
 
         What is left where energy is lost, and is little beside all before, is left to the passes. One thread calls it.
         """
-        turn = self.flags[None][TURN] + 1
+        turn = self.turn[None] + 1
         self.note_turn(ROUNDS, turn)
         work = self.total(WORK)
-        done = self.numbers[None][TOLERANCE] + work
+        done = self.tolerance[None] + work
         goes_on = work > ti.static(ERROR) * done or self.total(LACK) > 0
-        self.numbers[None][TOLERANCE] = done
-        self.flags[None][GOING], self.flags[None][TURN] = ti.cast(goes_on and turn < BOUNCES, ti.i32), turn
-        self.flags[None][GAINS] = ti.cast(self.total(UPHILL) > 0, ti.i32)
+        self.tolerance[None] = done
+        self.going[None], self.turn[None] = ti.cast(goes_on and turn < BOUNCES, ti.i32), turn
+        self.gains[None] = ti.cast(self.total(UPHILL) > 0, ti.i32)
 
     @ti.func
     def total(self, k: ti.template()):  # type: ignore[valid-type]
@@ -505,7 +474,7 @@ class Impulses:
         A load is what a row bore before, but for what forces may change in a substep and a small part; an impact passes.
         """
         p_own, m_own = 0 * self.state.d[i], self.no_moment()
-        scale, weight, pressed = self.rows.times[None][SCALE], self.weight(i), self.rows.pressed[i]
+        scale, weight, pressed = self.rows.scale[None], self.weight(i), self.rows.pressed[i]
         for row in range(self.rows.first(i, part), self.rows.last(i, part)):
             n = self.rows.normal.field[row]
             p, before = self.rows.p.field[row], self.rows.memory.field[self.rows.entry.field[row]]
@@ -559,7 +528,7 @@ class Impulses:
             e, p = self.rows.entry.field[row], self.rows.p.field[row]
             if ti.static(self.rows.bounces):
                 n = self.rows.normal.field[row]
-                load, size = self.rows.times[None][SCALE] * self.rows.along(self.rows.memory.field[e], n), self.rows.along(p, n)
+                load, size = self.rows.scale[None] * self.rows.along(self.rows.memory.field[e], n), self.rows.along(p, n)
                 bounces = self.rows.bounced(row)
                 self.rows.given.field[e] = size + self.rows.hit(row)
                 self.rows.touched.field[e] = ti.cast(not bounces and (self.rows.gap.field[row] == 0 or size > 0), ti.i32)

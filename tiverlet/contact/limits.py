@@ -10,15 +10,8 @@ AHEAD = 0.15  # of the smaller radius, or the median: pairs so near are rows alr
 CLOSE = 2.0**-7  # of AHEAD radii: by how much links may be violated before places move them together
 BLOCK = 64  # particles whose sums are added up first, so that sums have the same order on any number of threads
 GROUP = 64  # blocks whose sums are added up first
-BOUNCES = 200  # most passes of impulses where anything bounces or lands: the impulse has to reach the other end of what touches
-MOVES = 8  # most passes of places in a substep
 
 FOREIGN, OWN = range(2)  # parts of the rows of a particle: those that a particle of a lower piece has, too, and its own
-H, BEGIN, END, SCALE, WHOLE, SHARES = TIMES = range(6)  # what rows know of a substep, see Rows.times
 NEVER = 3.0  # a time after the substep
 APART, NEAR, TOGETHER = range(3)  # what rows are before impacts in turn: near ones go on together, unless they meet by themselves
 LACK, UPHILL, WORK, LOAD, ROWS, FORCE, HITS, WRONG, KINETIC = SUMS = range(9)  # sums over rows and particles
-# Numbers of the passes. LANDING: what rows lack in impacts. ALLOWED: work per impulse that is rounding [m]
-BETA, THETA, TOLERANCE, LANDING, ALLOWED = range(5)
-GOING, TURN, GAINS, STRUCK = range(4)  # whether another pass follows, its number, whether any particle gains energy, or bounces
-ROUNDS, IMPULSES, PLACES = range(3)  # kinds of passes: of impacts in turn, of stage 1, of stage 2

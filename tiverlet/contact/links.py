@@ -179,7 +179,7 @@ class Links:
             self.most[r] = ti.min(-lam, self.most[r])
         elif ti.static(batch.side < 0):
             self.least[r] = ti.max(-lam, self.least[r])
-        mu = batch.dev.equation.answered[c] * self.rows.scale()
+        mu = batch.dev.equation.answered[c] * self.rows.scale[None]
         if self.is_alone(batch, c):
             mu -= lam
         mu = ti.min(ti.max(mu, self.least[r]), self.most[r])

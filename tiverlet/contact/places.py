@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from ..device import ti
 from ..neighbours.neighbour_list import WALL
-from .limits import BEYOND, OWN, SLOP, TURN
+from .limits import BEYOND, OWN, SLOP
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
@@ -41,7 +41,7 @@ class Places:
         """
         out, total = ti.cast(0, self.real), 0 * self.state.d[i]
         kept, pressed, own = self.rows.kept[i], self.rows.pressed[i], self.rows.size(i)
-        again = self.impulses.flags[None][TURN] > 0
+        again = self.impulses.turn[None] > 0
         still = again and (self.bodies.last[i] == 0).all()
         for row in range(self.rows.first(i, part), self.rows.last(i, part)):
             other = self.rows.other.field[row]

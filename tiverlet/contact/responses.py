@@ -3,7 +3,6 @@
 from typing import TYPE_CHECKING, Any
 
 from ..device import at, inline, ti
-from .limits import SHARES
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
@@ -71,7 +70,7 @@ class Responses:
         """Return the same for tangential impulses at the point of contact of particle i [1/kg]."""
         out = self.split(i)
         if ti.static(self.spins):  # moments against rolling share the spin
-            out += self.rows.share[i] * (self.compliance(i) * self.rows.times[None][SHARES] * self.spin.inverse_inertia[i])
+            out += self.rows.share[i] * (self.compliance(i) * self.rows.turn_shares[None] * self.spin.inverse_inertia[i])
         return out
 
     @ti.func

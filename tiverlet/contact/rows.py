@@ -18,7 +18,7 @@ from ..features.material import DYNAMIC, RESTITUTION, ROLLING, STATIC, TANGENTIA
 from ..neighbours.neighbour_list import WALL
 from ..neighbours.pair_data import Column, PairData
 from .impacts import Impacts
-from .limits import AHEAD, BEGIN, BEYOND, END, FEW, FOREIGN, OWN, SCALE, SLOP, SLOW, TIMES, TOGETHER, WHOLE, H
+from .limits import AHEAD, BEYOND, FEW, FOREIGN, OWN, SLOP, SLOW, TOGETHER
 from .meeting import meeting
 
 if TYPE_CHECKING:
@@ -109,9 +109,10 @@ class Rows:
             self.arms, self.rolling, self.turn_stiff = (self.column(name, 2) for name in ("arms", "rolling", "turn_stiff"))
             self.across = self.column("across", self.dim)  # tangential displacement that the points which touch aim at [m]
         self.divided = (team.size > 1 or team.launched) and not edges
-        # H: the substep [s]. BEGIN, END: the fractions of the frame at its ends. SCALE: by how much what rows bore is scaled.
-        # WHOLE: the part of State.kick() that the substep adds to displacements. SHARES: spin_shares().
-        self.times = add("Contact.times", None, width=len(TIMES))
+        # Of the substep: its length [s]; the fractions of the frame at its ends; by how much what rows bore is scaled;
+        # the part of State.kick() that it adds to displacements; and spin_shares().
+        self.h, self.frame_fraction = add("Contact.h", None), add("Contact.frame_fraction", None, width=2)
+        self.scale, self.whole, self.turn_shares = (add(f"Contact.{name}", None) for name in ("scale", "whole", "turn_shares"))
         self.list: Any = None
         self.geometry: Any = None
 
@@ -164,16 +165,6 @@ class Rows:
         return p != 0
 
     @inline
-    def h(self):
-        """Return the length of the substep [s]."""
-        return at(at(self.times, None), H)
-
-    @inline
-    def scale(self):
-        """Return by how much impulses of the last substep are scaled to be loads in this one."""
-        return at(at(self.times, None), SCALE)
-
-    @inline
     def first(self, i, part):
         """Return the first row of a part of the rows of particle i: FOREIGN, those that lower pieces have, too, or OWN."""
         return ti.select(part == FOREIGN, at(self.begin, i), at(self.own, i)) if self.divided else at(self.own, i)
@@ -189,14 +180,9 @@ class Rows:
         return FOREIGN if self.divided else OWN
 
     @ti.func
-    def frame_fraction(self):
-        """Return the fractions of the frame at the start and the end of the substep."""
-        return ti.Vector([self.times[None][BEGIN], self.times[None][END]])
-
-    @ti.func
     def kick(self, i):
         """Return the displacement that forces add to particle i in the substep [m]."""
-        return self.times[None][WHOLE] * self.state.kick(i)
+        return self.whole[None] * self.state.kick(i)
 
     @ti.func
     def relative(self, u, d: ti.template(), i, other, row, pressed):  # type: ignore[valid-type]
@@ -285,7 +271,7 @@ class Rows:
     @ti.func
     def find(self, i, begin, end, row):
         """List the rows of particle i from `row` on. begin, end: of its piece. Returns the row behind the last."""
-        scale = self.times[None][SCALE]
+        scale = self.scale[None]
         self.begin[i] = row
         if ti.static(bool(self.edges)):
             row = self.find_edges(i, row)
@@ -486,7 +472,7 @@ class Rows:
             s, m = meeting(gap, bend, way, 0 * u, v, f, ti.cast(1, self.real), ti.cast(0, self.real))
             met = -(v + f * s).dot(m)
             blur = self.rounding * (u.norm() + ti.sqrt(size) * ti.static(2.0**-7))
-            least = ti.static(SLOW) * ti.max(self.times[None][WHOLE], 1) * f_own.norm() + blur
+            least = ti.static(SLOW) * ti.max(self.whole[None], 1) * f_own.norm() + blur
             rests = e * met <= ti.max(-f.dot(m), 0) * (1 - s) / 2
             hit = 0 <= s and (s - 1) * met <= blur and gap >= -met and met > least and not rests
             s = ti.min(s, 1)
@@ -572,7 +558,7 @@ class Rows:
         for group, w in ti.static([(g, g.wall) for g in self.walls]):
             if group.has_face(face):
                 group.enter(group.wall_of(face))
-                gap, n, bend, moved = w.gap(group.side_of(face), i, self.radius.of(i), self.frame_fraction(), True)
+                gap, n, bend, moved = w.gap(group.side_of(face), i, self.radius.of(i), self.frame_fraction[None], True)
                 u = self.state.d[i] - moved
                 un = u.dot(n)
                 ahead = gap + un
@@ -607,7 +593,7 @@ class Rows:
                     self.put(row, face + WALL, e, n, gap, bend, p * scale)
                     if ti.static(w.dev.surface.has_velocity):
                         belt = w.dev.surface.velocity[None]
-                        along = self.h() * (belt - belt.dot(n) * n)
+                        along = self.h[None] * (belt - belt.dot(n) * n)
                         moved += along
                         if ti.static(self.belts):
                             self.impacts.belt.field[row] = along
@@ -681,12 +667,12 @@ class Rows:
             for group in ti.static(self.logging):
                 if group.has_face(side):
                     push = p * self.state.w[i]
-                    group.wall.dev.log.record(i, -(self.gap.field[row] + ahead), n, push, -ahead, moved, self.h(), False)
+                    group.wall.dev.log.record(i, -(self.gap.field[row] + ahead), n, push, -ahead, moved, self.h[None], False)
 
     @ti.func
     def most_parting(self, radius, push_out):
         """Return by how much what overlaps may part in the substep [m]. radius: the smaller one; a point has none."""
-        return ti.select(push_out < 0, ti.select(radius > 0, ti.static(QUARTER) * radius, self.ahead), push_out * self.h())
+        return ti.select(push_out < 0, ti.select(radius > 0, ti.static(QUARTER) * radius, self.ahead), push_out * self.h[None])
 
     @ti.func
     def depth_in_walls(self, i):
@@ -705,6 +691,6 @@ class Rows:
         for group, w in ti.static([(g, g.wall) for g in self.walls]):
             if group.has_face(face):
                 group.enter(group.wall_of(face))
-                gap, n, _bend, _moved = w.gap(group.side_of(face), i, self.radius.of(i), self.frame_fraction(), False)
+                gap, n, _bend, _moved = w.gap(group.side_of(face), i, self.radius.of(i), self.frame_fraction[None], False)
                 push_out = w.dev.surface.push_out[None]
         return gap, n, push_out

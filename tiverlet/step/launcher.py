@@ -4,7 +4,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from ..contact.limits import BOUNCES, GOING, IMPULSES, MOVES, PLACES, ROUNDS
+from ..contact.impulses import BOUNCES, IMPULSES, MOVES, PLACES, ROUNDS
 from ..device.language import template
 from .span import LISTS, MOST, Moment, Span
 
@@ -170,7 +170,7 @@ class Launcher:
             self.flush()
             done += more
             more = min(done, MANY[what] - done) if self.taken[what] > self.few[what] else 0
-            if more and not self.runner.memory.read(self.rows.impulses.flags)[..., GOING].any():
+            if more and not self.runner.memory.read(self.rows.impulses.going).any():
                 return
 
     def passes(self, what: int) -> int:

@@ -4,27 +4,8 @@ from typing import TYPE_CHECKING, Any
 
 from ..constraints.core.spring import RESTARTED
 from ..contact.islands import ALL, BOUNCING, PRESSING
-from ..contact.limits import (
-    ALLOWED,
-    BETA,
-    BLOCK,
-    DIGIT,
-    FORCE,
-    GAINS,
-    GROUP,
-    HITS,
-    KINETIC,
-    LACK,
-    LOAD,
-    OWN,
-    ROWS,
-    STRUCK,
-    TURN,
-    UPHILL,
-    WORK,
-    WRONG,
-)
-from ..device import called, inline, ti
+from ..contact.limits import BLOCK, DIGIT, FORCE, GROUP, HITS, KINETIC, LACK, LOAD, OWN, ROWS, UPHILL, WORK, WRONG
+from ..device import at, called, inline, ti
 from ..device.number import OnDevice
 
 if TYPE_CHECKING:
@@ -75,16 +56,16 @@ class RowPass:
     @ti.func
     def solve_rows(self, thread: ti.i32, final: ti.i32, tick: ti.i32):
         """Stages 1 and 2."""
-        while self.impulses.going() != 0:
+        while self.impulses.going[None] != 0:
             self.relax_impulses(thread)
         self.finish_impulses(thread, final, tick)
-        while self.impulses.going() != 0:
+        while self.impulses.going[None] != 0:
             self.relax_places(thread)
 
     @inline
     def going(self):
         """Return 1 while passes go on, else 0: how often a loop of a pass runs."""
-        return self.impulses.going() if self.team.launched else 1
+        return at(self.impulses.going, None) if self.team.launched else 1
 
     @ti.func
     def find_rows(self, now):
@@ -169,7 +150,7 @@ class RowPass:
             begin, end = self.particles.piece(k, thread)
             for part in range(self.rows.parts(), OWN + 1):
                 for i in range(begin, end):
-                    self.impacts.look(i, part, self.impulses.flags[None][TURN])
+                    self.impacts.look(i, part, self.impulses.turn[None])
         self.team.wait()
         n = self.n * self.going()
         self.look_at_bodies(thread, n)
@@ -180,7 +161,7 @@ class RowPass:
         for _ in range(self.team.one(1, thread) * self.going()):
             self.impulses.decide_round()
         self.team.wait()
-        shared = 1 if ti.static(self.answers_later) else self.impulses.flags[None][GAINS]
+        shared = 1 if ti.static(self.answers_later) else self.impulses.gains[None]
         self.find_islands(thread, n * shared, BOUNCING)
         self.find_scales(thread, n * shared, self.impulses.blocks * ti.cast(n > 0, ti.i32) * shared, BOUNCING)
         ti.loop_config(serialize=self.islands.serial)
@@ -188,7 +169,7 @@ class RowPass:
             scale = ti.cast(2, self.real)
             if shared != 0:
                 scale = self.islands.scale[self.islands.root_of(i)]
-            self.impacts.apply(i, self.impulses.flags[None][TURN], scale, self.bodies)
+            self.impacts.apply(i, self.impulses.turn[None], scale, self.bodies)
         self.team.wait()
 
     @ti.func
@@ -243,7 +224,7 @@ class RowPass:
     @ti.func
     def strike_all(self, thread: ti.i32):
         """All rounds of impacts in turn."""
-        while self.impulses.going() != 0:
+        while self.impulses.going[None] != 0:
             self.strike(thread)
 
     @ti.func
@@ -350,7 +331,7 @@ class RowPass:
     @ti.func
     def aim(self, thread):
         """Find the times of impacts, and what bouncing rows aim at."""
-        n = self.n * self.impulses.flags[None][STRUCK]
+        n = self.n * self.impulses.strikes[None]
         if ti.static(self.in_turn):
             for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                 self.impacts.settle(i)
@@ -390,14 +371,14 @@ class RowPass:
             self.islands.add_up(b, which)
         self.team.wait()
         for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-            self.islands.find_scale(i, self.impulses.numbers[None][ALLOWED], which)
+            self.islands.find_scale(i, self.impulses.allowed[None], which)
         self.team.wait()
 
     @ti.func
     def scale_islands(self, thread):
         """Scale the impulses of islands that gain energy, if any particle does."""
-        n = self.n * self.impulses.flags[None][GAINS]
-        blocks = self.impulses.blocks * self.impulses.flags[None][GAINS]
+        n = self.n * self.impulses.gains[None]
+        blocks = self.impulses.blocks * self.impulses.gains[None]
         self.find_islands(thread, n, PRESSING)
         self.find_scales(thread, n, blocks, PRESSING)
         ti.loop_config(serialize=self.islands.serial)
@@ -460,7 +441,7 @@ class RowPass:
         if ti.static(bool(self.answers)):
             n = self.answers.links.n * self.going()
             for r in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-                self.answers.links.relax(r, self.bodies, self.impulses.numbers[None][BETA])
+                self.answers.links.relax(r, self.bodies, self.impulses.beta[None])
             self.team.wait()
         self.relax_rows(thread, OF_PASS)
         self.gather(thread, self.n * self.going())
@@ -470,9 +451,9 @@ class RowPass:
         for _ in range(self.team.one(1, thread) * self.going()):
             self.impulses.decide()
         self.team.wait()
-        n = self.n * self.impulses.going()
+        n = self.n * self.impulses.going[None]
         for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-            self.bodies.extrapolate(i, self.impulses.numbers[None][BETA])
+            self.bodies.extrapolate(i, self.impulses.beta[None])
         self.team.wait()
 
     @ti.func
@@ -490,7 +471,7 @@ class RowPass:
             self.impulses.check_work()
         self.team.wait()
         self.scale_islands(thread)
-        sums = ti.cast(final != 0 or self.impulses.flags[None][STRUCK] != 0, ti.i32)
+        sums = ti.cast(final != 0 or self.impulses.strikes[None] != 0, ti.i32)
         for k in range(self.particles.piece_count(thread) * sums):
             begin, end = self.particles.piece(k, thread)
             for part in range(self.rows.parts(), OWN + 1):
@@ -529,10 +510,10 @@ class RowPass:
         for _ in range(self.team.one(1, thread) * self.going()):
             self.impulses.decide_places()
         self.team.wait()
-        going *= self.impulses.moving()
+        going *= self.impulses.gains[None]
         n = self.n * going
         for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-            self.places.move(i, self.impulses.numbers[None][BETA])
+            self.places.move(i, self.impulses.beta[None])
         self.team.wait()
         if ti.static(self.answers_later):
             self.move_answers(thread, going, False)

@@ -6,7 +6,7 @@ from ..device import at, inline, record, ti
 
 BEFORE = -1  # the `half` of a substep that has not begun
 ENDLESS = 1 << 20  # substeps of a frame in which nothing comes nearer to its target, and each substep counts as a frame
-LISTS = -1  # what a frame stopped for; where phases are launched, it may be more passes of a kind, see contact/limits.py
+LISTS = -1  # what a frame stopped for; where phases are launched, it may be more passes of a kind, see contact/impulses.py
 
 
 @record

@@ -8,7 +8,7 @@ the integrator.
 
 from typing import TYPE_CHECKING, Any
 
-from ..contact.limits import IMPULSES, PLACES, ROUNDS
+from ..contact.impulses import IMPULSES, PLACES, ROUNDS
 from ..device import called, runtime, ti
 from ..device.number import OnDevice, read_all
 from ..device.thread_team import LEAST, Team

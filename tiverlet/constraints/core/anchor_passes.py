@@ -121,7 +121,7 @@ class AnchorPasses(Passes):
         i, place = self.corners.member(c, 0), self.corners.places[c][0]
         if place >= 0:
             answer, impulse = self.slots.answer[place], self.slots.answer[place] / self.w[i]
-            change = (answer - rows.scale() * self.answered[c]).norm()
+            change = (answer - rows.scale[None] * self.answered[c]).norm()
             self.answered[c] = answer
             self.blow[c] = ti.select(rows.is_steady(change, answer.norm(), rows.kick(i).norm()), 0 * impulse, impulse)
             self.lam[c] = self.lam[c] + impulse

@@ -325,7 +325,7 @@ class ClusterPasses(Passes):
             i, place = self.corners.members[e], self.corners.places[e]
             if place >= 0:
                 answer, m = self.slots.answer[place], 1 / self.w[i]
-                change += m * (answer - rows.scale() * self.answered[e]).norm()
+                change += m * (answer - rows.scale[None] * self.answered[e]).norm()
                 size += m * answer.norm()
                 slight += m * rows.kick(i).norm()
         for e in range(self.corners.starts[c], self.corners.starts[c + 1]):

@@ -145,7 +145,7 @@ class CornerPasses(Passes):
                     weight += self.w[i] * g.dot(g)
                     slight += g.norm() * rows.kick(i).norm()
             mu = ti.cast(self.slots.system.answer[self.row[c]], self.real)
-            self.equation.take_answer(c, mu, rows.scale() * self.equation.answered[c], weight, slight, rows)
+            self.equation.take_answer(c, mu, rows.scale[None] * self.equation.answered[c], weight, slight, rows)
 
     @ti.func
     def motion(self, c, n, together):
