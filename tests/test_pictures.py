@@ -502,6 +502,8 @@ def test_wrong_colours_are_refused(color, kind, text):
 
 def test_a_recorder_needs_the_quantity_that_it_shows(tmp_path):
     with rising() as w:
+        with pytest.warns(UserWarning, match="'speeed' has to be given to each log.*; did you mean 'speed'"):
+            tv.Recorder(tmp_path / "c.rrd", w, color="speeed")._closing()
         with tv.Recorder(tmp_path / "a.rrd", w, color=("heat", 0, 1)) as recorder:
             with pytest.raises(ValueError, match=r"'heat' is neither one of speed, .* Write recorder.log\(\*\*{'heat': ...}"):
                 recorder.log(heat=3.0)

@@ -336,7 +336,8 @@ OTHER, FAN = tv.HalfSpace((0, 1)), (np.zeros((3, 2)), np.ones((2, 2)))
     (lambda w: w.inside(tv.Mesh(CUBE, FACES)), "Mesh is for 3D, but the particles are in 2D"),
     (lambda w: w.inside(tv.Ball((0, 0), 1.0), "half"), "part = 'half', but it must be one of 'center', 'whole', 'touching'"),
     (lambda w: w.near([(0, 0)], -1.0), r"radius\[0\] = -1"),
-    (lambda w: w.nearest(np.zeros((3, 3))), "points has shape"),
+    (lambda w: w.nearest(np.zeros((3, 3))), "points has shape .* one row per point.$"),
+    (lambda w: w.near((0, 0), 1.0), r"one row per point; write \[\(0.0, 0.0\)\]"),
 ])  # fmt: skip
 def test_questions_that_make_no_sense_are_refused(world, ask, pattern):
     w = world(tv.Particles([(0, 0), (1, 0)], radius=0.1), [tv.Gravity()])

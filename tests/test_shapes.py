@@ -247,7 +247,7 @@ def test_boxes_have_their_size_and_even_sides(size):
         (lambda: S.box((0, 0), (1, 0.2), 0.1), r"box: size\[1\] = 0.2, but it must be above 0.2"),
         (lambda: S.truss((0, 0), (1, -1), 2), r"upper\[1\] = -1"),
         (lambda: S.truss((0, 0), (1, 1), (1, 2, 3)), r"cells = \(1, 2, 3\), but one number"),
-        (lambda: S.pile((0, 0), (1, 1), (1, 2, 3)), r"radius = \(1, 2, 3\), but a number"),
+        (lambda: S.pile((0, 0), (1, 1), (1, 2, 3)), r"radius has shape \(3,\), but a number"),
         (lambda: S.pile((0, 0), (1, 1), 2.0), "no particle of radius 2 fits"),
         (lambda: S.pile((0, 0), (1, 1), (0.2, 0.1)), "smallest comes first"),
         (lambda: S.tree((0, 0), 1.0, levels=0), "levels = 0"),

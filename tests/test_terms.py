@@ -38,7 +38,8 @@ def test_every_term_of_others_is_answered(scene):
     # Where it is read of what users hold, and where it is given to what they call.
     link, contact, wall = scene.features[1:]
     read = {
-        "tiverlet": tv, "tiverlet.measure": tv.measure, "World": scene, "Worlds": tv.Worlds(scene, 2),
+        "tiverlet": tv, "tiverlet.measure": tv.measure, "tiverlet.shapes": tv.shapes,
+        "World": scene, "Worlds": tv.Worlds(scene, 2),
         "Particles": scene.particles, "Feature": scene.features[0], "Batch": link, "Collider": wall, "PairContact": contact,
         "StepReport": scene.last, "Contacts": scene.contacts, "Hits": scene.ray((5.0, 5.0), (0, -1)),
         "Shape": tv.shapes.rope((0, 0), (1, 0), 3),
@@ -67,7 +68,9 @@ def test_every_term_of_others_is_answered(scene):
         (lambda w: tv.Distnace, AttributeError, "did you mean 'Distance'"),
         (lambda w: w.GetPosition, AttributeError, "did you mean 'position'"),
         (lambda w: tv.shapes.Rope, AttributeError, "did you mean 'rope'"),
+        (lambda w: tv.shapes.circle, AttributeError, "a filled one is ball"),
         (lambda w: setattr(w, "gravity", (0, -1)), AttributeError, "cannot be set; it is a feature"),
+        (lambda w: setattr(w, "mass", 3), AttributeError, "cannot be set; make tv.Particles for a new world. Live are"),
         (lambda w: setattr(w.features[1], "stiffness", 5.0), AttributeError, "write compliance = 1 / stiffness. Live are"),
         (lambda w: tv.World(w.particles, sub_steps=4), TypeError, "did you mean 'substeps'"),
         (
@@ -97,7 +100,7 @@ def test_an_error_inside_of_a_call_stays_what_it_is(scene):
 OWNERS: dict[str, Any] = {
     "Feature": Feature, "Batch": Batch, "PairContact": PairContact, "Contacts": Contacts, "Touches": Touches, "Hits": Hits,
     "Replay": Replay, "tiverlet": tv,
-    "tiverlet.measure": tv.measure, "Collider": tv.Box.__mro__[2], "Shape": tv.shapes.Shape,
+    "tiverlet.measure": tv.measure, "tiverlet.shapes": tv.shapes, "Collider": tv.Box.__mro__[2], "Shape": tv.shapes.Shape,
 }  # fmt: skip
 
 

@@ -98,7 +98,8 @@ def points(who: str, name: str, value, *, dim: int | None = None, count: int | N
     if array.ndim != 2 or array.shape[1] not in dims or (count is not None and len(array) != count):
         n = "n" if count is None else count
         want = " or ".join(f"({n}, {d})" for d in dims)
-        raise ValueError(f"{who}: {name} has shape {array.shape}, but {want} is needed, one row per point.")
+        write = f"; write [{tuple(array.tolist())}]" if array.ndim == 1 and len(array) in dims else ""
+        raise ValueError(f"{who}: {name} has shape {array.shape}, but {want} is needed, one row per point{write}.")
     finite(who, name, array)
     return array
 

@@ -802,6 +802,8 @@ class World:
     def __setattr__(self, name: str, value) -> None:
         if not name.startswith("_") and name not in LIVE:
             guess = "." if hasattr(self, name) else suggest(name, ["World"], LIVE)
+            if "world.particles" in guess:  # where to read it
+                guess = "; make tv.Particles for a new world."
             raise AttributeError(
                 f"World.{name} cannot be set{guess} Live are {', '.join(LIVE[:-1])} and {LIVE[-1]}, and the knobs of the "
                 "features; everything else is structure, fixed when the world is built."

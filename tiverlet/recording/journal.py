@@ -36,6 +36,7 @@ JOURNAL = "tiverlet/journal"
 SCENE = "world/scene"
 PARTED = "clock.parted"  # name of the clock's array, see Clock
 PARTICLES = "particles"  # last part of the entities with the positions of frames
+NOTHING = "was cut short, or damaged, before anything that can be replayed"
 WORLDS = re.compile(r"worlds/\d{1,9}/")  # first part of entities of many worlds, see side_by_side.py
 
 
@@ -118,11 +119,7 @@ def read(path: str, contents: rrd.Contents) -> tuple[list[Entry], str, int | Non
             "`rerun` shows it. Record one by itself, which has the same bits: tv.Recorder(path, worlds[k])."
         )
     if not rows:
-        why = (
-            "is not a recording of tiverlet; `rerun` shows it"
-            if contents.whole
-            else "was cut short before anything that can be replayed"
-        )
+        why = "is not a recording of tiverlet; `rerun` shows it" if contents.whole else f"{NOTHING}: {contents.why}"
         raise ValueError(f"replay: {path} {why}.")
     rows.sort(key=lambda row: row[:2])
     _check_format(path, rows[0][2].split(b"\n")[0])
@@ -144,7 +141,7 @@ def read(path: str, contents: rrd.Contents) -> tuple[list[Entry], str, int | Non
     if entries[-1].kind == "scene":  # the state that belongs to it was not flushed
         entries.pop()
     if not entries:
-        raise ValueError(f"replay: {path} was cut short before anything that can be replayed.")
+        raise ValueError(f"replay: {path} {NOTHING}: {contents.why}.")
     kinds = [entry.kind for entry in entries]
     if kinds[:2] != ["scene", "state"][: len(kinds)] or "end" in kinds[:-1]:
         raise ValueError(f"replay: {path} is damaged, or was not written by a Recorder: its entries are {', '.join(kinds[:5])}.")

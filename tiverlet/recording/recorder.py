@@ -3,6 +3,7 @@
 import contextlib
 import os
 import weakref
+from difflib import get_close_matches
 from time import perf_counter
 from typing import Any
 
@@ -75,6 +76,8 @@ class Recorder:
         self.budget = None if budget is None else checks.integer("Recorder", "budget", budget, least=1)
         down = checked_y_down("Recorder", world, y_down)
         coloring = Coloring.checked("Recorder", color, len(world.particles), None)
+        if not coloring.function and (near := get_close_matches(coloring.name, QUANTITIES, 1, 0.8)):
+            checks.warn(f"Recorder: color = {coloring.name!r} has to be given to each log(); did you mean {near[0]!r}?")
         following = coloring.following(world)
         self._overlays = Overlays.checked("Recorder", following, strain=strain, forces=forces, velocities=velocities, y_down=down)
         self._own: dict[str, Any] = {}  # the user's quantities, for the next frame that is drawn

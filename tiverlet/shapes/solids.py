@@ -238,7 +238,7 @@ def pile(lower, upper, radius) -> Shape:
     high = checks.vector("pile", "upper", upper, len(low))
     ends = np.atleast_1d(np.asarray(radius, dtype=np.float64))
     if ends.shape not in ((1,), (2,)):
-        raise ValueError(f"pile: radius = {radius!r}, but a number, or the smallest and the largest, is needed.")
+        raise ValueError(f"pile: radius has shape {ends.shape}, but a number, or the smallest and the largest, is needed.")
     small, large = checks.per_item("pile", "radius", ends if len(ends) == 2 else np.repeat(ends, 2), 2, above=0.0)
     if large < small:
         raise ValueError(f"pile: radius = ({small:g}, {large:g}), but the smallest comes first.")
