@@ -86,6 +86,14 @@ def test_each_of_two_equal_links_bears_half_of_the_load(world):
     np.testing.assert_array_equal(first, second)
 
 
+def test_links_that_are_given_twice_with_different_lengths_contradict_each_other():
+    for kind, words in ((tv.Distance, "rigid ones contradict each other"), (tv.Rope, "the tightest holds")):
+        with pytest.warns(UserWarning, match=f"Their rest values differ: {words}"):
+            kind([(0, 1), (1, 0)], [1.0, 2.0])
+        with pytest.warns(UserWarning, match="the same result where rigid"):
+            kind([(0, 1), (1, 0)], 1.0)
+
+
 def test_residuals_of_links_without_length_do_not_depend_on_rounding(world):
     # 0.1 + 0.2 and 0.3: the violation of a link of length 0 is relative to the size of the scene, not to 5e-17 m.
     told = []

@@ -67,9 +67,9 @@ class Scalar(Batch):
     def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
         """Store the arguments of __init__; prepare() checks what depends on the particles."""
         self.set_listing(indices)
-        self._warn_duplicates()
         if rest is not None:
             type(self).rest.check(self, rest)
+        self._warn_duplicates(rest)
         self._rest_given = rest
         self.break_at, self.compliance, self.damping = break_at, compliance, damping
 
@@ -89,20 +89,23 @@ class Scalar(Batch):
         """Raise ValueError where a constraint names a particle that does not exist."""
         self.members.check(repr(self), self.index_name, particles.count)
 
-    def _warn_duplicates(self) -> None:
-        """Warn of constraints that are given twice, at the line that created them."""
+    def _warn_duplicates(self, rest) -> None:
+        """Warn of constraints that are given twice, at the line that created them. rest: as the user gives it."""
         if not self.arity:
             return
         ordered = self.indices.copy()
         for group in self.quantity.exchangeable:
             ordered[:, group] = np.sort(ordered[:, group], axis=1)
-        unique, _, counts = distinct(ordered)
+        unique, which, counts = distinct(ordered)
         if len(unique) < len(ordered):
             first = tuple(int(v) for v in unique[int(np.argmax(counts > 1))])
-            checks.warn(
-                f"{self!r}: {len(ordered) - len(unique)} of the {self.index_name} are duplicates, the first of them {first}. "
-                "They act together: the same result where rigid, stiffer by their number where compliant."
-            )
+            given = np.broadcast_to(0.0 if rest is None else rest, len(ordered))
+            what = "They act together: the same result where rigid, stiffer by their number where compliant."
+            if len(distinct(np.column_stack([which, given]))[0]) > len(unique):
+                outcome = "the tightest holds" if self.side else "rigid ones contradict each other"
+                what = f"Their rest values differ: {outcome}."
+            twice = len(ordered) - len(unique)
+            checks.warn(f"{self!r}: {twice} of the {self.index_name} are duplicates, the first of them {first}. {what}")
 
     @property
     def transcends(self) -> bool:
