@@ -94,7 +94,8 @@ def refuse_deep(
             if depth > edge / 2 and not left_out(i, loops[k]):
                 raise ValueError(
                     f"Polygons: particle {i} starts {depth:.3g} m inside of loops[{k}], deeper than half of the nearest edge "
-                    f"({edge:.3g} m), so there is no telling where it came from. Move it out, or tie it to all corners, as a hub."
+                    f"({edge:.3g} m), so there is no telling where it came from. Move it out, or tie it to all corners of "
+                    "this loop, as a hub, or by tv.ShapeMatch over them and it; links to its neighbours are not enough."
                 )
 
 
