@@ -44,7 +44,7 @@ def heap(x, radius, high=99.0, **particles):
 
 
 WRONG = {  # scene, substeps, solver, the flag
-    "a linkage": (linkage, 8, None, "unconverged"),
+    "a linkage": (linkage, 8, tv.Jacobi(), "unconverged"),
     "relaxed links under a weight": (lambda: hanging(100, 100.0), 20, tv.Jacobi(), "unconverged"),
     "links that contradict each other": (
         lambda: linked([(0, 0), (0.5, 0.1), (1, 0)], 0.3, pinned=[0, 2]), 20, None, "unconverged"

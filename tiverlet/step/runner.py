@@ -550,51 +550,53 @@ class Runner:
                 self._launch(span)
             return
         self.team.rejoin(self._data[ACTIVE_THREADS])
-        while self._fuse(span):
-            pass
-
-    def _fuse(self, span: Span) -> bool:
-        """Run a part of a frame in one launch. Returns whether it stopped; then `span` is the rest, with room for its lists."""
-        GIVE(
-            self._given, 0, span.h64, span.start, span.end, span.tick, span.since, span.fresh, span.owed, span.substeps,
-            span.iterations, span.begin, span.half, span.resumed, 0, span.state_origin, span.until, span.part,
-        )  # fmt: skip
-        self._fused()
-        if not self._data[HALT]:
-            return False
-        span.resumed, span.begin, span.half = self.take_halt()[:3]
-        self.grow()
-        return True
+        while True:
+            GIVE(
+                self._given, 0, h, span.start, span.end, span.tick, span.since, True, 0.0, span.substeps, span.iterations,
+                span.begin, span.half, span.resumed, 0, STEPPED, span.until, span.part,
+            )  # fmt: skip
+            self._fused()
+            if not self._data[HALT]:
+                return
+            span.resumed, span.begin, span.half = self.take_halt()[:3]
+            self.grow()
 
     def run(self, substeps: int, iterations: int, end: float, state_origin: int) -> None:
         """Run all substeps of a frame, and the diagnostics."""
         clock, stages = self.clock, self.integrator.stages * substeps
         passes = self.integrator.passes(iterations)
-        span = Span(
-            clock.h, clock.time, end, clock.tick, clock.since, clock.d_is_velocity, clock.owed, state_origin, stages, passes,
-            until=stages + 1, part=passes,
-        )  # fmt: skip
         if self.launched:
+            span = Span(
+                clock.h, clock.time, end, clock.tick, clock.since, clock.d_is_velocity, clock.owed, state_origin, stages, passes
+            )
+            span.until, span.part = stages + 1, passes
             with self.memory.compiler():
                 self._launch(span)
             return
         self.team.rejoin(self._data[ACTIVE_THREADS])
-        some = self.passes_at_once
-        part = min(passes, some) if self.integrator.stages == 1 else passes
+        begin = half = resumed = 0
+        until, part, some = stages + 1, passes, self.passes_at_once
+        splits = self.integrator.stages == 1
         if stages * passes > some:
-            span.until, span.part = max(1, some // passes), part
+            until, part = max(1, some // passes), min(passes, some) if splits else passes
         while True:
-            if self._fuse(span):
-                self.wake_called(stages, passes, span.begin, span.half)
+            GIVE(
+                self._given, 0, clock.h, clock.time, end, clock.tick, clock.since, clock.d_is_velocity, clock.owed, stages,
+                passes, begin, half, resumed, 0, state_origin, until, part,
+            )  # fmt: skip
+            self._fused()
+            if self._data[HALT]:
+                resumed, begin, half = self.take_halt()[:3]
+                self.grow()
+                self.wake_called(stages, passes, begin, half)
                 continue
-            if span.begin == stages or (span.until > stages and span.part == passes):
+            if begin == stages or (until > stages and part == passes):
                 return
-            if span.part < passes:  # go on with this substep
-                span.resumed, span.begin, span.half = 1, span.until - 1, span.part * self.step.halves
-                span.part = min(passes, span.part + some)
+            if part < passes:  # go on with this substep
+                resumed, begin, half, part = 1, until - 1, part * self.step.halves, min(passes, part + some)
             else:
-                span.resumed, span.begin, span.half, span.part = 0, span.until, 0, part
-                span.until = min(stages + 1, span.until + max(1, some // passes))
+                resumed, begin, half, part = 0, until, 0, min(passes, some) if splits else passes
+                until = min(stages + 1, until + max(1, some // passes))
             self.raise_signals()
 
     def wake_called(self, substeps: int, passes: int, s: int, half: int) -> None:

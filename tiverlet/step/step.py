@@ -429,7 +429,7 @@ class Step:
         """On the launched path: stop the frame if more passes are needed than were launched, so that the host launches them."""
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, now.thread)):
-            if self.contact_pass.rows.impulses.going() != 0:
+            if self.contact_pass.rows.impulses.going[None] != 0:
                 self.halt[None] = [1, now.s, now.half, what]
 
     @ti.func
