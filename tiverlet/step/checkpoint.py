@@ -208,7 +208,7 @@ def transfer(old: "World", new: "World") -> None:
         put_working_fields(new, working_fields(old))
         return
     ours, theirs = new._clock, old._clock
-    ours.time, ours.tick, ours.since, ours.frame = theirs.time, theirs.tick, theirs.since, theirs.frame
+    ours.time, ours.tick, ours.frame = theirs.time, theirs.tick, theirs.frame
     new._controller.memory = kept.controller
     new.position, new.velocity = old.position, old.velocity
     if new._particles.spins:

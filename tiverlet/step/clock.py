@@ -7,7 +7,7 @@ import numpy as np
 
 # Names in recordings.
 NAMES = {
-    "_time": "time", "_tick": "tick", "_since": "since", "_h": "h", "_fresh": "d_is_velocity", "_iterations": "iterations",
+    "_time": "time", "_tick": "tick", "_h": "h", "_fresh": "d_is_velocity", "_iterations": "iterations",
     "_frame": "frame", "_drag": "drag", "_started": "started", "_owed": "owed", "_lacked": "lacked",
     "_parted": "velocity_override", "_placed": "first_moved", "_energy": "energy", "_bound": "bound",
     "_kinetic": "kinetic", "_overlap": "overlap", "_parting": "parting", "_softness": "softness", "_softened": "softened",
@@ -76,7 +76,7 @@ def initial_margin(inv_mass: np.ndarray, extent: np.ndarray, h: Any) -> Any:
 class Clock:
     """The time of a world, and the state that goes with it.
 
-    time: simulated [s]. tick, since: number of substeps so far, and since the last start, modulo 2^31. h: the last substep [s].
+    time: simulated [s]. tick: number of substeps so far, modulo 2^31. h: the last substep [s].
     d_is_velocity: whether displacements hold velocities, so that the next substep is a start. started: whether the last substep
     was a start. iterations: of the last frame. softness, softened: how many times as soft as passes make them links are, 1 or
     more, and when a substep last made them about that soft [s], see softness.py. part_softness: the same for the softest part of
@@ -95,7 +95,6 @@ class Clock:
 
     time: float = 0.0
     tick: int = 0
-    since: int = 0
     h: float = 0.0
     d_is_velocity: bool = True
     started: bool = False
@@ -155,7 +154,7 @@ class Clock:
 
     def advance(self, substeps: int, iterations: int, frame: tuple[float, float, int], started: bool) -> None:
         """Advance by so many substeps of so many passes, which made one frame."""
-        self.tick, self.since = (self.tick + substeps) % 2**31, (self.since + substeps) % 2**31
+        self.tick = (self.tick + substeps) % 2**31
         self.iterations, self.started, self.d_is_velocity, self.velocity_override = iterations, started, False, None
         self.lacked = self.owed if started else 0.0
         self.frame, self.time = frame, frame[0] + frame[1] * frame[2]
@@ -165,7 +164,7 @@ class Clock:
         """The values that the next frames depend on, for the hash."""
         later: list[Any] = [] if self.softness == 1 else [self.softness, self.softened]
         later += [] if self.velocity_override is None else [np.asarray(self.velocity_override, dtype=np.float64).tobytes()]
-        return [self.time, self.tick, self.since, self.h, self.d_is_velocity, *later]
+        return [self.time, self.tick, self.h, self.d_is_velocity, *later]
 
     def is_valid(self, particles: int, dim: int) -> bool:
         """Whether these values are valid for a world of so many particles."""
@@ -173,7 +172,7 @@ class Clock:
             np.shape(self.velocity_override) != (particles, dim) or not np.isfinite(self.velocity_override).all()
         ):
             return False
-        right = [type(k) is int and 0 <= k < 2**31 for k in (self.tick, self.since, self.iterations)]
+        right = [type(k) is int and 0 <= k < 2**31 for k in (self.tick, self.iterations)]
         right += [type(some) is bool for some in (self.d_is_velocity, self.started, self.parting)]
         energies = self.energy or 0, self.bound or 0, self.kinetic
         soft = self.softness, self.part_softness

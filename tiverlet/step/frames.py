@@ -11,7 +11,7 @@ from ..device.memory import Memory
 from ..device.patches.compiler import CachedLaunch
 from ..device.thread_team import LEAST
 from .diagnostics import STEPPED
-from .span import BEGIN, END, FIGURES, FIRST, FRESH, HALF, HALT, ORIGIN, RESUMED, SHEET, SINCE, START, TICK, H, integer
+from .span import BEGIN, END, FIGURES, FIRST, FRESH, HALF, HALT, ORIGIN, RESUMED, SHEET, START, TICK, H, integer
 
 if TYPE_CHECKING:
     from .step import Step
@@ -29,7 +29,7 @@ def sheets(clocks: Any, end: np.ndarray, origin: np.ndarray, substeps: int, pass
     """Return the sheets of frames, one row per copy, see Span. clocks: Clocks. end, origin: with a value per copy."""
     out, c = np.zeros((len(end), SHEET)), clocks
     given = (
-        c.h, c.time, end, c.tick, c.since, c.d_is_velocity, c.owed, substeps, passes, 0, 0, 0, 0, origin, substeps + 1, passes
+        c.h, c.time, end, c.tick, c.d_is_velocity, c.owed, substeps, passes, 0, 0, 0, 0, origin, substeps + 1, passes
     )  # fmt: skip
     out[:, H:] = np.column_stack([np.broadcast_to(values, len(end)) for values in given])
     return out
@@ -157,8 +157,7 @@ class Frames:
         self.dates[2] += 1
         self.sheet[START] = self.sheet[END]
         self.sheet[END] = self.dates[0] + self.dates[1] * (self.dates[2] + 1)
-        for k in ti.static((TICK, SINCE)):
-            count = self.sheet[k] + plan[SUBSTEPS]
-            self.sheet[k] = ti.select(count >= WRAP, count - WRAP, count)
+        count = self.sheet[TICK] + plan[SUBSTEPS]
+        self.sheet[TICK] = ti.select(count >= WRAP, count - WRAP, count)
         self.sheet[FRESH], self.sheet[ORIGIN] = 0, STEPPED
         self.sheet[BEGIN], self.sheet[HALF], self.sheet[RESUMED] = 0, 0, 0

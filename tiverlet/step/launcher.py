@@ -62,7 +62,7 @@ class Launcher:
             names, now, span = template(" ".join(phase.__name__ for phase in self.waiting)), self.now, self.now.span
             self.waiting = []
             self.step.phases(
-                names, span.h64, span.start, span.tick, span.since, span.fresh, span.owed, now.s, span.substeps,
+                names, span.h64, span.start, span.tick, span.fresh, span.owed, now.s, span.substeps,
                 span.iterations, now.half, now.newton,
             )  # fmt: skip
 

@@ -156,8 +156,8 @@ class Runner:
                 with self.memory.compiler():
                     softness.keep(self, h, dt, passes, adapts)
             return clock.energy is None
-        keeps, goes_on = self.solves_rows and clock.first_moved != 0, not clock.d_is_velocity
-        asleep = self._sleeping() if keeps and goes_on and clock.first_moved is None else None
+        keeps = self.solves_rows and clock.first_moved != 0
+        asleep = self._sleeping() if keeps and not clock.d_is_velocity and clock.first_moved is None else None
         if asleep is None:
             self.wake()
         with self.memory.compiler():
@@ -181,8 +181,6 @@ class Runner:
                     self._sleep_on(*asleep, h / clock.h)
                 elif asleep is not None:
                     self.wake()
-            if clock.d_is_velocity and not (keeps and goes_on):
-                clock.since = 0
             if first is not None:
                 bare = first < self.n and not any((b.indices >= first).any() for b in self.batches)
                 if not bare:  # particles added without constraints do not concern it
@@ -544,7 +542,7 @@ class Runner:
             semi_iteration.prepare(1)
         self.set_substep(h, self._drag(h))
         clock.d_is_velocity, clock.owed, clock.tick = True, 0.0, (clock.tick + 1) % 2**31
-        span = Span(h, clock.time, clock.time, clock.tick, clock.since, True, 0.0, STEPPED, ENDLESS * self.integrator.stages, 2)
+        span = Span(h, clock.time, clock.time, clock.tick, True, 0.0, STEPPED, ENDLESS * self.integrator.stages, 2)
         if self.launched:
             with self.memory.compiler():
                 self._launch(span)
@@ -552,7 +550,7 @@ class Runner:
         self.team.rejoin(self._data[ACTIVE_THREADS])
         while True:
             GIVE(
-                self._given, 0, h, span.start, span.end, span.tick, span.since, True, 0.0, span.substeps, span.iterations,
+                self._given, 0, h, span.start, span.end, span.tick, True, 0.0, span.substeps, span.iterations,
                 span.begin, span.half, span.resumed, 0, STEPPED, span.until, span.part,
             )  # fmt: skip
             self._fused()
@@ -566,9 +564,7 @@ class Runner:
         clock, stages = self.clock, self.integrator.stages * substeps
         passes = self.integrator.passes(iterations)
         if self.launched:
-            span = Span(
-                clock.h, clock.time, end, clock.tick, clock.since, clock.d_is_velocity, clock.owed, state_origin, stages, passes
-            )
+            span = Span(clock.h, clock.time, end, clock.tick, clock.d_is_velocity, clock.owed, state_origin, stages, passes)
             span.until, span.part = stages + 1, passes
             with self.memory.compiler():
                 self._launch(span)
@@ -581,7 +577,7 @@ class Runner:
             until, part = max(1, some // passes), min(passes, some) if splits else passes
         while True:
             GIVE(
-                self._given, 0, clock.h, clock.time, end, clock.tick, clock.since, clock.d_is_velocity, clock.owed, stages,
+                self._given, 0, clock.h, clock.time, end, clock.tick, clock.d_is_velocity, clock.owed, stages,
                 passes, begin, half, resumed, 0, state_origin, until, part,
             )  # fmt: skip
             self._fused()
@@ -604,9 +600,7 @@ class Runner:
         if self.sleep and self.memory.read(self.sleepers.calls)[0]:
             clock = self.clock
             with self.memory.compiler():
-                self.sleep.wake_called(
-                    clock.h, clock.time, clock.tick, clock.since, clock.d_is_velocity, s, substeps, passes, max(0, half)
-                )
+                self.sleep.wake_called(clock.h, clock.time, clock.tick, clock.d_is_velocity, s, substeps, passes, max(0, half))
 
     def take_halt(self) -> tuple[int, int, int, int]:
         """Return where the frame stopped (resumed, begin, half, what of Span), and clear the stop, for the host to handle."""

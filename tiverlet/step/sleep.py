@@ -231,7 +231,7 @@ class SleepPass:
     def compile(self, clock: "Clock") -> None:
         """Compile the kernels by launching them now, when no island is ready to sleep and none is called."""
         self.fall_asleep(clock.time)
-        self.wake_called(clock.h, clock.time, 0, 0, 0, 1, 1, 1, 0)
+        self.wake_called(clock.h, clock.time, 0, 0, 1, 1, 1, 0)
 
     def begin(self, dt: float, clock: "Clock") -> None:
         """Write the arguments of settle(), after a frame of dt [s]."""
@@ -244,7 +244,7 @@ class SleepPass:
         """
         awake, ready, called = self.sheet[AWAKE:].tolist()
         if called:
-            self.wake_called(clock.h, clock.time, 0, 0, 0, 1, 1, 1, 0)
+            self.wake_called(clock.h, clock.time, 0, 0, 1, 1, 1, 0)
         part = self.sleepers.time / TRIES
         if any(wall.does_work for wall in self.step.walls):  # what a slow belt carries along is no slower than its speed
             ready = 0
@@ -386,11 +386,11 @@ class SleepPass:
 
     @ti.kernel
     def wake_called(
-        self, h64: ti.f64, start: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32, s: ti.i32, substeps: ti.i32,
+        self, h64: ti.f64, start: ti.f64, tick: ti.i32, fresh: ti.i32, s: ti.i32, substeps: ti.i32,
         iterations: ti.i32, half: ti.i32,
     ):  # fmt: skip
         """Wake the called islands, and integrate their particles as all others were in substep s; not if s = substeps."""
-        span = Span(h64, start, start, tick, since, fresh, 0.0, 0, substeps, iterations)
+        span = Span(h64, start, start, tick, fresh, 0.0, 0, substeps, iterations)
         now = self.step.pass_of(self.step.moment(span, s), half)
         for i in range(self.n):
             if not self.sleepers.awake(i):

@@ -13,18 +13,17 @@ LISTS = -1  # what a frame stopped for; where phases are launched, it may be mor
 class Span:
     """The part of a frame that a launch covers.
 
-    h64: length of the substep (in orders above 2, of its first stage) [s]. start, end: of the frame [s]. tick, since: number of
-    substeps so far, and since the last start. fresh: whether displacements hold velocities. owed: the kick by rigid constraints
-    that these velocities lack, as a time [s]. state_origin: how the state came about, see Diagnostics. substeps, iterations: of
-    the frame. begin, until: the substeps of this launch. part: iterations in the last of them. resumed: 1 if substep `begin` was
+    h64: length of the substep (in orders above 2, of its first stage) [s]. start, end: of the frame [s]. tick: number of
+    substeps so far. fresh: whether displacements hold velocities. owed: the kick by rigid constraints that these velocities
+    lack, as a time [s]. state_origin: how the state came about, see Diagnostics. substeps, iterations: of the frame. begin, until: the substeps of this launch. part: iterations in the last of them. resumed: 1 if substep `begin` was
     interrupted before its half of a pass number `half`, or in it, by `what`, see LISTS.
     """
 
     def __init__(
-        self, h64, start, end, tick, since, fresh, owed, state_origin, substeps, iterations, begin=0, half=0, resumed=0, until=1,
+        self, h64, start, end, tick, fresh, owed, state_origin, substeps, iterations, begin=0, half=0, resumed=0, until=1,
         part=1, thread=0, sheet=None, what=LISTS,
     ):  # fmt: skip
-        self.h64, self.start, self.end, self.tick, self.since, self.fresh = h64, start, end, tick, since, fresh
+        self.h64, self.start, self.end, self.tick, self.fresh = h64, start, end, tick, fresh
         self.owed, self.state_origin = owed, state_origin
         self.substeps, self.iterations, self.begin, self.half = substeps, iterations, begin, half
         self.resumed, self.until, self.part, self.thread, self.sheet, self.what = resumed, until, part, thread, sheet, what
@@ -69,8 +68,8 @@ class Moment:
 # Then its arguments, see Span, with the number of the first thread.
 FIGURES = 15
 HALT, MOST, ACTIVE_THREADS = FIGURES, FIGURES + 4, FIGURES + 7
-GIVEN = tuple(range(ACTIVE_THREADS + 1, ACTIVE_THREADS + 17))
-H, START, END, TICK, SINCE, FRESH, OWED, SUBSTEPS, ITERATIONS, BEGIN, HALF, RESUMED, FIRST, ORIGIN, UNTIL, PART = GIVEN
+GIVEN = tuple(range(ACTIVE_THREADS + 1, ACTIVE_THREADS + 16))
+H, START, END, TICK, FRESH, OWED, SUBSTEPS, ITERATIONS, BEGIN, HALF, RESUMED, FIRST, ORIGIN, UNTIL, PART = GIVEN
 SHEET = PART + 1
 GIVE = Struct(f"{len(GIVEN)}d").pack_into  # takes a third of the time of an array assignment
 
@@ -85,12 +84,12 @@ def integer(sheet, k):
 def span_on(sheet: ti.template(), thread):  # type: ignore[valid-type]
     """Read the Span of a thread from a sheet."""
     h64, start, end = sheet[H], sheet[START], sheet[END]
-    tick, since, fresh = integer(sheet, TICK), integer(sheet, SINCE), integer(sheet, FRESH)
+    tick, fresh = integer(sheet, TICK), integer(sheet, FRESH)
     owed, state_origin = sheet[OWED], integer(sheet, ORIGIN)
     substeps, iterations = integer(sheet, SUBSTEPS), integer(sheet, ITERATIONS)
     begin, half, resumed = integer(sheet, BEGIN), integer(sheet, HALF), integer(sheet, RESUMED)
     until, part = integer(sheet, UNTIL), integer(sheet, PART)
     return Span(
-        h64, start, end, tick, since, fresh, owed, state_origin, substeps, iterations, begin, half, resumed, until, part,
+        h64, start, end, tick, fresh, owed, state_origin, substeps, iterations, begin, half, resumed, until, part,
         thread, sheet,
     )  # fmt: skip

@@ -168,11 +168,11 @@ class Step:
 
     @ti.kernel
     def phases(
-        self, names: ti.template(), h64: ti.f64, start: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32,  # type: ignore[valid-type]
+        self, names: ti.template(), h64: ti.f64, start: ti.f64, tick: ti.i32, fresh: ti.i32,  # type: ignore[valid-type]
         owed: ti.f64, s: ti.i32, substeps: ti.i32, iterations: ti.i32, half: ti.i32, newton: ti.i32,
     ):  # fmt: skip
         """Run some phases of a substep, by their names. It returns nothing, because the host would have to wait for a result."""
-        now = self.pass_of(self.moment(Span(h64, start, start, tick, since, fresh, owed, 0, substeps, iterations), s), half)
+        now = self.pass_of(self.moment(Span(h64, start, start, tick, fresh, owed, 0, substeps, iterations), s), half)
         for phase in ti.static(self.named(names)):
             phase(now.newton_step(newton))
 

@@ -102,8 +102,7 @@ class Clocks:
 
     def advance(self, substeps: int, iterations: int, frames: int, started: np.ndarray) -> None:
         """Advance all worlds by `frames` frames of so many substeps and passes. started: as in Clock, for one frame."""
-        for count in (self.tick, self.since):
-            count[...] = (count + substeps * frames) % 2**31
+        self.tick[...] = (self.tick + substeps * frames) % 2**31
         self.frame[:, 2] += frames
         self.time = self.frame[:, 0] + self.frame[:, 1] * self.frame[:, 2]
         self.iterations[:] = iterations

@@ -209,7 +209,6 @@ class Worlds:
         h = dt / world.substeps * runner.integrator.first
         ready = (clocks.first_moved == NONE) & (clocks.h == h) & ~clocks.needs_drag
         ready &= (clocks.softest == 1) & (clocks.iterations == world.iterations)
-        clocks.since[ready & clocks.d_is_velocity] = 0
         moved, released, jumped = np.zeros(len(self)), np.zeros(len(self)), np.zeros(len(self), dtype=bool)
         some = np.flatnonzero(~ready)
         with runner.memory.compiler():
