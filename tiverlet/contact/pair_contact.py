@@ -246,8 +246,8 @@ class PairContact(Feature):
                 self.dev.fast[None] = 1
 
     @ti.func
-    def reaction(self, i, h, soft):
-        """Return how far loads moved particle i in the last substep of a frame, h [s] long [m]."""
+    def reaction(self, i):
+        """Return how far loads moved particle i in the last substep of a frame [m]."""
         return self.dev.rows.borne[i]
 
     @ti.func

@@ -117,7 +117,7 @@ class Frames:
             self.copies.enter(w)
             self.step.write_reactions(given[k, 0], given[k, 2], given[k, 3])
             for i in range(self.step.n):
-                v = self.step.velocity_of(i, given[k, 0], given[k, 1], given[k, 4], given[k, 3])
+                v = self.step.velocity_of(i, given[k, 0], given[k, 1], given[k, 4])
                 for a in ti.static(range(self.step.dim)):
                     out[(w * self.step.n + i) * self.step.dim + a] = v[a]
 

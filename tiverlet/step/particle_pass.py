@@ -335,10 +335,10 @@ class ParticlePass:
             self.state.shift(i, -self.state.d[i])
 
     @ti.func
-    def reaction(self, i, h, t, firm, soft):
+    def reaction(self, i, h, t, firm):
         """Return h^2 times the acceleration of particle i by constraints (from Slots), contacts and walls in the last substep.
 
-        Also returns the share of the push of walls that it contains. firm, soft: see Passes.push_reaction().
+        Also returns the share of the push of walls that it contains. firm: see Passes.push_reaction().
         The push of walls counts as far as it balances all other forces. So a body at rest has velocity 0, but half of a blow is
         not added to the velocity of a particle that has just bounced, nor to the other particles of its body, whose walls and
         rigid constraints count for nothing.
@@ -347,7 +347,7 @@ class ParticlePass:
         if ti.static(self.held):
             reaction = self.slots.total_of(i)
         for c in ti.static(self.contacts):
-            reaction += firm * c.reaction(i, h, soft)
+            reaction += firm * c.reaction(i)
         if ti.static(len(self.walls) > 0):
             push = firm * self.wall_displacement[i]
             v = self.state.d[i] / h
@@ -369,13 +369,13 @@ class ParticlePass:
         return reaction, part
 
     @ti.func
-    def surface_velocity(self, i, h, t, firm, soft):
+    def surface_velocity(self, i, h, t, firm):
         """Return r omega of particle i at the end of the last substep: s / h plus half of what moments of forces added to it."""
         turned = 0 * self.state.spin.s[i]
         for c in ti.static(self.contacts):
             turned += c.dev.rows.turned[i]
         if ti.static(self.turned_by_walls):
-            _reaction, part = self.reaction(i, h, t, firm, soft)
+            _reaction, part = self.reaction(i, h, t, firm)
             turned += part * self.wall_turn[i]
         return (self.state.spin.s[i] + firm / 2 * turned) / h
 

@@ -15,8 +15,9 @@ class Span:
 
     h64: length of the substep (in orders above 2, of its first stage) [s]. start, end: of the frame [s]. tick: number of
     substeps so far. fresh: whether displacements hold velocities. owed: the kick by rigid constraints that these velocities
-    lack, as a time [s]. state_origin: how the state came about, see Diagnostics. substeps, iterations: of the frame. begin, until: the substeps of this launch. part: iterations in the last of them. resumed: 1 if substep `begin` was
-    interrupted before its half of a pass number `half`, or in it, by `what`, see LISTS.
+    lack, as a time [s]. state_origin: how the state came about, see Diagnostics. substeps, iterations: of the frame. begin,
+    until: the substeps of this launch. part: iterations in the last of them. resumed: 1 if substep `begin` was interrupted
+    before its half of a pass number `half`, or in it, by `what`, see LISTS.
     """
 
     def __init__(

@@ -592,7 +592,7 @@ class Step:
         self.write_reactions(given[0], given[2], given[3])
         for i in range(self.n):
             h, time, firm = ti.cast(given[0], self.real), ti.cast(given[1], self.real), ti.cast(given[2], self.real)
-            v = self.particles.surface_velocity(i, h, time, firm, ti.cast(given[3], self.real))
+            v = self.particles.surface_velocity(i, h, time, firm)
             for k in ti.static(range(self.state.spin.axes)):
                 out[i, k] = v[k]
 
@@ -616,7 +616,7 @@ class Step:
         """Body of velocities()."""
         self.write_reactions(given[0], given[2], given[3])
         for i in range(integer(given, 4), integer(given, 5)):
-            v = self.velocity_of(i, given[0], given[1], given[6], given[3])
+            v = self.velocity_of(i, given[0], given[1], given[6])
             for k in ti.static(range(self.dim)):
                 out[i, k] = v[k]
 
@@ -650,7 +650,7 @@ class Step:
         The law is that of Displacements.lengthen() on the host, see impulse.py.
         """
         d = self.state.d[i]
-        v = self.velocity_of(i, given[0], given[1], given[2], given[3])
+        v = self.velocity_of(i, given[0], given[1], given[2])
         more = ti.Vector.zero(ti.f64, self.dim)
         for a in ti.static(range(self.dim)):
             want = ti.cast(d[a] / ti.cast(given[0], self.real), ti.f64)
@@ -672,8 +672,8 @@ class Step:
         self.constraints.reactions(ti.cast(h64, self.real), ti.cast(firm64, self.real), ti.cast(soft64, self.real))
 
     @ti.func
-    def velocity_of(self, i, h64, t, firm64, soft64):
+    def velocity_of(self, i, h64, t, firm64):
         """The velocity of particle i, once write_reactions() has filled the slots."""
         h, time, firm = ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real)
-        reaction, _part = self.particles.reaction(i, h, time, firm, ti.cast(soft64, self.real))
+        reaction, _part = self.particles.reaction(i, h, time, firm)
         return self.integrator.velocity_after(i, h, time, reaction)
