@@ -185,7 +185,7 @@ class Probe:
         """Take a stage of h after one of `last` [s]. t: time [s]. end: fraction of the frame at its end."""
         ti.loop_config(serialize=True)
         for _ in range(1):
-            span = Span(h, t, t, 0, 0, 0, 0.0, 0, 1, passes, part=passes)
+            span = Span(h, t, t, tick=0, fresh=0, owed=0.0, state_origin=0, substeps=1, iterations=passes, part=passes)
             substep(self.step, Moment(span, 0, h, last, t, 0, ti.Vector([1.0, end, end - 1.0]), final=1))
 
 
