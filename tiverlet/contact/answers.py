@@ -16,6 +16,8 @@ from ..device import at, inline, ti
 from ..solvers.corners import bodies_of
 from .links import Links
 
+TURN = 1 / 64  # of its length: by how much places may move an end of a link in a substep
+
 if TYPE_CHECKING:
     from ..device.memory import Memory
     from ..features.feature import Batch, Scene
@@ -83,6 +85,12 @@ class Answers:
                 self.slots.answer[s] = 0 * self.state.d[i]
         if ti.static(self.in_turn):
             self.given[i] = 0 * self.state.d[i]
+            for s in range(self.slots.begin[i], self.slots.begin[i + 1]):
+                self.before[s] = 0 * self.state.d[i]
+                for system in ti.static(self.systems):
+                    r = system.row_that_begins(s)
+                    if r >= 0:
+                        self.before_row[r] = 0
         if ti.static(self.has_clusters):
             self.mobility[i] = self.shared[i] = self.state.w[i]
 
@@ -105,6 +113,26 @@ class Answers:
         change = held - self.held[i]
         self.held[i] = held
         return change
+
+    @ti.func
+    def count_left(self, i):
+        """Return how many rows of systems, whose first corner is particle i, places have left violated."""
+        out = 0 * self.state.w[i]
+        for system in ti.static(self.systems):
+            for s in range(self.slots.begin[i], self.slots.begin[i + 1]):
+                r = system.row_that_begins(s)
+                if r >= 0:
+                    out += ti.select(system.left[r] != 0, 1 + 0 * out, 0 * out)
+        return out
+
+    @ti.func
+    def most_placed(self, i):
+        """Return by how much places may move particle i in a substep, so that what holds it turns little [m]."""
+        out = ti.math.inf + 0 * self.state.w[i]
+        for system in ti.static(self.systems):
+            if system.particle_inverse_size[i] > 0:
+                out = ti.static(TURN) / system.particle_inverse_size[i]
+        return out
 
     @inline
     def beyond(self, i):

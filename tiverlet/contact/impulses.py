@@ -72,6 +72,9 @@ class Impulses:
         self.going, self.turn, self.gains, self.strikes = (
             add(f"Contact.{name}", None, kind=ti.i32) for name in ("going", "turn", "gains", "strikes")
         )
+        # Whether systems answer to second order, see RowPass.bend_systems(): 0: not yet, 1: from the next pass on, 2: they do.
+        self.has_systems = bool(bodies.answers) and bool(bodies.answers.systems)
+        self.bending: Any = add("Contact.bending", None, kind=ti.i32) if self.has_systems else None
         # Rounds, passes of impulses and of places that a substep of a frame took at most.
         self.most: Any = add("Contact.most", None, width=3, kind=ti.i32) if team.launched else None
         self.last_h2 = add("Contact.last_h2", None, state=True)  # h^2 of what rows bore [s^2]; 0 before the first substep
@@ -355,6 +358,8 @@ class Impulses:
         met, lands = ti.static(MET * MET) * force + self.total(LOAD), ti.static(LANDS * LANDS) * force
         self.beta[None], self.theta[None], self.tolerance[None], self.landing[None] = 0, ti.static(MOMENTUM), met, lands
         self.going[None], self.turn[None] = ti.cast(rows > 0, ti.i32), 0
+        if ti.static(self.has_systems):
+            self.bending[None] = 0
 
     @ti.func
     def momentum(self):
@@ -370,10 +375,6 @@ class Impulses:
         turn = self.turn[None] + 1
         if turn == 1:
             self.tolerance[None] = ti.max(self.tolerance[None], ti.static(LEFT) * lack)
-        beta, ahead = self.momentum()
-        if uphill > 0:
-            beta, ahead = 0 * beta, 1 + 0 * ahead
-        self.beta[None], self.theta[None] = beta, ahead
         self.turn[None] = turn
         self.note_turn(IMPULSES, turn)
         most = ti.select(lack > self.landing[None], BOUNCES, PASSES)
@@ -381,7 +382,19 @@ class Impulses:
         if ti.static(self.rows.bounces and not self.rows.impacts):  # else rounds have done it
             if self.strikes[None] != 0 and self.total(WRONG) > ti.static(ERROR) * self.total(KINETIC):
                 goes_on = turn < BOUNCES
-        self.going[None] = ti.cast((goes_on or turn < self.least) and self.total(ROWS) > 0, ti.i32)
+        goes_on = (goes_on or turn < self.least) and self.total(ROWS) > 0
+        if ti.static(self.has_systems):
+            before = self.bending[None]
+            bending = 2 * ti.min(before, 1)
+            if before == 0 and not goes_on and self.total(ROWS) > 0:
+                bending, goes_on = 1, True
+            self.bending[None] = bending
+            uphill = ti.select(bending == 1, 1 + 0 * uphill, uphill)  # what rows lack has another zero from here on
+        beta, ahead = self.momentum()
+        if uphill > 0:
+            beta, ahead = 0 * beta, 1 + 0 * ahead
+        self.beta[None], self.theta[None] = beta, ahead
+        self.going[None] = ti.cast(goes_on, ti.i32)
 
     @ti.func
     def start_places(self):

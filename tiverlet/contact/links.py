@@ -225,7 +225,8 @@ class Links:
             if self.least[r] < mu < self.most[r]:  # else it is slack, or as tense as the substep can stand
                 touched = 1
         self.violation[r] = (left + u + self.violation[r]) * touched
-        batch.dev.equation.touched[c] = touched
+        if self.begin[r] < self.begin[r + 1]:
+            batch.dev.equation.touched[c] = touched
         if self.stiff[r] > 0:
             batch.dev.equation.take_answer(c, mu, self.start[r], weight, slight, self.rows)
             if self.is_alone(batch, c):

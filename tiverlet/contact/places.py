@@ -71,7 +71,12 @@ class Places:
                     gap, n, push_out = self.rows.wall_gap(i, other - WALL)
             if gap < ti.static(-SLOP * BEYOND) * slop:
                 if not again:
-                    self.rows.gap.field[row] = gap + self.rows.most_parting(slop, push_out)
+                    most = self.rows.most_parting(slop, push_out)
+                    if ti.static(bool(self.bodies.answers)):
+                        most = ti.min(most, self.bodies.answers.most_placed(i))
+                        if row < pressed:
+                            most = ti.min(most, self.bodies.answers.most_placed(other))
+                    self.rows.gap.field[row] = gap + most
                 gap -= ti.min(self.rows.gap.field[row], ti.static(-SLOP) * slop)
             else:
                 gap = 0 * gap
@@ -88,6 +93,8 @@ class Places:
         if part == OWN:
             if ti.static(bool(self.bodies.answers)):
                 out += self.bodies.answers.links.sum_of(self.bodies.answers.links.lack, i)
+                if not again:
+                    out += self.bodies.answers.count_left(i)
             self.bodies.v[i] = total
         else:
             self.bodies.push[i] = total

@@ -567,7 +567,7 @@ class Rows:
                 if ti.static(bool(self.impacts)):  # what is struck may go anywhere
                     ahead = ti.min(ahead, gap + un - self.ahead)
                 # What it bore, it may still bear; but an open side, which is nowhere, has no row.
-                lists = ahead < ti.select(self.is_set(p), 1, ti.cast(SLOP, self.real)) * self.size(i)
+                lists = ahead < ti.select(self.is_set(p), 1, ti.cast(AHEAD, self.real)) * self.size(i)
                 if ti.static(w.dev.surface.has_switch):
                     lists = lists and w.dev.surface.active[None] != 0
                 if ti.static(w.dev.surface.is_one_way):

@@ -245,7 +245,7 @@ def _group(who: str, group, count: int) -> np.ndarray:
 
 
 def _pinned(who: str, pinned, count: int) -> np.ndarray:
-    array = checks.plain(who, "pinned", pinned)
+    array = checks.plain(who, "pinned", pinned if pinned is not None else ())  # as many libraries write "none"
     if array.dtype == bool:
         if array.shape != (count,):
             raise ValueError(f"{who}: pinned has shape {array.shape}, but a mask of shape ({count},) is needed.")

@@ -163,18 +163,23 @@ class Elimination(System):
         if self.answers:
             self.slots = slots
             self.answer, self.change, self.solution, self.gap = (reals(k) for k in ("answer", "change", "solution", "gap"))
+            # What is no reason for an impulse, and places remove; and the other violations at the start of the substep.
+            self.left, self.at_start = reals("left_by_places"), reals("at_start")
+            self.bends_far = ints("bends_far", np.zeros(found.parts))  # whether impulses of contacts turn a part far
             self.added, self.turned_to = reals("added", found.parts), reals("turned_to", found.parts)
         who = np.zeros(slots.total, dtype=np.int64)
         who[corner] = particle
         self.particle_of, self.w, self.inverse_size = ints("who", who), scene.state.w, reals("close")
         self.refines = scene.order == 2 and not (self.limits_steps or self.has_shared_particles)
+        self.part_of = ints("part_of", self._part)
+        near = np.zeros(len(scene.inv_mass))
+        for b in scalars:
+            inside = self.row(b) >= 0
+            np.maximum.at(near, b.indices[inside], b.inverse_size(b.start.position)[inside, None])
+        near[body >= 0] = 0  # which turn as a whole
+        self.particle_inverse_size = scene.memory.field("system.near", scene.count, values=near)
         if self.refines:
-            self.part_of, self.newton = ints("part_of", self._part), ints("newton", np.full(found.parts, UNKNOWN))
-            near = np.zeros(len(scene.inv_mass))
-            for b in scalars:
-                inside = self.row(b) >= 0
-                np.maximum.at(near, b.indices[inside], b.inverse_size(b.start.position)[inside, None])
-            self.particle_inverse_size = scene.memory.field("system.near", scene.count, values=near)
+            self.newton = ints("newton", np.full(found.parts, UNKNOWN))
             self.any_unmet = scene.memory.field("system.any_unmet", None, kind=ti.i32)
         self.sleeps = bool(scene.state.sleepers)
         if self.sleeps:  # all particles of a system sleep, or none
@@ -398,6 +403,15 @@ class Elimination(System):
             x[r] = ti.select(self.diagonal[r] != 0, rest / self.value[r], 0 * rest)
 
     @ti.func
+    def bears(self, r):
+        """Whether row r is met by its multiplier: it is not slack, and its part does not give way."""
+        out = self.alpha[r] == 0 and self.is_active(r) and self.added[self.part_of[r]] == 0 and self.diagonal[r] != 0
+        if ti.static(self.bounds):
+            if self.limited[r] != 0:
+                out = out and self.is_inside(r, self.solution[r] + self.answer[r])
+        return out
+
+    @ti.func
     def row_that_begins(self, s):
         """Return the row whose first corner has slot s, -1 if that is none."""
         r = self.row_of[s]
@@ -410,6 +424,7 @@ class Elimination(System):
     def begin_answer(self, b):
         """Before contacts are solved: part b has answered nothing, and has its directions at the start of the substep."""
         self.turned_to[b] = 0
+        self.bends_far[b] = 0
         for r in range(self.part_begin[b], self.part_begin[b + 1]):
             self.answer[r], self.solution[r], self.gap[r] = 0, self.lam[r] + self.step[r], 0
             if ti.static(self.bounds):
@@ -440,17 +455,16 @@ class Elimination(System):
     def answer_part(self, b, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]
         """Answer moves of the particles of part b, `moved` - d, by multipliers `answer`, with the matrix of the last solution.
 
-        With the moves A u + (alpha' + softness) answer = 0 again, where u is how far they have changed f.
+        With the moves A u + gap + (alpha' + softness) answer = 0 again, where u is how far they have changed f.
         """
         begin, end, any_change, switched = self.part_begin[b], self.part_begin[b + 1], False, False
         rows, entries = self.solved, self.entries
         if ti.static(bool(self.joined)):
             self.joined.begin_answer(b, self, moved, d)
         for r in range(begin, end):
-            change = -self.scale[r] * self.moved_along(r, moved, d, True)
+            change = -self.scale[r] * self.moved_along(r, moved, d, True) - self.gap[r]
             if ti.static(self.bounds):
                 if self.limited[r] != 0 and self.scale[r] != 0:
-                    change -= self.gap[r]
                     lam = self.solution[r] + self.answer[r]
                     acts = ti.select(self.active[r] != 0, self.is_inside(r, lam), self.leaves_bound(r, lam, -change))
                     if acts != (self.active[r] != 0):
@@ -487,15 +501,34 @@ class Elimination(System):
 
     @ti.func
     def end_answer(self, b, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]
-        """End the answers of part b to moves of its particles, `moved` - d: further moves are answered from here on."""
+        """End the answers of part b to moves of its particles, `moved` - d. Those to places remove what earlier ones left."""
         for r in range(self.part_begin[b], self.part_begin[b + 1]):
+            gap = self.scale[r] * self.left[r]
             if ti.static(self.bounds):
-                if self.limited[r] != 0:
-                    self.gap[r] = ti.select(
-                        self.active[r] != 0, 0 * self.gap[r], self.gap[r] + self.scale[r] * self.moved_along(r, moved, d, False)
-                    )
+                if self.limited[r] != 0 and self.active[r] == 0:
+                    gap += self.gap[r] + self.scale[r] * self.moved_along(r, moved, d, False)
                 self.solution[r] = self.solution[r] + self.answer[r]
-            self.answer[r] = 0
+            self.gap[r], self.answer[r] = gap, 0
+
+    @ti.func
+    def note_bend(self, r, turn):
+        """Note that impulses of contacts turn row r: the square of a move over its length."""
+        if turn > LONG_MOVE:
+            self.bends_far[self.part_of[r]] = 1  # all write the same
+
+    @ti.func
+    def bends(self, r):
+        """Whether row r answers to second order: it bears, and impulses of contacts do not turn its part far, see LONG_MOVE."""
+        return self.bears(r) and self.bends_far[self.part_of[r]] == 0
+
+    @ti.func
+    def bend_part(self, b, moved: ti.template(), d: ti.template()):  # type: ignore[valid-type]
+        """Let rows of part b answer with the violations that moves of its particles, `moved` - d, lead to, beyond first order."""
+        if ti.static(bool(self.joined)):
+            self.joined.begin_answer(b, self, moved, d)
+        for r in range(self.part_begin[b], self.part_begin[b + 1]):
+            if self.bends(r):
+                self.gap[r] = self.gap[r] - self.scale[r] * self.moved_along(r, moved, d, True)
 
     @ti.func
     def moved_along(self, r, moved: ti.template(), d: ti.template(), fits: ti.template()):  # type: ignore[valid-type]
@@ -629,6 +662,8 @@ class Elimination(System):
                     self.violation[r] = b.dev.quantity.exact_excess(self.number[r])
                     if ti.static(b.dev.limit.acts):
                         self.violation[r] -= b.dev.limit.postponed[self.number[r]]
+                    if ti.static(self.answers):
+                        self.violation[r] -= self.left[r]
                     if ti.static(bool(self.joined)):
                         self.violation[r] += self.shift[r]
 
@@ -656,6 +691,17 @@ class Elimination(System):
             self.softened[b][2] = energy
         else:
             self.softened[b] = ti.Vector.zero(ti.f64, 4)
+
+    @ti.func
+    def leave_to_places(self, begin, end):
+        """Leave to places what a part, which bears its load again, gave way by.
+
+        Its removal by an impulse would take contacts along, whose mass the tension found does not tell.
+        """
+        for r in range(begin, end):
+            self.violation[r] -= self.at_start[r]
+            self.left[r] = self.left[r] + self.at_start[r]
+            self.at_start[r] = 0
 
     @ti.func
     def limit_tensions(self, begin, end, longer):
@@ -722,6 +768,7 @@ class Elimination(System):
         stage, k, bound, soft, longer = FORWARD, 0, True, self.softness(b, begin, end), 1 + zero
         if soft > 0:
             longer = soft / kick
+        most_borne = ti.select(soft == 1, SOFTENED_TO, TENSEST)  # what gave way bears no more at once than it did then
         if ti.static(len(self.precise) > 0):
             stage = ROUGH
         if begin == end:
@@ -740,9 +787,14 @@ class Elimination(System):
                 if stage <= FORWARD and self.limit_steps(begin, end) != 0:
                     continue
             if stage <= AGAIN:
-                if (hard == 0 and tension <= TENSEST) or stage == AGAIN:
+                if (hard == 0 and tension <= most_borne) or stage == AGAIN:
                     ti.atomic_max(self.tension[None], tension / longer)
                     self.record_softness(b, begin, end, soft, False)
+                    if ti.static(self.answers):
+                        if soft == 1 and hard == 0:
+                            soft = zero
+                            self.leave_to_places(begin, end)
+                            continue
                     stage = DONE
                     if tension > CALM_TENSION:
                         self.end_newton(b)

@@ -101,7 +101,7 @@ class RowPass:
                         own = ti.cast(row - self.rows.own[i], self.real)
                         noise += self.noise(i) * own
                         if ti.static(bool(self.answers)):
-                            own += self.answers.links.sum_of(self.answers.links.open, i)
+                            own += self.answers.links.sum_of(self.answers.links.open, i) + self.answers.count_left(i)
                         count += own
                         force += own * kick.dot(kick)
                     if ti.static(self.rows.bounces):
@@ -198,7 +198,7 @@ class RowPass:
                 self.rows.when[i] = self.rows.when[self.answers.body(i)]
             self.team.wait()
             self.turn_answers(thread)
-            self.move_answers(thread, self.going(), True)
+            self.move_answers(thread, self.going(), False)
             for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                 self.bodies.last[i] = self.bodies.new[i] + self.answers.hold(i) - self.impacts.thrown[i]
             self.team.wait()
@@ -288,25 +288,47 @@ class RowPass:
             self.team.wait()
 
     @ti.func
+    def bend_systems(self, thread):
+        """Once passes have met what rows lack: let systems answer to second order, from where impulses have moved them."""
+        if ti.static(self.impulses.has_systems):
+            bending = ti.cast(self.impulses.bending[None] == 1, ti.i32)
+            for f in ti.static(self.in_systems):
+                n = f.count * bending
+                for c in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                    f.dev.note_bend(c, self.bodies)
+            self.team.wait()
+            for f in ti.static(self.in_systems):
+                n = f.count * bending
+                for c in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                    f.dev.bend_answer(c, self.bodies)
+            self.team.wait()
+            for system in ti.static(self.answers.systems):
+                n = system.parts * bending
+                for b in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                    system.bend_part(b, self.bodies.new, self.state.d)
+            self.team.wait()
+            self.answer(thread, self.n * bending)
+
+    @ti.func
     def answer(self, thread, n):
         """Let systems, clusters and places answer the impulses of a pass to n particles: all, or none where no passes go on."""
         if ti.static(self.answers_later):
-            self.move_answers(thread, self.going(), True)
+            self.move_answers(thread, ti.cast(n > 0, ti.i32), False)
             for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                 self.bodies.new[i] = self.bodies.new[i] + self.answers.hold(i)
             self.team.wait()
 
     @ti.func
-    def move_answers(self, thread, going, from_d: ti.template()):  # type: ignore[valid-type]
-        """Let systems, clusters and places answer moves `new` of particles; from_d: beyond their displacements."""
+    def move_answers(self, thread, going, places: ti.template()):  # type: ignore[valid-type]
+        """Let systems, clusters and pins answer moves `new` of particles, by places or beyond their displacements."""
         for system in ti.static(self.answers.systems):
             n = system.parts * going
             for b in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-                system.answer_part(b, self.bodies.new, self.state.d if ti.static(from_d) else self.answers.nothing)
+                system.answer_part(b, self.bodies.new, self.answers.nothing if ti.static(places) else self.state.d)
         for f in ti.static(self.answers.alone):
             n = f.count * going
             for c in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-                f.dev.answer(c, self.bodies.new, self.state.d if ti.static(from_d) else self.answers.nothing)
+                f.dev.answer(c, self.bodies.new, self.answers.nothing if ti.static(places) else self.state.d)
         self.team.wait()
 
     @ti.func
@@ -451,6 +473,7 @@ class RowPass:
         for _ in range(self.team.one(1, thread) * self.going()):
             self.impulses.decide()
         self.team.wait()
+        self.bend_systems(thread)
         n = self.n * self.impulses.going[None]
         for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
             self.bodies.extrapolate(i, self.impulses.beta[None])
@@ -493,6 +516,12 @@ class RowPass:
         for _ in range(self.team.one(1, thread)):
             self.impulses.start_places()
         self.team.wait()
+        for f in ti.static(self.in_systems):
+            n = f.count * self.impulses.going[None]
+            for c in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                f.dev.begin_places(c)
+        if ti.static(len(self.in_systems) > 0):
+            self.team.wait()
 
     @ti.func
     def relax_places(self, thread):
@@ -516,7 +545,12 @@ class RowPass:
             self.places.move(i, self.impulses.beta[None])
         self.team.wait()
         if ti.static(self.answers_later):
-            self.move_answers(thread, going, False)
+            self.move_answers(thread, going, True)
             for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                 self.places.follow(i)
+            self.team.wait()
+            for f in ti.static(self.in_systems):
+                n = f.count * going
+                for c in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                    f.dev.end_places(c)
             self.team.wait()

@@ -40,6 +40,9 @@ class CornerPasses(Passes):
         self.in_system, self.has_outside = bool((rows >= 0).any()), bool((rows < 0).any())
         if self.in_system:
             self.row = add(f"{name}.row", m, kind=ti.i32, values=rows)
+        self.answers_in_system = self.in_system and scene.slots.system.answers
+        if self.answers_in_system:
+            self.before = add(f"{name}.before", m)  # f - rest before places
         self.converges = batch.solvable_together and (self.in_system or bool(scene.slots.semi_iteration))
         if self.converges:
             self.inverse_size = add(f"{name}.close", m, values=batch.inverse_size(batch.start.position))
@@ -128,10 +131,81 @@ class CornerPasses(Passes):
                 )  # fmt: skip
             f0 = self.quantity.unwrap(f0, self.equation.rest[c])
             f = self.quantity.unwrap(f, f0)
+        if ti.static(self.equation.answers):
+            if first != 0 and self.is_row(c):
+                self.equation.remember(c, f0)
         violation, A, alpha, lam, W = self.equation.terms(c, f, f0, w, both, h, h2_effective, first, fresh)
         if ti.static(self.limit.acts):
             violation -= A * self.equation.postpone(c, f0, W, share, first)
         return violation, A, alpha, lam, W, n, g, turn * ti.cast(self.quantity.direction_reliable(f, f0), ti.i32), f - f0
+
+    @inline
+    def is_row(self, c):
+        """Whether contacts relax constraint c as a row of theirs."""
+        return at(self.row, c) < 0 if self.answers_in_system else always()
+
+    @ti.func
+    def note_bend(self, c, bodies: ti.template()):  # type: ignore[valid-type]
+        """Tell the system how far impulses of contacts turn constraint c; too far if they act for a part of the substep only."""
+        row = self.row[c]
+        if row >= 0:
+            most = ti.cast(0, self.real)
+            for k in ti.static(range(self.arity)):
+                i = self.corners.member(c, k)
+                most = ti.max(most, self.answered_move(c, k, bodies).norm_sqr())
+                most = ti.select(bodies.rows.when_of(i) > 0, ti.math.inf + most, most)
+            self.slots.system.note_bend(row, most * self.inverse_size[c] * self.inverse_size[c])
+
+    @ti.func
+    def bend_answer(self, c, bodies: ti.template()):  # type: ignore[valid-type]
+        """Give the system the violation of constraint c where impulses of contacts move its corners."""
+        row = self.row[c]
+        if row >= 0:
+            if self.slots.system.bends(row):
+                q, moves = self.corners.relative_positions(c, 0), False
+                for k in ti.static(range(self.corners.first, self.arity)):
+                    move = self.answered_move(c, k, bodies)
+                    moves = moves or (move != 0).any()
+                    for a in ti.static(range(self.state.dim)):
+                        q[k, a] += move[a]
+                if moves:
+                    f, _g = self.quantity.remeasure(c, q)
+                    excess = self.quantity.excess(c, self.quantity.unwrap(f, self.equation.rest[c]))
+                    self.slots.system.gap[row] = excess - self.equation.left[c]
+
+    @ti.func
+    def answered_move(self, c, k, bodies: ti.template()):  # type: ignore[valid-type]
+        """Return how far impulses of contacts move corner k of constraint c [m], relative to its first one if positions are."""
+        j = self.corners.member(c, k)
+        move = bodies.new[j] - self.state.d[j]
+        if ti.static(self.corners.first > 0):
+            i = self.corners.member(c, 0)
+            move -= bodies.new[i] - self.state.d[i]
+        return move
+
+    @ti.func
+    def excess_now(self, c):
+        """Return f - rest of constraint c at the present positions."""
+        f, _g = self.measured(c, 0)
+        return self.quantity.excess(c, self.quantity.unwrap(f, self.equation.rest[c]))
+
+    @ti.func
+    def begin_places(self, c):
+        """Before places move anything, note where impulses have left constraint c."""
+        if self.row[c] >= 0:
+            self.before[c] = self.excess_now(c)
+
+    @ti.func
+    def end_places(self, c):
+        """After a pass of places, note by how much they have left constraint c violated, beyond rounding."""
+        row = self.row[c]
+        if row >= 0:
+            left = ti.cast(self.slots.system.left[row], self.real) + (self.excess_now(c) - self.before[c])
+            extent = self.corners.relative_positions(c, 0)[1, :].norm()
+            digits = self.state.digits_of_difference(self.corners.member(c, 0), extent)
+            if ti.abs(left) * self.inverse_size[c] * extent <= digits or not self.slots.system.bears(row):
+                left = 0 * left
+            self.equation.left[c] = left
 
     @ti.func
     def end_answer(self, c, rows: ti.template()):  # type: ignore[valid-type]
@@ -196,6 +270,9 @@ class CornerPasses(Passes):
                 low, high = self.drive.bounds(c, self.side)
                 self.slots.system.bound_row(row, low, high)
         self.slots.system.set_row(row, violation, A, alpha, start, weight, self.geometric_stiffness(c, weight))
+        if ti.static(self.answers_in_system):
+            self.slots.system.left[row] = self.equation.left[c]
+            self.slots.system.at_start[row] = ti.select(self.spring.is_rigid(c), violation - moved, 0 * violation)
         if ti.static(self.slots.system.limits_steps):
             u, split, longest, _ = self.motion(c, n, 0)
             spare, most = ti.math.inf + 0 * u, ti.math.inf + 0 * u
@@ -319,6 +396,8 @@ class CornerPasses(Passes):
                     self.equation.lam[c] = step
                 else:
                     self.equation.lam[c] = self.equation.lam[c] + step
+                if ti.static(self.answers_in_system):
+                    self.equation.left[c] = ti.cast(self.slots.system.left[row], self.real)
 
     @ti.func
     def push_spring_force(self, c, h, soft, alone):

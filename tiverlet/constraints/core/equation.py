@@ -95,9 +95,6 @@ class Equation:
                 W = 0
         C, A = self.quantity.excess(c, f), ti.cast(1, self.real)
         if ti.static(self.answers):
-            if first != 0:
-                stays = self.touched[c] != 0 and not self.has_cusp(c)  # at a cusp, its direction would not be that of a link
-                self.left[c] = ti.select(stays, self.earlier_violation(c, f0, 1), 0 * f0)
             C -= self.left[c]
         B, alpha = ti.cast(0, self.real), ti.cast(0, self.real)
         lam = self.lam[c]
@@ -122,6 +119,12 @@ class Equation:
                 self.spring.history[c] = 0
                 self.spring.last[c] = f0
         return A * C + B + alpha * lam, A, alpha, lam, W
+
+    @ti.func
+    def remember(self, c, f0):
+        """At the start of a substep, note what the passes of contacts have left constraint c violated by, which they touched."""
+        stays = self.touched[c] != 0 and not self.has_cusp(c)  # at a cusp, its direction would not be that of a link
+        self.left[c] = ti.select(stays, self.earlier_violation(c, f0, 1), 0 * f0)
 
     @ti.func
     def earlier_violation(self, c, f, ago: ti.template()):  # type: ignore[valid-type]

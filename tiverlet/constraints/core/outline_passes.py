@@ -91,6 +91,9 @@ class OutlinePasses(Passes):
             if first != 0:
                 self.equation.ramp.update_rest(c, frame_fraction)
         f, f0, w, W, turn, extent, move = self.sum_blocks(c)
+        if ti.static(self.equation.answers):
+            if first != 0:
+                self.equation.remember(c, f0)
         violation, A, alpha, lam, W = self.equation.terms(c, f, f0, w, W, h, h2_effective, first, fresh)
         if ti.static(self.limit.acts):
             violation -= A * self.equation.postpone(c, f0, W, frame_fraction[2], first)
