@@ -564,10 +564,11 @@ class Rows:
                 ahead = gap + un
                 if ti.static(w.bends):
                     ahead += self.rise(u.dot(u) - un * un, un, bend)
+                near = ti.cast(AHEAD, self.real)
                 if ti.static(bool(self.impacts)):  # what is struck may go anywhere
-                    ahead = ti.min(ahead, gap + un - self.ahead)
+                    ahead, near = ti.min(ahead, gap + un - self.ahead), ti.cast(SLOP, self.real)
                 # What it bore, it may still bear; but an open side, which is nowhere, has no row.
-                lists = ahead < ti.select(self.is_set(p), 1, ti.cast(AHEAD, self.real)) * self.size(i)
+                lists = ahead < ti.select(self.is_set(p), 1, near) * self.size(i)
                 if ti.static(w.dev.surface.has_switch):
                     lists = lists and w.dev.surface.active[None] != 0
                 if ti.static(w.dev.surface.is_one_way):
