@@ -564,9 +564,10 @@ class Rows:
                 ahead = gap + un
                 if ti.static(w.bends):
                     ahead += self.rise(u.dot(u) - un * un, un, bend)
-                near = ti.cast(AHEAD, self.real)
                 if ti.static(bool(self.impacts)):  # what is struck may go anywhere
-                    ahead, near = ti.min(ahead, gap + un - self.ahead), ti.cast(SLOP, self.real)
+                    ahead = ti.min(ahead, gap + un - self.ahead)
+                # Others may press it there within the substep, as in pairs. Where things bounce, more rows take more passes.
+                near = ti.cast(ti.static(SLOP if self.bounces else AHEAD), self.real)
                 # What it bore, it may still bear; but an open side, which is nowhere, has no row.
                 lists = ahead < ti.select(self.is_set(p), 1, near) * self.size(i)
                 if ti.static(w.dev.surface.has_switch):
