@@ -63,6 +63,7 @@ class Rows:
         self.scene, self.state, self.table = scene, scene.state, table
         self.has_friction, self.real, self.dim, self.radius = has_friction, scene.real, scene.particles.dim, scene.radius
         self.sheared = bool(scene.state.images and scene.state.images.sheared)  # whether images move relative to each other
+        self.slots: Any = scene.slots if scene.slots and scene.slots.answers else None
         self.edges: Any = edges
         self.ends = 2 if edges else 1  # particles on which a row presses
         self.walls, self.width = walls, scene.particles.dim if has_friction else 0
@@ -566,8 +567,10 @@ class Rows:
                     ahead += self.rise(u.dot(u) - un * un, un, bend)
                 if ti.static(bool(self.impacts)):  # what is struck may go anywhere
                     ahead = ti.min(ahead, gap + un - self.ahead)
-                # Others may press it there within the substep, as in pairs. Where things bounce, more rows take more passes.
-                near = ti.cast(ti.static(SLOP if self.bounces else AHEAD), self.real)
+                near = ti.cast(SLOP, self.real)
+                if ti.static(bool(self.slots) and not self.bounces):
+                    if self.slots.begin[i + 1] > self.slots.begin[i]:  # what links hold, others may press there in the substep
+                        near = ti.cast(AHEAD, self.real)
                 # What it bore, it may still bear; but an open side, which is nowhere, has no row.
                 lists = ahead < ti.select(self.is_set(p), 1, near) * self.size(i)
                 if ti.static(w.dev.surface.has_switch):
