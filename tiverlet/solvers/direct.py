@@ -701,7 +701,6 @@ class Elimination(System):
         for r in range(begin, end):
             self.violation[r] -= self.at_start[r]
             self.left[r] = self.left[r] + self.at_start[r]
-            self.at_start[r] = 0
 
     @ti.func
     def limit_tensions(self, begin, end, longer):
