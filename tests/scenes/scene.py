@@ -15,12 +15,16 @@ AT_ANY_TIME = ("substeps", "iterations")  # settings that are no structure
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene. smooth: it converges with h^2. flags: those that it rightly has. first: assignments before its first frame."""
+    """A scene. smooth: it converges with h^2. flags: those that it rightly has. first: assignments before its first frame.
+
+    known: what is still wrong with it. Only the ledger runs such a scene.
+    """
 
     structure: Structure
     first: list[Event]
     smooth: bool
     flags: frozenset[str]
+    known: str
 
 
 class Calls:
@@ -34,7 +38,7 @@ class Calls:
 c: Any = Calls()
 
 
-def scene(smooth: bool = False, flags: set[str] = frozenset()):  # type: ignore[assignment]
+def scene(smooth: bool = False, flags: set[str] = frozenset(), known: str = ""):  # type: ignore[assignment]
     """Add a scene to the catalogue: a function that returns particles, features, and settings of the world, if any."""
 
     def add(make: Callable[[], tuple]) -> Callable[[], tuple]:
@@ -42,7 +46,7 @@ def scene(smooth: bool = False, flags: set[str] = frozenset()):  # type: ignore[
         given = {"path": "fused", **(settings[0] if settings else {})}
         first: list[Event] = [Set(None, name, given.pop(name)) for name in AT_ANY_TIME if name in given]
         ALL[make.__name__.replace("_", " ")] = Scene(
-            Structure(particles, tuple(features), given), first, smooth, frozenset(flags)
+            Structure(particles, tuple(features), given), first, smooth, frozenset(flags), known
         )
         return make
 

@@ -76,7 +76,7 @@ class Impulses:
         self.has_systems = bool(bodies.answers) and bool(bodies.answers.systems)
         self.bending: Any = add("Contact.bending", None, kind=ti.i32) if self.has_systems else None
         # Rounds, passes of impulses and of places that a substep of a frame took at most.
-        self.most: Any = add("Contact.most", None, width=3, kind=ti.i32) if team.launched else None
+        self.most = add("Contact.most", None, width=3, kind=ti.i32)
         self.last_h2 = add("Contact.last_h2", None, state=True)  # h^2 of what rows bore [s^2]; 0 before the first substep
 
     def regroup(self, n: int) -> None:
@@ -91,9 +91,8 @@ class Impulses:
 
     @ti.func
     def note_turn(self, k: ti.template(), turn):  # type: ignore[valid-type]
-        """On the launched path: note how many passes of a kind this substep took so far."""
-        if ti.static(self.team.launched):
-            self.most[None][k] = ti.max(self.most[None][k], turn)
+        """Note how many passes of a kind this substep took so far."""
+        self.most[None][k] = ti.max(self.most[None][k], turn)
 
     @ti.func
     def note(self, i, k: ti.template(), value):  # type: ignore[valid-type]

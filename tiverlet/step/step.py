@@ -521,7 +521,7 @@ class Step:
         if ti.static(len(self.searches) > 0):
             for k in ti.static(range(4)):
                 sheet[HALT + k] = self.halt[None][k]
-            if ti.static(self.launched and bool(self.contact_pass.rows)):
+            if ti.static(bool(self.contact_pass.rows)):
                 for k in ti.static(range(3)):
                     sheet[MOST + k] = self.contact_pass.rows.impulses.most[None][k]
                 if self.halted() == 0:
