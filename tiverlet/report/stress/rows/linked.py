@@ -131,7 +131,7 @@ def _point() -> Findings:
             w.run(1.0)
             apart = abs(w.position[5, 0] - w.position[4, 0])
             moved = np.abs(w.position[:4] - x[:4]).max()
-            yield f"{precision} moved {moved:g} m", finite(w) and moved < 1e-15 and apart <= 0.5 + 1e-6
+            yield f"{precision} moved {moved:g} m", finite(w) and moved < 1e-15 and apart <= 0.5 + 1e-12
 
 
 @row(17, "coincident at x_n, apart at the prediction", "the direction at the prediction takes its place")
@@ -151,8 +151,8 @@ def _whip() -> Findings:
         with world(particles, features, substeps=4, iterations=10, solver=solver) as w:
             report = w.run(1.5)
             told = ", ".join(sorted(report.flags)) or "no flag"
-            bounded = finite(w) and w.last.energy <= 1e-2
-            yield f"{solver}: {told}", bounded and report.flags & {"turned", "softened"}
+            yield f"{solver}: {told}", report.flags & {"turned", "softened"}
+            yield at_most(f"energy {w.last.energy:+.1e} J", w.last.energy, 0.0, finite(w))
 
 
 @row(21, "links that contradict each other (triangle 1, 1, 3)", "bounded for 1e5 substeps, the residual is least squares")

@@ -108,7 +108,7 @@ def _closing() -> Findings:
         with world(start, [Gravity(G), *made(), *room], precision="f32") as w:
             fastest = 0.0
             for _ in range(240):
-                lid.offset = min(-0.02, lid.offset + 0.01)
+                lid.offset = min(-0.02, float(lid.offset) + 0.01)
                 w.step(1 / 60)
                 fastest = max(fastest, float(np.abs(w.velocity).max()))
             holds[f"{name}: {fastest:.2g} m/s"] = fastest <= 60.0

@@ -27,6 +27,8 @@ EXCUSES: dict[str, dict[str, float]] = {
     "unconverged": {"residual": 1.0},  # links twice as long as they should be; beyond that nothing is held
     "softened": {"residual": 1.0},
     "turned": {"residual": 1.0},
+    "stuck": {"residual": 1.0, "overlap": 1.0},
+    "substeps-capped": {"residual": 1.0, "overlap": 1.0},
     "compressed": {"overlap": 1.0},  # up to the center of the smaller particle
     "tunnelling-risk": {"overlap": 2.0},  # up to the other side of it
 }
