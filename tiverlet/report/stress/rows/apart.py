@@ -13,7 +13,6 @@ from ....forces import Gravity, PairForce
 from ....particles import Particles
 from ....shapes import net, rope
 from ....step.sleep import Sleep
-from ....worlds import Worlds
 from ...accuracy.cases import known
 from ...accuracy.cases.chains import hung
 from .row import Findings, at_most, finite, row, world
@@ -93,6 +92,8 @@ def _sleep() -> Findings:
 
 @row(116, "6 copies with masses, lengths and speeds of 1e-6 ... 1e9, some out of range", "each has the same bits as alone")
 def _copies() -> Findings:
+    from ....worlds import Worlds  # here, since it stands on all else that is imported
+
     size = 10.0 ** np.linspace(-6, 9, 6)
     x = np.array([[0.0, 0], [1, 0], [2, 0.5]])
 
