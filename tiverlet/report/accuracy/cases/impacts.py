@@ -127,7 +127,7 @@ CASES = [
     Case("R15_oblique_discs", "Oblique collision of two discs", glanced, 0.6, turned, (1e-12, 5e-7), 1.0, "rad", order=None,
          momentum=sideways),
     bounces(0.5, (1e-12, 5e-6)),
-    bounces(0.8, (1e-12, 5e-6)),
+    bounces(0.8, (1e-12, 4e-6)),
     bounces(0.9, (1e-12, 3e-6)),
     Case("R17_newton_cradle", "Newton's cradle with gaps of 1 mm", cradle, 0.2,
          lambda run: rms(run.world.velocity[:, :1], [[0.0], [0], [0], [0], [1]]), (1e-12, 1e-12), 1.0, "m/s", 0.01,

@@ -221,7 +221,7 @@ def _clusters() -> Scenes:
     yield "links inside", Particles(x, mass=MASS, pinned=[0]), inside, {}
 
 
-@passive(78, "a bridge of ropes under 500 discs", gain=1e-3, speed=2.0)
+@passive(78, "a bridge of ropes under 500 discs", gain=0.0, speed=2.0)
 def _bridge() -> Scenes:
     rng = np.random.default_rng(3)
     particles, pairs, _ = ropes((30, 30), LEVEL * 2)
