@@ -19,6 +19,7 @@ from tiverlet.report.accuracy import baselines, errors, points
 from tiverlet.report.accuracy.cases import LEFT_OUT, chosen, entries
 from tiverlet.report.stress.certificate import certify
 from tiverlet.report.stress.rows import ROWS, Row
+from tiverlet.report.stress.rows.row import EXCUSES, at_most, excused
 
 from .conftest import figures
 
@@ -111,6 +112,15 @@ def test_wrong_orders_large_errors_and_divergence_are_named(report):
 
     assert re.search("order 1.0", str(altered(lambda p: replace(p, error=1e-6 * 20 / p.substeps)).failures))
     assert re.search("limit 1e-05", str(altered(lambda p: replace(p, error=10 * p.error)).failures))
+    assert re.search("times below its limit of 1e-05", str(altered(lambda p: replace(p, error=p.error / 20)).failures))
+    # Points with flags show no order, and a known fault fails once it does not show.
+    flagged = altered(lambda p: replace(p, flags=("softened",), error=p.error * (1 + (p.substeps == 10))))
+    assert flagged.order(case, method) is None and report.order(case, method) == pytest.approx(2, abs=0.05)
+    with pytest.MonkeyPatch.context() as m:
+        m.setitem(CASES, case, replace(CASES[case], known="it is wrong"))
+        wrong, right = altered(lambda p: replace(p, error=10 * p.error)), altered(lambda p: p)
+        assert not wrong.failures and "known fault; it is wrong" in str(wrong)
+        assert "strike it in its case: it is wrong" in str(right.failures)
     lost = altered(lambda p: replace(p, error=np.inf, diverged=True))
     assert "diverged at 20" in str(lost.failures) and any("20 substeps: diverged" in line for line in lost.omissions)
     assert json.loads(lost.json())["points"][0]["error"] is None
@@ -154,15 +164,46 @@ def test_the_certificate_tells_what_holds_and_what_does_not(monkeypatch, tmp_pat
     monkeypatch.setitem(ROWS, 71, Row(71, "a row", "holds", lambda: [("short", False), ("long", True)]))
     monkeypatch.setitem(ROWS, 72, Row(72, "another", "works", wrong))
     monkeypatch.setitem(ROWS, 73, Row(73, "an empty one", "says something", lambda: []))
-    assert [certify(n).verdict for n in (71, 72, 73)] == ["FAILED"] * 3
+    monkeypatch.setitem(ROWS, 74, Row(74, "a fault", "is named", lambda: [("off", False), ("on", True)], "it is off"))
+    monkeypatch.setitem(ROWS, 75, Row(75, "mended", "is struck", lambda: [("on", True)], "it was off"))
+    assert [certify(n).verdict for n in (71, 72, 73, 74, 75)] == ["FAILED"] * 3 + ["known fault", "FAILED"]
+    assert certify(74).failing == ("it is off", "off") and "strike it here: it was off" in certify(75).failing[0]
     assert certify(71).failing == ("short",) and "no such luck" in certify(72).failing[0]
     path = str(tmp_path / "certificate.json")
     assert main(["stress", "3", "5", "--workers", "1", "--json", path]) == 0
     assert json.loads(pathlib.Path(path).read_text())["passed"] is True
-    assert main(["stress", "71", "3", "--workers", "1"]) == 1
-    assert "1 of 2 passed, 1 failed" in capsys.readouterr().out
+    capsys.readouterr()
+    assert main(["stress", "71", "74", "3", "--workers", "1"]) == 1
+    told = capsys.readouterr().out
+    assert "1 of 3 passed, 1 with a known fault, 1 failed" in told
+    lines = told.splitlines()  # into a pipe: a line a row, in the order in which they finish, before the table, and no bar
+    assert [line.split()[:2] for line in lines[:3]] == [["71", "FAILED"], ["74", "known"], ["3", "passed"]]
+    assert "Stiff and extreme cases" in lines[3]
+    assert main(["stress", "74", "--workers", "1"]) == 0
     with pytest.raises(ValueError, match="rows has 99"):
         tv.report.stress(rows=[99])
+
+
+def test_limits_see_what_gets_worse():
+    # A finding holds within its limit, and as long as the limit is no more than ten times what is reached.
+    assert at_most("error", 1e-3, 5e-3) == ("error, limit 0.005", True)
+    assert not at_most("error", 6e-3, 5e-3)[1] and not at_most("error", float("nan"), 1.0)[1]
+    assert at_most("error", 1e-3, 1e-2)[1] and not at_most("error", 1e-3, 1.01e-2)[1]
+    assert not at_most("energy", -1.0, 1e-3)[1] and at_most("energy", -1.0, 0.0)[1]
+    assert at_most("rounding", 0.0, 1e-12)[1] and not at_most("rounding", 0.0, 1e-9)[1]
+    assert not at_most("error", 1e-3, 5e-3, also=False)[1]
+
+
+def test_flags_excuse_what_they_name():
+    clean = tv.StepReport(0.0, 20, 1, residual=0.04, overlap=0.04)
+    assert excused(clean, "residual", 0.05) and not excused(replace(clean, residual=0.06), "residual", 0.05)
+    for flag, named in EXCUSES.items():
+        for figure in ("residual", "overlap", "energy_change"):
+            most = named.get(figure, 0.05)
+            for value in (0.9 * most, 1.1 * most):
+                found = excused(replace(clean, flags=frozenset([flag]), **{figure: value}), figure, 0.05)
+                assert found == (value <= most), (flag, figure, value)
+    assert not excused(replace(clean, flags=frozenset(["unconverged"]), residual=180.0), "residual", 0.05)
 
 
 def test_commands(tmp_path, capsys):

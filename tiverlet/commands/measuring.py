@@ -1,4 +1,4 @@
-"""What commands that measure for minutes share: processes, a progress bar, and files for machines."""
+"""What commands that measure for minutes share: processes, verdicts as they come, and files for machines."""
 
 import argparse
 import contextlib
@@ -30,10 +30,9 @@ def measured(workers: int, measure: Callable[..., Any], *given: Any, **options: 
     """Return what measure(*given, **options) measures in this number of processes, and print it."""
     from rich.console import Console
 
-    console = Console()
     with _pool(workers) as executor:
-        report = measure(*given, **options, executor=executor, progress=console.is_terminal)
-    console.print(report)
+        report = measure(*given, **options, executor=executor, progress=True)
+    Console().print(report)
     return report
 
 

@@ -1,10 +1,12 @@
-"""Run the parts of a report, one after the other here or in the workers of an executor, with a progress bar."""
+"""Run the parts of a report, one after the other here or in the workers of an executor, and say what has finished."""
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, TypeVar
 
+from rich.console import Console
 from rich.progress import Progress
 
 from .output import error_line
@@ -12,22 +14,36 @@ from .output import error_line
 T = TypeVar("T")
 
 
-def done(
-    title: str, function: Callable[[T], Any], parts: Sequence[T], executor: Any, progress: bool, name: Callable[[T], str] = str
-) -> Iterator[tuple[T, Any, str]]:
+@contextmanager
+def finishing(title: str, count: int, shown: bool) -> Iterator[Callable[[str], None]]:
+    """Provide a function to call as each of `count` parts finishes, with a line to print at once; "" for none.
+
+    Lines are flushed, into a pipe or a file too; in a terminal they stand above a bar. shown: whether to print at all.
+    """
+    console = Console(soft_wrap=True, highlight=False, markup=False, quiet=not shown)
+    with Progress(console=console, disable=not (shown and console.is_terminal)) as bar:
+        task = bar.add_task(title, total=count)
+
+        def say(line: str) -> None:
+            """Print the line, if there is one, and advance the bar."""
+            if line:
+                console.print(line)
+            bar.advance(task)
+
+        yield say
+
+
+def done(function: Callable[[T], Any], parts: Sequence[T], executor: Any) -> Iterator[tuple[T, Any, str]]:
     """Yield (part, function(part), "") for each part as it finishes, or (part, None, error) if it or its worker failed.
 
-    executor: an object with submit(), or None. progress: whether to show a bar. name(part): the text beside the bar.
+    executor: an object with submit(), or None.
     """
-    with Progress(disable=not progress) as bar:
-        shown = bar.add_task(title, total=len(parts))
-        for part, call in _calls(function, parts, executor):
-            try:
-                made, why = call(), ""
-            except Exception as error:
-                made, why = None, error_line(error)
-            yield part, made, why
-            bar.update(shown, advance=1, description=name(part))
+    for part, call in _calls(function, parts, executor):
+        try:
+            made, why = call(), ""
+        except Exception as error:
+            made, why = None, error_line(error)
+        yield part, made, why
 
 
 def _calls(function: Callable[[T], Any], parts: Sequence[T], executor: Any) -> Iterator[tuple[T, Callable[[], Any]]]:

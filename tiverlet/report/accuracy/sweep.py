@@ -1,14 +1,15 @@
 """Error against run time: sweep substeps, solvers and precisions of the cases, with the baselines on the same axes."""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from typing import Any
 
-from ..jobs import done
+from ..jobs import done, finishing
 from ..output import machine
 from .baselines import BASELINES
 from .cases import CASES, LEFT_OUT, METHODS, Case, chosen
-from .errors import ErrorReport, Missing
+from .errors import ErrorReport, Missing, verdict
 from .points import Task, curve
 
 FARTHER = (4, 16)  # baselines also get these multiples of the most substeps, since theirs are cheaper
@@ -61,7 +62,7 @@ def error_vs_time(
     runs: timed runs of a point, after the run whose error is measured; the median counts (fewer runs if one takes long).
     executor: an object with submit(), as in concurrent.futures. Its workers measure the curves; they must not be forked from a
     process that has started Taichi (use the start method "spawn"). Curves of a worker that dies are named in .missing.
-    quick: fewer substeps and one timed run. progress: show a bar.
+    quick: fewer substeps and one timed run. progress: print the verdict on each case as it finishes, in a terminal with a bar.
 
     Protocol: Rackauckas and Nie, SciMLBenchmarks (work-precision diagrams with omissions).
     """
@@ -70,10 +71,13 @@ def error_vs_time(
             raise ValueError(f"error_vs_time: methods has {name!r}, but there are {', '.join(METHODS)}.")
     some = chosen(cases)
     tasks, omissions = plan(some, methods, precisions, efforts, baselines, 1 if quick else runs, quick)
-    points, missing = [], []
-    for task, made, why in done("error against run time", curve, tasks, executor, progress):
-        points += made or []
-        missing += [Missing(str(task), why)] if why else []
+    points, missing, curves = [], [], Counter(task.case for task in tasks)
+    with finishing("error against run time", len(tasks), progress) as say:
+        for task, made, why in done(curve, tasks, executor):
+            points += made or []
+            missing += [Missing(task.case, str(task), why)] if why else []
+            curves[task.case] -= 1
+            say("" if curves[task.case] else verdict(task.case, points, [m for m in missing if m.case == task.case]))
     order = {name: k for k, name in enumerate(CASES)}
     points.sort(key=lambda p: (order[p.case], p.method in BASELINES))
     left = [f"{name}: {why}" for name, why in LEFT_OUT.items()] if cases is None else []

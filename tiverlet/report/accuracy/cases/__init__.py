@@ -6,7 +6,7 @@ To add a case, add one entry to the list CASES of a file in this folder.
 import difflib
 
 from . import chains, free, impacts, statics
-from .case import FRAME, METHODS, Case, Run, entries, known
+from .case import FRAME, METHODS, SLACK, Case, Run, entries, known
 
 CASES: dict[str, Case] = {c.name: c for file in (chains, free, statics, impacts) for c in file.CASES}
 
@@ -36,4 +36,4 @@ def chosen(names=None) -> list[Case]:
     return list(out.values())
 
 
-__all__ = ["CASES", "FRAME", "LEFT_OUT", "METHODS", "Case", "Run", "chosen", "entries", "known"]
+__all__ = ["CASES", "FRAME", "LEFT_OUT", "METHODS", "SLACK", "Case", "Run", "chosen", "entries", "known"]

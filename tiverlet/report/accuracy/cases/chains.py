@@ -5,7 +5,7 @@ import numpy as np
 from ....constraints import Distance
 from ....forces import Gravity
 from ....particles import Particles
-from .case import Case, Run, Scene, ends_at, known, links, pendulum, rms, spin, upright
+from .case import Case, Limits, Run, Scene, ends_at, known, links, pendulum, rms, spin, upright
 
 CHAIN = ("Direct", "Jacobi")
 
@@ -25,7 +25,7 @@ def hung(name: str) -> tuple[Particles, tuple[Gravity, Distance]]:
     return start, (Gravity(p["g"]), Distance(links(len(angle))))
 
 
-def swings(name: str, t: float, limit: float, **more) -> Case:
+def swings(name: str, t: float, limit: Limits, **more) -> Case:
     """Return the case of a planar chain: the positions of all its particles, or those that the entry lists, at time t."""
     values = known(name)["values"][f"t{t}"]
     if "tip_xy" in values:
@@ -67,7 +67,7 @@ def rod(omega: float, masses: tuple[float, float], dim: int = 2) -> Scene:
     return Particles(x, velocity=v, mass=masses), [Distance([[0, 1]])]
 
 
-def spun(name: str, omega: float, masses: tuple[float, float], seconds: float, limit: float, **more) -> Case:
+def spun(name: str, omega: float, masses: tuple[float, float], seconds: float, limit: Limits, **more) -> Case:
     """Return the case of a free rod: the ends of the rod after `seconds`, at an angle of omega t."""
     a = omega * seconds
     arm = np.array([masses[1], -masses[0]]) / sum(masses)
@@ -77,7 +77,7 @@ def spun(name: str, omega: float, masses: tuple[float, float], seconds: float, l
     return Case(name, title, build, seconds, error, limit, 0.5, methods=("Jacobi",), momentum=spin, **more)
 
 
-def period(degrees: int, seconds: float, limit: float) -> Case:
+def period(degrees: int, seconds: float, limit: Limits) -> Case:
     """Return a case of R06: the period at an amplitude of `degrees`, measured from a quarter of it."""
     angle, frame = np.radians(degrees), seconds / 160
     title = f"Pendulum, period of {degrees} degrees"
@@ -87,7 +87,7 @@ def period(degrees: int, seconds: float, limit: float) -> Case:
     )  # fmt: skip
 
 
-def state(degrees: int, t: int, limit: float) -> Case:
+def state(degrees: int, t: int, limit: Limits) -> Case:
     """Return a case of R06b: the position of the pendulum after t seconds."""
     v, angle = known("R06b_pendulum_state")["values"][f"{degrees}deg_t{t}"], np.radians(degrees)
     title = f"Pendulum of {degrees} degrees after {t} s"
@@ -100,47 +100,48 @@ S01, S02, S04, R07 = map(known, ("S01_spherical_pendulum", "S02_chain5_3d", "S04
 HEAVY = {"efforts": (20, 80, 320, 640, 1280, 2560, 5120), "at": 320, "fit": (1280, 2560, 5120)}
 
 CASES = [
-    swings("D01_double_pendulum", 2.0, 1e-5),
-    swings("D02_double_pendulum_low", 5.0, 1e-4),
-    swings("D03_mueller_triple", 1.0, 1.4e-4),
-    swings("D04_mueller_heavy", 0.5, 5e-2),
-    swings("D05_chain10", 0.5, 1.15e-5),
-    swings("D06_chain100", 0.5, 1.25e-4, efforts=(10, 20, 40, 80, 160, 320, 640), fit=(80, 160, 320, 640)),
-    swings("D07_massratio_1000", 0.5, 4e-6),
-    swings("D07_massratio_10000", 0.5, 2.2e-5, **HEAVY),
-    swings("D07_massratio_100000", 0.5, 1e-4, **HEAVY),
+    swings("D01_double_pendulum", 2.0, (1e-5, 2e-5)),
+    swings("D02_double_pendulum_low", 5.0, (5e-6, 5e-6)),
+    swings("D03_mueller_triple", 1.0, (1.4e-4, 1.4e-4)),
+    swings("D04_mueller_heavy", 0.5, (5e-6, 5e-6)),
+    swings("D05_chain10", 0.5, (1.15e-5, 1.2e-5)),
+    swings("D06_chain100", 0.5, (1.25e-4, 1.25e-4), efforts=(10, 20, 40, 80, 160, 320, 640), fit=(80, 160, 320, 640)),
+    swings("D07_massratio_1000", 0.5, (4e-6, 4e-6)),
+    swings("D07_massratio_10000", 0.5, (3e-8, 3e-7), **HEAVY),
+    swings("D07_massratio_100000", 0.5, (5e-8, 3e-7), **HEAVY),
     swings(
-        "D07_massratio_1000000", 0.5, 1e-4, efforts=(80, 320, 1280, 5120, 10240, 20480), at=320, fit=(5120, 10240, 20480)
+        "D07_massratio_1000000", 0.5, (2e-8, 3e-7), efforts=(80, 320, 1280, 5120, 10240, 20480), at=320, fit=(5120, 10240, 20480)
     ),
-    swings("D08_massratio10", 0.5, 2e-5),
-    swings("D09_massratio_inverted", 0.5, 1e-4),
+    swings("D08_massratio10", 0.5, (1e-5, 1e-5)),
+    swings("D09_massratio_inverted", 0.5, (1e-5, 1e-5)),
     Case(
         "S01_spherical_pendulum", "Spherical pendulum",
         lambda: pendulum(S01["params"]["x0"], S01["params"]["v0"], Gravity(S01["params"]["g"])), 10.0,
-        ends_at([1], [S01["values"]["t10.0"]["xyz"]]), 1.8e-5, methods=CHAIN, momentum=upright,
+        ends_at([1], [S01["values"]["t10.0"]["xyz"]]), (1.8e-5, 4e-5), methods=CHAIN, momentum=upright,
     ),
     Case(
         "S02_chain5_3d", "Skew chain of 5 links in space", skew, 1.0,
-        ends_at(slice(1, None), S02["values"]["t1.0"]["xyz"]), 1.3e-4, methods=CHAIN, momentum=upright,
+        ends_at(slice(1, None), S02["values"]["t1.0"]["xyz"]), (1.3e-4, 1.3e-4), methods=CHAIN, momentum=upright,
     ),
-    swings("S03_folded_chain", 0.3, 1e-3),
+    swings("S03_folded_chain", 0.3, (5e-5, 5e-5)),
     Case(
         "S04_spring_pendulum", "Elastic pendulum",
         lambda: pendulum(
             S04["params"]["x0"], 0.0, Gravity(S04["params"]["g"]), rest=S04["params"]["L"], compliance=S04["params"]["alpha"]
-        ), 5.0, ends_at([1], [S04["values"]["t5.0"]["xy"]]), 1.2e-6,
+        ), 5.0, ends_at([1], [S04["values"]["t5.0"]["xy"]]), (1.2e-6, 3e-6),
     ),
-    spun("S09_spinning_rod_decay", 10.0, (1.0, 1.0), 10.0, 1e-2),
-    spun("R08_spinning_dumbbell", 50.0, (1.0, 3.0), 1.0, 2e-2),
-    period(10, PERIODS["10deg"], 2e-6),
-    period(90, PERIODS["90deg"], 2e-6),
-    period(170, PERIODS["170deg"], 1e-5),
-    state(90, 10, 5e-5),
+    spun("S09_spinning_rod_decay", 10.0, (1.0, 1.0), 10.0, (2e-3, 2e-3)),
+    spun("R08_spinning_dumbbell", 50.0, (1.0, 3.0), 1.0, (2e-2, 2e-2)),
+    period(10, PERIODS["10deg"], (5e-7, 5e-7)),
+    period(90, PERIODS["90deg"], (2e-6, 2e-6)),
+    period(170, PERIODS["170deg"], (1e-5, 1e-5)),
+    state(90, 10, (5e-5, 1e-4)),
     Case(
         "R07_conical_pendulum", "Conical pendulum",
         lambda: pendulum(
             (R07["values"]["radius"], -R07["values"]["depth"], 0), (0, 0, R07["values"]["speed"]), Gravity(R07["params"]["g"])
         ), 10.0,
-        lambda run: rms(run.world.position[1, [0, 2]], [R07["values"][k] for k in ("x_t10", "z_t10")]), 1e-3, momentum=upright,
+        lambda run: rms(run.world.position[1, [0, 2]], [R07["values"][k] for k in ("x_t10", "z_t10")]), (4e-5, 4e-5),
+        momentum=upright,
     ),
 ]  # fmt: skip

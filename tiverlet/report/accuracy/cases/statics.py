@@ -9,7 +9,7 @@ from ....device import ti
 from ....forces import Drag, Force, Gravity
 from ....particles import Particles
 from ....shapes import net
-from .case import Case, Scene, ends_at, known, links
+from .case import Case, Limits, Scene, ends_at, known, links
 
 RATE = 4.0  # [1/s] of the drag that brings scenes to rest; after 10 s exp(-20) of a swing is left
 FINER: dict[str, Any] = {"efforts": (10, 20, 40, 80, 160)}  # for scenes that need more substeps for the order of Jacobi
@@ -24,7 +24,7 @@ def rope(n: int, length: float, span: float, alpha: float) -> Scene:
     return Particles(x, mass=0.1, pinned=[0, n]), [Gravity(9.81), link, Drag(RATE)]
 
 
-def sags(name: str, key: str, n: int, length: float, span: float, alpha: float, limit: float, **more) -> Case:
+def sags(name: str, key: str, n: int, length: float, span: float, alpha: float, limit: Limits, **more) -> Case:
     """Return the case of a hanging rope: the relative error of its sag."""
     values = known(name)["values"]
     sag = (values[key] if key else values)["sag"]
@@ -35,7 +35,7 @@ def sags(name: str, key: str, n: int, length: float, span: float, alpha: float, 
     )  # fmt: skip
 
 
-def stretches(name: str, limit: float, **more) -> Case:
+def stretches(name: str, limit: Limits, **more) -> Case:
     """Return the case of an elastic chain that hangs straight down: the relative error of its elongation
     alpha m g N (N + 1) / 2."""
     p, v = known(name)["params"], known(name)["values"]
@@ -68,7 +68,7 @@ def cantilever() -> Scene:
     return Particles(x, mass=0.3, pinned=[0, 1]), [Force(_pull), strip, bend, Drag(3.0)]
 
 
-def hollows(n: int, alpha: float, limit: float) -> Case:
+def hollows(n: int, alpha: float, limit: Limits, **more) -> Case:
     """Return the case of a net in a pinned frame of 1 m under its weight: the relative error of the sag of its middle."""
     key, flat = f"n{n}_alpha{alpha:g}", net((0, 0, 0), (1, 0, 0), (0, 0, 1), (n + 1, n + 1))
     want = known("S08_net_sag")["values"][key]["center_y"]
@@ -77,27 +77,28 @@ def hollows(n: int, alpha: float, limit: float) -> Case:
         f"S08_net_sag:{key}", f"Net of {n} x {n} cells, {alpha:g} m/N",
         lambda: (start, [Gravity(9.81), Distance(flat.links, 1 / n, compliance=alpha), Drag(RATE)]), 12.0,
         lambda run: abs(float(run.world.position[(n + 1) ** 2 // 2, 1]) / want - 1), limit, 1.0, "relative",
-        methods=("CG x 20", "Jacobi"), **{**SETTLED, **FINER},
+        methods=("CG x 20", "Jacobi"), **{**SETTLED, **FINER, **more},
     )  # fmt: skip
 
 
 TIP = known("S06_cantilever_elastica")["values"]["N10_FL2_EI_1.0"]
 ELASTIC = {"methods": ("Direct", "Jacobi"), "efforts": (5, 10, 20, 40, 80, 160)}
+FLOORS = "conjugate gradients hold loads by a violation, also where passes converge: 6e-6 and 7e-5 of the sag, where it was 3e-9"
 CATENARY = {"methods": ("Direct", "Jacobi"), "order": None}
 
 CASES = [
     Case(
         "S06_cantilever_elastica", "Clamped strip with a force at its tip", cantilever, 15.0,
-        ends_at([-1], [[TIP["tip_x"], TIP["tip_y"]]]), 1e-3, methods=("Jacobi x 10", "Jacobi"), **SETTLED,
+        ends_at([-1], [[TIP["tip_x"], TIP["tip_y"]]]), (2e-5, 2e-5), methods=("Jacobi x 10", "Jacobi"), **SETTLED,
     ),
-    sags("S07_elastic_catenary", "N10_alpha1e-3", 10, 1.0, 0.8, 1e-3, 1e-4, **ELASTIC),
-    sags("S07_elastic_catenary", "N20_alpha1e-4", 20, 1.0, 0.8, 1e-4, 1e-4, **ELASTIC),
-    hollows(10, 0.01, 1e-3),
-    hollows(10, 0.001, 1e-3),
-    sags("R10b_discrete_catenary_N10", "", 10, 10.0, 6.0, 0.0, 1e-7, **CATENARY),
-    sags("R10b_discrete_catenary_N20", "", 20, 10.0, 6.0, 0.0, 1e-7, **CATENARY),
-    sags("R10b_discrete_catenary_N100", "", 100, 10.0, 6.0, 0.0, 1e-7, **CATENARY),
-    stretches("R11_elastic_rope_N10_alpha1e-3", 1e-6, order=None),
-    stretches("R11_elastic_rope_N32_alpha1e-3", 1e-6, order=None),
-    stretches("R11_elastic_rope_N100_alpha1e-5", 1e-6, order=None),
+    sags("S07_elastic_catenary", "N10_alpha1e-3", 10, 1.0, 0.8, 1e-3, (1e-9, 4e-8), **ELASTIC),
+    sags("S07_elastic_catenary", "N20_alpha1e-4", 20, 1.0, 0.8, 1e-4, (1e-9, 1e-7), **ELASTIC),
+    hollows(10, 0.01, (2e-9, 5e-8), known=FLOORS),
+    hollows(10, 0.001, (1e-8, 1e-6), known=FLOORS),
+    sags("R10b_discrete_catenary_N10", "", 10, 10.0, 6.0, 0.0, (1e-9, 2e-8), **CATENARY),
+    sags("R10b_discrete_catenary_N20", "", 20, 10.0, 6.0, 0.0, (1e-9, 1e-7), **CATENARY),
+    sags("R10b_discrete_catenary_N100", "", 100, 10.0, 6.0, 0.0, (1e-9, 2e-7), **CATENARY),
+    stretches("R11_elastic_rope_N10_alpha1e-3", (4e-9, 1e-6), order=None),
+    stretches("R11_elastic_rope_N32_alpha1e-3", (1e-8, 5e-7), order=None),
+    stretches("R11_elastic_rope_N100_alpha1e-5", (5e-9, 2e-6), order=None),
 ]  # fmt: skip

@@ -4,14 +4,18 @@ To add a row, add one function with the decorator @row in a file of this folder.
 """
 
 from . import (  # noqa: F401  (they register their rows)
+    apart,
     bodily,
+    driven,
     invalid_arguments,
     linked,
     motion,
     networks,
+    pressed,
     rays,
     sheets,
     spinning,
+    stops,
     taut,
     touching,
 )

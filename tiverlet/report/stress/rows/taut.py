@@ -13,61 +13,77 @@ from ....forces import Gravity
 from ....particles import Particles
 from ....solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
 from ....step.adaptive import StepController
+from ....step.step_report import UNCONVERGED
 from ...accuracy.cases.case import links
-from .row import FRAMES, Findings, row, summary, world
+from .row import FRAMES, Findings, at_most, excused, row, summary, world
 
 G, MASS = 9.81, 0.01
-RULE = "energy never above what it was plus 1e-3 of m g times the size, no speed above free fall, what is not met is flagged"
-WHIP = 2.0  # bound of speed over that of free fall: the end of a swinging chain is faster than free fall
+RULE = "energy never above what it was, no speed far above free fall, and what is not met is flagged"
 
 Scenes = Iterator[tuple[str, Particles, Sequence[Feature], dict[str, Any]]]  # name, particles, features, options of watched()
 
 
-def passive(number: int, what: str, criterion: str = RULE, softened: bool = False) -> Callable:
-    """Return a decorator that registers the scenes that a function yields as a row. softened: whether that flag must come."""
+def passive(
+    number: int,
+    what: str,
+    criterion: str = RULE,
+    *,
+    gain: float = 0.0,
+    speed: float = 1.0,
+    softened: bool = False,
+    known: str = "",
+) -> Callable:
+    """Return a decorator that registers the scenes that a function yields as a row.
+
+    gain: limit of energy, as a share of m g L. speed: limit of speed, over that of free fall. softened: whether that flag must
+    come. known: see Row.
+    """
 
     def register(scenes: Callable[[], Scenes]) -> Callable[[], Scenes]:
         """Register the function."""
-        row(number, what, criterion)(lambda: watched(scenes(), softened))
+        row(number, what, criterion, known)(lambda: watched(scenes(), gain, speed, softened))
         return scenes
 
     return register
 
 
-def watched(scenes: Scenes, softened: bool) -> Findings:
-    """Run passive scenes with every number of substeps in FRAMES, and yield the worst figures.
+def watched(scenes: Scenes, gain: float, speed: float, softened: bool) -> Findings:
+    """Run passive scenes with every number of substeps in FRAMES, and yield the worst figures, and where they are.
 
     Options of a scene: settings of its world (f32 by default), and
-    most: the residual above which a frame under "auto" must have a flag.
-    room: the allowed gain of energy, as a share of m g L, if a frame is flagged "unconverged"; else 1e-3.
+    most: the residual above which a frame must have a flag that excuses it; else 1e-2 under "auto", and UNCONVERGED.
+    only: the numbers of substeps. least: that from which a residual must be excused; 2 are too few for what a rope bears.
     """
-    most_gain, most_speed, holds, seen = -np.inf, 0.0, {}, set()
+    energies, speeds, holds, seen = [], [], {}, set()
     for name, particles, features, options in scenes:
         settings = {"precision": "f32", **options}
-        most, room = settings.pop("most", 1e-2), settings.pop("room", 1e-3)
+        most, only, least = settings.pop("most", None), settings.pop("only", tuple(FRAMES)), settings.pop("least", 20)
         x = particles.position
         size = float(np.ptp(x, axis=0).max())
         supply = MASS * G * np.count_nonzero(~particles.pinned) * size
         with world(particles, features, **settings) as w:
-            for n, frames in FRAMES.items():
+            for n in only:
+                frames, bound = FRAMES[n], most or (1e-2 if n == "auto" else UNCONVERGED)
                 w.position, w.velocity, w._controller = x, particles.velocity, StepController()
                 w.substeps = n
-                start, gain, fastest, lowest, silent, flags = None, -np.inf, 0.0, x[:, 1].min(), False, set()
+                start, most_energy, fastest, lowest, silent = None, -np.inf, 0.0, x[:, 1].min(), 0.0
                 for _ in range(frames):
                     report = w.step(1 / 60)
                     start = report.energy - report.energy_change if start is None else start
-                    gain = max(gain, (report.energy - start) / supply)
+                    most_energy = max(most_energy, report.energy)
                     fastest = max(fastest, float(np.linalg.norm(w.velocity, axis=1).max()))
                     lowest = min(lowest, w.position[:, 1].min())
-                    silent |= n == "auto" and report.residual > most and report.clean
-                    flags |= report.flags
-                fastest /= np.sqrt(2 * G * max(size, x[:, 1].max() - lowest))
+                    if (n == "auto" or n >= least) and not excused(report, "residual", bound):
+                        silent = max(silent, report.residual)
+                    seen |= report.flags
                 where = f"{name}, {settings['precision']}, {w._solver!r}, {n}"
-                holds[f"{where}: energy {gain:+.1e}"] = gain <= (room if "unconverged" in flags else 1e-3)
-                holds[f"{where}: speed {fastest:.2g} of free fall"] = fastest <= WHIP
-                holds[f"{where}: nothing silent"] = not silent
-                most_gain, most_speed, seen = max(most_gain, gain), max(most_speed, fastest), seen | flags
-    yield from summary(f"energy {most_gain:+.0e}, {most_speed:.2f} of free fall", holds)
+                energies.append(((most_energy - start) / supply, where))
+                speeds.append((fastest / np.sqrt(2 * G * max(size, x[:, 1].max() - lowest)), where))
+                holds[f"{where}: residual {silent:.2g} that no flag excuses"] = silent == 0
+    for figure, values, limit in (("energy {:+.1e} m g L", energies, gain), ("speed {:.2g} of free fall", speeds, speed)):
+        value, where = max(values)
+        yield at_most(f"{figure.format(value)} ({where})", value, limit)
+    yield from summary(f"{len(holds)} runs", holds)
     yield ", ".join(sorted(seen)) or "no flag", "softened" in seen or not softened
 
 
@@ -99,25 +115,42 @@ def complete(n: int) -> np.ndarray:
 LEVEL = [(1.0, 0.0)]
 
 
-@passive(71, "straight ropes of 2 to 400 points between two pins", f"{RULE}; 2e-2 for 400 points, flagged unconverged", True)
+@passive(71, "straight ropes of 2 to 400 points between two pins", gain=1e-3, speed=2.0, softened=True)
 def _taut() -> Scenes:
     for precision in ("f32", "f64"):
-        for counts, room in (((2, 5, 40), 1e-3), ((400,), 2e-2)):  # the longest sags by 0.9 of its length
+        for counts, only in (((2, 5, 40), tuple(FRAMES)), ((400,), (200, "auto"))):
             particles, pairs, _ = ropes(counts, LEVEL * len(counts))
-            yield "Distance", particles, [Gravity(G), Distance(pairs)], {"precision": precision, "room": room}
+            yield f"{counts[-1]} points", particles, [Gravity(G), Distance(pairs)], {"precision": precision, "only": only}
     particles, pairs, _ = ropes((5, 40), LEVEL * 2)
     for solver, passes in ((Jacobi(), 1), (Chebyshev(), 4), (ConjugateGradient(8), 1)):
         yield "Distance", particles, [Gravity(G), Distance(pairs)], {"solver": solver, "iterations": passes}
 
 
-@passive(72, "the same of Rope, upright, leaning, and 0.1 and 10 % too short", RULE, True)
+@passive(128, "straight ropes of 40 points in 2 substeps, and of 400 points in 20", gain=0.0, speed=2.0,
+         known="straight ropes in too few substeps give way by many times their length, and gain energy, flagged")  # fmt: skip
+def _too_taut() -> Scenes:
+    for count, n in ((40, 2), (400, 20)):
+        particles, pairs, _ = ropes((count,), LEVEL)
+        yield f"{count} points", particles, [Gravity(G), Distance(pairs)], {"precision": "f64", "only": (n,), "least": 2}
+
+
+@passive(72, "the same of Rope, upright, leaning, and 0.1 and 10 % too short", gain=0.0, speed=2.0, softened=True)
 def _short() -> Scenes:
     for rest in (1.0, 0.999, 0.9):
         particles, pairs, length = ropes((40, 20, 20), [(1.0, 0.0), (0.0, 1.0), (0.7, 0.7)], rest)
-        yield f"Rope {rest:g}", particles, [Gravity(G), Rope(pairs, length)], {"solver": Direct(), "most": 0.2}
+        yield f"Rope {rest:g}", particles, [Gravity(G), Rope(pairs, length)], {"solver": Direct()}
 
 
-@passive(74, "cantilever and plate with both diagonals, or of triangles that keep their areas")
+def tiled() -> tuple[Particles, np.ndarray, np.ndarray, np.ndarray]:
+    """Build a plate of 8 x 3 points, held on its left: particles, links, triangles and the numbers of the points."""
+    x, pairs = grid(8, 3, braced=False)
+    k = np.arange(24).reshape(8, 3)
+    below, above = (k[:-1, :-1], k[1:, :-1], k[:-1, 1:]), (k[1:, :-1], k[1:, 1:], k[:-1, 1:])
+    triangles = np.concatenate([np.stack([corner.ravel() for corner in half], axis=1) for half in (below, above)])
+    return Particles(x, mass=MASS, pinned=np.arange(3)), pairs, triangles, k
+
+
+@passive(74, "cantilever and plate with both diagonals, or of triangles that keep their areas", gain=5e-5, speed=2.0)
 def _braced() -> Scenes:
     for (nx, ny), solver, iterations in (
         ((10, 2), Jacobi(), 1), ((10, 2), Direct(), 1), ((10, 2), Chebyshev(), 4), ((6, 6), Jacobi(), 1)
@@ -125,18 +158,22 @@ def _braced() -> Scenes:
         x, pairs = grid(nx, ny)
         particles = Particles(x, mass=MASS, pinned=np.arange(ny))
         yield f"{nx} x {ny}", particles, [Gravity(G), Distance(pairs)], {"solver": solver, "iterations": iterations}
-    x, pairs = grid(8, 3, braced=False)
-    k = np.arange(24).reshape(8, 3)
-    below, above = (k[:-1, :-1], k[1:, :-1], k[:-1, 1:]), (k[1:, :-1], k[1:, 1:], k[:-1, 1:])
-    triangles = np.concatenate([np.stack([corner.ravel() for corner in half], axis=1) for half in (below, above)])
-    particles = Particles(x, mass=MASS, pinned=np.arange(3))
+    particles, pairs, triangles, k = tiled()
     loops = np.stack([c.ravel() for c in (k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:])], axis=1)
-    for name, areas, compliance in (("areas", triangles, 1e-3), ("loops", list(loops), 0.0)):
-        edges = Distance(pairs, compliance=compliance)
-        yield name, particles, [Gravity(G), edges, Area(areas)], {"solver": Jacobi()}
+    edges = Distance(pairs, compliance=1e-3)
+    yield "areas", particles, [Gravity(G), edges, Area(triangles)], {"solver": Jacobi(), "only": (2, 20, 200)}
+    yield "loops", particles, [Gravity(G), Distance(pairs), Area(list(loops))], {"solver": Jacobi()}
 
 
-@passive(75, "wheel with spokes, rigid loop, complete graph of 12 in 3D, truss between pins")
+@passive(129, "a plate of rigid areas and soft links by Jacobi under auto", gain=0.0, speed=2.0,
+         known="areas that one pass does not resolve grow to several times their size, flagged, also under auto")  # fmt: skip
+def _areas() -> Scenes:
+    particles, pairs, triangles, _ = tiled()
+    features = [Gravity(G), Distance(pairs, compliance=1e-3), Area(triangles)]
+    yield "areas", particles, features, {"solver": Jacobi(), "only": ("auto",)}
+
+
+@passive(75, "wheel with spokes, rigid loop, complete graph of 12 in 3D, truss between pins", gain=1e-3, speed=2.0)
 def _rigid() -> Scenes:
     rng = np.random.default_rng(0)
     a = 2 * np.pi * np.arange(16) / 16
@@ -156,7 +193,7 @@ def _rigid() -> Scenes:
         yield name, Particles(x, mass=MASS, pinned=pinned), [Gravity(G), Distance(pairs)], {"solver": solver}
 
 
-@passive(76, "links twice, with two lengths, and of length 0")
+@passive(76, "links twice, with two lengths, and of length 0", gain=0.0, speed=2.0)
 def _twice() -> Scenes:
     n = 10
     x = np.stack([0.1 * np.arange(n), np.full(n, 2.0)], axis=1)
@@ -172,7 +209,7 @@ def _twice() -> Scenes:
         yield "length 0", hung, [Gravity(G), zero], {"precision": "f64", "solver": solver, "iterations": passes}
 
 
-@passive(77, "rigid clusters that share three points, and one with links inside")
+@passive(77, "rigid clusters that share three points, and one with links inside", gain=1e-3, speed=2.0)
 def _clusters() -> Scenes:
     x, pairs = grid(3, 5)
     k = np.arange(15).reshape(3, 5).T
@@ -184,7 +221,7 @@ def _clusters() -> Scenes:
     yield "links inside", Particles(x, mass=MASS, pinned=[0]), inside, {}
 
 
-@passive(78, "a bridge of ropes under 500 discs", "energy as above; nothing flies, every disc stays in the box")
+@passive(78, "a bridge of ropes under 500 discs", gain=0.0, speed=2.0)
 def _bridge() -> Scenes:
     rng = np.random.default_rng(3)
     particles, pairs, _ = ropes((30, 30), LEVEL * 2)

@@ -12,12 +12,12 @@ from ....neighbours import Periodic
 from ....particles import Particles
 from ....solvers import Jacobi
 from ....world import World
-from .row import Findings, contacts_of, finite, refused, rerun, row, same_pairs, summary, warned, world
+from .row import Findings, at_most, contacts_of, finite, refused, rerun, row, same_pairs, summary, warned, world
 
 
 @row(16, "coincident particles in contact: 2, 100, 1000", "they part the same way each time, and no momentum is made")
 def _coincident() -> Findings:
-    for count, dim in ((2, 2), (100, 2), (1000, 3)):
+    for count, dim, limit in ((2, 2, 0.01), (100, 2, 0.05), (1000, 3, 0.05)):
         with world(Particles(np.zeros((count, dim)), radius=0.01), [Contact(push_out=0.25)], substeps=5) as w:
             made = []
             for _ in range(2):
@@ -25,7 +25,7 @@ def _coincident() -> Findings:
                 made.append(w.position)
             p = float(np.abs(w.velocity.sum(axis=0)).max())
             left = w.last.overlap
-            yield f"{count}: overlap {left:.2g}", np.array_equal(*made) and p <= 1e-12 * count and left < 0.05
+            yield at_most(f"{count}: overlap {left:.2g}", left, limit, np.array_equal(*made) and p <= 1e-12 * count)
 
 
 @row(25, "radii of 1:1000", "no contact missed, by brute force; in 2D and 3D")
@@ -91,7 +91,7 @@ def _grows() -> Findings:
         yield f"{few}, then {found} contacts", few == 0 and found == len(overlapping(tight, 0.3)[0])
 
 
-@row(43, "1e5 idle substeps of a resting column", "no creep (1e-6 of a radius), no energy")
+@row(43, "1e5 idle substeps of a resting column", "no creep, no energy")
 def _creep() -> Findings:
     x = [[0.5, 0.5], [0.5, 1.499]]
     with world(Particles(x, radius=0.5), [Gravity(9.81), Drag(1.0), Contact(), Box((0, 0), (1, 9))], substeps=200) as w:
@@ -99,8 +99,8 @@ def _creep() -> Findings:
         before = w.position
         w.run(100.0, dt=0.2)
         creep, energy = float(np.abs(w.position - before).max()), kinetic_energy(w)
-        yield f"{creep:.1e} m", creep <= 0.5e-6
-        yield f"{energy:.0e} J", energy <= 1e-6 * 9.81 * 0.5
+        yield at_most(f"{creep:.1e} m", creep, 1e-12)
+        yield at_most(f"{energy:.0e} J", energy, 1e-12)
 
 
 @row(45, "speeds up to 1e6 m/s against a half-space and a box", "impossible to pass")
@@ -114,7 +114,7 @@ def _fast() -> Findings:
         for _ in range(20):
             w.step(1 / 60)
             deepest = max(deepest, float(np.abs(w.position).max() - 0.9), float(-0.4 - (w.position @ slope).min()))
-    yield f"deepest {deepest:.0e} m, in the corner of both", deepest <= 1e-3
+    yield at_most(f"deepest {deepest:.0e} m, in the corner of both", deepest, 1e-12)
 
 
 ROOMS = {
@@ -172,7 +172,7 @@ def _thin() -> Findings:
         for _ in range(600):
             w.step(1 / 600)
             lowest = min(lowest, float(w.position[:, 1].min()))
-    yield f"lowest at {1e3 * lowest:.4f} mm", lowest >= 0.0005 - 1e-9
+    yield at_most(f"lowest at {1e3 * lowest:.4f} mm", 0.0005 - lowest, 1e-12)
 
 
 @row(47, "head-on at v h / r = 0.5, 0.9, 2, 5", "caught below 1, flagged above")
@@ -186,14 +186,16 @@ def _passing() -> Findings:
             yield f"{ratio:g}: {'flagged' if told else 'caught'}", told if ratio > 1 else caught and not told
 
 
-@row(48, "deep initial overlap: 200 discs in a tenth of their room", "no explosion: kinetic energy at the scale of push_out")
+@row(48, "deep initial overlap: 200 discs in a tenth of their room", "no explosion: they part without kinetic energy")
 def _deep() -> Findings:
     x = np.random.default_rng(0).uniform(0, 0.5, (200, 2))
     with world(Particles(x, radius=0.1), [Contact(push_out=0.5)]) as w:
-        w.run(4.0)
-        energy, limit = kinetic_energy(w), 0.5 * 200 * (4 * 0.5) ** 2
-        yield f"{energy:.0f} J (limit {limit:.0f})", finite(w) and energy <= limit
-        yield f"overlap {w.last.overlap:.2g}", w.last.overlap < 0.2
+        energies = []
+        for _ in range(240):
+            w.step(1 / 60)
+            energies.append(kinetic_energy(w))
+        yield at_most(f"{max(energies):.1f} J", max(energies), 1e-12, finite(w))
+        yield at_most(f"overlap {w.last.overlap:.2g}", w.last.overlap, 0.02)
 
 
 @row(82, "a link draws a disc through a pinned one", "flagged; not where the link is as long as it should be")
@@ -226,7 +228,7 @@ def _outside() -> Findings:
     with world(start, [Contact()]) as w:
         w.run(1.0)
         gap = abs(w.position[0, 0] - w.position[1, 0])
-        yield f"{gap:.3f} m apart", gap >= 0.4 - 1e-9
+        yield at_most(f"{gap:.3f} m apart", 0.4 - gap, 1e-12)
 
 
 @row(88, "a periodic box hardly longer than two contacts, and one 1e5 times as long", "each pair meets once; no energy is made")
@@ -239,27 +241,28 @@ def _small_periodic() -> Findings:
             w.run(2.0)
             gained = abs((w.velocity**2).sum() / (v**2).sum() - 1)
             yield f"{size:g} m: collided", not np.allclose(w.velocity, v)
-            yield f"energy to {gained:.0e}", gained < 1e-9
+            yield at_most(f"energy to {gained:.0e}", gained, 1e-12)
             yield "momentum kept", np.allclose(w.velocity.sum(axis=0), v.sum(axis=0), atol=1e-9)
 
 
 @row(103, "crosses of four discs hook into each other in a heap, e = 0.1 ... 1", "no energy is made, none is pressed together")
 def _crosses() -> Findings:
-    rng, cross, holds = np.random.default_rng(0), 0.28 * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]]), {}
+    rng, cross = np.random.default_rng(0), 0.28 * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
     angle = rng.uniform(0, 2 * np.pi, 30)
     turn = np.moveaxis(np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]), 2, 0)
     places = 0.6 + 0.8 * np.stack(np.divmod(np.arange(30), 6)[::-1], axis=1)
     x, body = (places[:, None] + cross @ turn).reshape(-1, 2), np.arange(120).reshape(30, 4)
     pairs = body[:, [[0, 1], [1, 2], [2, 3], [3, 0], [0, 2]]].reshape(-1, 2)
-    worst = 0.0
+    gains, overlaps = [], []
     for name, holding in (("links", lambda: Distance(pairs)), ("clusters", lambda: ShapeMatch(body))):
         for e in (0.1, 0.9, 1.0):
             features = [Gravity(9.81), holding(), Contact(friction=0.5, restitution=e), Box((0, 0), (5.3, 20), friction=0.5)]
             with world(Particles(x, radius=0.1), features, substeps=8) as w:
                 energy = [w.step(1 / 60).energy for _ in range(240)]
-                worst = max(worst, w.last.overlap)
-                holds[f"{name}, e = {e}"] = max(energy) <= 1.001 * energy[0] and w.last.overlap < 0.2
-    yield from summary(f"overlap of at most {worst:.2g} radii at the end", holds)
+                gains.append((max(energy) / energy[0] - 1, f"{name}, e = {e}"))
+                overlaps.append(w.last.overlap)
+    yield at_most(f"energy {max(gains)[0]:+.0e} ({max(gains)[1]})", max(gains)[0], 0.0)
+    yield at_most(f"overlap of at most {max(overlaps):.2g} radii at the end", max(overlaps), 0.05)
 
 
 @row(70, "resting contact on a moving belt", "friction drags the right way: up to its speed after v / (mu g), then along")
@@ -271,8 +274,8 @@ def _belt() -> Findings:
             belt.a, belt.b = (-50.0 + shift, -1.0), (50.0 + shift, -1.0)
             w.step(1 / 60)
         error = abs(w.position[0, 0] - (1.5 - 0.5 / (0.4 * 9.81)))
-        yield f"{error:.0e} m off", error <= 2e-3
-        yield "at the speed of the belt", abs(w.velocity[0, 0] - 1) < 1e-9
+        yield at_most(f"{error:.0e} m off", error, 2e-7)
+        yield at_most("at the speed of the belt", abs(w.velocity[0, 0] - 1), 1e-12)
 
 
 @row(85, "another particle at 1e2 ... 1e6 m, in f32: discs in a round room, beads on a wire", "the same bits for the rest")
@@ -294,7 +297,7 @@ def _far() -> Findings:
     # f32 cannot distinguish neighbouring cells of 5 cm there.
     yield from refused((lambda: places(1e6, Contact()), "Shift the scene"))
     gap = float((0.95 - np.linalg.norm(near[:4], axis=1)).min())
-    yield f"{abs(gap):.0e} m above the ground", abs(gap) < 1e-5
+    yield at_most(f"{abs(gap):.0e} m above the ground", abs(gap), 3e-6)
 
 
 @ti.func
