@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from .clock import Clock
 
 # Multiples of the golden ratio of two dimensions, mod 1, are the most even sequence of pairs. Each of the two sums takes one.
-DITHER = golden_steps(2)
+DITHER = golden_steps(2, bits=32)
 ALIKE = {ti.f32: 2.0**-12, ti.f64: 2.0**-26}  # least variation of a velocity, relative: the square root of its rounding error
 TINY = 1e-18  # [m/s], [m/s^2]: keeps divisors from being 0
 LEAST = 0.25  # least pivot with which a velocity is solved for; a force that feeds motion faster is taken explicitly
