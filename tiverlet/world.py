@@ -369,7 +369,7 @@ class World:
 
     @position.setter
     def position(self, value) -> None:
-        """Move particles to (n, dim) [m]. Velocities are kept, and neighbour lists are rebuilt."""
+        """Move particles to (n, dim) [m]. Velocities are kept. Writing back the positions that were read changes nothing."""
         value = checks.points("World", "position", value, dim=self._particles.dim, count=len(self._particles))
         self._check_places("World", value)
         self._runner.memory.check()

@@ -10,6 +10,7 @@ from ..constraints.core.anchored import Anchored
 from ..constraints.pin import Pin
 from ..features.arguments import knobs_of
 from ..features.feature import Feature
+from ..forces.gravity import Gravity
 from .clock import CHANGED
 
 Values = Mapping[Feature, Mapping[str, Any]]  # values of knobs
@@ -40,7 +41,17 @@ def shift(world: Any, by: np.ndarray) -> None:
     world._check_places("World.shift", position)
     knobs = {f: {name: getattr(type(f), name) for name in knobs_of(type(f))} for f in world.features}
     values = {f: {n: knob.place(f, getattr(f, n), by) for n, knob in own.items() if knob.place} for f, own in knobs.items()}
+    waits = any(f.changed or f.moving for f in world.features)
     _take(world, values, position)
+    clock, w = world._clock, world._runner.scene.inv_mass
+    if waits:  # what else was assigned since the last step has happened now
+        clock.energy, clock.bound = None, CHANGED
+        return
+    more = -(1 / w[w > 0]).sum() * sum(
+        float(np.dot(f.kernel_values()["g"], by)) for f in world.features if isinstance(f, Gravity)
+    )
+    clock.energy = None if clock.energy is None else clock.energy + more
+    clock.bound = None if clock.bound is None else clock.bound + more
 
 
 def _set(values: Values) -> None:
@@ -74,8 +85,6 @@ def _take(world: Any, values: Values, position: np.ndarray | None = None) -> Non
             f.end_motion()
     if position is not None:
         runner.scene.state.put(runner.memory, position)
-        runner.clock.energy, runner.clock.moved_mask = None, None
-        runner.clock.forget_bound()
     runner.wake()
     runner.invalidate()
     for watcher in world._watchers:
