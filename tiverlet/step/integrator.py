@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 DITHER = golden_steps(2, bits=32)
 ALIKE = {ti.f32: 2.0**-12, ti.f64: 2.0**-26}  # least variation of a velocity, relative: the square root of its rounding error
 STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges; velocities that forces turn this fast turn far too slowly
+CLOSE = 0.4  # the same in an encounter that changes the energy of motion by SHARE: a kick of 0.4 of the velocity
 FORCE = 0.06  # (omega h)^2 of forces that a substep resolves: 25 substeps per period, as in molecular dynamics
 TINY = 1e-18  # [m/s], [m/s^2]: keeps divisors from being 0
 LEAST = 0.25  # least pivot with which a velocity is solved for; a force that feeds motion faster is taken explicitly
@@ -75,14 +76,14 @@ class Forces:
         """Return (omega h)^2 of the closest encounter since the last report, 0 if there was none, and forget it.
 
         stiff, kinetic: (omega h)^2 at the end of the frame, and all energy of motion [J], of which what creeps over an edge of a
-        force has no share. A linear force is stable up to STIFF. Where a force has grown and fallen within the frame, a kick as
-        large as the velocity, (omega h)^2 = 1, is too large: it counts STIFF times.
+        force has no share. A linear force is stable up to STIFF. Where a force has grown and fallen within the frame, and so is
+        not linear, CLOSE counts as much.
         """
         out = ti.cast(0, ti.f64)
         if self.kicked[None] > SHARE * kinetic:
             out = self.unresolved[None]
             if out > STIFF * stiff:
-                out *= STIFF
+                out *= ti.static(STIFF / CLOSE)
         self.unresolved[None] = 0
         self.kicked[None] = 0
         return out
