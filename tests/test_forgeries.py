@@ -214,7 +214,7 @@ def test_the_memory_that_a_file_asks_for_is_bounded(original, rewritten, quick):
         if e["kind"] == "assigned" or e["kind"] == "turned":
             e.update(kind="assigned", data={"name": "_runner"}, arrays=[])
 
-    for change in (shape, count, lambda e: e.update(steps=[[1 / 60, "auto", 1, 1]]), lambda e: e.update(frame=[[[]]])):
+    for change in (shape, count, lambda e: e.update(steps=[[1 / 60, "auto", 1, 0, 1]]), lambda e: e.update(frame=[[[]]])):
         with pytest.raises(ValueError, match="^replay: |^The state|shape"):
             tv.replay(rewritten(change)).verify()
 

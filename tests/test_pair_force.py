@@ -112,6 +112,52 @@ def test_what_is_too_stiff_for_the_substep_is_named(world):
         assert w.run(0.1).flags == flags, w.substeps
 
 
+@ti.func
+def to_center(x):
+    """Return the force of a fixed center: that of newton() for a reduced mass of 1 / 2, at half the distance."""
+    return -x / (4 * x.norm() ** 3)
+
+
+@pytest.mark.parametrize("kind", ["pair", "center"])
+def test_a_close_encounter_keeps_its_energy_or_is_named(world, kind):
+    # Two bodies of 1 kg, 2 m apart, fall on each other to (2 v)^2 / 4, where a force 1 / r^2 is largest: the encounter takes a
+    # small part of a frame, and its end does not show it. E = sum m v^2 / 2 - 1 / r; a tenth of the energy of motion is too much.
+    falls = [(v, n) for v in (0.3, 0.1, 0.03, 0.01, 0.003, 0.0) for n in (20, 60, "auto")]
+    for v, n in [*falls, (0.0284, 100), (0.0475, 47)]:  # these are just too rough, and just good enough
+        x, features = [[-1.0, 0], [1, 0]], [tv.PairForce(newton)]
+        if kind == "center":
+            x, features = x[:1], [tv.Force(to_center)]
+        w = world(tv.Particles(x, velocity=[[0, v], [0, -v]][: len(x)]), features, substeps=n, precision="f64")
+
+        def energy(w=w):
+            x, kinetic = w.position, (w.velocity**2).sum() / len(w.position)
+            return kinetic - 1 / np.linalg.norm(x[0] - (x[1] if len(x) > 1 else -x[0])), kinetic
+
+        before, flags, fastest = energy()[0], set(), 0.0
+        for _ in range(180):
+            flags |= w.step(1 / 60).flags
+            fastest = max(fastest, energy()[1])
+        off = abs(energy()[0] - before) / fastest
+        assert off < 0.1 or flags & {"stiff-force", "stuck", "substeps-capped"}, (v, n, off)
+        assert off > 0.01 or not flags, (v, n, off, flags)
+        assert off < 0.01 or v < 0.1
+
+
+def test_what_creeps_over_the_edge_of_a_force_is_no_encounter(world):
+    # At the edge of a region with a wind the force changes by all of it, whatever the substep; a slow body hardly notices.
+    @ti.func
+    def region(x):
+        a = 0 * x
+        if x[0] > 0:
+            a[0] = 3.0
+        return a
+
+    w = world(tv.Particles([[-1e-4, 0.0], [5.0, 5.0]], velocity=[[1e-3, 0.0], [0.0, 1.0]]), [tv.Force(region)], precision="f64")
+    for w.substeps in (20, 200):
+        w.position, w.velocity = w.particles.position, w.particles.velocity
+        assert not w.run(0.2).flags
+
+
 def test_particles_in_one_place_and_held_ones_do_nothing_to_each_other(world):
     p = tv.Particles([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0], [2.0, 0.0]], pinned=[2, 3])
     w = world(p, [tv.PairForce(newton, potential=newton_energy)], substeps=8, precision="f64")

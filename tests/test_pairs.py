@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
+from tiverlet.device import room
 from tiverlet.step import checkpoint
 
 
@@ -71,3 +72,27 @@ def test_what_links_hold_inside_has_no_contact_unless_they_can_give_way(world):
     for more in ({}, {"compliance": 1e-3}, {"break_at": 5.0}):
         w = world(tv.Particles(x, radius=1.5), [tv.Distance([[0, 1], [1, 2]], **more), tv.Contact()])
         assert ([0, 2] in w._runner.search._excluded_pairs.tolist()) is (not more)  # these are not listed
+
+
+@pytest.mark.filterwarnings("ignore:.*near pairs per particle")
+def test_a_list_for_which_there_is_no_memory_is_refused_and_never_used(world, monkeypatch):
+    # All of n discs in a cell are near each other, n (n - 1) entries: with 20,000 discs 22 GB, and the system ended the process.
+    n = 1500
+    w = world(tv.Particles(1e-6 * tv.golden(np.arange(n), dim=2), radius=0.1), [tv.Contact()], substeps=2)
+    monkeypatch.setattr(room, "free_memory", lambda: 1e8)
+    for _ in range(2):  # nor is the list, which is too short, used by the next step
+        with pytest.raises(
+            MemoryError, match=r"of 28\d{5} near neighbours, 18\d\d for each .* 0.1 GB are free.*place them apart"
+        ):
+            w.step(1 / 60)
+    w.position = 100 * tv.golden(np.arange(n), dim=2)
+    w.step(1 / 60)
+    r = np.linalg.norm(w.position[:, None] - w.position, axis=2)
+    near = np.argwhere((r < 0.2 + w.contacts.overlap.max(initial=0.0)) & (r > 0))
+    assert len(w.contacts.pairs) == len(near) // 2
+    with pytest.raises(MemoryError, match=f"longer than {2**30 - 1}"):
+        w._runner.step.searches[0].list.allocate(2**30)
+    monkeypatch.setattr(room, "SMALL", 0)
+    monkeypatch.setattr(room, "free_memory", lambda: 1e4)
+    with pytest.raises(MemoryError, match="World: its fields take .* Take fewer particles"):
+        world(w.particles, [])

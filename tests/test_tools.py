@@ -1,5 +1,7 @@
 """The article's small tools, in Python and in kernels."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
@@ -25,7 +27,7 @@ def test_mix_clamp_smoothstep_and_approach():
 
 
 def test_golden_is_even_and_has_an_inverse():
-    n, many = 4096, np.array([0, 1, 2, 3, 1000, 2**31, 2**32 - 1])
+    n, many = 4096, np.array([0, 1, 2, 3, 1000, 2**31, 2**32 - 1, 2**53 - 1])
     for dim in (1, 2, 3):
         u = tv.golden(np.arange(n), dim=dim).reshape(n, dim)
         assert ((u >= 0) & (u < 1)).all()
@@ -36,13 +38,33 @@ def test_golden_is_even_and_has_an_inverse():
         np.testing.assert_array_equal(tv.golden_index(tv.golden(many, dim=dim), dim=dim), many)
     # d = 1: 1 / phi; d = 2: inverse powers of the plastic number, x^3 = x + 1 (Roberts 2018).
     plastic = 1.32471795724474602596
-    assert tv.golden(1) == pytest.approx(2 / (1 + 5**0.5), abs=2**-31)
-    np.testing.assert_allclose(tv.golden(1, dim=2), [1 / plastic, 1 / plastic**2], atol=2**-31)
+    assert tv.golden(1) == pytest.approx(2 / (1 + 5**0.5), abs=2**-52)
+    np.testing.assert_allclose(tv.golden(1, dim=2), [1 / plastic, 1 / plastic**2], atol=2**-52)
     with pytest.raises(ValueError, match="at least 0"):
         tv.golden(-1)
     colors = tv.golden_colors(12)
     assert colors.shape == (12, 3) and colors.dtype == np.uint8 and len(np.unique(colors, axis=0)) == 12
     assert tv.golden_colors(0).shape == (0, 3)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 5])
+def test_golden_is_the_exact_sequence_for_millions_of_points(dim):
+    # i y^k mod 1 with y^(d + 1) + y^d = 1, in fractions, to i 2^-53: a step of 53 bits.
+    y = Fraction(1, 2)
+    for k in range(2, 130):
+        y += Fraction(1, 2**k) * (1 if y ** (dim + 1) + y**dim < 1 else -1)
+    for i in (1, 30_001, 999_999, 10**9):
+        for k, u in enumerate(np.atleast_1d(tv.golden(i, dim=dim))):
+            off = (Fraction(float(u)) - i * y ** (k + 1)) % 1
+            assert min(off, 1 - off) <= Fraction(i, 2**53)
+
+
+def test_gaps_of_golden_have_two_lengths_or_three():
+    # Of n points the gaps have lengths whose ratios are powers of phi (Sos 1958): the largest is phi^2 times the smallest.
+    for n in (30_000, 1_000_000):
+        x = np.sort(tv.golden(np.arange(n)))
+        gaps = np.diff(x, append=x[0] + 1)
+        assert gaps.max() / gaps.min() <= (1 + 5**0.5) ** 2 / 4 + 2 * n * 2.0**-53 / gaps.min()
 
 
 def test_cosines_of_f64_are_right_to_the_last_digit():
@@ -61,10 +83,10 @@ def test_cosines_of_f64_are_right_to_the_last_digit():
 
 
 def test_tools_work_inside_kernels():
-    out, back = ti.field(ti.f64, 10), ti.field(ti.u32, (3, 4))
+    out, back = ti.field(ti.f64, 10), ti.field(ti.u64, (3, 4))
 
     @ti.kernel
-    def run(third: ti.f64, some: ti.types.ndarray(ti.u32, 1)):
+    def run(third: ti.f64, some: ti.types.ndarray(ti.u64, 1)):
         out[0] = tv.mix(third, ti.f64(2.0), ti.f64(0.25))
         out[1] = tv.clamp(third, 0, 1)
         out[2] = tv.smoothstep(ti.f64(0.0), ti.f64(1.0), third)
@@ -80,7 +102,7 @@ def test_tools_work_inside_kernels():
             back[1, k] = tv.golden_index(tv.golden(some[k], 2), 2)
             back[2, k] = tv.golden_index(tv.golden(some[k], 3), 3)
 
-    third, some = 1 / 3, np.array([0, 7, 2**31, 2**32 - 1], dtype=np.uint32)
+    third, some = 1 / 3, np.array([0, 7, 2**31, 2**53 - 1], dtype=np.uint64)
     run(third, some)
     want = [
         tv.mix(third, 2.0, 0.25), third, tv.smoothstep(0.0, 1.0, third), tv.approach(third, 2.0, 3.0, 0.5), tv.golden(12345),

@@ -224,6 +224,8 @@ def _bounds(who, name, array, **bounds) -> None:
 
 def group_pair(who: str, name: str, pair: Any, what: str = "") -> tuple[int, int]:
     """Check a pair of groups. what: the place of the pair in `name`, for the error."""
+    if isinstance(pair, np.ndarray):
+        pair = pair.tolist()
     if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and all(isinstance(k, (int, np.integer)) for k in pair)):
         raise TypeError(f"{who}: {name} has {what}{pair!r}, but a pair of groups such as (0, 1) is needed.")
     return int(pair[0]), int(pair[1])

@@ -11,18 +11,21 @@ from .device import ti
 from .device.language import inline, inside_kernel
 
 # x**(d + 1) = x + 1 has one positive root, the golden ratio of dimension d (Roberts 2018, the R_d sequence). Its
-# inverse powers are the steps along each axis. As odd 32-bit integers, i * step mod 2**32 visits every value once,
-# which makes the sequence exact in f64 and gives it an inverse.
-_BITS = 1 << 32
+# inverse powers are the steps along each axis. As odd integers of as many bits as an f64 holds, i * step mod 2**53 visits
+# every value once, which makes the sequence exact in f64 and gives it an inverse. After n points it is off by n 2**-53, and gaps
+# are 1 / n: it is as even as the exact sequence up to some 2**26 points.
+BITS = 53
 
 
 @functools.cache
-def golden_steps(dim: int) -> tuple[int, ...]:
-    """Return the step of the golden sequence along each of `dim` axes, as odd multiples of 2**-32."""
-    root = 2.0
-    for _ in range(64):
-        root = (1.0 + root) ** (1.0 / (dim + 1))
-    return tuple(int(_BITS / root ** (k + 1)) | 1 for k in range(dim))
+def golden_steps(dim: int, bits: int = BITS) -> tuple[int, ...]:
+    """Return the step of the golden sequence along each of `dim` axes, as odd multiples of 2**-bits."""
+    low, high = 0, 1 << 2 * BITS  # y**(d + 1) + y**d = 1 for the inverse y of the root, by halving, as an integer
+    one = high
+    while high - low > 1:
+        y = (low + high) // 2
+        low, high = (y, high) if y ** (dim + 1) + one * y**dim < one ** (dim + 1) else (low, y)
+    return tuple(low ** (k + 1) // (one ** (k + 1) >> bits) | 1 for k in range(dim))
 
 
 def _both(kernel: Callable) -> Callable[[Callable], Callable]:
@@ -75,8 +78,8 @@ def approach(value, target, rate, dt):
 
 @ti.func
 def _golden_axis(i, step: ti.template()):  # type: ignore[valid-type]
-    turned = ti.cast(i, ti.u32) * ti.u32(step)
-    return ti.cast(turned, ti.f64) / 4294967296.0
+    turned = (ti.cast(i, ti.u64) * ti.u64(step)) & ti.u64(2**BITS - 1)
+    return ti.cast(turned, ti.f64) * ti.static(2.0**-BITS)
 
 
 @ti.func
@@ -91,30 +94,30 @@ def _golden_kernel(i, dim: ti.template() = 1):  # type: ignore[valid-type]
 def golden(i, dim: int = 1):
     """Return the i-th point of the golden-ratio sequence: evenly spread over [0, 1)^dim for any number of points.
 
-    i: integer or integer array, 0 <= i < 2**32. Returns a number (dim 1) or dim numbers, added as the last axis.
-    In 1 dimension the sequence is i / phi mod 1; in more dimensions the R_d sequence (Roberts 2018).
+    i: integer or integer array, 0 <= i < 2**53. Returns a number (dim 1) or dim numbers, added as the last axis.
+    In 1 dimension the sequence is i / phi mod 1; in more dimensions the R_d sequence (Roberts 2018), to i 2**-53.
     """
     dim, index = checks.integer("golden", "dim", dim, least=1), np.asarray(i)
     if index.dtype.kind not in "iu":
         raise TypeError(f"golden: i has type {index.dtype}, but integers are needed.")
-    if index.size and (index.min() < 0 or index.max() >= _BITS):
-        raise ValueError("golden: i must be at least 0 and below 2**32.")
+    if index.size and (index.min() < 0 or index.max() >= 2**BITS):
+        raise ValueError("golden: i must be at least 0 and below 2**53.")
     steps = np.array(golden_steps(dim), dtype=np.uint64)
-    out = ((index.astype(np.uint64)[..., None] * steps) & np.uint64(_BITS - 1)) / _BITS
+    out = ((index.astype(np.uint64)[..., None] * steps) & np.uint64(2**BITS - 1)) * 2.0**-BITS
     out = out if dim > 1 else out[..., 0]
     return float(out) if out.ndim == 0 else out
 
 
 @functools.cache
 def _golden_inverse(dim: int) -> int:
-    """Return the inverse of the first step of the golden sequence, modulo 2**32."""
-    return pow(golden_steps(dim)[0], -1, _BITS)
+    """Return the inverse of the first step of the golden sequence, modulo 2**53."""
+    return pow(golden_steps(dim)[0], -1, 2**BITS)
 
 
 @ti.func
 def _golden_index_axis(value, inverse: ti.template()):  # type: ignore[valid-type]
-    turned = ti.floor(ti.cast(value, ti.f64) * 4294967296.0 + 0.5)
-    return ti.cast(turned, ti.u32) * ti.u32(inverse)
+    turned = ti.round(ti.cast(value, ti.f64) * ti.static(2.0**BITS), ti.u64)
+    return (turned * ti.u64(inverse)) & ti.u64(2**BITS - 1)
 
 
 @ti.func
@@ -127,16 +130,16 @@ def _golden_index_kernel(value, dim: ti.template() = 1):  # type: ignore[valid-t
 
 @_both(_golden_index_kernel)
 def golden_index(value, dim: int = 1):
-    """Invert golden: return the i whose point is `value` (dim 1) or has `value` as its first coordinate; a u32 in kernels.
+    """Invert golden: return the i whose point is `value` (dim 1) or has `value` as its first coordinate; a u64 in kernels.
 
-    Exact for every value that golden returns; for other values, the index of the nearest multiple of 2**-32.
+    Exact for every value that golden returns; for other values, the index of the nearest multiple of 2**-53.
     """
     array = np.asarray(value, dtype=np.float64)
     if dim > 1:
         array = array[..., 0]
     if not ((array >= 0) & (array < 1)).all():
         raise ValueError("golden_index: values must be at least 0 and below 1.")
-    index = (np.rint(array * _BITS).astype(np.uint64) * np.uint64(_golden_inverse(dim))) & np.uint64(_BITS - 1)
+    index = (np.rint(array * 2.0**BITS).astype(np.uint64) * np.uint64(_golden_inverse(dim))) & np.uint64(2**BITS - 1)
     return int(index) if index.ndim == 0 else index.astype(np.int64)
 
 

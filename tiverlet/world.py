@@ -103,6 +103,9 @@ class World:
         self._handles: weakref.WeakSet[Handle] = weakref.WeakSet()
         self._last: StepReport | None = None
         self._watchers: list[Any] = []  # recorders: called at each assignment, and before and after every step
+        # Iterations that the user set, where substeps and iterations of the last frame were chosen for accuracy; else 0.
+        self._adapted = 0
+        self._passes: int | None = None  # iterations of such a frame of a recording, which is made again; None for other frames
         self._undo: tuple | None = None  # the state before a step that takes long, and flags of features
         self._events: Told | None = None  # of the last frame, once the device has lost them
         self._ended: Told | None = None  # by edits before the last frame, of pairs and walls
@@ -165,8 +168,9 @@ class World:
                     with self._runner.memory.compiler():
                         report = self._controller.advance(self, dt, tolerance, budget)
                 else:
-                    self._runner.begin(dt, self.substeps, self._iterations)
-                    report = self._runner.advance(dt, self.substeps, self._iterations)
+                    self._runner.begin(dt, self.substeps, self._iterations, self._passes)
+                    report = self._runner.advance(dt, self.substeps, self._passes or self._iterations)
+                self._adapted = self._iterations if guarded or self._passes else 0
             except BaseException:
                 self._handle_failed_step()
                 raise
@@ -181,6 +185,14 @@ class World:
             for watcher in self._watchers:
                 watcher.after(dt, report)
         return report
+
+    def _make_again(self, dt: float, substeps: int, passes: int, adapted: int) -> None:
+        """Make a frame of a recording again, of so many iterations. adapted: as _adapted was after it."""
+        self.substeps, self.iterations, self._passes = substeps, adapted or passes, passes if adapted else None
+        try:
+            self.step(dt)
+        finally:
+            self._passes = None
 
     def _handle_failed_step(self) -> None:
         """Clean up after a step that ended with an exception: undo it, or inform recorders that no step leads to this state."""
@@ -357,7 +369,7 @@ class World:
 
     @position.setter
     def position(self, value) -> None:
-        """Move particles to (n, dim) [m]. Velocities are kept, and neighbour lists are rebuilt."""
+        """Move particles to (n, dim) [m]. Velocities are kept. Writing back the positions that were read changes nothing."""
         value = checks.points("World", "position", value, dim=self._particles.dim, count=len(self._particles))
         self._check_places("World", value)
         self._runner.memory.check()

@@ -60,13 +60,11 @@ class PairContact(Feature):
 
     def _surface(self, name: str, value):
         """Check one setting of pairs together with the other settings."""
-        if name in ("groups", "sensors") and value is not None:
-            value = checks.rows("Contact", name, value, "a list of pairs of groups, such as [(0, 1)],")
-        elif isinstance(value, list):
-            value = tuple(value)
         given = {"friction": 0.0, "restitution": 0.0, "groups": None, "sensors": ()} | vars(self) | {name: value}
-        Table("Contact", given["friction"], given["restitution"], given["groups"], given["sensors"])
-        return value
+        table = Table("Contact", given["friction"], given["restitution"], given["groups"], given["sensors"])
+        if name in ("groups", "sensors"):
+            return table.touching if name == "groups" else table.sensing
+        return tuple(value) if isinstance(value, (list, np.ndarray)) and np.ndim(value) else value
 
     @property
     def wanted(self) -> Table:

@@ -25,6 +25,7 @@ from .number import Number
 from .patches import enabled
 from .patches.compiler import LEAN, Compiler
 from .redeclaration import Redeclaration
+from .room import refuse_beyond
 
 GROUP = 16  # fields per transfer kernel; Taichi unrolls the loop over them
 Rows = np.ndarray | slice  # which elements of fields, by index; NumPy finds a single one in a fifth of the time by a slice
@@ -240,6 +241,8 @@ class Memory:
     def place(self) -> None:
         """Allocate the declared fields and write their first values (all others are zero)."""
         self._declare_numbers()
+        wanted = sum(e.bytes * max(1, e.copies) for e in self.entries)
+        refuse_beyond(wanted, "World: its fields take", "Take fewer particles, or fewer worlds at a time.")
         with self.compiler():
             shared = layout.can_share()
             held = [one for one, _ in self.compiler.places]

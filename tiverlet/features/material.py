@@ -32,7 +32,8 @@ class Bounce(NamedTuple):
 
 def friction_of(who: str, name: str, value: Any) -> Coefficients:
     """Check a friction coefficient: a number, (static, dynamic), or these with rolling and twisting behind them."""
-    given = value if isinstance(value, (tuple, list)) else (value, value)
+    given = _several(value)
+    given = (value, value) if given is None else given
     if not 2 <= len(given) <= 4:
         raise ValueError(
             f"{who}: {name} = {value!r}, but a number, (static, dynamic) or (static, dynamic, rolling, twisting) is needed."
@@ -47,7 +48,8 @@ def friction_of(who: str, name: str, value: Any) -> Coefficients:
 
 def restitution_of(who: str, name: str, value: Any) -> Bounce:
     """Check a coefficient of restitution, 0 (inelastic) to 1 (elastic), or (normal, tangential)."""
-    given = value if isinstance(value, (tuple, list)) else (value, 0.0)
+    given = _several(value)
+    given = (value, 0.0) if given is None else given
     if len(given) != 2:
         raise ValueError(f"{who}: {name} = {value!r}, but a number or (normal, tangential) is needed.")
     normal = checks.number(who, name, given[0], least=0.0, most=1.0)
@@ -62,7 +64,14 @@ def is_elastic(friction: Any, restitution: Any) -> bool:
 
 def as_given(value: Any) -> Any:
     """Return a checked number or tuple of numbers as floats, in the form shown to the user."""
-    return tuple(float(v) for v in value) if isinstance(value, (tuple, list)) else float(value)
+    several = _several(value)
+    return float(value) if several is None else tuple(float(v) for v in several)
+
+
+def _several(value: Any) -> tuple | None:
+    """Return the numbers of a tuple, list or array; None where it is one number."""
+    is_array = isinstance(value, np.ndarray) and value.ndim == 1
+    return tuple(value) if is_array or isinstance(value, (tuple, list)) else None
 
 
 def refuse_turning(who: str) -> None:

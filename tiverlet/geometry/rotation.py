@@ -9,6 +9,7 @@ from ..device import ti
 
 STEPS = 16  # Newton iterations at most; from the rotation of the last substep it takes two or three
 HEAVY = 1024  # masses of its body: that of a particle that cannot move
+LINE = 2.0**-46  # least moment of inertia about an axis, relative to the others: less is rounding of S, and the body a line
 
 
 def identity(dim: int) -> np.ndarray:
@@ -98,14 +99,19 @@ def rigid_rotation(S, X):
 
 @ti.func
 def turn_rate(S, moment):
-    """Return how fast a body turns with an angular momentum about its center: I^-1 L, for S = sum m r r^T."""
+    """Return how fast a body turns with an angular momentum about its center: I^-1 L, for S = sum m r r^T and I = tr S - S.
+
+    A line does not turn about itself: I^-1 = (1 - S / tr S) / tr S across it.
+    """
     out, size = 0 * moment, S.trace()
     if size > 0:
-        if ti.static(S.n == 2):
-            out = moment / size
-        else:
-            # The rotation about a line of particles is arbitrary. As a literal, 1 + 2^-46 would be 1 in f32.
-            out, _ = solve_3x3(diagonal(size + ti.static(2.0**-46) * size, S) - S, moment)
+        out = moment / size
+        if ti.static(S.n == 3):
+            whole, det = solve_3x3(diagonal(size, S) - S, moment)
+            if det > ti.static(LINE) * size * size * size:
+                out = whole
+            else:
+                out -= S @ out / size
     return out
 
 
@@ -144,9 +150,16 @@ def write_rows(field: ti.template(), i, B):  # type: ignore[valid-type]
 
 @ti.func
 def bend(turn, r, n):
-    """Return n.(T x (T x r)) / 2: how far the path of a point at r of a body that turns by T bends along n."""
+    """Return how far the path of a point at r of a body bends along n, n.(C + C^T - 2) r / 2 for C = cayley(T)."""
     B = skew(turn, n.outer_product(n))
-    return n.dot(B @ (B @ r)) / 2
+    return n.dot(B @ (B @ r)) / (2 + turn.dot(turn) / 2)
+
+
+@ti.func
+def moved_by(turn, r):
+    """Return (C - 1) r for C = cayley(T), (T x r + T x (T x r) / 2) / (1 + T^2 / 4)."""
+    B = skew(turn, r.outer_product(r))
+    return B @ (r + B @ r / 2) / (1 + turn.dot(turn) / 4)
 
 
 @ti.func

@@ -8,6 +8,7 @@ import numpy as np
 from .. import checks
 from ..device import at, inline, ti
 from ..device.number import Number, OnDevice
+from ..device.room import refuse_beyond
 from ..device.thread_team import Team
 from .pair_data import Column, PairData
 
@@ -80,8 +81,7 @@ class NeighbourList:
 
     def allocate(self, capacity: int) -> bool:
         """Allocate `capacity` entries in fields of their own, and keep the old list. Returns whether there are new fields."""
-        if 2 * capacity > 2**31 - 1:
-            raise MemoryError(f"{capacity} near pairs exceed what a list can index; the particles overlap too much.")
+        self._refuse_beyond(capacity)
         self.capacity_number.set(max(1, -(-capacity // self.blocks)))
         self.pitch_number.set(self.capacity + self.network_size)
         self.room = self.pitch * self.blocks
@@ -107,19 +107,34 @@ class NeighbourList:
                 self._write_padded(field, values)
         return True
 
+    def _refuse_beyond(self, capacity: int) -> None:
+        """Raise MemoryError if so many entries are more than can be numbered, or take more memory than is free."""
+        what = f"World: a list of {capacity} near neighbours, {capacity / self.n:.0f} for each particle,"
+        instead = (
+            "Particles overlap each other, or one is much larger than the rest: place them apart, as tv.shapes.pile does, give "
+            "them smaller radii, or give Contact a smaller skin."
+        )
+        if 2 * capacity > 2**31 - 1:
+            raise MemoryError(f"{what} is longer than {2**30 - 1}. {instead}")
+        width = {False: 2, True: 0}  # of an entry, in numbers of 4 bytes, and in those of the world
+        for piece in (*self.pair_data, *self.transferred, *self.columns):
+            width[piece.kind is None] += max(1, piece.width)
+        entry = 4 * width[False] + (8 if self.memory.real == ti.f64 else 4) * width[True]
+        copies = self.memory.copies.count if self.memory.copies else 1
+        refuse_beyond(entry * copies * (capacity - self.room), f"{what} takes", instead)
+
     def grow(self) -> bool:
         """Make room for the entries of the last build, plus a quarter. Returns whether kernels must be compiled again."""
         with self._all_copies():
             need = int(self.memory.read(self.need).max())
+        self.invalidate()  # also if there is no room for more: a list that is too short is never used
         each = need * self.blocks / self.n
         if each > CROWDED:
             checks.warn(
                 f"Contact: up to {each:.0f} near pairs per particle, so steps cost as the square of their number. Particles "
                 "overlap each other, or one is much larger than the rest."
             )
-        new = self.allocate(int(need * 1.25 + 16) * self.blocks)
-        self.invalidate()
-        return new
+        return self.allocate(int(need * 1.25 + 16) * self.blocks)
 
     def _fields(self) -> list:
         """Return the fields to keep: those of the old list; of many copies, some continue with their present list."""

@@ -30,7 +30,7 @@ from . import rrd
 if TYPE_CHECKING:
     from ..step.step_report import StepReport
 
-FORMAT = 11
+FORMAT = 12
 GUARD = {"stuck", "substeps-capped"}  # flags that depend on the StepController's failed tries, not on the recorded steps
 JOURNAL = "tiverlet/journal"
 SCENE = "world/scene"
@@ -50,7 +50,8 @@ class Changed(ValueError):
 
 @dataclass
 class Entry:
-    """One entry: an event after `steps`, which are rows of dt [s], substeps, iterations, and the number of such steps.
+    """One entry: an event after `steps`, which are rows of dt [s], substeps, iterations, the iterations that the user set where
+    these were chosen for accuracy, else 0, and the number of such steps.
 
     data["now"]: substeps, iterations and the memory of the controller after the event, if they differ from the entry before.
     """

@@ -103,9 +103,9 @@ class Journal:
 
     def after(self, dt: float, report: StepReport) -> None:
         """After a step: record it."""
-        step = [dt, report.substeps, report.iterations]
-        if self._steps and self._steps[-1][:3] == step:
-            self._steps[-1][3] += 1
+        step = [dt, report.substeps, report.iterations, self.world._adapted]
+        if self._steps and self._steps[-1][:-1] == step:
+            self._steps[-1][-1] += 1
         else:
             self._steps.append([*step, 1])
         self.worst = report if self.worst is None else self.worst.worse(report)

@@ -305,10 +305,10 @@ class Replay:
     def _apply(self, world: "World", entry: Entry) -> None:
         """Make the steps of an entry, then apply the change that it records."""
         settings = world.settings
-        for dt, substeps, iterations, count in entry.steps:
-            world.substeps, world.iterations = checks.integer("replay", "substeps", substeps, least=1), iterations
+        for dt, substeps, passes, adapted, count in entry.steps:
+            substeps, passes = (checks.integer("replay", "substeps", n, least=1) for n in (substeps, passes))
             for _ in range(count):
-                world.step(dt)
+                world._make_again(dt, substeps, passes, adapted)
         world.substeps, world.iterations = settings["substeps"], settings["iterations"]
         if entry.kind == "turned":
             for k, values in self._knob_values(entry):

@@ -37,7 +37,7 @@ TAKES = {
     "Sdf": ("function", "gradient"),
 }  # arguments that may be the user's functions
 MOST = 10_000  # most steps of a solver in a substep
-LONG = 8  # lists of at least so many numbers are stored as arrays
+LONG = 8  # lists of at least so many rows of numbers are stored as arrays, and read back as lists
 
 
 def plain(text: str) -> str:
@@ -87,7 +87,8 @@ def encode(value: Any, name: str, arrays: dict[str, np.ndarray], needs: Needs) -
     if isinstance(value, Iterable):
         parts = list(value)
         if len(parts) >= LONG and (array := _array(parts)) is not None:
-            return encode(array, name, arrays, needs)
+            arrays[name] = array
+            return {"list": name}
         return [encode(part, f"{name}.{k}", arrays, needs) for k, part in enumerate(parts)]
     return {"given": needs.name(value)}
 
@@ -101,7 +102,7 @@ def _array(parts: list) -> np.ndarray | None:
 
 
 def decode(data: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Return the value that encode() was given, for plain data."""
+    """Return the value that encode() was given, for plain data; tuples and other iterables as lists."""
     if isinstance(data, list):
         return [decode(part, arrays) for part in data]
     if not isinstance(data, dict):
@@ -109,6 +110,8 @@ def decode(data: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     ((kind, inner),) = data.items()
     if kind == "array":
         return arrays[inner]
+    if kind == "list":
+        return arrays[inner].tolist()
     if kind == "map":
         return {_key(decode(k, arrays)): decode(v, arrays) for k, v in inner}
     raise ValueError(f"replay: something of the user's stands where a scene has only data: {kind!r}.")

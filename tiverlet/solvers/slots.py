@@ -16,7 +16,8 @@ from .system import solvable
 
 # Where constraints converge within a substep, SHAKE is an explicit method for transverse vibrations, with a limit of stability:
 TENSEST = 4.0  # (omega h)^2 of a transverse vibration under a tension, beyond which Verlet diverges
-DITHER = golden_steps(1)[0], golden_steps(2)[0]  # steps of the dither of moves, from a substep and from a pass to the next
+# Steps of the dither of moves, from a substep and from a pass to the next, times 2^32.
+DITHER = golden_steps(1, bits=32)[0], golden_steps(2, bits=32)[0]
 
 
 def assign_slots(batches: list[Batch], inv_mass: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray]:

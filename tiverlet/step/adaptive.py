@@ -15,6 +15,7 @@ from ..solvers.slots import TENSEST
 from . import checkpoint, energy_bound
 from .clock import energy_limit
 from .diagnostics import KINETIC, STIFFNESS
+from .integrator import FORCE
 from .step_report import StepReport
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ PASSES = 64  # iterations of a substep
 RESIDUAL, OVERLAP = 1e-2, 0.1  # aims if no tolerance is given
 TENSION = 2.0  # (omega h)^2 across a tension: half the limit of stability
 STIFF = 2.0  # omega h from which on a spring is as good as rigid
-FORCE = 0.06  # (omega h)^2 in forces: 25 substeps per period, as in molecular dynamics
 RISKS = {"tunnelling-risk", "stiff-force", "non-finite"}
 FASTEST = 50.0  # omega dt of the fastest springs that substeps="auto" resolves: 8 periods in a frame, some 500 substeps
 LOSS = 2e-3  # share of the largest kinetic energy that springs may lose in a second: a percent in 5 s
@@ -40,6 +40,10 @@ ENOUGH = 64  # frames with plenty of room after which failures are forgotten
 OCTAVES = (MOST * PASSES).bit_length()  # of efforts, in substeps times iterations
 
 Figures = tuple[float, ...]  # residual, overlap, tension, motion, stiffness, damping and energy, relative to their aims
+MEASURES = (
+    "the residual", "the overlap", "(omega h)^2 of a tension", "the turn of a constraint", "(omega h)^2 of a force",
+    "the loss of springs", "the change of energy",
+)  # fmt: skip
 TENSE, HOPED = 2, 5  # in Figures: the index of the tension; the first of those that need not be met if no effort meets them
 NOTHING: Figures = (1.0,) * 7
 WORST: Figures = (float("inf"),) * 7
@@ -133,8 +137,9 @@ class StepController:
         self.substeps, self.iterations, self.stuck = n, k, tries.stuck  # so that the next frames do not try in vain
         self.plan_next_frame(world.iterations, max(figures), tries.verdict, tries.count)
         off = report.residual / (tolerance or RESIDUAL)
+        worst = max((off, MEASURES[0]), *zip(figures, MEASURES, strict=True))
         verdict = "stuck" if tries.verdict == "good" and off > 1 else tries.verdict  # links stiffen as energy allows
-        return with_verdict(report, max(*figures, off), risks, verdict, tries.count)
+        return with_verdict(report, worst, risks, verdict, tries.count)
 
     def prepare(self, iterations: int, dt: float, tolerance: float | None, budget: float | None) -> None:
         """Choose the substeps and iterations of the first try."""
@@ -409,15 +414,15 @@ def cheapest(known: dict[tuple[int, int], Figures], stuck: Figures) -> tuple[int
     return next(e for e in fit if not tense or e[0] == max(fit)[0])
 
 
-def with_verdict(report: StepReport, figure: float, risks: set[str], verdict: str, tries: int) -> StepReport:
-    """Return the report with the flag, the note and the number of tries of the controller."""
+def with_verdict(report: StepReport, worst: tuple[float, str], risks: set[str], verdict: str, tries: int) -> StepReport:
+    """Return the report with the flag, the note and the number of tries of the controller. worst: a figure, and what it is."""
     if verdict == "good":
         return replace(report, tries=tries)
-    wrong = sorted(risks) or [f"a figure is {figure:.3g} times what is asked"]
+    wrong = sorted(risks) or [f"{worst[1]} is {worst[0]:.3g} times what is asked"]
     why = {
         "stuck": "Nothing helps: constraints contradict each other, a load has no direction to be carried in (that of a straight "
-        "rope between two pins; give it slack or compliance), particles still part that began in one place, or what is "
-        "violated cannot be put right first, and would be energy in a shorter substep.",
+        "rope between two pins; give it slack or compliance), particles still part that began in one place, a force has no end "
+        "where its centers meet, or what is violated cannot be put right first, and would be energy in a shorter substep.",
         "substeps-capped": f"More than {report.substeps} substeps are needed, but the budget is spent or there can be no more.",
     }[verdict]
     note = f"The frame is not as good as asked: {', '.join(wrong)}. {why}"

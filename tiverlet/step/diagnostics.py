@@ -15,6 +15,7 @@ from ..particles import LARGEST
 from ..solvers.slots import TENSEST
 from ..solvers.solver import Solver
 from .force_stiffness import ForceStiffness
+from .integrator import STIFF
 from .span import END, FIGURES, ORIGIN, SHEET, H, integer
 from .step_report import COMPRESSED, UNCONVERGED, StepReport
 
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 
 BLOCKS = 64  # partial sums: a fixed number, so the total is the same bit for bit on any number of threads; squared on a GPU
 TURNS = (0, 26, 41)  # degrees, for 0, BENT and FAR
-STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges; velocities that forces turn this fast turn far too slowly
 
 # The origin of a state: an ordinary substep; a substep that was a start (the first after velocities were set); no substep yet.
 STEPPED, STARTED, UNSTEPPED = range(3)
@@ -266,6 +266,8 @@ class Diagnostics:
             if ti.static(len(self.pair_forces) > 0):
                 if total[8] > 0:
                     sheet[3] = ti.max(sheet[3], total[7] / total[8])
+            if ti.static(self.step.integrator.forces.has_unresolved):
+                sheet[3] = ti.max(sheet[3], self.step.integrator.forces.encounter(sheet[3], total[6]))
             if low[0] <= high[0]:
                 for k in ti.static(range(self.dim)):
                     sheet[REACH] = ti.max(sheet[REACH], -low[k], high[k])
@@ -471,7 +473,8 @@ class Reporter:
             need = np.ceil(substeps * np.sqrt(stiff / STIFF)) + 1
             return (
                 f"A force changes too fast for the substep: omega h = {np.sqrt(stiff):.3g}, resolved below 2. "
-                f"Use at least {need:.7g} substeps."
+                f"Use at least {need:.7g} substeps. A force that grows without bound, as 1 / r^2, is never resolved where its "
+                "centers meet: let it end, as r / (r^2 + e^2)^1.5."
             )
         if released > 0:
             return (

@@ -156,6 +156,9 @@ class Composition:
         if self.state.w[i] > 0:
             d = self.state.d[i]
             a = self.forces.accelerate(i, self.state.place(i), 0 * d, t, self.forces.pull(t))
+            if ti.static(self.forces.has_unresolved):
+                if starts == 0:
+                    self.forces.note_unresolved(i, self.state.place(i), d, h, t, a - self.forces.pull(t))
             if ti.static(self.springs_pull):
                 a += self.slots.total_of(i) / (h * h)
             if starts != 0:

@@ -7,14 +7,18 @@ import numpy as np
 from ..device import ti
 from ..features.feature import Acceleration, Scene
 from ..tools import golden_steps
+from .clock import SHARE
 from .span import ENDLESS
 
 if TYPE_CHECKING:
     from .clock import Clock
 
 # Multiples of the golden ratio of two dimensions, mod 1, are the most even sequence of pairs. Each of the two sums takes one.
-DITHER = golden_steps(2)
+DITHER = golden_steps(2, bits=32)
 ALIKE = {ti.f32: 2.0**-12, ti.f64: 2.0**-26}  # least variation of a velocity, relative: the square root of its rounding error
+STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges; velocities that forces turn this fast turn far too slowly
+CLOSE = 0.4  # the same in an encounter that changes the energy of motion by SHARE: a kick of 0.4 of the velocity
+FORCE = 0.06  # (omega h)^2 of forces that a substep resolves: 25 substeps per period, as in molecular dynamics
 TINY = 1e-18  # [m/s], [m/s^2]: keeps divisors from being 0
 LEAST = 0.25  # least pivot with which a velocity is solved for; a force that feeds motion faster is taken explicitly
 
@@ -35,6 +39,11 @@ class Forces:
         self.positional, self.velocity_dependent = ([f for f in self.others if f.uses_velocity is it] for it in (False, True))
         self.drags = [f for f in accelerations if f.decays]
         self.uneven = [f for f in self.all if not f.uniform]
+        self.w, self.has_unresolved = scene.state.w, bool(self.uneven or self.pairwise)
+        if self.has_unresolved:
+            add = scene.memory.field
+            self.unresolved = add("forces.unresolved", None, kind=ti.f64)
+            self.kicked = add("forces.kicked", None, kind=ti.f64)
 
     @ti.func
     def change_along(self, i, x, d, h, t):
@@ -43,6 +52,41 @@ class Forces:
         for f in ti.static(self.uneven):
             change += f.acceleration(i, x, d / h, t) - f.acceleration(i, x - d, d / h, t)
         return change
+
+    @ti.func
+    def note_unresolved(self, i, x, d, h, t, a):
+        """Note how fast forces change along the last displacement d of particle i.
+
+        a: its acceleration. `unresolved` is the largest (omega h)^2 = h^2 |a(x) - a(x - d)| / |d| since the last report, from
+        FORCE on, and `kicked` the largest energy m (|d / h|^2 + |h (a(x) - a(x - d))|^2) / 2 of these particles [J]. A close
+        encounter in a force that grows without bound lasts a few substeps, and the end of the frame does not show it.
+        """
+        size = ti.cast(d.norm(), ti.f64)
+        if self.w[i] > 0 and size > 0 and 2 * h * h * a.norm() > FORCE * size:  # a(x) or a(x - d) is half of the change, or more
+            change = self.change_along(i, x, d, h, t)
+            for f in ti.static(self.pairwise):
+                change += f.dev.now[i] - f.dev.last[i]
+            kick, v = ti.cast(h * change.norm(), ti.f64), size / h
+            if kick > FORCE * v:
+                ti.atomic_max(self.unresolved[None], kick / v)
+                ti.atomic_max(self.kicked[None], (v * v + kick * kick) / (2 * self.w[i]))
+
+    @ti.func
+    def encounter(self, stiff, kinetic):
+        """Return (omega h)^2 of the closest encounter since the last report, 0 if there was none, and forget it.
+
+        stiff, kinetic: (omega h)^2 at the end of the frame, and all energy of motion [J], of which what creeps over an edge of a
+        force has no share. A linear force is stable up to STIFF. Where a force has grown and fallen within the frame, and so is
+        not linear, CLOSE counts as much.
+        """
+        out = ti.cast(0, ti.f64)
+        if self.kicked[None] > SHARE * kinetic:
+            out = self.unresolved[None]
+            if out > STIFF * stiff:
+                out *= ti.static(STIFF / CLOSE)
+        self.unresolved[None] = 0
+        self.kicked[None] = 0
+        return out
 
     @ti.func
     def pull(self, t):
@@ -262,6 +306,9 @@ class Verlet:
         """
         live, x, d, h = self.state.moves(i), self.state.x[i], self.state.d[i], now.h
         a = self.acceleration_at(i, h, now.time, now.fresh, pull)
+        if ti.static(self.forces.has_unresolved):
+            if now.fresh == 0:
+                self.forces.note_unresolved(i, self.state.place(i), d, h, now.time, a - pull)
         before, low = ti.select(now.fresh != 0, h * d - h * h / 2 * a, d), ti.zero(d)
         if ti.static(self.state.carries):
             low = self.state.d_low[i]

@@ -10,6 +10,7 @@ from ..constraints.core.anchored import Anchored
 from ..constraints.pin import Pin
 from ..features.arguments import knobs_of
 from ..features.feature import Feature
+from ..forces.gravity import Gravity
 from .clock import CHANGED
 
 Values = Mapping[Feature, Mapping[str, Any]]  # values of knobs
@@ -36,11 +37,10 @@ def shift(world: Any, by: np.ndarray) -> None:
                 f"World.shift: {f!r} is fixed in space. Remove it before, and add it again where it belongs then: "
                 "world.remove(features=[...]), world.add(features=[...])."
             )
-    position = world.position + by
-    world._check_places("World.shift", position)
+    world._check_places("World.shift", world.position + by)
     knobs = {f: {name: getattr(type(f), name) for name in knobs_of(type(f))} for f in world.features}
     values = {f: {n: knob.place(f, getattr(f, n), by) for n, knob in own.items() if knob.place} for f, own in knobs.items()}
-    _take(world, values, position)
+    _take(world, values, by)
 
 
 def _set(values: Values) -> None:
@@ -53,8 +53,25 @@ def _set(values: Values) -> None:
             setattr(f, name, value)
 
 
-def _take(world: Any, values: Values, position: np.ndarray | None = None) -> None:
-    """Set knobs, and positions, (n, dim), without a motion from the present ones."""
+def _shift_energy(world: Any, by: np.ndarray, waits: bool) -> None:
+    """Change the energy that is known, and its bound, as a shift by a vector, (dim,) [m], does.
+
+    waits: whether anything else was assigned since the last step, which has happened now.
+    """
+    clock, w = world._clock, world._runner.scene.inv_mass
+    if waits:
+        clock.energy, clock.bound = None, CHANGED
+        return
+    more = -(1 / w[w > 0]).sum() * sum(
+        float(np.dot(f.kernel_values()["g"], by)) for f in world.features if isinstance(f, Gravity)
+    )
+    clock.energy = None if clock.energy is None else clock.energy + more
+    clock.bound = None if clock.bound is None else clock.bound + more
+
+
+def _take(world: Any, values: Values, by: np.ndarray | None = None) -> None:
+    """Set knobs, and shift all positions by a vector, (dim,) [m], without a motion from the present ones."""
+    waits = any(f.changed or f.moving for f in world.features)
     world._rebuild_for_knobs()  # for what waits already
     before = {f: {name: getattr(f, name) for name in some} for f, some in values.items()}
     try:
@@ -62,7 +79,7 @@ def _take(world: Any, values: Values, position: np.ndarray | None = None) -> Non
     except Exception:
         _set(before)
         raise
-    if position is None:  # a shift changes no force
+    if by is None:  # a shift changes no force
         world._rebuild_for_knobs()
     runner = world._runner
     for watcher in world._watchers:
@@ -72,10 +89,9 @@ def _take(world: Any, values: Values, position: np.ndarray | None = None) -> Non
         if f.moving:
             f.moving = False
             f.end_motion()
-    if position is not None:
-        runner.scene.state.put(runner.memory, position)
-        runner.clock.energy, runner.clock.moved_mask = None, None
-        runner.clock.forget_bound()
+    if by is not None:
+        runner.scene.state.put(runner.memory, world.position + by)
+        _shift_energy(world, by, waits)
     runner.wake()
     runner.invalidate()
     for watcher in world._watchers:

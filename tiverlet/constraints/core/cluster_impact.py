@@ -110,8 +110,7 @@ class ClusterImpact:
     def corrected_push(self, i, r, s, V, W, turn, M, S, m):
         """Correct the push of particle i. Returns the change of its impulse, times the substep, and how much the push changed."""
         n, p = ti.cast(self.impacts.normal[i], ti.f64), self.impacts.pushed[i]
-        B = rotation.skew(W, S)
-        d = ti.cast(self.state.d[i] - self.impacts.moved[i], ti.f64) + V + B @ (r + B @ r / 2)
+        d = ti.cast(self.state.d[i] - self.impacts.moved[i], ti.f64) + V + rotation.moved_by(W, r)
         miss = ti.cast(self.impacts.target[i], ti.f64) + rotation.bend(turn + W, s, n) - d.dot(n)
         self.impacts.pushed[i] = ti.max(p + ti.cast(miss / (m * self.give(s, n, M, S)), self.real), 0)
         push = ti.cast(self.impacts.pushed[i] - p, ti.f64) * n
