@@ -14,9 +14,10 @@ from tiverlet.step import checkpoint
 
 from .conftest import order, rms
 from .fuzz import oracles
-from .fuzz.scenes import Call, Event, Set, Step, Structure
+from .fuzz.scenes import Event, Set, Step, Structure
 from .fuzz.trials import HARD, RISKS, Refused, Trial, quiet
 from .fuzz.twins import WAYS, by_company, by_copies, by_path, by_threads
+from .fuzz.units import has_units, in_units
 from .scenes import SCENES
 
 __all__ = [
@@ -47,15 +48,13 @@ def pytest_generate_tests(metafunc) -> None:
     """Give tests the scenes of their file: all as `name`, smooth ones as `smooth`, those with known units as `measured`."""
     some = [name for name in SCENES if (name in TOUCHING) == metafunc.module.TOUCH]
     smooth = [name for name in some if SCENES[name].smooth]
-    for argument, names in (("name", some), ("smooth", smooth), ("measured", [name for name in some if has_units(name)])):
+    for argument, names in (
+        ("name", some),
+        ("smooth", smooth),
+        ("measured", [name for name in some if has_units(SCENES[name].structure)]),
+    ):
         if argument in metafunc.fixturenames:
             metafunc.parametrize(argument, names)
-
-
-def has_units(name: str) -> bool:
-    """Whether UNITS knows all that a scene is made of."""
-    structure = SCENES[name].structure
-    return all(call.name in UNITS for call in (structure.particles, *structure.features))
 
 
 @pytest.fixture
@@ -166,32 +165,6 @@ def test_a_smooth_scene_is_second_order(trial, smooth):
         trial.replay([*SCENES[smooth].first, Set(None, "substeps", substeps), *[Step(1 / 60)] * 20])
         ends.append(trial.world.position)
     assert 1.85 <= order([rms(a, b) for a, b in zip(ends[1:], ends[:-1], strict=True)]) <= 2.15
-
-
-# Powers of the units of length and mass in each argument; others have none. Times are as before.
-UNITS = {
-    "Particles": {"position": (1, 0), "velocity": (1, 0), "mass": (0, 1), "radius": (1, 0)},
-    "Gravity": {"g": (1, 0)}, "HalfSpace": {"offset": (1, 0)}, "Box": {"lower": (1, 0), "upper": (1, 0)},
-    "Ball": {"center": (1, 0), "radius": (1, 0)}, "Capsule": {"a": (1, 0), "b": (1, 0), "radius": (1, 0)},
-    "Polygon": {"vertices": (1, 0), "position": (1, 0), "radius": (1, 0)}, "Pin": {"compliance": (0, -1), "damping": (0, 1)},
-    "Distance": {"rest": (1, 0), "compliance": (0, -1), "damping": (0, 1), "break_at": (1, 1)}, "Contact": {},
-    "Spacer": {"length": (1, 0)},
-    "Rope": {"length": (1, 0), "compliance": (0, -1), "damping": (0, 1)}, "Area": {"compliance": (2, -1)}, "Polygons": {},
-    "ShapeMatch": {"compliance": (0, -1), "damping": (0, 1), "break_at": (1, 1)}, "Drag": {},
-}  # fmt: skip
-
-
-def in_units(call: Call, length: float, mass: float) -> Call:
-    """Return a call in other units."""
-    powers = UNITS[call.name]
-    if call.name == "Particles" and not {"mass"} & set(call.args):
-        call = Call(call.name, call.args | {"mass": 1.0})
-    if call.name == "Gravity" and not call.args:
-        call = Call(call.name, {"g": 9.81})
-    return Call(
-        call.name,
-        {k: np.multiply(v, length ** powers[k][0] * mass ** powers[k][1]) if k in powers else v for k, v in call.args.items()},
-    )
 
 
 @pytest.mark.slow

@@ -54,7 +54,7 @@ def convex(p: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 def gap(wall: Any, p: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Return how far particles are from a wall in its current pose, negative inside, (n,)."""
-    if wall.one_way is not None:  # any particle may be inside
+    if wall.one_way is not None or wall.active is False:  # any particle may be inside
         return np.full(len(p), np.inf)
     name = type(wall).__name__
     if name == "Box":
@@ -66,7 +66,8 @@ def gap(wall: Any, p: np.ndarray, r: np.ndarray) -> np.ndarray:
         return wall.radius - r - d if wall.inside else d - wall.radius - r
     if name == "Capsule":
         return segment(p, wall.a, wall.b) - wall.radius - r
-    p = p - np.asarray(wall.position)  # walls that are not rotated
+    place, rotation = wall.current_pose(p.shape[1])
+    p = (p - place) @ rotation
     if name == "Sdf":
         return SDF[plain(wall.function).__name__](p) - wall.radius - r
     d = polygon(p, wall.vertices) if name == "Polygon" else convex(p, wall.vertices)
