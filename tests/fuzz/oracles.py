@@ -150,6 +150,7 @@ def passive(structure: Structure) -> bool:
     args = structure.particles.args
     held = "pinned" in args or np.isinf(args.get("mass", 1.0)).any() or any(f.name in TETHERS for f in structure.features)
     driven = driven or (held and bool(np.any(args.get("spin", 0.0))))  # pinned particles that spin are rollers
+    driven = driven or any(np.any(f.args.get("surface_velocity", 0.0)) for f in structure.features)  # belts
     return not driven and all(f.name in (*PASSIVE, "Path", "Pin") for f in structure.features)
 
 
