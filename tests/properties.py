@@ -4,7 +4,6 @@ Two files, so that two processes share them; each compiles a scene once.
 """
 
 import contextlib
-import warnings
 from collections.abc import Iterator
 
 import numpy as np
@@ -15,9 +14,8 @@ from tiverlet.step import checkpoint
 from .conftest import order, rms
 from .fuzz import oracles
 from .fuzz.scenes import Event, Set, Step, Structure
-from .fuzz.trials import HARD, RISKS, Refused, Trial, quiet
+from .fuzz.trials import HARD, RISKS, Refused, Trial
 from .fuzz.twins import WAYS, by_company, by_copies, by_path, by_threads
-from .fuzz.units import has_units, in_units
 from .scenes import SCENES
 
 __all__ = [
@@ -27,7 +25,6 @@ __all__ = [
     "test_a_scene_has_the_same_bits_however_it_is_run",
     "test_a_frame_that_is_undone_leaves_nothing_behind",
     "test_a_smooth_scene_is_second_order",
-    "test_a_scene_moves_alike_in_other_units",
 ]
 DRAWN = np.random.default_rng(0).random(60)
 SCHEDULES = {  # substeps and dt of frame k
@@ -45,14 +42,9 @@ TOUCHING = {
 
 
 def pytest_generate_tests(metafunc) -> None:
-    """Give tests the scenes of their file: all as `name`, smooth ones as `smooth`, those with known units as `measured`."""
+    """Give tests the scenes of their file: all as `name`, smooth ones as `smooth`."""
     some = [name for name in SCENES if (name in TOUCHING) == metafunc.module.TOUCH]
-    smooth = [name for name in some if SCENES[name].smooth]
-    for argument, names in (
-        ("name", some),
-        ("smooth", smooth),
-        ("measured", [name for name in some if has_units(SCENES[name].structure)]),
-    ):
+    for argument, names in (("name", some), ("smooth", [name for name in some if SCENES[name].smooth])):
         if argument in metafunc.fixturenames:
             metafunc.parametrize(argument, names)
 
@@ -165,20 +157,3 @@ def test_a_smooth_scene_is_second_order(trial, smooth):
         trial.replay([*SCENES[smooth].first, Set(None, "substeps", substeps), *[Step(1 / 60)] * 20])
         ends.append(trial.world.position)
     assert 1.85 <= order([rms(a, b) for a, b in zip(ends[1:], ends[:-1], strict=True)]) <= 2.15
-
-
-@pytest.mark.slow
-def test_a_scene_moves_alike_in_other_units(taichi, measured):
-    # Lengths times 2^a, masses times 2^b and accelerations times 2^a give positions times 2^a: nothing has a size of its own.
-    scene, found = SCENES[measured].structure, []
-    events = [*SCENES[measured].first, *[Step(1 / 60)] * 8]
-    for length, mass in ((1.0, 1.0), (2.0**-7, 2.0**-10), (2.0**5, 2.0**12)):
-        parts = [in_units(call, length, mass) for call in (scene.particles, *scene.features)]
-        other = Trial(Structure(parts[0], tuple(parts[1:]), scene.settings))
-        with contextlib.closing(other), warnings.catch_warnings():
-            quiet()
-            other.replay(events)
-            found.append(other.world.position / length)
-            digit = 2.0**-23 * other.world.particles.size / length
-    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=digit)
-    np.testing.assert_allclose(found[2], found[0], rtol=0, atol=digit)

@@ -25,7 +25,6 @@ from .scene import SUBSTEPS, Run, Scene
 KINDS = HARD | {"energy", "energy, flagged", "wall, several"}
 DRAWN = np.random.default_rng(0).random(60)
 FAR = 60.0  # [m] where nothing of a scene comes
-COMPILED = ("contact", "polygons", "sleep", "spin", "launched", "worlds", "f64")  # conditions that need kernels of their own
 
 
 class Bench:
@@ -152,15 +151,22 @@ def polygons(bench: Bench) -> None:
     second_order(bench, bench.run(trial), "beside Polygons far away")
 
 
-def sleep(bench: Bench) -> None:
-    """A Sleep that never comes: the same bits."""
-    trial = bench.trial(more=(Call("Sleep", {"speed": 1e-9, "time": 1e6}),))
-    same(bench.plain, bench.run(trial), "beside Sleep that never sleeps")
+def idle(bench: Bench) -> None:
+    """A Sleep that never comes, and particles that may spin where nothing turns them: the same bits."""
+    turning, wakeful = may_spin(bench.scene), may_sleep(bench.scene)
+    more = (Call("Sleep", {"speed": 1e-9, "time": 1e6}),) if wakeful else ()
+    what = [word for word, is_so in (("Sleep that never sleeps", wakeful), ("spin, which nothing turns", turning)) if is_so]
+    same(bench.plain, bench.run(bench.trial({"spin": True} if turning else {}, more)), f"beside {' and '.join(what)}")
 
 
-def spin(bench: Bench) -> None:
-    """Particles that may spin, where nothing turns them: the same bits."""
-    same(bench.plain, bench.run(bench.trial({"spin": True})), "with spin, which nothing turns")
+def may_sleep(scene: Scene) -> bool:
+    """Whether a Sleep may be added: there is none, and nothing that refuses it."""
+    return not has(scene, "Sleep", "PairForce")
+
+
+def may_spin(scene: Scene) -> bool:
+    """Whether spin may be added and is not turned: without friction."""
+    return not any("friction" in call.args for call in scene.structure.features) and "spin" not in scene.structure.particles.args
 
 
 # In other ways
@@ -270,8 +276,7 @@ CONDITIONS: dict[str, Callable[[Bench], None]] = {
     "plain": timed(),
     "contact": contact,
     "polygons": polygons,
-    "sleep": sleep,
-    "spin": spin,
+    "idle": idle,
     "company": by(twins.by_company),
     "saved": by(by_saving),
     "cloned": by(twins.by_clone),
@@ -294,12 +299,10 @@ def applicable(scene: Scene) -> Iterator[str]:
     """Yield the conditions that make sense in a scene, by what it is made of."""
     s = scene.structure
     touching, dim = has(scene, "Contact", "Polygons"), s.position.shape[1]
-    friction = any("friction" in call.args for call in s.features)
     shut_out = {
         "contact": touching,  # a world has at most one
         "polygons": touching or dim == 3 or s.periodic,
-        "sleep": has(scene, "Sleep", "PairForce"),  # refused beside forces between pairs
-        "spin": friction or "spin" in s.particles.args,
+        "idle": not may_sleep(scene) and not may_spin(scene),
         "company": s.periodic or has(scene, "Sleep", "PairForce"),  # nothing is far
         "worlds": has(scene, "Sleep"),  # refused
         "units": not has_units(s),
