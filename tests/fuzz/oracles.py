@@ -40,14 +40,13 @@ def polygon(p: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     return np.where(inside, -away, away)
 
 
-def convex(p: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return a bound on the signed distance to a tetrahedron: exact inside and beside faces, too small beside edges."""
+def convex(p: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return a bound on the signed distance to a convex mesh: exact inside and beside faces, too small beside edges."""
     out = []
-    for k in range(4):
-        a, b, c = corners[[j for j in range(4) if j != k]]
+    for a, b, c in vertices[faces]:
         n = np.cross(b - a, c - a)
         n = n / np.linalg.norm(n)
-        n = n if (corners[k] - a) @ n < 0 else -n
+        n = n if (vertices.mean(axis=0) - a) @ n < 0 else -n
         out.append((p - a) @ n)
     return np.max(out, axis=0)
 
@@ -70,7 +69,7 @@ def gap(wall: Any, p: np.ndarray, r: np.ndarray) -> np.ndarray:
     p = (p - place) @ rotation
     if name == "Sdf":
         return SDF[plain(wall.function).__name__](p) - wall.radius - r
-    d = polygon(p, wall.vertices) if name == "Polygon" else convex(p, wall.vertices)
+    d = polygon(p, wall.vertices) if name == "Polygon" else convex(p, wall.vertices, wall.faces)
     return (-d if wall.inside else d) - wall.radius - r
 
 

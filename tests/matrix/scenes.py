@@ -439,7 +439,7 @@ def beads():
     return c.Particles(x + [[0, 0], [0, 0], [0, 0], [0, 0]], radius=0.02), features, promises
 
 
-@scene(turns={5: [Set(2, "at", 0.5)], 8: [Set(1, "speed", -0.5)]})
+@scene(turns={5: [Set(2, "at", 0.3)], 8: [Set(1, "speed", -0.5)]})
 def driven_beads():
     x = np.array([[0.0, 0], [3, 0], [0, -1]])
     features = [
@@ -451,7 +451,7 @@ def driven_beads():
     promises = [
         kept("Path", "speed", says="a bead is driven",
              figure=lambda r: r.x[8, 0, 0] / r.reports[7].time, least=0.4999, most=0.5001),
-        kept("Path", "at", says="another one goes where it is told", figure=lambda r: r.x[-1, 1, 0], least=3.49999, most=3.50001),
+        kept("Path", "at", says="another one goes where it is told", figure=lambda r: r.x[-1, 1, 0], least=3.29999, most=3.30001),
     ]  # fmt: skip
     return c.Particles(x, radius=0.02), features, promises
 
@@ -569,26 +569,24 @@ def pair_forces():
     )
 
 
-# Walls. Four particles meet each: one falls and bounces, one lies on it, one starts inside, and one lies on it. Then it is off.
+# Walls. Three particles meet each: one falls and bounces, and two lie on it. Then it is off.
 
-MATERIAL = {"friction": (0.5, 0.3), "restitution": 0.6, "push_out": 0.5, "active": True, "events": True}
+MATERIAL = {"friction": (0.5, 0.3), "restitution": 0.6, "active": True, "events": True}
 OFF = {15: [Set(1, "active", False)]}
 
 
 def wall(of: str, options: dict, *more: Call, dim: int = 2, x=(), v=(), promises: Iterable[Promise] = ()):
     """Return the scene of a wall, feature 1, whose top is at y = 0, with more walls, and particles at x of velocities v."""
-    at, way = np.zeros((4, dim)), np.zeros((4, dim))
-    at[:, 0], at[:, 1] = [-0.6, -0.2, 0.2, 0.6], [0.3, 0.1, 0.06, 0.1]
+    at, way = np.zeros((3, dim)), np.zeros((3, dim))
+    at[:, 0], at[:, 1] = [-0.6, -0.2, 0.6], [0.3, 0.1, 0.1]
     if len(x):
         at, way = np.concatenate([at, x]), np.concatenate([way, v])
     made = Call(of, options | MATERIAL | {"surface_velocity": np.eye(dim)[0]})
     return c.Particles(at, velocity=way, radius=0.1), [c.Gravity(G), made, *more], [
-        kept(of, *options, says="what is on it stays above", figure=lambda r: r.x[1:16, [0, 1, 3], 1].min(), least=0.05),
+        kept(of, *options, says="what is on it stays above", figure=lambda r: r.x[1:16, :3, 1].min(), least=0.05),
         kept(of, "restitution", says="what falls bounces", figure=lambda r: r.v[:16, 0, 1].max(), least=0.6),
         kept(of, "friction", "surface_velocity", says="what lies on it is carried along", figure=lambda r: r.v[15, 1, 0],
              least=0.15, most=1.001),
-        kept(of, "push_out", says="what is inside comes out, slowly", least=0.2, most=0.51,
-             figure=lambda r: (np.diff(r.x[:4, 2, 1]) / np.diff([0, *(report.time for report in r.reports[:3])])).max()),
         kept(of, "events", says="it tells of meetings", figure=lambda r: sum(p == (0, 1) for p in r.walls), least=1),
         kept(of, "active", says="what is off lets through", figure=lambda r: r.x[-1, 1, 1], most=-0.01),
         *promises,
@@ -596,9 +594,9 @@ def wall(of: str, options: dict, *more: Call, dim: int = 2, x=(), v=(), promises
 
 
 def one_way(of: str, *options: str) -> Promise:
-    """Return the promise of a platform at y = 0: particle 4 comes from below and passes, 5 comes from above and lands."""
+    """Return the promise of a platform at y = 0: particle 3 comes from below and passes, 4 comes from above and lands."""
     return kept(of, "one_way", *options, says="what comes from below passes, what comes from above lands", least=0.04,
-                figure=lambda r: min(r.x[:, 4, 1].max(), r.x[:, 5, 1].min()))  # fmt: skip
+                figure=lambda r: min(r.x[:, 3, 1].max(), r.x[:, 4, 1].min()))  # fmt: skip
 
 
 def carried(of: str) -> list[Promise]:
@@ -680,8 +678,39 @@ def a_room_that_is_carried():
 @scene(turns=OFF | {5: [Set(1, "position", np.array([0.0, 0.953])), Set(1, "rotation", 0.002)]}, frames=25)
 def distance_functions():
     form = {"function": functions.ground, "gradient": up, "radius": 0.05, "position": (0.0, 0.95), "rotation": 0.0}
-    lifted = kept("Sdf", "position", "rotation", says="it lifts what is on it", figure=lambda r: r.x[8, 3, 1], least=0.1035)
+    lifted = kept("Sdf", "position", "rotation", says="it lifts what is on it", figure=lambda r: r.x[8, 2, 1], least=0.1035)
     return wall("Sdf", form, promises=[lifted])
+
+
+def let_out(of: str, i: int, axis: int = 1) -> Promise:
+    """Return the promise that particle i leaves a wall slowly, at 0.3 m/s."""
+    return kept(of, "push_out", says="what is inside comes out, slowly", least=0.2, most=0.3 * (1 + 1e-3),
+                figure=lambda r: abs(r.x[1, i, axis] - r.x[0, i, axis]) / r.reports[0].time)  # fmt: skip
+
+
+@scene()
+def what_starts_in_walls():
+    # Each by 0.04 m: in a floor, on top of four pads, and beyond the side of a box.
+    x = np.array([[0.0, 0.06], [4, 1.56], [8, 1.56], [12, 1.56], [16, 1.56], [29.94, 3]])
+    slow = {"push_out": 0.3}
+    square = np.array([[-1.0, -0.5], [1, -0.5], [1, 0.5], [-1, 0.5]])
+    walls = [
+        Call("HalfSpace", {"normal": (0.0, 1.0)} | slow), Call("Ball", {"center": (4.0, 1.0), "radius": 0.5} | slow),
+        Call("Capsule", {"a": (7.0, 1.0), "b": (9.0, 1.0), "radius": 0.5} | slow),
+        Call("Polygon", {"vertices": square, "position": (12.0, 1.0)} | slow),
+        Call("Sdf", {"function": functions.pillar, "position": (14.0, 1.0)} | slow),
+        Call("Box", {"lower": (-30.0, -30.0), "upper": (30.0, 30.0)} | slow),
+    ]  # fmt: skip
+    names = [call.name for call in walls]
+    promises = [let_out(of, i, axis=0 if of == "Box" else 1) for i, of in enumerate(names)]
+    return c.Particles(x, radius=0.1), walls, promises
+
+
+@scene()
+def what_starts_in_a_mesh():
+    block = tv.shapes.box((0, -0.5, 0), (4, 1, 4))
+    mesh = c.Mesh(block.position, block.faces, push_out=0.3)
+    return c.Particles([[0.0, 0.06, 0.0]], radius=0.1), [mesh], [let_out("Mesh", 0)]
 
 
 # Contacts
