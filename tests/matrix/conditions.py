@@ -138,9 +138,9 @@ def contact(bench: Bench) -> None:
 
 
 def polygons(bench: Bench) -> None:
-    """Two triangles far away, with contacts of Polygons among themselves: the same."""
+    """Two triangles far away, wider than forces between pairs reach, with contacts of Polygons: the same."""
     args, n = bench.scene.structure.particles.args, len(bench.scene.structure.position)
-    far = {"position": FAR + np.array([[0.0, 0], [1, 0], [0, 1], [5, 0], [6, 0], [5, 1]]), "velocity": np.zeros((6, 2))}
+    far = {"position": FAR + np.array([[0.0, 0], [3, 0], [0, 3], [9, 0], [12, 0], [9, 3]]), "velocity": np.zeros((6, 2))}
     more = far | {"mass": np.ones(6), "group": np.zeros(6, int)}
     with_them = {
         name: np.concatenate([np.broadcast_to(args[name], (n, *values.shape[1:])), values])
