@@ -620,7 +620,7 @@ def half_spaces():
     return wall("HalfSpace", {"normal": (0.0, 1.0), "offset": 0.0})
 
 
-@scene(turns=OFF, frames=25)
+@scene(turns=OFF, frames=25, without={"polygons": "a wall is around all that there is"})
 def boxes():
     return wall("Box", {"lower": (-2.0, 0.0), "upper": (2.0, 3.0)})
 
@@ -630,7 +630,7 @@ def balls():
     return wall("Ball", {"center": (0.0, -20.0), "radius": 20.0})
 
 
-@scene()
+@scene(without={"polygons": "a wall is around all that there is"})
 def a_hollow():
     # Without friction: energy is constant.
     slides = kept("Ball", "inside", says="what is in a hollow slides to and fro in it", most=0.901,
@@ -652,7 +652,7 @@ def polygons_as_walls():
     return wall("Polygon", slab, line, x=ABOVE, v=SPEEDS, promises=[one_way("Polygon", "closed", "radius")])
 
 
-@scene(turns=CARRY)
+@scene(turns=CARRY, without={"polygons": "a wall is around all that there is"})
 def a_box_that_is_carried():
     box = c.Polygon([[-1.0, -1], [1, -1], [1, 1], [-1, 1]], inside=True, position=(0.0, 0.0), rotation=0.0, friction=0.5)
     return c.Particles(ENDS, radius=0.1), [c.Gravity(G), box], carried("Polygon")
@@ -688,7 +688,7 @@ def let_out(of: str, i: int, axis: int = 1) -> Promise:
                 figure=lambda r: abs(r.x[1, i, axis] - r.x[0, i, axis]) / r.reports[0].time)  # fmt: skip
 
 
-@scene()
+@scene(without={"polygons": "a wall is around all that there is"})
 def what_starts_in_walls():
     # Each by 0.04 m: in a floor, on top of four pads, and beyond the side of a box.
     x = np.array([[0.0, 0.06], [4, 1.56], [8, 1.56], [12, 1.56], [16, 1.56], [29.94, 3]])

@@ -16,7 +16,7 @@ from .scenes import SCENES
 
 # Options that change no motion: skins are for speed, loads has no effect any more.
 UNSEEN = {("Contact", "skin"), ("Contact", "loads"), ("Polygons", "skin"), ("Polygons", "loads")}
-TOGETHER = ("links", "ropes", "spacers", "angle limits", "motors", "winches", "pins", "own constraints")  # what has one compile
+TOGETHER = ("links", "ropes", "spacers", "angle limits", "motors", "winches")  # in one world, which compiles once
 CELLS = [(name, condition) for name, scene in SCENES.items() for condition in applicable(scene)]
 
 
