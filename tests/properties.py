@@ -4,7 +4,6 @@ Two files, so that two processes share them; each compiles a scene once.
 """
 
 import contextlib
-import warnings
 from collections.abc import Iterator
 
 import numpy as np
@@ -14,8 +13,8 @@ from tiverlet.step import checkpoint
 
 from .conftest import order, rms
 from .fuzz import oracles
-from .fuzz.scenes import Call, Event, Set, Step, Structure
-from .fuzz.trials import HARD, RISKS, Refused, Trial, quiet
+from .fuzz.scenes import Event, Set, Step, Structure
+from .fuzz.trials import HARD, RISKS, Refused, Trial
 from .fuzz.twins import WAYS, by_company, by_copies, by_path, by_threads
 from .scenes import SCENES
 
@@ -26,7 +25,6 @@ __all__ = [
     "test_a_scene_has_the_same_bits_however_it_is_run",
     "test_a_frame_that_is_undone_leaves_nothing_behind",
     "test_a_smooth_scene_is_second_order",
-    "test_a_scene_moves_alike_in_other_units",
 ]
 DRAWN = np.random.default_rng(0).random(60)
 SCHEDULES = {  # substeps and dt of frame k
@@ -44,18 +42,11 @@ TOUCHING = {
 
 
 def pytest_generate_tests(metafunc) -> None:
-    """Give tests the scenes of their file: all as `name`, smooth ones as `smooth`, those with known units as `measured`."""
+    """Give tests the scenes of their file: all as `name`, smooth ones as `smooth`."""
     some = [name for name, scene in SCENES.items() if (name in TOUCHING) == metafunc.module.TOUCH and not scene.known]
-    smooth = [name for name in some if SCENES[name].smooth]
-    for argument, names in (("name", some), ("smooth", smooth), ("measured", [name for name in some if has_units(name)])):
+    for argument, names in (("name", some), ("smooth", [name for name in some if SCENES[name].smooth])):
         if argument in metafunc.fixturenames:
             metafunc.parametrize(argument, names)
-
-
-def has_units(name: str) -> bool:
-    """Whether UNITS knows all that a scene is made of."""
-    structure = SCENES[name].structure
-    return all(call.name in UNITS for call in (structure.particles, *structure.features))
 
 
 @pytest.fixture
@@ -166,46 +157,3 @@ def test_a_smooth_scene_is_second_order(trial, smooth):
         trial.replay([*SCENES[smooth].first, Set(None, "substeps", substeps), *[Step(1 / 60)] * 20])
         ends.append(trial.world.position)
     assert 1.85 <= order([rms(a, b) for a, b in zip(ends[1:], ends[:-1], strict=True)]) <= 2.15
-
-
-# Powers of the units of length and mass in each argument; others have none. Times are as before.
-UNITS = {
-    "Particles": {"position": (1, 0), "velocity": (1, 0), "mass": (0, 1), "radius": (1, 0)},
-    "Gravity": {"g": (1, 0)}, "HalfSpace": {"offset": (1, 0)}, "Box": {"lower": (1, 0), "upper": (1, 0)},
-    "Ball": {"center": (1, 0), "radius": (1, 0)}, "Capsule": {"a": (1, 0), "b": (1, 0), "radius": (1, 0)},
-    "Polygon": {"vertices": (1, 0), "position": (1, 0), "radius": (1, 0)}, "Pin": {"compliance": (0, -1), "damping": (0, 1)},
-    "Distance": {"rest": (1, 0), "compliance": (0, -1), "damping": (0, 1), "break_at": (1, 1)}, "Contact": {},
-    "Spacer": {"length": (1, 0)},
-    "Rope": {"length": (1, 0), "compliance": (0, -1), "damping": (0, 1)}, "Area": {"compliance": (2, -1)}, "Polygons": {},
-    "ShapeMatch": {"compliance": (0, -1), "damping": (0, 1), "break_at": (1, 1)}, "Drag": {},
-}  # fmt: skip
-
-
-def in_units(call: Call, length: float, mass: float) -> Call:
-    """Return a call in other units."""
-    powers = UNITS[call.name]
-    if call.name == "Particles" and not {"mass"} & set(call.args):
-        call = Call(call.name, call.args | {"mass": 1.0})
-    if call.name == "Gravity" and not call.args:
-        call = Call(call.name, {"g": 9.81})
-    return Call(
-        call.name,
-        {k: np.multiply(v, length ** powers[k][0] * mass ** powers[k][1]) if k in powers else v for k, v in call.args.items()},
-    )
-
-
-@pytest.mark.slow
-def test_a_scene_moves_alike_in_other_units(taichi, measured):
-    # Lengths times 2^a, masses times 2^b and accelerations times 2^a give positions times 2^a: nothing has a size of its own.
-    scene, found = SCENES[measured].structure, []
-    events = [*SCENES[measured].first, *[Step(1 / 60)] * 8]
-    for length, mass in ((1.0, 1.0), (2.0**-7, 2.0**-10), (2.0**5, 2.0**12)):
-        parts = [in_units(call, length, mass) for call in (scene.particles, *scene.features)]
-        other = Trial(Structure(parts[0], tuple(parts[1:]), scene.settings))
-        with contextlib.closing(other), warnings.catch_warnings():
-            quiet()
-            other.replay(events)
-            found.append(other.world.position / length)
-            digit = 2.0**-23 * other.world.particles.size / length
-    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=digit)
-    np.testing.assert_allclose(found[2], found[0], rtol=0, atol=digit)

@@ -40,21 +40,20 @@ def polygon(p: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     return np.where(inside, -away, away)
 
 
-def convex(p: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return a bound on the signed distance to a tetrahedron: exact inside and beside faces, too small beside edges."""
+def convex(p: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return a bound on the signed distance to a convex mesh: exact inside and beside faces, too small beside edges."""
     out = []
-    for k in range(4):
-        a, b, c = corners[[j for j in range(4) if j != k]]
+    for a, b, c in vertices[faces]:
         n = np.cross(b - a, c - a)
         n = n / np.linalg.norm(n)
-        n = n if (corners[k] - a) @ n < 0 else -n
+        n = n if (vertices.mean(axis=0) - a) @ n < 0 else -n
         out.append((p - a) @ n)
     return np.max(out, axis=0)
 
 
 def gap(wall: Any, p: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Return how far particles are from a wall in its current pose, negative inside, (n,)."""
-    if wall.one_way is not None:  # any particle may be inside
+    if wall.one_way is not None or wall.active is False:  # any particle may be inside
         return np.full(len(p), np.inf)
     name = type(wall).__name__
     if name == "Box":
@@ -66,10 +65,11 @@ def gap(wall: Any, p: np.ndarray, r: np.ndarray) -> np.ndarray:
         return wall.radius - r - d if wall.inside else d - wall.radius - r
     if name == "Capsule":
         return segment(p, wall.a, wall.b) - wall.radius - r
-    p = p - np.asarray(wall.position)  # walls that are not rotated
+    place, rotation = wall.current_pose(p.shape[1])
+    p = (p - place) @ rotation
     if name == "Sdf":
         return SDF[plain(wall.function).__name__](p) - wall.radius - r
-    d = polygon(p, wall.vertices) if name == "Polygon" else convex(p, wall.vertices)
+    d = polygon(p, wall.vertices) if name == "Polygon" else convex(p, wall.vertices, wall.faces)
     return (-d if wall.inside else d) - wall.radius - r
 
 
@@ -149,6 +149,7 @@ def passive(structure: Structure) -> bool:
     args = structure.particles.args
     held = "pinned" in args or np.isinf(args.get("mass", 1.0)).any() or any(f.name in TETHERS for f in structure.features)
     driven = driven or (held and bool(np.any(args.get("spin", 0.0))))  # pinned particles that spin are rollers
+    driven = driven or any(np.any(f.args.get("surface_velocity", 0.0)) for f in structure.features)  # belts
     return not driven and all(f.name in (*PASSIVE, "Path", "Pin") for f in structure.features)
 
 

@@ -10,8 +10,7 @@ import numpy as np
 
 import tiverlet as tv
 
-from . import functions
-from .scenes import Call, Event, Set, Step, Structure, plain
+from .scenes import Call, Event, Set, Step, Structure
 from .trials import Find, Refused, Trial, door, quiet
 
 
@@ -103,15 +102,16 @@ def by_copies(trial: Trial, events: list[Event]) -> None:
             same(f"copy {k} after three frames in one launch", trial.world.hash(), many.hash(k))
 
 
+def functions_of(structure: Structure) -> list[Any]:
+    """Return the user's own functions, which a recording does not hold."""
+    values = [v for f in structure.features for v in f.args.values()]
+    return [v for v in values if callable(v) or getattr(v, "_is_taichi_function", False)]
+
+
 def by_recording(trial: Trial, events: list[Event]) -> None:
     """Check that a recording, computed again, gives what was recorded."""
     trial.reset()
-    own = [
-        v
-        for f in trial.structure.features
-        for v in f.args.values()
-        if getattr(functions, getattr(plain(v), "__name__", ""), None)
-    ]
+    own = functions_of(trial.structure)
     with tempfile.TemporaryDirectory() as folder:
         path = os.path.join(folder, "scene.rrd")
         try:

@@ -1,0 +1,58 @@
+"""Known faults: cells of the matrix that do not keep their equality, and why. What is mended has to be struck out."""
+
+BOUNDS = "rows of links ask for the side of a link, not for the bounds of a drive (contact/links.py, write())"
+SOFTNESS = "a rigid drive lags where substeps change: softness is one number for the whole world (step/softness.py)"
+BRAKE = "a brake slips where substeps get longer or change, below its torque"
+ALONG = "damping acts along a free axis once the substep changes: the history of a Snap is not projected"
+IMPACT = "a bounce off a wall beside contacts differs by a fraction of a substep from the bounce alone, which is exact"
+BELT = "friction on a curved wall is of first order, alone and as a row"
+PARTING = "beside contacts overlap parts 1.28 times as fast as push_out, and without velocity; alone it leaves with push_out"
+ONE_CORNER = "Taichi ends the process (scalarize.cpp) where a constraint of one corner is a row"
+ULP = "a digit depends on the unit of length"
+
+KNOWN: dict[tuple[str, str], str] = {
+    ("motors", "contact"): BOUNDS,
+    ("motors", "polygons"): BOUNDS,
+    ("servos", "polygons"): BOUNDS,
+    ("motors of free bodies", "polygons"): BOUNDS,
+    ("motors", "together"): BOUNDS,
+    ("winches", "together"): BOUNDS,
+    ("motors in space", "contact"): BOUNDS,
+    ("servos", "contact"): BOUNDS,
+    ("motors of free bodies", "contact"): BOUNDS,
+    ("motors", "uneven"): SOFTNESS,
+    ("motors", "changed back"): SOFTNESS,
+    ("motors in space", "uneven"): SOFTNESS,
+    ("motors in space", "changed back"): SOFTNESS,
+    ("servos", "late 0.25"): BRAKE,
+    ("servos", "changed back"): BRAKE,
+    ("servos", "auto"): BRAKE,
+    ("snaps", "late 0.05"): ALONG,
+    ("snaps", "late 0.25"): ALONG,
+    ("snaps", "uneven"): ALONG,
+    ("snaps", "changed back"): ALONG,
+    ("snaps", "auto"): ALONG,
+    ("angle limits", "units"): ULP,
+    ("balls roll on balls", "units"): ULP,
+    ("half spaces", "contact"): IMPACT,
+    ("boxes", "contact"): IMPACT,
+    ("capsules", "contact"): IMPACT,
+    ("polygons as walls", "contact"): IMPACT,
+    ("meshes", "contact"): IMPACT,
+    ("half spaces", "polygons"): IMPACT,
+    ("capsules", "polygons"): IMPACT,
+    ("polygons as walls", "polygons"): IMPACT,
+    ("balls", "contact"): BELT,
+    ("balls", "polygons"): BELT,
+    ("distance functions", "polygons"): BELT,
+    ("distance functions", "contact"): BELT,
+    ("what starts in walls", "contact"): PARTING,
+    ("what starts in a mesh", "contact"): PARTING,
+    ("discs meet", "f64"): "how fast overlap parts depends on rounding: passes end by a tolerance",
+}
+
+# Those that end the process: they are not run.
+CRASHES: dict[tuple[str, str], str] = {
+    ("a bead on a formula", "contact"): ONE_CORNER,
+    ("a bead on a formula", "polygons"): ONE_CORNER,
+}
