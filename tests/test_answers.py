@@ -68,6 +68,60 @@ def test_places_move_bodies_by_what_overlaps_and_not_by_what_impulses_gave(world
     assert (up > 0).all() and (up < over + BEYOND * SLOP * 0.1).all(), up
 
 
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_multipliers_stay_within_their_bounds_whatever_strikes(world, solver):
+    # Discs of 5 kg fall on what ropes, spacers, limits, motors and winches hold. None of these ever pulls the wrong way, or with
+    # more than its largest load: the bounds of a multiplier are the same in the passes of constraints and in those of contacts.
+    def length(a, b):
+        return (a - b).norm()
+
+    each = np.array([(-0.6, 0.0), (0.0, 0.0), (0.5, 0.0)])
+    x = np.concatenate([each + (3.0 * k, 0.0) for k in range(8)])
+    i = np.arange(24).reshape(8, 3)
+    rope, spacer = tv.Rope(i[[0], 1:], 0.52), tv.Spacer(i[[1], 1:], 0.4)
+    limit, winch = tv.AngleLimit(i[[2]], 2.0, 3.0), tv.Winch(i[[3], 1:], -0.1, force=30.0)
+    motor = tv.Motor(i[4:6], 2.0, torque=[3.0, 0.0])
+    servo = tv.Motor(i[[6]], 1.0, angle=np.pi, torque=8.0, compliance=1e-3, damping=2.0)
+    own = tv.Constraint(length, i[[7], 1:], rest=0.52, side=1)
+    links = tv.Distance(i[[2, 4, 5, 6], 1:])
+    balls = x[i[:, 2]] + (-0.05, 0.4)
+    start = tv.Particles(np.r_[x, balls], mass=np.r_[np.ones(24), np.full(8, 5.0)], radius=0.1, pinned=i[:, :2].ravel())
+    constraints = [rope, spacer, limit, winch, motor, servo, own, links]
+    w, struck = (
+        world(start, [tv.Gravity(G), tv.Contact(groups=[(0, 0)]), *constraints], precision="f64", solver=SOLVERS[solver]),
+        0,
+    )
+    bounds = ((rope, 0, np.inf), (spacer, -np.inf, 0), (winch, 0, 30.0), (motor, -motor.torque, motor.torque), (servo, -8, 8))
+    for _ in range(60):
+        w.step(1 / 60)
+        struck += len(w.contacts)
+        for feature, low, high in (*bounds, (own, 0, np.inf)):
+            load = feature.load
+            assert (load >= low - 1e-9 * np.abs(np.nan_to_num(low))).all(), (feature, load)
+            assert (load <= high + 1e-9 * np.abs(np.nan_to_num(high))).all(), (feature, load)
+    assert struck > 8
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_what_is_slack_does_not_hold_against_places(world, solver):
+    # Discs that are placed in each other part by places alone, to the slop. A slack rope, a spacer that is too short and a
+    # motor without torque do not hold them: they go as discs that are free. A spacer that just fits holds its disc.
+    at, far = np.array([(0.0, 0.0), (0.19, 0.0)]), np.array([(0.0, 0.0), (-1.0, 0.0), (-1.0, 1.0)])
+    x = np.concatenate([np.r_[at, far[1:]] + (0.0, 5.0 * k) for k in range(5)])
+    disc, anchor, other = 4 * np.arange(5), 4 * np.arange(5) + 2, 4 * np.arange(5) + 3
+    rope = tv.Rope([(anchor[1], disc[1])], 1.2)
+    spacer = tv.Spacer([(anchor[2], disc[2]), (anchor[4], disc[4])], [0.5, 1.0])
+    motor = tv.Motor([(other[3], anchor[3], disc[3])], 0.0, torque=0.0)
+    start = tv.Particles(x, radius=0.1, pinned=np.r_[anchor, other])
+    w = world(start, [rope, spacer, motor, tv.Contact()], precision="f64", solver=SOLVERS[solver], substeps=4)
+    w.run(0.5)
+    moved = (w.position - x).reshape(5, 4, 2)[:, :2, 0]
+    assert 2 * moved[0, 1] > 0.01 - BEYOND * SLOP * 0.1
+    assert moved[1:4, 0] == pytest.approx(-moved[1:4, 1], abs=1e-9)  # rows share masses, so passes overshoot less
+    assert moved[1:4, 1] == pytest.approx(moved[0, 1], abs=BEYOND * SLOP * 0.1)
+    assert abs(moved[4, 0]) < 0.1 * moved[4, 1]
+
+
 def test_what_is_placed_between_linked_discs_parts_without_speed(world):
     # Overlap stores no energy: discs part by moves alone. A cluster is as rigid as its polar decomposition, to 1e-3 of a move.
     x, *held = twice([(-0.15, 50.0), (0.15, 50.0)])

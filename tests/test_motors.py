@@ -45,6 +45,35 @@ def test_a_limited_torque_accelerates_and_the_speed_is_then_met(world):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("kind", [tv.Contact, lambda: tv.Polygons([])], ids=["Contact", "Polygons"])
+@pytest.mark.parametrize("solver", [None, tv.Jacobi()], ids=["default", "Jacobi"])
+def test_largest_loads_hold_beside_contacts_that_nothing_touches(world, kind, solver):
+    # Arms and weights as above: I w' = T up to the speed, m a = F. A soft motor of torque T bears T, too, once it is wound
+    # up by alpha T; a torque of 0 lets go.
+    T, t, speed = np.array([1.0, 1.0, 0.0, 100.0]), 0.5, 3.0
+    arms = np.concatenate([np.array([(-1, 0), (0, 0), (ARM, 0)]) + (0, 3.0 * k) for k in range(4)])
+    x = np.r_[arms, [(20.0, 0.0), (20.0, -2.0), (30.0, 0.0), (30.0, -2.0)]]
+    pinned = np.r_[np.arange(4) * 3, np.arange(4) * 3 + 1, 12, 14]
+    hinges = np.arange(12).reshape(4, 3)
+    motor, winch = (
+        tv.Motor(hinges, speed, torque=T, compliance=[0, 0.02, 0, 0]),
+        tv.Winch([(12, 13), (14, 15)], -50.0, force=[10, 0]),
+    )
+    w = world(
+        tv.Particles(x, mass=2.0, radius=0.02, pinned=pinned), [motor, winch, tv.Distance(hinges[:, 1:]), kind()],
+        substeps=20, precision="f64", solver=solver,
+    )  # fmt: skip
+    for _ in range(round(60 * t)):
+        w.step(1 / 60)
+        assert (np.abs(motor.load) <= T * (1 + 1e-12)).all() and (winch.load <= winch.force * (1 + 1e-12)).all()
+    turning = np.linalg.norm(w.velocity[hinges[:, 2]], axis=1) / ARM
+    inertia = 2.0 * ARM**2
+    assert turning[[0, 2, 3]] == pytest.approx(np.minimum(T * t / inertia, speed)[[0, 2, 3]], rel=1e-3, abs=1e-9)
+    assert turning[1] == pytest.approx(T[1] * t / inertia, rel=0.05)
+    assert w.position[[13, 15], 1] + 2 == pytest.approx([10.0 / 2.0 * t**2 / 2, 0.0], rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_a_wheel_turns_for_ever_however_slowly(world, precision):
     # The angle passes +-pi again and again; and 2^-24 of a turn per substep, which would be lost in a rest angle in f32.

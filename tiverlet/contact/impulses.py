@@ -153,7 +153,9 @@ class Impulses:
             p = self.rows.p.field[row]
             if ti.static(self.has_friction):
                 self.rows.stiff.field[row] = [step / w, step / across]
-                p = self.cone(ti.max(p.dot(n), 0), p - p.dot(n) * n, self.rows.friction.field[row], n, self.rows.hit(row))
+                if self.rows.friction.field[row][1] < self.rows.friction.field[row][0]:
+                    self.rows.bound_friction(row, n, self.slip(i, row, n, self.state.d, False), self.slight(i, row))
+                p = self.cone(row, ti.max(p.dot(n), 0), p - p.dot(n) * n, n)
             else:
                 self.rows.stiff.field[row] = step / w
                 p = ti.max(p, 0)
@@ -212,16 +214,37 @@ class Impulses:
         return ti.Vector.zero(self.real, 3 if self.dim == 3 else 1)
 
     @ti.func
-    def cone(self, normal, across, friction, n, hit):
-        """Return the impulse in Coulomb's cone that is next to the one with these parts along the normal and across it.
+    def cone(self, row, normal, across, n):
+        """Return the impulse of a row in Coulomb's cone that is next to the one with these parts along the normal and across it.
 
-        hit: the impulse of impacts in turn, which has friction, too.
+        Impulses of impacts in turn have friction, too.
         """
-        load = normal + hit
-        size, most = across.dot(across), friction[0] * load
+        size, most = across.dot(across), self.rows.friction_bound(row, across, n) * (normal + self.rows.hit(row))
         if size > most * most:
-            across *= friction[1] * load / ti.sqrt(size)
+            across *= most / ti.sqrt(size)
         return normal * n + across
+
+    @ti.func
+    def slip(self, i, row, n, d: ti.template(), at_end: ti.template()):  # type: ignore[valid-type]
+        """Return the slip of a row of particle i, across its normal, where particles move by d [m]."""
+        other, pressed = self.rows.other.field[row], self.rows.pressed[i]
+        t = self.rows.relative(d[i], d, i, other, row, pressed)
+        t -= t.dot(n) * n
+        if ti.static(self.bodies.spins):
+            s = self.bodies.new_s[i] if ti.static(at_end) else self.bodies.spin.s[i]
+            if row < pressed:
+                s += self.bodies.new_s[other] if ti.static(at_end) else self.bodies.spin.s[other]
+            t -= self.bodies.spin.surface(s, n)
+        return t
+
+    @ti.func
+    def slight(self, i, row):
+        """Return by how much forces move the particles of a row of particle i [m]."""
+        out = self.rows.kick(i).norm()
+        if row < self.rows.pressed[i]:
+            for k in ti.static(range(self.rows.ends)):
+                out += self.rows.kick(self.rows.pressed_on(row, k)).norm()
+        return out
 
     @ti.func
     def take(self, i, part, p, m):
@@ -286,7 +309,7 @@ class Impulses:
                     t -= self.rows.across.field[row]
                 yn = y.dot(n)
                 normal = ti.max(yn - gap * stiff[0], -self.rows.most_taken(row))
-                new = self.cone(normal, y - yn * n - stiff[1] * t, self.rows.friction.field[row], n, hit)
+                new = self.cone(row, normal, y - yn * n - stiff[1] * t, n)
                 miss = (normal - yn) / stiff[0]
                 lack += miss * miss
                 uphill += (y - new).dot(new - before)
@@ -538,6 +561,11 @@ class Impulses:
                 self.rows.turned[i] = turn - blow - self.excess(turn - blow, turn)
         for row in range(self.rows.begin[i], self.rows.end[i]):
             e, p = self.rows.entry.field[row], self.rows.p.field[row]
+            if ti.static(self.has_friction):
+                f, n = self.rows.friction.field[row], self.rows.normal.field[row]
+                if f[1] < f[0]:
+                    slip = self.slip(i, row, n, self.bodies.new, True)
+                    self.rows.note_slip(row, p + self.rows.hit(row) * n, n, slip, self.slight(i, row))
             if ti.static(self.rows.bounces):
                 n = self.rows.normal.field[row]
                 load, size = self.rows.scale[None] * self.rows.along(self.rows.memory.field[e], n), self.rows.along(p, n)

@@ -3,8 +3,10 @@
 Before contacts, the solver of links has found multipliers lam with A C + B + alpha' lam = 0, see Equation, or has gone part of
 the way. Impulses of contacts change displacements by delta. Links answer by further multipliers mu:
 
-    A (C + g . delta) + B + alpha' (lam + mu) = 0,    delta_i = w_i (p_i + sum n_i mu),    lam + mu on the side of lam.
+    A (C + g . delta) + B + alpha' (lam + mu) = 0,    delta_i = w_i (p_i + sum n_i mu),    lam + mu within its bounds.
 
+Bounds are those of Equation: of ropes, of drives with a largest load. Places keep them, too: what is slack does not hold against
+them before it is taut, and a drive at its largest load does not hold at all.
 g and n are the gradients of C at the end and at the start of the substep, or at the time of an impact. So an impulse reaches all
 of a body in the substep in which it acts, and bodies on links bounce, slide and rest as wholes. What rigid links are still
 violated by at the end is for places to remove, and no reason for an impulse later.
@@ -31,8 +33,8 @@ class Links:
     """The links of one world as rows.
 
     Corners that can move have a slot each, see Slots: `normal` and `gradient` there, and `row_of` the link, -1 for none. The
-    corners of row r are those from begin[r] to begin[r + 1], with their slot and particle. `least`, `most`: of mu, by the side of
-    lam and by the tension that the substep can stand. degree: the number of rows of each particle.
+    corners of row r are those from begin[r] to begin[r + 1], with their slot and particle. `least`, `most`: of mu, by the bounds
+    of lam and by the tension that the substep can stand; then of steps of places. degree: the number of rows of each particle.
     """
 
     n: Any = OnDevice()
@@ -169,16 +171,13 @@ class Links:
         self.firm[r] = ti.select(acts, 1 / ti.max(A * firm + alpha, FEW), 0 * W)
         self.factor[r], self.alpha[r], self.size[r] = A, alpha, size / ti.static(RELAXATION)
         self.violation[r] = violation
-        self.least[r], self.most[r] = -ti.math.inf, ti.math.inf
+        low, high = batch.dev.equation.bounds(c)
         if ti.static(batch.arity > 0):
             if ti.static(batch.dev.converges):
                 if acts and alpha == 0:
                     cap = self.slots.most_tense(batch.dev.geometric_stiffness(c, W))
-                    self.least[r], self.most[r] = -cap - lam, cap - lam
-        if ti.static(batch.side > 0):
-            self.most[r] = ti.min(-lam, self.most[r])
-        elif ti.static(batch.side < 0):
-            self.least[r] = ti.max(-lam, self.least[r])
+                    low, high = ti.max(low, -cap), ti.min(high, cap)
+        self.least[r], self.most[r] = low - lam, high - lam
         mu = batch.dev.equation.answered[c] * self.rows.scale[None]
         if self.is_alone(batch, c):
             mu -= lam
@@ -212,19 +211,20 @@ class Links:
     def end_impulses(self, batch: ti.template(), c, r, bodies: ti.template()):  # type: ignore[valid-type]
         """Add mu to the multiplier of constraint c of a batch, and find what places have to remove of it."""
         u, lam, mu, weight, slight = 0 * self.mu[r], batch.dev.equation.lam[c], self.mu[r], 0 * self.mu[r], 0 * self.mu[r]
+        left, rigid, reached = batch.dev.equation.left[c], True, False
         for e in range(self.begin[r], self.begin[r + 1]):
             i, g = self.particle[e], self.gradient[self.slot[e]]
+            reached = reached or self.rows.begin[i] < self.rows.end[i]  # places may move it
             u += g.dot(bodies.new[i] - self.state.d[i])
             weight += self.state.w[i] * g.dot(g)
             slight += g.norm() * self.rows.kick(i).norm()
-        left, rigid = batch.dev.equation.left[c], True
         if ti.static(batch.dev.spring.soft):
             rigid = batch.dev.spring.is_rigid(c)
-        touched = 0
-        if rigid and self.stiff[r] > 0 and (u != 0 or mu != 0 or left != 0):
-            if self.least[r] < mu < self.most[r]:  # else it is slack, or as tense as the substep can stand
-                touched = 1
-        self.violation[r] = (left + u + self.violation[r]) * touched
+        touched, holds = 0, self.least[r] < mu < self.most[r]  # else it is slack, or bears all that it or the substep can
+        slack = self.bound_places(batch, c, r, lam + mu, holds)
+        if rigid and self.stiff[r] > 0 and (holds or slack) and (reached or u != 0 or mu != 0 or left != 0):
+            touched = 1
+        self.violation[r] = ti.select(slack or touched != 0, left + u + self.violation[r], 0 * u)
         if self.begin[r] < self.begin[r + 1]:
             batch.dev.equation.touched[c] = touched
         if self.stiff[r] > 0:
@@ -233,6 +233,24 @@ class Links:
                 batch.dev.equation.answered[c] = lam + mu
         elif self.begin[r] < self.begin[r + 1]:
             batch.dev.equation.answered[c] = 0 * mu
+
+    @ti.func
+    def bound_places(self, batch: ti.template(), c, r, lam, holds):  # type: ignore[valid-type]
+        """Set the bounds of the steps of places of row r, whose multiplier is lam. Returns whether it is slack, but not soft."""
+        slack = False
+        self.least[r], self.most[r] = -ti.math.inf, ti.math.inf
+        if ti.static(batch.dev.equation.bounded):
+            low, high = batch.dev.equation.bounds(c)
+            if not holds and (lam <= low or lam >= high):
+                self.least[r], self.most[r] = 0, 0
+                if ti.static(batch.side != 0):
+                    slack = lam == 0 and low < high and batch.dev.spring.is_rigid(c)
+                if slack:
+                    if ti.static(batch.side > 0):
+                        self.least[r] = -ti.math.inf
+                    else:
+                        self.most[r] = ti.math.inf
+        return slack
 
     @ti.func
     def gap(self, r, bodies: ti.template()):  # type: ignore[valid-type]
@@ -246,6 +264,6 @@ class Links:
     def relax_place(self, r, bodies: ti.template()):  # type: ignore[valid-type]
         """One pass of places over row r."""
         u = self.factor[r] * self.gap(r, bodies)
-        self.step[r] = -u * self.firm[r]
-        wide = ti.abs(u) * self.firm[r] * self.size[r]
+        self.step[r] = ti.max(self.least[r], ti.min(self.most[r], -u * self.firm[r]))
+        wide = ti.abs(self.step[r]) * self.size[r]
         self.lack[r] = ti.select(wide > ti.static(CLOSE) * self.rows.ahead, wide, 0 * u)

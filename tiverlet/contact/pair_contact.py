@@ -137,6 +137,7 @@ class PairContact(Feature):
         dev.events = EventLog(scene, self.table) if dev.has_events else None
         pair_data = [
             dev.rows.memory,
+            *([dev.rows.slid] if friction else []),
             *([dev.rows.touched, dev.rows.given] if bounces else []),
             *([dev.rows.borne_moment] if turns else []),
             *([dev.events.touched] if dev.events else []),

@@ -29,6 +29,7 @@ TENSION = 2.0  # (omega h)^2 across a tension: half the limit of stability
 STIFF = 2.0  # omega h from which on a spring is as good as rigid
 RISKS = {"tunnelling-risk", "stiff-force", "non-finite"}
 FASTEST = 50.0  # omega dt of the fastest springs that substeps="auto" resolves: 8 periods in a frame, some 500 substeps
+FOLLOWS = 0.5  # of its violation: a spring that changes by less in a substep follows others, and does not vibrate by itself
 LOSS = 2e-3  # share of the largest kinetic energy that springs may lose in a second: a percent in 5 s
 GAIN = 1.4  # factor by which twice the effort must lower a figure; second order lowers it by 4, first order by 2
 FEW = 16  # substeps below which more of them may still help, although two doublings did not
@@ -341,26 +342,31 @@ def damping(world: "World", substeps: int) -> float:
     from a spring that became longer by u in a substep: 2 pi s^5 of its energy in each period. Springs at rest lose nothing,
     however stiff. Nothing counts where features brake anyway. Where bodies bounce, springs with theta > FIRM are rigid, see
     BodyImpacts, and do not count: an impact would make them vibrate in a substep that is some 40 times shorter. Springs of more
-    than FASTEST do not count either: to resolve them would take more time than it is worth.
+    than FASTEST that vibrate do not count either: to resolve them would take more time than it is worth. Where they follow a
+    slower motion, as the bends of a beam do, they count: what they lose is energy of that motion. It falls with h^5 where theta
+    is small, and with h where theta is 1.
     """
     runner, clock = world._runner, world._clock
     springs = [b for b in runner.batches if isinstance(b, (Scalar, Anchored)) and not b.is_kinematic and (b.compliance > 0).any()]
     if not (springs and clock.h and energy_bound.keeps_energy(world)):
         return 0.0
-    state, memory, lost = runner.scene.state, runner.memory, 0.0
+    state, memory, lost, firm = runner.scene.state, runner.memory, 0.0, 0.0
     x = state.get(memory)
     d = memory.read(state.d)[: len(x)].astype(np.float64)
     for b in springs:
         alpha, w = b.compliance, b.weights(x) * clock.h**2
         if isinstance(b, Scalar):
             now, before = (np.maximum(b.side * C, 0) if b.side else C for C in (b.violation(x), b.violation(x - d)))
-            square = (now - before) ** 2
+            square, bent = (now - before) ** 2, now**2
         else:
-            square = ((b.offset(x) - b.offset(x - d)) ** 2).sum(axis=1)
+            now = b.offset(x)
+            square, bent = ((now - b.offset(x - d)) ** 2).sum(axis=1), (now**2).sum(axis=1)
         theta = w**2 / (w**2 + alpha**2)
-        some = (alpha > 0) & ((theta <= FIRM) | (not runner.bounces)) & (substeps**2 * w <= FASTEST**2 * alpha)
-        lost += float((theta[some] * square[some] / alpha[some]).sum())
-    return (substeps * lost / energy_bound.allowed_loss(world, LOSS)) ** 0.4 if lost else 0.0
+        follows = (substeps**2 * w <= FASTEST**2 * alpha) | (square < FOLLOWS**2 * bent)
+        some = (alpha > 0) & ((theta <= FIRM) | (not runner.bounces)) & follows
+        each = theta[some] * square[some] / alpha[some]
+        lost, firm = lost + float(each.sum()), firm + float((theta[some] * each).sum())
+    return (substeps * lost / energy_bound.allowed_loss(world, LOSS)) ** (2 / (5 - 4 * firm / lost)) if lost else 0.0
 
 
 @np.errstate(all="ignore")  # energies may be infinite

@@ -146,15 +146,16 @@ def keeps_energy(world: "World") -> bool:
 def conserves(world: "World") -> bool:
     """Whether the scene has springs, and nothing that may take energy out of it or that errs by an unknown amount.
 
-    False for what dissipates, see keeps_energy(); for rigid constraints, since a link that becomes taut is an inelastic impact,
-    and violations are removed without a return; for forces that vary in space; and for constraints of unknown kinds.
+    False for what dissipates, see keeps_energy(); for rigid constraints on one side, since a rope that becomes taut is an
+    inelastic impact; for forces that vary in space; and for constraints of unknown kinds. Rigid links do no work, so a beam of
+    links and soft bends is checked.
     """
     if not keeps_energy(world) or not all(f.uniform for f in world.features if isinstance(f, Acceleration)):
         return False
     batches, inv_mass = [f for f in world.features if isinstance(f, Batch)], world._runner.scene.inv_mass
     springs = [f for f in batches if isinstance(f, (Scalar, Anchored))]
-    rigid = any(((f.compliance == 0) & ~f.immovable(inv_mass)).any() for f in springs)
-    return len(springs) == len(batches) and not rigid and any((f.compliance > 0).any() for f in springs)
+    jerks = any(getattr(f, "side", 0) and ((f.compliance == 0) & ~f.immovable(inv_mass)).any() for f in springs)
+    return len(springs) == len(batches) and not jerks and any((f.compliance > 0).any() for f in springs)
 
 
 def loss_error(world: "World", extent: np.ndarray, reach: Any) -> float:

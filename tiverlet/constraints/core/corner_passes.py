@@ -263,12 +263,12 @@ class CornerPasses(Passes):
             if W > 0:
                 new = self.equation.multiplier_of(c, violation, A, alpha, lam, W)
                 new, far = self.limit_step(c, lam, new, n, share, 1)
+                new = self.equation.within_bounds(c, new)
                 if far:  # its step is fixed, and the others follow: a row without a weight has the step -start
                     start, weight = lam - new, 0 * W
-        if ti.static(self.equation.driven):
-            if ti.static(self.drive.capped):
-                low, high = self.drive.bounds(c, self.side)
-                self.slots.system.bound_row(row, low, high)
+        if ti.static(self.equation.capped):
+            low, high = self.equation.bounds(c)
+            self.slots.system.bound_row(row, low, high)
         self.slots.system.set_row(row, violation, A, alpha, start, weight, self.geometric_stiffness(c, weight))
         if ti.static(self.answers_in_system):
             self.slots.system.left[row] = self.equation.left[c]
@@ -312,8 +312,7 @@ class CornerPasses(Passes):
         if ti.static(self.limit.acts):
             if W > 0:
                 new, _ = self.limit_step(c, lam, new, n, share, 0)
-                if ti.static(self.equation.driven):
-                    new = self.drive.clamp(c, new)
+                new = self.equation.within_bounds(c, new)
                 step = new - lam
         if ti.static(self.semi_iterates):
             self.step[c] = step

@@ -133,20 +133,3 @@ class Drive:
         if ti.static(self.capped):
             force = ti.max(-self.largest[c], ti.min(self.largest[c], force))
         return force
-
-    @ti.func
-    def clamp(self, c, lam):
-        """Return a multiplier, limited to the largest."""
-        if ti.static(self.capped):
-            lam = ti.max(-self.most[c], ti.min(self.most[c], lam))
-        return lam
-
-    @ti.func
-    def bounds(self, c, side: ti.template()):  # type: ignore[valid-type]
-        """Return the least and the largest multiplier of constraint c. side: see Equation."""
-        low, high = -self.most[c], self.most[c]
-        if ti.static(side > 0):
-            high = 0 * high
-        if ti.static(side < 0):
-            low = 0 * low
-        return low, high

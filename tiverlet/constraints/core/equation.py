@@ -51,6 +51,8 @@ class Equation:
         self.rest = add(f"{name}.rest", m, values=batch.goal, state=batch.driven)
         self.driven = batch.driven
         self.drive: Any = batch.drive_of(scene) if batch.driven else None
+        self.capped = batch.driven and self.drive.capped
+        self.bounded = self.capped or self.side != 0
         self.lam = add(f"{name}.multiplier", m, state=True)
         self.in_state = {"lam": self.lam}
         self.answers = scene.slots.answers
@@ -75,6 +77,29 @@ class Equation:
         if ti.static(self.side != 0):
             value = ti.max(self.side * value, 0) * self.side
         return value
+
+    @ti.func
+    def bounds(self, c):
+        """Return the least and the largest multiplier of constraint c: by its side, and by the largest load of its drive.
+
+        Whoever finds multipliers asks here: passes, systems, and contacts (`contact/links.py`).
+        """
+        low, high = ti.cast(-ti.math.inf, self.real), ti.cast(ti.math.inf, self.real)
+        if ti.static(self.capped):
+            low, high = -self.drive.most[c], self.drive.most[c]
+        if ti.static(self.side > 0):
+            high = ti.cast(0, self.real)
+        elif ti.static(self.side < 0):
+            low = ti.cast(0, self.real)
+        return low, high
+
+    @ti.func
+    def within_bounds(self, c, lam):
+        """Return the multiplier within the bounds of constraint c that is nearest to `lam`."""
+        if ti.static(self.bounded):
+            low, high = self.bounds(c)
+            lam = ti.max(low, ti.min(high, lam))
+        return lam
 
     @ti.func
     def has_cusp(self, c):
@@ -124,7 +149,7 @@ class Equation:
     def remember(self, c, f0):
         """At the start of a substep, note what the passes of contacts have left constraint c violated by, which they touched."""
         stays = self.touched[c] != 0 and not self.has_cusp(c)  # at a cusp, its direction would not be that of a link
-        self.left[c] = ti.select(stays, self.earlier_violation(c, f0, 1), 0 * f0)
+        self.left[c] = ti.select(stays, self.clip_to_side(self.earlier_violation(c, f0, 1)), 0 * f0)
 
     @ti.func
     def earlier_violation(self, c, f, ago: ti.template()):  # type: ignore[valid-type]
@@ -156,11 +181,7 @@ class Equation:
         """Return the multiplier after a Jacobi pass."""
         new = lam
         if W > 0:
-            new = lam - self.slots.relaxation * violation / (A * W + alpha)
-            if ti.static(self.side != 0):
-                new = -self.clip_to_side(-new)
-            if ti.static(self.driven):
-                new = self.drive.clamp(c, new)
+            new = self.within_bounds(c, lam - self.slots.relaxation * violation / (A * W + alpha))
         return new
 
     @ti.func
