@@ -134,7 +134,9 @@ class World:
     def step(self, dt: float, tolerance: float | None = None, budget: float | None = None) -> StepReport:
         """Advance the world by dt [s], one frame, and return its report.
 
-        Without tolerance and budget the frame has `substeps` substeps; with substeps="auto", as many as it needs to be stable.
+        Without tolerance and budget the first frame has `substeps` substeps, and later ones as many as keep their length: a late
+        one has more of them, up to eight times `substeps`; beyond that it is flagged. With substeps="auto" it has as many as it
+        needs to be stable.
         tolerance: upper bound of the residual and the overlap, both relative; of phi^2 / 24, for the angle phi by which rigid
         constraints, and beads on smooth curves, turn in a substep; of (omega h)^2 / 24 for forces that vary in space; and of
         about (omega h)^2 A / 12 for springs that vibrate by a share A of their size. The frame is repeated with more substeps
@@ -145,9 +147,7 @@ class World:
         machine.
 
         Raises ValueError for dt, tolerance or budget that is not finite and above 0. When the substep length changes,
-        displacements are turned into velocities first and back after (time-corrected Verlet), so the step stays second order. But
-        piles that stand by friction creep where a frame is less than 0.4 or more than 2.5 times as long as the last one: use one
-        dt, and take as many steps of it as the clock asks for.
+        displacements are turned into velocities first and back after (time-corrected Verlet), so the step stays second order.
         A signal such as Ctrl-C is handled after the frame. A frame that takes seconds is undone at once if the handler raises.
         Other threads that read the world or its features wait for the end of the frame.
         """
@@ -160,7 +160,8 @@ class World:
             try:
                 self._find_stiffened()
                 guarded = self._controller.auto or tolerance is not None or budget is not None
-                if guarded or self.substeps * self._iterations > self._runner.passes_at_once:
+                substeps = self.substeps if guarded else self._controller.pace.fit(dt, self.substeps)
+                if guarded or substeps * self._iterations > self._runner.passes_at_once:
                     self._undo = checkpoint.keep(self), checkpoint.flags(self)
                 self._upload_parameters()
                 self._runner.interruptible = self._undo is not None
@@ -168,8 +169,9 @@ class World:
                     with self._runner.memory.compiler():
                         report = self._controller.advance(self, dt, tolerance, budget)
                 else:
-                    self._runner.begin(dt, self.substeps, self._iterations, self._passes)
-                    report = self._runner.advance(dt, self.substeps, self._passes or self._iterations)
+                    self._runner.begin(dt, substeps, self._iterations, self._passes)
+                    report = self._runner.advance(dt, substeps, self._passes or self._iterations)
+                    report = self._controller.pace.checked(report, dt)
                 self._adapted = self._iterations if guarded or self._passes else 0
             except BaseException:
                 self._handle_failed_step()
@@ -662,7 +664,8 @@ class World:
 
     @property
     def substeps(self) -> int:
-        """Substeps per frame; with "auto", those of the next frame. Assign a number, "auto", or None for the usual number."""
+        """Substeps of the first frame after this was set, whose length later frames keep; with "auto", those of the next frame.
+        Assign a number, "auto", or None for the usual number."""
         return self._controller.substeps if self._controller.auto else self._substeps or self._usual_substeps
 
     @substeps.setter

@@ -304,12 +304,12 @@ class Replay:
 
     def _apply(self, world: "World", entry: Entry) -> None:
         """Make the steps of an entry, then apply the change that it records."""
-        settings = world.settings
+        settings, effort = world.settings, world._controller.memory
         for dt, substeps, passes, adapted, count in entry.steps:
             substeps, passes = (checks.integer("replay", "substeps", n, least=1) for n in (substeps, passes))
             for _ in range(count):
                 world._make_again(dt, substeps, passes, adapted)
-        world.substeps, world.iterations = settings["substeps"], settings["iterations"]
+        world.substeps, world.iterations, world._controller.memory = settings["substeps"], settings["iterations"], effort
         if entry.kind == "turned":
             for k, values in self._knob_values(entry):
                 scene.set_knobs(world.features[k], values)

@@ -13,7 +13,7 @@ from ..constraints.core.spring import FIRM
 from ..constraints.path import Path
 from ..solvers.slots import TENSEST
 from . import checkpoint, energy_bound
-from .clock import energy_limit
+from .clock import Pace, energy_limit
 from .diagnostics import KINETIC, STIFFNESS
 from .integrator import FORCE
 from .step_report import StepReport
@@ -82,6 +82,7 @@ class StepController:
 
     def __init__(self):
         self.auto = False
+        self.pace = Pace()  # of frames whose substeps the user has set
         self.substeps, self.iterations = START, 1  # of the next frame
         self.dt = 0.0  # of the last frame [s]
         self.wait = 0  # frames until less effort is tried
@@ -93,16 +94,17 @@ class StepController:
     @property
     def memory(self) -> tuple:
         """The values on which the next frames depend."""
-        now = self.substeps, self.iterations, self.dt, self.wait
+        now = self.pace.substeps, self.pace.dt, self.substeps, self.iterations, self.dt, self.wait
         failed = self.stuck != NOTHING or max(self.patience) > 1
         return (*now, self.worst, *self.patience, *self.stuck) if failed else (*now, *WELL)
 
     @memory.setter
     def memory(self, value: tuple) -> None:
         """Restore the values of another time."""
-        self.substeps, self.iterations, self.dt, self.wait, self.worst, *rest = value
-        failed = tuple(value[4:]) != WELL
-        self.patience = rest[:OCTAVES] if failed else [1] * OCTAVES
+        *pace, self.substeps, self.iterations, self.dt, self.wait, self.worst = value[:7]
+        self.pace, rest = Pace(*pace), value[7:]
+        failed = tuple(value[6:]) != WELL
+        self.patience = list(rest[:OCTAVES]) if failed else [1] * OCTAVES
         self.stuck = tuple(rest[OCTAVES:]) if failed else NOTHING
 
     def advance(self, world: "World", dt: float, tolerance: float | None, budget: float | None) -> StepReport:

@@ -5,15 +5,18 @@ from typing import Any
 
 import numpy as np
 
+from .step_report import StepReport
+
 # Names in recordings.
 NAMES = {
     "_time": "time", "_tick": "tick", "_h": "h", "_fresh": "d_is_velocity", "_iterations": "iterations",
     "_frame": "frame", "_drag": "drag", "_started": "started", "_owed": "owed", "_lacked": "lacked",
     "_parted": "velocity_override", "_placed": "first_moved", "_energy": "energy", "_bound": "bound",
-    "_kinetic": "kinetic", "_overlap": "overlap", "_parting": "parting", "_softness": "softness", "_softened": "softened",
+    "_kinetic": "kinetic", "_overlap": "overlap", "_parting": "parting", "_softness": "softness", "_longest": "longest",
     "_part_softness": "part_softness",
 }  # fmt: skip
 
+LATE = 8  # times as many substeps as were set, at most, in a frame that is late: a stalled program must not stall for more
 SHARE = 0.1  # of the largest kinetic energy: the gain, or the loss, that is allowed
 DIGITS = 1e-5  # of the energy: the gain, or the loss, that rounding may cause
 CHANGED = -np.inf  # the bound while work is done on the scene in the coming frame: earlier energies do not count
@@ -73,15 +76,48 @@ def initial_margin(inv_mass: np.ndarray, extent: np.ndarray, h: Any) -> Any:
 
 
 @dataclass
+class Pace:
+    """The length that substeps keep: that of the first frame, of dt [s], after the user has set so many of them.
+
+    A loop that measures dt has frames of any length. If their number stayed, the stiffness of what passes hold would change with
+    dt^2 from frame to frame, and with it the energy that this stores.
+    """
+
+    substeps: int = 0
+    dt: float = 0.0
+
+    def fit(self, dt: float, substeps: int) -> int:
+        """Return how many substeps a frame of dt [s] has where so many are set, at most LATE times as many."""
+        if self.substeps != substeps:
+            self.substeps, self.dt = substeps, dt
+        return max(1, min(round(substeps * dt / self.dt), LATE * substeps))
+
+    def late(self, dt: float) -> float:
+        """Return how many times too long the substeps of a frame of dt [s] are for want of more of them; else 0."""
+        times = dt / self.dt / LATE
+        return times if times > 1 + 1 / (2 * LATE * self.substeps) else 0.0
+
+    def checked(self, report: StepReport, dt: float) -> StepReport:
+        """Return the report of a frame of dt [s], with a flag if its substeps are too long."""
+        if not (times := self.late(dt)):
+            return report
+        note = (
+            f"The frame of {dt:.3g} s is {dt / self.dt:.3g} times as long as the first one with {self.substeps} substeps, so each "
+            f"of its {report.substeps} is {times:.3g} times as long. Take several frames of at most {LATE * self.dt:.3g} s."
+        )
+        return replace(report, flags=report.flags | {"substeps-capped"}, notes=(*report.notes, note))
+
+
+@dataclass
 class Clock:
     """The time of a world, and the state that goes with it.
 
     time: simulated [s]. tick: number of substeps so far, modulo 2^31. h: the last substep [s].
     d_is_velocity: whether displacements hold velocities, so that the next substep is a start. started: whether the last substep
-    was a start. iterations: of the last frame. softness, softened: how many times as soft as passes make them links are, 1 or
-    more, and when a substep last made them about that soft [s], see softness.py. part_softness: the same for the softest part of
-    a system that gave way in a longer substep. frame: when frames of the present length began [s], their length [s], their
-    number. drag: its factors for h, see integrator.decay(). owed: the kick by rigid constraints that velocities before a start
+    was a start. iterations: of the last frame. softness, longest: how many times as soft as passes make them links are, 1 or
+    more, and the longest of the substeps that are about as long as this one [s], see softness.py. part_softness: the first for
+    the softest part of a system that gave way in a longer substep. frame: when frames of the present length began [s], their
+    length [s], their number. drag: its factors for h, see integrator.decay(). owed: the kick by rigid constraints that velocities before a start
     lack, as a time [s]. lacked: `owed` of the last substep if it was a start, else 0. velocity_override: velocities, valid until
     the next step, after constraints that contribute to them were removed or velocities were assigned; a start before the next
     step takes these. first_moved: the first particle that the user placed since the last frame; None if there is none.
@@ -100,7 +136,7 @@ class Clock:
     started: bool = False
     iterations: int = 1
     softness: float = 1.0
-    softened: float = 0.0
+    longest: float = 0.0
     part_softness: float = 1.0
     frame: tuple[float, float, int] = (0.0, 0.0, 0)
     drag: list[float] | None = None
@@ -162,7 +198,7 @@ class Clock:
     @property
     def hashed(self) -> list[Any]:
         """The values that the next frames depend on, for the hash."""
-        later: list[Any] = [] if self.softness == 1 else [self.softness, self.softened]
+        later: list[Any] = [] if self.softness == 1 else [self.softness, self.longest]
         later += [] if self.velocity_override is None else [np.asarray(self.velocity_override, dtype=np.float64).tobytes()]
         return [self.time, self.tick, self.h, self.d_is_velocity, *later]
 
@@ -176,6 +212,6 @@ class Clock:
         right += [type(some) is bool for some in (self.d_is_velocity, self.started, self.parting)]
         energies = self.energy or 0, self.bound or 0, self.kinetic
         soft = self.softness, self.part_softness
-        right += [type(v) in (int, float) for v in (self.time, self.h, *soft, self.softened, *self.frame, *energies)]
+        right += [type(v) in (int, float) for v in (self.time, self.h, *soft, self.longest, *self.frame, *energies)]
         right += [self.first_moved is None or 0 <= self.first_moved <= particles, len(self.frame) == 3, min(soft) >= 1]
         return all(right) and (self.drag is None or [type(v) for v in self.drag] == [float] * 5)

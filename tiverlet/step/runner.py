@@ -25,6 +25,7 @@ from .step import frame
 from .step_report import StepReport
 
 NONE = np.zeros(0, dtype=np.int64)
+EQUAL = 2.0**-50  # substeps that differ by less, relatively, are of one length: 1 / 60 / 20 and 1 / 30 / 40
 KEPT = 100_000  # particles up to which the array for velocities is kept; above, allocating it costs next to nothing
 LONG = 10_000_000  # (particles + constraints) x passes in one launch at most: it takes about a second
 
@@ -149,7 +150,7 @@ class Runner:
     def prepare(self, dt: float, substeps: int, iterations: int, passes: int | None = None) -> bool:
         """The first half of begin(). Returns whether the second half is needed: the state has changed and must be diagnosed."""
         adapts, passes = passes is not None, passes or iterations
-        h, clock, self.released, self.jumped = dt / substeps * self.integrator.first, self.clock, 0.0, False
+        h, clock, self.released, self.jumped = self.length(dt, substeps), self.clock, 0.0, False
         drag = self._drag(h)
         if h == clock.h and drag == clock.drag and not clock.d_is_velocity and clock.first_moved is None:
             if max(clock.softness, clock.part_softness) > 1 or passes != clock.iterations:
@@ -173,7 +174,7 @@ class Runner:
             if h != clock.h or drag != clock.drag:
                 if self.scene.slots and self.scene.slots.system and clock.h:
                     self.scene.slots.system.keep_softness(h / clock.h)
-                less = settling.relieve(self, h, dt) if self._relieves(h, dt, keeps, adapts) else 1.0
+                less = settling.relieve(self, h, dt) if self._relieves(h, keeps, adapts) else 1.0
                 if less < 1:
                     self._forget_system()
                 softness.keep(self, h, dt, passes, adapts, less)
@@ -188,16 +189,20 @@ class Runner:
             self.set_substep(h, drag)
         return True
 
-    def _relieves(self, h: float, dt: float, keeps: bool, adapts: bool) -> bool:
+    def length(self, dt: float, substeps: int) -> float:
+        """Return the length of a substep in a frame of dt [s]: the last one, where they differ by rounding alone."""
+        h, last = dt / substeps * self.integrator.first, self.clock.h
+        return last if abs(h - last) <= EQUAL * h else h
+
+    def _relieves(self, h: float, keeps: bool, adapts: bool) -> bool:
         """Whether what longer substeps have left settles before substeps h [s].
 
-        Not so where a loop measures dt, nor where violations are what drives lag behind, unless `adapts`.
+        Not so where violations are what drives lag behind, unless `adapts`.
         """
         slots, clock = self.scene.slots, self.clock
-        if not slots or h >= clock.h or keeps or self.probe or clock.first_moved is not None:
+        if not slots or h >= softness.NEAR * clock.longest or keeps or self.probe or clock.first_moved is not None:
             return False
-        steady = dt == clock.frame[1] and not (self.driven or self.ramping)
-        return adapts or steady or bool(slots.system and slots.system.can_stiffen)
+        return adapts or not (self.driven or self.ramping) or bool(slots.system and slots.system.can_stiffen)
 
     def _forget_system(self) -> None:
         """Let a system forget what it has learnt from earlier positions."""

@@ -2,39 +2,34 @@
 
 A pass holds a load F by a violation C = s W h^2 F, beside that of its compliance, like a spring of stiffness 1 / (s W h^2); n
 passes hold it by an n-th of that. The softness s is 1. A shorter substep would make that spring stiffer while it is stretched,
-and its energy (h / h')^2 times as large; and where frames are uneven, the place where a net rests would be another one in each of
-them. So stiffness is state:
+and its energy (h / h')^2 times as large. So stiffness is state: links are as soft as in a substep of the length `longest`,
 
-    s' h'^2 = s h^2,  s' >= 1
+    s = (longest / h)^2
 
-Then links are as soft as in the longest recent substep, and nothing has to move. s is 1 again in a substep that is longer than
-all before, which takes energy out. Otherwise it approaches 1, (s - 1)' = -(s - 1) / SETTLE, which lifts what sags. So a frame
-adds a share dt / SETTLE of the energy that violations store, but not while the scene would have more energy than ever. Where a
-loop measures dt, links wait until no frame has been about as long for HOLD. What "auto" and systems need not wait for is
-in settling.py. And s is larger where a substep that is longer than what follows has left violations that store more.
+and nothing has to move. Substeps keep their length from frame to frame, to rounding of their number (see adaptive.py); so where
+frames are uneven, links are always as soft as in the longest substep so far, and a net rests in one place. Where the user sets
+another number of substeps, "auto" does, or after a frame that was far too late, s is larger at first, and approaches that by
+(s - 1)' = -(s - 1) / SETTLE, which lifts what sags. So a frame adds a share dt / SETTLE of the energy that violations store, but
+not while the scene would have more energy than ever.
 
 Parts of systems that gave way in a longer substep bear no larger tensions than in that one, see Elimination. In each frame these
 grow by half of what the energy allows.
 """
 
 from math import exp
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..constraints.core.anchored import Anchored
 from ..constraints.core.scalar import Scalar
-from ..particles import LARGEST
 from .clock import CHANGED
-from .solids import Solids
 
 if TYPE_CHECKING:
     from .runner import Runner
 
-NEAR = 0.8  # of the substep whose stiffness links have: a substep about as long
-HOLD, SETTLE = 1.0, 0.5  # how long links stay soft, and the time constant with which they stiffen then [s]
-CONVERGED = 1e-3  # of the violations that one pass leaves: with less, passes hold loads in the same place whatever h is
-TINY = 1e-4  # of its size: a violation that needs no care, in a substep as long as the last one
+NEAR = 0.6  # of a substep: one that is about as long; where two are set, they are from 3/4 to 5/4 as long in uneven frames
+SETTLE = 0.5  # time constant with which soft links stiffen [s]
 SETTLED = 1e-3  # excess of s that is dropped
 SLIGHT = 5e-4  # of the largest kinetic energy: what may be more than ever
 
@@ -48,7 +43,7 @@ def acts(runner: "Runner", h: float, iterations: int) -> bool:
     clock, slots = runner.clock, runner.scene.slots
     if not (slots and slots.sags_anywhere and clock.h) or runner.probe or clock.first_moved == 0:
         return False
-    return clock.softness > 1 or _growth(runner, h, iterations) < 1
+    return clock.softness > 1 or h < clock.longest or _growth(runner, h, iterations) < 1
 
 
 def _growth(runner: "Runner", h: float, iterations: int) -> float:
@@ -66,17 +61,15 @@ def keep(runner: "Runner", h: float, dt: float, iterations: int, adapts: bool = 
     clock, system = runner.clock, runner.scene.slots.system if runner.scene.slots else None
     clock.part_softness, energy = system.softness_of_longer(h) if system else (1.0, 0.0)
     if acts(runner, h, iterations):
-        growth, measured = _growth(runner, h, iterations), dt != clock.frame[1]
-        s = max(1.0, clock.softness * left / growth)
-        if s > 1 and clock.softness == 1 and needs_no_care(runner, s):
-            s = 1.0
-        elif measured and growth >= NEAR**2 * clock.softness:
-            clock.softened = clock.time
-        elif s > 1 and (adapts or clock.time >= clock.softened + HOLD * (clock.softened > 0)):
-            s /= stiffening(runner, s, _stored_before(runner, left) + energy, dt, adapts)
-        if growth < 1 < s:
-            s *= too_stiff(runner, _stored_before(runner, left))
-        runner.set_softness(s if s > 1 + SETTLED else 1.0)
+        soft = clock.softness * left / _growth(runner, h, iterations)
+        clock.longest = clock.longest if NEAR * clock.longest <= h <= clock.longest else h
+        least = (clock.longest / h) ** 2
+        more = max(1.0, soft / least)
+        if more > 1:
+            more /= stiffening(runner, more, _stored_before(runner, left) + energy, dt, adapts)
+        runner.set_softness(least * more if more > 1 + SETTLED else least)
+    else:
+        clock.longest = h
     if system and clock.part_softness > 1:
         store = _stored_before(runner, left) + energy
         system.stiffen((1 + stiffening(runner, clock.part_softness, store, dt, adapts=True)) / 2)
@@ -95,17 +88,6 @@ def stiffening(runner: "Runner", s: float, store: float, dt: float, adapts: bool
     return max(1.0, min(s, most))
 
 
-def too_stiff(runner: "Runner", store: float) -> float:
-    """Return how many times as soft links must get, so that the scene has no more energy than ever with what they store [J].
-
-    It is 1 but after a long substep that threw bodies about: violations that it left bear no load.
-    """
-    room = _room(runner)
-    if room is None or not (spare := max(room, SLIGHT * runner.clock.kinetic)) > 0:
-        return 1.0
-    return max(1.0, store / spare)
-
-
 def _stored_before(runner: "Runner", left: float) -> float:
     """Return what relaxed links stored before they settled [J], as they do with the softness that keep() gives them."""
     return stored(runner) / left if left > 0 else 0.0
@@ -117,42 +99,6 @@ def _room(runner: "Runner") -> float | None:
     if clock.energy is None or clock.bound is None or clock.bound == CHANGED:
         return None
     return clock.bound + SLIGHT * clock.kinetic - clock.energy
-
-
-def needs_no_care(runner: "Runner", s: float) -> bool:
-    """Whether links may be as stiff as passes make them at once, where they would be `s` times as soft.
-
-    So it is where violations are tiny and nothing may break, or where passes have left less than CONVERGED of the violations that
-    one pass would leave by the same loads.
-    """
-    memory, batches, w, h = runner.memory, runner.batches, runner.scene.inv_mass, runner.clock.h
-    x = runner.scene.state.get(memory)
-    if not (np.abs(x) < LARGEST).all():  # or NaN
-        return False
-    solids = Solids(batches, w)
-    far = float(solids.far(x).max(initial=0.0)) if solids.count else 0.0
-    if not any(b.soft or b.breaks for b in batches) and max(worst(batches, x), far) <= TINY / s:
-        return True
-    if any(isinstance(b, Anchored) or (b.clusters and b.soft) for b in batches) or not far <= CONVERGED * solids.worst:
-        return False
-    if worst(batches, x) > CONVERGED:  # an impact left it
-        return False
-    split, stores, one = memory.read(runner.scene.slots.split), 0.0, 0.0
-    for b in batches:
-        if isinstance(b, Scalar) and b.count:
-            one += float((b.weights(x, split) * (h * b.load) ** 2).sum()) / 2
-            stores += _stored_in(b, b.violation(x) * ~b.broken, np.zeros(b.count))
-    return stores <= CONVERGED * one
-
-
-def worst(batches: list[Any], x: np.ndarray) -> float:
-    """Return the worst violation of links at x, (n, dim), as a share of its size."""
-    out = 0.0
-    for b in batches:
-        if isinstance(b, Scalar) and b.count:
-            C = b.violation(x) * b.inverse_size(b.start.position) * ~b.broken
-            out = max(out, float((np.abs(C) if b.side == 0 else b.side * C).max(initial=0.0)))
-    return out
 
 
 def stored(runner: "Runner") -> float:

@@ -22,6 +22,7 @@ from ..step import frames as kernel
 from ..step.clock import CHANGED, energy_floor, energy_limit, exceeds, falls_short, initial_margin
 from ..step.diagnostics import ENERGY, EXTENT, KINETIC, OVERLAP, STARTED, STEPPED, TURNS, UNSTEPPED, risks
 from ..step.integrator import shares_of
+from ..step.runner import EQUAL
 from ..world import World
 from .clocks import NONE, Clocks
 from .knobs import Knobs
@@ -172,7 +173,8 @@ class Worlds:
     ) -> WorldsReport:  # fmt: skip
         """Step frames, several per launch. track: where the positions after each `every`-th frame go, see rollout()."""
         world = self._world
-        work = len(self) * world.substeps * world.iterations * self._runner.integrator.stages
+        substeps = world._controller.pace.fit(dt, world.substeps)
+        work = len(self) * substeps * world.iterations * self._runner.integrator.stages
         work *= 1 + len(world.particles) + sum(b.count for b in self._runner.batches)
         at_once = max(1, min(frames, WORK // work, LOGGED // (len(self) * kernel.FIGURES)))
         bar: Any = contextlib.nullcontext()
@@ -185,19 +187,19 @@ class Worlds:
             task = shown.add_task(f"{len(self)} worlds", total=frames) if shown else None
             while done < frames:
                 with self._open():
-                    moved, released = self._begin(dt)
+                    moved, released = self._begin(dt, substeps)
                     # A target moves during one frame, then the host ends the motion: launch that frame alone. The host stiffens
                     # soft links between frames, too.
                     alone = self._runner.ramping or self._knobs.any_moves or (self._clocks.softest > 1).any()
                     some = 1 if alone else min(at_once, frames - done)
-                    report = self._launch(dt, some, moved, released, every, track, done)
+                    report = self._launch(dt, substeps, some, moved, released, every, track, done)
                 worst, done = report if worst is None else worst.worse(report), done + some
                 if shown:
                     shown.update(task, completed=done)
         assert worst
         return worst
 
-    def _begin(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    def _begin(self, dt: float, substeps: int) -> tuple[np.ndarray, np.ndarray]:
         """Prepare all worlds for substeps of a frame of dt [s], see Runner.begin().
 
         Returns how far particles of each world were moved, and what a shorter substep released, (worlds,) each.
@@ -206,15 +208,15 @@ class Worlds:
         for drag in runner.drags:
             clocks.needs_drag |= self._knobs.has_changed(drag)
         self._upload()
-        h = dt / world.substeps * runner.integrator.first
-        ready = (clocks.first_moved == NONE) & (clocks.h == h) & ~clocks.needs_drag
+        h = dt / substeps * runner.integrator.first
+        ready = (clocks.first_moved == NONE) & (np.abs(clocks.h - h) <= EQUAL * h) & ~clocks.needs_drag
         ready &= (clocks.softest == 1) & (clocks.iterations == world.iterations)
         moved, released, jumped = np.zeros(len(self)), np.zeros(len(self)), np.zeros(len(self), dtype=bool)
         some = np.flatnonzero(~ready)
         with runner.memory.compiler():
             for k in some:
                 with self._as_world(k):
-                    runner.prepare(dt, world.substeps, world.iterations)
+                    runner.prepare(dt, substeps, world.iterations)
                     moved[k], released[k], jumped[k] = runner.moved, runner.released, runner.jumped
         unknown = np.flatnonzero(~clocks.known)
         if len(unknown):
@@ -245,13 +247,13 @@ class Worlds:
                 world._upload_parameters()
 
     def _launch(
-        self, dt: float, frames: int, moved: np.ndarray, released: np.ndarray, every: int = 0, track: np.ndarray | None = None,
-        before: int = 0,
+        self, dt: float, substeps: int, frames: int, moved: np.ndarray, released: np.ndarray, every: int = 0,
+        track: np.ndarray | None = None, before: int = 0,
     ) -> WorldsReport:  # fmt: skip
         """Launch frames, again for worlds that waited for a longer list. before: frames already on the track."""
         world, runner, clocks = self._world, self._runner, self._clocks
         runner.start_ramps()
-        substeps, iterations, stages = world.substeps, world.iterations, runner.integrator.stages
+        iterations, stages = world.iterations, runner.integrator.stages
         with runner.memory.compiler():
             for semi_iteration in runner.semi_iterations:
                 semi_iteration.prepare(iterations)
@@ -266,7 +268,7 @@ class Worlds:
         runner.end_ramps()
         clocks.advance(substeps, iterations, frames, started)
         with np.errstate(all="ignore"):  # energies may be infinite, which flags report
-            self._last = self._report(figures, moved, released, perf_counter() - begun)
+            self._last = self._report(figures, moved, released, dt, substeps, perf_counter() - begun)
         return self._last
 
     def _launch_worlds(
@@ -307,7 +309,9 @@ class Worlds:
             memory.write(self._kernels.sheet, sheets)
         return figures
 
-    def _report(self, figures: np.ndarray, moved: np.ndarray, released: np.ndarray, seconds: float) -> WorldsReport:
+    def _report(
+        self, figures: np.ndarray, moved: np.ndarray, released: np.ndarray, dt: float, substeps: int, seconds: float
+    ) -> WorldsReport:
         """Make the report from the figures of all frames, (worlds, frames, FIGURES)."""
         world, runner, clocks = self._world, self._runner, self._clocks
         before, n = clocks.energy, runner.n
@@ -321,6 +325,7 @@ class Worlds:
             n, runner.diagnostics.report.farthest, bad, reach, fast, overlap, pressed, turned,
             np.where(first, moved[:, None], 0.0), tension, stiff, np.where(first, released[:, None], 0.0), residual,
         ) | self._flag_energies(figures)  # fmt: skip
+        every["substeps-capped"] = np.full((len(self), 1), world._controller.pace.late(dt) > 0)
         wrong = bad < n
         clocks.energy, clocks.known[:] = energy[:, -1].copy(), True
         for search in runner.step.searches:
@@ -329,7 +334,7 @@ class Worlds:
             clocks.time.copy(), residual.max(1), overlap.max(1), contacts.max(1).astype(int), clocks.energy.copy(),
             clocks.energy - before, np.where(wrong.any(1), bad[np.arange(len(self)), wrong.argmax(1)], -1).astype(int),
             broken.sum(1).astype(int), np.array(TURNS)[turned.max(1).astype(int)], tension.max(1),
-            {name: there.any(1) for name, there in every.items() if there.any()}, world.substeps, world.iterations,
+            {name: there.any(1) for name, there in every.items() if there.any()}, substeps, world.iterations,
             seconds,
         )  # fmt: skip
 
