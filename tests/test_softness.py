@@ -75,6 +75,20 @@ def test_a_late_frame_has_the_bits_of_the_frames_that_it_missed(world, dts):
     assert one.last.time == pytest.approx(many.last.time, rel=1e-12)
 
 
+def test_frames_of_another_rate_have_as_many_substeps_as_are_set(world):
+    # Three frames in a row that are twice as long are late; the fourth is another rate, and so is the second frame of all, if the
+    # first one was longer. Frames that differ by less than half have no rate of their own.
+    def counts(*frames):
+        w = net(world, 1.0)
+        return [w.step(k / 60).substeps for k in frames]
+
+    n = SUBSTEPS
+    assert counts(1, 1, 2, 2, 2, 1, 2) == [n, n, 2 * n, 2 * n, 2 * n, n, 2 * n]
+    assert counts(1, 1, 2, 2, 2, 2, 2, 1) == [n, n, 2 * n, 2 * n, 2 * n, n, n, n // 2]
+    assert counts(15, 1, 1, 2) == [n, n, n, 2 * n] and counts(1, 0.5, 0.5) == [n, n, n]
+    assert counts(1, 1, *[0.7] * 6) == [n, n, *[round(0.7 * n)] * 6] and counts(1, 1, 0.01) == [n, n, 1]
+
+
 def test_a_frame_that_is_far_too_late_says_so(world):
     # 12 times as late, of which 8 times as many substeps are taken: each is 12 / 8 times as long. So is it in many worlds.
     w = net(world, 1.0)

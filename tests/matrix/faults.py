@@ -1,7 +1,5 @@
 """Known faults: cells of the matrix that do not keep their equality, and why. What is mended has to be struck out."""
 
-BOUNDS = "rows of links ask for the side of a link, not for the bounds of a drive (contact/links.py, write())"
-SOFTNESS = "a rigid drive lags where substeps change: softness is one number for the whole world (step/softness.py)"
 BRAKE = "a brake slips where substeps get longer or change, below its torque"
 ALONG = "damping acts along a free axis once the substep changes: the history of a Snap is not projected"
 IMPACT = "a bounce off a wall beside contacts differs by a fraction of a substep from the bounce alone, which is exact"
@@ -11,19 +9,6 @@ ONE_CORNER = "Taichi ends the process (scalarize.cpp) where a constraint of one 
 ULP = "a digit depends on the unit of length"
 
 KNOWN: dict[tuple[str, str], str] = {
-    ("motors", "contact"): BOUNDS,
-    ("motors", "polygons"): BOUNDS,
-    ("servos", "polygons"): BOUNDS,
-    ("motors of free bodies", "polygons"): BOUNDS,
-    ("motors", "together"): BOUNDS,
-    ("winches", "together"): BOUNDS,
-    ("motors in space", "contact"): BOUNDS,
-    ("servos", "contact"): BOUNDS,
-    ("motors of free bodies", "contact"): BOUNDS,
-    ("motors", "uneven"): SOFTNESS,
-    ("motors", "changed back"): SOFTNESS,
-    ("motors in space", "uneven"): SOFTNESS,
-    ("motors in space", "changed back"): SOFTNESS,
     ("servos", "late 0.25"): BRAKE,
     ("servos", "changed back"): BRAKE,
     ("servos", "auto"): BRAKE,

@@ -40,7 +40,7 @@ class ConjugateGradient(Solver):
     blocks, in f64, so results are the same bit for bit on any number of threads.
 
     If steps end before they have converged, their result differs in every substep. It acts as a spring whose stiffness jumps,
-    which adds energy. So the diagonal has a floor,
+    which adds energy. So the diagonal has a floor from then on,
 
         alpha'_j + sigma W_j,   sigma = lambda_max / steps^2
 
@@ -133,7 +133,7 @@ class CGSystem(System):
 
     def sag(self, batch: "Batch") -> np.ndarray:
         """Return the floor of the part of each constraint of a batch, (m,); 1 for those that are relaxed alone."""
-        row, floor = self.row(batch), np.maximum(self.memory.read(self.floor), self._least)
+        row, floor = self.row(batch), self.memory.read(self.floor)
         return np.where(row < 0, 1.0, floor[self.memory.read(self.representative)[row]])
 
     def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
@@ -163,8 +163,8 @@ class CGSystem(System):
 
     @ti.func
     def floor_of(self, i):
-        """Return the floor of the part of particle i."""
-        return ti.max(ti.cast(self.floor[i], self.real), self.least)
+        """Return the floor of the part of particle i; 0 as long as its steps converge."""
+        return ti.cast(self.floor[i], self.real)
 
     @ti.func
     def set_gradient(self, place, i, gradient):
@@ -224,7 +224,7 @@ class CGSystem(System):
         self.team.wait()
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             if self.floor_too_low[self.part_of[i]] != 0:
-                self.floor[i] = ti.min(GROWTH * self.floor_of(i), HIGHEST)
+                self.floor[i] = ti.max(self.least, ti.min(GROWTH * self.floor_of(i), HIGHEST))
         self.team.wait()
         for p in range(self.team.chunk_begin(self.part_count, thread), self.team.chunk_end(self.part_count, thread)):
             self.floor_too_low[p] = 0

@@ -94,16 +94,16 @@ class StepController:
     @property
     def memory(self) -> tuple:
         """The values on which the next frames depend."""
-        now = self.pace.substeps, self.pace.dt, self.substeps, self.iterations, self.dt, self.wait
+        now = self.pace.substeps, self.pace.dt, self.pace.off, self.substeps, self.iterations, self.dt, self.wait
         failed = self.stuck != NOTHING or max(self.patience) > 1
         return (*now, self.worst, *self.patience, *self.stuck) if failed else (*now, *WELL)
 
     @memory.setter
     def memory(self, value: tuple) -> None:
         """Restore the values of another time."""
-        *pace, self.substeps, self.iterations, self.dt, self.wait, self.worst = value[:7]
-        self.pace, rest = Pace(*pace), value[7:]
-        failed = tuple(value[6:]) != WELL
+        *pace, self.substeps, self.iterations, self.dt, self.wait, self.worst = value[:8]
+        self.pace, rest = Pace(*pace), value[8:]
+        failed = tuple(value[7:]) != WELL
         self.patience = list(rest[:OCTAVES]) if failed else [1] * OCTAVES
         self.stuck = tuple(rest[OCTAVES:]) if failed else NOTHING
 

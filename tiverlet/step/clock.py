@@ -16,6 +16,7 @@ NAMES = {
     "_part_softness": "part_softness",
 }  # fmt: skip
 
+RATE, OTHER = 4, 1.5  # frames in a row that are another rate, and by how many times they are longer or shorter
 LATE = 8  # times as many substeps as were set, at most, in a frame that is late: a stalled program must not stall for more
 SHARE = 0.1  # of the largest kinetic energy: the gain, or the loss, that is allowed
 DIGITS = 1e-5  # of the energy: the gain, or the loss, that rounding may cause
@@ -80,16 +81,26 @@ class Pace:
     """The length that substeps keep: that of the first frame, of dt [s], after the user has set so many of them.
 
     A loop that measures dt has frames of any length. If their number stayed, the stiffness of what passes hold would change with
-    dt^2 from frame to frame, and with it the energy that this stores.
+    dt^2 from frame to frame, and with it the energy that this stores. Frames of another length come singly, or some in a row; RATE
+    of them are another rate. The first frame counts as one that was too long, as where a program starts.
+
+    off: how many frames in a row were longer, if below 0 shorter, by more than OTHER.
     """
 
     substeps: int = 0
     dt: float = 0.0
+    off: int = 0
 
     def fit(self, dt: float, substeps: int) -> int:
         """Return how many substeps a frame of dt [s] has where so many are set, at most LATE times as many."""
         if self.substeps != substeps:
-            self.substeps, self.dt = substeps, dt
+            self.substeps, self.dt, self.off = substeps, dt, 1 - RATE
+        elif side := (dt > OTHER * self.dt) - (OTHER * dt < self.dt):
+            self.off = self.off + side if side * self.off >= 0 else side
+            if abs(self.off) >= RATE:
+                self.dt, self.off = dt, 0
+        else:
+            self.off = 0
         return max(1, min(round(substeps * dt / self.dt), LATE * substeps))
 
     def late(self, dt: float) -> float:
@@ -117,8 +128,8 @@ class Clock:
     was a start. iterations: of the last frame. softness, longest: how many times as soft as passes make them links are, 1 or
     more, and the longest of the substeps that are about as long as this one [s], see softness.py. part_softness: the first for
     the softest part of a system that gave way in a longer substep. frame: when frames of the present length began [s], their
-    length [s], their number. drag: its factors for h, see integrator.decay(). owed: the kick by rigid constraints that velocities before a start
-    lack, as a time [s]. lacked: `owed` of the last substep if it was a start, else 0. velocity_override: velocities, valid until
+    length [s], their number. drag: its factors for h, see integrator.decay(). owed: the kick by rigid constraints that velocities
+    before a start lack, as a time [s]. lacked: `owed` of the last substep if it was a start, else 0. velocity_override: velocities, valid until
     the next step, after constraints that contribute to them were removed or velocities were assigned; a start before the next
     step takes these. first_moved: the first particle that the user placed since the last frame; None if there is none.
     moved_mask: which of the particles from there on moved, (n,); None: all may have.

@@ -173,8 +173,7 @@ class Worlds:
     ) -> WorldsReport:  # fmt: skip
         """Step frames, several per launch. track: where the positions after each `every`-th frame go, see rollout()."""
         world = self._world
-        substeps = world._controller.pace.fit(dt, world.substeps)
-        work = len(self) * substeps * world.iterations * self._runner.integrator.stages
+        pace, work = world._controller.pace, len(self) * world.substeps * world.iterations * self._runner.integrator.stages
         work *= 1 + len(world.particles) + sum(b.count for b in self._runner.batches)
         at_once = max(1, min(frames, WORK // work, LOGGED // (len(self) * kernel.FIGURES)))
         bar: Any = contextlib.nullcontext()
@@ -187,10 +186,11 @@ class Worlds:
             task = shown.add_task(f"{len(self)} worlds", total=frames) if shown else None
             while done < frames:
                 with self._open():
+                    substeps = pace.fit(dt, world.substeps)
                     moved, released = self._begin(dt, substeps)
                     # A target moves during one frame, then the host ends the motion: launch that frame alone. The host stiffens
                     # soft links between frames, too.
-                    alone = self._runner.ramping or self._knobs.any_moves or (self._clocks.softest > 1).any()
+                    alone = self._runner.ramping or self._knobs.any_moves or (self._clocks.softest > 1).any() or pace.off
                     some = 1 if alone else min(at_once, frames - done)
                     report = self._launch(dt, substeps, some, moved, released, every, track, done)
                 worst, done = report if worst is None else worst.worse(report), done + some

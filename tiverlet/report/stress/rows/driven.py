@@ -76,8 +76,7 @@ def _weak() -> Findings:
     return held()
 
 
-@row(106, "the same beside contacts that touch nothing", "the same closed forms",
-     known="the largest torque of a motor is ignored in a world with contacts")  # fmt: skip
+@row(106, "the same beside contacts that touch nothing", "the same closed forms")
 def _weak_beside() -> Findings:
     return held(Contact())
 
