@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from .rows import Rows
 
 # Lengths relative to an edge.
-SLACK = 1 / 512  # extension of an edge at its ends, so that bodies of the same width stand on each other
+SLACK = 1 / 512  # of what is behind an edge that counts as in front of it; and see is_beside()
 STRETCH = 1.25  # longest edge, relative to its first length, for which all contacts in its middle are listed
 PAST = 1 / 4  # how far beyond the end of an edge a contact may be
 REACH = 1.35  # from one end of an edge to the farthest contact: |(1 + PAST, 1 / 2)|
@@ -149,6 +149,16 @@ class Edges:
         """Return the size of a contact of vertex v with an edge from a: the smaller one; a point has none [m]."""
         return ti.select(self.size[v] > 0, ti.min(self.size[v], self.size[a]), self.size[a])
 
+    @ti.func
+    def is_beside(self, v, a, t, length):
+        """Whether vertex v is beside the edge from a, at t of its length [m].
+
+        Edges reach beyond their ends by SLACK of what touches there, twice its size, so that bodies of the same width stand on
+        each other; by a part of their own length, what falls beside a long one would stand on air.
+        """
+        slack = ti.static(2 * SLACK) * self.smaller(v, a)
+        return -slack <= t * length and (t - 1) * length <= slack
+
     @called
     @ti.func
     def corner(self, v: ti.i32, a: ti.i32, start: ti.i32) -> ti.i32:
@@ -182,7 +192,7 @@ class Edges:
             t, n = r.dot(u) / uu, perp(u) / length
             height, shared, tips = r.dot(n), a, 0
             outside = height >= -SLACK * length
-            beside = -SLACK <= t <= 1 + SLACK
+            beside = self.is_beside(v, a, t, length)
             if height < 0 and height >= -length / 2 and -PAST <= t <= 1 + PAST:
                 at_end = t > 0.5
                 tips = self.tips_cross(v, ti.select(at_end, b, a), start) * ti.select(at_end, -1, 1)
@@ -407,7 +417,7 @@ class Edges:
                             s = ti.min(ti.max(s + left / ti.max(gap - ahead, TINY), 0), 1)
                     r, u = r0 + s * dr, u0 + s * du
                     n, t = perp(u).normalized(), r.dot(u) / ti.max(u.dot(u), TINY)
-                    lists = -SLACK <= t <= 1 + SLACK and self.inward(v, 1).dot(n) >= 0
+                    lists = self.is_beside(v, a, t, u.norm()) and self.inward(v, 1).dot(n) >= 0
                     lists = lists and not self.grazes(v, a, b, r, u, n, size)
                     t = ti.min(ti.max(t, 0), 1)
             else:
@@ -521,7 +531,7 @@ class Edges:
         a, b, t = self.rows.other.field[row], self.end.field[row], self.place.field[row]
         r, u = self.state.separation(v, a), self.state.separation(b, a)
         n, gap, place = perp(u).normalized(), 1 + 0 * t, r.dot(u) / ti.max(u.dot(u), TINY)
-        if -SLACK <= place <= 1 + SLACK:
+        if self.is_beside(v, a, place, u.norm()):
             gap = r.dot(n) - self.contact_radius(v, a, b, t)
         return gap, n
 
@@ -620,7 +630,7 @@ class Edges:
             out = overlap > 0
             r, u = self.state.separation(i, j), self.state.separation(self.after(j), j)
             t, height = r.dot(u) / ti.max(u.dot(u), TINY), r.dot(perp(u).normalized())
-            if -SLACK <= t <= 1 + SLACK and 0 <= height:
+            if self.is_beside(i, j, t, u.norm()) and 0 <= height:
                 near = self.contact_radius(i, j, self.after(j), ti.min(ti.max(t, 0), 1)) + margin + SLOP * self.size[j]
                 out = out or height < near
         if not out and self.radius.of(i) + self.radius.of(j) > 0:

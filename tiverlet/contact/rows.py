@@ -588,6 +588,19 @@ class Rows:
         return q * (0.5 - ti.min(ti.abs(bend * q), 1) / 8 - ti.min(ti.max(bend * un, -0.5), 0.5) / 2)
 
     @ti.func
+    def goes_past(self, gap, bend, u, un):
+        """Whether a particle that moves by u, and by un along its normal, goes past the corner of a wall in this substep.
+
+        Where it is r = 1 / bend away from the corner, its path is r |u_t| / |u| away at its nearest, after the part -r un / u^2.
+        The gap to the plane across the normal would be below 0 beyond.
+        """
+        out, uu = False, u.dot(u)
+        if bend > 0 and un < 0 and -un <= bend * uu:
+            r = 1 / bend
+            out = r * r * (uu - un * un) > (r - gap) * (r - gap) * uu
+        return out
+
+    @ti.func
     def put(self, row, other, e, n, gap, bend, p):
         """Write a row. p: the impulse that it bore; what is left of it along the normal and within friction is kept."""
         self.other.field[row], self.entry.field[row] = other, e
@@ -626,6 +639,8 @@ class Rows:
                         near = ti.cast(AHEAD, self.real)
                 # What it bore, it may still bear; but an open side, which is nowhere, has no row.
                 lists = ahead < ti.select(self.is_set(p), 1, near) * self.size(i)
+                if ti.static(w.bends):
+                    lists = lists and not self.goes_past(gap, bend, u, un)
                 if ti.static(w.dev.surface.has_switch):
                     lists = lists and w.dev.surface.active[None] != 0
                 if ti.static(w.dev.surface.is_one_way):
