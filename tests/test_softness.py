@@ -48,17 +48,18 @@ def test_what_auto_leaves_violated_is_not_called_good(world):
 @pytest.mark.slow
 def test_a_net_rests_where_it_does_in_the_longest_substeps(world):
     # Half as many substeps are twice as long, and s W h^2 F is four times the sag. Where there are as many as before again, the
-    # net is lifted to where it rests in these, but for corners that fold another way, and never has more energy than there.
+    # net is lifted to where it rests in these, but for corners that fold another way, and never has more energy than at first.
     short, turns = net(world, 3.0), net(world, 3.0)
+    begun = short.step(1 / 60)
     short.run(6.0)
     turns.substeps = SUBSTEPS // 2
     turns.run(6.0)
     sag = np.abs(turns.position - short.position).max()
-    assert sag > 5e-3 and turns.last.energy < short.last.energy
+    assert sag > 5e-3
     turns.substeps = SUBSTEPS
     most = max(turns.step(1 / 60).energy for _ in range(720))
     assert np.median(np.abs(turns.position - short.position)) < 0.02 * sag
-    assert most < short.last.energy + 0.02 * (short.last.energy - turns.last.energy) + 1e-3 * G * 1.21
+    assert most < begun.energy - begun.energy_change
 
 
 @pytest.mark.parametrize("dts", [(1 / 30,), (1 / 20, 1 / 60), (1 / 7.5,)])
@@ -76,17 +77,17 @@ def test_a_late_frame_has_the_bits_of_the_frames_that_it_missed(world, dts):
 
 
 def test_frames_of_another_rate_have_as_many_substeps_as_are_set(world):
-    # Three frames in a row that are twice as long are late; the fourth is another rate, and so is the second frame of all, if the
+    # 15 frames in a row that are twice as long are late; the 16th is another rate, and so is the second frame of all, if the
     # first one was longer. Frames that differ by less than half have no rate of their own.
     def counts(*frames):
         w = net(world, 1.0)
         return [w.step(k / 60).substeps for k in frames]
 
     n = SUBSTEPS
-    assert counts(1, 1, 2, 2, 2, 1, 2) == [n, n, 2 * n, 2 * n, 2 * n, n, 2 * n]
-    assert counts(1, 1, 2, 2, 2, 2, 2, 1) == [n, n, 2 * n, 2 * n, 2 * n, n, n, n // 2]
+    assert counts(1, 1, *[2] * 15, 1, 2) == [n, n, *[2 * n] * 15, n, 2 * n]
+    assert counts(1, 1, *[2] * 17, 1) == [n, n, *[2 * n] * 15, n, n, n // 2]
     assert counts(15, 1, 1, 2) == [n, n, n, 2 * n] and counts(1, 0.5, 0.5) == [n, n, n]
-    assert counts(1, 1, *[0.7] * 6) == [n, n, *[round(0.7 * n)] * 6] and counts(1, 1, 0.01) == [n, n, 1]
+    assert counts(1, 1, *[0.7] * 17) == [n, n, *[round(0.7 * n)] * 17] and counts(1, 1, 0.01) == [n, n, 1]
 
 
 def test_a_frame_that_is_far_too_late_says_so(world):

@@ -9,7 +9,7 @@ import numpy as np
 from ..features.feature import Batch
 from ..neighbours.neighbour_list import WALL
 from ..neighbours.periodic import Periodic
-from .clock import Clock
+from .clock import PACE, Clock
 
 if TYPE_CHECKING:
     from ..world import World
@@ -76,7 +76,7 @@ def keep(world: "World", pairs: bool = True) -> Checkpoint:
 
 def digest(world: "World", kept: Checkpoint) -> str:
     """Return the SHA-256 hash of a state of the world, with its clock and the memory of its controller."""
-    numbers = [v.item() if isinstance(v, np.generic) else v for v in (*kept.clock.hashed, *kept.controller)]
+    numbers = [v.item() if isinstance(v, np.generic) else v for v in (*kept.clock.hashed, *kept.controller[PACE:])]
     out = hashlib.sha256(repr(tuple(numbers)).encode())  # Python's numbers, as recordings restore them, not NumPy's
     for name, values in _hashed(world, kept.values).items():
         out.update(name.encode())

@@ -16,7 +16,8 @@ NAMES = {
     "_part_softness": "part_softness",
 }  # fmt: skip
 
-RATE, OTHER = 4, 1.5  # frames in a row that are another rate, and by how many times they are longer or shorter
+RATE = 16  # frames in a row that are another rate: a quarter of a second at 60 a second
+OTHER = 1.5  # times as long, or as short, as the frames so far: one of another rate, if it is not alone
 LATE = 8  # times as many substeps as were set, at most, in a frame that is late: a stalled program must not stall for more
 SHARE = 0.1  # of the largest kinetic energy: the gain, or the loss, that is allowed
 DIGITS = 1e-5  # of the energy: the gain, or the loss, that rounding may cause
@@ -24,6 +25,7 @@ CHANGED = -np.inf  # the bound while work is done on the scene in the coming fra
 SQUEEZED = 0.1  # overlap [radii] from which particles that were pressed together may push themselves apart
 MET = 1e-6  # relative violation that counts as rounding
 PARTED = 0.01  # overlap [radii] down to which particles placed into each other push themselves apart
+PACE = 3  # values of a Pace, which say nothing of the present state
 NO, YES, UNKNOWN = range(3)  # whether a scene conserves energy
 
 
@@ -81,8 +83,8 @@ class Pace:
     """The length that substeps keep: that of the first frame, of dt [s], after the user has set so many of them.
 
     A loop that measures dt has frames of any length. If their number stayed, the stiffness of what passes hold would change with
-    dt^2 from frame to frame, and with it the energy that this stores. Frames of another length come singly, or some in a row; RATE
-    of them are another rate. The first frame counts as one that was too long, as where a program starts.
+    dt^2 from frame to frame, and with it the energy that this stores. Frames of another length come singly, or some in a row;
+    RATE of them are another rate. The first frame counts as one that was too long, as where a program starts.
 
     off: how many frames in a row were longer, if below 0 shorter, by more than OTHER.
     """
@@ -113,8 +115,8 @@ class Pace:
         if not (times := self.late(dt)):
             return report
         note = (
-            f"The frame of {dt:.3g} s is {dt / self.dt:.3g} times as long as the first one with {self.substeps} substeps, so each "
-            f"of its {report.substeps} is {times:.3g} times as long. Take several frames of at most {LATE * self.dt:.3g} s."
+            f"The frame of {dt:.3g} s is {dt / self.dt:.3g} times as long as those with {self.substeps} substeps, so each of its "
+            f"{report.substeps} is {times:.3g} times as long. Take several frames of at most {LATE * self.dt:.3g} s."
         )
         return replace(report, flags=report.flags | {"substeps-capped"}, notes=(*report.notes, note))
 
@@ -129,10 +131,10 @@ class Clock:
     more, and the longest of the substeps that are about as long as this one [s], see softness.py. part_softness: the first for
     the softest part of a system that gave way in a longer substep. frame: when frames of the present length began [s], their
     length [s], their number. drag: its factors for h, see integrator.decay(). owed: the kick by rigid constraints that velocities
-    before a start lack, as a time [s]. lacked: `owed` of the last substep if it was a start, else 0. velocity_override: velocities, valid until
-    the next step, after constraints that contribute to them were removed or velocities were assigned; a start before the next
-    step takes these. first_moved: the first particle that the user placed since the last frame; None if there is none.
-    moved_mask: which of the particles from there on moved, (n,); None: all may have.
+    before a start lack, as a time [s]. lacked: `owed` of the last substep if it was a start, else 0. velocity_override:
+    velocities, valid until the next step, after constraints that contribute to them were removed or velocities were assigned; a
+    start before the next step takes these. first_moved: the first particle that the user placed since the last frame; None if
+    there is none. moved_mask: which of the particles from there on moved, (n,); None: all may have.
     energy: at the end of the last frame [J]; None if unknown. bound, kinetic, parting: the energy that must not be exceeded [J],
     None if unknown; the largest kinetic energy since then [J]; whether particles that were placed into each other still part;
     see energy_bound.py. overlap: of the worst contact at the end of the last frame [radii]. conserves: NO, YES or
