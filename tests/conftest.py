@@ -260,7 +260,8 @@ def rerun(w: tv.World, seconds: float, dt: float = 1 / 60, **settings) -> tv.Wor
     """
     w._start_from(w.particles.velocity)
     w.position = w.particles.position
-    for name, value in settings.items():
+    again = {} if w.settings["substeps"] == "auto" else {"substeps": w.substeps}  # of frames of a length of their own
+    for name, value in (again | settings).items():
         setattr(w, name, value)
     w.run(seconds, dt=dt)
     return w

@@ -319,10 +319,10 @@ def test_gltf_holds_every_frame(steady, tmp_path):
     part = made.part("surfaces")
     corners = made.values(part["indices"]).reshape(-1, 3)
     assert sorted(map(sorted, corners.tolist())) == steady.frames[0]["faces"]
-    # The ends of a link that broke are in one place.
+    # The ends of a link that broke are in one place, to rounding of what they have moved.
     ends = made.values(made.part("links")["indices"]).reshape(-1, 2)
     for at, row in zip(made.places("links"), steady.frames, strict=True):
-        shown = np.array([at[pair] for pair in ends if (at[pair[0]] != at[pair[1]]).any()])
+        shown = np.array([at[pair] for pair in ends if np.ptp(at[pair], axis=0).max() > 1e-6])
         np.testing.assert_allclose(shown, row["position"][np.array(row["links"])], atol=1e-6)
     # Normals belong to the recorded positions and point up, which is z; a node rotates z to y.
     last = x[-1, :5].astype(np.float64)

@@ -26,7 +26,7 @@ def brake(x, v):
 def again(w, **settings):
     """Put a world back to its start, with other settings."""
     w.velocity, w.position = w.particles.velocity, w.particles.position
-    for name, value in settings.items():
+    for name, value in ({"substeps": w.substeps} | settings).items():
         setattr(w, name, value)
 
 

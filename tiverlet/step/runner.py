@@ -343,11 +343,9 @@ class Runner:
     def place(self, position: np.ndarray, iterations: int) -> None:
         """Set positions, (n, dim) [m], and keep velocities."""
         with self.memory.compiler():
-            moved = (self.scene.state.get(self.memory) != position).any(axis=1)
-            if not moved.any():
-                return
             self.restart(iterations)
             self.forget_loads(position)
+            moved = (self.scene.state.get(self.memory) != position).any(axis=1)
             self.scene.state.put(self.memory, position)
         clock, known = self.clock, moved if self.clock.first_moved is None else self.clock.moved_mask
         clock.energy, clock.first_moved, clock.moved_mask = None, 0, None if known is None else known | moved
