@@ -130,7 +130,7 @@ FAULTS = (
     Fault("614ec68b", "faces are not renumbered where walls go", "step/build_again.py",
           "face[kept] = WALL + now[wall][: len(kept)]", "face[kept] = WALL + kept", "edits"),
     Fault("7ee942f9", "World.shift glides", "step/placing.py",
-          "    _take(world, values, position)\n", "    _take(world, values)\n    world.position = position\n", "placing"),
+          "    _take(world, values, by)\n", "    _take(world, values)\n    world.position = world.position + by\n", "placing"),
 )  # fmt: skip
 
 
