@@ -11,7 +11,8 @@ g and n are the gradients of C at the end and at the start of the substep, or at
 of a body in the substep in which it acts, and bodies on links bounce, slide and rest as wholes. What rigid links are still
 violated by at the end is for places to remove, and no reason for an impulse later.
 
-Links of a System that solves them at once are no rows: the system answers, see Elimination.answer_part().
+Links of a System that solves them at once are no rows: the system answers, see Elimination.answer_part(). Those of one that takes
+steps answer what contacts add, as softly as its floor, see ConjugateGradient; what its steps leave is left.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -42,6 +43,7 @@ class Links:
     def __init__(self, scene: "Scene", batches: "list[Batch]", rows: "Rows"):
         slots, add, system = scene.slots, scene.memory.field, scene.slots.system
         self.state, self.slots, self.rows, self.real = scene.state, slots, rows, scene.real
+        self.iterates = bool(system) and system.steps > 0  # whether a system leaves violations on purpose, see ConjugateGradient
         some = [b for b in batches if not b.answers_alone]
         free = {id(b): slots.rows(b) < 0 if system and system.answers else np.ones(b.count, dtype=bool) for b in some}
         self.batches = [b for b in some if free[id(b)].any()]
@@ -166,6 +168,12 @@ class Links:
             weight += split * n.dot(self.gradient[self.slot[e]])
             firm += eigenvalue * n.dot(self.gradient[self.slot[e]])
             size += split * ti.sqrt(n.dot(n))
+        if ti.static(self.iterates):
+            if not self.is_alone(batch, c):
+                # Its system has left it as soft as its floor, and as near as its steps come: it answers what contacts add alone.
+                violation *= 0
+                if self.begin[r] < self.begin[r + 1]:
+                    alpha += A * W * self.slots.system.floor_at(self.slot[self.begin[r]])
         acts = W > 0 and weight > 0  # a link of a system has no corners here, and no weight
         self.stiff[r] = ti.select(acts, ti.static(RELAXATION) / ti.max(A * weight + alpha, FEW), 0 * W)
         self.firm[r] = ti.select(acts, 1 / ti.max(A * firm + alpha, FEW), 0 * W)
@@ -224,6 +232,9 @@ class Links:
         slack = self.bound_places(batch, c, r, lam + mu, holds)
         if rigid and self.stiff[r] > 0 and (holds or slack) and (reached or u != 0 or mu != 0 or left != 0):
             touched = 1
+        if ti.static(self.iterates):
+            if not self.is_alone(batch, c):  # what contacts leave of it is for its system, as all that it leaves itself
+                touched = 0
         self.violation[r] = ti.select(slack or touched != 0, left + u + self.violation[r], 0 * u)
         if self.begin[r] < self.begin[r + 1]:
             batch.dev.equation.touched[c] = touched

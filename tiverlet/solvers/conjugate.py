@@ -167,6 +167,11 @@ class CGSystem(System):
         return ti.cast(self.floor[i], self.real)
 
     @ti.func
+    def floor_at(self, slot):
+        """Return the floor of the part of the row with this slot."""
+        return self.floor_of(self.representative[self.row_of[slot]])
+
+    @ti.func
     def set_gradient(self, place, i, gradient):
         """Set the gradient at a corner with slot `place` and particle i."""
         if place >= 0:
