@@ -202,7 +202,7 @@ def seen_in(trial: Trial, how: str, column: str, seen: list[tuple], floor: float
     size = oracles.height(trial.features, p, trial.free, low, np.maximum(high, low + p.size)) + m @ (v**2).sum(axis=1) / 2
     if oracles.passive(structure):
         # The largest rise since any earlier frame, in the heights that are passed and the motion at the start.
-        rise = np.nan_to_num(energies - np.minimum.accumulate(energies), nan=np.inf) / max(size, 1e-300)
+        rise = np.nan_to_num(energies - np.minimum.accumulate(energies), nan=np.inf) / (size or abs(energies[0]) or 1.0)
         yield how, "energy rise", column, figure(float(rise.max()), floor)
     if oracles.closed(structure):
         momenta = np.array([q for *_, q, _ in seen])

@@ -17,7 +17,7 @@ def chain(n: int, k: int, first: int = 0) -> np.ndarray:
     return first + np.arange(n - k + 1)[:, None] + np.arange(k)
 
 
-@scene(flags={"unconverged"})
+@scene(flags={"unconverged", "energy-loss"})
 def clamped_beams_from_rigid_to_soft_sag():
     alphas, n = (0.0, 1e-12, 1e-6, 1e-3, 1e-1, 1.0, 1e12), 8
     x = np.zeros((len(alphas), n, 3))
@@ -32,7 +32,7 @@ def clamped_beams_from_rigid_to_soft_sag():
     return start, features, {"solver": c.Jacobi(), "substeps": 4, "precision": "f64"}
 
 
-@scene()
+@scene(flags={"energy-loss"})
 def a_chain_that_is_straight_but_for_rounding_flies():
     # Points on a line along (1, 2, 3) are off it by 1e-16 m: the plane of a path that is almost straight turns far in a substep.
     rope = tv.shapes.rope((0, 0, 0), np.array([1.0, 2.0, 3.0]) / np.sqrt(14) * 9, points=10)

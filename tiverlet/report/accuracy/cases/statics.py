@@ -92,7 +92,7 @@ CASES = [
     ),
     sags("S07_elastic_catenary", "N10_alpha1e-3", 10, 1.0, 0.8, 1e-3, (1e-9, 4e-8), **ELASTIC),
     sags("S07_elastic_catenary", "N20_alpha1e-4", 20, 1.0, 0.8, 1e-4, (1e-9, 1e-7), **ELASTIC),
-    hollows(10, 0.01, (2e-9, 5e-8)),
+    hollows(10, 0.01, (2e-9, 5e-7)),
     hollows(10, 0.001, (1e-8, 1e-6)),
     sags("R10b_discrete_catenary_N10", "", 10, 10.0, 6.0, 0.0, (1e-9, 2e-8), **CATENARY),
     sags("R10b_discrete_catenary_N20", "", 20, 10.0, 6.0, 0.0, (1e-9, 1e-7), **CATENARY),
