@@ -13,10 +13,11 @@ from tiverlet.device.language import COMPILER
 from tiverlet.features.arguments import knobs_of
 
 from .conftest import parsed
+from .laboratory import pages, results
+from .laboratory.__main__ import EXPERIMENTS
 
-ROOT = pathlib.Path(__file__).parent.parent
-FOLDERS = ("demos/*.md", "tiverlet/**/*.md", "tests/laboratory/README.md")
-PAGES = [p.relative_to(ROOT) for p in (ROOT / "README.md", *(p for f in FOLDERS for p in ROOT.glob(f)))]
+ROOT = pages.ROOT
+PAGES = [page.relative_to(ROOT) for page in pages.PAGES]
 
 
 def blocks(page: pathlib.Path) -> list[str]:
@@ -72,6 +73,15 @@ def test_the_first_page_is_short_and_leads_to_all_others():
     text = (ROOT / "README.md").read_text()
     assert len(text.encode()) <= 8192
     assert all(str(page) in text for page in PAGES[1:])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=str)
+def test_figures_in_tables_are_those_of_the_laboratory(page):
+    # `python -m tests.laboratory NAME --write` writes them.
+    text = (ROOT / page).read_text()
+    assert not pages.unwritten(text)
+    assert set(re.findall(r"python -m tests\.laboratory (\w+)", text)) <= EXPERIMENTS.keys()
+    assert pages.filled(text, results.FILE.read_text()) == text
 
 
 def undocumented(tree: ast.Module) -> list[str]:

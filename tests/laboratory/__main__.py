@@ -1,4 +1,4 @@
-"""Run one experiment of the laboratory, print its tables and, with --write, keep them in RESULTS.md."""
+"""Run one experiment of the laboratory, print its tables and, with --write, keep them in RESULTS.md and on pages."""
 
 import argparse
 import shlex
@@ -7,6 +7,7 @@ from importlib import import_module
 
 from rich.console import Console
 
+from . import pages
 from .results import write
 
 # Each module has main(args) -> an iterator over tables.
@@ -24,6 +25,7 @@ EXPERIMENTS = {
     "gpu": "what runs on a GPU, with which bits, how fast, and how often the host waits (parts: its tables)",
     "piles": "piles of discs and boxes beside Box2D and pymunk, in turns (parts: discs, equal discs, boxes, towers)",
     "structures": "ladders, bridges, wheels, tents on ropes: strain against run time, by solver and load",
+    "pay": "what each feature costs: fields, bytes and time of the scene of demos/pay.py",
     "mutations": "faults of the past, put back one by one: which tests notice (parts: beginnings of commits)",
     "grains": "heaps, drums and silos of spinning grains, beside LAMMPS (parts: its tables)",
 }
@@ -41,7 +43,7 @@ def main(words: list[str]) -> None:
     parser.add_argument("--threads", type=int, nargs="+", default=(), metavar="T", help="numbers of CPU threads")
     parser.add_argument("--pythons", nargs="+", default=(), metavar="PATH", help="other Pythons in which to look for engines")
     parser.add_argument("--quick", action="store_true", help="small sizes and few runs")
-    parser.add_argument("--write", action="store_true", help="replace the experiment's section of RESULTS.md")
+    parser.add_argument("--write", action="store_true", help="replace its section of RESULTS.md, and what pages show of it")
     args = parser.parse_args(words)
     tables, console = [], Console(width=None if sys.stdout.isatty() else 150)
     for table in import_module(f"tests.laboratory.{args.name}").main(args):
@@ -49,6 +51,7 @@ def main(words: list[str]) -> None:
         tables.append(table)
     if args.write:
         write(args.name, f"python -m tests.laboratory {shlex.join(w for w in words if w != '--write')}", tables)
+        pages.write()
 
 
 if __name__ == "__main__":

@@ -160,12 +160,21 @@ ENGINES = ((Tiverlet, 1, ""), (Tiverlet, 2, ""), (Tiverlet, 4, ""), (Box2D, 4, "
 
 
 def main(args) -> Iterator[Table]:
-    """Yield a table for each scene."""
+    """Yield a table for each scene, and one of all."""
+    tv.init(threads=1)
+    short: dict[tuple[str, str], list[str]] = {}
+    titles: list[str] = []
     notes = [*NOTES, *(f"Left out: {need}, since it is not installed." for *_, need in ENGINES if need and not find_spec(need))]
     for name, sizes in SIZES.items():
         if name in (args.parts or SIZES):
             for n in args.sizes or (sizes[:1] if args.quick else sizes):
-                yield Table(f"{name.capitalize()}, {n}", HEADS, list(rows(name, n, 60 if args.quick else 600)), notes)
+                titles.append(f"{name.capitalize()}, {n}")
+                some = list(rows(name, n, 60 if args.quick else 600))
+                for engine, steps, ms, _, _, worst, _ in some:
+                    short.setdefault((engine, steps), []).append(f"{float(ms):.2g}; {float(worst):.1g}")
+                yield Table(titles[-1], HEADS, some, notes)
+    shown = [(f"{engine}, {steps} step{'s' * (steps != '1')}", *found) for (engine, steps), found in short.items()]
+    yield Table("Milliseconds a frame; worst overlap", ("engine", *titles), shown)
 
 
 def rows(name: str, n: int, frames: int) -> Iterator[tuple]:

@@ -21,15 +21,20 @@ def commit() -> str:
     return named.stdout.strip() or "unknown"
 
 
+def sections(text: str) -> dict[str, str]:
+    """Return the sections of the file by the names of their experiments."""
+    parts = re.split(r"^(?=## )", text, flags=re.M)[1:]
+    return {part[3:].partition("\n")[0]: part for part in parts}
+
+
 def write(name: str, command: str, tables: Iterable[Table], file: Path = FILE, origin: str = "") -> None:
     """Replace a section of the file, or add one. origin: date, machine and commit, if they are not those of now."""
     text = file.read_text() if file.exists() else HEAD
-    head, *parts = re.split(r"^(?=## )", text, flags=re.M)
-    sections = {part[3:].partition("\n")[0]: part for part in parts}
+    parts = sections(text)
     origin = origin or f"{datetime.date.today()}, {machine()}, commit {commit()}"
     lines = [f"## {name}", "", f"`{command}`: {origin}.", ""]
-    sections[name] = "\n".join([*lines, *(table.markdown() for table in tables)]) + "\n"
-    file.write_text(head + "".join(sections[key] for key in sorted(sections)))
+    parts[name] = "\n".join([*lines, *(table.markdown() for table in tables)]) + "\n"
+    file.write_text(HEAD + "".join(parts[key] for key in sorted(parts)))
 
 
 def mean_and_error(values: np.ndarray) -> tuple[float, float]:

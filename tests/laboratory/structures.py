@@ -25,10 +25,21 @@ NOTES = ["2 s of swinging; the largest strain after the first second. A load of 
 
 
 def main(args) -> Iterator[Table]:
-    """Yield a table for bars, and one for ropes."""
+    """Yield a table for bars, one for ropes, and of each what is on the page of solvers."""
+    tv.init(threads=1)
     for link in (tv.Distance, tv.Rope):
         some = list(rows(link, (20,) if args.quick else (4, 8, 20)))
         yield Table(f"Structures of {link.__name__}", HEADS, some, NOTES)
+        yield short(link, some)
+
+
+def short(link, some: list[tuple]) -> Table:
+    """Return the strains at 20 substeps by solver and load, and the mean time of a frame."""
+    by_solver = {name: [row for row in some if row[0] == name and row[1] == "20"] for name in SOLVERS}
+    heads = [f"{link.__name__}, 20 substeps", *(f"load {row[2]}" for row in by_solver["default"]), "ms a frame"]
+    times = {name: np.mean([float(row[5]) for row in found]) for name, found in by_solver.items()}
+    cells = [(name, *(row[3] for row in found), f"{times[name]:.2f}") for name, found in by_solver.items()]
+    return Table("Strain by load", heads, cells)
 
 
 def rows(link, substeps) -> Iterator[tuple]:
