@@ -28,6 +28,7 @@ from tiverlet.device.patches.compiler import BRIEF
 from tiverlet.recording import reader, rrd, scene
 from tiverlet.report.accuracy.cases import entries, known
 from tiverlet.step import build
+from tiverlet.step.clock import Pace
 
 from .launches import launching
 
@@ -260,11 +261,16 @@ def rerun(w: tv.World, seconds: float, dt: float = 1 / 60, **settings) -> tv.Wor
     """
     w._start_from(w.particles.velocity)
     w.position = w.particles.position
-    again = {} if w.settings["substeps"] == "auto" else {"substeps": w.substeps}  # of frames of a length of their own
-    for name, value in (again | settings).items():
+    forget_pace(w)
+    for name, value in settings.items():
         setattr(w, name, value)
     w.run(seconds, dt=dt)
     return w
+
+
+def forget_pace(w: tv.World) -> None:
+    """Let the next frame have as many substeps as are set, however long it is."""
+    w._controller.pace = Pace()
 
 
 def unprojected(w: tv.World) -> tv.World:

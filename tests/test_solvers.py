@@ -50,7 +50,8 @@ def test_solvers_that_solve_nothing_or_are_unstable_are_refused(world):
 @pytest.mark.slow
 def test_conjugate_gradients_reach_the_direct_solution(world):
     # One Newton step with the same linear system, of rigid links and of springs with dashpots. Enough steps of conjugate
-    # gradients give the direct solution, since there is no floor where they converge. Fewer come less near, but second order.
+    # gradients give the direct solution but for what the floor lets sag, sigma W h^2 F in a link: with sigma = 1.2 lambda / 60^2
+    # < 1.4e-3, 1.4e-3 * 2 / m * h^2 * 6 m g < 5e-7 m. Before that, each comes nearer.
     (x, pairs), made = cloth(6), []
     for solver in (tv.Direct(width=100), tv.ConjugateGradient(60), tv.ConjugateGradient(8)):
         link = tv.Distance(pairs, compliance=1e-3 * (np.arange(len(pairs)) % 2), damping=1.0)
@@ -58,9 +59,9 @@ def test_conjugate_gradients_reach_the_direct_solution(world):
         w = world(start, [tv.Gravity(9.81), link, tv.Drag(5.0)], solver=solver, **some)
         w.run(0.3)
         made.append((w.position, link.load))
-    np.testing.assert_allclose(made[0][0], made[1][0], atol=1e-8)
+    np.testing.assert_allclose(made[0][0], made[1][0], atol=5e-7)
     np.testing.assert_allclose(made[0][1], made[1][1], atol=1e-5 * np.abs(made[0][1]).max())
-    assert 1e-8 < np.abs(made[2][0] - made[0][0]).max() < 1e-6
+    assert 1e-5 < np.abs(made[2][0] - made[0][0]).max() < 1e-2
 
 
 @pytest.mark.slow

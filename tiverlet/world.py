@@ -28,7 +28,7 @@ from .step import checkpoint, edit_scene, energy_bound, impulse, placing, violat
 from .step.adaptive import StepController
 from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver, usual_substeps
 from .step.build_again import Rebuild
-from .step.clock import CHANGED, NO, Clock, Pace, exceeds, falls_short
+from .step.clock import CHANGED, NO, Clock, exceeds, falls_short
 from .step.diagnostics import KINETIC
 from .step.edit_scene import Handle
 from .step.explain import compiling, explain
@@ -664,8 +664,8 @@ class World:
 
     @property
     def substeps(self) -> int:
-        """Substeps of the next frame after this was assigned, whose length later frames keep; with "auto", of the next frame.
-        Assign a number, "auto", or None for the usual number."""
+        """Substeps of the first frame after their number was changed, whose length later frames keep; with "auto", of the next
+        frame. Assign a number, "auto", or None for the usual number."""
         return self._controller.substeps if self._controller.auto else self._substeps or self._usual_substeps
 
     @substeps.setter
@@ -673,7 +673,7 @@ class World:
         """Set the substeps from the next frame on: at least 1, "auto", or None."""
         if isinstance(value, str) and value != "auto":
             raise ValueError(f'World: substeps = {value!r}, but it must be an integer of at least 1, "auto" or None.')
-        self._controller.auto, self._controller.pace = value == "auto", Pace()
+        self._controller.auto = value == "auto"
         if not self._controller.auto:
             self._substeps = None if value is None else checks.integer("World", "substeps", value, least=1)
 

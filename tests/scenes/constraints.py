@@ -32,7 +32,7 @@ def clamped_beams_from_rigid_to_soft_sag():
     return start, features, {"solver": c.Jacobi(), "substeps": 4, "precision": "f64"}
 
 
-@scene(flags={"energy-loss"})
+@scene()
 def a_chain_that_is_straight_but_for_rounding_flies():
     # Points on a line along (1, 2, 3) are off it by 1e-16 m: the plane of a path that is almost straight turns far in a substep.
     rope = tv.shapes.rope((0, 0, 0), np.array([1.0, 2.0, 3.0]) / np.sqrt(14) * 9, points=10)

@@ -173,7 +173,7 @@ class Links:
                 # Its system has left it as soft as its floor, and as near as its steps come: it answers what contacts add alone.
                 violation *= 0
                 if self.begin[r] < self.begin[r + 1]:
-                    alpha += A * W * self.slots.system.floor_at(self.slot[self.begin[r]])
+                    alpha = ti.max(alpha, A * W * self.slots.system.floor_at(self.slot[self.begin[r]]))
         acts = W > 0 and weight > 0  # a link of a system has no corners here, and no weight
         self.stiff[r] = ti.select(acts, ti.static(RELAXATION) / ti.max(A * weight + alpha, FEW), 0 * W)
         self.firm[r] = ti.select(acts, 1 / ti.max(A * firm + alpha, FEW), 0 * W)

@@ -40,9 +40,9 @@ class ConjugateGradient(Solver):
     blocks, in f64, so results are the same bit for bit on any number of threads.
 
     If steps end before they have converged, their result differs in every substep. It acts as a spring whose stiffness jumps,
-    which adds energy. So the diagonal has a floor from then on,
+    which adds energy. So what is added to the diagonal has a floor,
 
-        alpha'_j + sigma W_j,   sigma = lambda_max / steps^2
+        max(alpha'_j, sigma W_j),   sigma = lambda_max / steps^2
 
     with W_j the diagonal of A = G w G^T and lambda_max the largest eigenvalue of W^-1 A. The condition number is then at most
     steps^2 + 1, for which so many steps suffice, and a link gives way like one of compliance sigma W h^2. It stays as soft where
@@ -133,7 +133,7 @@ class CGSystem(System):
 
     def sag(self, batch: "Batch") -> np.ndarray:
         """Return the floor of the part of each constraint of a batch, (m,); 1 for those that are relaxed alone."""
-        row, floor = self.row(batch), self.memory.read(self.floor)
+        row, floor = self.row(batch), np.maximum(self.memory.read(self.floor), self._least)
         return np.where(row < 0, 1.0, floor[self.memory.read(self.representative)[row]])
 
     def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
@@ -157,14 +157,14 @@ class CGSystem(System):
         zero = 0 * violation
         self.step[r] = ti.select(W > 0, ti.cast(0, ti.f64), -ti.cast(lam, ti.f64))
         self.residual[r] = ti.select(W > 0, -violation / A, zero)
-        self.shift[r] = ti.select(W > 0, alpha / A + self.floor_of(self.representative[r]) * W, zero)
+        self.shift[r] = ti.select(W > 0, ti.max(alpha / A, self.floor_of(self.representative[r]) * W), zero)
         self.inverse_diagonal[r] = ti.select(W > 0, 1 / (W + self.shift[r]), zero)
         self.direction[r] = self.inverse_diagonal[r] * self.residual[r]
 
     @ti.func
     def floor_of(self, i):
-        """Return the floor of the part of particle i; 0 as long as its steps converge."""
-        return ti.cast(self.floor[i], self.real)
+        """Return the floor of the part of particle i."""
+        return ti.max(ti.cast(self.floor[i], self.real), self.least)
 
     @ti.func
     def floor_at(self, slot):
@@ -229,7 +229,7 @@ class CGSystem(System):
         self.team.wait()
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             if self.floor_too_low[self.part_of[i]] != 0:
-                self.floor[i] = ti.max(self.least, ti.min(GROWTH * self.floor_of(i), HIGHEST))
+                self.floor[i] = ti.min(GROWTH * self.floor_of(i), HIGHEST)
         self.team.wait()
         for p in range(self.team.chunk_begin(self.part_count, thread), self.team.chunk_end(self.part_count, thread)):
             self.floor_too_low[p] = 0

@@ -174,7 +174,7 @@ class Runner:
             if h != clock.h or drag != clock.drag:
                 if self.scene.slots and self.scene.slots.system and clock.h:
                     self.scene.slots.system.keep_softness(h / clock.h)
-                less = settling.relieve(self, h, dt) if self._relieves(h, keeps, adapts) else 1.0
+                less = settling.relieve(self, h, dt) if self._relieves(h, dt, keeps, adapts) else 1.0
                 if less < 1:
                     self._forget_system()
                 softness.keep(self, h, dt, passes, adapts, less)
@@ -194,15 +194,16 @@ class Runner:
         h, last = dt / substeps * self.integrator.first, self.clock.h
         return last if abs(h - last) <= EQUAL * h else h
 
-    def _relieves(self, h: float, keeps: bool, adapts: bool) -> bool:
+    def _relieves(self, h: float, dt: float, keeps: bool, adapts: bool) -> bool:
         """Whether what longer substeps have left settles before substeps h [s].
 
-        Not so where violations are what drives lag behind, unless `adapts`.
+        Not so after a late frame, nor where violations are what drives lag behind, unless `adapts`.
         """
         slots, clock = self.scene.slots, self.clock
         if not slots or h >= softness.NEAR * clock.longest or keeps or self.probe or clock.first_moved is not None:
             return False
-        return adapts or not (self.driven or self.ramping) or bool(slots.system and slots.system.can_stiffen)
+        steady = dt == clock.frame[1] and not (self.driven or self.ramping)
+        return adapts or steady or bool(slots.system and slots.system.can_stiffen)
 
     def _forget_system(self) -> None:
         """Let a system forget what it has learnt from earlier positions."""

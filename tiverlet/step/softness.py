@@ -17,19 +17,23 @@ grow by half of what the energy allows.
 """
 
 from math import exp
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..constraints.core.anchored import Anchored
 from ..constraints.core.scalar import Scalar
+from ..particles import LARGEST
 from .clock import CHANGED
+from .solids import Solids
 
 if TYPE_CHECKING:
     from .runner import Runner
 
 NEAR = 0.6  # of a substep: one that is about as long; where two are set, they are from 3/4 to 5/4 as long in uneven frames
 SETTLE = 0.5  # time constant with which soft links stiffen [s]
+CONVERGED = 1e-3  # of the violations that one pass leaves: with less, passes hold loads in the same place whatever h is
+TINY = 1e-4  # of its size: a violation that needs no care, in a substep as long as the last one
 SETTLED = 1e-3  # excess of s that is dropped
 SLIGHT = 5e-4  # of the largest kinetic energy: what may be more than ever
 
@@ -65,6 +69,8 @@ def keep(runner: "Runner", h: float, dt: float, iterations: int, adapts: bool = 
         clock.longest = clock.longest if NEAR * clock.longest <= h <= clock.longest else h
         least = (clock.longest / h) ** 2
         more = max(1.0, soft / least)
+        if more > 1 and clock.softness == 1 and needs_no_care(runner, more * least):
+            clock.longest, least, more = h, 1.0, 1.0
         if more > 1:
             more /= stiffening(runner, more, _stored_before(runner, left) + energy, dt, adapts)
         runner.set_softness(least * more if more > 1 + SETTLED else least)
@@ -99,6 +105,42 @@ def _room(runner: "Runner") -> float | None:
     if clock.energy is None or clock.bound is None or clock.bound == CHANGED:
         return None
     return clock.bound + SLIGHT * clock.kinetic - clock.energy
+
+
+def needs_no_care(runner: "Runner", s: float) -> bool:
+    """Whether links may be as stiff as passes make them at once, where they would be `s` times as soft.
+
+    So it is where violations are tiny and nothing may break, or where passes have left less than CONVERGED of the violations that
+    one pass would leave by the same loads.
+    """
+    memory, batches, w, h = runner.memory, runner.batches, runner.scene.inv_mass, runner.clock.h
+    x = runner.scene.state.get(memory)
+    if not (np.abs(x) < LARGEST).all():  # or NaN
+        return False
+    solids = Solids(batches, w)
+    far = float(solids.far(x).max(initial=0.0)) if solids.count else 0.0
+    if not any(b.soft or b.breaks for b in batches) and max(worst(batches, x), far) <= TINY / s:
+        return True
+    if any(isinstance(b, Anchored) or (b.clusters and b.soft) for b in batches) or not far <= CONVERGED * solids.worst:
+        return False
+    if worst(batches, x) > CONVERGED:  # an impact left it
+        return False
+    split, stores, one = memory.read(runner.scene.slots.split), 0.0, 0.0
+    for b in batches:
+        if isinstance(b, Scalar) and b.count:
+            one += float((b.weights(x, split) * (h * b.load) ** 2).sum()) / 2
+            stores += _stored_in(b, b.violation(x) * ~b.broken, np.zeros(b.count))
+    return stores <= CONVERGED * one
+
+
+def worst(batches: list[Any], x: np.ndarray) -> float:
+    """Return the worst violation of links at x, (n, dim), as a share of its size."""
+    out = 0.0
+    for b in batches:
+        if isinstance(b, Scalar) and b.count:
+            C = b.violation(x) * b.inverse_size(b.start.position) * ~b.broken
+            out = max(out, float((np.abs(C) if b.side == 0 else b.side * C).max(initial=0.0)))
+    return out
 
 
 def stored(runner: "Runner") -> float:
