@@ -67,7 +67,7 @@ def test_a_late_frame_has_the_bits_of_the_frames_that_it_missed(world, dts):
     # Substeps keep their length, so a frame that is n times as long is n frames. Up to eight times as many substeps: no flag.
     one, many = net(world, 1.0), net(world, 1.0)
     for w in (one, many):
-        w.step(1 / 60)
+        w.run(2 / 60)
     for dt in dts:
         assert one.step(dt).substeps == round(dt * 60) * SUBSTEPS and "substeps-capped" not in one.last.flags
         for _ in range(round(dt * 60)):
@@ -77,8 +77,8 @@ def test_a_late_frame_has_the_bits_of_the_frames_that_it_missed(world, dts):
 
 
 def test_frames_of_another_rate_have_as_many_substeps_as_are_set(world):
-    # 15 frames in a row that are twice as long are late; the 16th is another rate, and so is the second frame of all, if the
-    # first one was longer. Frames that differ by less than half have no rate of their own.
+    # 15 frames in a row that are twice as long are late; the 16th is another rate, and so is each frame until a second one is
+    # about as long. Frames that differ by less than half have no rate of their own.
     def counts(*frames):
         w = net(world, 1.0)
         return [w.step(k / 60).substeps for k in frames]
@@ -87,6 +87,7 @@ def test_frames_of_another_rate_have_as_many_substeps_as_are_set(world):
     assert counts(1, 1, *[2] * 15, 1, 2) == [n, n, *[2 * n] * 15, n, 2 * n]
     assert counts(1, 1, *[2] * 17, 1) == [n, n, *[2 * n] * 15, n, n, n // 2]
     assert counts(15, 1, 1, 2) == [n, n, n, 2 * n] and counts(1, 0.5, 0.5) == [n, n, n]
+    assert counts(0.06, 1, 1, 2) == [n, n, n, 2 * n] and counts(1, 15, 1, 1, 2) == [n, n, n, n, 2 * n]
     assert counts(1, 1, *[0.7] * 17) == [n, n, *[round(0.7 * n)] * 17] and counts(1, 1, 0.01) == [n, n, 1]
 
 
@@ -95,7 +96,7 @@ def test_a_frame_that_is_far_too_late_says_so(world):
     w = net(world, 1.0)
     copies = tv.Worlds(w, 2)
     for each in (w, copies):
-        each.step(1 / 60)
+        each.run(2 / 60)
         report = each.step(0.2)
         assert report.substeps == 8 * SUBSTEPS and "substeps-capped" in report.flags
         assert "substeps-capped" not in each.step(1 / 60).flags

@@ -134,9 +134,9 @@ class World:
     def step(self, dt: float, tolerance: float | None = None, budget: float | None = None) -> StepReport:
         """Advance the world by dt [s], one frame, and return its report.
 
-        Without tolerance and budget the first frame has `substeps` substeps, and later ones as many as keep their length: a late
-        one has more of them, up to eight times `substeps`; beyond that it is flagged. With substeps="auto" it has as many as it
-        needs to be stable.
+        Without tolerance and budget frames of the usual length have `substeps` substeps, and others as many as keep their length:
+        a late one has more of them, up to eight times `substeps`; beyond that it is flagged. With substeps="auto" it has as many
+        as it needs to be stable.
         tolerance: upper bound of the residual and the overlap, both relative; of phi^2 / 24, for the angle phi by which rigid
         constraints, and beads on smooth curves, turn in a substep; of (omega h)^2 / 24 for forces that vary in space; and of
         about (omega h)^2 A / 12 for springs that vibrate by a share A of their size. The frame is repeated with more substeps
@@ -664,8 +664,8 @@ class World:
 
     @property
     def substeps(self) -> int:
-        """Substeps of the first frame after their number was changed, whose length later frames keep; with "auto", of the next
-        frame. Assign a number, "auto", or None for the usual number."""
+        """Substeps of frames of the usual length, which others keep; with "auto", of the next frame. Assign a number, "auto", or
+        None for the usual number."""
         return self._controller.substeps if self._controller.auto else self._substeps or self._usual_substeps
 
     @substeps.setter

@@ -68,7 +68,7 @@ def a_net_that_is_solved_as_a_whole_hangs_from_a_corner():
     return start, [c.Gravity(G), c.Distance(pairs)], settings
 
 
-@scene(flags={"moved"})
+@scene(flags={"moved", "stiff-force"})
 def forces_of_all_kinds_drive_links_between_walls():
     n = 20
     x = 2.0 * heap(n)

@@ -84,9 +84,9 @@ class Pace:
 
     A loop that measures dt has frames of any length. If their number stayed, the stiffness of what passes hold would change with
     dt^2 from frame to frame, and with it the energy that this stores. Frames of another length come singly, or some in a row;
-    RATE of them are another rate. The first frame counts as one that was too long, as where a program starts.
+    RATE of them are another rate. A first frame sets the length until a second one is about as long, as programs start unevenly.
 
-    off: how many frames in a row were longer, if below 0 shorter, by more than OTHER.
+    off: how many frames in a row were longer, if below 0 shorter, by more than OTHER; RATE while one alone sets the length.
     """
 
     substeps: int = 0
@@ -96,11 +96,11 @@ class Pace:
     def fit(self, dt: float, substeps: int) -> int:
         """Return how many substeps a frame of dt [s] has where so many are set, at most LATE times as many."""
         if self.substeps != substeps:
-            self.substeps, self.dt, self.off = substeps, dt, 1 - RATE
+            self.substeps, self.dt, self.off = substeps, dt, RATE
         elif side := (dt > OTHER * self.dt) - (OTHER * dt < self.dt):
-            self.off = self.off + side if side * self.off >= 0 else side
-            if abs(self.off) >= RATE:
-                self.dt, self.off = dt, 0
+            self.off = RATE if self.off == RATE else self.off + side if side * self.off >= 0 else side
+            if abs(self.off) == RATE:
+                self.dt, self.off = dt, RATE
         else:
             self.off = 0
         return max(1, min(round(substeps * dt / self.dt), LATE * substeps))
