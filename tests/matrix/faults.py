@@ -6,13 +6,12 @@ IMPACT = "a bounce off a wall beside contacts differs by a fraction of a substep
 BELT = "friction on a curved wall is of first order, alone and as a row"
 PARTING = "beside contacts overlap parts 1.28 times as fast as push_out, and without velocity; alone it leaves with push_out"
 ONE_CORNER = "Taichi ends the process (scalarize.cpp) where a constraint of one corner is a row"
+FEWER = '"auto" takes 1 to 8 substeps, in which balls that roll on each other part another way than in 20 and more'
 ULP = "a digit depends on the unit of length"
 
 KNOWN: dict[tuple[str, str], str] = {
-    ("servos", "late 0.25"): BRAKE,
-    ("servos", "changed back"): BRAKE,
     ("servos", "auto"): BRAKE,
-    ("snaps", "late 0.05"): ALONG,
+    ("balls roll on balls", "auto"): FEWER,
     ("snaps", "late 0.25"): ALONG,
     ("snaps", "uneven"): ALONG,
     ("snaps", "changed back"): ALONG,
