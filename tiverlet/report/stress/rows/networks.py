@@ -70,8 +70,8 @@ def _long() -> Findings:
         w.step(1e-3)
         error = float(np.abs(link.load / (m * 9.81 * np.arange(n, 0, -1)) - 1).max())
         report = w.run(0.2, dt=1e-3)
-        yield at_most(f"loads to {error:.0e}", error, 1e-7)
-        yield at_most(f"stays to {report.residual:.0e}", report.residual, 1e-9, report.clean)
+        yield at_most(f"loads to {error:.0e}", error, 3e-8)
+        yield at_most(f"stays to {report.residual:.0e}", report.residual, 1e-12, report.clean)
 
 
 @row(40, "a closed loop of 100 links", "solved as one system: lengths, momentum and energy hold")
