@@ -197,7 +197,8 @@ def _uneven() -> Findings:
     yield at_most(f"soft rope {gain:+.1e} m g L", gain, 1e-3)
 
 
-@row(120, "rigid ropes, one with an end 40 times as heavy, and a net in such frames, without and with late ones", "at most 3e-2 m g L")
+@row(120, "rigid ropes, one with an end 40 times as heavy, and a net in such frames, without and with late ones",
+     "at most 3e-2 m g L")  # fmt: skip
 def _uneven_rigid() -> Findings:
     scenes = hanging()
     start, features = scenes["rope"]
